@@ -1,0 +1,62 @@
+"""Differentiable dynamics of holonomic and nonholonomic mechanical systems, by Jourdain's principle of virtual power.
+
+Importing this package switches JAX to 64-bit floats, unless the environment variable JAX_ENABLE_X64 is set to 0, and asks for at least 16
+threads on the CPU, unless PJRT_NPROC or NPROC is set.
+"""
+
+import os as _os
+
+import jax as _jax
+
+if _os.environ.get("JAX_ENABLE_X64", "1").lower() not in ("0", "false", "off"):
+    _jax.config.update("jax_enable_x64", True)
+
+# A batched LAPACK call of jaxlib 0.10 waits, in a thread of the pool, for work that is queued on the same pool: as many such calls at once as
+# there are threads wait for ever (seen with two cores and batches of some thousand). jaxlib 0.11 no longer splits batches.
+if not {"PJRT_NPROC", "NPROC"} & _os.environ.keys():
+    _os.environ["PJRT_NPROC"] = str(max(16, _os.cpu_count() or 1))
+
+from jourdain_jax import models
+from jourdain_jax.analysis.bijections import bounds, positive, unbounded
+from jourdain_jax.analysis.fit import fit, fit_batch
+from jourdain_jax.analysis.likelihood import log_likelihood
+from jourdain_jax.analysis.linearize import Linearization, linearize
+from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.report import Report, report
+from jourdain_jax.analysis.steady import steady
+from jourdain_jax.analysis.verify import Verification, verify
+from jourdain_jax.calculus.guards import DifferentiationModeError
+from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
+from jourdain_jax.equations.accelerations import Accelerations, Baumgarte, accelerations, reductions
+from jourdain_jax.equations.gibbs_appell import GibbsAppell, gibbs_equations, gibbs_function
+from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
+from jourdain_jax.equations.lagrange import lagrange_equations
+from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, NullSpaceSVD, Privileged, UdwadiaKalaba
+from jourdain_jax.equations.rows import constraint_rows, position_residual, velocity_residual
+from jourdain_jax.equations.structure import sample_states, structure_of
+from jourdain_jax.equations.virtual_power import (
+    generalized_forces,
+    kinetic_energy,
+    newton_residual,
+    potential_energy,
+    unconstrained_equations,
+    virtual_power,
+)
+from jourdain_jax.motion.diagnostics import diagnose
+from jourdain_jax.motion.inputs import Sampled
+from jourdain_jax.motion.results import SimulationError
+from jourdain_jax.motion.rollout import Rollout, rollout
+from jourdain_jax.motion.simulate import simulate
+from jourdain_jax.motion.start import State, consistent, start
+from jourdain_jax.motion.storage import load, save
+from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.plotting.animation import animate
+from jourdain_jax.plotting.quantities import plot
+from jourdain_jax.scene.bodies import Particle, RigidBody
+from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
+from jourdain_jax.scene.contacts import Plane, ball_contact, disc_contact
+from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, speeds
+from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
+from jourdain_jax.scene.motion_state import fixed_point
+from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.scene import Scene

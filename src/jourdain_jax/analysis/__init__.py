@@ -1,0 +1,1 @@
+"""What can be said of a scene and of a state: integrability, report, energy, verification."""

@@ -1,0 +1,78 @@
+"""The energy of a scene, and whether it is conserved.
+
+E = T + V,   T = sum m v.v/2 + omega.I omega/2,   dE/dt = power of what has no potential      (see `equations.power`)
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.equations.accelerations import bare_accelerations
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.power import power
+from jourdain_jax.equations.structure import sample_states
+from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy, unconstrained_equations
+from jourdain_jax.scene.scene import Scene
+
+_ORIGINS = {
+    "loads": "loads without a potential",
+    "rows": "constraint rows that do real work",
+    "driven": "poses driven as functions of time",
+    "potential": "potentials that depend on time",
+}
+
+
+class Energy(eqx.Module):
+    """Energy of one state, in J."""
+
+    kinetic: Float[Array, ""]
+    potential: Float[Array, ""]  # of all loads and of the scene that have one; loads without one are not in it
+
+    @property
+    def total(self) -> Float[Array, ""]:
+        """T + V."""
+        return self.kinetic + self.potential
+
+
+@dataclass(frozen=True)
+class EnergyBalance:
+    """Whether T + V is conserved along every motion of a scene, and what changes it otherwise."""
+
+    conserved: bool
+    changed_by: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return "T + V is conserved" if self.conserved else f"T + V is changed by {' and '.join(self.changed_by)}"
+
+
+def energy(scene: Scene, t, q, u, inputs=None) -> Energy:
+    """Kinetic and potential energy at (t, q, u)."""
+    return Energy(kinetic_energy(scene, t, q, u), potential_energy(scene, motion_at(scene, t, q, u, inputs)))
+
+
+def energy_balance(scene: Scene, *, points: int = 8, seed: int = 0) -> EnergyBalance:
+    """Whether T + V is conserved: the powers that change it, at random admissible states and with random inputs, are all zero.
+
+    A power counts as zero below 1e-9 of the powers at hand (1e-4 in single precision).
+    """
+    t, q, u = (jnp.asarray(x) for x in sample_states(scene, points, seed))
+    inputs = jnp.asarray(np.random.default_rng(seed).normal(size=(len(t), len(scene.inputs))))
+    powers, size = _powers(scene, t, q, u, inputs)
+    limit = (1e-9 if q.dtype == jnp.float64 else 1e-4) * float(jnp.max(size))
+    changed_by = tuple(text for name, text in _ORIGINS.items() if float(jnp.max(jnp.abs(getattr(powers, name)))) > limit)
+    return EnergyBalance(not changed_by, changed_by)
+
+
+@eqx.filter_jit
+def _powers(scene: Scene, t, q, u, inputs):
+    def one(t, q, u, inputs):
+        found = bare_accelerations(scene, t, q, u, inputs)
+        equations = unconstrained_equations(scene, t, q, u, inputs)
+        forces = jnp.abs(equations.M) @ jnp.abs(found.udot) + jnp.abs(equations.h) + jnp.abs(equations.Q)
+        return power(scene, t, q, u, inputs, found), jnp.abs(u) @ forces
+
+    return jax.vmap(one)(t, q, u, inputs)

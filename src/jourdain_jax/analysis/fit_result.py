@@ -1,0 +1,166 @@
+"""The result of a fit: estimates with their uncertainty, residuals, the fitted scene, and what the measurements cannot tell."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jourdain_jax.analysis.information import Information, hidden_combinations
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.scene import Scene
+
+
+class Estimate(eqx.Module):
+    """One unknown, in its unit; NaN for what the measurements cannot tell."""
+
+    value: Float[Array, "*repeats"]
+    standard_error: Float[Array, "*repeats"]
+    low: Float[Array, "*repeats"]  # ends of the 95 % interval
+    high: Float[Array, "*repeats"]
+    unit: str = eqx.field(static=True)
+
+
+class ChannelResiduals(eqx.Module):
+    """Residuals of one channel of one run, in units of sigma. Good fits have mean near 0 and rms near 1."""
+
+    run: int
+    channel: str
+    samples: int
+    mean: float
+    rms: float
+    largest: float  # in magnitude
+
+
+class Fit(eqx.Module):
+    """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene; `print(fit)` shows a table.
+
+    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too.
+    """
+
+    scene: Scene  # with the estimates
+    starts: tuple[dict[str, Float[Array, "..."]], ...]  # initial values of each run, with the estimates
+    values: Float[Array, "unknowns"]
+    sizes: Float[Array, "unknowns"]  # against which the rank is judged
+    standard_errors: Float[Array, "unknowns"]  # NaN where not identifiable
+    low: Float[Array, "unknowns"]  # ends of the 95 % intervals; NaN where not identifiable
+    high: Float[Array, "unknowns"]
+    at_bound: Bool[Array, "unknowns"]  # estimates that a bound decides; they have no interval
+    information: Information
+    residuals: tuple[dict[str, Float[Array, "..."]], ...]  # (times, *channel): (prediction - value) / sigma; NaN where missing
+    chi_square: Float[Array, ""]
+    samples: Int[Array, ""]  # with a finite sigma
+    converged: Bool[Array, ""]
+    steps: Int[Array, ""]  # tried
+    labels: tuple[str, ...] = eqx.field(static=True)  # names of the unknowns
+    units: tuple[str, ...] = eqx.field(static=True)
+    cutoff: float = eqx.field(static=True)
+
+    def __getitem__(self, name: str) -> Estimate:
+        if name not in self.labels:
+            raise KeyError(f"`{name}` was not estimated; {nearest(name, self.labels)}")
+        i = self.labels.index(name)
+        return Estimate(self.values[..., i], self.standard_errors[..., i], self.low[..., i], self.high[..., i], self.units[i])
+
+    @property
+    def estimates(self) -> dict[str, Estimate]:
+        """All estimates by name."""
+        return {name: self[name] for name in self.labels}
+
+    @property
+    def covariance(self) -> Float[Array, "*repeats unknowns unknowns"]:
+        """Covariance of the estimates in the order of `labels`, to first order; NaN where not identifiable."""
+        return self.information.covariance
+
+    @property
+    def correlation(self) -> Float[Array, "*repeats unknowns unknowns"]:
+        """Correlation of the estimates."""
+        return self.covariance / (self.standard_errors[..., :, None] * self.standard_errors[..., None, :])
+
+    @property
+    def degrees_of_freedom(self) -> Int[Array, "*repeats"]:
+        """Samples less the directions that were determined."""
+        return self.samples - self.information.rank
+
+    @property
+    def reduced_chi_square(self) -> Float[Array, "*repeats"]:
+        """Sum of squared residuals per degree of freedom: near 1 where scene and sigmas are right."""
+        return self.chi_square / self.degrees_of_freedom
+
+    # Of one fit, not of a batch. -----------------------------------------------------------------------------------
+
+    @property
+    def not_identifiable(self) -> tuple[str, ...]:
+        """What the measurements cannot tell, one sentence per combination of unknowns."""
+        if not np.isfinite(self.chi_square):
+            return ()
+        hidden = np.asarray(self.information.directions)[int(self.information.rank) :]
+        return hidden_combinations(hidden, np.asarray(self.sizes), np.asarray(self.values), self.labels)
+
+    @property
+    def warning(self) -> str:
+        """Why the estimates should not be relied on, in one sentence; empty where nothing speaks against them."""
+        if not np.isfinite(self.chi_square):
+            return "the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`"
+        if np.any(self.at_bound):
+            names = ", ".join(f"`{name}`" for name, at in zip(self.labels, np.asarray(self.at_bound), strict=True) if at)
+            return f"{names} lies at a bound, which decides its value; all standard errors lose their meaning: widen the bounds"
+        if not self.converged:
+            return "no minimum was found; raise `max_iterations`, or start nearer to it"
+        # chi-square has mean n and variance 2 n
+        if self.reduced_chi_square > 1 + 5 * np.sqrt(2 / max(int(self.degrees_of_freedom), 1)):
+            return (
+                "the residuals are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, "
+                "or sigmas that are too small"
+            )
+        return ""
+
+    def residual_summary(self) -> tuple[ChannelResiduals, ...]:
+        """Count, mean, rms and largest residual per run and channel."""
+        return tuple(_summary(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
+
+    def __str__(self) -> str:
+        return _batch_text(self) if self.values.ndim > 1 else _text(self)
+
+
+def _summary(run: int, name: str, r: np.ndarray) -> ChannelResiduals:
+    r = r[~np.isnan(r)]
+    mean, rms, largest = (r.mean(), np.sqrt((r**2).mean()), np.abs(r).max()) if r.size else (np.nan,) * 3
+    return ChannelResiduals(run, name, r.size, float(mean), float(rms), float(largest))
+
+
+def _text(fit: Fit) -> str:
+    lines = [
+        f"Fit of {type(fit.scene).__name__}: {'converged' if fit.converged else 'NOT CONVERGED'} in {int(fit.steps)} steps; "
+        f"{int(fit.samples)} samples, {len(fit.labels)} unknowns, reduced chi-square {float(fit.reduced_chi_square):.4g}"
+    ]
+    lines += [f"WARNING: {fit.warning}"] if fit.warning else []
+    rows = [("unknown", "unit", "estimate", "std. error", "95 % interval")]
+    for name, e in fit.estimates.items():
+        error = f"{e.standard_error:.2g}" if np.isfinite(e.standard_error) else "-"
+        interval = f"[{e.low:.6g}, {e.high:.6g}]" if np.isfinite(e.low) else "none"
+        rows.append((name, e.unit, f"{e.value:.6g}", error, interval))
+    lines += _table(rows)
+    if fit.not_identifiable:
+        lines.append(f"singular values below {fit.cutoff:g} of the largest count as zero:")
+        lines += [f"  {sentence}" for sentence in fit.not_identifiable]
+    rows = [("run", "channel", "samples", "mean", "rms", "largest residual (in sigmas)")]
+    for s in fit.residual_summary():
+        rows.append((str(s.run), s.channel, str(s.samples), f"{s.mean:.2g}", f"{s.rms:.3g}", f"{s.largest:.3g}"))
+    return "\n".join(lines + _table(rows))
+
+
+def _batch_text(fit: Fit) -> str:
+    good = np.asarray(fit.converged)
+    rows = [("unknown", "unit", "mean", "std. deviation", "mean std. error")]
+    for name, e in fit.estimates.items():
+        values, errors = np.asarray(e.value)[good], np.asarray(e.standard_error)[good]
+        some = good.sum() > 1
+        numbers = (f"{values.mean():.6g}", f"{values.std(ddof=1):.2g}", f"{errors.mean():.2g}") if some else ("-", "-", "-")
+        rows.append((name, e.unit, *numbers))
+    return "\n".join([f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} converged", *_table(rows)])
+
+
+def _table(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

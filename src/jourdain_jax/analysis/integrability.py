@@ -1,0 +1,243 @@
+"""Which rows are holonomic: one by one by Frobenius' criterion, all together by the growth of the admissible velocities.
+
+A row `A u + d = 0` is the differential form `w = alpha . dq + alpha_0 dt`, `alpha = A N+`, `alpha_0 = d - alpha . nu`. By itself
+it is integrable if and only if `w ^ dw = 0`, that is, if the two-form dw vanishes on the velocities that w admits (Frobenius).
+
+Rows together: with `qdot = X y + X_0` the admissible velocities, the spaces `D_1 = span X`, `D_k+1 = D_k + [D_1, D_k]` grow to
+a last dimension; the motion stays on a manifold of that dimension. Time counts as one more coordinate with the field `(1, X_0)`
+where the rows or rates depend on time or are not homogeneous; its dimension is left out of the growth vector.
+
+`[X, Y] = DY X - DX Y` by jvp. A bracket of brackets needs the derivative of such a jvp: taken by eighth-order central differences
+(to about 1e-11), because every further nesting of jvp doubles the program to be compiled.
+Source: Wang and Pao (2003), section II; for the growth vector A. M. Vershik and V. Ya. Gershkovich, Dynamical Systems VII (1994).
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
+from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.reductions import partition
+from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.equations.scaling import row_scale
+from jourdain_jax.equations.structure import sample_states, structure_of
+from jourdain_jax.scene.scene import Scene
+
+INTEGRABLE = 1e-9  # size of dw on the velocities that w admits, relative to the derivatives of w
+STEP = 0.02  # of the differences, along unit directions
+BATCH = 32  # points evaluated together
+
+
+@dataclass(frozen=True)
+class RowIntegrability:
+    """Rows that are holonomic one by one, and those that are not; sizes of the violation of Frobenius' criterion."""
+
+    integrable_rows: tuple[str, ...]
+    nonholonomic_rows: tuple[str, ...]
+    violations: dict[str, float]  # relative; infinite for rows nonlinear in the speeds, which are no differential forms
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Dimensions of the spaces reached by brackets of admissible velocities; empty for rows nonlinear in the speeds."""
+
+    vector: tuple[int, ...]
+    closed: bool  # brackets to the given depth bring nothing new, or everything is reached
+    depth: int  # the largest number of fields in one bracket
+    tolerance: float  # relative size below which a bracket counts as nothing new
+    holonomic_rows_together: int | None  # all coordinates less the last dimension; None where not closed
+
+
+def row_integrability(scene: Scene, *, points: int = 6, seed: int = 0) -> RowIntegrability:
+    """Frobenius' criterion for every row by itself, at random admissible states of the scene's domain.
+
+    The violation is the largest value of the two-form dw on unit velocities that w admits, over all states, divided by the size
+    of w and of its derivatives. Below 1e-9 (1e-4 in single precision) a row counts as integrable.
+    """
+    names = structure_of(scene).row_names
+    if not names:
+        return RowIntegrability((), (), {})
+    states = [jnp.asarray(x) for x in sample_states(scene, points, seed)]
+    forms, derivatives, frames, nonlinear = (np.asarray(x) for x in _forms_at(scene, *states))
+    limit = INTEGRABLE if forms.dtype == np.float64 else 1e-4
+    violations = {}
+    for s, name in enumerate(names):
+        at_states = zip(forms[:, s], derivatives[:, s], frames, strict=True)
+        worst = max(_frobenius_violation(w, dw, frame) for w, dw, frame in at_states)
+        violations[name] = float("inf") if nonlinear[:, s].any() else worst
+    integrable = tuple(name for name in names if violations[name] <= limit)
+    return RowIntegrability(integrable, tuple(name for name in names if name not in integrable), violations)
+
+
+def _frobenius_violation(w: np.ndarray, derivative: np.ndarray, frame: np.ndarray) -> float:
+    """Largest entry of dw on the kinematically possible velocities that w admits."""
+    basis, _ = np.linalg.qr(frame)
+    on_basis = w @ basis
+    size = np.linalg.norm(on_basis)
+    if size == 0:
+        return 0.0
+    admitted = basis @ np.linalg.svd(on_basis[None])[2][1:].T
+    two_form = admitted.T @ (derivative.T - derivative) @ admitted
+    return float(np.max(np.abs(two_form), initial=0.0) / (size + np.max(np.abs(derivative))))
+
+
+@eqx.filter_jit
+def _forms_at(scene: Scene, t, q, u):
+    """Forms over (t, q), derivatives (component, direction), a frame of the possible velocities, and which rows are nonlinear."""
+
+    def one(t, q, u):
+        def forms(x):
+            t, q = x[0], x[1:]
+            N, nu = _rates(scene, t, q, u)
+            A, d = _linear_rows(scene, t, q, u)
+            alpha = A @ pseudo_inverse(N)
+            return jnp.concatenate([(d - alpha @ nu)[:, None], alpha], axis=1)
+
+        x = jnp.concatenate([t[None], q])
+        N, nu = _rates(scene, t, q, u)
+        frame = jnp.concatenate([jnp.concatenate([jnp.ones(1), nu])[:, None], jnp.pad(N, ((1, 0), (0, 0)))], axis=1)
+        (A, _), (A_other, _) = _linear_rows(scene, t, q, u), _linear_rows(scene, t, q, -0.7 * u[::-1])
+        curved = jnp.max(jnp.abs(A - A_other), axis=1) > 1e-9 * (1 + jnp.max(jnp.abs(A), axis=1))
+        return forms(x), jax.jacfwd(forms)(x), frame, curved
+
+    return jax.vmap(one)(t, q, u)
+
+
+def _rates(scene: Scene, t, q, u) -> tuple[Float[Array, "coordinates speeds"], Float[Array, "coordinates"]]:
+    """N and nu of `qdot = N u + nu`."""
+    N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
+    return N, coordinate_rates(scene, t, q, jnp.zeros_like(u))
+
+
+def _linear_rows(scene: Scene, t, q, u) -> tuple[Float[Array, "rows speeds"], Float[Array, "rows"]]:
+    """A and d of `A u + d`, taken at u."""
+    A = jax.jacfwd(lambda u: velocity_residual(scene, t, q, u))(u)
+    return A, velocity_residual(scene, t, q, u) - A @ u
+
+
+def growth_vector(scene: Scene, *, depth: int = 4, points: int = 2, seed: int = 0) -> Growth:
+    """Growth vector of the admissible velocities at generic states, by brackets of at most `depth` fields.
+
+    Of the states tried, the one with the largest dimensions is generic. A bracket counts as a new direction where it adds more
+    than `tolerance` (1e-6; 1e-2 in single precision) of the terms that it is made of.
+    """
+    structure = structure_of(scene)
+    reachable = len(scene.coordinate_names) - len(scene.coordinates.quaternions)  # unit norms hold by themselves
+    tolerance = 1e-6 if jnp.result_type(float) == jnp.float64 else 1e-2
+    if not structure.affine:
+        return Growth((), False, depth, tolerance, None)
+    with_time = structure.rheonomic or structure.driven or not structure.homogeneous
+    states = zip(*sample_states(scene, points, seed), strict=True)
+    vector, closed = max(_grow(_Fields(scene, with_time, u), t, q, reachable, depth, tolerance) for t, q, u in states)
+    return Growth(vector, closed, depth, tolerance, reachable - vector[-1] if closed else None)
+
+
+def _grow(fields: "_Fields", t, q, reachable: int, depth: int, tolerance: float) -> tuple[tuple[int, ...], bool]:
+    """Dimensions at one state, and whether they stopped growing."""
+    x = np.concatenate([t[None], q]) if fields.with_time else q
+    generators = np.eye(structure_of(fields.scene).degrees_of_freedom + fields.with_time)
+    if not len(generators):
+        return (0,), True
+    spanned = np.zeros((0, len(x)))
+    newest = generators[:, None]  # brackets: number, fields in each, coefficients of the generators
+    dimensions: list[int] = []
+    size = 0.0
+    for length in range(1, depth + 1):
+        if length > 1:
+            newest = np.array([[first, *rest] for first in generators for rest in newest])
+        values, sizes = _brackets(fields, np.tile(x, (len(newest), 1)), newest)
+        size = max(size, float(sizes.max()))
+        spanned, chosen = _extended(spanned, values, tolerance * size)
+        if not chosen:
+            return tuple(dimensions), True
+        dimensions.append(len(spanned) - fields.with_time)
+        if dimensions[-1] == reachable:
+            return tuple(dimensions), True
+        newest = newest[chosen]
+    return tuple(dimensions), False
+
+
+def _extended(spanned: np.ndarray, values: np.ndarray, smallest: float) -> tuple[np.ndarray, list[int]]:
+    """An orthonormal basis extended by those values that add to it, largest first; and which ones did."""
+    chosen: list[int] = []
+    while len(chosen) < len(values):
+        rest = values - (values @ spanned.T) @ spanned
+        rest = rest - (rest @ spanned.T) @ spanned  # twice, for orthogonality to round-off
+        lengths = np.linalg.norm(rest, axis=1)
+        best = int(np.argmax(lengths))
+        if not lengths[best] > smallest:
+            break
+        spanned = np.vstack([spanned, rest[best] / lengths[best]])
+        chosen.append(best)
+    return spanned, chosen
+
+
+def _brackets(fields: "_Fields", x: np.ndarray, parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Brackets `[X, [Y, ...]]` at points x, and the sizes of the terms they are made of.
+
+    `x` has shape (brackets, coordinates), `parts` (brackets, fields in each, generators): the coefficients of X, Y, ...
+    """
+    here, _ = fields(x, np.zeros_like(x))
+    first = np.einsum("bng,bg->bn", here, parts[:, 0])
+    if parts.shape[1] == 1:
+        return first, np.abs(first).max(axis=1)
+    rest, _ = _brackets(fields, x, parts[:, 1:])
+    if parts.shape[1] == 2:
+        along_first = np.einsum("bng,bg->bn", fields(x, first)[1], parts[:, 1])
+    else:
+        along_first = _differences(lambda x, parts: _brackets(fields, x, parts)[0], x, first, parts[:, 1:])
+    along_rest = np.einsum("bng,bg->bn", fields(x, rest)[1], parts[:, 0])
+    # [X, Y] = DY X - DX Y
+    return along_first - along_rest, np.abs(along_first).max(axis=1) + np.abs(along_rest).max(axis=1)
+
+
+def _differences(f, x: np.ndarray, direction: np.ndarray, parts: np.ndarray) -> np.ndarray:
+    """Derivative of `f(x, parts)` along a direction, by central differences of eighth order."""
+    length = np.linalg.norm(direction, axis=1, keepdims=True)
+    steps = STEP * np.array([1, 2, 3, 4, -1, -2, -3, -4])
+    weights = np.array([672, -168, 32, -3, -672, 168, -32, 3]) / (840 * STEP)
+    unit = direction / np.where(length > 0, length, 1)
+    points = x + steps[:, None, None] * unit
+    values = f(points.reshape(-1, x.shape[1]), np.tile(parts, (len(steps), 1, 1)))
+    return length * np.tensordot(weights, values.reshape(len(steps), *x.shape), 1)
+
+
+class _Fields:
+    """The generators `X` (and `(1, X_0)` first, where time counts) as columns over (t, q) or q, and their derivatives."""
+
+    def __init__(self, scene: Scene, with_time: bool, u):
+        self.scene, self.with_time, self.u = scene, with_time, jnp.asarray(u)
+
+    def __call__(self, x: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values and derivatives along `direction` at many points, in batches of one size, so that one program serves all."""
+        count = len(x)
+        padded = -count % BATCH
+        x, direction = (np.pad(a, ((0, padded), (0, 0)), mode="edge") for a in (x, direction))
+        batches = [
+            _fields_along(self.scene, self.with_time, self.u, x[i : i + BATCH], direction[i : i + BATCH])
+            for i in range(0, len(x), BATCH)
+        ]
+        values, derivatives = (np.concatenate([np.asarray(batch[k]) for batch in batches]) for k in (0, 1))
+        return values[:count], derivatives[:count]
+
+
+@eqx.filter_jit
+def _fields_along(scene: Scene, with_time: bool, u, x, direction):
+    return jax.vmap(lambda x, direction: jax.jvp(lambda x: _fields_at(scene, with_time, u, x), (x,), (direction,)))(x, direction)
+
+
+def _fields_at(scene: Scene, with_time: bool, u, x) -> Float[Array, "directions generators"]:
+    t, q = (x[0], x[1:]) if with_time else (jnp.zeros((), x.dtype), x)
+    A, d = _linear_rows(scene, t, q, u)
+    scale = row_scale(A)
+    C, c, _ = partition(structure_of(scene).independent, scale[:, None] * A, -scale * d)
+    N, nu = _rates(scene, t, q, u)
+    if not with_time:
+        return N @ C
+    drift = jnp.concatenate([jnp.ones(1, x.dtype), N @ c + nu])
+    return jnp.concatenate([drift[:, None], jnp.pad(N @ C, ((1, 0), (0, 0)))], axis=1)

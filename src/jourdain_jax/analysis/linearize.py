@@ -1,0 +1,213 @@
+"""Small motions about a steady motion, on the constraint manifold.
+
+    x = (independent coordinates, privileged speeds):              dx/dt = A x + B f
+    named coordinates p, virtual velocities W that make pdot = 1:  M pddot + C pdot + K p = F f,   M = W' (mass matrix) W
+
+Dependent coordinates and speeds follow from the linearised rows (`tangent.py`). The second form is Appell's equations for the named
+coordinates: the first form with the privileged speeds changed to (pdot, the others), times M.
+Source: Wang and Pao (2003), eqs. (25)-(31), (41); D. L. Peterson, G. Gede and M. Hubbard, Multibody System Dynamics 33 (2015) 143.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from jourdain_jax.analysis.tangent import (
+    Flow,
+    carried_along,
+    dependent_coordinates,
+    eliminated,
+    flow_of,
+    others,
+    perturbations,
+    privileged_speeds,
+)
+from jourdain_jax.motion.start import State
+from jourdain_jax.scene.scene import Scene
+
+
+class Modes(eqx.Module):
+    """Free small motions `p(t) = shape exp(s t)`."""
+
+    eigenvalues: Complex[Array, "modes"]  # s, in 1/s
+    shapes: Complex[Array, "parts modes"]  # one column per mode, its largest entry 1
+
+
+class Linearization(eqx.Module):
+    """Equations of small motions about a state; see the module's head."""
+
+    A: Float[Array, "states states"]
+    B: Float[Array, "states inputs"]
+    M: Float[Array, "parts parts"]  # of the named coordinates
+    C: Float[Array, "parts parts"]
+    K: Float[Array, "parts parts"]
+    F: Float[Array, "parts inputs"]
+    acceleration: Float[Array, ""]  # largest |dy/dt| of the privileged speeds at the state: zero if it is steady
+    residual: Float[Array, ""]  # the larger of that and of |d2y/dt2| along the motion: both zero if it is steady
+    coupling: Float[Array, ""]  # largest coefficient, in the second form, of what is not named, relative to those in M, C, K
+    pivot: Float[Array, ""]  # smallest singular value of the eliminated (scaled) rows; near zero: choose other dependent ones
+    states: tuple[str, ...] = eqx.field(static=True)  # names of the entries of x
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    coordinates: tuple[str, ...] = eqx.field(static=True)  # names of p
+
+    def eigenvalues(self) -> Complex[Array, "modes"]:
+        """Roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. Differentiable where distinct."""
+        return _ascending(jnp.linalg.eigvals(self._companion()))
+
+    def modes(self) -> Modes:
+        """The same with the shapes of the named coordinates (no derivative)."""
+        values, vectors = jnp.linalg.eig(jax.lax.stop_gradient(self._companion()))
+        order = jnp.lexsort((values.imag, values.real))
+        shapes = vectors[: len(self.coordinates), order]
+        largest = jnp.argmax(jnp.abs(shapes), axis=0)
+        return Modes(values[order], shapes / jnp.take_along_axis(shapes, largest[None], axis=0))
+
+    def state_eigenvalues(self) -> Complex[Array, "states"]:
+        """Eigenvalues of A, 1/s, by ascending real part.
+
+        Ignorable coordinates, and speeds that a steady motion may have at will, add zeros, often in Jordan blocks: a root of
+        round-off then stands in their place. `eigenvalues` is free of them.
+        """
+        return _ascending(jnp.linalg.eigvals(self.A))
+
+    def _companion(self) -> Float[Array, "modes modes"]:
+        k = len(self.coordinates)
+        if k == 0:
+            raise ValueError("no coordinates are named, so there is no second-order form; give `coordinates` to `linearize`, or use `state_eigenvalues`")
+        lower = -jnp.linalg.solve(self.M, jnp.concatenate([self.K, self.C], axis=1))
+        return jnp.concatenate([jnp.eye(k, 2 * k, k, dtype=lower.dtype), lower])
+
+
+def linearize(
+    scene: Scene,
+    state: State,
+    coordinates: tuple[str, ...] | None = None,
+    *,
+    inputs: Float[Array, "inputs"] | None = None,
+    dependent: tuple[str, ...] | None = None,
+    privileged: tuple[str, ...] | None = None,
+) -> Linearization:
+    """Linear equations of small motions about a steady `state`, with the residual of its steadiness.
+
+        bicycle = WhippleBicycle()
+        small = linearize(bicycle, start(bicycle, **bicycle.upright(5.0)), ("lean", "steer"))
+        small.M, small.C, small.K, small.eigenvalues()
+
+    **Arguments**
+    - `state`: on the constraints. It need not be steady: A, B and M, C, K are then those of this instant, and `residual` says so. They are
+      constant along a steady motion where only ignorable coordinates move: a disc's yaw and spin, but not the attitude of a spinning disc.
+    - `coordinates`: names for the second-order form; default: all whose own rate is a privileged speed. A quaternion `attitude` has
+      `attitude_turn_x`, `..._y`, `..._z`: small turns in body axes.
+    - `inputs`: values of the scene's inputs (default: zero), held constant.
+    - `dependent`: names of the coordinates that follow from the geometric rows; `privileged`: names of the independent speeds. The default
+      is well conditioned at the state (over the scene's domain, while state or parameters are traced).
+
+    **Returns** a `Linearization`. Pure: runs under jit, vmap and differentiation, over scene parameters and the state.
+
+    **Raises** ValueError: an unknown coordinate or speed, a coordinate that is both named and dependent, or whose rate is no privileged speed.
+    """
+    f = jnp.zeros(len(scene.inputs), state.q.dtype) if inputs is None else jnp.asarray(inputs, state.q.dtype)
+    y = privileged_speeds(scene, privileged)
+    dependent_s = dependent_coordinates(scene, state, coordinates or (), dependent)
+    return _linearize(scene, state, f, y, tuple(dependent_s.tolist()), None if coordinates is None else tuple(coordinates))
+
+
+@eqx.filter_jit
+def _linearize(scene: Scene, state: State, f, y: tuple[int, ...], dependent: tuple[int, ...], coordinates: tuple[str, ...] | None) -> Linearization:
+    perturbed = perturbations(scene, state.q)
+    dependent_s = np.array(dependent, int)
+    independent = tuple(perturbed.names[i] for i in others(dependent_s, len(perturbed.names)))
+    if coordinates is None:
+        coordinates = tuple(name for name in independent if _own_rate(scene, name) in y)
+
+    # the flow's derivative along every perturbation (ds, du, df) and, last, along the motion itself
+    now, slope, mass_matrix = jax.linearize(flow_of(scene, y), state.t, state.q, state.u, f, has_aux=True)
+    counts = len(perturbed.names), state.u.shape[0], f.shape[0]
+    s, u, _ = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+    ds, du, df = jnp.split(jnp.eye(sum(counts), dtype=f.dtype), np.cumsum(counts)[:-1])
+    dq, motion = perturbed.E @ ds, (jnp.ones_like(state.t), now.qdot, now.udot, jnp.zeros_like(f))
+    directions = [jnp.column_stack([d, m]) for d, m in zip((0 * dq[:1], dq, du, df), motion, strict=True)]
+    slopes = jax.vmap(lambda dt, *d: slope(dt[0], *d), in_axes=1, out_axes=1)(*directions)
+    along: Flow = jax.tree.map(lambda x: x[:, :-1], slopes)
+    change = slopes.udot[np.array(y, int), -1]
+
+    # all perturbations from the independent ones: first ds, then du
+    T, pivot_s = eliminated(along.g[:, s], dependent_s)
+    T = jax.scipy.linalg.block_diag(T, jnp.eye(counts[1] + counts[2], dtype=f.dtype))
+    dependent_u = T.shape[1] - counts[1] - counts[2] + others(y, counts[1])
+    U, pivot_u = eliminated(along.phi @ T, dependent_u)
+    T = T @ U
+
+    # rows of A and B: rates of the independent ds in axes that go with the motion, and of the privileged speeds
+    read = perturbed.D[others(dependent_s, counts[0])]
+    drag = carried_along(scene, state.q, now.qdot) @ dq
+    rates = jnp.concatenate([read @ (along.qdot - drag), along.udot[np.array(y, int)]]) @ T
+    n = rates.shape[0]
+    A, B, Z = rates[:, :n], rates[:, n:], T[u][:, len(independent) : n]
+    M, C, K, F, coupling = _second_order(scene, A, B, Z.T @ mass_matrix @ Z, independent, y, coordinates)
+    acceleration = jnp.max(jnp.abs(now.udot[np.array(y, int)]), initial=0.0)
+    return Linearization(
+        A=A,
+        B=B,
+        M=M,
+        C=C,
+        K=K,
+        F=F,
+        acceleration=acceleration,
+        residual=jnp.maximum(acceleration, jnp.max(jnp.abs(change), initial=0.0)),
+        coupling=coupling,
+        pivot=jnp.minimum(pivot_s, pivot_u),
+        states=(*independent, *(scene.speed_names.entries[i] for i in y)),
+        inputs=scene.inputs.entries,
+        coordinates=coordinates,
+    )
+
+
+def _second_order(scene: Scene, A, B, mass, independent: tuple[str, ...], y: tuple[int, ...], coordinates: tuple[str, ...]):
+    """M, C, K, F of the named coordinates and what couples them to the rest; `mass` is that of the privileged speeds."""
+    count, k = len(independent), len(coordinates)
+    p = np.array([independent.index(name) for name in coordinates], int)
+    # (ds, pdot, other privileged speeds) = change x
+    kept = count + _speeds_beside(scene, y, coordinates)
+    change = jnp.concatenate([jnp.eye(count, A.shape[0], dtype=A.dtype), A[p], jnp.eye(A.shape[0], dtype=A.dtype)[kept]])
+    back = jnp.linalg.inv(change)
+    rates, forced = (change @ A @ back)[count:], (change @ B)[count:]
+    M = back[count:, count:].T @ mass @ back[count:, count:]
+    K, C, F = -M @ rates[:, :count], -M @ rates[:, count:], M @ forced
+    beside = others(p, count)
+    neglected = [_relative(M[:k, k:], M[:k, :k]), _relative(C[:k, k:], C[:k, :k]), _relative(K[:k, beside], K[:k, p])]
+    return M[:k, :k], C[:k, :k], K[:k, p], F[:k], jnp.max(jnp.stack(neglected))
+
+
+def _relative(neglected, kept):
+    """Largest neglected entry over the largest kept one; the entry itself where nothing is kept."""
+    size = jnp.max(jnp.abs(kept), initial=0.0)
+    return jnp.max(jnp.abs(neglected), initial=0.0) / jnp.where(size > 0, size, 1.0)
+
+
+def _ascending(values: Complex[Array, "modes"]) -> Complex[Array, "modes"]:
+    return values[jnp.lexsort((values.imag, values.real))]
+
+
+def _own_rate(scene: Scene, name: str) -> int | None:
+    """Index of the speed that is the rate of the perturbation `name`; None where the scene has speeds of its own."""
+    if scene.speeds is not None:
+        return None
+    speed = f"{name}_rate" if name in scene.coordinate_names.entries else name.replace("_turn_", "_omega_")
+    return scene.speed_names.entries.index(speed)
+
+
+def _speeds_beside(scene: Scene, y: tuple[int, ...], coordinates: tuple[str, ...]) -> np.ndarray:
+    """Positions in y of the privileged speeds that stay beside the rates of the named coordinates."""
+    if len(coordinates) == len(y):
+        return np.zeros(0, int)  # as many as there are freedoms: their rates are the new speeds, whatever y was
+    own = [_own_rate(scene, name) for name in coordinates]
+    beside = [j for j, speed in enumerate(y) if speed not in own]
+    if len(beside) + len(coordinates) == len(y):
+        return np.array(beside, int)
+    raise ValueError(
+        f"the rates of the coordinates {', '.join(f'`{name}`' for name in coordinates)} are not among the privileged speeds of `{type(scene).__name__}` "
+        f"({', '.join(f'`{scene.speed_names.entries[i]}`' for i in y)}); name {len(y)} coordinates, or give `privileged` speeds that contain their rates"
+    )

@@ -1,0 +1,174 @@
+"""Measurements of one run of a scene: times, named channels with a sigma each, the start, sampled inputs.
+
+value_k = channel(motion at t_k) + sigma_k e_k,   e_k independent, standard normal
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jourdain_jax.analysis.bijections import Bijection
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.motion.inputs import Inputs, as_inputs
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.scene import Scene
+
+
+class Measurements(eqx.Module):
+    """One run.
+
+        Measurements(ts, {"x": x, "nose": path}, {"x": 0.01, "nose": 0.02}, start={"x_rate": 0.6}, functions={"nose": ...})
+
+    **Arguments**
+    - `ts`: times in s, strictly increasing.
+    - `values`: channel -> measured values, shape (times, *channel). A channel is a coordinate, a speed, or a name in `functions`.
+    - `sigma`: standard deviation of the noise, in the unit of the channel: channel -> number, (times,) or the shape of its
+      values; or one number for all channels. An infinite sigma marks a sample that is missing (give any finite value there).
+    - `start`: coordinate or speed -> value at `t0`. These are held; what is not given is solved for, as by `jj.start`.
+    - `unknown_start`: names in `start` whose values are first guesses, to be estimated; or name -> `bounds(...)`, `positive()`,
+      `unbounded()` (None: unbounded).
+    - `inputs`: as in `simulate`: name -> number, function of time, or `Sampled`.
+    - `functions`: channel -> function of a `Motion` (one instant), such as
+      `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`.
+    - `t0`: time of the start in s; default: the first of `ts`.
+
+    **Raises** ValueError for times that do not increase, values that are not finite, sigmas that are not positive, and names
+    that do not match.
+    """
+
+    ts: Float[Array, "times"]  # s
+    values: dict[str, Float[Array, "..."]]
+    sigma: dict[str, Float[Array, "..."]]
+    start: dict[str, Float[Array, "..."]]
+    unknown_start: dict[str, Bijection | None]
+    inputs: dict | Inputs | None
+    functions: dict[str, Callable]
+    t0: Float[Array, ""]  # s
+
+    def __init__(
+        self,
+        ts,
+        values: Mapping,
+        sigma,
+        *,
+        start: Mapping,
+        unknown_start: Mapping | Iterable[str] = (),
+        inputs: "dict | Inputs | None" = None,
+        functions: Mapping[str, Callable] | None = None,
+        t0: float | Array | None = None,
+    ):
+        real = jnp.result_type(float)
+        self.ts = jnp.asarray(ts, real)
+        _check_times(self.ts)
+        self.values = {name: jnp.asarray(value, real) for name, value in values.items()}
+        given = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.values, sigma)
+        self.sigma = {name: jnp.asarray(value, real) for name, value in given.items()}
+        self.start = {name: jnp.asarray(value, real) for name, value in start.items()}
+        self.unknown_start = dict(unknown_start) if isinstance(unknown_start, Mapping) else dict.fromkeys(unknown_start)
+        self.inputs = inputs
+        self.functions = dict(functions or {})
+        self.t0 = self.ts[0] if t0 is None else jnp.asarray(t0, real)
+
+    def __check_init__(self):
+        if not _holds(lambda t: (t[0] <= t[1]) & (t[0] < t[2]), jnp.stack([self.t0, self.ts[0], self.ts[-1]])):
+            raise ValueError(
+                f"the start at t0 = {self.t0} s comes after the first sample ({self.ts[0]} s), or not before the last "
+                f"({self.ts[-1]} s); give an earlier `t0`"
+            )
+        if not self.values:
+            raise ValueError("`values` is empty; give at least one channel: name -> measured values")
+        _check_same_names("sigma", self.sigma, self.values)
+        for name in self.functions:
+            if name not in self.values:
+                raise ValueError(f"function `{name}` has no measured values; {nearest(name, self.values)}")
+        for name in self.unknown_start:
+            if name not in self.start:
+                raise ValueError(
+                    f"unknown start value `{name}` has no first guess; give one in `start`. {nearest(name, self.start)}"
+                )
+        for name, value in self.values.items():
+            if not _holds(np.isfinite, value):
+                raise ValueError(
+                    f"channel `{name}` holds values that are not finite, the first at sample {_first_bad(value)}; leave these "
+                    "samples out, or give them any finite value and an infinite sigma"
+                )
+        for name, value in self.sigma.items():
+            if not _holds(lambda x: x > 0, value):
+                raise ValueError(
+                    f"sigma of channel `{name}` must be above zero (and not NaN); give the standard deviation of its noise"
+                )
+
+    def counted(self) -> Int[Array, ""]:
+        """Number of samples with a finite sigma, each component of a channel counted by itself."""
+        return sum(jnp.sum(jnp.isfinite(self.sigma_of(name))) for name in self.values)
+
+    def sigma_of(self, name: str) -> Float[Array, "times *channel"]:
+        """Sigma of each measured value of a channel."""
+        sigma, values = self.sigma[name], self.values[name]
+        # one sigma per time acts on all components of the channel
+        aligned = sigma.reshape(sigma.shape + (1,) * (values.ndim - sigma.ndim)) if sigma.ndim else sigma
+        return jnp.broadcast_to(aligned, values.shape)
+
+
+def _holds(condition: Callable, x) -> bool:
+    """Whether a condition holds throughout; traced values are not looked at."""
+    return isinstance(x, jax.core.Tracer) or bool(np.all(condition(np.asarray(x))))
+
+
+def _check_times(ts) -> None:
+    if ts.ndim != 1 or ts.size == 0:
+        raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
+    if not (_holds(np.isfinite, ts) and _holds(lambda t: np.diff(t) > 0, ts)):
+        raise ValueError("`ts` must be finite and strictly increasing; sort the samples by time and merge repeated ones")
+
+
+def _first_bad(x) -> int:
+    return int(np.argwhere(~np.isfinite(np.asarray(x)))[0][0])
+
+
+def _check_same_names(what: str, names, expected) -> None:
+    for name in names:
+        if name not in expected:
+            raise ValueError(f"`{what}` names channel `{name}`, which has no values; {nearest(name, expected)}")
+    for name in expected:
+        if name not in names:
+            raise ValueError(f"channel `{name}` has no {what}; give `{what}` a number for it, or one number for all channels")
+
+
+def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measurements:
+    """The run with its inputs made ready, after its channels and shapes were compared with the scene.
+
+    `repeats`: values have a leading axis. Raises ValueError for an unknown channel, start value or input, and for wrong shapes.
+    """
+    where = f"run {index} of `{type(scene).__name__}`"
+    q, u, _ = scene.named(**run.start)
+    motion = jax.eval_shape(lambda s: motion_at(s, 0.0, q, u), scene)
+    times = run.ts.shape[0]
+    for name, values in run.values.items():
+        shape = (times, *_channel_shape(run, name, motion, where))
+        found = values.shape[1:] if repeats else values.shape
+        if found != shape:
+            expected = f"(repeats, {', '.join(map(str, shape))})" if repeats else f"{shape}"
+            hint = "; many repeats go to `fit_batch`" if values.shape[1:] == shape and not repeats else ""
+            raise ValueError(f"channel `{name}` of {where} has shape {values.shape}, expected {expected} for {times} times{hint}")
+        if run.sigma[name].shape not in ((), (times,), shape):
+            raise ValueError(
+                f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, expected (), {(times,)} or {shape}"
+            )
+    return eqx.tree_at(lambda r: r.inputs, run, as_inputs(scene, run.inputs), is_leaf=lambda x: x is None)
+
+
+def _channel_shape(run: Measurements, name: str, motion, where: str) -> tuple[int, ...]:
+    if name in run.functions:
+        return jax.eval_shape(run.functions[name], motion).shape
+    lengths = {slot: length for slot, _, length in motion.q.slots + motion.u.slots}
+    if name not in lengths:
+        raise ValueError(
+            f"{where} has unknown channel `{name}`; {nearest(name, (*lengths, *run.functions))} "
+            "For other quantities give a function of the motion in `functions`."
+        )
+    return (lengths[name],) if lengths[name] else ()

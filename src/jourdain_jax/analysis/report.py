@@ -1,0 +1,142 @@
+"""What kind of system a scene is, in one table: freedoms, rows, rank, integrability, growth, cyclic and ignorable coordinates."""
+
+from dataclasses import asdict, dataclass
+
+from jourdain_jax.analysis.integrability import growth_vector, row_integrability
+from jourdain_jax.equations.cyclic import cyclic_coordinates, ignorable_coordinates
+from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.scene.scene import Scene
+
+_LABEL = 26  # width of the first column
+_LINE = 120
+
+
+@dataclass(frozen=True)
+class Report:
+    """Facts about a scene, found by probing at random and symmetric states of its domain."""
+
+    scene: str
+    coordinates: tuple[str, ...]
+    speeds: tuple[str, ...]
+    degrees_of_freedom: int
+    rows: tuple[str, ...]
+    rank: int  # of the rows at generic states
+    redundant_rows: tuple[str, ...]  # may be left out together; the others keep the rank at every probed state
+    integrable_rows: tuple[str, ...]  # holonomic by themselves
+    nonholonomic_rows: tuple[str, ...]  # by themselves
+    frobenius_violations: dict[str, float]  # relative
+    growth_vector: tuple[int, ...]  # empty for rows nonlinear in the speeds
+    closed: bool  # further brackets bring nothing new
+    bracket_depth: int
+    holonomic_rows_together: int | None  # None where the growth vector is not closed
+    rheonomic: bool  # rows, poses or rates depend on time
+    affine: bool  # rows are linear or affine in the speeds
+    cyclic_coordinates: tuple[str, ...]
+    ignorable_coordinates: tuple[str, ...]
+    privileged_velocities: tuple[str, ...]
+    privileged_by_user: bool
+    worst_pivot: float  # smallest singular value of the scaled A_z over all probed states; zero: singular somewhere
+    typical_pivot: float
+    rank_losses: tuple[str, ...]  # probed configurations where the rows lose rank
+
+    def as_dict(self) -> dict:
+        """The report for machines: the fields by name; what has no finite value is None."""
+        facts = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        facts["frobenius_violations"] = {
+            row: size if size < float("inf") else None for row, size in self.frobenius_violations.items()
+        }
+        return facts
+
+    def __str__(self) -> str:
+        facts = {
+            "coordinates": _listed(self.coordinates),
+            "speeds": _listed(self.speeds),
+            "rows": f"{len(self.rows)}, of rank {self.rank}" if self.rows else "none",
+            "degrees of freedom": str(self.degrees_of_freedom),
+            "redundant rows": _listed(self.redundant_rows) if self.redundant_rows else self._no_redundant_rows(),
+            "holonomic row by row": _listed(self.integrable_rows),
+            "nonholonomic row by row": _listed(self.nonholonomic_rows),
+            "growth vector": self._growth(),
+            "depends on time": "yes (rheonomic)" if self.rheonomic else "no (scleronomic)",
+            "cyclic coordinates": _listed(self.cyclic_coordinates),
+            "ignorable coordinates": _listed(self.ignorable_coordinates),
+            "privileged velocities": _listed(self.privileged_velocities),
+            "chosen by": "the scene" if self.privileged_by_user else "the engine",
+            "their conditioning": self._conditioning(),
+            "rank is lost at": "none of the probed configurations" if not self.rank_losses else "; ".join(self.rank_losses[:4]),
+        }
+        lines = [f"Report on {self.scene}"]
+        for label, text in facts.items():
+            lines += _wrapped(label, text)
+        return "\n".join(lines)
+
+    def _no_redundant_rows(self) -> str:
+        if self.rank < len(self.rows):
+            return (
+                f"none may be left out, though {len(self.rows)} rows have rank {self.rank}: each is needed at some configuration"
+            )
+        return "none"
+
+    def _growth(self) -> str:
+        if not self.growth_vector:
+            return "none: rows are nonlinear in the speeds"
+        sizes = f"({', '.join(map(str, self.growth_vector))})"
+        if not self.closed:
+            return f"{sizes}, still growing at brackets of {self.bracket_depth} fields"
+        count = self.holonomic_rows_together
+        together = f"rows that are holonomic taken together: {count or 'none'}"
+        return f"{sizes}, closed; {together}; the motion stays on a manifold of dimension {self.growth_vector[-1]}"
+
+    def _conditioning(self) -> str:
+        worst = f"smallest pivot {self.worst_pivot:.2g}" if self.worst_pivot > 1e-9 else "singular at some probed configuration"
+        return f"{worst}, typically {self.typical_pivot:.2g} (1 is best)"
+
+
+def report(scene: Scene, *, depth: int = 4) -> Report:
+    """Degrees of freedom, rows, rank, redundancy, integrability, growth vector, cyclic and ignorable coordinates of a scene.
+
+    `depth` bounds the number of fields in a bracket for the growth vector. `print(report(scene))` shows a table; `as_dict()` is
+    for machines. Found numerically at random states of the scene's `domain` and at symmetric configurations (zero and right
+    angles): what holds at all of them is taken to hold everywhere.
+    """
+    structure = structure_of(scene)
+    by_row, growth = row_integrability(scene), growth_vector(scene, depth=depth)
+    return Report(
+        scene=type(scene).__name__,
+        coordinates=scene.coordinate_names.entries,
+        speeds=scene.speed_names.entries,
+        degrees_of_freedom=structure.degrees_of_freedom,
+        rows=structure.row_names,
+        rank=structure.rank,
+        redundant_rows=structure.redundant_rows,
+        integrable_rows=by_row.integrable_rows,
+        nonholonomic_rows=by_row.nonholonomic_rows,
+        frobenius_violations=by_row.violations,
+        growth_vector=growth.vector,
+        closed=growth.closed,
+        bracket_depth=depth,
+        holonomic_rows_together=growth.holonomic_rows_together,
+        rheonomic=structure.rheonomic,
+        affine=structure.affine,
+        cyclic_coordinates=cyclic_coordinates(scene),
+        ignorable_coordinates=ignorable_coordinates(scene),
+        privileged_velocities=tuple(scene.speed_names.entries[i] for i in structure.independent),
+        privileged_by_user=structure.chosen_by_user,
+        worst_pivot=structure.worst_pivot,
+        typical_pivot=structure.typical_pivot,
+        rank_losses=structure.rank_losses,
+    )
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return f"{len(names)}: {', '.join(names)}" if names else "none"
+
+
+def _wrapped(label: str, text: str) -> list[str]:
+    """One fact in two columns, broken at blanks."""
+    words, lines = text.split(" "), [""]
+    for word in words:
+        if lines[-1] and len(lines[-1]) + 1 + len(word) > _LINE - _LABEL:
+            lines.append("")
+        lines[-1] += f" {word}" if lines[-1] else word
+    return [f"  {label if i == 0 else '':<{_LABEL - 2}}{line}" for i, line in enumerate(lines)]

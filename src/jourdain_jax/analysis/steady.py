@@ -1,0 +1,162 @@
+"""Steady motions by root finding: the privileged speeds are constant, and only coordinates that do not matter to them move.
+
+    g(t, q) = 0,   phi(t, q, u) = 0,   dy/dt = 0,   qdot_j = 0        y: the privileged speeds;  j: the coordinates not ignorable
+
+Whether what was found is steady is then judged without that list, by dy/dt and d2y/dt2 along the motion.
+Levenberg-Marquardt from the guess (J. Nocedal and S. Wright, Numerical Optimization, 2006, section 10.3).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jourdain_jax.analysis.tangent import flow_of, privileged_speeds
+from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
+from jourdain_jax.equations.cyclic import ignorable_coordinates
+from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.motion.start import State
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.scene import Scene
+
+_FINAL_STEPS = 3
+
+
+class SteadyMotion(eqx.Module):
+    """A state of steady motion, and how steady it is."""
+
+    state: State
+    acceleration: Float[Array, ""]  # largest |dy/dt| that is left
+    residual: Float[Array, ""]  # largest of that, of |d2y/dt2| along the motion, and of what is left of the rows
+    converged: Bool[Array, ""]  # whether `residual` is below the root of round-off
+
+    def __getitem__(self, name: str):
+        """A coordinate, speed, quaternion or angular velocity by name."""
+        return self.state[name]
+
+    def __str__(self) -> str:
+        found = "steady motion" if self.converged else "no steady motion found near the guess"
+        return f"{found}: residual {self.residual:.1e} (accelerations {self.acceleration:.1e})\n{self.state}"
+
+
+def steady(
+    scene: Scene,
+    guess: "State | dict",
+    *,
+    held: tuple[str, ...] = (),
+    moving: tuple[str, ...] | None = None,
+    t0: float = 0.0,
+    inputs: Float[Array, "inputs"] | None = None,
+    privileged: tuple[str, ...] | None = None,
+    max_steps: int = 60,
+) -> SteadyMotion:
+    """The steady motion near a guess.
+
+        steady(disc, {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held=("lean", "yaw_rate"))["spin_rate"]
+
+    **Arguments**
+    - `guess`: a `State`, or named values (the rest zero). It need not meet the constraints.
+    - `held`: names of coordinates and speeds that keep the guess's value; all others are solved for. Where many steady motions meet this,
+      the result is one near the guess.
+    - `moving`: names of the coordinates that may keep moving; default: those that the scene's accelerations do not depend on (`ignorable`).
+    - `inputs`: values of the scene's inputs (default: zero); `privileged`: names of the speeds that are to be constant (default: the scene's
+      own). Choose speeds in which the motion is steady: rates of yaw, lean and spin, say, not velocities along fixed axes.
+
+    **Returns** a `SteadyMotion`; look at `converged` and `residual`, nothing is raised where none is found. Differentiable in any mode in the
+    scene's parameters and in the held values, where the steady motion is a smooth function of them.
+
+    **Raises** ValueError: an unknown name.
+    """
+    t, q, u = (guess.t, guess.q, guess.u) if isinstance(guess, State) else (jnp.asarray(t0, jnp.result_type(float)), *scene.named(**guess)[:2])
+    f = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else jnp.asarray(inputs, q.dtype)
+    names = scene.coordinate_names.entries + scene.speed_names.entries
+    _check_names(scene, held, names)
+    moving = ignorable_coordinates(scene) if moving is None else moving
+    groups = {group: scene.coordinate_names.entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
+    _check_names(scene, moving, (*scene.coordinate_names.entries, *groups))
+    carried = {entry for name in moving for entry in groups.get(name, (name,))}
+    resting = tuple(i for i, name in enumerate(scene.coordinate_names.entries) if name not in carried)
+    free = jnp.array([name not in held for name in names], bool)
+    return _solve(_Problem(scene, t, f, privileged_speeds(scene, privileged), resting), q, u, free, max_steps)
+
+
+def _check_names(scene: Scene, given: tuple[str, ...], valid: tuple[str, ...]) -> None:
+    for name in given:
+        if name not in valid:
+            raise ValueError(f"`{type(scene).__name__}` has no `{name}` to hold or to move; {nearest(name, valid)}")
+
+
+class _Problem(eqx.Module):
+    """What vanishes at a steady motion, as a function of z = (q, u)."""
+
+    scene: Scene
+    t: Float[Array, ""]
+    f: Float[Array, "inputs"]
+    privileged: tuple[int, ...] = eqx.field(static=True)
+    resting: tuple[int, ...] = eqx.field(static=True)  # coordinates that must not move
+
+    def __call__(self, z: Float[Array, "unknowns"]) -> Float[Array, "residuals"]:
+        n = len(self.scene.coordinate_names)
+        now, _ = flow_of(self.scene, self.privileged)(self.t, z[:n], z[n:], self.f)
+        constant, still = now.udot[np.array(self.privileged, int)], now.qdot[np.array(self.resting, int)]
+        return jnp.concatenate([closure_residual(self.scene, self.t, z[:n]), now.phi, constant, still])
+
+    def unsteadiness(self, q, u) -> tuple[Float[Array, "freedoms"], Float[Array, "freedoms"]]:
+        """dy/dt and d2y/dt2."""
+        flow, y = flow_of(self.scene, self.privileged), np.array(self.privileged, int)
+        now, slope = jax.linearize(lambda t, q, u: flow(t, q, u, self.f)[0], self.t, q, u)
+        return now.udot[y], slope(jnp.ones_like(self.t), now.qdot, now.udot).udot[y]
+
+
+class _Search(eqx.Module):
+    """The best point so far, and the next to try."""
+
+    trial: Float[Array, "unknowns"]
+    best: Float[Array, "unknowns"]
+    R: Float[Array, "residuals"]  # at the best point, and its Jacobian
+    J: Float[Array, "residuals unknowns"]
+    damping: Float[Array, ""]
+
+
+@eqx.filter_jit
+def _solve(problem: _Problem, q, u, free: Bool[Array, "unknowns"], max_steps: int) -> SteadyMotion:
+    z = jnp.concatenate([q, u])
+    z = _root(problem, z, free, max_steps)
+    n = q.shape[0]
+    first, second = (jnp.max(jnp.abs(x), initial=0.0) for x in problem.unsteadiness(z[:n], z[n:]))
+    rows = jnp.max(jnp.abs(problem(z)[: -len(problem.privileged) - len(problem.resting)]), initial=0.0)
+    moved_q, moved_u = (jnp.max(jnp.abs(a - b), initial=0.0) for a, b in ((z[:n], q), (z[n:], u)))
+    residual = jnp.maximum(rows, jnp.maximum(first, second))
+    state = State(problem.t, z[:n], z[n:], moved_q, moved_u, rows, (problem.scene.coordinate_names, problem.scene.speed_names))
+    return SteadyMotion(state, first, residual, residual < _round_off_root(z.dtype))
+
+
+def _root(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unknowns"], max_steps: int) -> Float[Array, "unknowns"]:
+    """The root near z: a search without derivative, then steps `z <- z - J+ R(z)` with the J found, which carry one order of derivative each."""
+    still, guess, movable = jax.lax.stop_gradient((problem, z, free))
+    found = jax.lax.stop_gradient(_search(still, guess, movable, max_steps))
+    inverse = pseudo_inverse(found.J, _round_off_root(z.dtype))
+    root = jax.lax.scan(lambda z, _: (z - jnp.where(free, inverse @ problem(z), 0.0), None), jnp.where(free, found.best, z), length=_FINAL_STEPS)
+    return root[0]
+
+
+def _search(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unknowns"], max_steps: int) -> _Search:
+    """Levenberg-Marquardt: `min |J d + R|^2 + damping^2 |d|^2`, of minimum norm where many steady motions are near."""
+
+    def step(search: _Search, _):
+        R, J = problem(search.trial), jnp.where(free, jax.jacfwd(problem)(search.trial), 0.0)
+        better = R @ R < search.R @ search.R
+        best, R, J = (jnp.where(better, a, b) for a, b in ((search.trial, search.best), (R, search.R), (J, search.J)))
+        damping = jnp.clip(jnp.where(better, search.damping / 5, search.damping * 3), 1e-8, 1e8)
+        system = jnp.concatenate([J, damping * jnp.eye(z.shape[0], dtype=z.dtype)])
+        d = -pseudo_inverse(system, _round_off_root(z.dtype)) @ jnp.concatenate([R, jnp.zeros_like(z)])
+        return _Search(best + jnp.where(free, d, 0.0), best, R, J, damping), None
+
+    size = jax.eval_shape(problem, z).shape[0]
+    start = _Search(z, z, jnp.full(size, jnp.inf, z.dtype), jnp.zeros((size, z.shape[0]), z.dtype), jnp.full((), 1e-3, z.dtype))
+    return jax.lax.scan(step, start, length=max_steps)[0]
+
+
+def _round_off_root(dtype) -> float:
+    return float(np.sqrt(np.finfo(dtype).eps))

@@ -1,0 +1,1 @@
+"""Measured bicycles: parameter files, linear stability and its uncertainty."""

@@ -1,0 +1,182 @@
+"""The real job: measured bicycles in, stability speeds with honest uncertainty and simulated rides out.
+
+For each file: build the nonlinear Whipple bicycle, linearise it, find weave, capsize and double-root speeds by root finding, propagate the
+measured standard deviations by Monte Carlo to 2.5 and 97.5 % limits, and ride it hands-free below, inside and above the stable range.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.bicycle.linear import linear_matrices
+from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, read_bicycle
+from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
+from jourdain_jax.bicycle.rides import Rides, ride, ride_speeds
+from jourdain_jax.bicycle.stability import eigenvalues, stability_speeds
+from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
+from jourdain_jax.motion.results import EVENT
+
+SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")
+MAX_SPEED = 50.0  # m/s; a speed beyond it counts as none
+CAVEAT = (
+    "Limits are the 2.5 and 97.5 % quantiles over the samples that have the speed; `fraction` is how many have it. Sigmas are taken as\n"
+    f"independent, because the files carry no covariance; a missing sigma counts as zero. Speeds above {MAX_SPEED:g} m/s count as none."
+)
+_GRID = 81
+
+
+class Refused(eqx.Module):
+    """A file that describes no bicycle, and why."""
+
+    path: str = eqx.field(static=True)
+    error: str = eqx.field(static=True)
+
+    def as_dict(self) -> dict:
+        """One object of `result.json`."""
+        return {"file": self.path, "bicycle": None, "error": self.error} | dict.fromkeys(SPEEDS)
+
+
+class Study(eqx.Module):
+    """What was found out about one bicycle."""
+
+    path: str = eqx.field(static=True)
+    bicycle: MeasuredBicycle
+    speeds: dict[str, dict | None]  # name -> value, low, high, fraction
+    stable_fraction: float  # of the samples, those that have a stable range
+    grid: np.ndarray  # forward speeds of the eigenvalues, m/s
+    eigenvalues: np.ndarray  # (samples + 1, speeds, modes), the first of the measured values; castering, capsize, weave, weave
+    physical: np.ndarray  # which samples are bicycles, and count
+    rides: Rides
+
+    def as_dict(self) -> dict:
+        """One object of `result.json`."""
+        lanes = self.rides.lanes
+        rides = [
+            {
+                "label": label,
+                "speed": float(speed),
+                "stopped": int(lanes.result[i]) == EVENT,
+                "t_end": float(lanes.lanes.t_end[i]),
+                "lean_at_end": float(lanes.lanes.q_end[i, 3]),
+                "message": lanes.lane(i).message,
+            }
+            for i, (label, speed) in enumerate(zip(self.rides.labels, self.rides.speeds, strict=True))
+        ]
+        return {
+            "file": self.path,
+            "bicycle": self.bicycle.name,
+            "error": None,
+            **{name: self.speeds[name] for name in SPEEDS},
+            "samples": len(self.physical),
+            "refused_samples": int(np.sum(~self.physical)),
+            "fraction_with_stable_range": self.stable_fraction,
+            "without_sigma": list(self.bicycle.without_sigma),
+            "warnings": list(self.bicycle.warnings),
+            "rides": rides,
+        }
+
+
+def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Refused:
+    """Everything about one file; `Refused`, not an exception, where it describes no bicycle."""
+    try:
+        bicycle = read_bicycle(path)
+    except ValueError as error:
+        return Refused(str(path), str(error))
+    drawn = sample_parameters(bicycle, jax.random.key(seed), samples)
+    nominal = jnp.array([bicycle.values[name] for name in PARAMETER_NAMES])
+    physical = np.asarray(drawn.physical)
+    # a sample that is no bicycle is computed as the measured one, and not counted
+    values = jnp.concatenate([nominal[None], jnp.where(drawn.physical[:, None], drawn.values, nominal)])
+    found, matrices = _speeds(values)
+    weave, capsize = float(found.weave_speed[0]), float(found.capsize_speed[0])
+    grid = np.linspace(0.0, _top_speed(weave, capsize), _GRID)
+    labels, ridden = ride_speeds(weave, capsize, bool(found.stable_range_exists[0]))
+    return Study(
+        path=str(path),
+        bicycle=bicycle,
+        speeds={name: _interval(getattr(found, name), physical) for name in SPEEDS},
+        stable_fraction=float(np.mean(np.asarray(found.stable_range_exists)[1:][physical])) if physical.any() else 0.0,
+        grid=grid,
+        eigenvalues=np.asarray(_modes(matrices, jnp.asarray(grid))),
+        physical=physical,
+        rides=ride(bicycle.values, labels, ridden),
+    )
+
+
+@eqx.filter_jit
+def _speeds(values):
+    matrices = jax.vmap(lambda row: linear_matrices(dict(zip(PARAMETER_NAMES, row, strict=True))))(values)
+    return jax.vmap(lambda m: stability_speeds(*m, max_speed=MAX_SPEED))(matrices), matrices
+
+
+@eqx.filter_jit
+def _modes(matrices, grid):
+    return jax.vmap(lambda m: eigenvalues(*m, grid))(matrices)
+
+
+def _interval(values, physical) -> dict | None:
+    """value, low, high, fraction of one speed; None where neither the bicycle nor any sample has it."""
+    if np.isnan(values).all():
+        return None
+    limits = interval(values[1:], nominal=values[0], counted=jnp.asarray(physical))
+    numbers = {"value": limits.value, "low": limits.low, "high": limits.high, "fraction": limits.fraction}
+    return {name: None if np.isnan(x) else float(x) for name, x in numbers.items()}
+
+
+def _top_speed(weave: float, capsize: float) -> float:
+    known = [v for v in (weave, capsize) if np.isfinite(v)]
+    return float(np.clip(1.6 * max(known, default=6.0), 8.0, 20.0))
+
+
+def run(paths: Sequence[str | Path], *, samples: int = 2000, seed: int = 0, progress=lambda text: None) -> list[Study | Refused]:
+    """Study all files, one after another through the same compiled programs."""
+    studies = []
+    for path in paths:
+        progress(f"{path} ...")
+        studies.append(study(path, samples=samples, seed=seed))
+    return studies
+
+
+def write_results(studies: Sequence[Study | Refused], path: str | Path) -> None:
+    """`result.json`: a list, one object per file."""
+    with open(path, "w", encoding="utf-8") as file:
+        json.dump([one.as_dict() for one in studies], file, indent=2)
+
+
+def table(studies: Sequence[Study | Refused]) -> str:
+    """The printed table, with what the limits mean."""
+    lines = [f"{'bicycle':<18}{'weave':>26}{'capsize':>26}{'double root':>26}   stable range"]
+    lines.append(f"{'':<18}" + f"{'m/s   95 % limits':>26}" * 3)
+    for one in studies:
+        if isinstance(one, Refused):
+            lines.append(f"refused: {one.error}")
+            continue
+        cells = "".join(f"{_cell(one.speeds[name]):>26}" for name in SPEEDS)
+        lines.append(f"{one.bicycle.name:<18}{cells}   in {100 * one.stable_fraction:.1f} % of samples")
+        lines += [f"{'':<18}{text}" for text in _notes(one)]
+    return "\n".join([*lines, "", CAVEAT])
+
+
+def _cell(speed: dict | None) -> str:
+    if speed is None:
+        return "none"
+    value = "none" if speed["value"] is None else f"{speed['value']:.4f}"
+    if speed["low"] is None:
+        return value
+    limits = f"[{speed['low']:.3f}, {speed['high']:.3f}]"
+    return f"{value} {limits}" + ("" if speed["fraction"] == 1 else f" {100 * speed['fraction']:.1f}%")
+
+
+def _notes(one: Study) -> list[str]:
+    notes = [f"ride at {r['speed']:.2f} m/s, {r['label']}: {r['message']} at t = {r['t_end']:.2f} s" for r in one.as_dict()["rides"]]
+    refused = int(np.sum(~one.physical))
+    if refused:
+        notes.append(f"{refused} samples are no bicycles and do not count")
+    if one.bicycle.without_sigma:
+        notes.append("without a sigma: " + ", ".join(one.bicycle.without_sigma))
+    return notes + [f"warning: {text}" for text in one.bicycle.warnings]

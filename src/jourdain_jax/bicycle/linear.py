@@ -1,0 +1,40 @@
+"""M, C1, K0 and K2 of a bicycle from its nonlinear model, by linearisation about upright straight running.
+
+    M q'' + v C1 q' + (g K0 + v^2 K2) q = f,   q = (lean, steer)
+
+The nonlinear model is linearised at rest and at one speed; that C grows with v and K with v^2 is a fact of the model, checked in the tests.
+Source of the form: J. P. Meijaard, J. M. Papadopoulos, A. Ruina and A. L. Schwab, Proc. R. Soc. A 463 (2007) 1955.
+"""
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.analysis.linearize import linearize
+from jourdain_jax.bicycle.characteristic import BicycleMatrices
+from jourdain_jax.models.whipple_bicycle import WhippleBicycle
+from jourdain_jax.motion.start import State
+
+_SPEED = 4.0  # m/s, of the second linearisation
+_DEPENDENT = ("pitch",)
+
+
+def upright_running(bicycle: WhippleBicycle, speed) -> State:
+    """Running straight and upright at `speed` (m/s): an exact steady motion, on the constraints as it stands."""
+    q, u, _ = bicycle.named(**bicycle.upright(speed))
+    zero = jnp.zeros(())
+    return State(zero, q, u, zero, zero, zero, (bicycle.coordinate_names, bicycle.speed_names))
+
+
+def linear_matrices(values: Mapping[str, float | Float[Array, ""]]) -> BicycleMatrices:
+    """M, C1, K0, K2 (2x2, in lean and steer) and g from the 26 parameters by name. Runs under jit and vmap."""
+    bicycle = WhippleBicycle.from_values(values)
+
+    def at(speed):
+        small = linearize(bicycle, upright_running(bicycle, speed), ("lean", "steer"), dependent=_DEPENDENT)
+        return small.M, small.C, small.K
+
+    M, C, K = jax.vmap(at)(jnp.array([0.0, _SPEED]))
+    return BicycleMatrices(M[0], C[1] / _SPEED, K[0] / bicycle.g, (K[1] - K[0]) / _SPEED**2, bicycle.g)

@@ -1,0 +1,185 @@
+"""Measured bicycle parameter files, `name = value+/-sigma` per line, read into values, sigmas and remarks.
+
+Format of BicycleParameters (Moore, Hubbard & Kooijman): SI units, the names of Meijaard et al. 2007, `#` comments.
+A missing sigma counts as zero. The files carry no covariance: sigmas are those of independent errors.
+"""
+
+import difflib
+import math
+import re
+from importlib import resources
+from pathlib import Path
+
+import equinox as eqx
+
+from .parameters import PARAMETER_NAMES, doubts, violations
+
+_LARGEST_FILE = 1_000_000  # bytes; a parameter file has about a thousand
+_FORMAT = "`name = value` or `name = value+/-sigma`, for example `rF = 0.35+/-0.001`"
+_HANDLEBAR_FORK_SPLIT = re.compile(r"m[GS]|[xyz][GS]|I[GS](xx|yy|zz|xz)")  # bodies G and S together are H
+_REPEATED = {"IRzz": "IRxx", "IFzz": "IFxx"}  # a wheel is symmetric
+_OUT_OF_PLANE = ("yB", "yH")  # a Whipple bicycle is symmetric: zero
+_NOT_OF_THE_BICYCLE = ("v",)
+
+
+class MeasuredBicycle(eqx.Module):
+    """One bicycle's measured parameters: `values` and standard deviations `sigmas`, by name, in SI units."""
+
+    name: str = eqx.field(static=True)
+    values: dict[str, float]  # every name of PARAMETER_NAMES, in that order
+    sigmas: dict[str, float]  # the same names; zero where the file gives none
+    path: str = eqx.field(static=True)
+    without_sigma: tuple[str, ...] = eqx.field(static=True)  # names whose sigma the file does not give
+    ignored: tuple[str, ...] = eqx.field(static=True)  # names in the file that the Whipple bicycle does not use
+    warnings: tuple[str, ...] = eqx.field(static=True)  # sentences: odd values, taken as they are
+
+
+def shipped_bicycles() -> dict[str, Path]:
+    """The parameter files that come with the package, name -> path (`Tms` is among them, and is degenerate)."""
+    folder = Path(str(resources.files("jourdain_jax") / "data" / "bicycles"))
+    return {_bicycle_name(path): path for path in sorted(folder.glob("*Benchmark.txt"))}
+
+
+def read_bicycle(path: str | Path) -> MeasuredBicycle:
+    """Read one parameter file.
+
+        bicycle = read_bicycle(shipped_bicycles()["Browser"])
+        bicycle.values["c"], bicycle.sigmas["c"]  # trail and its standard deviation, m
+
+    **Raises:** `ValueError` naming file, line and parameter: a file that cannot be read or is not text; a line of another
+    form; an unknown (with the nearest valid one), repeated or missing name; a number that is none, not finite, or a
+    negative sigma; a degenerate bicycle (radius, mass, wheelbase or gravity not positive, negative moment of inertia).
+    """
+    path = Path(path)
+    values: dict[str, float] = {}
+    sigmas: dict[str, float] = {}
+    lines: dict[str, int] = {}
+    for number, line in enumerate(_read_text(path).splitlines(), start=1):
+        line = line.partition("#")[0].strip()
+        if not line:
+            continue
+        where = f"{path}, line {number}"
+        name, value, sigma = _read_line(line, where)
+        if name in lines:
+            raise ValueError(f"{where}: `{name}` was already given in line {lines[name]}. Keep one of the two lines.")
+        lines[name] = number
+        values[name] = value
+        if sigma is not None:
+            sigmas[name] = sigma
+
+    missing = [name for name in PARAMETER_NAMES if name not in values]
+    if missing:
+        raise ValueError(
+            f"{path}: missing {_listed(missing)}; a bicycle needs all of {' '.join(PARAMETER_NAMES)}. "
+            f"Add a line {_FORMAT} for each."
+        )
+    known = {name: values[name] for name in PARAMETER_NAMES}
+    broken = [sentence for sentence, is_broken in violations(known).items() if is_broken]
+    if broken:
+        got = ", ".join(f"{name} = {known[name]:g}" for name in PARAMETER_NAMES if any(f"`{name}`" in s for s in broken))
+        raise ValueError(
+            f"{path}: degenerate bicycle: {'; '.join(broken)}; got {got}. The nonlinear model rolls on real wheels: "
+            f"give their true radii, masses and moments of inertia (SI units, radians), or leave this bicycle out."
+        )
+    return MeasuredBicycle(
+        name=_bicycle_name(path),
+        values=known,
+        sigmas={name: sigmas.get(name, 0.0) for name in PARAMETER_NAMES},
+        path=str(path),
+        without_sigma=tuple(name for name in PARAMETER_NAMES if name not in sigmas),
+        ignored=tuple(name for name in values if name not in known),
+        warnings=doubts(known) + _ignored_but_telling(values),
+    )
+
+
+def _bicycle_name(path: Path) -> str:
+    return path.stem.removesuffix("Benchmark") or path.stem
+
+
+def _read_text(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            content = file.read(_LARGEST_FILE + 1)
+    except FileNotFoundError:
+        near = difflib.get_close_matches(path.name, [p.name for p in path.parent.glob("*")] + list(shipped_bicycles()), 1)
+        hint = f" Did you mean `{near[0]}`?" if near else ""
+        raise ValueError(f"{path}: no such file. Give the path of a bicycle parameter file.{hint}") from None
+    except OSError as error:
+        reason = error.strerror or type(error).__name__
+        raise ValueError(f"{path}: cannot be read ({reason}). Give the path of a readable parameter file.") from None
+    if len(content) > _LARGEST_FILE:
+        raise ValueError(f"{path}: larger than {_LARGEST_FILE} bytes, so not a bicycle parameter file; expected {_FORMAT}")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{path}: not UTF-8 text (byte {error.start} is {content[error.start]:#04x}). Expected lines {_FORMAT}."
+        ) from None
+    if "\0" in text:
+        raise ValueError(f"{path}: a binary file (it contains zero bytes). Expected text lines {_FORMAT}.")
+    if not text.strip():
+        raise ValueError(f"{path}: the file is empty. Expected lines {_FORMAT}.")
+    return text
+
+
+def _read_line(line: str, where: str) -> tuple[str, float, float | None]:
+    """Name, value and sigma (None where not given) of one line without comment."""
+    name, equals, right = (part.strip() for part in line.partition("="))
+    if not equals or not name or not right:
+        raise ValueError(f"{where}: got {_clipped(line)}, expected {_FORMAT}")
+    if not _is_known(name):
+        lower_case = {known.lower(): known for known in reversed(PARAMETER_NAMES)}
+        near = difflib.get_close_matches(name.lower(), lower_case, 1, cutoff=0.0)
+        nearest = lower_case[near[0]] if near else PARAMETER_NAMES[0]
+        raise ValueError(
+            f"{where}: unknown parameter {_clipped(name)}; the nearest valid name is `{nearest}`. "
+            f"Valid names: {' '.join(PARAMETER_NAMES)}."
+        )
+    value_text, separator, sigma_text = right.replace("±", "+/-").partition("+/-")
+    value = _read_number(value_text, f"value of `{name}`", where)
+    if not separator:
+        return name, value, None
+    sigma = _read_number(sigma_text, f"sigma of `{name}`", where)
+    if sigma < 0:
+        raise ValueError(
+            f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0. "
+            f"Give its size, or leave `+/-` out if it is not known."
+        )
+    return name, value, sigma
+
+
+def _read_number(text: str, what: str, where: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        hint = " Write the decimal point as `.`, not `,`." if "," in text else ""
+        raise ValueError(f"{where}: {what} is {_clipped(text.strip())}, expected a number; form: {_FORMAT}.{hint}") from None
+    if not math.isfinite(number):
+        raise ValueError(f"{where}: {what} is {number}, expected a finite number. Measure it, or leave this bicycle out.")
+    return number
+
+
+def _is_known(name: str) -> bool:
+    ignored = (*_REPEATED, *_OUT_OF_PLANE, *_NOT_OF_THE_BICYCLE)
+    return name in PARAMETER_NAMES or name in ignored or _HANDLEBAR_FORK_SPLIT.fullmatch(name) is not None
+
+
+def _ignored_but_telling(values: dict[str, float]) -> tuple[str, ...]:
+    """Warnings where an ignored value contradicts the symmetry that the model assumes."""
+    found = [
+        f"`{name}` = {values[name]:g} is ignored: the Whipple bicycle is symmetric about its plane"
+        for name in _OUT_OF_PLANE
+        if values.get(name, 0.0) != 0.0
+    ]
+    for name, twin in _REPEATED.items():
+        if values.get(name, values[twin]) != values[twin]:
+            found.append(f"`{name}` = {values[name]:g} is ignored: a wheel is symmetric, so `{twin}` is used instead")
+    return tuple(found)
+
+
+def _clipped(text: str) -> str:
+    return f"`{text}`" if len(text) <= 60 else f"`{text[:57]}...`"
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)

@@ -1,0 +1,85 @@
+"""The parameters of the Whipple bicycle and what values a real bicycle can have.
+
+Names of Meijaard, Papadopoulos, Ruina & Schwab (Proc. R. Soc. A 463, 2007, table 1): origin at the rear contact, x
+forward, z down; R rear wheel, B rear frame with rider, H handlebar and fork, F front wheel. Wheels have Izz = Ixx.
+"""
+
+import math
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool
+
+# Name -> (meaning, unit), in the order of the paper's table; arrays of parameters keep this order.
+PARAMETERS: dict[str, tuple[str, str]] = {
+    "w": ("wheelbase", "m"),
+    "c": ("trail", "m"),
+    "lam": ("steer axis tilt from the vertical", "rad"),
+    "g": ("gravity", "m/s^2"),
+    "rR": ("rear wheel radius", "m"),
+    "mR": ("rear wheel mass", "kg"),
+    "IRxx": ("rear wheel diametral moment of inertia", "kg m^2"),
+    "IRyy": ("rear wheel axial moment of inertia", "kg m^2"),
+    "xB": ("rear frame centre of mass, forward", "m"),
+    "zB": ("rear frame centre of mass, down", "m"),
+    "mB": ("rear frame mass", "kg"),
+    "IBxx": ("rear frame moment of inertia about x", "kg m^2"),
+    "IByy": ("rear frame moment of inertia about y", "kg m^2"),
+    "IBzz": ("rear frame moment of inertia about z", "kg m^2"),
+    "IBxz": ("rear frame product of inertia", "kg m^2"),
+    "xH": ("fork centre of mass, forward", "m"),
+    "zH": ("fork centre of mass, down", "m"),
+    "mH": ("fork mass", "kg"),
+    "IHxx": ("fork moment of inertia about x", "kg m^2"),
+    "IHyy": ("fork moment of inertia about y", "kg m^2"),
+    "IHzz": ("fork moment of inertia about z", "kg m^2"),
+    "IHxz": ("fork product of inertia", "kg m^2"),
+    "rF": ("front wheel radius", "m"),
+    "mF": ("front wheel mass", "kg"),
+    "IFxx": ("front wheel diametral moment of inertia", "kg m^2"),
+    "IFyy": ("front wheel axial moment of inertia", "kg m^2"),
+}
+PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETERS)
+
+_POSITIVE = ("w", "g", "rR", "mR", "mB", "mH", "rF", "mF")
+_NOT_NEGATIVE = ("IRxx", "IRyy", "IBxx", "IByy", "IBzz", "IHxx", "IHyy", "IHzz", "IFxx", "IFyy")
+
+
+def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*samples"]]:
+    """What makes a bicycle impossible: each condition as a sentence, and where it is broken (NaN breaks it).
+
+    **Arguments:** `values`, every name of `PARAMETER_NAMES` to a number or to an array of samples, all of one shape.
+    **Returns:** sentence -> True where the values break it.
+    """
+    broken = {}
+    for name in _POSITIVE:
+        broken[f"`{name}` ({PARAMETERS[name][0]}) must be positive"] = ~(jnp.asarray(values[name]) > 0)
+    for name in _NOT_NEGATIVE:
+        broken[f"`{name}` ({PARAMETERS[name][0]}) must not be negative"] = ~(jnp.asarray(values[name]) >= 0)
+    upright = jnp.abs(jnp.asarray(values["lam"])) < math.pi / 2
+    broken["`lam` (steer axis tilt, in radians) must lie between -pi/2 and pi/2"] = ~upright
+    return broken
+
+
+def doubts(values: Mapping[str, float]) -> tuple[str, ...]:
+    """What is odd about one bicycle's values though they can be simulated: one sentence each.
+
+    A rigid body's inertia matrix is positive definite, and each principal moment is at most the sum of the other two.
+    **Arguments:** `values`, every name of `PARAMETER_NAMES` to a number.
+    """
+    found = []
+    for wheel in "RF":
+        if values[f"I{wheel}yy"] > 2 * values[f"I{wheel}xx"]:
+            found.append(f"`I{wheel}yy` > 2 `I{wheel}xx`: no wheel, even a flat one, has such moments of inertia")
+    for body in "BH":
+        xx, yy, zz, xz = (values[f"I{body}{axes}"] for axes in ("xx", "yy", "zz", "xz"))
+        middle, half_spread = (xx + zz) / 2, math.hypot((xx - zz) / 2, xz)
+        smallest, largest = middle - half_spread, middle + half_spread  # principal moments in the plane of symmetry
+        if smallest <= 0 or yy <= 0:
+            found.append(f"the inertia matrix of body {body} is not positive definite")
+        if yy > smallest + largest or largest > smallest + yy:
+            found.append(f"a principal moment of inertia of body {body} exceeds the sum of the other two")
+        if values[f"z{body}"] > 0:
+            found.append(f"`z{body}` > 0: the centre of mass of body {body} lies below the ground (z points down)")
+    return tuple(found)

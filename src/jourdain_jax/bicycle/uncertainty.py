@@ -1,0 +1,93 @@
+"""From measured standard deviations to limits on what follows from the parameters, by Monte Carlo.
+
+Each parameter is drawn from a normal distribution with the measured value and sigma, independently of the others: the
+files carry no covariance. A quantity that only some bicycles have (a capsize speed) is reported with the fraction of
+samples that have it, and its limits are those of these samples.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Key, UInt32
+
+from .parameter_files import MeasuredBicycle
+from .parameters import PARAMETER_NAMES, violations
+
+Scalar = Float[Array, ""]
+
+LIMITS = (0.025, 0.975)  # quantiles
+
+
+class ParameterSamples(eqx.Module):
+    """Sampled parameters of one bicycle, in SI units, and which samples are bicycles at all."""
+
+    values: Float[Array, "samples parameters"]  # columns in the order of `names`
+    physical: Bool[Array, " samples"]  # False where a sample has, say, a negative radius
+    refused: dict[str, Array]  # condition that some samples break, as a sentence -> how many break it
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def by_name(self) -> dict[str, Float[Array, " samples"]]:
+        """One array of samples per parameter, for `jax.vmap` over a function of a dict of parameters."""
+        return dict(zip(self.names, self.values.T, strict=True))
+
+
+class Interval(eqx.Module):
+    """A quantity with the limits that contain 95 % of the samples which have it."""
+
+    value: Scalar  # NaN where there is none
+    low: Scalar  # 2.5 % quantile, NaN if no sample has the quantity
+    high: Scalar  # 97.5 % quantile
+    fraction: Scalar  # of the samples counted, those that have the quantity
+
+
+def sample_parameters(
+    bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Array, "2"], count: int
+) -> ParameterSamples:
+    """Draw `count` bicycles from independent normal distributions with the measured values and sigmas.
+
+        samples = sample_parameters(bicycle, jax.random.key(0), 2000)
+        weave = jax.vmap(lambda parameters: ...)(samples.by_name())
+
+    **Arguments:** `bicycle`; `key`, a JAX random key; `count`, number of samples.
+    **Returns:** all samples, the unphysical ones included, marked and counted by what is wrong with them.
+    **Raises:** `ValueError` if `count` is not positive.
+    """
+    if count < 1:
+        raise ValueError(f"`count` is {count}, expected at least 1 sample. Some 2000 give limits to about 0.1 sigma.")
+    value = jnp.array([bicycle.values[name] for name in PARAMETER_NAMES])
+    sigma = jnp.array([bicycle.sigmas[name] for name in PARAMETER_NAMES])
+    values = value + sigma * jax.random.normal(key, (count, len(PARAMETER_NAMES)), value.dtype)
+    broken = violations(dict(zip(PARAMETER_NAMES, values.T, strict=True)))
+    return ParameterSamples(
+        values=values,
+        physical=~jnp.any(jnp.stack(list(broken.values())), axis=0),
+        refused={sentence: jnp.sum(where) for sentence, where in broken.items() if jnp.any(where)},
+        names=PARAMETER_NAMES,
+    )
+
+
+def interval(
+    values: Float[Array, " samples"],
+    *,
+    nominal: ArrayLike | None = None,
+    counted: Bool[Array, " samples"] | None = None,
+) -> Interval:
+    """Limits of a sampled quantity, over those samples that have it (that are finite).
+
+    **Arguments:** `values`, one per sample, NaN where a sample has no such quantity; `nominal`, the quantity of the
+    bicycle as measured (default: the median of the samples); `counted`, False for samples to leave out altogether, such
+    as unphysical ones.
+    **Returns:** `value`, 2.5 % and 97.5 % quantiles, and the fraction of the counted samples that have the quantity.
+    """
+    counted = jnp.ones(values.shape, bool) if counted is None else counted
+    has = counted & jnp.isfinite(values)
+    present = jnp.where(has, values, jnp.nan)
+    low, median, high = jnp.nanquantile(present, jnp.array([LIMITS[0], 0.5, LIMITS[1]], values.dtype))
+    return Interval(
+        value=median if nominal is None else jnp.asarray(nominal, values.dtype),
+        low=low,
+        high=high,
+        fraction=jnp.sum(has) / jnp.maximum(jnp.sum(counted), 1),
+    )

@@ -1,0 +1,65 @@
+"""Orthonormal bases of the null space of a wide matrix, with a derivative that is right for basis-independent results.
+
+    A Z = 0,   dZ = -A+ dA Z
+
+The rule leaves out the rotation of the basis within the null space (its gauge), which LAPACK chooses as it likes; results that do
+not change under Z -> Z R never see it. It is wrong for Z itself: do not let a basis leave the function that uses it.
+
+To keep shapes static where the rank is not known in advance, a basis has as many columns as `A`; the columns that are not in
+the null space are zero, and `present` says which are.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jourdain_jax.calculus.pseudo_inverse import numerical_rank, pseudo_inverse
+
+
+def null_space_svd(A: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
+    """Null-space basis from the full singular value decomposition; columns of the row space are zero."""
+    return _null_space(A, "svd")
+
+
+def null_space_qr(A: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
+    """Null-space basis from the column-pivoted QR decomposition of `A'`; columns of the row space are zero."""
+    return _null_space(A, "qr")
+
+
+def present(Z: Float[Array, "columns columns"]) -> Bool[Array, "columns"]:
+    """Which columns of a basis belong to the null space."""
+    return jnp.any(jax.lax.stop_gradient(Z) != 0, axis=0)
+
+
+def _null_space(A, method):
+    if A.shape[0] == 0:
+        return jnp.eye(A.shape[1], dtype=A.dtype)
+    return _basis(A, method)
+
+
+def _svd_basis(A):
+    _, sigma, right = jnp.linalg.svd(A, full_matrices=True)
+    return right.T, numerical_rank(sigma)
+
+
+def _qr_basis(A):
+    Q, R, _ = jax.lax.linalg.qr(A.T, full_matrices=True, pivoting=True)
+    return Q, numerical_rank(jnp.abs(jnp.diagonal(R)))
+
+
+_BASES = {"svd": _svd_basis, "qr": _qr_basis}
+
+
+def _masked(A, method):
+    basis, rank = _BASES[method](A)
+    return jnp.where(jnp.arange(A.shape[1]) >= rank, basis, 0)
+
+
+_basis = jax.custom_jvp(_masked, nondiff_argnums=(1,))
+
+
+@_basis.defjvp
+def _basis_jvp(method, primals, tangents):
+    (A,), (dA,) = primals, tangents
+    Z = _basis(A, method)
+    return Z, -pseudo_inverse(A) @ (dA @ Z)

@@ -1,0 +1,79 @@
+"""Rotation matrices, quaternions and the cross-product matrix.
+
+A rotation matrix `R` takes body components to space components, `r_space = R r_body`. Its body angular velocity is
+`omega_body = vee(R' Rdot)`, its space angular velocity `omega = vee(Rdot R') = R omega_body`. Quaternions are `(w, x, y, z)`.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def rot_x(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Rotation by `angle` (rad) about the x axis."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    o, i = jnp.zeros_like(c), jnp.ones_like(c)
+    return jnp.stack([jnp.stack([i, o, o]), jnp.stack([o, c, -s]), jnp.stack([o, s, c])])
+
+
+def rot_y(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Rotation by `angle` (rad) about the y axis."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    o, i = jnp.zeros_like(c), jnp.ones_like(c)
+    return jnp.stack([jnp.stack([c, o, s]), jnp.stack([o, i, o]), jnp.stack([-s, o, c])])
+
+
+def rot_z(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Rotation by `angle` (rad) about the z axis."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    o, i = jnp.zeros_like(c), jnp.ones_like(c)
+    return jnp.stack([jnp.stack([c, -s, o]), jnp.stack([s, c, o]), jnp.stack([o, o, i])])
+
+
+def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    """The matrix of the cross product, `skew(v) w = v x w`."""
+    x, y, z = v[0], v[1], v[2]
+    o = jnp.zeros_like(x)
+    return jnp.stack([jnp.stack([o, -z, y]), jnp.stack([z, o, -x]), jnp.stack([-y, x, o])])
+
+
+def vee(S: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """The vector of the antisymmetric part of `S`, the inverse of `skew`."""
+    return 0.5 * jnp.stack([S[2, 1] - S[1, 2], S[0, 2] - S[2, 0], S[1, 0] - S[0, 1]])
+
+
+def quaternion_to_matrix(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """Rotation matrix of a quaternion `(w, x, y, z)` of any non-zero norm (the formula divides by the squared norm)."""
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    # R = 1 + 2 (w [v]x + [v]x^2) / (w^2 + v.v): unchanged by the norm, so that a drifting norm never scales an inertia.
+    two = 2.0 / (w * w + x * x + y * y + z * z)
+    return jnp.stack(
+        [
+            jnp.stack([1 - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)]),
+            jnp.stack([two * (x * y + w * z), 1 - two * (x * x + z * z), two * (y * z - w * x)]),
+            jnp.stack([two * (x * z - w * y), two * (y * z + w * x), 1 - two * (x * x + y * y)]),
+        ]
+    )
+
+
+def quaternion_rate(quaternion: Float[Array, "4"], omega_body: Float[Array, "3"]) -> Float[Array, "4"]:
+    """`d quaternion / dt = 1/2 quaternion (0, omega_body)` for the body angular velocity `omega_body` (rad/s)."""
+    return 0.5 * quaternion_product(quaternion, jnp.concatenate([jnp.zeros_like(omega_body[:1]), omega_body]))
+
+
+def quaternion_product(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Hamilton's product of two quaternions `(w, x, y, z)`."""
+    pw, px, py, pz = p[0], p[1], p[2], p[3]
+    qw, qx, qy, qz = q[0], q[1], q[2], q[3]
+    return jnp.stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ]
+    )
+
+
+def quaternion_from_axis_angle(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "4"]:
+    """The unit quaternion of a rotation by `angle` (rad) about the unit vector `axis`."""
+    return jnp.concatenate([jnp.cos(angle / 2)[None], jnp.sin(angle / 2) * axis])

@@ -1,0 +1,73 @@
+"""The verbs about bicycles: `bicycle FILE...` and `demo`."""
+
+import json
+import os
+import re
+import sys
+from pathlib import Path
+
+from jourdain_jax.bicycle.job import Refused, Study, run, table, write_results
+from jourdain_jax.bicycle.parameter_files import shipped_bicycles
+from jourdain_jax.plotting.bicycle_figures import animate_ride, draw_eigenvalues, draw_rides
+
+DEMO = "Rigid"  # a measured bicycle with all sigmas and a stable range
+
+
+def add(verbs) -> None:
+    """Add the verbs to the parser."""
+    job = verbs.add_parser("bicycle", help="stability speeds with uncertainty, and rides, of measured bicycles")
+    job.add_argument("files", nargs="+", metavar="FILE", help="parameter files (NAME = VALUE+/-SIGMA), or names of shipped bicycles")
+    _options(job, "bicycle-results")
+    job.set_defaults(run=_bicycle)
+
+    demo = verbs.add_parser("demo", help=f"the same for a shipped bicycle ({DEMO})")
+    _options(demo, "demo-results")
+    demo.set_defaults(run=_demo)
+
+
+def _options(parser, folder: str) -> None:
+    parser.add_argument("--out", default=folder, help=f"folder for tables and figures (default: {folder})")
+    parser.add_argument("--samples", type=int, default=2000, help="bicycles in the Monte Carlo (default 2000)")
+    parser.add_argument("--seed", type=int, default=0, help="of the Monte Carlo (default 0)")
+    parser.add_argument("--no-figures", action="store_true", help="numbers only")
+    parser.add_argument("--json", action="store_true", help="print result.json instead of the table")
+
+
+def _bicycle(options) -> bool:
+    shipped = shipped_bicycles()
+    return _job([shipped.get(name, name) if not os.path.exists(name) else name for name in options.files], options)
+
+
+def _demo(options) -> bool:
+    return _job([shipped_bicycles()[DEMO]], options)
+
+
+def _job(paths, options) -> bool:
+    if options.samples < 1:
+        raise ValueError(f"--samples is {options.samples}, expected at least 1")
+    out = Path(options.out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"cannot make the folder `{out}`: {error.strerror}; choose another with --out") from None
+    studies = run(paths, samples=options.samples, seed=options.seed, progress=lambda text: print(text, file=sys.stderr))
+    write_results(studies, out / "result.json")
+    written = [out / "result.json"]
+    good = [one for one in studies if isinstance(one, Study)]
+    if not options.no_figures:
+        for one in good:
+            written += _figures(one, out, len(good) > 1)
+    print(json.dumps([one.as_dict() for one in studies], indent=2) if options.json else table(studies))
+    print("wrote " + ", ".join(str(path) for path in written), file=sys.stderr)
+    return not any(isinstance(one, Refused) for one in studies)
+
+
+def _figures(study: Study, out: Path, several: bool) -> list[Path]:
+    """`eigenvalues.png`, `ride.png`, `ride.gif`; with the bicycle's name in front where there are several."""
+    prefix = re.sub(r"[^\w.-]", "_", study.bicycle.name) + "-" if several else ""
+    written = []
+    for name, draw in (("eigenvalues.png", draw_eigenvalues), ("ride.png", draw_rides), ("ride.gif", animate_ride)):
+        path = out / f"{prefix}{name}"
+        draw(study, path)
+        written.append(path)
+    return written

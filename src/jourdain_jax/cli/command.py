@@ -1,0 +1,46 @@
+"""Parsing of the command line, and its exit codes.
+
+Exit codes: 0 all went well; 1 something ran and failed its check (a verification, a motion that did not reach its end, a file refused);
+2 the command was wrong (unknown verb, name or option, unreadable file, bad number).
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from jourdain_jax.cli.bicycle_verbs import add as add_bicycle_verbs
+from jourdain_jax.cli.model_verbs import add as add_model_verbs
+from jourdain_jax.scene.names import nearest
+
+OK, FAILED, USAGE = 0, 1, 2
+VERBS = ("models", "report", "verify", "simulate", "bicycle", "demo")
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of all verbs."""
+    top = argparse.ArgumentParser(
+        prog="jourdain-jax",
+        description="Dynamics of holonomic and nonholonomic mechanical systems.",
+        epilog="exit codes: 0 well; 1 a check failed, a motion did not reach its end, or a file was refused; 2 wrong usage or unknown name",
+    )
+    verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
+    add_model_verbs(verbs)
+    add_bicycle_verbs(verbs)
+    return top
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit code."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in VERBS:
+        print(f"jourdain-jax: unknown verb `{arguments[0]}`; {nearest(arguments[0], VERBS)}", file=sys.stderr)
+        return USAGE
+    options = parser().parse_args(arguments)
+    try:
+        return OK if options.run(options) else FAILED
+    except ValueError as error:
+        print(f"jourdain-jax: {error}", file=sys.stderr)
+        return USAGE
+    except BrokenPipeError:  # the reader of our output (head, less) has gone
+        sys.stderr.close()
+        return OK

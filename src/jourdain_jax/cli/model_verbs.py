@@ -1,0 +1,158 @@
+"""The verbs about models: `models`, `report`, `verify`, `simulate`."""
+
+import json
+import os
+
+import numpy as np
+
+from jourdain_jax.analysis.report import report
+from jourdain_jax.analysis.verify import verify
+from jourdain_jax.models.registry import MODELS, model
+from jourdain_jax.motion.diagnostics import diagnose
+from jourdain_jax.motion.results import EVENT, SUCCESS
+from jourdain_jax.motion.simulate import simulate
+from jourdain_jax.motion.start import start
+from jourdain_jax.motion.storage import save
+from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.plotting.animation import animate
+from jourdain_jax.plotting.quantities import plot
+from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.scene import Scene
+
+
+def add(verbs) -> None:
+    """Add the verbs to the parser."""
+    listing = verbs.add_parser("models", help="list the models")
+    listing.add_argument("--json", action="store_true", help="machine-readable")
+    listing.set_defaults(run=_models)
+
+    about = verbs.add_parser("report", help="what kind of system a model is: freedoms, rows, integrability, cyclic coordinates")
+    _model_options(about)
+    about.set_defaults(run=_report)
+
+    checking = verbs.add_parser("verify", help="check a model's equations against each other")
+    _model_options(checking)
+    _start_options(checking)
+    checking.set_defaults(run=_verify)
+
+    running = verbs.add_parser("simulate", help="integrate a model's motion")
+    _model_options(running)
+    _start_options(running)
+    running.add_argument("--t1", type=float, help="end of the span, s (default: the model's example)")
+    running.add_argument("--samples", type=int, default=201, help="times saved (default 201)")
+    running.add_argument("--rtol", type=float, default=1e-8, help="relative tolerance (default 1e-8)")
+    running.add_argument("--atol", type=float, default=1e-8, help="absolute tolerance (default 1e-8)")
+    running.add_argument("--out", help="trajectory file to write (.npz)")
+    running.add_argument("--plot", metavar="FILE", help="plot of all coordinates to write (.png, .svg, .pdf)")
+    running.add_argument("--animate", metavar="FILE", help="animation to write (.gif)")
+    running.set_defaults(run=_simulate)
+
+
+def _model_options(parser) -> None:
+    parser.add_argument("model", help="name, see `jourdain-jax models`")
+    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="parameters")
+    parser.add_argument("--json", action="store_true", help="machine-readable")
+
+
+def _start_options(parser) -> None:
+    parser.add_argument("--start", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="start values (default: the model's example)")
+
+
+def _pairs(words: list[str], what: str) -> dict[str, float]:
+    values = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        try:
+            values[name] = float(text)
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise ValueError(f"{what} `{word}` is not NAME=VALUE with a number; write, for example, {what} mass=2.5")
+    return values
+
+
+def _scene(options) -> Scene:
+    return model(options.model, **_pairs(options.set, "--set"))
+
+
+def _state(scene: Scene, options):
+    return start(scene, **(_pairs(options.start, "--start") or scene.example))
+
+
+def _models(options) -> bool:
+    rows = [_model_row(name) for name in MODELS]
+    if options.json:
+        print(json.dumps(rows, indent=2))
+    else:
+        width = max(map(len, MODELS))
+        print("\n".join(f"{row['name']:<{width}}  {row['about']}" for row in rows))
+    return True
+
+
+def _model_row(name: str) -> dict:
+    scene = MODELS[name]()
+    about = (type(scene).__doc__ or "").strip().splitlines()[0]
+    parameters = {key: {"value": np.asarray(value).tolist(), "unit": meta["unit"]} for key, value, meta in parameters_of(scene)}
+    names = {"coordinates": scene.coordinate_names.entries, "speeds": scene.speed_names.entries, "inputs": scene.inputs.entries}
+    return {"name": name, "about": about, **names, "parameters": parameters, "conventions": scene.conventions}
+
+
+def _report(options) -> bool:
+    found = report(_scene(options))
+    print(json.dumps({"model": options.model, **found.as_dict()}, indent=2) if options.json else found)
+    return True
+
+
+def _verify(options) -> bool:
+    scene = _scene(options)
+    found = verify(scene, _state(scene, options))
+    print(json.dumps({"model": options.model, **found.as_dict()}, indent=2) if options.json else found)
+    return bool(found.passed)
+
+
+def _simulate(options) -> bool:
+    scene = _scene(options)
+    t1 = scene.example_span if options.t1 is None else options.t1
+    if options.samples < 2:
+        raise ValueError(f"--samples is {options.samples}, expected at least 2")
+    _check_folders(options)
+    trajectory = simulate(scene, _state(scene, options), ts=np.linspace(0.0, t1, options.samples), rtol=options.rtol, atol=options.atol)
+    if options.out:
+        save(trajectory, options.out)
+    if options.plot:
+        plot(trajectory, *scene.coordinate_names.entries, path=options.plot)
+    if options.animate:
+        animate(trajectory, options.animate)
+    print(json.dumps(_motion_row(options.model, trajectory), indent=2) if options.json else trajectory)
+    written = [path for path in (options.out, options.plot, options.animate) if path]
+    if written and not options.json:
+        print("wrote " + ", ".join(written))
+    return int(trajectory.result) in (SUCCESS, EVENT)
+
+
+def _check_folders(options) -> None:
+    """Before a long run, not after it: the files can be written."""
+    for path in (options.out, options.plot, options.animate):
+        folder = os.path.dirname(path or "") or "."
+        if not os.path.isdir(folder):
+            raise ValueError(f"cannot write `{path}`: there is no folder `{folder}`; make it first")
+
+
+def _motion_row(name: str, trajectory: Trajectory) -> dict:
+    found = diagnose(trajectory)
+    final = dict(zip(trajectory.scene.coordinate_names.entries, np.asarray(trajectory.q_end).tolist(), strict=True))
+    final |= dict(zip(trajectory.scene.speed_names.entries, np.asarray(trajectory.u_end).tolist(), strict=True))
+    return {
+        "model": name,
+        "result": int(trajectory.result),
+        "message": trajectory.message,
+        "t_end": float(trajectory.t_end),
+        "state": trajectory.state_form,
+        "steps_accepted": int(trajectory.accepted),
+        "steps_rejected": int(trajectory.rejected),
+        "energy_drift": float(found.energy_drift),
+        "energy_kind": found.energy_kind,
+        "position_residual": float(found.position_residual),
+        "velocity_residual": float(found.velocity_residual),
+        "final": final,
+    }

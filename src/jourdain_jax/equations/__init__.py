@@ -1,0 +1,1 @@
+"""Jourdain's principle of virtual power: kinematics -> virtual power -> rows -> reduction -> accelerations."""

@@ -1,0 +1,117 @@
+"""Accelerations of a scene at one state: the whole of the dynamics below time integration.
+
+kinematics -> virtual power (M, h, Q) -> rows (A, drift) -> reduction -> udot, lambda
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.equations.gibbs_appell import GibbsAppell
+from jourdain_jax.equations.reductions import (
+    Accelerations,
+    Multipliers,
+    NullSpaceQR,
+    NullSpaceSVD,
+    Privileged,
+    Reduced,
+    Reduction,
+    UdwadiaKalaba,
+    diagnosed,
+    partition,
+    reduce,
+)
+from jourdain_jax.equations.rows import ConstraintRows, constraint_rows, position_residual
+from jourdain_jax.equations.scaling import row_scale, scaled
+from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.virtual_power import UnconstrainedEquations, unconstrained_equations
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.scene import Scene
+
+
+class Baumgarte(eqx.Module):
+    """Stabilisation terms: `A udot = -drift - 2 a phi - b^2 g` on geometric rows, `- a phi` on velocity rows (a, b in 1/s).
+
+    Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1. Projection (the default of `simulate`) is more accurate.
+    """
+
+    alpha: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=5.0)
+    beta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=5.0)
+
+
+def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
+    """All reductions by short name, set up with the scene's privileged velocities."""
+    independent = structure_of(scene).independent
+    return {
+        "privileged": Privileged(independent),
+        "qr": NullSpaceQR(),
+        "svd": NullSpaceSVD(),
+        "kkt": Multipliers(),
+        "udwadia-kalaba": UdwadiaKalaba(),
+        "gibbs-appell": GibbsAppell(independent),
+    }
+
+
+def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
+    """A reduction from a short name, or the object itself; the null space by QR for None."""
+    if reduction is None:
+        return NullSpaceQR()
+    if isinstance(reduction, str):
+        known = reductions(scene)
+        if reduction not in known:
+            raise ValueError(f"unknown reduction `{reduction}`; {nearest(reduction, known)}")
+        return known[reduction]
+    return reduction
+
+
+def accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None) -> Accelerations:
+    """Accelerations, multipliers and diagnostics of a scene at (t, q, u).
+
+    `reduction` is a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt", "udwadia-kalaba", "gibbs-appell";
+    `stabilisation` adds Baumgarte terms. Pure: works under any nesting of jit, vmap, jvp and vjp, with right derivatives
+    wherever the rank of the rows is constant.
+    """
+    return diagnosed(*_reduced(scene, t, q, u, inputs, reduction, stabilisation))
+
+
+def bare_accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None) -> Reduced:
+    """Accelerations and constraint force alone, as `accelerations` but without multipliers and diagnostics: for use inside integration."""
+    return _reduced(scene, t, q, u, inputs, reduction, stabilisation)[0]
+
+
+def _reduced(scene: Scene, t, q, u, inputs, reduction, stabilisation) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
+    reduction = as_reduction(scene, reduction)
+    equations = unconstrained_equations(scene, t, q, u, inputs)
+    rows = constraint_rows(scene, t, q, u, inputs)
+    if stabilisation is not None:
+        rows = _stabilised(scene, t, q, rows, stabilisation)
+    if isinstance(reduction, GibbsAppell):
+        return reduction.accelerations(scene, t, q, u, equations, rows), equations, rows
+    return reduce(reduction, equations, rows), equations, rows
+
+
+def _stabilised(scene: Scene, t, q, rows: ConstraintRows, terms: Baumgarte) -> ConstraintRows:
+    g = position_residual(scene, t, q)
+    count = g.shape[0]
+    extra = jnp.concatenate([2 * terms.alpha * rows.phi[:count] + terms.beta**2 * g, terms.alpha * rows.phi[count:]])
+    return ConstraintRows(rows.phi, rows.A, rows.drift + extra, rows.names)
+
+
+def partition_pivot(scene: Scene, independent: tuple[int, ...], t, q, u, inputs=None) -> Float[Array, ""]:
+    """Smallest singular value of the scaled A_z of a partition at one state: near zero where these privileged speeds do not serve."""
+    problem = scaled(unconstrained_equations(scene, t, q, u, inputs), constraint_rows(scene, t, q, u, inputs))
+    return jax.lax.stop_gradient(partition(independent, problem.A, problem.b)[2])
+
+
+def speeds_from_privileged(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> Float[Array, "speeds"]:
+    """All speeds from the independent ones, `u = C y + c`: rows linear or affine in the speeds then hold exactly (eqs. (25)-(31))."""
+    n = len(scene.speed_names)
+    u = jnp.zeros(n, q.dtype).at[jnp.array(independent, jnp.int32)].set(y)
+    rows = constraint_rows(scene, t, q, u, inputs)
+    if not rows.names:
+        return u
+    # A (u + du) + d = 0 with du in the dependent speeds only
+    d = row_scale(rows.A)
+    _, du, _ = partition(independent, d[:, None] * rows.A, -d * rows.phi)
+    return u + du

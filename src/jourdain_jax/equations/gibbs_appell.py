@@ -1,0 +1,56 @@
+"""The Gibbs function and the Gibbs-Appell equations.
+
+    G = sum m a.a / 2 + alpha.I alpha / 2 + alpha.(omega x I omega),     dG/d(yddot_k) = Q_k          (12)-(17)
+
+G is evaluated from the bodies' accelerations; its gradient and Hessian over the accelerations are taken by autodiff, so that this is an
+independent way to the same equations: the Hessian of G over all speeds is M, its gradient at `udot = 0` is h.
+Source: Wang and Pao (2003), section II.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.equations.kinematics import bias_accelerations, inertias, velocities
+from jourdain_jax.equations.reductions import Reduced, partition, reduced, solve_definite
+from jourdain_jax.equations.rows import ConstraintRows
+from jourdain_jax.equations.scaling import scaled
+from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces
+from jourdain_jax.scene.scene import Scene
+
+
+def gibbs_function(scene: Scene, t, q, u, udot) -> Float[Array, ""]:
+    """G(t, q, u, udot) in kg m^2/s^4, up to terms without accelerations."""
+    velocity, bias = bias_accelerations(scene, t, q, u)
+    _, partial = jax.jvp(lambda u: velocities(scene, t, q, u), (u,), (udot,))  # beta udot, gamma udot
+    a, alpha, omega = bias.linear + partial.linear, bias.angular + partial.angular, velocity.angular
+    weights = inertias(scene, t, q)
+    gyroscopic = jnp.cross(omega, jnp.einsum("bij,bj->bi", weights.inertia, omega))
+    return 0.5 * jnp.sum(weights.mass * jnp.sum(a * a, 1)) + 0.5 * jnp.einsum("bi,bij,bj->", alpha, weights.inertia, alpha) + jnp.sum(alpha * gyroscopic)
+
+
+def gibbs_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
+    """M and h as Hessian and gradient of the Gibbs function at `udot = 0`, and Q."""
+    zero = jnp.zeros_like(u)
+    h, M = _gradient_and_hessian(lambda a: gibbs_function(scene, t, q, u, a), zero)
+    return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs))
+
+
+def _gradient_and_hessian(f, x):
+    return jax.grad(f)(x), jax.hessian(f)(x)
+
+
+class GibbsAppell(eqx.Module):
+    """The Gibbs-Appell equations `dG/d(yddot_k) = Q_k` in the privileged accelerations `independent`."""
+
+    independent: tuple[int, ...] = eqx.field(static=True)
+    name = "Gibbs-Appell"
+
+    def accelerations(self, scene: Scene, t, q, u, equations: UnconstrainedEquations, rows: ConstraintRows) -> Reduced:
+        """Accelerations; of `equations`, only Q is used for them."""
+        problem = scaled(equations, rows)
+        C, c, pivot = partition(self.independent, problem.A, problem.b)
+        gradient, hessian = _gradient_and_hessian(lambda yddot: gibbs_function(scene, t, q, u, problem.c * (C @ yddot + c)), jnp.zeros(C.shape[1], u.dtype))
+        yddot, definite = solve_definite(hessian, C.T @ (problem.c * equations.Q) - gradient)
+        return reduced(problem.c * (C @ yddot + c), pivot, definite & (pivot > 1e-7), equations)

@@ -1,0 +1,87 @@
+"""Kinematics of all bodies by automatic differentiation of their poses.
+
+    qdot = N u + nu          v = d r/dt,  omega = vee(Rdot R')          along (1, qdot)
+    v = beta u + v_t,        omega_body = gamma u + omega_t             partial velocities (26)-(31), (49)
+    a = beta udot + a_0,     alpha_body = gamma udot + alpha_0          a_0, alpha_0: the accelerations at udot = 0
+
+Source: Wang and Pao (2003), sections III and V.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.rotations import vee
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Pose
+from jourdain_jax.scene.scene import Scene
+
+
+class Velocities(eqx.Module):
+    """Velocities of the mass centres (inertial frame) and angular velocities (body axes; zero rows for particles)."""
+
+    linear: Float[Array, "bodies 3"]  # m/s
+    angular: Float[Array, "bodies 3"]  # rad/s
+
+
+class Inertias(eqx.Module):
+    """Masses and central inertias (body axes; zero for particles) of all bodies."""
+
+    mass: Float[Array, "bodies"]  # kg
+    inertia: Float[Array, "bodies 3 3"]  # kg m^2
+
+
+def coordinate_rates(scene: Scene, t, q: Float[Array, "coordinates"], u: Float[Array, "speeds"]) -> Float[Array, "coordinates"]:
+    """`qdot = N(q,t) u + nu(q,t)`."""
+    t = jnp.asarray(t, jnp.result_type(float))
+    return jnp.asarray(scene.coordinate_rates(t, scene.coordinate_names.view(q), scene.speed_names.view(u)))
+
+
+def pose_at(scene: Scene, t, q: Float[Array, "coordinates"]) -> Pose:
+    """Poses of all bodies, sorted by name: the order in which JAX returns dictionaries, so that it is the same everywhere."""
+    t, named = jnp.asarray(t, jnp.result_type(float)), scene.coordinate_names.view(q)
+    return Pose(t, named, {name: BodyPose(name, body) for name, body in sorted(scene.bodies(t, named).items())})
+
+
+def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
+    """Poses and velocities of all bodies at one instant."""
+    t = jnp.asarray(t, jnp.result_type(float))
+    inputs = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else inputs
+    qdot = coordinate_rates(scene, t, q, u)
+    poses, rates = jax.jvp(lambda t, q: pose_at(scene, t, q).bodies, (t, q), (jnp.ones_like(t), qdot))
+    bodies = {
+        name: BodyMotion(name, pose.body, rates[name].body.position, _space_angular_velocity(pose.body, rates[name].body)) for name, pose in poses.items()
+    }
+    return Motion(t, scene.coordinate_names.view(q), scene.speed_names.view(u), scene.coordinate_names.view(qdot), scene.inputs.view(inputs), bodies)
+
+
+def _space_angular_velocity(body, rate) -> Float[Array, "3"]:
+    if isinstance(body, RigidBody):
+        return vee(rate.orientation @ body.orientation.T)  # omega = vee(Rdot R')
+    return jnp.zeros_like(body.position)
+
+
+def velocities(scene: Scene, t, q, u) -> Velocities:
+    """Velocities of the mass centres and body angular velocities, affine in u."""
+    bodies = motion_at(scene, t, q, u).bodies.values()
+    return Velocities(jnp.stack([b.velocity for b in bodies]), jnp.stack([b.angular_velocity_body for b in bodies]))
+
+
+def partial_velocities(scene: Scene, t, q, u) -> Velocities:
+    """`beta = dv/du` and `gamma = d omega_body/du`, shape (bodies, 3, speeds)."""
+    return jax.jacfwd(lambda u: velocities(scene, t, q, u))(u)
+
+
+def bias_accelerations(scene: Scene, t, q, u) -> tuple[Velocities, Velocities]:
+    """Velocities, and accelerations at `udot = 0`: the derivative of the velocities along `(1, qdot, 0)`."""
+    t = jnp.asarray(t, jnp.result_type(float))
+    qdot = coordinate_rates(scene, t, q, u)
+    return jax.jvp(lambda t, q: velocities(scene, t, q, u), (t, q), (jnp.ones_like(t), qdot))
+
+
+def inertias(scene: Scene, t, q) -> Inertias:
+    """Masses and inertias of all bodies."""
+    bodies = [pose.body for pose in pose_at(scene, t, q).bodies.values()]
+    zero = jnp.zeros((3, 3), q.dtype)
+    return Inertias(jnp.stack([b.mass for b in bodies]), jnp.stack([b.inertia if isinstance(b, RigidBody) else zero for b in bodies]))

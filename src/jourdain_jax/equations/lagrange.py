@@ -1,0 +1,36 @@
+"""Lagrange's equations in energy-derivative form, for scenes whose speeds are the coordinate rates (row S2).
+
+    d/dt dT/dqdot - dT/dq = Q - dV/dq + A' lambda          (11)
+
+An independent way to M, h and Q: `M = d2T/dqdot2`, `h = d/dt(dT/dqdot) at qddot = 0 - dT/dq`.
+Source: Wang and Pao (2003), eq. (11).
+"""
+
+import jax
+import jax.numpy as jnp
+
+from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces, kinetic_energy
+from jourdain_jax.scene.scene import Scene
+
+
+def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
+    """M, h and Q from derivatives of the kinetic energy; a ValueError where the speeds are not the coordinate rates."""
+    if not speeds_are_rates(scene):
+        raise ValueError(
+            f"Lagrange's equations hold for coordinate rates, and the speeds of `{type(scene).__name__}` are quasi-velocities; use Appell's equations"
+        )
+    t = jnp.asarray(t, jnp.result_type(float))
+
+    def momentum(t, q, u):
+        return jax.grad(kinetic_energy, argnums=3)(scene, t, q, u)
+
+    M = jax.jacfwd(momentum, argnums=2)(t, q, u)
+    _, momentum_rate = jax.jvp(lambda t, q: momentum(t, q, u), (t, q), (jnp.ones_like(t), u))
+    # h = d/dt (dT/dqdot) at qddot = 0, less dT/dq
+    h = momentum_rate - jax.grad(kinetic_energy, argnums=2)(scene, t, q, u)
+    return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs))
+
+
+def speeds_are_rates(scene: Scene) -> bool:
+    """Whether the speeds are the coordinates' own rates (no quaternions, no quasi-velocities)."""
+    return not scene.coordinates.quaternions and scene.speeds is None and type(scene).coordinate_rates is Scene.coordinate_rates

@@ -1,0 +1,85 @@
+"""The power that changes the energy T + V of a scene.
+
+    d(T + V)/dt = sum F.v + L.omega + Q_k u_k   loads without a potential
+                + (A' lambda).u                 rows that do real work: prescribed, nonhomogeneous or nonlinear in u
+                + sum R.v_0 + T.omega_0         what drives poses given as functions of time; v_0, omega_0: velocities at u = 0
+                + dV/dt at fixed poses          potentials that depend on time
+
+A term that is zero at every state by the scene's structure is left out, not computed.
+Source: Wang and Pao (2003), eqs. (71)-(73).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
+from jourdain_jax.equations.reductions import Accelerations, Reduced
+from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.virtual_power import newton_residual, potential_energy, resultants
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.scene import Scene
+
+
+class Power(eqx.Module):
+    """Power in W by origin; positive where it adds to T + V."""
+
+    loads: Float[Array, ""]  # of loads without a potential
+    rows: Float[Array, ""]  # of constraint rows that do real work
+    driven: Float[Array, ""]  # of whatever moves poses that are given functions of time
+    potential: Float[Array, ""]  # explicit rate of potentials that depend on time
+
+    @property
+    def total(self) -> Float[Array, ""]:
+        """`d(T + V)/dt`."""
+        return self.loads + self.rows + self.driven + self.potential
+
+
+def power_of_nonconservative(scene: Scene, t, q, u, inputs, accelerations: Accelerations | Reduced) -> Float[Array, ""]:
+    """`d(T + V)/dt` in W along the motion with the given accelerations: zero where the energy T + V is conserved."""
+    return power(scene, t, q, u, inputs, accelerations).total
+
+
+def power(scene: Scene, t, q, u, inputs, accelerations: Accelerations | Reduced) -> Power:
+    """The same by origin."""
+    structure = structure_of(scene)
+    motion = motion_at(scene, t, q, u, inputs)
+    zero = jnp.zeros_like(motion.t)
+    works = not (structure.affine and structure.homogeneous)
+    return Power(
+        loads=power_of_loads(scene, motion, conservative=False),
+        # lambda . (A u), which is lambda . phi = 0 for rows homogeneous and linear in u
+        rows=accelerations.constraint_force @ u if works else zero,
+        driven=_power_of_drives(scene, motion, accelerations.udot) if structure.driven else zero,
+        potential=_explicit_rate_of_potential(scene, motion),
+    )
+
+
+def power_of_loads(scene: Scene, motion: Motion, *, conservative: bool | None = None) -> Float[Array, ""]:
+    """`sum F.v + L.omega + Q_k u_k` in W; only loads with (`conservative=True`) or without a potential (`False`) if asked."""
+    loads = resultants(scene, motion, conservative=conservative)
+    v = jnp.stack([body.velocity for body in motion.bodies.values()])
+    omega = jnp.stack([body.angular_velocity for body in motion.bodies.values()])
+    return jnp.sum(loads.force * v) + jnp.sum(loads.torque * omega) + loads.direct @ motion.u.array
+
+
+def _power_of_drives(scene: Scene, motion: Motion, udot) -> Float[Array, ""]:
+    """The constraint forces of bodies that move while all speeds are zero, times those velocities."""
+    t, q, u, inputs = motion.t, motion.q.array, motion.u.array, motion.inputs.array
+    total = newton_residual(scene, t, q, u, udot, inputs)
+    at_rest = motion_at(scene, t, q, jnp.zeros_like(u), inputs).bodies.values()
+    v, omega = jnp.stack([body.velocity for body in at_rest]), jnp.stack([body.angular_velocity for body in at_rest])
+    return jnp.sum(total.linear * v) + jnp.sum(total.angular * omega)
+
+
+def _explicit_rate_of_potential(scene: Scene, motion: Motion) -> Float[Array, ""]:
+    """`dV/dt` with all poses held, and with coordinates moving only as they do at `u = 0`."""
+    q = motion.q.array
+    nu = coordinate_rates(scene, motion.t, q, jnp.zeros_like(motion.u.array))
+
+    def V(t, q):
+        held = eqx.tree_at(lambda m: (m.t, m.q.array), motion, (t, q))
+        return potential_energy(scene, held)
+
+    return jax.jvp(V, (motion.t, q), (jnp.ones_like(motion.t), nu))[1]

@@ -1,0 +1,59 @@
+"""Projection onto the constraints: positions by Gauss-Newton, speeds M-orthogonally.
+
+    q <- q - G+ g(q),  G = dg/dq               u <- u - M^-1 A' (A M^-1 A')+ phi(u)
+
+Each is iterated a fixed number of times, so that it can be differentiated in any mode; the iteration converges quadratically, and its
+derivative with it. Unit norms of quaternions count as position rows here.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
+from jourdain_jax.equations.reductions import cholesky
+from jourdain_jax.equations.rows import position_residual, velocity_residual
+from jourdain_jax.equations.scaling import row_scale, speed_scale
+from jourdain_jax.equations.virtual_power import unconstrained_equations
+from jourdain_jax.scene.scene import Scene
+
+
+def closure_residual(scene: Scene, t, q) -> Float[Array, "closures"]:
+    """Geometric rows, and `(|quaternion|^2 - 1)/2` of every quaternion."""
+    norms = [(q[i : i + 4] @ q[i : i + 4] - 1)[None] / 2 for i, _ in scene.coordinates.quaternions]
+    return jnp.concatenate([position_residual(scene, t, q), *norms])
+
+
+def project_positions(scene: Scene, t, q: Float[Array, "coordinates"], *, free: Bool[Array, "coordinates"] | None = None, iterations: int = 25):
+    """Coordinates on the geometric rows, near q; only coordinates that are `free` move."""
+    if jax.eval_shape(lambda s, q: closure_residual(s, 0.0, q), scene, q).shape[0] == 0:
+        return q
+    free = jnp.ones(q.shape, bool) if free is None else free
+
+    def step(q, _):
+        residual, G = closure_residual(scene, t, q), jax.jacfwd(lambda q: closure_residual(scene, t, q))(q)
+        G = jnp.where(free, G, 0.0)
+        d = row_scale(G)
+        return q - pseudo_inverse(d[:, None] * G) @ (d * residual), None
+
+    return jax.lax.scan(step, q, length=iterations)[0]
+
+
+def project_speeds(scene: Scene, t, q, u: Float[Array, "speeds"], inputs=None, *, free: Bool[Array, "speeds"] | None = None, iterations: int = 8):
+    """Speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are `free` move."""
+    if jax.eval_shape(lambda s, q, u: velocity_residual(s, 0.0, q, u), scene, q, u).shape[0] == 0:
+        return u
+    free = jnp.ones(u.shape, bool) if free is None else free
+    M = unconstrained_equations(scene, t, q, u, inputs).M
+    c = speed_scale(M)
+    M = jnp.where(free[:, None] & free, c[:, None] * M * c, jnp.eye(u.shape[0], dtype=u.dtype))
+    L, _ = cholesky(M)  # the identity where M is singular: then nearest in the scaled speeds
+
+    def step(u, _):
+        phi, A = velocity_residual(scene, t, q, u, inputs), jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
+        weighted = jax.scipy.linalg.solve_triangular(L, jnp.where(free, A * c, 0.0).T, lower=True).T  # A L'^-1
+        d = row_scale(weighted)
+        x = pseudo_inverse(d[:, None] * weighted) @ (d * phi)
+        return u - jnp.where(free, c * jax.scipy.linalg.solve_triangular(L.T, x, lower=False), 0.0), None
+
+    return jax.lax.scan(step, u, length=iterations)[0]

@@ -1,0 +1,207 @@
+"""Reductions: interchangeable ways from virtual power and rows to accelerations.
+
+    M udot + h = Q + A' lambda,   A udot = -drift
+
+- `Privileged`: independent and dependent speeds, `zdot = B ydot + b` (Appell, Kane; eqs. (25)-(31), (41))
+- `NullSpaceQR`, `NullSpaceSVD`: `udot = udot_p + Z zeta`, `(Z'MZ) zeta = Z'(Q - h - M udot_p)`
+- `Multipliers`: the saddle-point (KKT) system, (68)-(70)
+- `UdwadiaKalaba`: Gauss's principle of least constraint, `min |udot - M^-1 (Q - h)|_M` over `A udot = -drift`
+- `GibbsAppell`: Hessian of the Gibbs function over the privileged accelerations (in `gibbs_appell.py`)
+
+All agree to round-off where they apply; `applicable` says whether one does. Dependent rows are allowed everywhere: the rank is found at
+every state, the multipliers are those of minimum norm.
+"""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, present
+from jourdain_jax.calculus.pseudo_inverse import numerical_rank, pseudo_inverse, rank_cutoff, singular_values
+from jourdain_jax.equations.rows import ConstraintRows
+from jourdain_jax.equations.scaling import ScaledProblem, scaled
+from jourdain_jax.equations.virtual_power import UnconstrainedEquations
+
+
+class Accelerations(eqx.Module):
+    """Accelerations of one state, with what is needed to trust them."""
+
+    udot: Float[Array, "speeds"]
+    multipliers: Float[Array, "rows"]  # lambda of minimum norm: the constraint force on the speeds is A' lambda
+    constraint_force: Float[Array, "speeds"]  # A' lambda = M udot + h - Q
+    rank: Int[Array, ""]  # of the rows at this state
+    smallest_singular_value: Float[Array, ""]  # of the scaled rows, the smallest that counts (1 without rows); reduction's own pivot if it has one
+    residual: Float[Array, ""]  # |A udot + drift| in scaled rows; large where rows contradict each other
+    applicable: Bool[Array, ""]  # whether this reduction works at this state
+
+
+class Reduction(eqx.Module):
+    """A way from the equations and rows of one state to its accelerations."""
+
+    name: eqx.AbstractClassVar[str]
+
+    @abc.abstractmethod
+    def solve(self, problem: ScaledProblem) -> tuple[Float[Array, "speeds"], Float[Array, ""], Bool[Array, ""]]:
+        """Scaled accelerations, the reduction's smallest pivot, and whether it applies."""
+
+
+class Reduced(eqx.Module):
+    """What a reduction finds, before multipliers and diagnostics are worked out."""
+
+    udot: Float[Array, "speeds"]
+    constraint_force: Float[Array, "speeds"]  # A' lambda = M udot + h - Q
+    pivot: Float[Array, ""]
+    applicable: Bool[Array, ""]
+
+
+def reduce(reduction: Reduction, equations: UnconstrainedEquations, rows: ConstraintRows) -> Reduced:
+    """Accelerations by the given reduction."""
+    problem = scaled(equations, rows)
+    w, pivot, applicable = reduction.solve(problem)
+    return reduced(problem.c * w, pivot, applicable, equations)
+
+
+def reduced(udot, pivot, applicable, equations: UnconstrainedEquations) -> Reduced:
+    """Known accelerations with the constraint force that goes with them."""
+    # A' lambda = M udot + h - Q
+    return Reduced(udot, equations.M @ udot + equations.h - equations.Q, pivot, applicable)
+
+
+def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: ConstraintRows) -> Accelerations:
+    """Accelerations with multipliers of minimum norm, rank, conditioning and residual."""
+    problem = scaled(equations, rows)
+    sigma = singular_values(problem.A)
+    return Accelerations(
+        udot=found.udot,
+        multipliers=pseudo_inverse(rows.A).T @ found.constraint_force,
+        constraint_force=found.constraint_force,
+        rank=numerical_rank(sigma),
+        smallest_singular_value=jax.lax.stop_gradient(jnp.minimum(found.pivot, smallest_that_counts(sigma))),
+        residual=jnp.max(jnp.abs(problem.d * (rows.A @ found.udot + rows.drift)), initial=0.0),
+        applicable=found.applicable & jnp.all(jnp.isfinite(found.udot)),
+    )
+
+
+def smallest_that_counts(sigma: Float[Array, "values"]) -> Float[Array, ""]:
+    """The smallest singular value above the cut-off; 1 where there is none."""
+    if sigma.shape[0] == 0:
+        return jnp.ones((), sigma.dtype)
+    counts = sigma > rank_cutoff(sigma.dtype) * sigma[0]
+    return jnp.min(jnp.where(counts, sigma, jnp.inf), initial=1.0)
+
+
+def cholesky(M: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
+    """Lower Cholesky factor, and whether M is positive definite; the identity's factor where it is not."""
+    factor = jnp.linalg.cholesky(jax.lax.stop_gradient(M))
+    # a pivot at round-off means a singular matrix, whatever its sign came out as
+    definite = jnp.all(jnp.isfinite(factor)) & (jnp.min(jnp.diagonal(factor), initial=1.0) ** 2 > 16 * M.shape[0] * jnp.finfo(M.dtype).eps)
+    usable = definite | ~jnp.all(jnp.isfinite(M))  # NaN in M must show, not vanish
+    return jnp.linalg.cholesky(jnp.where(usable, M, jnp.eye(M.shape[0], dtype=M.dtype))), definite
+
+
+def solve_definite(M: Float[Array, "n n"], f: Float[Array, "n"]) -> tuple[Float[Array, "n"], Bool[Array, ""]]:
+    """`M^-1 f` by Cholesky, and whether M is positive definite."""
+    factor, definite = cholesky(M)
+    return jax.scipy.linalg.cho_solve((factor, True), f), definite
+
+
+class Privileged(Reduction):
+    """Appell's equations in privileged velocities: the speeds `independent` are free, the others follow from the rows.
+
+    `zdot = B ydot + b` with `B = -A_z^-1 A_y`; with C from `udot = C yddot + c`, `C' (M (C yddot + c) + h - Q) = 0`.
+    Rows that are dependent everywhere are allowed (A_z of full column rank). Not applicable where A_z is singular.
+    """
+
+    independent: tuple[int, ...] = eqx.field(static=True)
+    name = "privileged"
+
+    def solve(self, problem):
+        C, c, pivot = partition(self.independent, problem.A, problem.b)
+        # (C' M C) yddot = C' (f - M c)
+        yddot, definite = solve_definite(C.T @ problem.M @ C, C.T @ (problem.f - problem.M @ c))
+        return C @ yddot + c, pivot, definite & (pivot > 1e-7)
+
+
+def partition(independent: tuple[int, ...], A, b) -> tuple[Float[Array, "speeds freedoms"], Float[Array, "speeds"], Float[Array, ""]]:
+    """`C`, `c` of `u = C y + c` with `A u = b`, y the independent speeds (eqs. (25)-(31)); and the smallest singular value of A_z."""
+    n = A.shape[1]
+    y = jnp.array(independent, jnp.int32)
+    dependent = [i for i in range(n) if i not in independent]
+    z = jnp.array(dependent, jnp.int32)
+    C = jnp.zeros((n, len(independent)), A.dtype).at[y, jnp.arange(len(independent))].set(1.0)
+    if not dependent:
+        return C, jnp.zeros(n, A.dtype), jnp.ones((), A.dtype)
+    # B = -A_z^-1 A_y,  b = A_z^-1 b;  A_z may be tall where rows are dependent everywhere
+    A_z = A[:, z]
+    Bb = jnp.concatenate([-A[:, y], b[:, None]], axis=1)
+    Bb = jnp.linalg.solve(A_z, Bb) if A_z.shape[0] == A_z.shape[1] else pseudo_inverse(A_z) @ Bb
+    sigma = singular_values(A_z)
+    smallest = sigma[-1] if A_z.shape[0] >= A_z.shape[1] else jnp.zeros((), A.dtype)
+    return C.at[z].set(Bb[:, :-1]), jnp.zeros(n, A.dtype).at[z].set(Bb[:, -1]), smallest
+
+
+def _by_null_space(problem: ScaledProblem, Z):
+    # A udot_p = -drift;  (Z' M Z) zeta = Z' (Q - h - M udot_p);  absent columns of Z get a unit diagonal and a zero right-hand side
+    particular = pseudo_inverse(problem.A) @ problem.b
+    S = Z.T @ problem.M @ Z + jnp.diag(jnp.where(present(Z), 0.0, 1.0).astype(Z.dtype))
+    zeta, definite = solve_definite(S, Z.T @ (problem.f - problem.M @ particular))
+    return particular + Z @ zeta, jnp.ones((), Z.dtype), definite
+
+
+class NullSpaceQR(Reduction):
+    """Null space of the rows from a column-pivoted QR decomposition. Applies wherever `Z'MZ` is positive definite."""
+
+    name = "null space (QR)"
+
+    def solve(self, problem):
+        return _by_null_space(problem, null_space_qr(problem.A))
+
+
+class NullSpaceSVD(Reduction):
+    """Null space of the rows from the singular value decomposition. Applies wherever `Z'MZ` is positive definite."""
+
+    name = "null space (SVD)"
+
+    def solve(self, problem):
+        return _by_null_space(problem, null_space_svd(problem.A))
+
+
+def _refined(inverse, A, b):
+    """`A+ b` and one step of iterative refinement: an explicit inverse alone loses two digits more."""
+    x = inverse @ b
+    return x + inverse @ (b - A @ x)
+
+
+class Multipliers(Reduction):
+    """Lagrange multipliers: the saddle-point system `[[M, -A'], [A, 0]] [udot, lambda] = [f, b]`, truncated where rows are dependent."""
+
+    name = "multipliers (KKT)"
+
+    def solve(self, problem):
+        n, m = problem.M.shape[0], problem.A.shape[0]
+        saddle = jnp.block([[problem.M, -problem.A.T], [problem.A, jnp.zeros((m, m), problem.A.dtype)]])
+        sigma = singular_values(saddle)
+        rows_rank = numerical_rank(singular_values(problem.A))
+        w = _refined(pseudo_inverse(saddle), saddle, jnp.concatenate([problem.f, problem.b]))
+        return w[:n], jnp.ones((), w.dtype), numerical_rank(sigma) == n + rows_rank
+
+
+class UdwadiaKalaba(Reduction):
+    """Gauss's least constraint: `udot = a + M^-1/2 (A M^-1/2)+ (b - A a)`, `a = M^-1 f`. Needs a positive definite M.
+
+    Source: F. E. Udwadia and R. E. Kalaba, Proc. R. Soc. A 439 (1992) 407, with the Cholesky factor in place of the square root.
+    """
+
+    name = "Udwadia-Kalaba (Gauss)"
+
+    def solve(self, problem):
+        L, definite = cholesky(problem.M)
+        free = jax.scipy.linalg.solve_triangular(L, problem.f, lower=True)  # L' a
+        weighted = jax.scipy.linalg.solve_triangular(L, problem.A.T, lower=True).T  # A L'^-1
+        d = jax.lax.stop_gradient(1 / jnp.maximum(jnp.sqrt(jnp.sum(weighted**2, axis=1)), jnp.finfo(L.dtype).tiny))
+        weighted = d[:, None] * weighted
+        x = free + _refined(pseudo_inverse(weighted), weighted, d * problem.b - weighted @ free)
+        return jax.scipy.linalg.solve_triangular(L.T, x, lower=False), jnp.ones((), L.dtype), definite

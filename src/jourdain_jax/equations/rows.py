@@ -1,0 +1,129 @@
+"""Constraint rows: their names, values, Jacobian and drift.
+
+    phi(t, q, u) = 0,   A = d phi/du,   A udot = -drift,   drift = d phi/dt at udot = 0
+
+Geometric rows `g(t, q) = 0` enter as `phi = dg/dt`, and keep their position residual `g`. Order: prescribed coordinates, geometric
+rows, contact heights (these have a position residual), then contact no-slip rows and velocity rows.
+Source: Wang and Pao (2003), eqs. (5)-(9), (19), (25).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.rotations import skew
+from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, pose_at
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
+from jourdain_jax.scene.scene import Scene
+
+
+class ConstraintRows(eqx.Module):
+    """The rows at one state, linearised: `A udot = -drift`."""
+
+    phi: Float[Array, "rows"]  # velocity residual
+    A: Float[Array, "rows speeds"]
+    drift: Float[Array, "rows"]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+
+def position_rows(scene: Scene, pose: Pose) -> dict[str, Array]:
+    """Values of all geometric rows by name: prescribed coordinates, geometric constraints, contact heights."""
+    rows = {f"prescribed {name}": pose.q[_coordinate(scene, name)] - value for name, value in scene.prescribed(pose.t).items()}
+    rows |= {name: jnp.asarray(value) for name, value in scene.geometric_constraints(pose).items()}
+    return rows | {f"{name} height": contact.gap() for name, contact in scene.contacts(pose).items() if contact.height == "row"}
+
+
+def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
+    """Values of all rows at the level of velocities, by name."""
+    rows = _rates_of_position_rows(scene, motion)
+    for name, contact in scene.contacts(motion.pose()).items():
+        slip = motion[contact.body].velocity_at(contact.point) - contact.plane.velocity_at(contact.point)
+        rows[f"{name} slip"] = contact.plane.tangents @ slip
+    for name, value in scene.velocity_constraints(motion).items():
+        if name in rows:
+            raise ValueError(f"row name `{name}` of `{type(scene).__name__}` is used twice; give every constraint a name of its own")
+        rows[name] = jnp.asarray(value)
+    return rows
+
+
+def _rates_of_position_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
+    """`dg/dt` along the velocities that the motion carries, so that it can be differentiated by a body's velocity alone."""
+
+    def g(t, q, bodies):
+        return position_rows(scene, Pose(t, scene.coordinate_names.view(q), bodies))
+
+    pose = motion.pose()
+    rates = {name: BodyPose(name, _pose_rate(body)) for name, body in motion.bodies.items()}
+    values = jax.jvp(g, (motion.t, motion.q.array, pose.bodies), (jnp.ones_like(motion.t), motion.qdot.array, rates))[1]
+    return {name: values[name] for name in position_rows(scene, pose)}  # JAX returns dictionaries sorted by name
+
+
+def _pose_rate(body_motion):
+    """Tangent of a body's pose: `rdot = v`, `Rdot = [omega] R`, nothing else changes."""
+    zero = jax.tree.map(jnp.zeros_like, body_motion.body)
+    if isinstance(zero, RigidBody):
+        turned = skew(body_motion.angular_velocity) @ body_motion.body.orientation
+        return eqx.tree_at(lambda b: (b.position, b.orientation), zero, (body_motion.velocity, turned))
+    return eqx.tree_at(lambda b: b.position, zero, body_motion.velocity)
+
+
+def _coordinate(scene: Scene, name: str) -> str:
+    scene.coordinate_names.index(name, f"prescribed coordinate of `{type(scene).__name__}`:")
+    return name
+
+
+def row_names(rows: dict[str, Array | jax.ShapeDtypeStruct]) -> tuple[str, ...]:
+    """One name per scalar row: the given one, with an index where a constraint has several rows."""
+    names: list[str] = []
+    for name, value in rows.items():
+        names += [name] if value.ndim == 0 else [f"{name}[{i}]" for i in range(value.size)]
+    return tuple(names)
+
+
+def flatten_rows(rows: dict[str, Array], dtype) -> Float[Array, "rows"]:
+    """All rows in one vector."""
+    return jnp.concatenate([value.reshape(-1) for value in rows.values()]) if rows else jnp.zeros(0, dtype)
+
+
+def position_residual(scene: Scene, t, q) -> Float[Array, "geometric_rows"]:
+    """`g(t, q)` of all geometric rows."""
+    t = jnp.asarray(t, jnp.result_type(float))
+    return flatten_rows(position_rows(scene, pose_at(scene, t, q)), q.dtype)
+
+
+def velocity_residual(scene: Scene, t, q, u, inputs=None) -> Float[Array, "rows"]:
+    """`phi(t, q, u)` of all rows."""
+    return flatten_rows(velocity_rows(scene, motion_at(scene, t, q, u, inputs)), q.dtype)
+
+
+def names_of_rows(scene: Scene) -> tuple[str, ...]:
+    """Names of all rows, in order, without evaluating them."""
+    q, u, _ = scene.named()
+    return _names(lambda s: velocity_rows(s, motion_at(s, 0.0, q, u)), scene)
+
+
+def names_of_position_rows(scene: Scene) -> tuple[str, ...]:
+    """Names of the geometric rows, in order; they come first among all rows."""
+    q, _, _ = scene.named()
+    return _names(lambda s: position_rows(s, pose_at(s, jnp.zeros(()), q)), scene)
+
+
+def _names(rows, scene: Scene) -> tuple[str, ...]:
+    """Names of `rows(scene)` by tracing. They are noted inside, because JAX returns dictionaries sorted by name."""
+    names: list[str] = []
+    jax.eval_shape(lambda s: names.extend(row_names(rows(s))), scene)
+    return tuple(names)
+
+
+def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
+    """phi, `A = d phi/du` and the drift `d phi/dt` at `udot = 0`."""
+    t = jnp.asarray(t, jnp.result_type(float))
+    names = names_of_rows(scene)
+    if not names:
+        return ConstraintRows(jnp.zeros(0, q.dtype), jnp.zeros((0, u.shape[0]), q.dtype), jnp.zeros(0, q.dtype), ())
+    qdot = coordinate_rates(scene, t, q, u)
+    phi, drift = jax.jvp(lambda t, q: velocity_residual(scene, t, q, u, inputs), (t, q), (jnp.ones_like(t), qdot))
+    A = jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
+    return ConstraintRows(phi, A, drift, names)

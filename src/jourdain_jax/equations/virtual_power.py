@@ -1,0 +1,164 @@
+"""Jourdain's principle for rigid bodies: the virtual power that must vanish for every admissible virtual velocity.
+
+    sum_j (m_j a_j - F_j) . beta_j^k + (I_j alpha_j + omega_j x I_j omega_j - L_j) . gamma_j^k  =  M udot + h - Q        (50), (56)
+
+    M = sum m beta' beta + gamma' I gamma
+    h = sum m beta' a_0 + gamma' (I alpha_0 + omega x I omega)          (h from a second directional derivative, never from dM/dq)
+    Q = sum beta' F + gamma' L + Q_direct - N' dV/dq
+
+Source: Wang and Pao (2003), eqs. (18), (50), (56). Angular quantities in body axes.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.rotations import skew
+from jourdain_jax.equations.kinematics import Inertias, Velocities, bias_accelerations, coordinate_rates, inertias, motion_at, partial_velocities, pose_at
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.scene import Scene
+
+
+class UnconstrainedEquations(eqx.Module):
+    """`M udot + h = Q`, the equations without constraint forces."""
+
+    M: Float[Array, "speeds speeds"]  # mass matrix
+    h: Float[Array, "speeds"]  # inertia forces at udot = 0
+    Q: Float[Array, "speeds"]  # generalized impressed forces
+
+
+class Resultants(eqx.Module):
+    """Impressed forces on the mass centres and torques about them (inertial frame), and forces directly on the speeds."""
+
+    force: Float[Array, "bodies 3"]  # N
+    torque: Float[Array, "bodies 3"]  # N m
+    direct: Float[Array, "speeds"]
+
+
+def resultants(scene: Scene, motion: Motion, *, conservative: bool | None = None) -> Resultants:
+    """Sum of the loads per body and per speed; only those with (`conservative=True`) or without a potential (`False`) if asked."""
+    force = {name: jnp.zeros_like(body.position) for name, body in motion.bodies.items()}
+    torque = dict(force)
+    direct = {name: jnp.zeros_like(motion.t) for name in scene.speed_names.entries}
+    for load in scene.loads(motion):
+        if conservative is not None and conservative != (load.potential is not None):
+            continue
+        for total, part, kind in ((force, load.forces, "body"), (torque, load.torques, "body"), (direct, load.generalized, "speed")):
+            for name, value in part.items():
+                if name not in total:
+                    raise ValueError(f"a load of `{type(scene).__name__}` acts on unknown {kind} `{name}`; {nearest(name, total)}")
+                total[name] = total[name] + value
+    return Resultants(_rows(force), _rows(torque), jnp.stack(list(direct.values())) if direct else jnp.zeros(0))
+
+
+def _rows(vectors: dict) -> Float[Array, "bodies 3"]:
+    return jnp.stack(list(vectors.values()))
+
+
+def potential_energy(scene: Scene, motion: Motion) -> Float[Array, ""]:
+    """V in J: the potentials of the loads and of the scene."""
+    V = jnp.zeros_like(motion.t)
+    for load in scene.loads(motion):
+        if load.potential is not None:
+            V = V + load.potential
+    extra = scene.potential(motion.pose())
+    return V if extra is None else V + extra
+
+
+def kinetic_energy(scene: Scene, t, q, u) -> Float[Array, ""]:
+    """T = sum m v.v/2 + omega.I omega/2 in J."""
+    from_bodies = inertias(scene, t, q)
+    bodies = motion_at(scene, t, q, u).bodies.values()
+    v, w = jnp.stack([b.velocity for b in bodies]), jnp.stack([b.angular_velocity_body for b in bodies])
+    return 0.5 * (jnp.sum(from_bodies.mass * jnp.sum(v * v, 1)) + jnp.einsum("bi,bij,bj->", w, from_bodies.inertia, w))
+
+
+def unconstrained_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
+    """M, h and Q of `M udot + h = Q`."""
+    partial, weights = partial_velocities(scene, t, q, u), inertias(scene, t, q)
+    beta, gamma = partial.linear, partial.angular
+    velocity, bias = bias_accelerations(scene, t, q, u)
+    # M = sum m beta' beta + gamma' I gamma
+    M = jnp.einsum("b,bik,bil->kl", weights.mass, beta, beta) + jnp.einsum("bik,bij,bjl->kl", gamma, weights.inertia, gamma)
+    inertia_force, inertia_torque = _inertia_resultants(weights, velocity, bias)
+    h = jnp.einsum("bik,bi->k", beta, inertia_force) + jnp.einsum("bik,bi->k", gamma, inertia_torque)
+    return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs, partial))
+
+
+def _inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: Velocities):
+    """`m a` and `I alpha + omega x I omega` per body."""
+    momentum = jnp.einsum("bij,bj->bi", weights.inertia, velocity.angular)
+    torque = jnp.einsum("bij,bj->bi", weights.inertia, acceleration.angular) + jnp.cross(velocity.angular, momentum)
+    return weights.mass[:, None] * acceleration.linear, torque
+
+
+def generalized_forces(scene: Scene, t, q, u, inputs=None, partial: Velocities | None = None) -> Float[Array, "speeds"]:
+    """`Q = sum beta' F + gamma' L + Q_direct - N' dV/dq`."""
+    partial = partial_velocities(scene, t, q, u) if partial is None else partial
+    motion = motion_at(scene, t, q, u, inputs)
+    loads = resultants(scene, motion)
+    orientation = jnp.stack([body.orientation for body in motion.bodies.values()])
+    torque = jnp.einsum("bji,bj->bi", orientation, loads.torque)  # in body axes
+    Q = jnp.einsum("bik,bi->k", partial.linear, loads.force) + jnp.einsum("bik,bi->k", partial.angular, torque) + loads.direct
+    return Q - _potential_gradient(scene, motion)
+
+
+def _potential_gradient(scene: Scene, motion: Motion) -> Float[Array, "speeds"]:
+    """`N' dV/dq` of the scene's own potential."""
+    t, q, u = motion.t, motion.q.array, motion.u.array
+    if scene.potential(motion.pose()) is None:
+        return jnp.zeros_like(u)
+    dV = jax.grad(lambda q: scene.potential(pose_at(scene, t, q)))(q)
+    N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
+    return dV @ N
+
+
+def potential_resultants(scene: Scene, motion: Motion) -> Resultants:
+    """The scene's own potential as forces `-dV/dr`, torques `-dV/dtheta` on the bodies, and `-N' dV/dq` at fixed poses on the speeds."""
+    t, q, u, pose = motion.t, motion.q.array, motion.u.array, motion.pose()
+    zero = jnp.zeros((len(pose.bodies), 3), q.dtype)
+    if scene.potential(pose) is None:
+        return Resultants(zero, zero, jnp.zeros_like(u))
+
+    def V(shift, turn, q):
+        bodies = {name: _displaced(body, shift[j], turn[j]) for j, (name, body) in enumerate(pose.bodies.items())}
+        return scene.potential(Pose(t, scene.coordinate_names.view(q), bodies))
+
+    force, moment, direct = jax.grad(V, argnums=(0, 1, 2))(zero, zero, q)
+    N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
+    return Resultants(-force, -moment, -direct @ N)
+
+
+def _displaced(pose: BodyPose, shift, turn) -> BodyPose:
+    """A pose moved by `shift` and turned by the small rotation vector `turn` (inertial frame), to first order."""
+    moved = eqx.tree_at(lambda p: p.body.position, pose, pose.body.position + shift)
+    if isinstance(pose.body, RigidBody):
+        moved = eqx.tree_at(lambda p: p.body.orientation, moved, pose.body.orientation + skew(turn) @ pose.body.orientation)
+    return moved
+
+
+def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
+    """The constraint force and torque on each body, `R = m a - F` and `I alpha + omega x I omega - L` (row S1; inertial frame).
+
+    Impressed forces that a scene states on its speeds, not on bodies, cannot be told apart from constraint forces here.
+    """
+    partial, weights = partial_velocities(scene, t, q, u), inertias(scene, t, q)
+    velocity, bias = bias_accelerations(scene, t, q, u)
+    acceleration = Velocities(bias.linear + partial.linear @ udot, bias.angular + partial.angular @ udot)
+    force, torque = _inertia_resultants(weights, velocity, acceleration)
+    motion = motion_at(scene, t, q, u, inputs)
+    loads, potential = resultants(scene, motion), potential_resultants(scene, motion)
+    orientation = jnp.stack([body.orientation for body in motion.bodies.values()])
+    return Velocities(force - loads.force - potential.force, jnp.einsum("bij,bj->bi", orientation, torque) - loads.torque - potential.torque)
+
+
+def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) -> Float[Array, ""]:
+    """Jourdain's variational equation (18) as a residual: `sum (m a - F) . delta_1 v` for any virtual `delta u` (row S6), in W.
+
+    Zero for every virtual velocity with `A delta u = 0` if and only if `udot` is the constrained acceleration.
+    """
+    equations = unconstrained_equations(scene, t, q, u, inputs)
+    return virtual_velocity @ (equations.M @ udot + equations.h - equations.Q)

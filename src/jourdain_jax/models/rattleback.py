@@ -1,0 +1,110 @@
+"""The rattleback (celt): an ellipsoid rolling without slip on a level plane, its inertia axes turned against its own axes.
+
+Space axes n1, n2 level, n3 DOWN. Body axes are those of the ellipsoid, axis 3 down at zero angles; the body is turned by gamma
+about 3, alpha about 1, beta about 2, in this order. mu = R' n3 is the downward vertical in body axes. The contact point, from
+the mass centre, is where the outward normal is mu (h: depth of the mass centre below the ellipsoid's centre):
+
+    rho = S mu / sqrt(mu . S mu) - h e3,   S = diag(a^2, b^2, c^2)
+
+The height of the mass centre, rho . mu, is built into the coordinates; no slip makes two rows. The speeds are the mass centre's
+level velocities and the body angular velocity (w1, w2, w3): three degrees of freedom.
+Source: T. R. Kane and D. A. Levinson, Int. J. Non-Linear Mech. 17 (1982) 175.
+"""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.contacts import Contact, Plane
+from jourdain_jax.scene.coordinates import coordinates, speeds
+from jourdain_jax.scene.loads import gravity
+from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.scene import Scene
+
+_HALF_TURN = np.diag([1.0, -1.0, -1.0])  # from axes with n3 down to the engine's, z up
+
+
+class Rattleback(Scene):
+    """x, y of the mass centre; angles alpha, beta, gamma; body angular velocity w1, w2, w3. Singular at alpha = +-pi/2."""
+
+    mass: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
+    a: Float[Array, ""] = parameter(0.20, unit="m", positive=True, about="semi-axis along body 1")
+    b: Float[Array, ""] = parameter(0.03, unit="m", positive=True, about="semi-axis along body 2")
+    c: Float[Array, ""] = parameter(0.02, unit="m", positive=True, about="semi-axis along body 3")
+    h: Float[Array, ""] = parameter(0.01, unit="m", about="of the mass centre below the ellipsoid's centre")
+    A: Float[Array, ""] = parameter(2e-4, unit="kg m^2", positive=True, about="central moment of inertia about 1")
+    B: Float[Array, ""] = parameter(16e-4, unit="kg m^2", positive=True, about="central moment of inertia about 2")
+    C: Float[Array, ""] = parameter(17e-4, unit="kg m^2", positive=True, about="central moment of inertia about 3")
+    D: Float[Array, ""] = parameter(-0.2e-4, unit="kg m^2", about="entry 12 of the inertia matrix")
+    gravity: Float[Array, ""] = parameter(9.81, unit="m/s^2")
+
+    coordinates = coordinates("x y alpha beta gamma")
+    speeds = speeds("x_rate y_rate w1 w2 w3")
+    privileged = ("w1", "w2", "w3")
+    domain = {
+        "alpha": (-1.0, 1.0),
+        "beta": (-1.0, 1.0),
+        "gamma": (-3.2, 3.2),
+        "w1": (-5.0, 5.0),
+        "w2": (-5.0, 5.0),
+        "w3": (-5.0, 5.0),
+    }
+    conventions = (
+        "x, y, z inertial with z up, of the mass centre; angles and w1, w2, w3 refer to axes with n3 = -z down: R = rot3(gamma) "
+        "rot1(alpha) rot2(beta), body axis 3 down at zero angles, so that w3 > 0 turns clockwise seen from above."
+    )
+    example = {"alpha": math.radians(0.5), "beta": math.radians(0.5), "w1": 0.0, "w2": 0.0, "w3": -5.0}
+    example_span = 20.0
+
+    def bodies(self, t, q):
+        level = jnp.stack([q.x, q.y])
+        turned = _HALF_TURN @ rot_z(q.gamma) @ rot_x(q.alpha) @ rot_y(q.beta)
+        down = -turned[2]  # mu
+        height = self.contact_arm(down) @ down
+        return {"stone": RigidBody(self.mass, self._inertia(), jnp.append(level, height), turned, self._outline())}
+
+    def coordinate_rates(self, t, q, u):
+        # body 1-3 components of gammadot n3 + alphadot n1' + betadot b2, solved for the rates
+        gamma_rate = (u.w3 * jnp.cos(q.beta) - u.w1 * jnp.sin(q.beta)) / jnp.cos(q.alpha)
+        alpha_rate = u.w1 * jnp.cos(q.beta) + u.w3 * jnp.sin(q.beta)
+        beta_rate = u.w2 - gamma_rate * jnp.sin(q.alpha)
+        return jnp.stack([u.x_rate, u.y_rate, alpha_rate, beta_rate, gamma_rate])
+
+    def loads(self, motion):
+        return (gravity(motion, self.gravity),)
+
+    def contacts(self, pose):
+        stone = pose["stone"]
+        point = stone.place(self.contact_arm(-stone.orientation[2]))
+        return {"sole": Contact("stone", point, Plane(), "coordinates")}
+
+    def events(self, motion):
+        return {"on edge": 1.4 - jnp.abs(motion.q.alpha)}
+
+    def contact_arm(self, down: Float[Array, "3"]) -> Float[Array, "3"]:
+        """rho (m), body axes: from the mass centre to the ellipsoid's lowest point when `down` is the downward vertical."""
+        weighted = jnp.stack([self.a**2, self.b**2, self.c**2]) * down
+        return weighted / jnp.sqrt(down @ weighted) - self._below_centre()
+
+    def _below_centre(self) -> Float[Array, "3"]:
+        return jnp.stack([0 * self.h, 0 * self.h, self.h])
+
+    def _inertia(self) -> Float[Array, "3 3"]:
+        o = jnp.zeros_like(self.A)
+        return jnp.stack([jnp.stack([self.A, self.D, o]), jnp.stack([self.D, self.B, o]), jnp.stack([o, o, self.C])])
+
+    def _outline(self) -> Float[Array, "points 3"]:
+        """Half of the ellipsoid that is down: its rim and two arcs."""
+        return jnp.stack([self.a, self.b, self.c]) * _half_sphere() - self._below_centre()
+
+
+def _half_sphere() -> np.ndarray:
+    angle = np.linspace(0, 2 * np.pi, 33)
+    circle, half = np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([np.cos(angle / 2), np.sin(angle / 2)], 1)
+    rim = np.insert(circle, 2, 0.0, axis=1)
+    along, across = np.insert(half, 1, 0.0, axis=1), np.insert(half, 0, 0.0, axis=1)
+    return np.concatenate([rim, along, rim[16:25], across])

@@ -1,0 +1,35 @@
+"""Rosenberg's particle: free but for the row `zdot = y xdot`, the smallest nonholonomic system that bends a path.
+
+    ydot = const,   xdot sqrt(1 + y^2) = const
+
+Source: R. M. Rosenberg, Analytical Dynamics of Discrete Systems (1977), ch. 15.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.scene.bodies import Particle
+from jourdain_jax.scene.coordinates import coordinates
+from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.scene import Scene
+
+
+class RosenbergParticle(Scene):
+    """A free particle under one linear row; lengths in units of the length that makes the row `zdot = y xdot`."""
+
+    mass: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
+
+    coordinates = coordinates("x y z")
+    privileged = ("x_rate", "y_rate")
+    conventions = "Right-handed inertial frame without gravity; y counts in metres in the row zdot = y xdot."
+    example = {"y": -1.0, "x_rate": 1.1 / 2**0.5, "y_rate": 0.8}
+    example_span = 5.0
+
+    def bodies(self, t, q):
+        return {"particle": Particle(self.mass, jnp.stack([q.x, q.y, q.z]))}
+
+    def velocity_constraints(self, motion):
+        return {"sheet": motion.u.z_rate - motion.q.y * motion.u.x_rate}
+
+    def invariants(self, motion):
+        return {"y rate": motion.u.y_rate, "speed in the sheet": motion.u.x_rate * jnp.sqrt(1 + motion.q.y**2)}

@@ -1,0 +1,167 @@
+"""Two wheels on a rigid axle that roll down an incline: one system, four scenes, one per method of the paper.
+
+    Method I    `TwoWheelAxleFree`         two free bodies, 12 coordinates, ten rows: five geometric, four of rolling, (61)
+    Method II   `TwoWheelAxleCoordinates`  seven coordinates, the five rows (65)
+    Method III  `TwoWheelAxleQuasi`        seven coordinates, two quasi-velocities (67), no rows
+    the trap    `TwoWheelAxleRedundant`    Method I with (60a) and (60b) for the axle: eleven rows of rank 10, none of them spare
+
+All have two degrees of freedom and Appell's equations (64):
+
+    2 a (M + m') psi1'' -      l (M + m') phi''                = 2 M g sin(alpha) cos(phi)
+    a l (M + m') psi1'' - (M l^2 + m' l^2 + m' a^2) phi''      = M g l sin(alpha) cos(phi)
+
+hence `phi'' = 0` and `psi1'' = M g sin(alpha) cos(phi) / (a (M + m'))`.
+Source: Wang and Pao, Am. J. Phys. 71 (2003) 72, section VI, eqs. (57)-(67).
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.contacts import disc_contact
+from jourdain_jax.scene.coordinates import coordinates, speeds
+from jourdain_jax.scene.loads import gravity
+from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.scene import Scene
+
+_TURN = (-3.2, 3.2)
+_ANGLES = {"psi1": _TURN, "psi2": _TURN}
+
+
+class _TwoWheelAxle(Scene):
+    """What the four scenes share: the parameters, a wheel, the weight, the known integrals."""
+
+    radius: Float[Array, ""] = parameter(0.3, unit="m", positive=True, about="a, of the wheels")
+    length: Float[Array, ""] = parameter(0.8, unit="m", positive=True, about="l, of the axle")
+    mass: Float[Array, ""] = parameter(1.2, unit="kg", positive=True, about="M, of a wheel with its load, at its centre")
+    rim_mass: Float[Array, ""] = parameter(0.5, unit="kg", positive=True, about="m': a wheel's moments are m'a^2 and m'a^2/2")
+    slope: Float[Array, ""] = parameter(0.2, unit="rad", about="alpha, of the incline")
+    gravity: Float[Array, ""] = parameter(9.81, unit="m/s^2")
+
+    conventions = (
+        "x down the slope, y across it, z along its normal; heading phi from x towards y, theta about the heading, psi about the "
+        "axle, positive forwards: angular velocity phidot k + thetadot i' + psidot j''; wheel 2 is on the left of wheel 1."
+    )
+    example_span = 10.0
+
+    def loads(self, motion):
+        down = jnp.stack([jnp.sin(self.slope), jnp.zeros_like(self.slope), -jnp.cos(self.slope)])
+        return (gravity(motion, self.gravity, down),)
+
+    def _wheel(self, centre, phi, theta, psi) -> RigidBody:
+        return RigidBody.thin_disc(
+            self.mass,
+            self.radius,
+            axis="y",
+            position=jnp.stack(centre),
+            orientation=rot_z(phi) @ rot_x(theta) @ rot_y(psi),
+            axial=self.rim_mass * self.radius**2,
+            diametral=self.rim_mass * self.radius**2 / 2,
+        )
+
+    def _rolling(self, pose, height: str):
+        """Both wheels roll; each carries itself, the axle bends no load from one to the other."""
+        return {wheel: disc_contact(pose[wheel], self.radius, height=height, carried=(wheel,)) for wheel in ("wheel1", "wheel2")}
+
+    def _axle_row(self, psi1_rate, psi2_rate, phi_rate):
+        # (61): a psidot_2 = a psidot_1 - l phidot
+        return self.radius * psi2_rate - self.radius * psi1_rate + self.length * phi_rate
+
+    def _integrals(self, q, phi, psi1_rate, phi_rate):
+        push = self.mass * self.gravity * jnp.sin(self.slope) / (self.mass + self.rim_mass)
+        return {
+            "turn rate": phi_rate,
+            "rolling and heading": self.radius * psi1_rate * phi_rate - push * jnp.sin(phi),
+            "wheel angles": self.radius * (q.psi2 - q.psi1) + self.length * phi,
+            "axle along x": q.x2 - q.x1 + self.length * jnp.sin(phi),
+            "axle along y": q.y2 - q.y1 - self.length * jnp.cos(phi),
+        }
+
+
+class _FreeWheels(_TwoWheelAxle):
+    """Two wheels as free bodies, upright, of one heading and rolling; the axle's own row is still missing."""
+
+    coordinates = coordinates("x1 y1 z1 phi1 theta1 psi1 x2 y2 z2 phi2 theta2 psi2")
+    privileged = ("psi1_rate", "phi1_rate")
+    domain = {"z1": (0.1, 0.5), "z2": (0.1, 0.5), "phi1": _TURN, "phi2": _TURN, **_ANGLES}
+    example = {"y2": 0.8, "psi1_rate": 0.7 / 0.3, "phi1_rate": 1.1}
+
+    def bodies(self, t, q):
+        return {
+            "wheel1": self._wheel([q.x1, q.y1, q.z1], q.phi1, q.theta1, q.psi1),
+            "wheel2": self._wheel([q.x2, q.y2, q.z2], q.phi2, q.theta2, q.psi2),
+        }
+
+    def geometric_constraints(self, pose):
+        return {"wheel1 upright": pose.q.theta1, "wheel2 upright": pose.q.theta2, "one heading": pose.q.phi1 - pose.q.phi2}
+
+    def contacts(self, pose):
+        return self._rolling(pose, "row")
+
+    def invariants(self, motion):
+        return self._integrals(motion.q, motion.q.phi1, motion.u.psi1_rate, motion.u.phi1_rate)
+
+
+class TwoWheelAxleFree(_FreeWheels):
+    """Method I: Jourdain's equation (50) for two free bodies, ten rows."""
+
+    def velocity_constraints(self, motion):
+        return {"rigid axle": self._axle_row(motion.u.psi1_rate, motion.u.psi2_rate, motion.u.phi1_rate)}
+
+
+class TwoWheelAxleRedundant(_FreeWheels):
+    """Method I with both rows (60a) and (60b): either alone loses the axle where its factor, cos phi or sin phi, passes zero."""
+
+    def velocity_constraints(self, motion):
+        u, phi = motion.u, motion.q.phi1
+        return {
+            "axle along x": u.x2_rate - u.x1_rate + self.length * u.phi1_rate * jnp.cos(phi),  # (60a)
+            "axle along y": u.y2_rate - u.y1_rate + self.length * u.phi1_rate * jnp.sin(phi),  # (60b)
+        }
+
+
+class _UprightWheels(_TwoWheelAxle):
+    """Two upright wheels of one heading in the seven coordinates of Methods II and III."""
+
+    coordinates = coordinates("x1 y1 psi1 x2 y2 psi2 phi")
+    domain = {"phi": _TURN, **_ANGLES}
+
+    def bodies(self, t, q):
+        upright = jnp.zeros_like(q.phi)
+        return {
+            "wheel1": self._wheel([q.x1, q.y1, self.radius], q.phi, upright, q.psi1),
+            "wheel2": self._wheel([q.x2, q.y2, self.radius], q.phi, upright, q.psi2),
+        }
+
+
+class TwoWheelAxleCoordinates(_UprightWheels):
+    """Method II: Appell's equations (52) in seven coordinates with the five rows (65)."""
+
+    privileged = ("psi1_rate", "phi_rate")
+    example = {"y2": 0.8, "psi1_rate": 0.7 / 0.3, "phi_rate": 1.1}
+
+    def contacts(self, pose):
+        return self._rolling(pose, "coordinates")
+
+    def velocity_constraints(self, motion):
+        return {"rigid axle": self._axle_row(motion.u.psi1_rate, motion.u.psi2_rate, motion.u.phi_rate)}
+
+    def invariants(self, motion):
+        return self._integrals(motion.q, motion.q.phi, motion.u.psi1_rate, motion.u.phi_rate)
+
+
+class TwoWheelAxleQuasi(_UprightWheels):
+    """Method III: of the seven quasi-velocities (67) the five rows are set to zero; rolling of wheel 1 and turning remain."""
+
+    speeds = speeds("rolling turning")
+    example = {"y2": 0.8, "rolling": 0.7 / 0.3, "turning": 1.1}
+
+    def coordinate_rates(self, t, q, u):
+        forward = self.radius * jnp.stack([jnp.cos(q.phi), jnp.sin(q.phi)])
+        psi1_rate, psi2_rate = u.rolling, u.rolling - self.length / self.radius * u.turning
+        first, second = forward * psi1_rate, forward * psi2_rate
+        return jnp.stack([first[0], first[1], psi1_rate, second[0], second[1], psi2_rate, u.turning])
+
+    def invariants(self, motion):
+        return self._integrals(motion.q, motion.q.phi, motion.u.rolling, motion.u.turning)

@@ -1,0 +1,161 @@
+"""The full nonlinear Whipple bicycle: four rigid bodies on two knife-edge wheels that roll without slip.
+
+Rear wheel R, rear frame with rider B, front frame (handlebar and fork) H, front wheel F. The rear contact and its height are
+built into the coordinates; the front contact is the lowest point of the front wheel: a height row and two no-slip rows, valid at
+any lean and steer. Five rows, three degrees of freedom: lean, steer, forward motion.
+
+Parameters have the names and the frame of the source: origin at the rear contact, x forward, y to the right, z DOWN. The
+engine's frame has y to the left and z up, half a turn about x away: `(x, y, z) -> (x, -y, -z)`, so products of inertia change
+sign, `Ixz -> -Ixz`. Lean is a turn about x in both. Steer is a turn about the steer axis `(sin lam, 0, -cos lam)`, downwards.
+Source: J. P. Meijaard, J. M. Papadopoulos, A. Ruina and A. L. Schwab, Proc. R. Soc. A 463 (2007) 1955; defaults: its benchmark.
+"""
+
+import math
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.contacts import disc_contact
+from jourdain_jax.scene.coordinates import coordinates, inputs
+from jourdain_jax.scene.loads import generalized_force, gravity
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.parameters import parameter, parameters_of
+from jourdain_jax.scene.scene import Scene
+
+
+class WhippleBicycle(Scene):
+    """Coordinates: x, y of the rear contact; yaw, lean, pitch of the rear frame; steer; spins of the wheels in their frames.
+
+    Inputs, both positive to the right (N m): `lean_torque` from outside on the rear frame about the level line through the rear
+    contact; `steer_torque` on the front frame about the steer axis, with its reaction on the rear frame.
+    """
+
+    w: Float[Array, ""] = parameter(1.02, unit="m", positive=True, about="wheelbase")
+    c: Float[Array, ""] = parameter(0.08, unit="m", about="trail")
+    lam: Float[Array, ""] = parameter(math.pi / 10, unit="rad", about="steer axis tilt, backwards from the vertical")
+    g: Float[Array, ""] = parameter(9.81, unit="m/s^2", about="gravity")
+    rR: Float[Array, ""] = parameter(0.3, unit="m", positive=True, about="rear wheel radius")
+    mR: Float[Array, ""] = parameter(2.0, unit="kg", positive=True, about="rear wheel mass")
+    IRxx: Float[Array, ""] = parameter(0.0603, unit="kg m^2", non_negative=True, about="rear wheel, diametral")
+    IRyy: Float[Array, ""] = parameter(0.12, unit="kg m^2", non_negative=True, about="rear wheel, about the axle")
+    xB: Float[Array, ""] = parameter(0.3, unit="m", about="rear frame mass centre, forward")
+    zB: Float[Array, ""] = parameter(-0.9, unit="m", about="rear frame mass centre, down")
+    mB: Float[Array, ""] = parameter(85.0, unit="kg", positive=True, about="rear frame and rider mass")
+    IBxx: Float[Array, ""] = parameter(9.2, unit="kg m^2", non_negative=True)
+    IByy: Float[Array, ""] = parameter(11.0, unit="kg m^2", non_negative=True)
+    IBzz: Float[Array, ""] = parameter(2.8, unit="kg m^2", non_negative=True)
+    IBxz: Float[Array, ""] = parameter(2.4, unit="kg m^2")
+    xH: Float[Array, ""] = parameter(0.9, unit="m", about="front frame mass centre, forward")
+    zH: Float[Array, ""] = parameter(-0.7, unit="m", about="front frame mass centre, down")
+    mH: Float[Array, ""] = parameter(4.0, unit="kg", positive=True, about="front frame mass")
+    IHxx: Float[Array, ""] = parameter(0.05892, unit="kg m^2", non_negative=True)
+    IHyy: Float[Array, ""] = parameter(0.06, unit="kg m^2", non_negative=True)
+    IHzz: Float[Array, ""] = parameter(0.00708, unit="kg m^2", non_negative=True)
+    IHxz: Float[Array, ""] = parameter(-0.00756, unit="kg m^2")
+    rF: Float[Array, ""] = parameter(0.35, unit="m", positive=True, about="front wheel radius")
+    mF: Float[Array, ""] = parameter(3.0, unit="kg", positive=True, about="front wheel mass")
+    IFxx: Float[Array, ""] = parameter(0.1405, unit="kg m^2", non_negative=True, about="front wheel, diametral")
+    IFyy: Float[Array, ""] = parameter(0.28, unit="kg m^2", non_negative=True, about="front wheel, about the axle")
+
+    coordinates = coordinates("x y yaw lean pitch steer rear_spin front_spin")
+    inputs = inputs("lean_torque steer_torque")
+    privileged = ("lean_rate", "steer_rate", "rear_spin_rate")
+    domain = {
+        "yaw": (-3.2, 3.2),
+        "lean": (-0.8, 0.8),
+        "pitch": (-0.1, 0.1),
+        "steer": (-1.0, 1.0),
+        "rear_spin": (-3.2, 3.2),
+        "front_spin": (-3.2, 3.2),
+    }
+    conventions = (
+        "z up, x forward, y to the left at yaw = 0; parameters in the z-down frame of Meijaard et al. (2007). Turns in the order "
+        "yaw, lean, pitch. Positive: yaw left, lean right, pitch nose down, steer right, spins rolling forward."
+    )
+    example = {"rear_spin_rate": 15.0, "lean_rate": 0.2, "steer_rate": 0.0}
+    example_span = 5.0
+
+    @classmethod
+    def from_values(cls, values: Mapping[str, float | Array]) -> "WhippleBicycle":
+        """The bicycle with these 26 parameters by name, as read from a parameter file.
+
+        Raises a ValueError that names parameters which are missing or unknown.
+        """
+        names = [name for name, _, _ in parameters_of(cls())]
+        for name in values:
+            if name not in names:
+                raise ValueError(f"unknown bicycle parameter `{name}`; {nearest(name, names)}")
+        missing = [name for name in names if name not in values]
+        if missing:
+            raise ValueError(f"bicycle parameters missing: {', '.join(f'`{name}`' for name in missing)}; give all {len(names)}")
+        return cls(**values)
+
+    def upright(self, speed) -> dict[str, Float[Array, ""]]:
+        """Speeds of running straight and upright at `speed` (m/s), the steady motion of the linear model; all else is zero."""
+        speed = jnp.asarray(speed, jnp.result_type(float))
+        return {"x_rate": speed, "rear_spin_rate": speed / self.rR, "front_spin_rate": speed / self.rF}
+
+    def bodies(self, t, q):
+        contact = jnp.stack([q.x, q.y, 0.0 * q.x])
+        wheel_plane = rot_z(q.yaw) @ rot_x(q.lean)
+        rear = wheel_plane @ rot_y(q.pitch)
+        # about the steer axis (sin lam, 0, -cos lam) by +steer: about its opposite, the z axis tilted back, by -steer
+        front = rear @ rot_y(-self.lam) @ rot_z(-q.steer) @ rot_y(self.lam)
+        rear_centre = contact + self.rR * wheel_plane[:, 2]
+        on_steer_axis = rear_centre + rear @ _vector(self.w + self.c, self.rR)  # where the axis meets the ground when upright
+        front_centre = on_steer_axis + front @ _vector(-self.c, -self.rF)
+        frame_centre = rear_centre + rear @ _vector(self.xB, self.zB + self.rR)
+        fork_centre = on_steer_axis + front @ _vector(self.xH - self.w - self.c, self.zH)
+        frame_inertia = _inertia(self.IBxx, self.IByy, self.IBzz, self.IBxz)
+        fork_inertia = _inertia(self.IHxx, self.IHyy, self.IHzz, self.IHxz)
+        frame_lines, fork_lines = self._outlines()
+        return {
+            "rear wheel": _wheel(self.mR, self.rR, self.IRxx, self.IRyy, rear_centre, rear @ rot_y(q.rear_spin)),
+            "rear frame": RigidBody(self.mB, frame_inertia, frame_centre, rear, frame_lines),
+            "front frame": RigidBody(self.mH, fork_inertia, fork_centre, front, fork_lines),
+            "front wheel": _wheel(self.mF, self.rF, self.IFxx, self.IFyy, front_centre, front @ rot_y(q.front_spin)),
+        }
+
+    def _outlines(self) -> tuple[Float[Array, "frame_points 3"], Float[Array, "fork_points 3"]]:
+        """Lines of the two frames for drawing, through mass centre, hub and the steer axis at the height of the front frame."""
+        frame, fork = (self.xB, self.zB), (self.xH, self.zH)
+        head = (self.w + self.c + self.zH * jnp.tan(self.lam), self.zH)
+        return _side_view(frame, frame, (0.0, -self.rR), head, frame), _side_view(fork, fork, head, (self.w, -self.rF))
+
+    def loads(self, motion):
+        torques = generalized_force(motion, lean_rate=motion.inputs.lean_torque, steer_rate=motion.inputs.steer_torque)
+        return gravity(motion, self.g), torques
+
+    def contacts(self, pose):
+        return {
+            "rear": disc_contact(pose["rear wheel"], self.rR, axis="y", height="coordinates"),
+            "front": disc_contact(pose["front wheel"], self.rF, axis="y", height="row"),
+        }
+
+    def events(self, motion):
+        # leant over too far, or the handlebar past a right angle, where a real one meets the frame
+        return {"fallen": jnp.minimum(1.2 - jnp.abs(motion.q.lean), jnp.pi / 2 - jnp.abs(motion.q.steer))}
+
+
+def _vector(x, z) -> Float[Array, "3"]:
+    """Components (x, 0, -z) in the engine's axes of a vector in the plane of symmetry, with z down."""
+    x, z = jnp.asarray(x), jnp.asarray(z)
+    return jnp.stack([x, jnp.zeros_like(x), -z])
+
+
+def _inertia(xx, yy, zz, xz) -> Float[Array, "3 3"]:
+    """Inertia in the engine's axes: the product changes sign under half a turn about x."""
+    zero = jnp.zeros_like(xx)
+    return jnp.stack([jnp.stack([xx, zero, -xz]), jnp.stack([zero, yy, zero]), jnp.stack([-xz, zero, zz])])
+
+
+def _wheel(mass, radius, diametral, axial, centre, orientation) -> RigidBody:
+    return RigidBody.thin_disc(mass, radius, axis="y", position=centre, orientation=orientation, axial=axial, diametral=diametral)
+
+
+def _side_view(centre, *points) -> Float[Array, "points 3"]:
+    """Outline through points (x, z) of the plane of symmetry, relative to a mass centre."""
+    return jnp.stack([_vector(x - centre[0], z - centre[1]) for x, z in points])

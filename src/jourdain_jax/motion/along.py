@@ -1,0 +1,127 @@
+"""Quantities along a recorded motion: a function of one state, mapped over all saved times."""
+
+from typing import Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jourdain_jax.equations.accelerations import Accelerations, accelerations
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.equations.reactions import ContactForce, RowReactions, contact_forces, row_reactions
+from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy
+from jourdain_jax.motion.inputs import Inputs
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.scene import Scene
+
+
+@runtime_checkable
+class Record(Protocol):
+    """What is needed of a recorded motion; NaN at times that were not reached."""
+
+    scene: Scene
+    ts: Float[Array, "times"]
+    q: Float[Array, "times coordinates"]
+    u: Float[Array, "times speeds"]
+    t_end: Float[Array, ""]
+    q_end: Float[Array, "coordinates"]
+    u_end: Float[Array, "speeds"]
+    inputs: Inputs
+    work: Float[Array, "times"] | None
+    accepted: Int[Array, ""]
+    rejected: Int[Array, ""]
+    moved_q: Float[Array, ""]
+    moved_u: Float[Array, ""]
+    smallest_pivot: Float[Array, ""]
+    state_form: str
+    reduction: str
+    solver: str
+    projected: bool
+
+
+@eqx.filter_jit
+def along(f, record: Record):
+    """`f(scene, t, q, u, inputs)` at all times; NaN at times that were not reached. f must be a named function or a module (it is a cache key)."""
+
+    def one(t, q, u):
+        reached = jnp.all(jnp.isfinite(q))
+        t, q, u = (jnp.where(reached, a, b) for a, b in ((t, record.t_end), (q, record.q_end), (u, record.u_end)))
+        values = f(record.scene, t, q, u, record.inputs(t))
+        return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan) if eqx.is_inexact_array(x) else x, values)
+
+    return jax.vmap(one)(record.ts, record.q, record.u)
+
+
+def motions(record: Record) -> Motion:
+    """Poses and velocities of all bodies (leading axis: times)."""
+    return along(motion_at, record)
+
+
+def path(record: Record, body: str, local) -> Float[Array, "times 3"]:
+    """Path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m, from the mass centre)."""
+    return along(_Point(body, jnp.asarray(local, record.q.dtype)), record)
+
+
+def energies(record: Record) -> tuple[Float[Array, "times"], Float[Array, "times"]]:
+    """Kinetic and potential energy, J."""
+    return along(_energies, record)
+
+
+def accelerations_along(record: Record) -> Accelerations:
+    """Accelerations, multipliers, rank and smallest singular value."""
+    return along(_accelerations, record)
+
+
+def reactions_along(record: Record) -> RowReactions:
+    """Constraint forces per row and per body."""
+    return along(_reactions, record)
+
+
+def contact_forces_along(record: Record) -> dict[str, ContactForce]:
+    """Normal and tangential force and the friction coefficient needed, of every rolling contact."""
+    return along(_contacts, record)
+
+
+def residuals(record: Record) -> tuple[Float[Array, "times closures"], Float[Array, "times rows"]]:
+    """Residuals of the geometric rows and quaternion norms, and of the velocity rows."""
+    return along(_residuals, record)
+
+
+def invariants(record: Record) -> dict[str, Float[Array, "times"]]:
+    """The quantities that the scene is known to conserve."""
+    return along(_invariants, record)
+
+
+class _Point(eqx.Module):
+    body: str = eqx.field(static=True)
+    local: Float[Array, "3"]
+
+    def __call__(self, scene, t, q, u, inputs):
+        return motion_at(scene, t, q, u, inputs)[self.body].place(self.local)
+
+
+def _energies(scene, t, q, u, inputs):
+    return kinetic_energy(scene, t, q, u), potential_energy(scene, motion_at(scene, t, q, u, inputs))
+
+
+def _accelerations(scene, t, q, u, inputs):
+    return accelerations(scene, t, q, u, inputs, reduction="svd")
+
+
+def _reactions(scene, t, q, u, inputs):
+    return row_reactions(scene, t, q, u, _accelerations(scene, t, q, u, inputs), inputs)
+
+
+def _contacts(scene, t, q, u, inputs):
+    return contact_forces(scene, t, q, u, _accelerations(scene, t, q, u, inputs), inputs)
+
+
+def _residuals(scene, t, q, u, inputs):
+    return closure_residual(scene, t, q), velocity_residual(scene, t, q, u, inputs)
+
+
+def _invariants(scene, t, q, u, inputs):
+    return scene.invariants(motion_at(scene, t, q, u, inputs))

@@ -1,0 +1,137 @@
+"""Numbers that a motion carries to be trusted: drifts, residuals, conditioning, contact forces, and their printed summary."""
+
+import html
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jourdain_jax.equations.reactions import ContactForce
+from jourdain_jax.motion.along import Record, accelerations_along, contact_forces_along, energies, invariants, residuals
+
+
+class Energies(eqx.Module):
+    """Energies along a motion, in J. `balance` is constant for a right motion: T + V, less the work done where some is tracked."""
+
+    kinetic: Float[Array, "times"]
+    potential: Float[Array, "times"]
+    work: Float[Array, "times"] | None
+
+    @property
+    def balance(self) -> Float[Array, "times"]:
+        """T + V - W; W is the work of forces without potential and of rows that do work."""
+        total = self.kinetic + self.potential
+        return total if self.work is None else total - self.work
+
+    @property
+    def kind(self) -> str:
+        """What `balance` is, in words."""
+        return "T + V" if self.work is None else "T + V less the work done"
+
+
+class Diagnostics(eqx.Module):
+    """Extremes of what can be checked along a motion."""
+
+    energy_drift: Float[Array, ""]  # J, max - min of T + V, less the work done where it is tracked
+    energy_kind: str = eqx.field(static=True)
+    position_residual: Float[Array, ""]  # largest residual of the geometric rows and quaternion norms
+    velocity_residual: Float[Array, ""]  # largest residual of the velocity rows
+    smallest_singular_value: Float[Array, ""]  # of the scaled rows, smallest along the motion
+    rank: tuple[Int[Array, ""], Int[Array, ""]]  # lowest and highest rank of the rows
+    invariant_drifts: dict[str, Float[Array, ""]]
+    contacts: dict[str, "ContactExtremes"]
+
+
+class ContactExtremes(eqx.Module):
+    """What a rolling contact had to bear."""
+
+    lowest_normal: Float[Array, ""]  # N; negative: it would have had to pull
+    highest_normal: Float[Array, ""]  # N
+    friction_needed: Float[Array, ""]  # largest |tangential| / normal
+    determined: Array  # whether the rows determine these forces all along
+
+    @property
+    def honest(self) -> bool:
+        """Whether the contact only ever pushed."""
+        return bool(self.lowest_normal > 0)
+
+
+def energies_of(record: Record, work) -> Energies:
+    """Kinetic and potential energy, and the work where it is tracked (`work` is None where it is not)."""
+    return Energies(*energies(record), work)
+
+
+def diagnose(trajectory: Record) -> Diagnostics:
+    """Drifts, residuals, conditioning and contact extremes of one motion (not of a batch: use `jax.vmap` or `rollout.lane(i)`)."""
+    energy = energies_of(trajectory, trajectory.work)
+    geometric, rows = residuals(trajectory)
+    motion = accelerations_along(trajectory)
+    reached = jnp.all(jnp.isfinite(trajectory.q), axis=-1)
+    return Diagnostics(
+        energy_drift=_span(energy.balance),
+        energy_kind=energy.kind,
+        position_residual=_largest(geometric),
+        velocity_residual=_largest(rows),
+        smallest_singular_value=jnp.nanmin(jnp.where(reached, motion.smallest_singular_value, jnp.nan)),
+        rank=(jnp.min(motion.rank), jnp.max(motion.rank)),
+        invariant_drifts={name: _span(values) for name, values in invariants(trajectory).items()},
+        contacts={name: _extremes(force) for name, force in contact_forces_along(trajectory).items()},
+    )
+
+
+def _extremes(force: ContactForce) -> ContactExtremes:
+    friction = jnp.where(jnp.isnan(force.normal), 0.0, force.friction_needed)
+    return ContactExtremes(jnp.nanmin(force.normal), jnp.nanmax(force.normal), jnp.max(friction), jnp.all(force.determined))
+
+
+def _span(values) -> Float[Array, ""]:
+    return jnp.nanmax(values) - jnp.nanmin(values)
+
+
+def _largest(values) -> Float[Array, ""]:
+    return jnp.max(jnp.where(jnp.isnan(values), 0.0, jnp.abs(values)), initial=0.0)
+
+
+def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
+    """The summary as pairs of heading and text."""
+    found = diagnose(trajectory)
+    ts = np.asarray(trajectory.ts)
+    saved = f"{int(np.sum(np.isfinite(np.asarray(trajectory.q)).all(axis=-1)))} of {len(ts)} times saved"
+    pivot = "" if trajectory.state_form == "full" else f"; pivot of the privileged speeds at least {float(trajectory.smallest_pivot):.1e}"
+    low, high = (int(r) for r in found.rank)
+    rows = [
+        ("motion", f"t {float(ts[0]):.6g} to {float(trajectory.t_end):.6g} s, {saved}; {message}"),
+        ("solver", f"{trajectory.solver}, {int(trajectory.accepted)} steps accepted, {int(trajectory.rejected)} rejected"),
+        ("state", f"{trajectory.state_form}, reduction: {trajectory.reduction}" + (", projected after each step" if trajectory.projected else "") + pivot),
+        ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}"),
+        ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
+        ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),
+        ("start", f"moved by {float(trajectory.moved_q):.1e} (coordinates), {float(trajectory.moved_u):.1e} (speeds) onto the constraints"),
+    ]
+    rows += [(f"invariant {name}", f"drift {float(drift):.2e}") for name, drift in found.invariant_drifts.items()]
+    rows += [(f"contact {name}", _contact_text(contact)) for name, contact in found.contacts.items()]
+    return rows
+
+
+def _contact_text(contact: ContactExtremes) -> str:
+    text = f"normal force {float(contact.lowest_normal):.5g} to {float(contact.highest_normal):.5g} N"
+    text += f", friction coefficient needed {float(contact.friction_needed):.3g}"
+    if not contact.honest:
+        text += "; WOULD HAVE TO PULL: a real contact lifts off"
+    return text if bool(contact.determined) else f"{text}; not determined by the rows (minimum norm)"
+
+
+def summary(trajectory: Record, message: str) -> str:
+    """A printed summary: steps, drift, residuals, contacts, result."""
+    rows = [(f"Trajectory of {type(trajectory.scene).__name__}", ""), *summary_rows(trajectory, message)]
+    width = max(len(name) for name, _ in rows[1:])
+    return "\n".join([rows[0][0], *(f"  {name:<{width}}  {text}" for name, text in rows[1:])])
+
+
+def summary_html(trajectory: Record, message: str) -> str:
+    """The summary as an HTML table, for notebooks."""
+    left = "style='text-align:left'"
+    rows = summary_rows(trajectory, message)
+    body = "".join(f"<tr><th {left}>{html.escape(a)}</th><td {left}>{html.escape(b)}</td></tr>" for a, b in rows)
+    return f"<table><caption>Trajectory of {html.escape(type(trajectory.scene).__name__)}</caption>{body}</table>"

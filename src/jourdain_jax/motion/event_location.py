@@ -1,0 +1,67 @@
+"""Where in time a stop event lies, to the accuracy of the steps and with the right derivative.
+
+diffrax stops at the end of the step in which an event value c changed sign. From there the motion is integrated back to c = 0:
+
+    tau* by Newton on c(y(t_f + tau)) = 0 (held constant in differentiation),   then   t_e = t* - c / cdot,   y_e = y* - f c / cdot
+
+The last correction is zero in value, and carries the derivative of the event time and of the state at the event (the saltation term).
+"""
+
+from collections.abc import Callable
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PyTree
+
+_NEWTON_STEPS = 12
+
+
+class Located(eqx.Module):
+    """Time and state of an event."""
+
+    t: Float[Array, ""]
+    y: PyTree
+
+
+def locate(rates: Callable, value: Callable, t_f, y_f: PyTree, args: PyTree, happened: Bool[Array, ""], longest: Float[Array, ""]) -> Located:
+    """Time and state where `value(t, y, args)` is zero, near and before (t_f, y_f); (t_f, y_f) itself where nothing happened.
+
+    `rates(t, y, args)` is the vector field; `longest` bounds how far back the event can lie (s, signed like the motion).
+    """
+    t_f = jax.lax.stop_gradient(t_f)
+
+    def newton(tau, _):
+        # tau is a number to differentiation; its last, vanishing, correction is not, and carries the derivative of the event time
+        tau = jax.lax.stop_gradient(tau)
+        y, f = _moved(rates, t_f, y_f, args, tau)
+        c, c_dot = jax.jvp(lambda t, y: value(t, y, args), (t_f + tau, y), (jnp.ones_like(t_f), f))
+        usable = happened & (c_dot != 0) & jnp.isfinite(c) & jnp.isfinite(c_dot)
+        shift = jnp.where(usable, -c / jnp.where(usable, c_dot, 1.0), 0.0)
+        end = Located(t_f + tau + shift, jax.tree.map(lambda a, b: a + shift * b, y, f))
+        return jnp.clip(tau + shift, jnp.minimum(-longest, 0.0), jnp.maximum(-longest, 0.0)), end
+
+    # every pass works out the end it would give; the last one is taken, so that the vector field is compiled once
+    start = (jnp.zeros_like(t_f), Located(t_f, y_f))
+    return jax.lax.scan(lambda carry, _: (newton(carry[0], None), None), start, length=_NEWTON_STEPS)[0][1]
+
+
+def _moved(rates: Callable, t_f, y_f, args, tau):
+    """State and rate at `t_f + tau`, by one step of the eighth-order Dormand-Prince method."""
+    flat, unravel = ravel_pytree(y_f)
+    tableau = diffrax.Dopri8.tableau
+    stages = len(tableau.b_sol)
+    # one row per stage, and the solution itself as a last stage, whose slope is the rate there
+    A = jnp.zeros((stages + 1, stages + 1), flat.dtype).at[jnp.tril_indices(stages, -1)].set(jnp.concatenate([jnp.asarray(row) for row in tableau.a_lower]))
+    A = A.at[stages, :stages].set(jnp.asarray(tableau.b_sol))
+    c = jnp.concatenate([jnp.zeros(1), jnp.asarray(tableau.c), jnp.ones(1)])
+
+    def stage(carry, i):
+        slopes, _ = carry
+        at = flat + tau * (A[i] @ slopes)
+        return (slopes.at[i].set(ravel_pytree(rates(t_f + c[i] * tau, unravel(at), args))[0]), at), None
+
+    (slopes, at), _ = jax.lax.scan(stage, (jnp.zeros((stages + 1, flat.size), flat.dtype), flat), jnp.arange(stages + 1))
+    return unravel(at), unravel(slopes[-1])

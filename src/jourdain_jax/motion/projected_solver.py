@@ -1,0 +1,57 @@
+"""A diffrax solver whose every step ends on the constraints.
+
+The projection changes the end of the step, so the slope that first-same-as-last methods (Tsit5, Dopri) carry over is out of date: the
+next step is told that there was a jump, and recomputes it.
+"""
+
+from collections.abc import Callable
+
+import diffrax
+import equinox as eqx
+
+
+class ProjectedSolver(diffrax.AbstractWrappedSolver):
+    """`solver`, followed by `project(t, y, args)` after every step."""
+
+    solver: diffrax.AbstractSolver
+    project: Callable = eqx.field(static=False)
+
+    @property
+    def term_structure(self):
+        """As the wrapped solver."""
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self):
+        """As the wrapped solver."""
+        return self.solver.interpolation_cls
+
+    @property
+    def term_compatible_contr_kwargs(self):
+        """As the wrapped solver."""
+        return self.solver.term_compatible_contr_kwargs
+
+    def order(self, terms):
+        """As the wrapped solver."""
+        return self.solver.order(terms)
+
+    def strong_order(self, terms):
+        """As the wrapped solver."""
+        return self.solver.strong_order(terms)
+
+    def error_order(self, terms):
+        """As the wrapped solver."""
+        return self.solver.error_order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        """As the wrapped solver."""
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        """One step of the wrapped solver, then the projection."""
+        y1, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, True)
+        return self.project(t1, y1, args), error, dense, solver_state, result
+
+    def func(self, terms, t0, y0, args):
+        """As the wrapped solver."""
+        return self.solver.func(terms, t0, y0, args)

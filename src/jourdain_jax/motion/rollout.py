@@ -1,0 +1,169 @@
+"""Batches of motions: many starts, many parameters, or both; a result per lane, and one bad lane harms no other.
+
+Lanes of one chunk run in lockstep as one vmapped integration; chunks run one after another through the same compiled program.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from tqdm.auto import tqdm
+
+from jourdain_jax.motion import results
+from jourdain_jax.motion.simulate import saved_times, simulate
+from jourdain_jax.motion.start import State
+from jourdain_jax.motion.start import start as consistent_start
+from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.scene import Scene
+
+CHUNK = 1024
+MEMORY = 2**30  # bytes of saved states per chunk, at most
+
+
+class Rollout(eqx.Module):
+    """Many motions of one scene: a `Trajectory` whose arrays have a leading axis of lanes."""
+
+    lanes: Trajectory
+
+    def __len__(self) -> int:
+        return self.lanes.q.shape[0]
+
+    def __getitem__(self, name: str) -> Float[Array, "lanes times *shape"]:
+        """A coordinate or speed by name, of all lanes at all times."""
+        return jax.vmap(lambda lane: lane[name])(self.lanes)
+
+    def lane(self, index: int) -> Trajectory:
+        """The motion of one lane."""
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"lane {index} does not exist; this rollout has {len(self)} lanes, 0 to {len(self) - 1}")
+        return jax.tree.map(lambda x: x[index], self.lanes)
+
+    @property
+    def result(self) -> np.ndarray:
+        """Result code of every lane."""
+        return np.asarray(self.lanes.result)
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Numbers of the lanes that reached neither their end nor an event."""
+        return np.flatnonzero((self.result != results.SUCCESS) & (self.result != results.EVENT))
+
+    def quantiles(self, name: str, levels: Sequence[float] = (0.025, 0.5, 0.975)) -> np.ndarray:
+        """Quantiles over lanes of a named quantity at all times, shape (levels, times); lanes that ended are left out from then on."""
+        values = np.asarray(self[name])
+        out = np.full((len(levels), *values.shape[1:]), np.nan)
+        reached = np.isfinite(values).any(axis=0)
+        out[:, reached] = np.nanquantile(values[:, reached], levels, axis=0)
+        return out
+
+    def __str__(self) -> str:
+        lines = [f"Rollout of {type(self.lanes.scene).__name__}: {len(self)} lanes"]
+        for code, message in results.MESSAGES.items():
+            lanes = np.flatnonzero(self.result == code)
+            if lanes.size == 0:
+                continue
+            named = ""
+            if code == results.EVENT:
+                events = np.asarray(self.lanes.event)[lanes]
+                named = " " + ", ".join(f"`{self.lanes.event_names[i]}` {int(np.sum(events == i))}" for i in np.unique(events))
+            elif code != results.SUCCESS:
+                named = ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
+            lines.append(f"  {lanes.size} {message}{named}")
+        steps = np.asarray(self.lanes.accepted)
+        lines.append(f"  steps accepted: {steps.min()} to {steps.max()}, median {int(np.median(steps))}")
+        return "\n".join(lines)
+
+
+def rollout(
+    scene: Scene,
+    starts: "dict | State | None" = None,
+    *,
+    parameters: dict | None = None,
+    chunk: int | None = None,
+    progress: bool | None = None,
+    **options,
+) -> Rollout:
+    """Simulate many lanes.
+
+    - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a `State` with a leading axis of lanes.
+    - `parameters`: parameter name -> array with a leading axis of lanes, where lanes differ in parameters.
+    - `chunk`: lanes that run together (default: 1024, less where saved states would pass 1 GiB); `progress`: a bar (default: with several chunks).
+    - further options as in `simulate`.
+
+    Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`.
+    """
+    starts = dict(scene.example) if starts is None else starts
+    parameters = {} if parameters is None else {name: jnp.asarray(value) for name, value in parameters.items()}
+    fixed, varied, count = _lanes(scene, starts, parameters)
+    chunk = _chunk(scene, count, chunk, options)
+    if options.get("ts") is not None:
+        options["ts"] = saved_times(options["ts"])
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, fixed, varied, parameters))):
+        return Rollout(_together(scene, fixed, options, varied, parameters))  # being differentiated or batched: one piece, no host loop
+    pieces = []
+    bar = tqdm(total=count, unit="lane", disable=not (count > chunk if progress is None else progress))
+    for first in range(0, count, chunk):
+        index = np.minimum(np.arange(first, first + chunk), count - 1)  # the last chunk is filled up with copies of its last lane
+        piece = _together(scene, fixed, options, *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+        kept = min(chunk, count - first)
+        pieces.append(jax.tree.map(lambda x, kept=kept: np.asarray(x)[:kept], piece))
+        bar.update(kept)
+    bar.close()
+    return Rollout(jax.tree.map(lambda *parts: jnp.asarray(np.concatenate(parts)), *pieces))
+
+
+@eqx.filter_jit
+def _together(scene, fixed, options, varied, parameters) -> Trajectory:
+    """All given lanes in lockstep; compiled once for scenes and lanes of one shape."""
+
+    def lane(varied, parameters):
+        own = scene.replace(**parameters) if parameters else scene
+        if isinstance(varied, State):
+            return simulate(own, varied, **options)
+        return simulate(own, consistent_start(own, t0=options.get("t0", 0.0), **fixed, **varied), **options)
+
+    return jax.vmap(lane)(varied, parameters)
+
+
+def _lanes(scene: Scene, starts, parameters: dict):
+    """Start values common to all lanes, those that vary, and the number of lanes."""
+    known = [name for name, _, _ in parameters_of(scene)]
+    for name in parameters:
+        if name not in known:
+            raise ValueError(f"scene `{type(scene).__name__}` has no parameter `{name}`; {nearest(name, known)}")
+    lengths = {f"parameter `{name}`": value.shape[0] if value.ndim else None for name, value in parameters.items()}
+    if isinstance(starts, State):
+        fixed, varied = {}, starts
+        lengths["`starts`"] = starts.q.shape[0] if starts.q.ndim == 2 else None
+    else:
+        arrays = {name: jnp.asarray(value, jnp.result_type(float)) for name, value in starts.items()}
+        groups = {group for names in (scene.coordinate_names, scene.speed_names) for group, _, _ in names.groups}  # quaternions and their rates
+        fixed = {name: value for name, value in arrays.items() if value.ndim == (1 if name in groups else 0)}
+        varied = {name: value for name, value in arrays.items() if name not in fixed}
+        lengths |= {f"start `{name}`": value.shape[0] for name, value in varied.items()}
+    return fixed, varied, _common_length(lengths)
+
+
+def _common_length(lengths: dict) -> int:
+    for what, length in lengths.items():
+        if length is None:
+            raise ValueError(f"{what} has no axis of lanes; give an array with one entry per lane, or set it on the scene itself")
+    counts = set(lengths.values())
+    if len(counts) > 1:
+        raise ValueError("lanes differ in number: " + ", ".join(f"{what} has {length}" for what, length in lengths.items()) + "; give arrays of one length")
+    if not counts or counts == {0}:
+        raise ValueError("no lanes: give at least one start value or parameter as an array with one entry per lane, or use `simulate` for one motion")
+    return counts.pop()
+
+
+def _chunk(scene: Scene, count: int, chunk: int | None, options: dict) -> int:
+    if chunk is not None and chunk < 1:
+        raise ValueError(f"`chunk` is {chunk}, expected at least one lane")
+    times = 201 if options.get("ts") is None else np.shape(options["ts"])[0]
+    per_lane = 8 * times * (len(scene.coordinate_names) + len(scene.speed_names) + 2)
+    return max(1, min(count, CHUNK if chunk is None else chunk, max(1, MEMORY // per_lane)))

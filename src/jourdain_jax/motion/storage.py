@@ -1,0 +1,105 @@
+"""Saving and loading trajectories: NumPy's `.npz`, readable by anything that reads `.npz`.
+
+Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent where not tracked), `t_end`, `q_end`, `u_end`,
+`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `inputs` (times, inputs; sampled at `ts`), and `parameter:NAME` for every
+parameter. `header` is JSON text: `format`, `scene` (class name), `coordinates`, `speeds`, `input_names`, `units` of the parameters,
+`static` (fields that are no parameters), `state_form`, `reduction`, `solver`, `projected`, `event_names`, `versions`.
+"""
+
+import json
+import os
+import zipfile
+from dataclasses import fields
+from importlib.metadata import PackageNotFoundError, version
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.motion.inputs import Inputs, Sampled
+from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.scene import Scene
+
+_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", "result", "event", "accepted", "rejected", "moved_q", "moved_u", "smallest_pivot")
+_TEXTS = ("state_form", "reduction", "solver", "projected")
+
+
+def save(trajectory: Trajectory, path: str | os.PathLike) -> None:
+    """Write a trajectory to `path` (`.npz`, format 1 above). Inputs are stored as samples at the saved times."""
+    scene = trajectory.scene
+    arrays = {name: np.asarray(getattr(trajectory, name)) for name in _ARRAYS}
+    if trajectory.work is not None:
+        arrays["work"] = np.asarray(trajectory.work)
+    arrays["inputs"] = np.asarray(jax.vmap(trajectory.inputs)(trajectory.ts)).reshape(len(trajectory.ts), len(scene.inputs))
+    arrays |= {f"parameter:{name}": np.asarray(value) for name, value, _ in parameters_of(scene)}
+    header = {name: getattr(trajectory, name) for name in _TEXTS} | {
+        "format": 1,
+        "scene": type(scene).__name__,
+        "coordinates": scene.coordinate_names.entries,
+        "speeds": scene.speed_names.entries,
+        "input_names": scene.inputs.entries,
+        "units": {name: metadata["unit"] for name, _, metadata in parameters_of(scene)},
+        "static": {name: getattr(scene, name) for name in _static_fields(scene)},
+        "event_names": trajectory.event_names,
+        "versions": {name: _version(name) for name in ("jourdain-jax", "jax", "diffrax", "numpy")},
+    }
+    with open(path, "wb") as file:  # a handle, so that numpy does not append a suffix to the name
+        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+
+
+def load(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
+    """Read a trajectory written by `save`. `scene`: the scene's class, or any scene of that class; parameters come from the file.
+
+    ValueError where the file cannot be read, is of another format, or belongs to another scene.
+    """
+    header, arrays = _read(path)
+    kind = scene if isinstance(scene, type) else type(scene)
+    if header["scene"] != kind.__name__:
+        raise ValueError(f"`{path}` holds a trajectory of `{header['scene']}`, expected `{kind.__name__}`; pass the class it was made with")
+    values = {name.removeprefix("parameter:"): value for name, value in arrays.items() if name.startswith("parameter:")}
+    known = [field.name for field in fields(kind)]
+    unknown = [name for name in (*values, *header["static"]) if name not in known]
+    if unknown:
+        raise ValueError(f"`{path}` has a parameter `{unknown[0]}` that `{kind.__name__}` has not; {nearest(unknown[0], known)}")
+    rebuilt = kind(**values, **header["static"])
+    inputs = Inputs(tuple(Sampled(jnp.asarray(arrays["ts"]), jnp.asarray(column)) for column in arrays["inputs"].T))
+    return Trajectory(
+        scene=rebuilt,
+        work=jnp.asarray(arrays["work"]) if "work" in arrays else None,
+        inputs=inputs,
+        event_names=tuple(header["event_names"]),
+        **{name: jnp.asarray(arrays[name]) for name in _ARRAYS},
+        **{name: header[name] for name in _TEXTS},
+    )
+
+
+def _read(path) -> tuple[dict, dict]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(str(arrays.pop("header")))
+    except FileNotFoundError:
+        raise ValueError(f"there is no file `{path}`; check the path") from None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"`{path}` is no trajectory file, or is damaged ({error}); expected an .npz written by `save`") from None
+    if header.get("format") != 1:
+        raise ValueError(f"`{path}` has format {header.get('format')}, expected 1; read it with the version of jourdain-jax that wrote it")
+    missing = [name for name in (*_ARRAYS, "inputs") if name not in arrays]
+    if missing:
+        raise ValueError(f"`{path}` lacks the array `{missing[0]}`; it is damaged or was not written by `save`")
+    return header, arrays
+
+
+def _static_fields(scene: Scene) -> list[str]:
+    """Fields that are plain numbers or texts, such as a number of bodies."""
+    parameters = {name for name, _, _ in parameters_of(scene)}
+    return [field.name for field in fields(scene) if field.name not in parameters and isinstance(getattr(scene, field.name), int | float | str | bool)]
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"

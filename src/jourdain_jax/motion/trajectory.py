@@ -1,0 +1,113 @@
+"""A motion in time, with named access and everything needed to trust it."""
+
+import html
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jourdain_jax.equations.accelerations import Accelerations
+from jourdain_jax.equations.reactions import ContactForce, RowReactions
+from jourdain_jax.motion import along, results
+from jourdain_jax.motion.diagnostics import Energies, energies_of, summary, summary_html
+from jourdain_jax.motion.inputs import Inputs
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.scene import Scene
+
+
+class Trajectory(eqx.Module):
+    """The motion of a scene. Times after an early end (event, failure) hold NaN; `t_end`, `q_end`, `u_end` are the last state."""
+
+    scene: Scene
+    ts: Float[Array, "times"]  # s
+    q: Float[Array, "times coordinates"]
+    u: Float[Array, "times speeds"]
+    work: Float[Array, "times"] | None  # J, since the start; None where all forces have potentials and no row does work
+    t_end: Float[Array, ""]  # s
+    q_end: Float[Array, "coordinates"]
+    u_end: Float[Array, "speeds"]
+    result: Int[Array, ""]  # code, see `jourdain_jax.motion.results`
+    event: Int[Array, ""]  # index into `event_names`, -1: none
+    accepted: Int[Array, ""]  # steps
+    rejected: Int[Array, ""]
+    moved_q: Float[Array, ""]  # how far the start was moved onto the constraints
+    moved_u: Float[Array, ""]
+    smallest_pivot: Float[Array, ""]  # of the partition into privileged and dependent speeds, over the saved times; 1 for the full state
+    inputs: Inputs
+    state_form: str = eqx.field(static=True)  # "minimal" or "full"
+    reduction: str = eqx.field(static=True)
+    solver: str = eqx.field(static=True)
+    projected: bool = eqx.field(static=True)
+    event_names: tuple[str, ...] = eqx.field(static=True)
+
+    # Named access. -------------------------------------------------------------------------------------------------
+
+    def __getitem__(self, name: str) -> Float[Array, "times *shape"]:
+        """A coordinate, speed, quaternion or angular velocity by name, at all times; `"t"` for the times."""
+        if name == "t":
+            return self.ts
+        for names, array in ((self.scene.coordinate_names, self.q), (self.scene.speed_names, self.u)):
+            if name in names.view(array):
+                return names.view(array)[name]
+        valid = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries, "t")
+        raise KeyError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}")
+
+    @property
+    def valid(self) -> Bool[Array, "times"]:
+        """Which times were reached."""
+        return jnp.all(jnp.isfinite(self.q), axis=-1)
+
+    # Derived quantities. -------------------------------------------------------------------------------------------
+
+    def motions(self) -> Motion:
+        """Poses and velocities of all bodies at all times (leading axis: times)."""
+        return along.motions(self)
+
+    def point(self, body: str, local=(0.0, 0.0, 0.0)) -> Float[Array, "times 3"]:
+        """Path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m, from the mass centre)."""
+        return along.path(self, body, local)
+
+    def energies(self) -> Energies:
+        """Kinetic and potential energy, and the work where it is tracked, in J; `.balance` is constant for a right motion."""
+        return energies_of(self, self.work)
+
+    def accelerations(self) -> Accelerations:
+        """Accelerations, multipliers, rank and smallest singular value at all times."""
+        return along.accelerations_along(self)
+
+    def constraint_forces(self) -> RowReactions:
+        """Constraint forces per row and per body at all times; `.forces_on("disc")` by row, in N."""
+        return along.reactions_along(self)
+
+    def contact_forces(self) -> dict[str, ContactForce]:
+        """Normal and tangential force (N) and friction coefficient needed, of every rolling contact at all times."""
+        return along.contact_forces_along(self)
+
+    def residuals(self) -> tuple[Float[Array, "times closures"], Float[Array, "times rows"]]:
+        """Residuals of the geometric rows (and quaternion norms), and of the velocity rows, at all times."""
+        return along.residuals(self)
+
+    def invariants(self) -> dict[str, Float[Array, "times"]]:
+        """The quantities that the scene is known to conserve, at all times."""
+        return along.invariants(self)
+
+    def __str__(self) -> str:
+        return summary(self, self.message) if self.q.ndim == 2 else f"Trajectories of {type(self.scene).__name__}, lanes {self.q.shape[:-2]}"
+
+    def _repr_html_(self) -> str:
+        return summary_html(self, self.message) if self.q.ndim == 2 else html.escape(str(self))
+
+    # How it ended. -------------------------------------------------------------------------------------------------
+
+    @property
+    def message(self) -> str:
+        """How the motion ended, in words."""
+        text = results.MESSAGES[int(self.result)]
+        return f"{text} `{self.event_names[int(self.event)]}`" if int(self.result) == results.EVENT else text
+
+    def raise_if_failed(self) -> "Trajectory":
+        """The trajectory itself; a SimulationError with reason and time where it did not reach its end or an event."""
+        if int(self.result) not in (results.SUCCESS, results.EVENT):
+            raise results.SimulationError(f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: {self.message}")
+        return self

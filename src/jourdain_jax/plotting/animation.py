@@ -1,0 +1,138 @@
+"""Animations straight from a scene's bodies: outlines of rigid bodies, dots for particles, paths of points, and the ground."""
+
+import os
+from collections.abc import Sequence
+
+import numpy as np
+
+from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.plotting.backend import pyplot
+from jourdain_jax.scene.bodies import RigidBody
+
+FRAMES = 60
+
+
+class _Figure:
+    """What is drawn: world points of every body's outline at every frame (frames, points, 3), and paths of points (frames, 3)."""
+
+    def __init__(self, trajectory: Trajectory, frames: int, paths: Sequence[tuple[str, Sequence[float]]]):
+        reached = np.flatnonzero(np.asarray(trajectory.valid))
+        if reached.size == 0:
+            raise ValueError("the motion reached none of its saved times; there is nothing to animate")
+        chosen = reached[np.unique(np.linspace(0, reached.size - 1, min(frames, reached.size)).astype(int))]
+        self.ts = np.asarray(trajectory.ts)[chosen]
+        self.outlines: dict[str, np.ndarray] = {}
+        for name, body in trajectory.motions().bodies.items():
+            centre = np.asarray(body.body.position)[chosen][:, None]
+            self.outlines[name] = centre
+            if isinstance(body.body, RigidBody) and body.body.outline.shape[1] > 0:
+                turned = np.einsum("fij,fpj->fpi", np.asarray(body.body.orientation)[chosen], np.asarray(body.body.outline)[chosen])
+                self.outlines[name] = centre + turned
+        self.paths = [np.asarray(trajectory.point(name, local))[chosen] for name, local in paths]
+
+    def extent(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of the box that holds everything."""
+        points = np.concatenate([outline.reshape(-1, 3) for outline in self.outlines.values()] + self.paths)
+        return points.min(axis=0), points.max(axis=0)
+
+
+def animate(
+    trajectory: Trajectory,
+    path: str | os.PathLike,
+    *,
+    frames: int = FRAMES,
+    paths: Sequence[tuple[str, Sequence[float]]] | None = None,
+    follow: bool = False,
+    view: tuple[float, float] = (22.0, -60.0),
+    title: str | None = None,
+) -> None:
+    """Write an animation (.gif) of a motion, drawn from the scene's bodies.
+
+    - `frames`: at most so many, evenly chosen from the saved times; the playing time is the motion's own, 2 to 12 s.
+    - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of every body.
+    - `follow`: keep the view on the bodies as they move, instead of showing the whole path. `view`: elevation and azimuth in degrees.
+
+    ValueError for another suffix than .gif, or a motion that reached none of its times; ImportError without matplotlib.
+    """
+    if not str(path).lower().endswith(".gif"):
+        raise ValueError(f"cannot write `{path}`: an animation is a .gif file")
+    plt = pyplot()
+    from matplotlib.animation import FuncAnimation, PillowWriter
+
+    paths = [(name, (0.0, 0.0, 0.0)) for name in trajectory.motions().bodies] if paths is None else list(paths)
+    drawn = _Figure(trajectory, frames, paths)
+    figure = plt.figure(figsize=(6.0, 5.0))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 0.96), projection="3d")
+    axes.set_proj_type("persp")
+    colours = plt.rcParams["axes.prop_cycle"].by_key()["color"]
+    lines = {}
+    for k, (name, outline) in enumerate(drawn.outlines.items()):
+        style = {"marker": "o", "ms": 6} if outline.shape[1] == 1 else {"lw": 1.8}
+        lines[name] = axes.plot([], [], [], color=colours[k % len(colours)], label=name, zorder=5, **style)[0]
+    traces = [axes.plot([], [], [], color="0.45", lw=1.0)[0] for _ in drawn.paths]
+    clock = figure.text(0.03, 0.95, "", family="monospace")
+    if title:
+        figure.text(0.25, 0.95, title)
+    if len(lines) > 1:
+        axes.legend(loc="upper left", bbox_to_anchor=(0.03, 0.97), fontsize=8, frameon=False)
+    axes.view_init(*view)
+    _label(axes)
+    low, high = drawn.extent()
+    radius = _radius(drawn, follow, low, high)
+    grounded = _ground(axes, low, high, radius)
+
+    def draw(i):
+        for name, outline in drawn.outlines.items():
+            lines[name].set_data_3d(*outline[i].T)
+        for trace, points in zip(traces, drawn.paths, strict=True):
+            trace.set_data_3d(*points[: i + 1].T)
+        clock.set_text(f"t = {drawn.ts[i]:6.2f} s")
+        here = np.mean([outline[i].mean(axis=0) for outline in drawn.outlines.values()], axis=0)
+        centre = here if follow else (low + high) / 2
+        _frame(axes, np.array([centre[0], centre[1], 0.9 * radius]) if grounded else centre, radius)
+        return [*lines.values(), *traces, clock]
+
+    count = len(drawn.ts)
+    seconds = float(np.clip(abs(drawn.ts[-1] - drawn.ts[0]), 2.0, 12.0))
+    FuncAnimation(figure, draw, frames=count, blit=False).save(path, writer=PillowWriter(fps=max(1, round(count / seconds))), dpi=80)
+    plt.close(figure)
+
+
+def _radius(drawn: _Figure, follow: bool, low, high) -> float:
+    """Half the side of the cube that is shown."""
+    if not follow:
+        return float(max(np.max(high - low) / 2 * 1.05, 1e-3))
+    spans = [np.ptp(np.concatenate([outline[i] for outline in drawn.outlines.values()]), axis=0).max() for i in range(len(drawn.ts))]
+    return float(max(max(spans) * 0.62, 1e-3))
+
+
+def _frame(axes, centre, radius: float) -> None:
+    axes.set_xlim(centre[0] - radius, centre[0] + radius)
+    axes.set_ylim(centre[1] - radius, centre[1] + radius)
+    axes.set_zlim(centre[2] - radius, centre[2] + radius)
+    axes.set_box_aspect((1, 1, 1), zoom=1.15)
+
+
+def _ground(axes, low, high, radius: float) -> bool:
+    """A grid at z = 0 under the motion, where the bodies stand on it; whether they do."""
+    if low[2] < -0.05 * radius or low[2] > 0.2 * radius:
+        return False
+    step = 10.0 ** np.floor(np.log10(radius)) / 2
+    xs = np.arange(np.floor((low[0] - radius) / step), np.ceil((high[0] + radius) / step) + 1) * step
+    ys = np.arange(np.floor((low[1] - radius) / step), np.ceil((high[1] + radius) / step) + 1) * step
+    if len(xs) + len(ys) > 160:  # a long ride: a grid so fine would be a grey smear
+        return True
+    for x in xs:
+        axes.plot([x, x], [ys[0], ys[-1]], [0, 0], color="0.85", lw=0.6, zorder=0)
+    for y in ys:
+        axes.plot([xs[0], xs[-1]], [y, y], [0, 0], color="0.85", lw=0.6, zorder=0)
+    return True
+
+
+def _label(axes) -> None:
+    axes.set_xlabel("x in m")
+    axes.set_ylabel("y in m")
+    axes.set_zlabel("z in m")
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
+    axes.grid(False)

@@ -1,0 +1,105 @@
+"""The figures of the bicycle job: eigenvalues against speed with uncertainty bands, rides against time, a ride in space."""
+
+import os
+
+import numpy as np
+
+from jourdain_jax.bicycle.job import Study
+from jourdain_jax.plotting.animation import animate
+from jourdain_jax.plotting.backend import pyplot
+
+_MODES = (("castering", 0, "tab:green"), ("capsize", 1, "tab:orange"), ("weave", 2, "tab:blue"))
+_FLOOR, _CEILING = -12.0, 12.0  # 1/s; castering goes far below what matters
+
+
+def draw_eigenvalues(study: Study, path: str | os.PathLike) -> None:
+    """Real and imaginary parts against forward speed; bands are the 2.5 and 97.5 % quantiles of the samples, the stable range is shaded."""
+    plt = pyplot()
+    figure, (real, imaginary) = plt.subplots(2, 1, sharex=True, figsize=(7.5, 6.5), height_ratios=(3, 2), layout="constrained")
+    nominal, samples = study.eigenvalues[0], study.eigenvalues[1:][study.physical]
+    for name, column, colour in _MODES:
+        _band(real, study.grid, nominal[:, column].real, samples[:, :, column].real, colour, name)
+    weave = nominal[:, 2].imag
+    _band(imaginary, study.grid, np.abs(weave), np.abs(samples[:, :, 2].imag), "tab:blue", "weave")
+    _mark_range(study, (real, imaginary))
+    real.axhline(0.0, color="0.3", lw=0.8)
+    real.set_ylim(_FLOOR, _CEILING)
+    real.set_ylabel("real part in 1/s")
+    imaginary.set_ylabel("imaginary part in rad/s")
+    imaginary.set_ylim(bottom=0.0)
+    imaginary.set_xlabel("forward speed in m/s")
+    imaginary.set_xlim(study.grid[0], study.grid[-1])
+    real.set_title(f"{study.bicycle.name}: eigenvalues of upright running, bands hold 95 % of {len(samples)} samples", fontsize=11)
+    real.legend(loc="lower right", fontsize=9)
+    for axis in (real, imaginary):
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def _band(axis, speed, nominal, samples, colour, name) -> None:
+    if len(samples):
+        low, high = np.quantile(samples, (0.025, 0.975), axis=0)
+        axis.fill_between(speed, low, high, color=colour, alpha=0.25, lw=0)
+    axis.plot(speed, nominal, color=colour, lw=1.6, label=name)
+
+
+def _mark_range(study: Study, axes) -> None:
+    weave, capsize = (_value(study, name) for name in ("weave_speed", "capsize_speed"))
+    if weave is not None:
+        end = capsize if capsize is not None and capsize > weave else study.grid[-1]
+        for axis in axes:
+            axis.axvspan(weave, min(end, study.grid[-1]), color="tab:green", alpha=0.08, lw=0)
+    for name, value in (("weave", weave), ("capsize", capsize)):
+        if value is None or value > study.grid[-1]:
+            continue
+        for axis in axes:
+            axis.axvline(value, color="0.4", lw=0.8, ls="--")
+        side = "right" if name == "weave" else "left"
+        axes[0].annotate(
+            f"{name} speed\n{value:.2f} m/s",
+            (value, _CEILING),
+            xytext=(-4 if side == "right" else 4, -6),
+            textcoords="offset points",
+            ha=side,
+            va="top",
+            fontsize=9,
+        )
+
+
+def _value(study: Study, name: str) -> float | None:
+    speed = study.speeds[name]
+    return None if speed is None else speed["value"]
+
+
+def draw_rides(study: Study, path: str | os.PathLike) -> None:
+    """Lean and steer against time for the three rides."""
+    plt = pyplot()
+    figure, (lean, steer) = plt.subplots(2, 1, sharex=True, figsize=(7.5, 5.5), layout="constrained")
+    rides = study.rides
+    for i, (label, speed) in enumerate(zip(rides.labels, rides.speeds, strict=True)):
+        lane = rides.lanes.lane(i)
+        t = np.asarray(lane.ts)
+        for axis, name in ((lean, "lean"), (steer, "steer")):
+            axis.plot(t, np.degrees(np.asarray(lane[name])), lw=1.6, label=f"{speed:.2f} m/s, {label}")
+        if np.isnan(np.asarray(lane["lean"])[-1]):
+            lean.plot(float(lane.t_end), np.degrees(float(lane.q_end[3])), "kx")
+            lean.annotate(
+                lane.event_names[int(lane.event)], (float(lane.t_end), np.degrees(float(lane.q_end[3]))), xytext=(6, -4), textcoords="offset points", fontsize=9
+            )
+    lean.set_ylabel("lean to the right in degrees")
+    steer.set_ylabel("steer to the right in degrees")
+    steer.set_xlabel("t in s")
+    lean.set_title(f"{study.bicycle.name}: hands-free after a kick in lean rate", fontsize=11)
+    lean.legend(fontsize=9)
+    for axis in (lean, steer):
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def animate_ride(study: Study, path: str | os.PathLike) -> None:
+    """The first ride (below the stable range) in space, the view following the bicycle."""
+    rides = study.rides
+    lane = rides.lanes.lane(0)
+    animate(lane, path, follow=True, paths=[], title=f"{study.bicycle.name} at {rides.speeds[0]:.2f} m/s, {rides.labels[0]}")

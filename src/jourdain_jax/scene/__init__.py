@@ -1,0 +1,1 @@
+"""The nouns of a scene: coordinates, bodies, loads, constraints, contacts. No algorithms."""

@@ -1,0 +1,122 @@
+"""Particles and rigid bodies: what they weigh and where they are, as functions of the coordinates. Velocities come by autodiff.
+
+A body states its pose in the inertial frame; `outline` is a closed or open line in its own frame, for drawing only.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+_AXES = {"x": 0, "y": 1, "z": 2}
+
+
+class Particle(eqx.Module):
+    """A point mass."""
+
+    mass: Float[Array, ""]  # kg
+    position: Float[Array, "3"]  # m, inertial frame
+
+    def __init__(self, mass, position):
+        self.mass = jnp.asarray(mass)
+        self.position = jnp.asarray(position)
+
+    def __check_init__(self):
+        _check_shape("position of a particle", self.position, (3,))
+        _check_shape("mass of a particle", self.mass, ())
+
+
+class RigidBody(eqx.Module):
+    """A rigid body: mass, central inertia in body axes, position of the mass centre, orientation (body to space)."""
+
+    mass: Float[Array, ""]  # kg
+    inertia: Float[Array, "3 3"]  # kg m^2, about the mass centre, body axes
+    position: Float[Array, "3"]  # m, mass centre, inertial frame
+    orientation: Float[Array, "3 3"]  # body components to space components
+    outline: Float[Array, "points 3"]  # m, body frame, relative to the mass centre; for drawing only
+
+    def __init__(self, mass, inertia, position, orientation, outline=None):
+        inertia = jnp.asarray(inertia)
+        self.mass = jnp.asarray(mass)
+        self.inertia = jnp.diag(inertia) if inertia.ndim == 1 else inertia
+        self.position = jnp.asarray(position)
+        self.orientation = jnp.asarray(orientation)
+        self.outline = jnp.zeros((0, 3)) if outline is None else jnp.asarray(outline)
+
+    def __check_init__(self):
+        _check_shape("mass of a rigid body", self.mass, ())
+        _check_shape("inertia of a rigid body (a 3x3 matrix or three principal moments)", self.inertia, (3, 3))
+        _check_shape("position of a rigid body", self.position, (3,))
+        _check_shape("orientation of a rigid body", self.orientation, (3, 3))
+
+    @staticmethod
+    def thin_disc(mass, radius, *, axis: str, position, orientation, axial=None, diametral=None) -> "RigidBody":
+        """A disc about the body axis `axis`: uniform, `C = m a^2/2` and `A = m a^2/4`, unless `axial` (C) and `diametral` (A) are given."""
+        axial = mass * radius**2 / 2 if axial is None else axial
+        diametral = mass * radius**2 / 4 if diametral is None else diametral
+        k = _axis_index(axis)
+        moments = [diametral] * 3
+        moments[k] = axial
+        return RigidBody(mass, _stack(moments), position, orientation, radius * _wheel_outline(k))
+
+    @staticmethod
+    def ball(mass, radius, *, position, orientation, factor=0.4) -> "RigidBody":
+        """A ball with central moment of inertia `factor m r^2` (2/5 when solid, 2/3 when hollow)."""
+        moment = factor * mass * radius**2
+        return RigidBody(mass, _stack([moment] * 3), position, orientation, radius * _ball_outline())
+
+    @staticmethod
+    def rod(mass, length, *, axis: str, position, orientation) -> "RigidBody":
+        """A thin uniform rod of the given length along the body axis `axis`, `m l^2/12` about the others."""
+        k = _axis_index(axis)
+        moments = [mass * length**2 / 12] * 3
+        moments[k] = jnp.zeros_like(jnp.asarray(moments[k]))
+        ends = np.zeros((2, 3))
+        ends[0, k], ends[1, k] = -0.5, 0.5
+        return RigidBody(mass, _stack(moments), position, orientation, length * ends)
+
+    @staticmethod
+    def box(mass, sides, *, position, orientation) -> "RigidBody":
+        """A uniform cuboid with the three `sides` (m) along the body axes."""
+        a, b, c = sides[0], sides[1], sides[2]
+        moments = _stack([mass * (b**2 + c**2) / 12, mass * (a**2 + c**2) / 12, mass * (a**2 + b**2) / 12])
+        return RigidBody(mass, moments, position, orientation, _box_outline() * jnp.asarray(sides))
+
+
+Body = Particle | RigidBody
+
+
+def _stack(values) -> Array:
+    return jnp.stack([jnp.asarray(v, jnp.result_type(float)) for v in values])
+
+
+def _axis_index(axis: str) -> int:
+    if axis not in _AXES:
+        raise ValueError(f"body axis `{axis}` is unknown; expected one of `x`, `y`, `z`")
+    return _AXES[axis]
+
+
+def _check_shape(what: str, array, shape: tuple[int, ...]) -> None:
+    if jnp.shape(array) != shape:
+        raise ValueError(f"{what} has shape {jnp.shape(array)}, expected {shape}; check how it is put together")
+
+
+def _wheel_outline(k: int) -> np.ndarray:
+    """A circle with one diameter drawn, in the plane normal to axis `k`."""
+    angle = np.linspace(0, 2 * np.pi, 41)
+    i, j = [(1, 2), (2, 0), (0, 1)][k]
+    points = np.zeros((43, 3))
+    points[:41, i], points[:41, j] = np.cos(angle), np.sin(angle)
+    points[41, i] = -1.0
+    points[42, i] = 0.0
+    return points
+
+
+def _ball_outline() -> np.ndarray:
+    return np.concatenate([_wheel_outline(k)[:41] for k in range(3)])
+
+
+def _box_outline() -> np.ndarray:
+    corners = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 0), (0, 0, 1), (1, 0, 1), (1, 0, 0)]
+    corners += [(1, 0, 1), (1, 1, 1), (1, 1, 0), (1, 1, 1), (0, 1, 1), (0, 1, 0), (0, 1, 1), (0, 0, 1)]
+    return np.array(corners, float) - 0.5

@@ -1,0 +1,85 @@
+"""Rolling contacts without slip, of discs and balls, on planes at rest, moving or tilted.
+
+A contact contributes two velocity rows (no slip along the plane's two tangents) and, with `height="row"`, one geometric row (the gap
+is zero). With `height="coordinates"` the coordinates keep the contact point on the plane by construction; then the normal force is
+found from Newton's equation (row S1) instead of from a multiplier.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.scene.bodies import _axis_index
+from jourdain_jax.scene.motion_state import BodyPose
+
+_HEIGHTS = ("coordinates", "row")
+
+
+class Plane(eqx.Module):
+    """A plane through `origin`, at rest or in rigid motion: velocity of its point at p is `velocity + angular_velocity x (p - origin)`."""
+
+    origin: Float[Array, "3"]  # m
+    normal: Float[Array, "3"]  # unit vector, out of the ground
+    tangents: Float[Array, "2 3"]  # unit vectors along the no-slip rows
+    velocity: Float[Array, "3"]  # m/s, of the point at the origin
+    angular_velocity: Float[Array, "3"]  # rad/s
+
+    def __init__(self, origin=(0.0, 0.0, 0.0), tilt=0.0, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
+        """The plane z = 0, turned by `tilt` (rad) about the y axis so that positive tilt slopes down along x."""
+        c, s = jnp.cos(jnp.asarray(tilt, jnp.result_type(float))), jnp.sin(jnp.asarray(tilt, jnp.result_type(float)))
+        o, i = jnp.zeros_like(c), jnp.ones_like(c)
+        self.origin = jnp.asarray(origin)
+        self.normal = jnp.stack([s, o, c])
+        self.tangents = jnp.stack([jnp.stack([c, o, -s]), jnp.stack([o, i, o])])
+        self.velocity = jnp.asarray(velocity)
+        self.angular_velocity = jnp.asarray(angular_velocity)
+
+    def velocity_at(self, position: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Velocity of the plane's material point at `position`, m/s."""
+        return self.velocity + jnp.cross(self.angular_velocity, position - self.origin)
+
+    def height_of(self, position: Float[Array, "3"]) -> Float[Array, ""]:
+        """Signed distance of a point from the plane, m."""
+        return self.normal @ (position - self.origin)
+
+
+class Contact(eqx.Module):
+    """A point contact of a body with a plane, rolling without slip."""
+
+    body: str = eqx.field(static=True)
+    point: Float[Array, "3"]  # m, inertial frame
+    plane: Plane
+    height: str = eqx.field(static=True)  # "coordinates" or "row"
+    carried: tuple[str, ...] | None = eqx.field(static=True, default=None)  # bodies this contact alone holds up; None: all of them
+
+    def gap(self) -> Float[Array, ""]:
+        """Signed distance of the contact point from the plane, m."""
+        return self.plane.height_of(self.point)
+
+
+def disc_contact(
+    body: BodyPose, radius, *, axis: str = "y", plane: Plane | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None
+) -> Contact:
+    """Rolling of the edge of a thin disc (centre: the mass centre; axis: a body axis) on a plane.
+
+    The contact is the lowest point of the circle, `r - a (n - (n.k) k)/|n - (n.k) k|` with plane normal n and disc axis k. Undefined for
+    a disc lying flat. `carried` names the bodies that this contact holds up, for the normal force where `height="coordinates"`.
+    """
+    _check_height(height)
+    plane = Plane() if plane is None else plane
+    k = body.orientation[:, _axis_index(axis)]
+    up = plane.normal - (plane.normal @ k) * k
+    point = body.position - radius * up / jnp.sqrt(up @ up)
+    return Contact(body.name, point, plane, height, carried)
+
+
+def ball_contact(body: BodyPose, radius, *, plane: Plane | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None) -> Contact:
+    """Rolling of a ball (centre: the mass centre) on a plane; the contact point is `r - a n`."""
+    _check_height(height)
+    plane = Plane() if plane is None else plane
+    return Contact(body.name, body.position - radius * plane.normal, plane, height, carried)
+
+
+def _check_height(height: str) -> None:
+    if height not in _HEIGHTS:
+        raise ValueError(f"contact height `{height}` is unknown; expected `coordinates` (kept by the coordinates) or `row` (a geometric row)")

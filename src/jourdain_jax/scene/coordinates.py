@@ -1,0 +1,116 @@
+"""Generalized coordinates `q` and generalized speeds `u`: their names, and how they go together when the user says nothing.
+
+A plain coordinate `x` has the speed `x_rate = xdot`. A quaternion `attitude` has as speeds the three body components of the
+angular velocity, `attitude_omega_x`, `..._y`, `..._z`, with `d attitude/dt = 1/2 attitude (0, omega)`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.rotations import quaternion_rate
+from jourdain_jax.scene.names import Named, nearest
+
+
+@dataclass(frozen=True)
+class Quaternion:
+    """A singularity-free attitude: four coordinates `(w, x, y, z)`, three speeds (body angular velocity, rad/s)."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Names:
+    """Names of the entries of a flat vector, with runs of entries that may be reached together."""
+
+    entries: tuple[str, ...]
+    groups: tuple[tuple[str, int, int], ...] = ()  # name, first entry, length
+
+    def view(self, array: Float[Array, "*shape"]) -> Named:
+        """The array with named access."""
+        return Named(array, tuple((name, i, 0) for i, name in enumerate(self.entries)) + self.groups)
+
+    def index(self, name: str, kind: str) -> int:
+        """Position of `name`; a ValueError that lists the valid names otherwise."""
+        if name not in self.entries:
+            raise ValueError(f"unknown {kind} `{name}`; {nearest(name, self.entries)}")
+        return self.entries.index(name)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """The names of a scene's coordinates and of the speeds that belong to them by default."""
+
+    names: Names
+    default_speeds: Names
+    quaternions: tuple[tuple[int, int], ...]  # first coordinate, first speed
+    plain: tuple[tuple[int, int], ...]  # coordinate, speed
+
+    def reference(self) -> Float[Array, "coordinates"]:
+        """The reference configuration: zero, and the identity for every quaternion."""
+        q = jnp.zeros(len(self.names))
+        for first, _ in self.quaternions:
+            q = q.at[first].set(1.0)
+        return q
+
+    def default_rates(self, q: Float[Array, "coordinates"], u: Float[Array, "speeds"]) -> Float[Array, "coordinates"]:
+        """`qdot` from the default speeds: `xdot = x_rate`, `d quaternion/dt = 1/2 quaternion (0, omega)`."""
+        parts: list[tuple[int, Array]] = [(i, u[k : k + 1]) for i, k in self.plain]
+        parts += [(i, quaternion_rate(q[i : i + 4], u[k : k + 3])) for i, k in self.quaternions]
+        return jnp.concatenate([part for _, part in sorted(parts, key=lambda p: p[0])]) if parts else jnp.zeros(0)
+
+
+def quaternion(name: str) -> Quaternion:
+    """A quaternion coordinate, for use in `coordinates(...)`: `coordinates("x y z", quaternion("attitude"))`."""
+    return Quaternion(name)
+
+
+def coordinates(*parts: str | Quaternion) -> Coordinates:
+    """Names of a scene's coordinates: strings of names parted by blanks, and quaternions, in order.
+
+    Example: `coordinates("x y z", quaternion("attitude"))` has 7 coordinates and 6 default speeds.
+    """
+    names: list[str] = []
+    speeds: list[str] = []
+    q_groups, u_groups, quaternions, plain = [], [], [], []
+    for part in parts:
+        if isinstance(part, Quaternion):
+            quaternions.append((len(names), len(speeds)))
+            q_groups.append((part.name, len(names), 4))
+            u_groups.append((f"{part.name}_omega", len(speeds), 3))
+            names += [f"{part.name}_{c}" for c in "wxyz"]
+            speeds += [f"{part.name}_omega_{c}" for c in "xyz"]
+            continue
+        for name in part.split():
+            plain.append((len(names), len(speeds)))
+            names.append(name)
+            speeds.append(f"{name}_rate")
+    _check_names(names, "coordinate")
+    return Coordinates(Names(tuple(names), tuple(q_groups)), Names(tuple(speeds), tuple(u_groups)), tuple(quaternions), tuple(plain))
+
+
+def speeds(names: str) -> Names:
+    """Names of user-defined generalized speeds (quasi-velocities), parted by blanks."""
+    _check_names(names.split(), "speed")
+    return Names(tuple(names.split()))
+
+
+def inputs(names: str) -> Names:
+    """Names of a scene's inputs (actuator torques, say), parted by blanks."""
+    _check_names(names.split(), "input")
+    return Names(tuple(names.split()))
+
+
+def _check_names(names: Sequence[str], kind: str) -> None:
+    for name in names:
+        if not name.isidentifier():
+            raise ValueError(f"{kind} name `{name}` is not an identifier; use letters, digits and underscores")
+        if names.count(name) > 1:
+            raise ValueError(f"{kind} name `{name}` is used twice; every {kind} needs a name of its own")
+        if name in ("array", "slots", "keys"):
+            raise ValueError(f"{kind} name `{name}` is taken by the container itself; choose another")

@@ -1,0 +1,91 @@
+"""Impressed forces: known functions of time, state and parameters, as resultants on bodies or on speeds.
+
+A load acts on the mass centres (`forces`), as torques (`torques`), or directly on generalized speeds (`generalized`). Its
+virtual power is `sum F . dv + sum L . domega + sum Q_k du_k`. A load with a `potential` is conservative, and its energy counts in V;
+the work of the others is integrated along the motion.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.scene.motion_state import Motion, Point
+from jourdain_jax.scene.names import nearest
+
+
+class Load(eqx.Module):
+    """One impressed force system: resultants per body, and forces on speeds by name."""
+
+    forces: dict[str, Float[Array, "3"]] = eqx.field(default_factory=dict)  # N, inertial frame, at the mass centre
+    torques: dict[str, Float[Array, "3"]] = eqx.field(default_factory=dict)  # N m, inertial frame, about the mass centre
+    generalized: dict[str, Float[Array, ""]] = eqx.field(default_factory=dict)  # N or N m, on the named speed
+    potential: Float[Array, ""] | None = None  # J
+
+
+def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
+    """Uniform gravity `m g e` on every body; `strength` g in m/s^2, `direction` e a unit vector of the inertial frame."""
+    g = strength * jnp.asarray(direction)
+    forces = {name: body.mass * g for name, body in motion.bodies.items()}
+    potential = -sum(body.mass * (g @ body.position) for body in motion.bodies.values())
+    return Load(forces=forces, potential=jnp.asarray(potential))
+
+
+def point_force(point: Point, force) -> Load:
+    """A force (N, inertial frame) on a point of a body, `motion["body"].point(local)`."""
+    return _on_point(point, jnp.asarray(force), None)
+
+
+def torque(motion: Motion, body: str, moment, *, reaction: str | None = None) -> Load:
+    """A torque (N m, inertial frame) on `body`, with the opposite torque on the body `reaction` where one is named."""
+    moment = jnp.asarray(moment)
+    names = [body] if reaction is None else [body, reaction]
+    for name in names:
+        if name not in motion.bodies:
+            raise ValueError(f"torque on unknown body `{name}`; {nearest(name, motion.bodies)}")
+    return Load(torques={name: sign * moment for name, sign in zip(names, (1.0, -1.0), strict=False)})
+
+
+def spring(a: Point, b: Point, stiffness, rest_length=0.0) -> Load:
+    """A linear spring between two points: tension `k (l - l0)`, potential `k (l - l0)^2 / 2` (N/m, m)."""
+    apart, length, direction = _line(a, b)
+    extension = length - rest_length
+    # k (l - l0) e, written so that a spring of no natural length is smooth where its ends meet
+    pull = stiffness * (apart - rest_length * direction)
+    return _between(a, b, pull, 0.5 * stiffness * extension**2)
+
+
+def damper(a: Point, b: Point, damping) -> Load:
+    """A linear damper between two points: tension `c dl/dt` along the line (N s/m)."""
+    _, _, direction = _line(a, b)
+    return _between(a, b, damping * ((b.velocity - a.velocity) @ direction) * direction, None)
+
+
+def generalized_force(motion: Motion, **forces) -> Load:
+    """Forces on speeds by name, `generalized_force(motion, steer_rate=torque)`: power `sum Q_k u_k` (N or N m)."""
+    for name in forces:
+        if name not in motion.u:
+            raise ValueError(f"generalized force on unknown speed `{name}`; {nearest(name, motion.u.keys())}")
+    return Load(generalized={name: jnp.asarray(value) for name, value in forces.items()})
+
+
+def _line(a: Point, b: Point):
+    apart = b.position - a.position
+    squared = apart @ apart
+    apart_is_nonzero = squared > 0
+    length = jnp.where(apart_is_nonzero, jnp.sqrt(jnp.where(apart_is_nonzero, squared, 1.0)), 0.0)
+    direction = apart / jnp.where(apart_is_nonzero, length, 1.0)
+    return apart, length, direction
+
+
+def _on_point(point: Point, force, potential) -> Load:
+    if point.body is None:
+        return Load(potential=potential)
+    return Load({point.body: force}, {point.body: jnp.cross(point.arm, force)}, {}, potential)
+
+
+def _between(a: Point, b: Point, pull, potential) -> Load:
+    """`pull` acts on `a` towards `b`, and its opposite on `b`."""
+    if a.body is not None and a.body == b.body:
+        return Load(potential=potential)  # an internal force of one rigid body does no virtual power
+    first, second = _on_point(a, pull, None), _on_point(b, -pull, None)
+    return Load(first.forces | second.forces, first.torques | second.torques, {}, potential)

@@ -1,0 +1,116 @@
+"""What the methods of a scene are given: poses, and poses with velocities, of all bodies at one instant.
+
+`Pose` (t, q, bodies) is given to geometric constraints and contacts; `Motion` adds `u`, `qdot`, inputs and velocities and is given to
+loads, velocity constraints and events. Velocities are those of the mass centres and angular velocities in space components.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.scene.bodies import Body, RigidBody
+from jourdain_jax.scene.names import Named, nearest
+
+
+class Point(eqx.Module):
+    """A point of a body (or of the inertial frame, `body` None): where it is and how fast it moves."""
+
+    position: Float[Array, "3"]  # m, inertial frame
+    velocity: Float[Array, "3"]  # m/s, inertial frame
+    arm: Float[Array, "3"]  # m, from the mass centre of the body to the point, inertial frame
+    body: str | None = eqx.field(static=True, default=None)
+
+
+def fixed_point(position) -> Point:
+    """A point at rest in the inertial frame, for springs, dampers and rods."""
+    position = jnp.asarray(position, jnp.result_type(float))
+    return Point(position, jnp.zeros_like(position), jnp.zeros_like(position))
+
+
+class BodyPose(eqx.Module):
+    """One body's pose."""
+
+    name: str = eqx.field(static=True)
+    body: Body
+
+    @property
+    def mass(self) -> Float[Array, ""]:
+        """Mass in kg."""
+        return self.body.mass
+
+    @property
+    def position(self) -> Float[Array, "3"]:
+        """Position of the mass centre, m, inertial frame."""
+        return self.body.position
+
+    @property
+    def orientation(self) -> Float[Array, "3 3"]:
+        """Rotation matrix, body to space; the identity for a particle."""
+        return self.body.orientation if isinstance(self.body, RigidBody) else jnp.eye(3, dtype=self.body.position.dtype)
+
+    def place(self, local) -> Float[Array, "3"]:
+        """Position (inertial frame) of the point with body-frame coordinates `local` (m, relative to the mass centre)."""
+        return self.position + self.orientation @ jnp.asarray(local)
+
+
+class BodyMotion(eqx.Module):
+    """One body's pose and velocity."""
+
+    name: str = eqx.field(static=True)
+    body: Body
+    velocity: Float[Array, "3"]  # m/s, mass centre, inertial frame
+    angular_velocity: Float[Array, "3"]  # rad/s, inertial frame; zero for a particle
+
+    mass = BodyPose.mass
+    position = BodyPose.position
+    orientation = BodyPose.orientation
+    place = BodyPose.place
+
+    @property
+    def angular_velocity_body(self) -> Float[Array, "3"]:
+        """Angular velocity in body components, rad/s."""
+        return self.orientation.T @ self.angular_velocity
+
+    def velocity_at(self, position: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Velocity of the material point that is at `position` (inertial frame): `v + omega x (position - r)`."""
+        return self.velocity + jnp.cross(self.angular_velocity, position - self.position)
+
+    def point(self, local=(0.0, 0.0, 0.0)) -> Point:
+        """The material point with body-frame coordinates `local` (m, relative to the mass centre)."""
+        position = self.place(jnp.asarray(local, self.position.dtype))
+        return Point(position, self.velocity_at(position), position - self.position, self.name)
+
+
+class Pose(eqx.Module):
+    """Time, coordinates and the poses of all bodies; `pose["disc"]` is a body, `pose.q.yaw` a coordinate."""
+
+    t: Float[Array, ""]
+    q: Named
+    bodies: dict[str, BodyPose]
+
+    def __getitem__(self, name: str) -> BodyPose:
+        return _lookup(self.bodies, name)
+
+
+class Motion(eqx.Module):
+    """Time, coordinates, speeds, inputs and the motion of all bodies; `motion["disc"].velocity`, `motion.u.yaw_rate`."""
+
+    t: Float[Array, ""]
+    q: Named
+    u: Named
+    qdot: Named
+    inputs: Named
+    bodies: dict[str, BodyMotion]
+
+    def __getitem__(self, name: str) -> BodyMotion:
+        return _lookup(self.bodies, name)
+
+    def pose(self) -> Pose:
+        """The same without velocities."""
+        return Pose(self.t, self.q, {name: BodyPose(name, motion.body) for name, motion in self.bodies.items()})
+
+
+def _lookup(bodies: dict, name: str):
+    if name not in bodies:
+        raise KeyError(f"no body `{name}` in this scene; {nearest(name, bodies)}")
+    return bodies[name]

@@ -1,0 +1,43 @@
+"""Named access to flat arrays, and error texts that list the valid names and the nearest one."""
+
+import difflib
+from collections.abc import Iterable
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """The end of an error message: the nearest valid name, if any is near, and all valid names."""
+    valid = list(valid)
+    match = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+    hint = f"did you mean `{match[0]}`? " if match else ""
+    return f"{hint}Valid names: {', '.join(f'`{v}`' for v in valid) or 'none'}."
+
+
+class Named(eqx.Module):
+    """A flat array whose entries, or runs of entries, are reached by name: `q.yaw`, `q["yaw"]`, `q.array`."""
+
+    array: Float[Array, "*shape"]
+    slots: tuple[tuple[str, int, int], ...] = eqx.field(static=True)  # name, first entry, length (0 for a scalar)
+
+    def __getitem__(self, name: str):
+        for slot, first, length in self.slots:
+            if slot == name:
+                return self.array[..., first] if length == 0 else self.array[..., first : first + length]
+        raise KeyError(f"no `{name}` here; {nearest(name, [slot for slot, _, _ in self.slots])}")
+
+    def __getattr__(self, name: str):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        try:
+            return self[name]
+        except KeyError as error:
+            raise AttributeError(error.args[0]) from None
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.keys()
+
+    def keys(self) -> tuple[str, ...]:
+        """The names, in order."""
+        return tuple(slot for slot, _, _ in self.slots)

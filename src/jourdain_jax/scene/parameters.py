@@ -1,0 +1,51 @@
+"""Physical parameters of a scene: differentiable leaves, stated once, checked where their values are known."""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+
+def _as_leaf(value) -> Array:
+    array = jnp.asarray(value)
+    dtype = array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else jnp.result_type(float)
+    return jnp.asarray(array, dtype)  # never weakly typed, so that one trace serves defaults and other values alike
+
+
+def parameter(default=..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = ""):
+    """A field of a scene that is a physical parameter: converted to a floating-point array, so that it is a differentiable leaf.
+
+    `unit` and `about` describe it; `positive` and `non_negative` are checked when the scene is built with known values.
+    """
+    options = {} if default is ... else {"default": default}
+    metadata = {"parameter": True, "unit": unit, "positive": positive, "non_negative": non_negative, "about": about}
+    return eqx.field(converter=_as_leaf, metadata=metadata, **options)
+
+
+def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:
+    """Name, value and metadata (unit, ...) of every parameter of a scene."""
+    for name, field in scene.__dataclass_fields__.items():
+        if field.metadata.get("parameter"):
+            yield name, getattr(scene, name), dict(field.metadata)
+
+
+def check_parameters(scene) -> None:
+    """Raise a ValueError that names a parameter which is not finite or has the wrong sign; traced values are not checked."""
+    for name, value, metadata in parameters_of(scene):
+        if isinstance(value, jax.core.Tracer) or not hasattr(value, "dtype"):
+            continue
+        numbers = np.asarray(value)
+        where = f"parameter `{name}` of `{type(scene).__name__}`"
+        if not np.all(np.isfinite(numbers)):
+            raise ValueError(f"{where} is {numbers}, expected finite numbers; check where it was computed")
+        if metadata["positive"] and not np.all(numbers > 0):
+            raise ValueError(f"{where} is {numbers}, expected a positive number{_in(metadata)}; give a value above zero")
+        if metadata["non_negative"] and not np.all(numbers >= 0):
+            raise ValueError(f"{where} is {numbers}, expected a number >= 0{_in(metadata)}; give a value that is not negative")
+
+
+def _in(metadata: dict) -> str:
+    return f" in {metadata['unit']}" if metadata["unit"] else ""

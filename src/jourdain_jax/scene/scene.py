@@ -1,0 +1,139 @@
+"""The scene: one module whose fields are physical parameters and whose methods say, in plain JAX, where the bodies are, what pushes
+them and what holds them. Everything else (velocities, partial velocities, mass matrix, rows) comes by automatic differentiation.
+"""
+
+from dataclasses import replace
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.scene.bodies import Body
+from jourdain_jax.scene.contacts import Contact
+from jourdain_jax.scene.coordinates import Coordinates, Names
+from jourdain_jax.scene.loads import Load
+from jourdain_jax.scene.motion_state import Motion, Pose
+from jourdain_jax.scene.names import Named, nearest
+from jourdain_jax.scene.parameters import check_parameters, parameters_of
+
+
+class Scene(eqx.Module):
+    """Base class of all scenes. Subclass it, state `coordinates` and `bodies`, and what else the scene needs.
+
+    Class attributes (or properties, where they depend on a static field such as a number of bodies)
+    - `coordinates`: names, from `jj.coordinates(...)` (required).
+    - `speeds`: names of user-defined quasi-velocities, from `jj.speeds(...)`; then also define `coordinate_rates`.
+    - `inputs`: names of inputs, from `jj.inputs(...)`; `motion.inputs.name` in the methods.
+    - `privileged`: names of the independent speeds, where the user wants to choose them; otherwise the engine does.
+    - `domain`: coordinate or speed name -> (low, high), where states may be sampled for probing and tests; default (-3.2, 3.2)
+      for coordinates, (-1, 1) for speeds.
+    - `conventions`: one text: axes, signs, frames.
+    - `example`: coordinate or speed name -> value, a typical start; `example_span`: its duration in s.
+    """
+
+    coordinates: ClassVar[Coordinates]
+    speeds: ClassVar[Names | None] = None
+    inputs: ClassVar[Names] = Names(())
+    privileged: ClassVar[tuple[str, ...] | None] = None
+    domain: ClassVar[dict[str, tuple[float, float]]] = {}
+    conventions: ClassVar[str] = "SI units, radians; right-handed inertial frame, z up."
+    example: ClassVar[dict[str, float]] = {}
+    example_span: ClassVar[float] = 5.0
+
+    def __check_init__(self):
+        if not isinstance(getattr(self, "coordinates", None), Coordinates):
+            raise ValueError(f"scene `{type(self).__name__}` has no `coordinates`; state them as a class attribute: coordinates = jj.coordinates('x y ...')")
+        check_parameters(self)
+
+    # What a scene says. -------------------------------------------------------------------------------------------
+
+    def bodies(self, t: Float[Array, ""], q: Named) -> dict[str, Body]:
+        """Poses of all bodies at time t and coordinates q."""
+        raise NotImplementedError(f"scene `{type(self).__name__}` does not say where its bodies are; define `bodies(self, t, q)`")
+
+    def coordinate_rates(self, t: Float[Array, ""], q: Named, u: Named) -> Float[Array, "coordinates"]:
+        """`qdot = N(q,t) u + nu(q,t)`, affine in u. The default: every coordinate's own rate, quaternions by body angular velocity."""
+        return self.coordinates.default_rates(q.array, u.array)
+
+    def loads(self, motion: Motion) -> tuple[Load, ...]:
+        """Impressed forces."""
+        return ()
+
+    def potential(self, pose: Pose) -> Float[Array, ""] | None:
+        """Potential energy (J) besides that of the loads, a function of time and coordinates; None where there is none."""
+        return None
+
+    def prescribed(self, t: Float[Array, ""]) -> dict[str, Float[Array, ""]]:
+        """Coordinates driven as given functions of time: name -> value. The multiplier of the row is the actuator's force."""
+        return {}
+
+    def geometric_constraints(self, pose: Pose) -> dict[str, Array]:
+        """Geometric rows g(q, t) = 0 by name, each a scalar or a vector."""
+        return {}
+
+    def velocity_constraints(self, motion: Motion) -> dict[str, Array]:
+        """Velocity rows phi(q, u, t) = 0 by name, each a scalar or a vector: linear, affine or nonlinear in the speeds."""
+        return {}
+
+    def contacts(self, pose: Pose) -> dict[str, Contact]:
+        """Rolling contacts by name; each adds its no-slip rows, and its height row if it says so."""
+        return {}
+
+    def events(self, motion: Motion) -> dict[str, Float[Array, ""]]:
+        """Named stop events: positive while the motion may go on; the motion stops where a value falls through zero."""
+        return {}
+
+    def invariants(self, motion: Motion) -> dict[str, Float[Array, ""]]:
+        """Named quantities that this scene is known to conserve, besides its energy; for checks and summaries."""
+        return {}
+
+    # What can be asked of any scene. ------------------------------------------------------------------------------
+
+    @property
+    def coordinate_names(self) -> Names:
+        """Names of the coordinates q."""
+        return self.coordinates.names
+
+    @property
+    def speed_names(self) -> Names:
+        """Names of the speeds u."""
+        return self.coordinates.default_speeds if self.speeds is None else self.speeds
+
+    def replace(self, **changes) -> "Scene":
+        """The same scene with some parameters changed; unknown names raise a ValueError with the nearest valid name."""
+        names = [name for name, _, _ in parameters_of(self)]
+        for name in changes:
+            if name not in self.__dataclass_fields__:
+                raise ValueError(f"scene `{type(self).__name__}` has no parameter `{name}`; {nearest(name, names)}")
+        return replace(self, **changes)
+
+    def named(self, **values) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"], tuple[str, ...]]:
+        """q and u with the named values, the rest at the reference; and the names that were given.
+
+        A quaternion or its angular velocity may be given whole, by its own name.
+        """
+        q, u = self.coordinates.reference(), jnp.zeros(len(self.speed_names))
+        given: list[str] = []
+        for name, value in values.items():
+            q, q_hit = _put(self.coordinate_names, q, name, value)
+            u, u_hit = _put(self.speed_names, u, name, value)
+            if not q_hit + u_hit:
+                valid = self.coordinate_names.entries + self.speed_names.entries
+                raise ValueError(f"scene `{type(self).__name__}` has no coordinate or speed `{name}`; {nearest(name, valid)}")
+            given += q_hit + u_hit
+        return q, u, tuple(given)
+
+
+def _put(names: Names, array, name: str, value):
+    value = jnp.asarray(value, array.dtype)
+    if name in names.entries:
+        if value.shape != ():
+            raise ValueError(f"`{name}` was given an array of shape {value.shape}, expected one number; use `jax.vmap` or `rollout` for many")
+        return array.at[names.entries.index(name)].set(value), [name]
+    for group, first, length in names.groups:
+        if group == name:
+            if value.shape != (length,):
+                raise ValueError(f"`{name}` was given an array of shape {value.shape}, expected ({length},)")
+            return array.at[first : first + length].set(value), list(names.entries[first : first + length])
+    return array, []

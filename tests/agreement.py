@@ -1,0 +1,42 @@
+"""Random admissible states of a scene, and all its reductions against each other there."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+import jourdain_jax as jj
+
+
+def admissible_states(scene: jj.Scene, count: int, seed: int = 0) -> list[tuple]:
+    """Random states (t, q, u) on the constraints, as JAX arrays."""
+    return list(zip(*map(jnp.asarray, jj.sample_states(scene, count, seed)), strict=True))
+
+
+def disagreement(scene: jj.Scene, count: int = 20, seed: int = 0) -> dict[str, float]:
+    """Largest difference of accelerations and constraint forces from those by QR, relative to the largest at each state.
+
+    The size of forces is the largest of constraint, impressed and inertia forces, for scenes without constraints. Reductions that
+    say that they do not apply at some state are left out.
+    """
+    by_name = jj.reductions(scene)
+
+    @eqx.filter_jit
+    def all_of_them(scene, t, q, u):
+        found = {name: jj.accelerations(scene, t, q, u, reduction=reduction) for name, reduction in by_name.items()}
+        equations = jj.unconstrained_equations(scene, t, q, u)
+        forces = jnp.stack([equations.h, equations.Q, found["qr"].constraint_force])
+        sizes = jnp.max(jnp.abs(found["qr"].udot)), jnp.max(jnp.abs(forces))
+        return {name: (a.udot, a.constraint_force, a.applicable) for name, a in found.items()}, sizes
+
+    states = admissible_states(scene, count, seed)
+    assert len(states) >= count // 2
+    results, sizes = jax.vmap(lambda t, q, u: all_of_them(scene, t, q, u))(*map(jnp.stack, zip(*states, strict=True)))
+    return {
+        name: max(_relative(*compared) for compared in zip(result[:2], results["qr"][:2], sizes, strict=True))
+        for name, result in results.items()
+        if name != "qr" and bool(jnp.all(result[2]))
+    }
+
+
+def _relative(values, expected, size) -> float:
+    return float(jnp.max(jnp.max(jnp.abs(values - expected), axis=1) / jnp.where(size > 0, size, 1.0)))

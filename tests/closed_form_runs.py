@@ -1,0 +1,23 @@
+"""Runs at rtol = atol = 1e-12 against closed forms, measured at the end of the run."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from tolerances import relative_error
+
+import jourdain_jax as jj
+
+
+def end_error(scene: jj.Scene, start: dict, expected: Callable[[np.ndarray], dict], span: float) -> float:
+    """Largest error at the end of a run, of each quantity relative to the largest value that it takes during the run.
+
+    **Arguments:** `start`, values by name; `expected(times)`, name of a coordinate or speed -> its true values; `span` in s.
+    """
+    times = np.linspace(0.0, span, 101)
+    ends = jnp.asarray([0.0, span])  # no time between, where the solver interpolates less accurately than it steps
+    trajectory = jj.simulate(scene, start, ts=ends, rtol=1e-12, atol=1e-12).raise_if_failed()
+    return max(
+        relative_error(trajectory[name][-1], values[-1], size=float(np.max(np.abs(values))))
+        for name, values in expected(times).items()
+    )

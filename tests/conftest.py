@@ -1,0 +1,36 @@
+"""Session set-up: run-time shape checks, a headless plot backend, a compile cache; no precision is set here.
+
+`JOURDAIN_JAX_NO_TYPE_CHECKS=1` switches the jaxtyping/beartype checks off (faster, for timing only).
+"""
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+# Before any import of the package: every annotated function is then checked, shapes and dtypes included.
+if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":
+    install_import_hook("jourdain_jax", "beartype.beartype")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep compiled programs in pytest's cache, so that a second run does not compile again."""
+    if not config.pluginmanager.hasplugin("cacheprovider"):
+        return
+    compiled: Path = config.cache.mkdir("jax_compilation")
+    jax.config.update("jax_compilation_cache_dir", str(compiled))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    """A run in which every test was skipped has tested nothing: fail it as pytest fails an empty run."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    on_worker = "PYTEST_XDIST_WORKER" in os.environ
+    if reporter is None or on_worker or session.config.option.collectonly or exitstatus != pytest.ExitCode.OK:
+        return
+    if not any(reporter.stats.get(outcome) for outcome in ("passed", "failed", "xfailed", "xpassed")):
+        session.exitstatus = pytest.ExitCode.NO_TESTS_COLLECTED

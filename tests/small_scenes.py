@@ -1,0 +1,103 @@
+"""Small scenes, each with one feature that the analysis must recognise."""
+
+import jax.numpy as jnp
+
+import jourdain_jax as jj
+
+
+class DiscWithHeightRow(jj.Scene):
+    """A disc with six coordinates that rolls without slip; its height is a row."""
+
+    mass: jnp.ndarray = jj.parameter(1.0, unit="kg", positive=True)
+    radius: jnp.ndarray = jj.parameter(0.5, unit="m", positive=True)
+    gravity: jnp.ndarray = jj.parameter(9.81, unit="m/s^2")
+    coordinates = jj.coordinates("x y z yaw lean spin")
+    domain = {"yaw": (-3.2, 3.2), "lean": (-1.2, 1.2), "spin": (-3.2, 3.2)}
+
+    def bodies(self, t, q):
+        turned = jj.rot_z(q.yaw) @ jj.rot_x(q.lean) @ jj.rot_y(q.spin)
+        centre = jnp.stack([q.x, q.y, q.z])
+        return {"disc": jj.RigidBody.thin_disc(self.mass, self.radius, axis="y", position=centre, orientation=turned)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, self.gravity),)
+
+    def contacts(self, pose):
+        return {"rim": jj.disc_contact(pose["disc"], self.radius, axis="y", height="row")}
+
+
+class BeadOnTurningWire(jj.Scene):
+    """A bead on a straight wire that is turned at a given rate about the vertical: pose given as a function of time."""
+
+    mass: jnp.ndarray = jj.parameter(0.6, unit="kg", positive=True)
+    rate: jnp.ndarray = jj.parameter(1.7, unit="rad/s")
+    damping: jnp.ndarray = jj.parameter(0.0, unit="N s/m")
+    coordinates = jj.coordinates("r")
+    domain = {"r": (0.2, 1.0)}
+
+    def bodies(self, t, q):
+        angle = self.rate * t
+        return {"bead": jj.Particle(self.mass, q.r * jnp.stack([jnp.cos(angle), jnp.sin(angle), 0.0 * angle]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, r_rate=-self.damping * motion.u.r_rate),)
+
+
+class DrivenPendulum(jj.Scene):
+    """A pendulum whose pivot is driven sideways as a given function of time, by a prescribed coordinate; damped and sprung."""
+
+    mass: jnp.ndarray = jj.parameter(0.8, unit="kg", positive=True)
+    length: jnp.ndarray = jj.parameter(0.9, unit="m", positive=True)
+    stiffness: jnp.ndarray = jj.parameter(5.0, unit="N/m")
+    damping: jnp.ndarray = jj.parameter(0.3, unit="N s/m")
+    gravity: jnp.ndarray = jj.parameter(9.81, unit="m/s^2")
+    coordinates = jj.coordinates("pivot angle")
+    domain = {"angle": (-1.0, 1.0)}
+
+    def bodies(self, t, q):
+        hang = self.length * jnp.stack([jnp.sin(q.angle), 0.0 * q.angle, -jnp.cos(q.angle)])
+        pivot = jnp.stack([q.pivot, 0.0 * q.pivot, 0.0 * q.pivot])
+        return {"cart": jj.Particle(0.5 * self.mass, pivot), "bob": jj.Particle(self.mass, pivot + hang)}
+
+    def loads(self, motion):
+        bob = motion["bob"].point()
+        moving_end = jj.fixed_point(jnp.stack([jnp.cos(motion.t), 1.0 + 0.0 * motion.t, jnp.sin(3 * motion.t)]))
+        return (
+            jj.spring(bob, moving_end, self.stiffness, 0.2),
+            jj.damper(bob, jj.fixed_point((0.0, 1.0, 0.0)), self.damping),
+        )
+
+    def potential(self, pose):
+        return sum(body.mass * self.gravity * body.position[2] for body in pose.bodies.values())
+
+    def prescribed(self, t):
+        return {"pivot": 0.3 * jnp.sin(2.0 * t)}
+
+
+class Goursat(jj.Scene):
+    """Two particles with `q2dot = q3 q1dot`, `q3dot = q4 q1dot`, ...: brackets reach one new direction at a time."""
+
+    coordinates = jj.coordinates("q1 q2 q3 q4 q5 q6")
+    privileged = ("q1_rate", "q6_rate")
+
+    def bodies(self, t, q):
+        return {"first": jj.Particle(1.0, q.array[:3]), "second": jj.Particle(1.0, q.array[3:])}
+
+    def velocity_constraints(self, motion):
+        q, u = motion.q.array, motion.u.array
+        return {f"row {k}": u[k] - q[k + 1] * u[0] for k in range(1, 5)}
+
+
+class AffineRows(jj.Scene):
+    """A particle with an integrable row that is not homogeneous, and one that differs from an integrable row by `strength`."""
+
+    strength: jnp.ndarray = jj.parameter(0.0)
+    coordinates = jj.coordinates("x y z")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, q.array)}
+
+    def velocity_constraints(self, motion):
+        q, u = motion.q, motion.u
+        # exp(t) (dx + x dt) is the differential of x exp(t); dy - strength z dx is none, whatever its factor
+        return {"growing": u.x_rate + q.x, "sheet": u.y_rate - self.strength * q.z * u.x_rate}

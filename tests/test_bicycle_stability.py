@@ -1,0 +1,213 @@
+"""Stability speeds of linear bicycles: published numbers, eigenvalues on either side, and derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import meijaard
+from oracles.meijaard import meijaard_matrices
+from tolerances import tolerance
+
+from jourdain_jax.bicycle.characteristic import BicycleMatrices
+from jourdain_jax.bicycle.parameter_files import read_bicycle, shipped_bicycles
+from jourdain_jax.bicycle.polynomial_roots import real_roots
+from jourdain_jax.bicycle.stability import characteristic_polynomial, eigenvalues, stability_speeds
+from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
+
+jax.config.update("jax_enable_x64", True)
+
+BENCHMARK = (meijaard.BENCHMARK_M, meijaard.BENCHMARK_C1, meijaard.BENCHMARK_K0, meijaard.BENCHMARK_K2, 9.81)
+RIDEABLE = [name for name in shipped_bicycles() if name != "Tms"]
+
+speeds_of = jax.jit(stability_speeds)
+eigenvalues_of = jax.jit(eigenvalues)
+
+
+def _parameters(name):
+    return read_bicycle(shipped_bicycles()[name]).values
+
+
+def _matrices(parameters):
+    return BicycleMatrices(*meijaard_matrices(parameters), jnp.asarray(parameters["g"]))
+
+
+def _growth_rates(matrices, speed):
+    """Ascending real parts of numpy's eigenvalues of the first-order system, and their imaginary parts."""
+    M, C1, K0, K2, g = (np.asarray(matrix) for matrix in matrices)
+    system = np.block([
+        [np.zeros((2, 2)), np.eye(2)],
+        [-np.linalg.solve(M, g * K0 + speed**2 * K2), -np.linalg.solve(M, speed * C1)],
+    ])
+    values = np.linalg.eigvals(system)
+    return values[np.lexsort((values.imag, values.real))]
+
+
+def test_the_appendix_formulas_give_the_published_matrices():
+    for matrix, published in zip(_matrices(_parameters("Benchmark"))[:4], BENCHMARK[:4], strict=True):
+        np.testing.assert_allclose(matrix, published, rtol=1e-14, atol=1e-13)
+
+
+@pytest.mark.parametrize("row", meijaard.BENCHMARK_EIGENVALUES, ids=lambda row: f"v={row[0]:g}")
+def test_the_benchmark_eigenvalues_are_the_published_ones(row):
+    speed, castering, capsize, real, imaginary = row
+    weave = [real, imaginary] if speed == 0 else [real - 1j * imaginary, real + 1j * imaginary]
+    (found,) = eigenvalues_of(*BENCHMARK, np.array([speed]))
+    np.testing.assert_allclose(found, [castering, capsize, *weave], rtol=1e-12, atol=1e-12)
+
+
+def test_the_benchmark_speeds_are_the_published_ones():
+    found = speeds_of(*BENCHMARK)
+    close = {"rtol": 5e-14, "atol": 0}
+    np.testing.assert_allclose(found.weave_speed, meijaard.BENCHMARK_WEAVE_SPEED, **close)
+    np.testing.assert_allclose(found.capsize_speed, meijaard.BENCHMARK_CAPSIZE_SPEED, **close)
+    np.testing.assert_allclose(found.double_root_speed, meijaard.BENCHMARK_DOUBLE_ROOT_SPEED, **close)
+    np.testing.assert_allclose(found.weave_frequency, meijaard.BENCHMARK_WEAVE_FREQUENCY, **close)
+    np.testing.assert_allclose(found.double_root_eigenvalue, meijaard.BENCHMARK_DOUBLE_ROOT_EIGENVALUE, **close)
+    np.testing.assert_allclose(found.stable_from, found.weave_speed, **close)
+    np.testing.assert_allclose(found.stable_to, found.capsize_speed, **close)
+    assert bool(found.stable_range_exists)
+
+
+def test_the_characteristic_polynomial_is_zero_at_the_eigenvalues():
+    for speed in (0.0, 0.7, 3.0, 12.0):
+        coefficients = np.asarray(characteristic_polynomial(_matrices(_parameters("Rigid")), speed))
+        roots = np.roots(coefficients[::-1])
+        expected = _growth_rates(_matrices(_parameters("Rigid")), speed)
+        np.testing.assert_allclose(roots[np.lexsort((roots.imag, roots.real))], expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", RIDEABLE)
+def test_the_eigenvalues_cross_where_the_speeds_say(name):
+    matrices = _matrices(_parameters(name))
+    found = speeds_of(*matrices)
+
+    def weave(v):
+        values = _growth_rates(matrices, v)
+        return values[values.imag > 0][-1].real
+
+    def slowest_real(v):
+        values = _growth_rates(matrices, v)
+        return values[values.imag == 0].real.max()
+
+    assert weave(found.weave_speed * (1 - 1e-6)) > 0 > weave(found.weave_speed * (1 + 1e-6))
+    assert abs(weave(found.weave_speed)) < 1e-11
+    if np.isnan(found.capsize_speed):
+        assert all(slowest_real(v) < 0 for v in np.linspace(float(found.weave_speed), 50.0, 50))
+        assert float(found.stable_to) == 50.0
+    else:
+        assert slowest_real(found.capsize_speed * (1 - 1e-6)) < 0 < slowest_real(found.capsize_speed * (1 + 1e-6))
+
+    below, above = (_growth_rates(matrices, found.double_root_speed * (1 + shift))[2:] for shift in (-1e-6, 1e-6))
+    assert (below.imag == 0).all()
+    assert (above.imag != 0).all()
+    np.testing.assert_allclose([below.real, above.real], found.double_root_eigenvalue, rtol=1e-2)
+
+    assert bool(found.stable_range_exists)
+    middle = 0.5 * (found.stable_from + found.stable_to)
+    assert (_growth_rates(matrices, middle).real < 0).all()
+
+
+@pytest.mark.parametrize("name", ["Pista", "Rigid"])
+def test_modes_keep_their_names_along_the_speeds(name):
+    found = np.asarray(eigenvalues_of(*_matrices(_parameters(name)), np.linspace(0.0, 10.0, 401)))
+    assert np.abs(np.diff(found.real, axis=0)).max() < 0.6  # without names they would jump by several 1/s
+    assert (found[-1].imag[:2] == 0).all()
+    assert found[-1, 2] == np.conj(found[-1, 3])
+
+
+def test_a_bicycle_that_speed_does_not_change_has_no_stable_range():
+    # C1 = K2 = 0: it falls at every speed as it does at rest.
+    M, _, K0, _, g = BENCHMARK
+    found = speeds_of(M, np.zeros((2, 2)), K0, np.zeros((2, 2)), g)
+    assert np.isnan([found.weave_speed, found.capsize_speed, found.double_root_speed]).all()
+    assert np.isnan([found.weave_frequency, found.stable_from, found.stable_to]).all()
+    assert not bool(found.stable_range_exists)
+
+    def weave_and_double_root(M):
+        found = stability_speeds(M, np.zeros((2, 2)), K0, np.zeros((2, 2)), g)
+        return jnp.stack([found.weave_speed, found.weave_frequency, found.double_root_speed, found.capsize_speed])
+
+    assert (np.asarray(jax.jit(jax.jacrev(weave_and_double_root))(M)) == 0).all()
+
+
+def test_speeds_beyond_the_largest_are_not_reported():
+    found = speeds_of(*BENCHMARK, max_speed=5.0)
+    assert np.isnan(found.capsize_speed)
+    np.testing.assert_allclose([found.weave_speed, found.stable_to], [meijaard.BENCHMARK_WEAVE_SPEED, 5.0], rtol=1e-13)
+
+
+def test_speeds_scale_with_the_square_root_of_gravity_and_with_nothing_else():
+    M, C1, K0, K2, g = BENCHMARK
+    here, there = speeds_of(*BENCHMARK), speeds_of(*(7.0 * A for A in (M, C1, K0, K2)), 4.0 * g)
+    for name in ("weave_speed", "capsize_speed", "double_root_speed", "stable_from", "stable_to"):
+        np.testing.assert_allclose(getattr(there, name), 2.0 * getattr(here, name), rtol=1e-13)
+
+
+@pytest.mark.parametrize("quantity", ["weave_speed", "capsize_speed", "double_root_speed", "weave_frequency"])
+def test_derivatives_of_the_speeds_are_their_central_differences(quantity):
+    names = ("c", "lam", "zB", "IHzz", "g")
+    parameters = _parameters("Benchmark")
+
+    @jax.jit
+    def speed(changed):
+        changed = {**parameters, **dict(zip(names, changed, strict=True))}
+        return getattr(stability_speeds(*_matrices(changed)), quantity)
+
+    start = jnp.array([parameters[name] for name in names])
+    reverse, forward = jax.jit(jax.grad(speed))(start), jax.jit(jax.jacfwd(speed))(start)
+    np.testing.assert_allclose(reverse, forward, rtol=tolerance("round_off"))
+    for k, size in enumerate(np.abs(start)):
+        step = 1e-4 * size * np.eye(len(names))[k]
+        near, far = (speed(start + h * step) - speed(start - h * step) for h in (1, 2))
+        difference = (8 * near - far) / (12 * 1e-4 * size)  # fourth order
+        np.testing.assert_allclose(forward[k], difference, rtol=tolerance("gradient_fd"))
+
+
+def test_second_derivatives_of_a_speed_are_differences_of_the_first():
+    parameters = _parameters("Benchmark")
+
+    def weave(trail):
+        return stability_speeds(*_matrices({**parameters, "c": trail})).weave_speed
+
+    slope = jax.jit(jax.grad(weave))
+    difference = (slope(0.08 + 1e-5) - slope(0.08 - 1e-5)) / 2e-5
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.grad(weave)))(0.08), difference, rtol=tolerance("gradient_fd"))
+    np.testing.assert_allclose(jax.jit(jax.grad(jax.grad(weave)))(0.08), difference, rtol=tolerance("gradient_fd"))
+
+
+def test_a_missing_speed_does_not_spoil_the_derivatives_of_the_others():
+    parameters = _parameters("Yellowrev")
+
+    def speeds(parameters):
+        found = stability_speeds(*_matrices(parameters))
+        return jnp.stack([found.weave_speed, found.capsize_speed])
+
+    found, pull_back = jax.vjp(jax.jit(speeds), parameters)
+    assert np.isnan(found[1])
+    assert all(np.isfinite(derivative) for derivative in pull_back(jnp.array([1.0, 0.0]))[0].values())
+
+
+def test_two_thousand_measured_bicycles_give_limits_on_the_speeds():
+    bicycle = read_bicycle(shipped_bicycles()["Browser"])
+    samples = sample_parameters(bicycle, jax.random.key(0), 2000)
+    batch = jax.jit(jax.vmap(lambda parameters: stability_speeds(*_matrices(parameters))))
+    found, nominal = batch(samples.by_name()), speeds_of(*_matrices(bicycle.values))
+    one = speeds_of(*_matrices({name: column[7] for name, column in samples.by_name().items()}))
+    np.testing.assert_allclose(found.weave_speed[7], one.weave_speed, rtol=1e-12)
+    np.testing.assert_allclose(found.capsize_speed[7], one.capsize_speed, rtol=1e-12)
+    weave = interval(found.weave_speed, nominal=nominal.weave_speed, counted=samples.physical)
+    assert float(weave.fraction) == 1.0
+    assert float(weave.low) < float(weave.value) < float(weave.high)
+    # Linear propagation: half the width of the interval is 1.96 standard deviations.
+    slopes = jax.jit(jax.grad(lambda parameters: stability_speeds(*_matrices(parameters)).weave_speed))(bicycle.values)
+    sigma = np.sqrt(sum((slopes[name] * bicycle.sigmas[name]) ** 2 for name in slopes))
+    np.testing.assert_allclose((weave.high - weave.low) / 2, 1.96 * sigma, rtol=0.08)
+
+
+def test_all_real_roots_in_an_interval_are_found_and_no_others():
+    for expected in ([0.5, 1.0, 1.5], [0.1, 0.2, 0.3, 0.4, 1.9], []):
+        inside = np.polynomial.polynomial.polyfromroots([*expected, -1.0, 2.5])
+        coefficients = np.polynomial.polynomial.polymul(inside, [1.0, 0.0, 1.0])
+        found = np.asarray(real_roots(list(jnp.asarray(coefficients)), jnp.asarray(0.0), jnp.asarray(2.0)))
+        np.testing.assert_allclose(found[: len(expected)], expected, rtol=1e-10)
+        assert np.isnan(found[len(expected) :]).all()

@@ -1,0 +1,81 @@
+"""The wrong mode of differentiation is answered by an error of our own, the right one by the right derivative."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jourdain_jax.calculus.guards import DifferentiationModeError, forward_only, reverse_only
+
+
+def decay(rate, adjoint):
+    """`sum y(1)` of `ydot = -rate y` from ones."""
+    controller = diffrax.PIDController(rtol=1e-10, atol=1e-10)
+    term = diffrax.ODETerm(lambda t, y, rate: -y * rate)
+    solution = diffrax.diffeqsolve(term, diffrax.Tsit5(), 0.0, 1.0, None, jnp.ones(2), rate, stepsize_controller=controller, adjoint=adjoint, throw=False)
+    return jnp.sum(solution.ys)
+
+
+def reverse(rate):
+    return decay(reverse_only(rate), diffrax.RecursiveCheckpointAdjoint())
+
+
+def forward(rate):
+    return forward_only(decay(rate, diffrax.ForwardMode()))
+
+
+FORWARD_USES = {
+    "jacfwd": jax.jacfwd(reverse),
+    "jacfwd of jit": jax.jacfwd(eqx.filter_jit(reverse)),
+    "jit of jacfwd": jax.jit(jax.jacfwd(reverse)),
+    "jit of jacfwd of jit": jax.jit(jax.jacfwd(jax.jit(reverse))),
+    "jvp": lambda x: jax.jvp(reverse, (x,), (x,)),
+    "jvp of jit": lambda x: jax.jvp(jax.jit(reverse), (x,), (x,)),
+}
+SECOND_USES = {
+    "hessian": jax.hessian(reverse),
+    "grad of grad": jax.grad(jax.grad(reverse)),
+    "grad of grad of jit": jax.grad(lambda x: jax.grad(eqx.filter_jit(reverse))(x)),
+    "jit of grad of grad": jax.jit(jax.grad(jax.grad(reverse))),
+}
+
+
+@pytest.mark.parametrize("use", FORWARD_USES)
+def test_forward_mode_through_a_reverse_only_adjoint_names_the_adjoint_to_use(use):
+    with pytest.raises(DifferentiationModeError, match="ForwardMode"):
+        FORWARD_USES[use](1.0)
+
+
+@pytest.mark.parametrize("use", SECOND_USES)
+def test_second_derivatives_through_a_reverse_only_adjoint_name_the_adjoint_to_use(use):
+    with pytest.raises(DifferentiationModeError, match="DirectAdjoint"):
+        SECOND_USES[use](1.0)
+
+
+@pytest.mark.parametrize("use", [jax.grad(forward), jax.jit(jax.grad(jax.jit(forward)))])
+def test_reverse_mode_through_a_forward_only_adjoint_names_the_adjoint_to_use(use):
+    with pytest.raises(DifferentiationModeError, match="RecursiveCheckpointAdjoint"):
+        use(1.0)
+
+
+BATCHED_REVERSE = {
+    "vmap of grad": jax.vmap(jax.grad(reverse)),
+    "jit of vmap of grad of jit": jax.jit(jax.vmap(jax.grad(jax.jit(reverse)))),
+    "grad of vmap": jax.grad(lambda x: jnp.sum(jax.vmap(reverse)(x))),
+    "grad of vmap of jit": jax.jit(jax.grad(lambda x: jnp.sum(jax.vmap(eqx.filter_jit(reverse))(x)))),
+    "grad of checkpoint": jax.grad(jax.checkpoint(lambda x: jnp.sum(jax.vmap(reverse)(x)))),
+    "grad of map": jax.grad(lambda x: jnp.sum(jax.lax.map(reverse, x))),
+    "diagonal of jacrev": lambda x: jnp.diagonal(jax.jacrev(jax.jit(jax.vmap(reverse)))(x)),
+}
+
+
+@pytest.mark.parametrize("use", BATCHED_REVERSE)
+def test_first_order_reverse_mode_passes_the_marker_under_any_nesting(use):
+    rates = jnp.array([1.0, 2.0, 3.0])
+    np.testing.assert_allclose(BATCHED_REVERSE[use](rates), -2 * np.exp(-np.asarray(rates)), rtol=1e-8)
+
+
+def test_forward_over_forward_passes_the_forward_only_marker():
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(forward)))(1.0), 2 * np.exp(-1.0), rtol=1e-8)

@@ -1,0 +1,443 @@
+"""Identification: estimates from synthetic measurements, their coverage, what cannot be told, and advice on bad input.
+
+Measurements come from closed forms or hand-written equations (tests/oracles), not from the engine.
+"""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import chaplygin_sleigh as sleigh_oracle
+from oracles import rattleback as rattleback_oracle
+
+import jourdain_jax as jj
+from jourdain_jax.analysis.bijections import bounds, positive, unbounded
+from jourdain_jax.analysis.fit import fit, fit_batch
+from jourdain_jax.analysis.information import hidden_combinations, information
+from jourdain_jax.analysis.likelihood import log_likelihood
+from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
+from jourdain_jax.models.rattleback import Rattleback
+from jourdain_jax.motion.forward_mode import simulate_forward
+
+REPEATS = 200
+SIGMA = 0.02  # m, rad
+TRUTH = ChaplyginSleigh()
+GUESS = TRUTH.replace(inertia=0.6, offset=0.35)
+SLEIGH_START = {"x_rate": -0.6, "heading_rate": 0.9}
+
+
+def sleigh_data(seed: int, repeats: tuple[int, ...] = ()) -> Measurements:
+    """Position of the mass centre and heading of the default sleigh at 41 times over 8 s."""
+    ts = np.linspace(0.0, 8.0, 41)
+    parameters = {"mass": 1.3, "inertia": 0.4, "a": 0.25, "v0": -0.6, "w0": 0.9}
+    motion = sleigh_oracle.motion(ts, **parameters)
+    noise = np.random.default_rng(seed)
+    exact = {"x": motion["x"], "y": motion["y"], "heading": motion["th"]}
+    return Measurements(
+        ts, {k: v + SIGMA * noise.normal(size=(*repeats, 41)) for k, v in exact.items()}, SIGMA, start=SLEIGH_START
+    )
+
+
+@pytest.fixture(scope="module")
+def sleigh_fit():
+    return fit(GUESS, sleigh_data(0), ("inertia", "offset"))
+
+
+@pytest.fixture(scope="module")
+def sleigh_batch():
+    return fit_batch(GUESS, sleigh_data(1, (REPEATS,)), ("inertia", "offset"))
+
+
+def near(estimate, truth: float, errors: float = 4.0) -> bool:
+    """Within so many standard errors."""
+    return abs(float(estimate.value) - truth) <= errors * float(estimate.standard_error)
+
+
+# The sleigh. ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_sleigh_is_identified(sleigh_fit):
+    assert sleigh_fit.converged
+    assert sleigh_fit.warning == ""
+    assert near(sleigh_fit["inertia"], 0.4)
+    assert near(sleigh_fit["offset"], 0.25)
+    assert sleigh_fit["offset"].standard_error < 1e-3
+    assert sleigh_fit.not_identifiable == ()
+    assert 0.6 < sleigh_fit.reduced_chi_square < 1.4  # 121 degrees of freedom: standard deviation 0.13
+    assert float(sleigh_fit.scene.offset) == float(sleigh_fit["offset"].value)
+    assert float(sleigh_fit.scene.mass) == 1.3
+
+
+def test_covariance_is_that_of_central_differences(sleigh_fit):
+    data, step = sleigh_data(0), 1e-5
+    simulate = eqx.filter_jit(lambda scene: simulate_forward(scene, SLEIGH_START, ts=data.ts, rtol=1e-11, atol=1e-11).q)
+    scene = sleigh_fit.scene
+    columns = []
+    for name in ("inertia", "offset"):
+        value = float(getattr(scene, name))
+        apart = [simulate(scene.replace(**{name: value * (1 + sign * step)})) for sign in (1, -1)]
+        columns.append(np.ravel(apart[0] - apart[1]) / (2 * value * step * SIGMA))
+    J = np.stack(columns, axis=1)
+    np.testing.assert_allclose(
+        sleigh_fit.covariance, np.linalg.inv(J.T @ J), rtol=1e-4
+    )  # simulation at 1e-8, differences at 1e-5
+    np.testing.assert_allclose(sleigh_fit.correlation[0, 1], sleigh_fit.covariance[0, 1] / np.prod(sleigh_fit.standard_errors))
+
+
+def test_intervals_cover_the_truth_in_90_to_99_percent_of_200_repeats(sleigh_batch):
+    assert sleigh_batch.converged.shape == (REPEATS,)
+    assert sleigh_batch.converged.all()
+    for name in ("inertia", "offset"):
+        estimate, truth = sleigh_batch[name], float(getattr(TRUTH, name))
+        covered = np.mean((estimate.low < truth) & (truth < estimate.high))
+        assert 0.90 <= covered <= 0.99, (name, covered)
+        # spread of the estimates against the error each claims: 5 % is the sampling error of a deviation from 200
+        assert float(np.std(estimate.value)) == pytest.approx(float(np.mean(estimate.standard_error)), rel=0.2)
+    assert "200 fits of ChaplyginSleigh: 200 converged" in str(sleigh_batch)
+
+
+def test_a_batch_gives_what_single_fits_give(sleigh_batch):
+    data = sleigh_data(1, (REPEATS,))
+    one = eqx.tree_at(lambda d: d.values, data, {name: values[17] for name, values in data.values.items()})
+    single = fit(GUESS, one, ("inertia", "offset"))
+    apart = np.abs(single.values - sleigh_batch.values[17]) / single.standard_errors
+    assert apart.max() < 1e-2  # both stop within the tolerance of the minimum
+    np.testing.assert_allclose(single.standard_errors, sleigh_batch.standard_errors[17], rtol=1e-4)
+
+
+def test_mass_and_inertia_of_the_sleigh_are_named_as_inseparable(sleigh_fit):
+    found = fit(GUESS.replace(mass=1.0), sleigh_data(0), ("mass", "inertia", "offset"))
+    assert found.converged
+    assert int(found.information.rank) == 2
+    (sentence,) = found.not_identifiable
+    assert "`mass` and `inertia` do not show separately" in sentence
+    assert "d mass/mass : d inertia/inertia = 1 : 1" in sentence
+    assert "what shows is inertia mass^-1" in sentence
+    for name in ("mass", "inertia"):
+        assert np.isnan([found[name].standard_error, found[name].low, found[name].high]).all()
+    # the offset, and the ratio that shows, are those of the fit with the mass known
+    offset, known = found["offset"], sleigh_fit["offset"]
+    np.testing.assert_allclose([offset.value, offset.low, offset.high], [known.value, known.low, known.high], atol=1e-6)
+    ratio = found["inertia"].value / found["mass"].value
+    assert ratio == pytest.approx(float(sleigh_fit["inertia"].value) / 1.3, rel=1e-4)
+    table = str(found)
+    assert "none" in table
+    assert "singular values below 1e-06 of the largest count as zero" in table
+
+
+def test_printed_table(sleigh_fit):
+    text = str(sleigh_fit)
+    assert "Fit of ChaplyginSleigh: converged in" in text
+    assert "123 samples, 2 unknowns" in text
+    assert f"{float(sleigh_fit['offset'].value):.6g}" in text
+    assert "heading  41" in text
+    assert "WARNING" not in text
+    for summary in sleigh_fit.residual_summary():
+        assert summary.samples == 41
+        assert 0.6 < summary.rms < 1.4
+    with pytest.raises(KeyError, match="did you mean `offset`"):
+        sleigh_fit["ofset"]
+
+
+# The rattleback. --------------------------------------------------------------------------------------------------------
+
+
+def test_the_rattleback_and_its_unknown_tilt_are_identified():
+    ts = np.linspace(0.0, 0.5, 26)
+    start = {"alpha": 0.1, "beta": 0.01, "w1": 0.0, "w2": 0.0, "w3": -5.0}
+    motion = rattleback_oracle.motion(ts, **{**rattleback_oracle.RUN, **start})
+    noise, sigma = np.random.default_rng(2), {"w1": 0.05, "w3": 0.02}
+    values = {name: motion[name] + s * noise.normal(size=26) for name, s in sigma.items()}
+    data = Measurements(ts, values, sigma, start={**start, "alpha": 0.105}, unknown_start=("alpha",))
+    found = fit(Rattleback(D=-0.24e-4, h=0.0104), data, ("D", "h"), rtol=1e-7, atol=1e-7)
+    assert found.warning == ""
+    assert found.not_identifiable == ()
+    assert near(found["D"], -0.2e-4)
+    assert near(found["h"], 0.01)
+    assert near(found["run 0: alpha"], 0.1)
+    assert found["D"].standard_error < 0.05 * 0.2e-4
+    assert float(found.starts[0]["alpha"]) == float(found["run 0: alpha"].value)
+
+
+# A cart with a spring, a damper and a push: quick, and with inputs. ------------------------------------------------------
+
+
+class Cart(jj.Scene):
+    """`m x'' = push - c x' - k x`."""
+
+    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
+    damping: jnp.ndarray = jj.parameter(0.6, unit="N s/m", non_negative=True)
+    stiffness: jnp.ndarray = jj.parameter(5.0, unit="N/m")
+
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("push")
+
+    def bodies(self, t, q):
+        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        force = motion.inputs.push - self.damping * motion.u.x_rate - self.stiffness * motion.q.x
+        return (jj.generalized_force(motion, x_rate=force),)
+
+
+CART = Cart()
+TS = np.linspace(0.0, 4.0, 21)
+
+
+def cart_motion(ts, x0, v0, push):
+    """x and v of the cart under a push that is constant in time, in closed form."""
+    rest, rate = push / 5.0, 0.6 / 4.0
+    w = np.sqrt(5.0 / 2.0 - rate**2)
+    a, b = x0 - rest, (v0 + rate * (x0 - rest)) / w
+    decay = np.exp(-rate * ts)
+    x = rest + decay * (a * np.cos(w * ts) + b * np.sin(w * ts))
+    return x, -rate * (x - rest) + decay * w * (b * np.cos(w * ts) - a * np.sin(w * ts))
+
+
+def cart_run(x0=0.3, v0=0.0, push=1.0, ts=TS, **options) -> Measurements:
+    """A run without noise; the push comes as samples."""
+    x, v = cart_motion(ts, x0, v0, push)
+    sampled = jj.Sampled(jnp.array([0.0, 10.0]), jnp.array([push, push]))
+    given = {"values": {"x": x, "x_rate": v}, "sigma": {"x": 0.01, "x_rate": 0.02}, "start": {"x": x0, "x_rate": v0}}
+    given |= {"inputs": {"push": sampled}} | options
+    return Measurements(ts, given.pop("values"), given.pop("sigma"), **given)
+
+
+def test_several_runs_with_sampled_inputs_bounds_and_unknown_starts():
+    runs = [
+        cart_run(),
+        cart_run(x0=-0.2, v0=0.5, push=-0.5, start={"x": -0.1, "x_rate": 0.5}, unknown_start={"x": bounds(-1.0, 1.0)}),
+        cart_run(x0=0.1, push=2.0, ts=TS[:11]),
+        cart_run(x0=0.4, push=0.0),
+    ]
+    free = {"mass": bounds(0.5, 5.0), "damping": None, "stiffness": unbounded(10.0)}
+    found = fit(Cart(mass=1.5, damping=0.9, stiffness=6.5), runs, free)
+    assert found.labels == ("mass", "damping", "stiffness", "run 1: x")
+    assert found.units == ("kg", "N s/m", "N/m", "")
+    assert found.converged
+    # without noise the estimates are the truth, to the accuracy of the simulation
+    np.testing.assert_allclose(found.values, [2.0, 0.6, 5.0, -0.2], rtol=1e-6)
+    assert found.chi_square < 1e-8
+    assert int(found.samples) == 2 * (3 * 21 + 11)
+    assert [residual["x"].shape for residual in found.residuals] == [(21,), (21,), (11,), (21,)]
+    assert all(found.low < found.values)
+    assert all(found.values < found.high)
+
+
+def test_runs_of_equal_shape_are_traced_once_and_repeated_fits_not_at_all():
+    traces = []
+
+    def position(motion):
+        traces.append(1)
+        return motion["cart"].position
+
+    def run(x0):
+        x, _ = cart_motion(TS, x0, 0.0, 0.0)
+        path = np.stack([x, 0 * x, 0 * x], axis=1)
+        return Measurements(TS, {"cart": path}, 0.01, start={"x": x0, "x_rate": 0.0}, functions={"cart": position})
+
+    first = fit(Cart(mass=1.5), [run(0.3)], ("mass",))
+    alone = len(traces)
+    traces.clear()
+    both = fit(Cart(mass=1.5), [run(0.3), run(-0.5)], ("mass",))
+    together = len(traces)
+    assert together <= alone + 1  # one more look at the shape of the second run's channel
+    traces.clear()
+    again = fit(Cart(mass=1.7), [run(0.2), run(-0.4)], ("mass",))
+    assert len(traces) <= 2  # at most the shapes of the two channels
+    for found in (first, both, again):
+        assert float(found["mass"].value) == pytest.approx(2.0, rel=1e-6)
+
+
+def test_missing_samples_and_sigmas_per_sample():
+    x, _ = cart_motion(TS, 0.3, 0.0, 1.0)
+    x = np.where(np.arange(21) % 2 == 0, x, 99.0)
+    sigma = np.where(np.arange(21) % 2 == 0, 0.01, np.inf)
+    data = cart_run(values={"x": x}, sigma={"x": sigma})
+    found = fit(Cart(mass=1.7), data, ("mass",))
+    assert int(found.samples) == 11
+    assert float(found["mass"].value) == pytest.approx(2.0, rel=1e-6)
+    assert np.isnan(found.residuals[0]["x"][1::2]).all()
+    assert found.residual_summary()[0].samples == 11
+
+
+def test_log_likelihood_is_the_gaussian_one_and_differentiable():
+    data = cart_run(x0=0.3)
+    scene = Cart(mass=2.02)
+
+    @jax.jit
+    def value(mass):
+        return log_likelihood(scene.replace(mass=mass), data, adjoint=diffrax.ForwardMode())  # compiles in a quarter of the time
+
+    found, slope = jax.jvp(value, (2.02,), (1.0,))
+    motion = jj.simulate(scene, {"x": 0.3, "x_rate": 0.0}, ts=TS, inputs={"push": 1.0})
+    r = np.concatenate([(motion["x"] - data.values["x"]) / 0.01, (motion["x_rate"] - data.values["x_rate"]) / 0.02])
+    expected = -0.5 * np.sum(r**2) - 21 * np.log(0.01 * 0.02) - 21 * np.log(2 * np.pi)
+    assert found == pytest.approx(expected, rel=1e-9)
+    step = 1e-4
+    assert slope == pytest.approx(float(value(2.02 + step) - value(2.02 - step)) / (2 * step), rel=1e-5)
+    assert log_likelihood(scene, data, max_steps=2) == -np.inf
+
+
+def test_a_parameter_at_its_bound_is_said_to_be_there():
+    found = fit(Cart(mass=3.0), cart_run(), {"mass": bounds(2.5, 4.0)})
+    assert found.at_bound.all()
+    assert "`mass` lies at a bound" in found.warning
+    assert "WARNING: `mass` lies at a bound" in str(found)
+    assert np.isnan(found["mass"].low)
+
+
+def test_a_motion_that_fails_gives_a_flag_and_no_numbers():
+    found = fit(Cart(mass=1.7), cart_run(), ("mass",), max_steps=2)
+    assert not found.converged
+    assert "the motion fails at the first guess" in found.warning
+    assert "NOT CONVERGED" in str(found)
+    assert np.isnan([found["mass"].standard_error, found["mass"].low]).all()
+
+
+def test_too_few_iterations_and_wrong_sigmas_are_warned_of():
+    found = fit(Cart(mass=1.5), cart_run(), ("mass",), max_iterations=2)
+    assert not found.converged
+    assert "no minimum was found" in found.warning
+    data = cart_run()
+    shaken = {name: values + 0.1 * np.sin(5.0 * TS) for name, values in data.values.items()}
+    assert "residuals are larger than the sigmas allow" in fit(Cart(mass=1.7), cart_run(values=shaken), ("mass",)).warning
+
+
+def test_one_bad_repeat_harms_no_other():
+    data = cart_run()
+    values = {name: np.stack([v, np.full_like(v, 1e300), v]) for name, v in data.values.items()}
+    found = fit_batch(Cart(mass=1.7), cart_run(values=values), ("mass",))
+    assert found.converged.tolist() == [True, False, True]
+    np.testing.assert_allclose(found["mass"].value[::2], 2.0, rtol=1e-6)
+
+
+# Information. -------------------------------------------------------------------------------------------------------------
+
+
+def test_information_of_full_rank_is_the_inverse():
+    J = np.random.default_rng(0).normal(size=(30, 3)) * np.array([1.0, 100.0, 1e-3])
+    found = information(jnp.asarray(J), jnp.array([1.0, 0.01, 1e3]), 1e-6)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(J.T @ J), rtol=1e-9)
+    assert int(found.rank) == 3
+    assert found.identifiable.all()
+
+
+def test_information_of_deficient_rank_keeps_the_unknowns_that_are_not_involved():
+    generator = np.random.default_rng(1)
+    shown, alone = generator.normal(size=(30, 1)), generator.normal(size=(30, 1))
+    size = jnp.array([2.0, 5.0, 3.0])
+    # only theta_0^2 theta_2 shows, and theta_1
+    J = np.concatenate([2 * shown / 2.0, alone / 5.0, shown / 3.0], axis=1)
+    found = information(jnp.asarray(J), size, 1e-6)
+    assert int(found.rank) == 2
+    assert found.identifiable.tolist() == [False, True, False]
+    pair = np.concatenate([shown, alone / 5.0], axis=1)
+    assert found.covariance[1, 1] == pytest.approx(np.linalg.inv(pair.T @ pair)[1, 1], rel=1e-9)
+    assert np.isnan(found.covariance[0]).all()
+    hidden = np.asarray(found.directions)[2:]
+    (sentence,) = hidden_combinations(hidden, np.asarray(size), np.array([2.0, 5.0, 3.0]), ("p", "q", "r"))
+    assert "`p` and `r` do not show separately: no channel changes along d p/p : d r/r = -0.5 : 1" in sentence
+    assert "what shows is r p^2" in sentence
+
+
+def test_two_hidden_directions_and_a_parameter_that_does_nothing():
+    # d theta_0/theta_0 = d theta_2/theta_2, with theta_1 = 0 counted in its own unit; theta_3 does nothing
+    directions = np.linalg.qr(np.array([[1.0, 0.5, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]).T)[0].T
+    turned = np.array([[0.6, 0.8], [-0.8, 0.6]]) @ directions
+    sentences = hidden_combinations(turned, np.ones(4), np.array([1.0, 0.0, 1.0, 1.0]), ("a", "b", "c", "d"))
+    assert any(s == "`d` does not show in any channel" for s in sentences)
+    assert any("`a` and `b` and `c`" in s and "d a/a : d b : d c/c = 1 : 0.5 : 1" in s for s in sentences)
+    assert len(sentences) == 2
+    # where two directions share an unknown, no product of powers of two unknowns shows
+    rows = np.linalg.qr(np.array([[1.0, 0.0, 0.4], [0.0, 1.0, 0.3]]).T)[0].T
+    for sentence in hidden_combinations(rows, np.ones(3), np.ones(3), ("a", "b", "c")):
+        assert "`c` do not show separately" in sentence
+        assert "what shows" not in sentence
+
+
+def test_bijections_are_inverses_within_their_bounds():
+    guess = jnp.array(0.7)
+    for bijection in (bounds(0.1, 2.0), positive(), unbounded(), unbounded(3.0)):
+        assert bijection.value(bijection.coordinate(guess), guess) == pytest.approx(0.7, rel=1e-14)
+    far = jnp.array([-30.0, 30.0])
+    assert (bounds(0.1, 2.0).value(far, guess) >= 0.1).all()
+    assert (bounds(0.1, 2.0).value(far, guess) <= 2.0).all()
+    assert (positive().value(far, guess) > 0).all()
+
+
+# Bad input. ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("call", "advice"),
+    [
+        (lambda: fit(CART, cart_run(), ("mas",)), "`mas`, which is no parameter of `Cart`; did you mean `mass`"),
+        (lambda: fit(CART, cart_run(), ()), "nothing is free; name parameters in `free`"),
+        (lambda: fit(CART, cart_run(), {"mass": 3.0}), "`mass` was given 3.0; expected `bounds"),
+        (
+            lambda: fit(CART, cart_run(), {"mass": bounds(3.0, 4.0)}),
+            "first guess of `mass` is 2.0; expected a first guess between",
+        ),
+        (
+            lambda: fit(Cart(damping=0.0), cart_run(), ("damping",)),
+            "first guess of `damping` is 0.0; expected a first guess above",
+        ),
+        (lambda: fit(CART, [], ("mass",)), "`data` must be a `Measurements` or a sequence"),
+        (
+            lambda: fit(CART, cart_run(values={"x_rat": TS}, sigma=1.0), ("mass",)),
+            "unknown channel `x_rat`; did you mean `x_rate`",
+        ),
+        (lambda: fit(CART, cart_run(start={"y": 0.0}), ("mass",)), "no coordinate or speed `y`"),
+        (lambda: fit(CART, cart_run(inputs={"pus": 1.0}), ("mass",)), "no input `pus`; did you mean `push`"),
+        (lambda: fit(CART, cart_run(values={"x": TS[:5]}, sigma=1.0), ("mass",)), r"shape \(5,\), expected \(21,\) for 21 times"),
+        (lambda: fit(CART, cart_run(values={"x": np.ones((3, 21))}, sigma=1.0), ("mass",)), "many repeats go to `fit_batch`"),
+        (lambda: fit(CART, cart_run(sigma={"x": np.ones(5), "x_rate": 1.0}), ("mass",)), r"sigma of channel `x`.*shape \(5,\)"),
+        (lambda: fit_batch(CART, cart_run(), ("mass",)), r"expected \(repeats, 21\)"),
+        (
+            lambda: fit_batch(CART, cart_run(values={"x": np.ones((3, 21)), "x_rate": np.ones((2, 21))}, sigma=1.0), ("mass",)),
+            r"hold \[2, 3\] repeats",
+        ),
+        (
+            lambda: fit(CART, cart_run(values={"x": [0.1, 0.2]}, sigma=1.0, ts=TS[:2]), ("mass", "damping", "stiffness")),
+            "2 measured values cannot determine 3 unknowns",
+        ),
+        (lambda: cart_run(sigma={"x": 0.0, "x_rate": 1.0}), "sigma of channel `x` must be above zero"),
+        (lambda: cart_run(sigma={"x": np.nan, "x_rate": 1.0}), "sigma of channel `x` must be above zero"),
+        (lambda: cart_run(sigma={"x": 0.1}), "channel `x_rate` has no sigma"),
+        (lambda: cart_run(sigma={"x": 0.1, "x_rate": 1.0, "y": 1.0}), "`sigma` names channel `y`"),
+        (lambda: cart_run(values={"x": np.where(TS[4] == TS, np.nan, TS)}, sigma=1.0), "not finite, the first at sample 4"),
+        (lambda: cart_run(values={}, sigma=1.0), "`values` is empty"),
+        (lambda: cart_run(ts=TS[::-1]), "`ts` must be finite and strictly increasing"),
+        (lambda: cart_run(ts=np.where(TS[4] == TS, np.nan, TS)), "`ts` must be finite and strictly increasing"),
+        (lambda: Measurements(TS[:0], {"x": TS}, 1.0, start={}), "expected a vector of at least one time"),
+        (lambda: cart_run(t0=1.0), "the start at t0 = 1.0 s comes after the first sample"),
+        (lambda: cart_run(unknown_start=("y",)), "unknown start value `y` has no first guess"),
+        (lambda: cart_run(functions={"place": lambda motion: motion.q.x}), "function `place` has no measured values"),
+        (lambda: bounds(2.0, 1.0), "expected finite numbers low < high"),
+        (lambda: bounds(0.0, np.inf), "for one bound at zero use `positive"),
+        (lambda: unbounded(0.0), "expected a positive scale"),
+    ],
+)
+def test_bad_input_gets_advice(call, advice):
+    with pytest.raises(ValueError, match=advice):
+        call()
+
+
+def test_start_values_that_depend_on_each_other_are_refused():
+    data = sleigh_data(0)
+    consistent = {"x_rate": -0.6, "y_rate": 0.25 * 0.9, "heading_rate": 0.9}
+
+    def run(start, **options):
+        return Measurements(data.ts, data.values, SIGMA, start=start, **options)
+
+    # y_rate follows from the offset, which is to change
+    with pytest.raises(ValueError, match=r"the start of run 0 no longer meets the constraints when the unknowns change.*`blade`"):
+        fit(TRUTH, run(consistent), ("offset",))
+    with pytest.raises(ValueError, match="no longer meets the constraints"):
+        fit(TRUTH, run(consistent, unknown_start=("x_rate", "y_rate", "heading_rate")), ("inertia",))
+    with pytest.raises(ValueError, match=r"the start of run 1 is not admissible.*contradicts row `blade`"):
+        fit(TRUTH, [data, run({"y_rate": 1.0, "x_rate": 0.0, "heading_rate": 0.0})], ("inertia",))

@@ -1,0 +1,110 @@
+"""Particles under one row: Rosenberg's and Heisenberg's, a spring and a rod, and one of constant speed."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from closed_form_runs import end_error
+from oracles import heisenberg_particle, isokinetic_particle, rosenberg_particle, spring_and_rod
+from solved_states import solved_at_random_states, solved_by_every_reduction
+from tolerances import relative_error, tolerance
+
+from jourdain_jax.models.heisenberg_particle import HeisenbergParticle
+from jourdain_jax.models.isokinetic_particle import IsokineticParticle
+from jourdain_jax.models.rosenberg_particle import RosenbergParticle
+from jourdain_jax.models.spring_and_rod import SpringAndRod
+
+ROUND_OFF, CLOSED_FORM = tolerance("round_off"), tolerance("closed_form")
+
+
+def test_rosenbergs_particle_is_bent_by_its_row():
+    q, u, udot, _ = solved_at_random_states(RosenbergParticle(mass=1.7))
+    ax = -q.y * u.x_rate * u.y_rate / (1 + q.y**2)  # xdot sqrt(1 + y^2) is constant
+    expected = jnp.stack([ax, jnp.zeros_like(ax), u.x_rate * u.y_rate + q.y * ax], axis=1)
+    assert relative_error(udot.array, expected) <= ROUND_OFF
+
+
+@pytest.mark.parametrize("b", [rosenberg_particle.RUN["b"], 0.0])
+def test_rosenbergs_particle_follows_its_closed_form(b):
+    run = rosenberg_particle.RUN | {"b": b}
+    start = {"y": run["y0"], "x_rate": run["c"] / np.sqrt(1 + run["y0"] ** 2), "y_rate": b}
+
+    def expected(times):
+        motion = rosenberg_particle.motion(times, **run)
+        return {name: motion[name] for name in ("x", "y", "z")}
+
+    assert end_error(RosenbergParticle(), start, expected, run["t_end"]) <= CLOSED_FORM
+
+
+def test_heisenbergs_particle_needs_no_constraint_force():
+    solved = solved_at_random_states(HeisenbergParticle(mass=1.7))[-1]
+    assert jnp.max(jnp.abs(solved.udot)) <= ROUND_OFF
+    assert jnp.max(jnp.abs(solved.multipliers)) <= ROUND_OFF
+
+
+def test_heisenbergs_particle_moves_straight_and_not_in_helices():
+    run = heisenberg_particle.RUN
+    start = {"x": run["x0"], "y": run["y0"], "x_rate": run["xdot"], "y_rate": run["ydot"]}
+
+    def expected(times):
+        motion = heisenberg_particle.motion(times, **run)
+        return {name: motion[name] for name in ("x", "y", "z")}
+
+    assert end_error(HeisenbergParticle(), start, expected, run["t_end"]) <= CLOSED_FORM
+
+
+def _rod_run(**changes):
+    """Scene, start and closed form of the spring with the rod."""
+    run = spring_and_rod.RUN | changes
+    scene = SpringAndRod(
+        mass1=run["masses"][0],
+        mass2=run["masses"][1],
+        stiffness=run["stiffness"],
+        natural_length=run["natural_length"],
+        damping=run["damping"],
+        rod_length=np.hypot(*np.subtract(run["r0"][1], run["r0"][0])),
+        gravity=run["gravity"],
+    )
+    places = dict(zip(("x1", "z1", "x2", "z2"), np.ravel(run["r0"]), strict=True))
+    rates = dict(zip(("x1_rate", "z1_rate", "x2_rate", "z2_rate"), np.ravel(run["v0"]), strict=True))
+
+    def expected(times):
+        r = spring_and_rod.motion(times, **run)["r"]
+        return {"x1": r[:, 0, 0], "z1": r[:, 0, 1], "x2": r[:, 1, 0], "z2": r[:, 1, 1]}
+
+    return scene, places | rates, expected, run
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.8])
+def test_spring_and_rod_follow_newtons_equations(damping):
+    # the rod turns through level and upright: no fixed pair of rates stays privileged
+    scene, start, expected, run = _rod_run(damping=damping)
+    assert end_error(scene, start, expected, run["t_end"]) <= CLOSED_FORM
+
+
+def test_the_rods_multiplier_is_its_thrust():
+    scene, start, _, run = _rod_run()
+    q, u, _ = scene.named(**start)
+    tension = spring_and_rod.motion(np.array([0.0]), **run)["tensions"][0, 0]
+    for name, solved in solved_by_every_reduction(scene, q, u).items():
+        assert solved.applicable, name
+        assert relative_error(-solved.multipliers[0], tension) <= ROUND_OFF, name
+
+
+def test_the_force_that_keeps_the_speed_lies_along_the_velocity():
+    scene = IsokineticParticle(mass=1.4, speed=2.1)
+    _, u, _, solved = solved_at_random_states(scene)
+    # lambda = m g sin(theta); it has real power, and no virtual power: v . dv = 0
+    thrust = scene.mass * scene.gravity * u.z_rate / scene.speed
+    assert relative_error(solved.multipliers[:, 0], thrust) <= ROUND_OFF
+    assert relative_error(solved.constraint_force, thrust[:, None] * u.array / scene.speed) <= ROUND_OFF
+
+
+def test_the_particle_of_constant_speed_turns_downwards():
+    run = isokinetic_particle.RUN
+    scene = IsokineticParticle(speed=run["speed"], gravity=run["gravity"])
+
+    def expected(times):
+        motion = isokinetic_particle.motion(times, **run)
+        return {"x": motion["x"], "z": motion["y"], "x_rate": motion["vx"], "z_rate": motion["vy"]}
+
+    assert end_error(scene, {"x_rate": run["speed"]}, expected, run["t_end"]) <= CLOSED_FORM

@@ -1,0 +1,91 @@
+"""The rattleback against Kane and Levinson's equations written out by hand, and their published motion."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from agreement import admissible_states, disagreement
+from oracles import rattleback as oracle
+from tolerances import relative_error, tolerance
+
+import jourdain_jax as jj
+from jourdain_jax.models.rattleback import Rattleback
+
+STONE = Rattleback()
+RUN = {name: oracle.RUN[name] for name in oracle.NAMES}
+SHAPE = {name: oracle.RUN[name] for name in ("a", "b", "c", "h", "A", "B", "C", "D", "gravity")}
+
+
+@pytest.fixture(scope="module")
+def motion():
+    """20 s of the published motion, saved at whole seconds. Errors grow by 6e3 in the first of them: hence the tolerances."""
+    return jj.simulate(STONE, RUN, ts=jnp.arange(21.0), rtol=1e-13, atol=1e-13)
+
+
+def test_rates_are_those_of_the_equations_by_hand():
+    @eqx.filter_jit
+    def rates(q, u):
+        qdot, udot = jj.coordinate_rates(STONE, 0.0, q, u), jj.accelerations(STONE, 0.0, q, u).udot
+        return jnp.concatenate([qdot[2:], udot[2:]])
+
+    for _, q, u in admissible_states(STONE, 20):
+        expected = oracle.rates(np.concatenate([q[2:], u[2:]]), **SHAPE)
+        assert relative_error(rates(q, u), expected.astype(float)) <= tolerance("round_off")
+
+
+def test_the_contact_point_is_on_the_ellipsoid_where_its_normal_is_vertical():
+    squares = np.array([oracle.RUN[axis] ** 2 for axis in "abc"])
+    for down in np.random.default_rng(3).normal(size=(10, 3)):
+        down /= np.linalg.norm(down)
+        point = np.asarray(STONE.contact_arm(jnp.asarray(down))) + np.array(
+            [0.0, 0.0, oracle.RUN["h"]]
+        )  # from the ellipsoid's centre
+        normal = point / squares
+        assert abs(point @ normal - 1) <= tolerance("round_off")
+        assert relative_error(normal / np.linalg.norm(normal), down) <= tolerance("round_off")
+
+
+def test_all_reductions_agree():
+    apart = disagreement(STONE)
+    assert set(apart) == {"privileged", "svd", "kkt", "udwadia-kalaba", "gibbs-appell"}
+    assert max(apart.values()) <= tolerance("round_off"), apart
+
+
+def test_after_one_second_the_state_is_known_to_nine_digits(motion):
+    found = [float(motion[name][1]) for name in oracle.NAMES]
+    assert np.max(np.abs(np.array(found) - oracle.REFERENCE[1.0])) <= 1e-9  # sensitivity 6e3
+
+
+@pytest.mark.parametrize("time", oracle.TABLE)
+def test_all_printed_digits_come_out(motion, time):
+    found = [float(motion[name][int(time)]) for name in oracle.NAMES]
+    assert np.all(np.abs(np.array(found) - oracle.TABLE[time]) <= oracle.DIGITS[time])
+
+
+def test_energy_is_kept_through_every_reversal(motion):
+    energy = np.asarray(motion.energies().balance)
+    assert abs(energy[0] - oracle.ENERGY) <= 1e-14
+    assert relative_error(energy, np.full_like(energy, oracle.ENERGY)) <= 1e-10
+
+
+def test_spinning_the_wrong_way_it_stops_and_turns_back():
+    before, after = oracle.FIRST_REVERSAL - 1e-6, oracle.FIRST_REVERSAL + 1e-6
+    motion = jj.simulate(STONE, RUN, ts=jnp.array([before, after]), rtol=1e-10, atol=1e-10)
+    assert motion["w3"][0] < 0 < motion["w3"][1]
+
+
+def test_units_do_not_matter():
+    ((_, q, u),) = admissible_states(STONE, 1)
+    metres = jj.accelerations(STONE, 0.0, q, u).udot
+    scale = {"a": 100, "b": 100, "c": 100, "h": 100, "A": 1e4, "B": 1e4, "C": 1e4, "D": 1e4, "gravity": 100}
+    in_centimetres = STONE.replace(**{name: factor * getattr(STONE, name) for name, factor in scale.items()})
+    level = jnp.array([100.0, 100.0, 1.0, 1.0, 1.0])
+    centimetres = jj.accelerations(in_centimetres, 0.0, level * q, level * u).udot
+    assert relative_error(centimetres / level, metres) <= tolerance("round_off")
+
+
+def test_the_normal_force_at_rest_is_the_weight():
+    q, u, _ = STONE.named()
+    force = jax.jit(lambda q, u: jj.newton_residual(STONE, 0.0, q, u, jj.accelerations(STONE, 0.0, q, u).udot).linear[0])(q, u)
+    assert relative_error(force, [0.0, 0.0, float(STONE.mass * STONE.gravity)]) <= tolerance("round_off")

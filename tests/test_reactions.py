@@ -1,0 +1,141 @@
+"""Constraint forces by row and by body, and contact forces, against statics, closed forms and the principle of virtual power."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+import small_scenes as small
+from tolerances import tolerance
+
+import jourdain_jax as jj
+from jourdain_jax.equations.reactions import contact_forces, row_reactions
+from jourdain_jax.models import (
+    BallOnTurntable,
+    ChaplyginSleigh,
+    TiltingDisc,
+    TiltingDiscQuaternion,
+    TwoWheelAxleRedundant,
+    VerticalDisc,
+    WhippleBicycle,
+)
+
+SCENES = [
+    TwoWheelAxleRedundant(),
+    ChaplyginSleigh(),
+    small.DrivenPendulum(),
+    BallOnTurntable(tilt=0.1),
+    TiltingDiscQuaternion(),
+    WhippleBicycle(),
+]
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda s: type(s).__name__)
+def test_forces_by_row_and_body_have_the_virtual_power_of_the_multipliers(scene):
+    @eqx.filter_jit
+    def compare(t, q, u):
+        found = jj.accelerations(scene, t, q, u)
+        rows = row_reactions(scene, t, q, u, found)
+        partial, motion = jj.partial_velocities(scene, t, q, u), jj.motion_at(scene, t, q, u)
+        turned = jnp.stack([body.orientation for body in motion.bodies.values()])
+        gamma = jnp.einsum("bij,bjk->bik", turned, partial.angular)  # space axes
+        power = jnp.einsum("sbi,bik->k", rows.force, partial.linear) + jnp.einsum("sbi,bik->k", rows.torque, gamma)
+        return power + jnp.sum(rows.direct, axis=0), found.constraint_force
+
+    states = [jnp.asarray(x) for x in jj.sample_states(scene, 10)]
+    by_body, expected = jax.vmap(compare)(*states)
+    assert jnp.max(jnp.abs(by_body - expected)) <= tolerance("round_off") * jnp.max(jnp.abs(expected))
+
+
+def test_the_forces_of_a_blade_act_sideways_at_the_blade():
+    scene = ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)
+    t, q, u = (jnp.asarray(x[0]) for x in jj.sample_states(scene, 1))
+    rows = row_reactions(scene, t, q, u, jj.accelerations(scene, t, q, u))
+    force, torque = rows.forces_on("sleigh")["blade"], rows.torques_on("sleigh")["blade"]
+    heading = q[2]
+    sideways, forward = (
+        jnp.array([-jnp.sin(heading), jnp.cos(heading), 0.0]),
+        jnp.array([jnp.cos(heading), jnp.sin(heading), 0.0]),
+    )
+    # the blade is `offset` behind the mass centre: torque = -offset * sideways force
+    assert jnp.abs(force @ forward) <= tolerance("round_off")
+    assert jnp.allclose(torque, jnp.array([0.0, 0.0, -0.25 * (force @ sideways)]), atol=tolerance("round_off"))
+
+
+def test_an_unknown_body_is_answered_with_the_nearest_name():
+    scene = ChaplyginSleigh()
+    t, q, u = (jnp.asarray(x[0]) for x in jj.sample_states(scene, 1))
+    rows = row_reactions(scene, t, q, u, jj.accelerations(scene, t, q, u))
+    with pytest.raises(KeyError, match="did you mean `sleigh`"):
+        rows.forces_on("slegh")
+
+
+def test_multipliers_of_dependent_rows_are_marked_as_not_determined():
+    scene = TwoWheelAxleRedundant()
+    t, q, u = (jnp.asarray(x[0]) for x in jj.sample_states(scene, 1))
+    rows = row_reactions(scene, t, q, u, jj.accelerations(scene, t, q, u))
+    unique = dict(zip(rows.row_names, rows.determined.tolist(), strict=True))
+    # across the axle wheels and axle share the load as they like; the heights and the common heading are each their own
+    assert {row for row, alone in unique.items() if alone} == {"one heading", "wheel1 height", "wheel2 height"}
+
+
+def test_a_vertical_disc_presses_with_its_weight_and_needs_the_friction_of_its_turn():
+    # B4: multipliers -m w_heading R w_spin (sin heading, -cos heading); N = m g
+    scene = VerticalDisc(mass=1.4, radius=0.7)
+    q, u, _ = scene.named(heading=0.4, heading_rate=2.0, roll_rate=1.5, x_rate=1.05 * jnp.cos(0.4), y_rate=1.05 * jnp.sin(0.4))
+    contact = contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"]
+    centripetal = 1.4 * 2.0 * 0.7 * 1.5
+    assert jnp.allclose(contact.normal, 1.4 * 9.81, rtol=tolerance("round_off"))
+    assert jnp.allclose(contact.tangential, centripetal * jnp.array([-jnp.sin(0.4), jnp.cos(0.4)]), rtol=tolerance("round_off"))
+    assert jnp.allclose(contact.friction_needed, centripetal / (1.4 * 9.81), rtol=tolerance("round_off"))
+    assert contact.determined
+    assert not contact.pulls
+
+
+def test_the_normal_force_is_the_same_from_newtons_equation_and_from_a_height_row():
+    built_in, as_row = TiltingDisc(), small.DiscWithHeightRow()
+
+    @eqx.filter_jit
+    def both(t, q, u):
+        # the tilting disc's x, y are those of the contact point, the other's those of the centre
+        motion = jj.motion_at(built_in, t, q, u)["disc"]
+        q6 = jnp.concatenate([motion.position, q[2:]])
+        u6 = jnp.concatenate([motion.velocity, u[2:]])
+        first = contact_forces(built_in, t, q, u, jj.accelerations(built_in, t, q, u))["rim"]
+        second = contact_forces(as_row, t, q6, u6, jj.accelerations(as_row, t, q6, u6))["rim"]
+        return first, second
+
+    first, second = jax.vmap(both)(*(jnp.asarray(x) for x in jj.sample_states(built_in, 20)))
+    size = jnp.max(jnp.abs(first.normal))
+    assert jnp.max(jnp.abs(first.normal - second.normal)) <= tolerance("round_off") * size
+    assert jnp.max(jnp.abs(first.tangential - second.tangential)) <= tolerance("round_off") * size
+
+
+@pytest.mark.parametrize("scene", [VerticalDisc(gravity=-9.81), small.DiscWithHeightRow(gravity=-9.81)], ids=["Newton", "row"])
+def test_a_contact_that_would_have_to_pull_is_flagged(scene):
+    q, u, _ = scene.named()
+    contact = contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"]
+    assert contact.pulls
+    assert contact.normal < 0
+    assert jnp.isinf(contact.friction_needed)
+
+
+def test_the_wheels_of_a_standing_bicycle_carry_its_weight():
+    # rear 612.836470588236 N, front 309.303529411765 N: static equilibrium, as printed by symbrim's test of the same bicycle
+    scene = WhippleBicycle()
+    q, u, _ = scene.named()
+    wheels = contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))
+    assert jnp.allclose(wheels["rear"].normal, 612.836470588236, rtol=tolerance("round_off"))
+    assert jnp.allclose(wheels["front"].normal, 309.303529411765, rtol=tolerance("round_off"))
+
+
+def test_friction_needed_has_a_finite_gradient_where_nothing_slides():
+    def friction(radius):
+        scene = VerticalDisc(radius=radius)
+        q, u, _ = scene.named()
+        return contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"].friction_needed
+
+    assert jnp.isfinite(jax.grad(friction)(0.7))
+
+
+# Minutes of compilation, and not yet run since the default sampling domain grew: kept out of the short run until it has been.
+pytestmark = pytest.mark.slow

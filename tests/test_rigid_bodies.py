@@ -1,0 +1,84 @@
+"""A free rigid body by Jacobi's elliptic functions, and Suslov's problem by hyperbolic ones."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from agreement import disagreement
+from oracles import free_rigid_body, suslov
+from tolerances import relative_error, tolerance
+
+import jourdain_jax as jj
+from jourdain_jax.models.free_rigid_body import FreeRigidBody
+from jourdain_jax.models.suslov import Suslov
+
+MOMENTS = dict(zip(("i1", "i2", "i3"), free_rigid_body.RUN["inertia"], strict=True))
+TOP, HELD = FreeRigidBody(**MOMENTS), Suslov()
+
+
+@pytest.mark.parametrize("scene", [TOP, HELD], ids=lambda s: type(s).__name__)
+def test_all_reductions_agree(scene):
+    apart = disagreement(scene)
+    assert set(apart) == {"privileged", "svd", "kkt", "udwadia-kalaba", "gibbs-appell"}
+    assert max(apart.values()) <= tolerance("round_off"), apart
+
+
+@pytest.fixture(scope="module")
+def free():
+    """20 s, turning and flying off."""
+    start = {"attitude_omega": jnp.asarray(free_rigid_body.RUN["w0"]), "x": 1.0, "x_rate": 0.3, "y_rate": -0.1, "z_rate": 0.2}
+    return jj.simulate(TOP, start, ts=jnp.linspace(0.0, free_rigid_body.RUN["t_end"], 21), rtol=1e-12, atol=1e-12)
+
+
+def test_a_free_body_turns_by_elliptic_functions(free):
+    expected = free_rigid_body.motion(free.ts, **free_rigid_body.RUN)
+    assert relative_error(free["attitude_omega"], expected) <= tolerance("closed_form")
+    turned = free_rigid_body.rotation(free_rigid_body.attitude(np.asarray(free.ts), **free_rigid_body.RUN))
+    assert relative_error(free_rigid_body.rotation(free["attitude"]), turned) <= tolerance("closed_form")
+
+
+def test_its_mass_centre_flies_straight(free):
+    along = np.asarray(free.ts)[:, None] * [0.3, -0.1, 0.2] + [1.0, 0.0, 0.0]
+    assert relative_error(np.stack([free["x"], free["y"], free["z"]], 1), along) <= tolerance("closed_form")
+
+
+def test_momentum_and_angular_momentum_and_energy_are_conserved(free):
+    energy = free.energies().balance
+    assert relative_error(energy, jnp.full_like(energy, energy[0])) <= tolerance("closed_form")
+    for k in (5, 20):
+        first, later = (TOP.invariants(jj.motion_at(TOP, free.ts[i], free.q[i], free.u[i])) for i in (0, k))
+        size = float(np.linalg.norm(np.array(free_rigid_body.RUN["w0"]) * free_rigid_body.RUN["inertia"]))
+        for name, value in first.items():
+            assert abs(later[name] - value) <= tolerance("closed_form") * size, name
+
+
+def test_turning_about_the_middle_axis_is_steady_until_disturbed():
+    q, u, _ = TOP.named(attitude_omega=jnp.array([0.0, 1.0, 0.0]))
+    assert jnp.max(jnp.abs(jj.accelerations(TOP, 0.0, q, u).udot)) == 0
+    nearly = (0.01, 1.0, 0.0)
+    kicked = jj.simulate(TOP, {"attitude_omega": jnp.array(nearly)}, ts=jnp.linspace(0.0, 15.0, 7), rtol=1e-12, atol=1e-12)
+    expected = free_rigid_body.motion(kicked.ts, inertia=free_rigid_body.RUN["inertia"], w0=nearly)
+    assert np.min(expected[:, 1]) < -0.9  # turned over
+    assert relative_error(kicked["attitude_omega"], expected) <= tolerance("closed_form")
+
+
+def test_suslov_motion_ends_in_a_turn_about_the_second_axis():
+    motion = jj.simulate(HELD, ts=jnp.linspace(0.0, suslov.RUN["t_end"], 11), rtol=1e-12, atol=1e-12)
+    times = np.asarray(motion.ts)
+    expected = suslov.motion(times, **suslov.RUN)
+    for name, key in (("attitude_omega_x", "w1"), ("attitude_omega_y", "w2"), ("attitude_omega_z", "w3")):
+        assert relative_error(motion[name], expected[key], 1.0) <= tolerance("closed_form"), name
+    turned = suslov.attitude(times, **suslov.RUN)
+    assert relative_error(motion["attitude"], turned) <= tolerance("closed_form")
+
+
+def test_suslov_multiplier_is_the_torque_about_the_third_axis():
+    q, u, _ = HELD.named(attitude_omega_x=suslov.RUN["w1"], attitude_omega_y=suslov.RUN["w2"])
+    found = jj.accelerations(HELD, 0.0, q, u).multipliers[0]
+    expected = suslov.motion(np.zeros(1), **suslov.RUN)["torque"][0]
+    assert abs(found - expected) <= tolerance("round_off")
+
+
+def test_a_body_held_along_a_principal_axis_turns_steadily():
+    principal = HELD.replace(i13=0.0)
+    q, u, _ = principal.named(attitude_omega_x=0.6, attitude_omega_y=0.8)
+    assert jnp.max(jnp.abs(jj.accelerations(principal, 0.0, q, u).udot)) <= tolerance("round_off")

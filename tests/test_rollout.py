@@ -1,0 +1,83 @@
+"""Batches: every lane as if it were alone, one bad lane harms no other, differentiable as a whole."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
+from jourdain_jax.models.tilting_disc import TiltingDisc
+from jourdain_jax.motion import results
+
+OPTIONS = {"t1": 2.0, "ts": jnp.linspace(0.0, 2.0, 5), "rtol": 1e-9, "atol": 1e-9}
+
+
+@pytest.fixture(scope="module")
+def sleighs():
+    """Seven sleighs with different starts and offsets in chunks of three; lane 2 starts from NaN, lane 5 with a NaN offset."""
+    turning = np.array([0.9, 0.5, np.nan, -0.3, 0.2, 0.7, 0.1])
+    offset = np.array([0.25, 0.2, 0.25, 0.3, 0.1, np.nan, 0.2])
+    starts = {"x_rate": -0.6, "heading_rate": turning}
+    return turning, offset, jj.rollout(ChaplyginSleigh(), starts, parameters={"offset": offset}, chunk=3, progress=False, **OPTIONS)
+
+
+def test_every_lane_is_the_motion_it_would_be_alone(sleighs):
+    turning, offset, lanes = sleighs
+    for i in (0, 3, 6):
+        scene = ChaplyginSleigh(offset=offset[i])
+        alone = jj.simulate(scene, {"x_rate": -0.6, "heading_rate": turning[i]}, **OPTIONS)
+        np.testing.assert_allclose(lanes.lane(i).q, alone.q, atol=1e-9)
+        assert float(lanes.lane(i).scene.offset) == offset[i]
+
+
+def test_bad_lanes_are_counted_and_named_and_harm_no_other(sleighs):
+    _, _, lanes = sleighs
+    assert lanes.failed.tolist() == [2, 5]
+    good = np.setdiff1d(np.arange(7), lanes.failed)
+    assert np.all(lanes.result[good] == results.SUCCESS)
+    assert np.all(np.isfinite(np.asarray(lanes["x"])[good]))
+    assert "lanes 2, 5" in str(lanes)
+    assert lanes.quantiles("heading", (0.5,)).shape == (1, 5)
+    np.testing.assert_allclose(lanes.quantiles("heading", (0.5,))[0], np.median(np.asarray(lanes["heading"])[good], axis=0))
+
+
+def test_a_lane_that_falls_stops_at_its_event_and_the_others_go_on():
+    fallen = jj.rollout(TiltingDisc(), {"lean": np.array([0.3, 0.3]), "spin_rate": np.array([-6.0, -0.1])}, t1=2.0, ts=[0.0, 2.0], progress=False)
+    assert fallen.result.tolist() == [results.SUCCESS, results.EVENT]
+    assert fallen.failed.size == 0
+    assert "`fallen` 1" in str(fallen)
+
+
+def test_the_gradient_of_a_batch_is_the_sum_of_the_gradients_of_its_lanes():
+    scene, options = ChaplyginSleigh(), OPTIONS | {"ts": [2.0]}
+
+    def alone(offset, turning):
+        return jj.simulate(scene.replace(offset=offset), {"x_rate": 0.5, "heading_rate": turning}, **options).q_end[2]
+
+    def together(offset):
+        lanes = jj.rollout(scene, {"x_rate": 0.5, "heading_rate": jnp.array([0.4, 0.8])}, parameters={"offset": offset * jnp.ones(2)}, **options)
+        return jnp.sum(lanes.lanes.q_end[:, 2])
+
+    each = sum(float(jax.grad(alone)(0.25, turning)) for turning in (0.4, 0.8))
+    np.testing.assert_allclose(jax.grad(together)(0.25), each, rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("starts", "parameters", "sentence"),
+    [
+        ({"heading_rate": [1.0, 2.0]}, {"mass": [1.0, 2.0, 3.0]}, "lanes differ in number: parameter `mass` has 3, start `heading_rate` has 2"),
+        ({"heading_rate": 1.0}, None, "no lanes: give at least one"),
+        (None, {"masss": [1.0]}, "has no parameter `masss`; did you mean `mass`"),
+        (None, {"mass": 1.0}, "parameter `mass` has no axis of lanes"),
+        ({"headin": [1.0]}, None, "has no coordinate or speed `headin`; did you mean `heading`"),
+    ],
+)
+def test_wrong_lanes_are_refused_by_name(starts, parameters, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        jj.rollout(ChaplyginSleigh(), starts, parameters=parameters, progress=False, **OPTIONS)
+
+
+def test_a_lane_that_does_not_exist_is_refused(sleighs):
+    with pytest.raises(IndexError, match="lane 7 does not exist; this rollout has 7 lanes"):
+        sleighs[2].lane(7)

@@ -1,0 +1,135 @@
+"""A wrong description of a scene is answered at build time, by name, with what to do."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+
+class Slider(jj.Scene):
+    """A bead on a plane."""
+
+    mass: object = jj.parameter(1.0, unit="kg", positive=True)
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+
+def described(**methods):
+    """The bead with some methods replaced."""
+    return type("Described", (Slider,), methods)()
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"mass": -1.0}, "parameter `mass` of `Slider` is -1.0, expected a positive number in kg"),
+        ({"mass": np.nan}, "parameter `mass` of `Slider` is nan, expected finite numbers"),
+        ({"mas": 1.0}, "has no parameter `mas`; did you mean `mass`"),
+    ],
+)
+def test_a_wrong_parameter_is_named(change, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        Slider().replace(**change)
+
+
+def test_a_scene_without_coordinates_says_how_to_state_them():
+    class Empty(jj.Scene):
+        pass
+
+    with pytest.raises(ValueError, match=r"`Empty` has no `coordinates`; state them"):
+        Empty()
+
+
+def test_a_scene_without_bodies_says_what_to_define():
+    class Bare(jj.Scene):
+        coordinates = jj.coordinates("x")
+
+    with pytest.raises(NotImplementedError, match=r"define `bodies\(self, t, q\)`"):
+        jj.simulate(Bare(), {}, t1=1.0)
+
+
+@pytest.mark.parametrize(
+    ("names", "sentence"),
+    [(("x x",), "coordinate name `x` is used twice"), (("1x",), "`1x` is not an identifier"), (("array",), "`array` is taken")],
+)
+def test_a_wrong_coordinate_name_is_named(names, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        jj.coordinates(*names)
+
+
+def test_an_unknown_coordinate_in_a_method_lists_the_valid_ones():
+    wrong = described(loads=lambda self, motion: (jj.generalized_force(motion, x_rate=motion.q.z),))
+    with pytest.raises(AttributeError, match=r"no `z` here; .*`x`, `y`"):
+        jj.accelerations(wrong, 0.0, jnp.zeros(2), jnp.zeros(2))
+
+
+@pytest.mark.parametrize(
+    ("loads", "sentence"),
+    [
+        (lambda self, motion: (jj.torque(motion, "bed", jnp.ones(3)),), "torque on unknown body `bed`; did you mean `bead`"),
+        (lambda self, motion: (jj.generalized_force(motion, x_rat=1.0),), "unknown speed `x_rat`; did you mean `x_rate`"),
+        (lambda self, motion: (jj.Load(forces={"bed": jnp.ones(3)}),), "acts on unknown body `bed`"),
+    ],
+)
+def test_a_load_on_something_unknown_is_named(loads, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        jj.accelerations(described(loads=loads), 0.0, jnp.zeros(2), jnp.zeros(2))
+
+
+def test_an_unknown_body_is_answered_with_the_nearest_name():
+    wrong = described(velocity_constraints=lambda self, motion: {"row": motion["baed"].velocity[0]})
+    with pytest.raises(KeyError, match="did you mean `bead`"):
+        jj.accelerations(wrong, 0.0, jnp.zeros(2), jnp.zeros(2))
+
+
+def test_two_rows_of_one_name_are_refused():
+    wrong = described(
+        geometric_constraints=lambda self, pose: {"row": pose.q.x - pose.q.y},
+        velocity_constraints=lambda self, motion: {"row": motion.u.x_rate},
+    )
+    with pytest.raises(ValueError, match="row name `row` of `Described` is used twice"):
+        jj.accelerations(wrong, 0.0, jnp.zeros(2), jnp.zeros(2))
+
+
+def test_an_unknown_prescribed_coordinate_is_named():
+    wrong = described(prescribed=lambda self, t: {"w": t})
+    with pytest.raises(ValueError, match=r"prescribed coordinate of `Described`: `w`"):
+        jj.accelerations(wrong, 0.0, jnp.zeros(2), jnp.zeros(2))
+
+
+@pytest.mark.parametrize(
+    ("privileged", "sentence"),
+    [(("z_rate", "x_rate"), "unknown privileged speed of `Described`: `z_rate`"), (("x_rate",), "names 1 speeds, but the scene has 2 degrees of freedom")],
+)
+def test_wrong_privileged_speeds_are_named(privileged, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        jj.structure_of(described(privileged=privileged))
+
+
+@pytest.mark.parametrize(
+    ("build", "sentence"),
+    [
+        (lambda: jj.Particle(1.0, jnp.zeros(2)), r"position of a particle has shape \(2,\), expected \(3,\)"),
+        (lambda: jj.RigidBody(1.0, jnp.zeros((2, 2)), jnp.zeros(3), jnp.eye(3)), r"inertia .* has shape \(2, 2\)"),
+        (lambda: jj.RigidBody(1.0, jnp.ones(3), jnp.zeros(3), jnp.eye(2)), r"orientation .* has shape \(2, 2\)"),
+        (lambda: jj.RigidBody.thin_disc(1.0, 1.0, axis="w", position=jnp.zeros(3), orientation=jnp.eye(3)), "body axis `w` is unknown"),
+        (lambda: jj.pin(jnp.zeros(3), jnp.zeros(3), axes="xw"), "pin along axes `xw`"),
+    ],
+)
+def test_a_body_or_joint_of_the_wrong_shape_is_refused(build, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        build()
+
+
+def test_geometric_rows_that_cannot_be_met_are_found_when_probed():
+    apart = described(geometric_constraints=lambda self, pose: {"far": pose.q.x**2 + 1.0})
+    with pytest.raises(ValueError, match="no admissible state of `Described` was found"):
+        jj.structure_of(apart)
+
+
+def test_an_unknown_reduction_is_answered_with_the_nearest_name():
+    with pytest.raises(ValueError, match="unknown reduction `svdd`; did you mean `svd`"):
+        jj.accelerations(Slider(), 0.0, jnp.zeros(2), jnp.zeros(2), reduction="svdd")

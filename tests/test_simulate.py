@@ -1,0 +1,232 @@
+"""Simulation: right to tolerance in every state form, honest about how it ended, differentiable in every supported mode."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.calculus.guards import DifferentiationModeError
+from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
+from jourdain_jax.models.double_pendulum_rods import DoublePendulumRods
+from jourdain_jax.models.skate import Skate
+from jourdain_jax.motion import results
+
+
+class Falling(jj.Scene):
+    """A particle thrown up from the floor, with air drag if asked: the smallest scene with an event."""
+
+    mass: object = jj.parameter(1.0, positive=True)
+    gravity: object = jj.parameter(9.81)
+    drag: object = jj.parameter(0.0)
+    push: object = jj.parameter(0.0)
+
+    coordinates = jj.coordinates("x z")
+    inputs = jj.inputs("force")
+    example = {"z_rate": 5.0, "x_rate": 2.0}
+
+    def bodies(self, t, q):
+        return {"stone": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, q.z]))}
+
+    def loads(self, motion):
+        drag = jj.point_force(motion["stone"].point(), -self.drag * motion["stone"].velocity)
+        return (jj.gravity(motion, self.gravity), drag, jj.generalized_force(motion, x_rate=motion.inputs.force))
+
+    def events(self, motion):
+        return {"landed": motion.q.z + 0.5, "too far": 100.0 - motion.q.x}
+
+
+def flight_time(speed, gravity=9.81, drop=0.5):
+    return (speed + np.sqrt(speed**2 + 2 * gravity * drop)) / gravity
+
+
+def test_an_event_stops_the_motion_at_the_closed_form_time():
+    motion = jj.simulate(Falling(), t1=3.0, rtol=1e-10, atol=1e-10)
+    assert int(motion.result) == results.EVENT
+    assert "`landed`" in motion.message
+    np.testing.assert_allclose(motion.t_end, flight_time(5.0), rtol=1e-12)
+    np.testing.assert_allclose(motion.q_end, [2 * flight_time(5.0), -0.5], rtol=1e-11)
+    later = np.asarray(motion.ts) > float(motion.t_end)
+    assert np.all(np.isnan(np.asarray(motion.q)[later]))
+    assert np.all(np.isfinite(np.asarray(motion.q)[~later]))
+
+
+@pytest.mark.parametrize(
+    ("derivative", "adjoint"),
+    [(jax.jacrev, None), (jax.jacfwd, diffrax.ForwardMode()), (jax.jacrev, diffrax.DirectAdjoint()), (jax.jacfwd, diffrax.DirectAdjoint())],
+    ids=["reverse", "forward", "direct reverse", "direct forward"],
+)
+def test_the_derivative_of_an_event_time_is_that_of_the_closed_form(derivative, adjoint):
+    def landing(speed):
+        motion = jj.simulate(Falling(), {"z_rate": speed, "x_rate": 2.0}, t1=3.0, ts=jnp.array([0.0]), rtol=1e-10, atol=1e-10, adjoint=adjoint)
+        return jnp.stack([motion.t_end, motion.q_end[0], motion.u_end[1]])
+
+    dt = (flight_time(5.0 + 1e-6) - flight_time(5.0 - 1e-6)) / 2e-6
+    np.testing.assert_allclose(derivative(landing)(5.0), [dt, 2 * dt, 1 - 9.81 * dt], rtol=1e-8)
+
+
+def test_a_motion_that_starts_beyond_an_event_does_not_start():
+    motion = jj.simulate(Falling(), {"z": -1.0}, t1=1.0)
+    assert int(motion.result) == results.EVENT
+    assert float(motion.t_end) == 0.0
+
+
+def test_work_without_potential_is_taken_off_the_energy_and_the_result_says_so():
+    options = {"rtol": 1e-11, "atol": 1e-11}
+    motion = jj.simulate(Falling(drag=0.3), t1=1.0, inputs={"force": lambda t: jnp.sin(3 * t)}, **options)
+    energy = motion.energies()
+    assert energy.kind == "T + V less the work done"
+    assert float(jnp.ptp(energy.kinetic + energy.potential)) > 1.0
+    assert float(jnp.ptp(energy.balance)) < 1e-10
+
+
+def test_a_conservative_scene_tracks_no_work():
+    motion = jj.simulate(ChaplyginSleigh(), t1=1.0)
+    assert motion.work is None
+    assert motion.energies().kind == "T + V"
+
+
+def test_sampled_constant_and_functional_inputs_agree():
+    ends = [
+        jj.simulate(Falling(), t1=0.5, rtol=1e-9, atol=1e-9, inputs={"force": force}).q_end
+        for force in (2.0, lambda t: 2.0 + 0 * t, jj.Sampled(jnp.array([0.0, 1.0]), jnp.array([2.0, 2.0])))
+    ]
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-12)
+    np.testing.assert_allclose(ends[2], ends[0], atol=1e-12)
+    np.testing.assert_allclose(ends[0][0], 2 * 0.5 + 0.5 * 2.0 * 0.25, rtol=1e-8)
+
+
+def test_minimal_and_full_state_give_the_same_motion():
+    options = {"t1": 3.0, "rtol": 1e-10, "atol": 1e-10}
+    minimal, full = (jj.simulate(ChaplyginSleigh(), state=form, **options) for form in ("minimal", "full"))
+    assert (minimal.state_form, full.state_form) == ("minimal", "full")
+    np.testing.assert_allclose(minimal.q, full.q, atol=1e-8)
+    assert float(jnp.max(jnp.abs(minimal.residuals()[1]))) < 1e-14
+    assert float(jnp.max(jnp.abs(full.residuals()[1]))) < 1e-13  # by projection
+
+
+def test_geometric_rows_hold_after_every_step_by_projection_and_drift_without():
+    options = {"t1": 10.0, "rtol": 1e-6, "atol": 1e-6, "ts": jnp.linspace(0.0, 10.0, 21)}
+    kept, drifted = (jj.simulate(DoublePendulumRods(), projection=p, state="full", **options) for p in (True, False))
+    assert float(jnp.max(jnp.abs(kept.residuals()[0]))) < 1e-12
+    assert float(jnp.max(jnp.abs(drifted.residuals()[0]))) > 1e-8
+
+
+def test_the_default_state_is_full_where_no_partition_serves_everywhere():
+    motion = jj.simulate(Skate(), t1=1.0)  # the heading passes through all angles
+    assert motion.state_form == "full"
+
+
+def test_a_start_off_the_constraints_is_moved_onto_them_and_the_motion_says_how_far():
+    scene = ChaplyginSleigh()
+    off = jj.start(scene, **scene.example)
+    pushed = jj.State(off.t, off.q, off.u + 1e-3, off.moved_q, off.moved_u, off.residual, off.names)
+    motion = jj.simulate(scene, pushed, t1=0.5)
+    assert 1e-5 < float(motion.moved_u) < 2e-3
+    assert float(jnp.max(jnp.abs(motion.residuals()[1]))) < 1e-13
+
+
+def test_a_start_that_contradicts_the_rows_is_refused_by_row_name():
+    with pytest.raises(ValueError, match=r"contradicts row `.*`: residual"):
+        jj.start(Skate(), heading=0.0, x_rate=1.0, y_rate=1.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"t1": 0.0}, "is empty or not finite"),
+        ({"t1": np.inf}, "is empty or not finite"),
+        ({"ts": [0.0, 2.0, 1.0]}, "strictly increasing"),
+        ({"ts": [[0.0, 1.0]]}, r"`ts` has shape \(1, 2\)"),
+        ({"t1": 1.0, "state": "minimum"}, "unknown state form `minimum`; did you mean `minimal`"),
+        ({"t1": 1.0, "inputs": {"forse": 1.0}}, "has no input `forse`; did you mean `force`"),
+        ({"t1": 1.0, "start": {"zz": 1.0}}, "has no coordinate or speed `zz`"),
+        ({"t1": 1.0, "start": {"z": np.nan}}, "start value `z` is nan"),
+        ({"t1": 1.0, "start": {"z": [1.0, 2.0]}}, "expected one number; use `jax.vmap` or `rollout`"),
+        ({"t1": 1.0, "start": 3.0}, "`start` is a float, expected a State"),
+        ({"t1": 1.0, "saveat": diffrax.SaveAt(dense=True, t1=True)}, "must be a plain `diffrax.SaveAt"),
+    ],
+)
+def test_wrong_arguments_are_answered_before_anything_runs(arguments, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        jj.simulate(Falling(), arguments.pop("start", None), **arguments)
+
+
+def test_too_few_steps_are_a_result_code_and_an_error_only_on_request():
+    motion = jj.simulate(ChaplyginSleigh(), t1=5.0, max_steps=8)
+    assert int(motion.result) == results.MAX_STEPS
+    assert np.isnan(np.asarray(motion.q)[-1]).all()
+    assert np.isfinite(np.asarray(motion.q_end)).all()
+    with pytest.raises(jj.SimulationError, match=r"`ChaplyginSleigh` at t = .* s: ran out of steps"):
+        motion.raise_if_failed()
+
+
+def test_accelerations_that_are_not_finite_are_a_result_code():
+    class Blown(Falling):
+        def loads(self, motion):
+            return (jj.generalized_force(motion, x_rate=jnp.sqrt(0.5 - motion.t)),)
+
+    motion = jj.simulate(Blown(), t1=1.0, rtol=1e-6, atol=1e-6)
+    assert int(motion.result) in (results.STEP_TOO_SMALL, results.NOT_FINITE)
+    assert 0.4 < float(motion.t_end) <= 0.5 + 1e-6
+
+
+def test_reversed_time_runs_back_to_the_start():
+    there = jj.simulate(ChaplyginSleigh(), t1=2.0, rtol=1e-11, atol=1e-11)
+    scene = there.scene
+    end = jj.consistent(scene, 2.0, there.q_end, there.u_end)
+    back = jj.simulate(scene, end, t0=2.0, t1=0.0, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(back.q_end, there.q[0], atol=1e-8)
+
+
+def test_second_derivatives_need_the_adjoint_that_supports_them():
+    def end(x_rate, adjoint):
+        return jj.simulate(Falling(drag=0.3), {"x_rate": x_rate}, t1=0.2, ts=jnp.array([0.2]), rtol=1e-9, atol=1e-9, adjoint=adjoint).q_end[0] ** 2
+
+    with pytest.raises(DifferentiationModeError, match="DirectAdjoint"):
+        jax.grad(jax.grad(lambda x: end(x, None)))(2.0)
+    with pytest.raises(DifferentiationModeError, match="ForwardMode"):
+        jax.jacfwd(lambda x: end(x, None))(2.0)
+    with pytest.raises(DifferentiationModeError, match="forward-only"):
+        jax.grad(lambda x: end(x, diffrax.ForwardMode()))(2.0)
+    reach = (1 - np.exp(-0.3 * 0.2)) / 0.3  # x = x_rate * reach
+    for second in (jax.jacfwd(jax.jacfwd(lambda x: end(x, diffrax.ForwardMode()))), jax.hessian(lambda x: end(x, diffrax.DirectAdjoint()))):
+        np.testing.assert_allclose(second(2.0), 2 * reach**2, rtol=1e-7)
+
+
+def test_simulate_traces_once_for_different_numbers():
+    import equinox as eqx
+
+    run = eqx.filter_jit(eqx.debug.assert_max_traces(lambda scene, start: jj.simulate(scene, start, t1=0.5).q_end, max_traces=1))
+    for mass in (1.0, 2.0):
+        scene = Falling(mass=mass)
+        run(scene, jj.start(scene, z_rate=mass))
+
+
+def test_float32_with_tight_tolerances_is_warned_about():
+    class Bare(Falling):
+        def events(self, motion):
+            return {}
+
+    scene = jax.tree.map(lambda x: x.astype(jnp.float32), Bare())
+    state = jax.tree.map(lambda x: x.astype(jnp.float32), jj.start(Bare(), z_rate=1.0))
+    with pytest.warns(UserWarning, match="more digits than float32 has"):
+        jj.simulate(scene, state, t1=0.1, rtol=1e-8)
+
+
+class UndeclaredSkate(Skate):
+    """The skate with a domain too narrow for its motion, so that a partition seems to serve which fails at a right angle."""
+
+    domain = {"heading": (-0.5, 0.5)}
+
+
+def test_a_motion_that_leaves_the_domain_of_its_partition_is_continued_with_the_full_state():
+    start = {"heading": 0.0, "heading_rate": 1.3, "x_rate": 0.4}
+    options = {"t1": 4.0, "rtol": 1e-10, "atol": 1e-10}
+    motion = jj.simulate(UndeclaredSkate(), start, **options)
+    assert motion.state_form == "full"
+    np.testing.assert_allclose(motion.q_end, jj.simulate(Skate(), start, state="full", **options).q_end, atol=1e-9)
+    forced = jj.simulate(UndeclaredSkate(), start, state="minimal", **options)
+    assert int(forced.result) != results.SUCCESS
+    assert float(forced.smallest_pivot) < 0.02

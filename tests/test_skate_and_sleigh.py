@@ -1,0 +1,105 @@
+"""One blade: the skate on an incline and the Chaplygin sleigh."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from closed_form_runs import end_error
+from derivatives import derivatives
+from oracles import chaplygin_sleigh, skate
+from solved_states import solved_at_random_states, solved_by_every_reduction
+from tolerances import relative_error, tolerance
+
+import jourdain_jax as jj
+from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
+from jourdain_jax.models.skate import Skate
+
+ROUND_OFF = tolerance("round_off")
+
+
+def _skate_accelerations(x):
+    """Of (slope, heading, x', y', heading'), at any speeds: x', y' need not obey the row."""
+    slope, heading, vx, vy, w = x
+    c, s = jnp.cos(heading), jnp.sin(heading)
+    v, push = vx * c + vy * s, 9.81 * jnp.sin(slope) * jnp.cos(heading)
+    # along the blade: x'' c + y'' s = push;   the row's rate: x'' s - y'' c = -w v
+    return jnp.stack([push * c - w * v * s, push * s + w * v * c, jnp.zeros_like(w)])
+
+
+def _skate_by(reduction, x):
+    slope, heading, vx, vy, w = x
+    q, u = jnp.stack([0.3, -0.2, heading]), jnp.stack([vx, vy, w])
+    return jj.accelerations(Skate(slope=slope), 0.0, q, u, reduction=reduction).udot
+
+
+def _applies(name, heading):
+    """x' and heading' are privileged: not across the slope, where x' is held."""
+    return not (name in ("privileged", "gibbs-appell") and abs(np.cos(heading)) < 1e-9)
+
+
+@pytest.mark.parametrize("name", ["privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell"])
+def test_derivatives_of_the_skates_accelerations_are_exact_at_any_heading(name):
+    # heading 0 puts the row along a leading coordinate, where a plain QR differentiates to NaN
+    reduction = jj.reductions(Skate())[name]
+    weights = jnp.array([0.7, -1.1, 0.4])
+    directions = jax.random.normal(jax.random.key(1), (2, 5))
+    differentiate = jax.jit(lambda x: derivatives(lambda x: weights @ _skate_by(reduction, x), x, directions))
+    for heading in (0.0, 0.6, np.pi / 2, np.pi):
+        if _applies(name, heading):
+            x = jnp.array([0.3, heading, 0.8, 0.1, 1.3])
+            expected = derivatives(lambda x: weights @ _skate_accelerations(x), x, directions)
+            for mode, value in differentiate(x).items():
+                assert relative_error(value, expected[mode]) <= ROUND_OFF, f"{mode} at heading {heading}"
+
+
+def test_privileged_velocities_say_that_they_do_not_apply_across_the_slope():
+    scene = Skate()
+    q, u, _ = scene.named(heading=np.pi / 2, y_rate=1.0, heading_rate=0.5)
+    for name, solved in solved_by_every_reduction(scene, q, u).items():
+        assert solved.applicable == _applies(name, np.pi / 2), name
+
+
+def test_the_skate_drifts_across_the_slope():
+    run = skate.RUN
+    scene = Skate(run["mass"], run["inertia"], run["slope"], run["gravity"])
+
+    def expected(times):  # passes heading 90 degrees, where x' is no privileged speed
+        motion = skate.motion(times, **run)
+        return {"x": motion["x"], "y": motion["y"], "heading": motion["th"]}
+
+    assert end_error(scene, {"heading_rate": run["th_rate"]}, expected, run["t_end"]) <= tolerance("closed_form")
+
+
+def test_a_moving_skate_follows_its_closed_form():
+    run = skate.RUN | {"u0": 0.9, "th0": 0.4, "th_rate": -0.7}
+    start = {"heading": 0.4, "x_rate": 0.9 * np.cos(0.4), "y_rate": 0.9 * np.sin(0.4), "heading_rate": -0.7}
+
+    def expected(times):
+        motion = skate.motion(times, **run)
+        return {"x": motion["x"], "y": motion["y"], "heading": motion["th"]}
+
+    assert end_error(Skate(), start, expected, run["t_end"]) <= tolerance("closed_form")
+
+
+def test_the_sleighs_blade_obeys_the_reduced_equations():
+    scene = ChaplyginSleigh(mass=0.9, inertia=0.5, offset=0.35)
+    q, u, udot, _ = solved_at_random_states(scene)
+    c, s, w = jnp.cos(q.heading), jnp.sin(q.heading), u.heading_rate
+    v, side = u.x_rate * c + u.y_rate * s, u.y_rate * c - u.x_rate * s
+    forward = udot.x_rate * c + udot.y_rate * s + w * side
+    a, k2 = scene.offset, scene.inertia / scene.mass + scene.offset**2
+    assert relative_error(forward, a * w**2) <= ROUND_OFF  # v' = a w^2
+    assert relative_error(udot.heading_rate, -(a / k2) * v * w) <= ROUND_OFF  # w' = -(a/k^2) v w
+
+
+@pytest.mark.parametrize("turn", [0.9, -0.9])
+def test_the_sleigh_turns_round_and_runs_straight(turn):
+    run = chaplygin_sleigh.RUN | {"w0": turn}
+    scene = ChaplyginSleigh(run["mass"], run["inertia"], run["a"])
+    start = {"x_rate": run["v0"], "y_rate": run["a"] * turn, "heading_rate": turn}
+
+    def expected(times):
+        motion = chaplygin_sleigh.motion(times, **run)
+        return {"x": motion["x"], "y": motion["y"], "heading": motion["th"], "heading_rate": motion["w"]}
+
+    assert end_error(scene, start, expected, run["t_end"]) <= tolerance("closed_form")

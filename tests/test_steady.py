@@ -1,0 +1,103 @@
+"""Steady motions: closed forms of the disc and the bicycle, derivatives through the root, and honest residuals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import rolling_disc
+
+import jourdain_jax as jj
+from jourdain_jax.analysis.steady import steady
+from jourdain_jax.models.double_pendulum_angles import DoublePendulumAngles
+from jourdain_jax.models.free_rigid_body import FreeRigidBody
+from jourdain_jax.models.tilting_disc import TiltingDisc
+
+DISC = {"mass": 1.0, "radius": 0.5, "gravity": 9.81}
+GUESS = {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0, "lean_rate": 0.3}
+HELD = ("lean", "yaw_rate")
+
+
+def _circle(lean, yaw_rate, **disc):
+    """spin_rate in the disc's own convention."""
+    return -rolling_disc.steady_circle(np.pi / 2 + lean, yaw_rate, **{**DISC, **disc})["spin_rate"]
+
+
+@pytest.mark.parametrize(("lean", "yaw_rate"), [(0.3, 2.0), (-0.6, 3.0), (1.0, 1.0)])
+def test_a_disc_rolls_in_the_circle_of_the_closed_form(lean, yaw_rate):
+    found = steady(TiltingDisc(**DISC), {**GUESS, "lean": lean, "yaw_rate": yaw_rate}, held=HELD)
+    assert bool(found.converged)
+    assert float(found.residual) < 1e-11  # rad/s^2, with spins up to 20 rad/s
+    assert float(found["lean"]) == lean
+    assert float(found["yaw_rate"]) == yaw_rate
+    assert float(found["lean_rate"]) == pytest.approx(0.0, abs=1e-12)
+    assert float(found["spin_rate"]) == pytest.approx(_circle(lean, yaw_rate), rel=1e-12)
+    assert "steady motion" in str(found)
+
+
+def test_a_disc_keeps_to_the_circle_it_was_put_on():
+    disc = TiltingDisc(**DISC)
+    ride = jj.simulate(disc, steady(disc, GUESS, held=HELD).state, t1=5.0, rtol=1e-10, atol=1e-10)
+    assert float(jnp.max(jnp.abs(ride["lean"] - 0.3))) < 1e-8
+    assert float(jnp.max(jnp.abs(ride["yaw_rate"] - 2.0))) < 1e-8
+
+
+def test_derivatives_of_a_steady_motion_are_those_of_the_closed_form():
+    """In a parameter and in a held value, forward, reverse and second."""
+
+    def spin(radius, lean):
+        return steady(TiltingDisc(**{**DISC, "radius": radius}), {**GUESS, "lean": lean}, held=HELD)["spin_rate"]
+
+    closed = lambda radius, lean: _circle(lean, 2.0, radius=radius)  # noqa: E731
+    h = 1e-4
+    expected = [(closed(0.5 + h, 0.3) - closed(0.5 - h, 0.3)) / (2 * h), (closed(0.5, 0.3 + h) - closed(0.5, 0.3 - h)) / (2 * h)]
+    second = (closed(0.5 + h, 0.3) + closed(0.5 - h, 0.3) - 2 * closed(0.5, 0.3)) / h**2
+    reverse = jax.jit(jax.grad(spin, (0, 1)))(0.5, 0.3)
+    np.testing.assert_allclose(reverse, expected, rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(spin, (0, 1)))(0.5, 0.3), reverse, rtol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(spin)))(0.5, 0.3), second, rtol=1e-5)  # differences of second order at 1e-4
+
+
+def test_steady_motions_are_found_in_batches():
+    leans = jnp.array([0.2, 0.5, 0.8])
+    found = jax.jit(jax.vmap(lambda lean: steady(TiltingDisc(**DISC), {**GUESS, "lean": lean}, held=HELD)))(leans)
+    np.testing.assert_allclose(found["spin_rate"], [_circle(float(lean), 2.0) for lean in leans], rtol=1e-11)
+    assert bool(jnp.all(found.converged))
+
+
+def test_a_pendulum_comes_to_rest_at_an_equilibrium():
+    pendulum = DoublePendulumAngles()
+    found = steady(pendulum, {"theta1": 0.4, "theta2": -0.3, "theta1_rate": 0.5})
+    np.testing.assert_allclose(jnp.concatenate([found.state.q, found.state.u]), np.zeros(4), atol=1e-12)
+    inverted = steady(pendulum, {"theta1": 3.0, "theta2": 0.1})
+    np.testing.assert_allclose(inverted.state.q, [np.pi, 0.0], atol=1e-12)
+
+
+def test_a_free_body_spins_steadily_about_the_nearest_axis():
+    found = steady(FreeRigidBody(), {"attitude_omega_z": 2.0, "attitude_omega_x": 0.1}, held=("attitude_omega_z",))
+    assert bool(found.converged)
+    np.testing.assert_allclose(found["attitude_omega"], [0.0, 0.0, 2.0], atol=1e-10)
+
+
+def test_where_there_is_no_steady_motion_the_residual_says_so():
+    """A disc that leans and neither yaws nor spins falls."""
+    found = steady(TiltingDisc(**DISC), {"lean": 0.3}, held=("lean", "yaw_rate", "spin_rate", "lean_rate"))
+    assert not bool(found.converged)
+    assert float(found.acceleration) == pytest.approx(9.81 * 0.5 * np.sin(0.3) / (0.25 / 4 + 0.25), rel=1e-9)
+    assert "no steady motion found" in str(found)
+
+
+def test_a_motion_forbidden_to_move_comes_to_rest():
+    found = steady(TiltingDisc(**DISC), {"lean": 0.1, "yaw_rate": 1.0, "spin_rate": 1.0}, moving=())
+    np.testing.assert_allclose(found.state.u, np.zeros(5), atol=1e-10)
+    assert float(found["lean"]) == pytest.approx(0.0, abs=1e-10)
+
+
+def test_wrong_names_are_answered_with_valid_ones():
+    with pytest.raises(ValueError, match="did you mean `lean`"):
+        steady(TiltingDisc(), GUESS, held=("leen",))
+    with pytest.raises(ValueError, match="did you mean `spin`"):
+        steady(TiltingDisc(), GUESS, moving=("spinn",))
+
+
+# Minutes of compilation, and not yet run together with the rest: kept out of the short run until it has been.
+pytestmark = pytest.mark.slow

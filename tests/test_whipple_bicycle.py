@@ -1,0 +1,168 @@
+"""The nonlinear Whipple bicycle against the published linear one, statics, geometry and symmetry."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from agreement import admissible_states, disagreement
+from oracles import whipple_bicycle as oracle
+from tolerances import relative_error, tolerance
+
+import jourdain_jax as jj
+from jourdain_jax.equations.accelerations import speeds_from_privileged
+from jourdain_jax.equations.projection import project_positions
+from jourdain_jax.equations.reactions import contact_forces
+from jourdain_jax.models.whipple_bicycle import WhippleBicycle
+
+BICYCLE = WhippleBicycle()
+NAMES = WhippleBicycle.coordinates.names.entries
+LEAN, STEER = NAMES.index("lean"), NAMES.index("steer")
+INDEPENDENT = jj.structure_of(BICYCLE).independent
+
+
+def state(bicycle, lean, steer, lean_rate, steer_rate, speed):
+    """The admissible state with the rear wheel rolling at `speed`; the pitch follows from the front contact."""
+    q = project_positions(bicycle, 0.0, bicycle.named(lean=lean, steer=steer)[0], free=jnp.array([n == "pitch" for n in NAMES]))
+    y = jnp.stack([lean_rate, steer_rate, speed / bicycle.rR])
+    return q, speeds_from_privileged(bicycle, INDEPENDENT, 0.0, q, y)
+
+
+@eqx.filter_jit
+def accelerations(bicycle, x, speed, torques):
+    """Lean and steer accelerations at x = (lean, steer, lean rate, steer rate), on the constraints."""
+    q, u = state(bicycle, *x, speed)
+    udot = jj.accelerations(bicycle, 0.0, q, u, torques, reduction="privileged").udot
+    return udot[jnp.array([LEAN, STEER])]
+
+
+@eqx.filter_jit
+def linear(bicycle, speed):
+    """Jacobians of those accelerations by x and by the torques, upright and straight."""
+    return jax.jacfwd(lambda x, torques: accelerations(bicycle, x, speed, torques), argnums=(0, 1))(jnp.zeros(4), jnp.zeros(2))
+
+
+def matrices(bicycle) -> dict[str, np.ndarray]:
+    """M, C1, K0, K2 of `M x'' + v C1 x' + (g K0 + v^2 K2) x = torques`."""
+    (standing, by_torque), (rolling, _) = (map(np.asarray, linear(bicycle, jnp.asarray(speed))) for speed in (0.0, 1.0))
+    M = np.linalg.inv(by_torque)
+    K0, stiffness = -M @ standing[:, :2] / float(bicycle.g), -M @ rolling[:, :2]
+    return {"M": M, "C1": -M @ rolling[:, 2:], "K0": K0, "K2": stiffness - float(bicycle.g) * K0}
+
+
+def other_bicycle() -> dict[str, float]:
+    """Parameters 5 to 20 % from the benchmark's, so that nothing cancels by chance."""
+    factors = 1 + np.random.default_rng(7).uniform(0.05, 0.2, len(oracle.BENCHMARK))
+    return {name: value * factor for (name, value), factor in zip(oracle.BENCHMARK.items(), factors, strict=True)}
+
+
+def test_defaults_are_the_benchmark_bicycle():
+    for name, value in oracle.BENCHMARK.items():
+        assert float(getattr(BICYCLE, name)) == value
+
+
+@pytest.mark.parametrize("speed", [0.0, 4.6, 10.0])
+def test_running_straight_and_upright_is_an_exact_steady_motion(speed):
+    q, u, _ = BICYCLE.named(**BICYCLE.upright(speed))
+    assert jnp.max(jnp.abs(jj.position_residual(BICYCLE, 0.0, q))) <= 1e-13
+    assert jnp.max(jnp.abs(jj.velocity_residual(BICYCLE, 0.0, q, u))) <= 1e-13
+    assert jnp.max(jnp.abs(jj.accelerations(BICYCLE, 0.0, q, u).udot)) <= 1e-13
+
+
+@pytest.mark.parametrize("name", ["M", "C1", "K0", "K2"])
+def test_small_lean_and_steer_obey_the_published_linear_equations(name):
+    assert np.max(np.abs(matrices(BICYCLE)[name] - getattr(oracle, name))) <= tolerance("linearization")
+
+
+def test_any_other_bicycle_obeys_them_too():
+    values = other_bicycle()
+    expected, found = oracle.matrices(values), matrices(WhippleBicycle.from_values(values))
+    for name, matrix in found.items():
+        assert relative_error(matrix, expected[name]) <= tolerance("linearization"), name
+
+
+@pytest.mark.parametrize("speed", range(11))
+def test_eigenvalues_are_the_published_ones(speed):
+    by_state = np.asarray(linear(BICYCLE, jnp.asarray(float(speed)))[0])
+    found = np.linalg.eigvals(np.vstack([np.eye(4)[2:], by_state]))
+    apart = np.abs(found[:, None] - oracle.EIGENVALUES[speed])
+    assert sorted(np.argmin(apart, axis=0)) == [0, 1, 2, 3]
+    assert np.max(np.min(apart, axis=0)) <= tolerance("linearization")
+
+
+def test_wheels_carry_the_published_loads_at_rest():
+    q, u, _ = BICYCLE.named()
+    forces = contact_forces(BICYCLE, 0.0, q, u, jj.accelerations(BICYCLE, 0.0, q, u))
+    for wheel, load in oracle.WHEEL_LOADS.items():
+        assert abs(forces[wheel].normal - load) <= tolerance("linearization")
+
+
+def test_the_front_contact_is_the_lowest_point_of_the_wheel_at_any_lean_and_steer():
+    _, configurations, _ = jj.sample_states(BICYCLE, 30)
+    assert np.max(np.abs(configurations[:, LEAN])) > 0.6
+    assert np.max(np.abs(configurations[:, STEER])) > 0.8
+    angle = np.linspace(0, 2 * np.pi, 20001)
+    rim = float(BICYCLE.rF) * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
+    for q in configurations:
+        wheel = jj.pose_at(BICYCLE, jnp.zeros(()), jnp.asarray(q))["front wheel"]
+        heights = np.asarray(wheel.position)[2] + rim @ np.asarray(wheel.orientation)[2]
+        # between two points of the rim, 3e-4 rad apart, the circle sags by less than 1e-8 of its radius
+        assert -tolerance("round_off") <= heights.min() <= 1e-8
+
+
+def test_rear_wheel_and_front_wheel_roll_without_slip():
+    for t, q, u in admissible_states(BICYCLE, 10):
+        motion = jj.motion_at(BICYCLE, t, q, u)
+        for name, wheel in (("rear wheel", motion["rear wheel"]), ("front wheel", motion["front wheel"])):
+            heading = jnp.cross(wheel.orientation[:, 1], jnp.array([0.0, 0.0, 1.0]))
+            down = jnp.cross(heading / jnp.linalg.norm(heading), wheel.orientation[:, 1])
+            radius = BICYCLE.rR if name == "rear wheel" else BICYCLE.rF
+            slip = wheel.velocity_at(wheel.position - jnp.sign(down[2]) * radius * down)
+            assert jnp.max(jnp.abs(slip)) <= tolerance("round_off"), name
+
+
+def test_a_mirrored_bicycle_moves_as_the_mirror_image():
+    mirror = np.array([-1.0 if name in ("y", "yaw", "lean", "steer") else 1.0 for name in NAMES])
+
+    @eqx.filter_jit
+    def udot(q, u, torques):
+        return jj.accelerations(BICYCLE, 0.0, q, u, torques).udot
+
+    torques = jnp.array([3.0, 0.5])
+    for _, q, u in admissible_states(BICYCLE, 5):
+        there, mirrored = udot(q, u, torques), udot(mirror * q, mirror * u, -torques)
+        assert relative_error(mirrored, mirror * there) <= tolerance("round_off")
+
+
+def test_all_reductions_agree():
+    apart = disagreement(BICYCLE)
+    assert set(apart) == {"privileged", "svd", "kkt", "udwadia-kalaba", "gibbs-appell"}
+    assert max(apart.values()) <= tolerance("round_off"), apart
+
+
+def test_a_hands_free_ride_keeps_its_energy_and_its_contacts():
+    ride = jj.simulate(BICYCLE, t1=3.0, rtol=1e-10, atol=1e-10)
+    ride.raise_if_failed()
+    energy = ride.energies().balance
+    assert relative_error(energy, jnp.full_like(energy, energy[0])) <= tolerance("drift")
+    # inside the stable range 4.29 to 6.02 m/s a kick of 0.2 rad/s dies out
+    assert jnp.max(jnp.abs(ride["lean"])) < 0.1
+
+
+def test_a_slow_bicycle_falls_and_the_ride_stops():
+    ride = jj.simulate(
+        BICYCLE, {"rear_spin_rate": 1.0 / 0.3, "lean_rate": 0.2, "steer_rate": 0.0}, t1=5.0, rtol=1e-10, atol=1e-10
+    )
+    assert ride.event_names[int(ride.event)] == "fallen"
+    lean_left, steer_left = 1.2 - abs(ride.q_end[LEAN]), jnp.pi / 2 - abs(ride.q_end[STEER])
+    assert abs(min(lean_left, steer_left)) <= 1e-9
+
+
+def test_parameters_come_by_name_and_only_by_name():
+    values = other_bicycle()
+    bicycle = WhippleBicycle.from_values(values)
+    assert {name: float(getattr(bicycle, name)) for name in values} == values
+    with pytest.raises(ValueError, match=r"unknown bicycle parameter `lambda`; did you mean `lam`"):
+        WhippleBicycle.from_values(values | {"lambda": 0.3})
+    with pytest.raises(ValueError, match=r"missing: `lam`; give all 26"):
+        WhippleBicycle.from_values({name: value for name, value in values.items() if name != "lam"})
