@@ -3,6 +3,7 @@
 `JOURDAIN_JAX_NO_TYPE_CHECKS=1` switches the jaxtyping/beartype checks off (faster, for timing only).
 """
 
+import gc
 import os
 from pathlib import Path
 
@@ -15,6 +16,14 @@ from jaxtyping import install_import_hook
 # Before any import of the package: every annotated function is then checked, shapes and dtypes included.
 if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":
     install_import_hook("jourdain_jax", "beartype.beartype")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_programs_are_dropped():
+    """Every compiled program holds memory maps, of which a process may have 65530: without this a long run ends in an abort inside the compiler."""
+    yield
+    jax.clear_caches()
+    gc.collect()
 
 
 def pytest_configure(config: pytest.Config) -> None:
