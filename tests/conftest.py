@@ -7,7 +7,13 @@ import gc
 import os
 from pathlib import Path
 
+import jaxlib
+
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Most of the time of a test is spent compiling. With less effort on machine code the same tests take half as long; the flags belong to the
+# tested version of jaxlib (another one might not know them). Timings are taken in `bench/`, with none of this.
+if jaxlib.__version__.startswith("0.10."):
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
 
 import jax
 import pytest

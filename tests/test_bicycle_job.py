@@ -74,7 +74,3 @@ def test_the_command_writes_its_table_and_figures(tmp_path, capsys):
     assert main(["bicycle", "Rigid", "Tms", "--samples", "60", "--out", str(tmp_path / "out")]) == 1  # one file was refused
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"result.json", "eigenvalues.png", "ride.png", "ride.gif"}
     assert "5.0084" in capsys.readouterr().out
-
-
-# Minutes of compilation, and not yet run since the default sampling domain grew: kept out of the short run until it has been.
-pytestmark = pytest.mark.slow

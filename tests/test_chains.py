@@ -109,7 +109,3 @@ def test_a_chain_needs_links():
         PendulumChain(links=0)
     with pytest.raises(ValueError, match="`trailers` of `TrailerChain` is -1"):
         TrailerChain(trailers=-1)
-
-
-# Minutes of compilation, and not yet run since the default sampling domain grew: kept out of the short run until it has been.
-pytestmark = pytest.mark.slow

@@ -35,7 +35,3 @@ def test_a_bicycle_ignores_its_place_its_heading_and_the_turns_of_its_wheels():
 def test_an_attitude_that_changes_nothing_is_ignorable_as_a_whole_and_not_cyclic():
     assert ignorable_coordinates(Suslov()) == ("attitude",)
     assert cyclic_coordinates(Suslov()) == ()
-
-
-# Minutes of compilation, and not yet run since the default sampling domain grew: kept out of the short run until it has been.
-pytestmark = pytest.mark.slow

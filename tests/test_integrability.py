@@ -109,7 +109,3 @@ def test_nonlinear_rows_have_no_growth_vector():
     found = growth_vector(IsokineticParticle())
     assert found.vector == ()
     assert not found.closed
-
-
-# Minutes of compilation, and not yet run since the default sampling domain grew: kept out of the short run until it has been.
-pytestmark = pytest.mark.slow

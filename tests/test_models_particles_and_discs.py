@@ -116,7 +116,3 @@ def test_the_example_starts_on_the_rows(scene, freedoms):
     start = jj.start(scene, **scene.example)
     assert start.residual <= tolerance("round_off")
     assert all(jnp.allclose(start[name], value, rtol=0, atol=0) for name, value in scene.example.items())
-
-
-# Minutes of compilation, and not yet run since the default sampling domain grew: kept out of the short run until it has been.
-pytestmark = pytest.mark.slow

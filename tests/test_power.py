@@ -51,7 +51,7 @@ def test_the_wire_does_the_work_that_turns_the_bead():
     # torque about the axis is d(m r^2 w)/dt = 2 m r rdot w, its power 2 m r rdot w^2
     scene = small.BeadOnTurningWire(mass=0.6, rate=1.7)
     t, q, u = jnp.asarray(0.4), jnp.array([0.5]), jnp.array([0.8])
-    found = power(scene, t, q, u, None, jj.accelerations(scene, t, q, u))
+    found = power(scene, jj.motion_at(scene, t, q, u), jj.accelerations(scene, t, q, u))
     assert jnp.allclose(found.driven, 2 * 0.6 * 0.5 * 0.8 * 1.7**2, rtol=tolerance("round_off"))
     assert found.loads == 0.0
 
@@ -66,12 +66,10 @@ def test_a_damper_takes_energy_at_the_rate_c_times_speed_squared():
 def test_prescribed_coordinates_and_moving_springs_each_do_work_of_their_own():
     scene = small.DrivenPendulum()
     t, q, u = (jnp.asarray(x[0]) for x in jj.sample_states(scene, 1))
-    found = power(scene, t, q, u, None, jj.accelerations(scene, t, q, u))
+    found = power(scene, jj.motion_at(scene, t, q, u), jj.accelerations(scene, t, q, u))
     assert all(jnp.abs(part) > 1e-3 for part in (found.loads, found.rows, found.potential))
 
 
-# Minutes of compilation, and not yet run since the default sampling domain grew: kept out of the short run until it has been.
-pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize(

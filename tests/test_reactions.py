@@ -135,7 +135,3 @@ def test_friction_needed_has_a_finite_gradient_where_nothing_slides():
         return contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"].friction_needed
 
     assert jnp.isfinite(jax.grad(friction)(0.7))
-
-
-# Minutes of compilation, and not yet run since the default sampling domain grew: kept out of the short run until it has been.
-pytestmark = pytest.mark.slow

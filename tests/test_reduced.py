@@ -144,4 +144,3 @@ def test_rows_nonlinear_in_the_speeds_have_no_reduced_equations():
 
 
 # Minutes of compilation, and not yet run together with the rest: kept out of the short run until it has been.
-pytestmark = pytest.mark.slow

@@ -78,7 +78,3 @@ def test_the_report_for_machines_has_the_named_fields_and_is_json(scene):
         "privileged_velocities",
     }
     assert facts["degrees_of_freedom"] == len(facts["privileged_velocities"])
-
-
-# Minutes of compilation, and not yet run since the default sampling domain grew: kept out of the short run until it has been.
-pytestmark = pytest.mark.slow

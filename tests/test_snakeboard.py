@@ -71,7 +71,3 @@ def test_a_torque_on_the_wheels_opens_both_pairs():
     udot = BOARD.speed_names.view(jj.accelerations(BOARD, 0.0, q, u, jnp.array([0.0, 0.3])).udot)
     assert relative_error(udot.steer_rate, 0.3 / (2 * BOARD.wheel_inertia)) <= tolerance("round_off")
     assert abs(udot.heading_rate) <= tolerance("round_off")
-
-
-# Minutes of compilation, and not yet run since the default sampling domain grew: kept out of the short run until it has been.
-pytestmark = pytest.mark.slow

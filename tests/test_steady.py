@@ -100,4 +100,3 @@ def test_wrong_names_are_answered_with_valid_ones():
 
 
 # Minutes of compilation, and not yet run together with the rest: kept out of the short run until it has been.
-pytestmark = pytest.mark.slow

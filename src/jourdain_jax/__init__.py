@@ -29,10 +29,11 @@ from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.equations.accelerations import Accelerations, Baumgarte, accelerations, reductions
 from jourdain_jax.equations.gibbs_appell import GibbsAppell, gibbs_equations, gibbs_function
+from jourdain_jax.equations.instant import constraint_rows
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.lagrange import lagrange_equations
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, NullSpaceSVD, Privileged, UdwadiaKalaba
-from jourdain_jax.equations.rows import constraint_rows, position_residual, velocity_residual
+from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.equations.structure import sample_states, structure_of
 from jourdain_jax.equations.virtual_power import (
     generalized_forces,

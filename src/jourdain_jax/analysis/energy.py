@@ -73,6 +73,6 @@ def _powers(scene: Scene, t, q, u, inputs):
         found = bare_accelerations(scene, t, q, u, inputs)
         equations = unconstrained_equations(scene, t, q, u, inputs)
         forces = jnp.abs(equations.M) @ jnp.abs(found.udot) + jnp.abs(equations.h) + jnp.abs(equations.Q)
-        return power(scene, t, q, u, inputs, found), jnp.abs(u) @ forces
+        return power(scene, motion_at(scene, t, q, u, inputs), found), jnp.abs(u) @ forces
 
     return jax.vmap(one)(t, q, u, inputs)

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.equations.kinematics import coordinate_rates
-from jourdain_jax.equations.reductions import partition
+from jourdain_jax.equations.reductions import Partition
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.equations.structure import sample_states, structure_of
@@ -235,7 +235,8 @@ def _fields_at(scene: Scene, with_time: bool, u, x) -> Float[Array, "directions 
     t, q = (x[0], x[1:]) if with_time else (jnp.zeros((), x.dtype), x)
     A, d = _linear_rows(scene, t, q, u)
     scale = row_scale(A)
-    C, c, _ = partition(structure_of(scene).independent, scale[:, None] * A, -scale * d)
+    split = Partition(scale[:, None] * A, structure_of(scene).independent)
+    C, c = split.C, split.particular(-scale * d)
     N, nu = _rates(scene, t, q, u)
     if not with_time:
         return N @ C

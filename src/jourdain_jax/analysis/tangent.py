@@ -15,11 +15,12 @@ from jaxtyping import Array, Float, Int
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff, singular_values
 from jourdain_jax.calculus.rotations import quaternion_product
 from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.probing import concretised, on_numbers
 from jourdain_jax.equations.reductions import Privileged
-from jourdain_jax.equations.rows import constraint_rows, names_of_position_rows, position_residual
+from jourdain_jax.equations.rows import names_of_position_rows, position_residual
 from jourdain_jax.equations.scaling import row_scale, scaled
-from jourdain_jax.equations.structure import concretised, sample_states, structure_of
-from jourdain_jax.equations.virtual_power import unconstrained_equations
+from jourdain_jax.equations.structure import sample_states, structure_of
+from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
@@ -46,7 +47,7 @@ def flow_of(scene: Scene, privileged: tuple[int, ...]):
     """`(t, q, u, f) -> (Flow, mass matrix)` with the accelerations in the given privileged speeds."""
 
     def flow(t, q, u, f):
-        equations, rows = unconstrained_equations(scene, t, q, u, f), constraint_rows(scene, t, q, u, f)
+        equations, rows = equations_and_rows(scene, t, q, u, f)
         problem = scaled(equations, rows)
         w, _, _ = Privileged(privileged).solve(problem)
         return Flow(coordinate_rates(scene, t, q, u), problem.c * w, rows.phi, position_residual(scene, t, q)), equations.M
@@ -139,9 +140,13 @@ def dependent_coordinates(scene: Scene, state: State, named: tuple[str, ...], de
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, state))):
         scene = concretised(scene)
         t, q, _ = sample_states(scene, 16)
-    with jax.ensure_compile_time_eval():
-        G = np.asarray(jax.vmap(lambda t, q: jax.jacfwd(position_residual, 2)(scene, t, q) @ perturbations(scene, q).E)(jnp.asarray(t), jnp.asarray(q)))
-    return _pivots(G, [names.index(name) for name in named], type(scene).__name__)
+    return _pivots(_geometric_rows(scene, t, q), [names.index(name) for name in named], type(scene).__name__)
+
+
+@on_numbers
+def _geometric_rows(scene: Scene, t, q):
+    """dg over the perturbations, at every state."""
+    return jax.vmap(lambda t, q: jax.jacfwd(position_residual, 2)(scene, t, q) @ perturbations(scene, q).E)(t, q)
 
 
 def _pivots(G: Float[np.ndarray, "samples rows columns"], kept: list[int], scene: str) -> Int[np.ndarray, "dependent"]:

@@ -18,14 +18,15 @@ from jourdain_jax.calculus.null_space import null_space_svd
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
 from jourdain_jax.equations.accelerations import reductions
 from jourdain_jax.equations.gibbs_appell import GibbsAppell, gibbs_equations
+from jourdain_jax.equations.instant import constraint_rows
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities
 from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
 from jourdain_jax.equations.power import power_of_nonconservative
 from jourdain_jax.equations.reactions import row_reactions
 from jourdain_jax.equations.reductions import diagnosed, reduce
-from jourdain_jax.equations.rows import constraint_rows, names_of_rows
+from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
-from jourdain_jax.equations.virtual_power import kinetic_energy, newton_residual, potential_energy, unconstrained_equations
+from jourdain_jax.equations.virtual_power import equations_and_rows, kinetic_energy, newton_residual, potential_energy
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.scene import Scene
 
@@ -107,7 +108,7 @@ def verify(scene: Scene, state: State, inputs: Float[Array, "inputs"] | None = N
 
 @eqx.filter_jit
 def _evaluate(scene, t, q, u, inputs) -> dict:
-    equations, rows = unconstrained_equations(scene, t, q, u, inputs), constraint_rows(scene, t, q, u, inputs)
+    equations, rows = equations_and_rows(scene, t, q, u, inputs)
     ways = {name: diagnosed(_by(way, scene, t, q, u, equations, rows), equations, rows) for name, way in reductions(scene).items()}
     c = speed_scale(equations.M)
     reference = ways["svd"]
@@ -278,7 +279,7 @@ def _outcome(arguments, point) -> Float[Array, "reductions"]:
     ways, weights, t, inputs, fixed = arguments
     parameters, q, u = point
     scene = eqx.combine(parameters, fixed)
-    equations, rows = unconstrained_equations(scene, t, q, u, inputs), constraint_rows(scene, t, q, u, inputs)
+    equations, rows = equations_and_rows(scene, t, q, u, inputs)
     found = [_by(reductions(scene)[way], scene, t, q, u, equations, rows) for way in ways]
     return jnp.stack([weights @ jnp.concatenate([a.udot, a.constraint_force]) for a in found])
 

@@ -4,7 +4,6 @@ kinematics -> virtual power (M, h, Q) -> rows (A, drift) -> reduction -> udot, l
 """
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -19,13 +18,11 @@ from jourdain_jax.equations.reductions import (
     Reduction,
     UdwadiaKalaba,
     diagnosed,
-    partition,
     reduce,
 )
-from jourdain_jax.equations.rows import ConstraintRows, constraint_rows, position_residual
-from jourdain_jax.equations.scaling import row_scale, scaled
+from jourdain_jax.equations.rows import ConstraintRows, position_residual
 from jourdain_jax.equations.structure import structure_of
-from jourdain_jax.equations.virtual_power import UnconstrainedEquations, unconstrained_equations
+from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
@@ -82,8 +79,7 @@ def bare_accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, st
 
 def _reduced(scene: Scene, t, q, u, inputs, reduction, stabilisation) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
     reduction = as_reduction(scene, reduction)
-    equations = unconstrained_equations(scene, t, q, u, inputs)
-    rows = constraint_rows(scene, t, q, u, inputs)
+    equations, rows = equations_and_rows(scene, t, q, u, inputs)
     if stabilisation is not None:
         rows = _stabilised(scene, t, q, rows, stabilisation)
     if isinstance(reduction, GibbsAppell):
@@ -96,22 +92,3 @@ def _stabilised(scene: Scene, t, q, rows: ConstraintRows, terms: Baumgarte) -> C
     count = g.shape[0]
     extra = jnp.concatenate([2 * terms.alpha * rows.phi[:count] + terms.beta**2 * g, terms.alpha * rows.phi[count:]])
     return ConstraintRows(rows.phi, rows.A, rows.drift + extra, rows.names)
-
-
-def partition_pivot(scene: Scene, independent: tuple[int, ...], t, q, u, inputs=None) -> Float[Array, ""]:
-    """Smallest singular value of the scaled A_z of a partition at one state: near zero where these privileged speeds do not serve."""
-    problem = scaled(unconstrained_equations(scene, t, q, u, inputs), constraint_rows(scene, t, q, u, inputs))
-    return jax.lax.stop_gradient(partition(independent, problem.A, problem.b)[2])
-
-
-def speeds_from_privileged(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> Float[Array, "speeds"]:
-    """All speeds from the independent ones, `u = C y + c`: rows linear or affine in the speeds then hold exactly (eqs. (25)-(31))."""
-    n = len(scene.speed_names)
-    u = jnp.zeros(n, q.dtype).at[jnp.array(independent, jnp.int32)].set(y)
-    rows = constraint_rows(scene, t, q, u, inputs)
-    if not rows.names:
-        return u
-    # A (u + du) + d = 0 with du in the dependent speeds only
-    d = row_scale(rows.A)
-    _, du, _ = partition(independent, d[:, None] * rows.A, -d * rows.phi)
-    return u + du

@@ -16,11 +16,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at
-from jourdain_jax.equations.reductions import Privileged, partition, reduce
-from jourdain_jax.equations.rows import constraint_rows, velocity_residual
+from jourdain_jax.equations.probing import on_numbers, probed_once
+from jourdain_jax.equations.reductions import Partition, Privileged, reduce
+from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.equations.structure import probed_once, sample_states, structure_of
-from jourdain_jax.equations.virtual_power import potential_resultants, resultants, unconstrained_equations
+from jourdain_jax.equations.structure import sample_states, structure_of
+from jourdain_jax.equations.virtual_power import equations_and_rows, potential_resultants, resultants
 from jourdain_jax.scene.scene import Scene
 
 PROBES = 8
@@ -50,7 +51,8 @@ def admissible_rates(scene: Scene, t, q, u) -> AdmissibleRates:
     """C, c, B and b at one state; u matters for rows nonlinear in the speeds only, which are linearised there."""
     A = jax.jacfwd(lambda u: velocity_residual(scene, t, q, u))(u)
     scale = row_scale(A)
-    C, c, _ = partition(structure_of(scene).independent, scale[:, None] * A, scale * (A @ u - velocity_residual(scene, t, q, u)))
+    split = Partition(scale[:, None] * A, structure_of(scene).independent)
+    C, c = split.C, split.particular(scale * (A @ u - velocity_residual(scene, t, q, u)))
     nu = coordinate_rates(scene, t, q, jnp.zeros_like(u))
     N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
     return AdmissibleRates(C, c, N @ C, N @ c + nu)
@@ -102,9 +104,7 @@ def dependence(scene: Scene) -> Dependence:
     t, q, u = sample_states(scene, PROBES)
     q = q + DISPLACEMENT * generator.uniform(-1, 1, q.shape)
     shifts = DISPLACEMENT * generator.uniform(0.5, 1, q.shape)
-    with jax.ensure_compile_time_eval():
-        probed = jax.tree.map(np.asarray, _probe(scene, *(jnp.asarray(x) for x in (t, q, u, shifts))))
-    values, one_speed = probed
+    values, one_speed = _probe(scene, t, q, u, shifts)
     changed = {name: _changed(value) for name, value in values.items()}
     appears = [changed[name].any(axis=0) for name in values if name not in ("rates", "accelerations")]
     return Dependence(np.any(appears, axis=0), changed["rates"], changed["accelerations"].any(axis=0), one_speed.all(axis=0))
@@ -117,7 +117,7 @@ def _changed(values: np.ndarray) -> Bool[np.ndarray, "entries coordinates"]:
     return ~np.all(np.abs(values[:, 1:] - values[:, :1]) <= limit * size, axis=0).T  # NaN counts as a change
 
 
-@eqx.filter_jit
+@on_numbers
 def _probe(scene: Scene, t, q, u, shifts):
     """Quantities by name at every state, undisplaced and with one coordinate after another displaced; whose rate is one speed."""
 
@@ -146,7 +146,7 @@ def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
     inertia = jnp.einsum("bij,bjk,blk->bil", turned, inertias(scene, t, q).inertia, turned)
     loads, potential = resultants(scene, motion), potential_resultants(scene, motion)
     forces = [loads.force, loads.torque, loads.direct @ rates.C, potential.force, potential.torque, potential.direct @ rates.C]
-    udot = reduce(Privileged(independent), unconstrained_equations(scene, t, q, u), constraint_rows(scene, t, q, u)).udot
+    udot = reduce(Privileged(independent), *equations_and_rows(scene, t, q, u)).udot
     return {
         "rates": rates.B @ y + rates.b,
         "accelerations": jnp.concatenate([udot[chosen], y]),  # y, which depends on nothing, gives free motion a size

@@ -64,7 +64,12 @@ def _space_angular_velocity(body, rate) -> Float[Array, "3"]:
 
 def velocities(scene: Scene, t, q, u) -> Velocities:
     """Velocities of the mass centres and body angular velocities, affine in u."""
-    bodies = motion_at(scene, t, q, u).bodies.values()
+    return velocities_of(motion_at(scene, t, q, u))
+
+
+def velocities_of(motion: Motion) -> Velocities:
+    """The same from a known motion."""
+    bodies = motion.bodies.values()
     return Velocities(jnp.stack([b.velocity for b in bodies]), jnp.stack([b.angular_velocity_body for b in bodies]))
 
 
@@ -82,6 +87,11 @@ def bias_accelerations(scene: Scene, t, q, u) -> tuple[Velocities, Velocities]:
 
 def inertias(scene: Scene, t, q) -> Inertias:
     """Masses and inertias of all bodies."""
-    bodies = [pose.body for pose in pose_at(scene, t, q).bodies.values()]
-    zero = jnp.zeros((3, 3), q.dtype)
+    return inertias_of(pose_at(scene, t, q))
+
+
+def inertias_of(pose: Pose | Motion) -> Inertias:
+    """The same from known poses."""
+    bodies = [body.body for body in pose.bodies.values()]
+    zero = jnp.zeros((3, 3), pose.q.array.dtype)
     return Inertias(jnp.stack([b.mass for b in bodies]), jnp.stack([b.inertia if isinstance(b, RigidBody) else zero for b in bodies]))

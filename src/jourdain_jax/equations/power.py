@@ -38,19 +38,18 @@ class Power(eqx.Module):
 
 def power_of_nonconservative(scene: Scene, t, q, u, inputs, accelerations: Accelerations | Reduced) -> Float[Array, ""]:
     """`d(T + V)/dt` in W along the motion with the given accelerations: zero where the energy T + V is conserved."""
-    return power(scene, t, q, u, inputs, accelerations).total
+    return power(scene, motion_at(scene, t, q, u, inputs), accelerations).total
 
 
-def power(scene: Scene, t, q, u, inputs, accelerations: Accelerations | Reduced) -> Power:
+def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) -> Power:
     """The same by origin."""
     structure = structure_of(scene)
-    motion = motion_at(scene, t, q, u, inputs)
     zero = jnp.zeros_like(motion.t)
     works = not (structure.affine and structure.homogeneous)
     return Power(
         loads=power_of_loads(scene, motion, conservative=False),
         # lambda . (A u), which is lambda . phi = 0 for rows homogeneous and linear in u
-        rows=accelerations.constraint_force @ u if works else zero,
+        rows=accelerations.constraint_force @ motion.u.array if works else zero,
         driven=_power_of_drives(scene, motion, accelerations.udot) if structure.driven else zero,
         potential=_explicit_rate_of_potential(scene, motion),
     )

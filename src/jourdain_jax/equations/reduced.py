@@ -71,7 +71,7 @@ def _groups(droppable: set[int], needs) -> list[list[int]]:
 
 def full_coordinates(scene: Scene, kept: Float[Array, "kept"], dropped=None) -> Float[Array, "coordinates"]:
     """All coordinates from the kept ones; the dropped ones by name, at the reference where they are not given."""
-    reduced, q = reduced_coordinates(scene), scene.coordinates.reference()
+    reduced, q = reduced_coordinates(scene), jnp.asarray(scene.coordinates.reference())
     q = q.at[_indices(scene, reduced.kept)].set(kept)
     for name, value in (dropped or {}).items():
         q = q.at[scene.coordinate_names.index(name, "coordinate")].set(value)

@@ -17,6 +17,7 @@ import abc
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, present
@@ -119,28 +120,62 @@ class Privileged(Reduction):
     name = "privileged"
 
     def solve(self, problem):
-        C, c, pivot = partition(self.independent, problem.A, problem.b)
-        # (C' M C) yddot = C' (f - M c)
-        yddot, definite = solve_definite(C.T @ problem.M @ C, C.T @ (problem.f - problem.M @ c))
-        return C @ yddot + c, pivot, definite & (pivot > 1e-7)
+        split = Partition(problem.A, self.independent)
+        return *appell(problem.M, problem.f, split.C, split.particular(problem.b), split.pivot()),
 
 
-def partition(independent: tuple[int, ...], A, b) -> tuple[Float[Array, "speeds freedoms"], Float[Array, "speeds"], Float[Array, ""]]:
-    """`C`, `c` of `u = C y + c` with `A u = b`, y the independent speeds (eqs. (25)-(31)); and the smallest singular value of A_z."""
-    n = A.shape[1]
-    y = jnp.array(independent, jnp.int32)
-    dependent = [i for i in range(n) if i not in independent]
-    z = jnp.array(dependent, jnp.int32)
-    C = jnp.zeros((n, len(independent)), A.dtype).at[y, jnp.arange(len(independent))].set(1.0)
-    if not dependent:
-        return C, jnp.zeros(n, A.dtype), jnp.ones((), A.dtype)
-    # B = -A_z^-1 A_y,  b = A_z^-1 b;  A_z may be tall where rows are dependent everywhere
-    A_z = A[:, z]
-    Bb = jnp.concatenate([-A[:, y], b[:, None]], axis=1)
-    Bb = jnp.linalg.solve(A_z, Bb) if A_z.shape[0] == A_z.shape[1] else pseudo_inverse(A_z) @ Bb
-    sigma = singular_values(A_z)
-    smallest = sigma[-1] if A_z.shape[0] >= A_z.shape[1] else jnp.zeros((), A.dtype)
-    return C.at[z].set(Bb[:, :-1]), jnp.zeros(n, A.dtype).at[z].set(Bb[:, -1]), smallest
+def appell(M, f, C, c, pivot):
+    """`udot = C yddot + c` from `C' M C yddot = C' (f - M c)`, the pivot, and whether both serve (eq. (41))."""
+    yddot, definite = solve_definite(C.T @ M @ C, C.T @ (f - M @ c))
+    return C @ yddot + c, pivot, definite & (pivot > 1e-7)
+
+
+class Partition(eqx.Module):
+    """Independent and dependent speeds, y and z: `A u = b` solved as `u = C y + c` (eqs. (25)-(31)).
+
+    `B = -A_z^-1 A_y`; A_z may be tall, where rows are dependent everywhere.
+    """
+
+    A: Float[Array, "rows speeds"]
+    independent: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def dependent(self) -> tuple[int, ...]:
+        """Indices of the dependent speeds."""
+        return tuple(i for i in range(self.A.shape[1]) if i not in self.independent)
+
+    def all_from(self, y: Float[Array, "freedoms *k"], z: Float[Array, "rank *k"]) -> Float[Array, "speeds *k"]:
+        """All speeds, in order, from the independent and the dependent ones."""
+        order = np.argsort([*self.independent, *self.dependent])
+        return jnp.concatenate([y, z])[order]
+
+    @property
+    def C(self) -> Float[Array, "speeds freedoms"]:
+        """All speeds per independent one."""
+        B = self._solved(-self.A[:, np.array(self.independent, int)])
+        return self.all_from(jnp.eye(len(self.independent), dtype=B.dtype), B)
+
+    def particular(self, b: Float[Array, "rows"]) -> Float[Array, "speeds"]:
+        """`c`: the solution of `A c = b` with all independent speeds zero."""
+        return self.all_from(jnp.zeros(len(self.independent), b.dtype), self._solved(b[:, None])[:, 0])
+
+    def pivot(self) -> Float[Array, ""]:
+        """Smallest singular value of A_z; 1 without rows."""
+        A_z = self._A_z
+        if not self.dependent:
+            return jnp.ones((), A_z.dtype)
+        return singular_values(A_z)[-1] if A_z.shape[0] >= A_z.shape[1] else jnp.zeros((), A_z.dtype)
+
+    @property
+    def _A_z(self):
+        return self.A[:, np.array(self.dependent, int)]
+
+    def _solved(self, right: Float[Array, "rows k"]) -> Float[Array, "rank k"]:
+        """`A_z^-1 right`."""
+        A_z = self._A_z
+        if not self.dependent:
+            return jnp.zeros((0, right.shape[1]), right.dtype)
+        return jnp.linalg.solve(A_z, right) if A_z.shape[0] == A_z.shape[1] else pseudo_inverse(A_z) @ right
 
 
 def _by_null_space(problem: ScaledProblem, Z):

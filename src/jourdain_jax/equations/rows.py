@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import skew
-from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, pose_at
+from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.scene import Scene
@@ -115,15 +115,3 @@ def _names(rows, scene: Scene) -> tuple[str, ...]:
     names: list[str] = []
     jax.eval_shape(lambda s: names.extend(row_names(rows(s))), scene)
     return tuple(names)
-
-
-def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
-    """phi, `A = d phi/du` and the drift `d phi/dt` at `udot = 0`."""
-    t = jnp.asarray(t, jnp.result_type(float))
-    names = names_of_rows(scene)
-    if not names:
-        return ConstraintRows(jnp.zeros(0, q.dtype), jnp.zeros((0, u.shape[0]), q.dtype), jnp.zeros(0, q.dtype), ())
-    qdot = coordinate_rates(scene, t, q, u)
-    phi, drift = jax.jvp(lambda t, q: velocity_residual(scene, t, q, u, inputs), (t, q), (jnp.ones_like(t), qdot))
-    A = jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
-    return ConstraintRows(phi, A, drift, names)

@@ -7,28 +7,27 @@ parameters are traced (the class's default values stand in), so that the choice 
 
 import itertools
 from dataclasses import dataclass
-from functools import lru_cache, wraps
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.equations.kinematics import coordinate_rates, velocities
+from jourdain_jax.equations.probing import on_numbers, probed_once
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_rows, velocity_residual
 from jourdain_jax.equations.scaling import row_scale, speed_scale
-from jourdain_jax.equations.virtual_power import unconstrained_equations
-from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene
 
 RANDOM_PROBES = 24
-SYMMETRIC_PROBES = 40
+SYMMETRIC_PROBES = 200
 # Where a scene states no domain: wide enough that an angle meets every direction, so that no partition passes by luck.
 COORDINATE_DOMAIN = (-3.2, 3.2)
 SPEED_DOMAIN = (-1.0, 1.0)
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
 _EXHAUSTIVE = 3000
+_SHORTLIST = 40
 
 
 @dataclass(frozen=True)
@@ -60,62 +59,10 @@ class Structure:
         return self.worst_pivot >= WELL_CONDITIONED
 
 
-def probed_once(probe):
-    """A function of a scene that runs on concrete parameters, also while they are traced, and once per class and values."""
-    cached = lru_cache(maxsize=512)(lambda wrapped: probe(wrapped.scene))
-
-    @wraps(probe)
-    def of(scene: Scene):
-        concrete = concretised(scene)
-        leaves, treedef = jax.tree.flatten(concrete)
-        key = tuple((np.asarray(x).tobytes(), np.shape(x), str(np.asarray(x).dtype)) for x in leaves)
-        return cached(_Hashable(concrete, (treedef, key, type(scene))))
-
-    return of
-
-
-class _Hashable:
-    """A scene with the key it is cached by."""
-
-    def __init__(self, scene, key):
-        self.scene, self.key = scene, key
-
-    def __hash__(self):
-        return hash(self.key)
-
-    def __eq__(self, other):
-        return self.key == other.key
-
-
-def concretised(scene: Scene) -> Scene:
-    """The scene with numbers in place of traced parameters: generic ones near the class's defaults, else near one.
-
-    Generic, because a default of zero (a tilt, a rate) must not pass for a term that is absent.
-    """
-    if not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(scene)):
-        return scene
-    for name, value, _ in parameters_of(scene):
-        if isinstance(value, jax.core.Tracer):
-            default = scene.__dataclass_fields__[name].default
-            usable = isinstance(default, int | float) or hasattr(default, "shape")
-            number = _generic(np.broadcast_to(np.asarray(default, value.dtype), value.shape)) if usable else _near_one(value)
-            scene = eqx.tree_at(lambda s, name=name: getattr(s, name), scene, number)
-    return jax.tree.map(lambda x: _near_one(x) if isinstance(x, jax.core.Tracer) else x, scene)
-
-
-def _generic(x: np.ndarray) -> np.ndarray:
-    return np.asarray(np.where(x == 0, 0.1, x) * (1.0 + 0.01 * np.random.default_rng(0).uniform(size=x.shape)), x.dtype)
-
-
-def _near_one(x) -> np.ndarray:
-    return np.asarray(1.0 + 0.1 * np.random.default_rng(0).uniform(size=x.shape), x.dtype)
-
-
 def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Random admissible states (t, q, u) from the scene's domain, on the rows; scene parameters must be concrete."""
     t, q, u = _random_states(scene, count, np.random.default_rng(seed))
-    with jax.ensure_compile_time_eval():
-        q, u, miss = (np.asarray(x) for x in _projected(scene, jnp.asarray(t), jnp.asarray(q), jnp.asarray(u)))
+    q, u, miss = _projected(scene, t, q, u)
     good = _assembled(scene, miss, np.ones(count, bool))
     return t[good], q[good], u[good]
 
@@ -147,7 +94,7 @@ def _bounds(scene: Scene, names, default) -> tuple[np.ndarray, np.ndarray]:
     return np.array([p[0] for p in pairs], float), np.array([p[1] for p in pairs], float)
 
 
-@eqx.filter_jit
+@on_numbers
 def _projected(scene, t, q, u):
     def one(t, q, u):
         q = project_positions(scene, t, q)
@@ -165,11 +112,11 @@ def _miss(scene, t, q):
 def _symmetric_configurations(scene: Scene) -> np.ndarray:
     """Zero, and right angles (within the domain) in one or two coordinates."""
     low, high = _bounds(scene, scene.coordinate_names.entries, COORDINATE_DOMAIN)
-    with jax.ensure_compile_time_eval():
-        reference = np.asarray(scene.coordinates.reference())
+    reference = scene.coordinates.reference()
     attitude = {i + k for i, _ in scene.coordinates.quaternions for k in range(4)}
     turns = [(i, a) for i in range(len(low)) if i not in attitude for a in (np.pi / 2, -np.pi / 2) if low[i] <= a <= high[i]]
-    chosen = [(), *((turn,) for turn in turns), *itertools.combinations(turns, 2)]
+    pairs = sorted(itertools.combinations(turns, 2), key=lambda pair: pair[0][1] != pair[1][1])  # equal angles first: headings of one axle
+    chosen = [(), *((turn,) for turn in turns), *pairs]
     configurations = []
     for turned in chosen[:SYMMETRIC_PROBES]:
         q = np.where([i in attitude for i in range(len(low))], reference, np.clip(reference, low, high))
@@ -179,11 +126,11 @@ def _symmetric_configurations(scene: Scene) -> np.ndarray:
     return np.array(configurations).reshape(-1, len(low))
 
 
-@eqx.filter_jit
+@on_numbers
 def _probe(scene, t, q, u, u_other):
     def one(t, q, u, u_other):
         q = project_positions(scene, t, q)
-        M = unconstrained_equations(scene, t, q, u).M
+        M = mass_matrix_at(scene, t, q)
         A, A_other = (jax.jacfwd(lambda v: velocity_residual(scene, t, q, v))(v) for v in (u, u_other))
         c = speed_scale(M)
         scaled = row_scale(A * c)[:, None] * A * c
@@ -211,8 +158,7 @@ def structure_of(scene: Scene) -> Structure:
     t, q, u = _random_states(scene, RANDOM_PROBES, np.random.default_rng(0))
     symmetric = _symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
-    with jax.ensure_compile_time_eval():
-        scaled, still, curved, timed, moving, miss = (np.asarray(x) for x in _probe(scene, *(jnp.asarray(x) for x in (t, q, u, -u[::-1]))))
+    scaled, still, curved, timed, moving, miss = _probe(scene, t, q, u, -u[::-1])
     generic = np.arange(len(t)) < RANDOM_PROBES
     usable = np.all(np.isfinite(scaled), axis=(1, 2)) & _assembled(scene, miss, generic)
     q, scaled, still, curved, timed, moving = (x[usable] for x in (q, scaled, still, curved, timed, moving))
@@ -296,10 +242,12 @@ def _choose(scaled: np.ndarray, count: int, rank: int) -> tuple[int, ...]:
     if len(subsets) > _EXHAUSTIVE:
         subsets = list({_greedy(A, rank) for A in scaled})
 
-    def merit(dependent):
-        return round(_worst(scaled, list(dependent), rank), 6), round(float(np.median(_pivots(scaled, list(dependent), rank))), 6)
+    def merit(dependent, probes):
+        return round(_worst(probes, list(dependent), rank), 6), round(float(np.median(_pivots(probes, list(dependent), rank))), 6)
 
-    dependent = max(subsets, key=merit)
+    some = scaled[:: max(1, len(scaled) // 40)]
+    best = sorted(subsets, key=lambda dependent: merit(dependent, some), reverse=True)[:_SHORTLIST]
+    dependent = max(best, key=lambda dependent: merit(dependent, scaled))
     return tuple(i for i in range(count) if i not in dependent)
 
 

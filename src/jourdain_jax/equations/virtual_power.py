@@ -15,7 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import skew
+from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import Inertias, Velocities, bias_accelerations, coordinate_rates, inertias, motion_at, partial_velocities, pose_at
+from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.names import nearest
@@ -78,14 +80,33 @@ def kinetic_energy(scene: Scene, t, q, u) -> Float[Array, ""]:
 
 def unconstrained_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
     """M, h and Q of `M udot + h = Q`."""
-    partial, weights = partial_velocities(scene, t, q, u), inertias(scene, t, q)
+    return equations_of(scene, instant_at(scene, t, q, u, inputs))
+
+
+def equations_and_rows(scene: Scene, t, q, u, inputs=None) -> tuple[UnconstrainedEquations, ConstraintRows]:
+    """M, h, Q and the rows, from the same poses."""
+    instant = instant_at(scene, t, q, u, inputs)
+    return equations_of(scene, instant), rows_of(scene, instant)
+
+
+def equations_of(scene: Scene, instant: Instant) -> UnconstrainedEquations:
+    """The same of a known instant."""
+    partial = instant.by_speeds.bodies
+    force, torque = _inertia_resultants(instant.weights, instant.value.bodies, instant.rate.bodies)
+    h = jnp.einsum("bik,bi->k", partial.linear, force) + jnp.einsum("bik,bi->k", partial.angular, torque)
+    return UnconstrainedEquations(mass_matrix(instant.weights, partial), h, _generalized_forces(scene, instant.motion, partial))
+
+
+def mass_matrix(weights: Inertias, partial: Velocities) -> Float[Array, "speeds speeds"]:
+    """`M = sum m beta' beta + gamma' I gamma`."""
     beta, gamma = partial.linear, partial.angular
-    velocity, bias = bias_accelerations(scene, t, q, u)
-    # M = sum m beta' beta + gamma' I gamma
-    M = jnp.einsum("b,bik,bil->kl", weights.mass, beta, beta) + jnp.einsum("bik,bij,bjl->kl", gamma, weights.inertia, gamma)
-    inertia_force, inertia_torque = _inertia_resultants(weights, velocity, bias)
-    h = jnp.einsum("bik,bi->k", beta, inertia_force) + jnp.einsum("bik,bi->k", gamma, inertia_torque)
-    return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs, partial))
+    return jnp.einsum("b,bik,bil->kl", weights.mass, beta, beta) + jnp.einsum("bik,bij,bjl->kl", gamma, weights.inertia, gamma)
+
+
+def mass_matrix_at(scene: Scene, t, q) -> Float[Array, "speeds speeds"]:
+    """M at (t, q); it does not depend on u."""
+    rest = jnp.zeros(len(scene.speed_names), q.dtype)
+    return mass_matrix(inertias(scene, t, q), partial_velocities(scene, t, q, rest))
 
 
 def _inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: Velocities):
@@ -95,10 +116,12 @@ def _inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: V
     return weights.mass[:, None] * acceleration.linear, torque
 
 
-def generalized_forces(scene: Scene, t, q, u, inputs=None, partial: Velocities | None = None) -> Float[Array, "speeds"]:
+def generalized_forces(scene: Scene, t, q, u, inputs=None) -> Float[Array, "speeds"]:
     """`Q = sum beta' F + gamma' L + Q_direct - N' dV/dq`."""
-    partial = partial_velocities(scene, t, q, u) if partial is None else partial
-    motion = motion_at(scene, t, q, u, inputs)
+    return _generalized_forces(scene, motion_at(scene, t, q, u, inputs), partial_velocities(scene, t, q, u))
+
+
+def _generalized_forces(scene: Scene, motion: Motion, partial: Velocities) -> Float[Array, "speeds"]:
     loads = resultants(scene, motion)
     orientation = jnp.stack([body.orientation for body in motion.bodies.values()])
     torque = jnp.einsum("bji,bj->bi", orientation, loads.torque)  # in body axes

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.guards import forward_only, reverse_only
-from jourdain_jax.equations.accelerations import Baumgarte, as_reduction, partition_pivot
+from jourdain_jax.equations.accelerations import Baumgarte, as_reduction
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.structure import Structure, structure_of
@@ -90,7 +90,9 @@ def simulate(
     saved = diffrax.SaveAt(ts=ts) if saveat is None else _checked_saveat(saveat)
     names = _event_names(scene) if events else ()
     dt0 = 1e-4 * (t1 - t0) if dt0 is None else dt0  # diffrax's own guess costs two more copies of the vector field to compile
-    arguments = (as_inputs(scene, inputs), t0, t1, saved)
+    inputs = as_inputs(scene, inputs)
+    start = consistent(scene, t0, start.q, start.u, inputs(t0)) if projection else start
+    arguments = (inputs, t0, t1, saved)
     options = (solver, controller, dt0, adjoint, max_steps, names, projection)
     motion = _integrate(scene, start, *arguments, form, *options)
     if state == "auto" and not isinstance(motion.result, jax.core.Tracer) and int(motion.result) == results.SINGULAR_PARTITION:
@@ -189,10 +191,14 @@ def _controller(rtol, atol, t0, t1) -> diffrax.PIDController:
 
 
 class _StateNorm(eqx.Module):
-    """Root mean square over coordinates and speeds; the work that rides along does not decide the step size."""
+    """Root mean square over coordinates and speeds; the work that rides along does not decide the step size.
+
+    What is not a number counts as infinite: the step shrinks and the motion ends, where NaN would be tried until the last allowed step.
+    """
 
     def __call__(self, y: Integrated) -> Float[Array, ""]:
         squared = jnp.mean(jnp.concatenate([y.q, y.v]) ** 2)
+        squared = jnp.where(jnp.isnan(squared), jnp.inf, squared)
         return jnp.where(squared == 0, 0.0, jnp.sqrt(jnp.where(squared == 0, 1.0, squared)))
 
 
@@ -242,7 +248,6 @@ def _mark_outputs(adjoint, tree):
 @eqx.filter_jit
 def _integrate(original, start, inputs, t0, t1, saved, form, solver, controller, dt0, adjoint, max_steps, names, projection) -> Trajectory:
     scene, start, inputs = _mark_inputs(adjoint, (original, start, inputs))
-    start = consistent(scene, t0, start.q, start.u, inputs(t0)) if projection else start
     args = (form, scene, inputs)
     moving = form.projects_positions or form.projects_speeds
     solution = diffrax.diffeqsolve(
@@ -269,20 +274,23 @@ def _integrate(original, start, inputs, t0, t1, saved, form, solver, controller,
         # times never reached hold infinities: compute at the end state instead, then mark
         t, y = jnp.where(valid, t, end.t), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, end.y)
         y = _project(t, y, args) if moving else y
-        u = form.unpack(scene, t, y, inputs(t))
-        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, y.work))
+        u, pivot = form.unpack_with_pivot(scene, t, y, inputs(t))
+        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, y.work)), pivot
 
-    q, u, work = jax.vmap(saved_state)(ts, solution.ys[0], valid)
-    pivot = _smallest_pivot(scene, form, inputs, ts, q, u, end)
+    # the end state as one more saved one, so that all this is compiled once
+    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (ts, solution.ys[0], valid), (end.t, end.y, jnp.array(True)))
+    (q, u, work), pivots = jax.vmap(saved_state)(*with_end)
+    # fmin passes over NaN, which stands for an end that is lost already
+    pivot = jax.lax.reduce(pivots, jnp.inf, jnp.fmin, (0,))
     return Trajectory(
         scene=original,
         ts=ts,
-        q=q,
-        u=u,
-        work=work,
+        q=q[:-1],
+        u=u[:-1],
+        work=None if work is None else work[:-1],
         t_end=end.t,
-        q_end=end.y.q,
-        u_end=form.unpack(scene, end.t, end.y, inputs(end.t)),
+        q_end=q[-1],
+        u_end=u[-1],
         result=_result(solution.result, event, end.y, start, pivot),
         event=event,
         accepted=solution.stats["num_accepted_steps"],
@@ -318,20 +326,6 @@ def _end(solution, args, t0, y0, names):
     # a motion that starts beyond an event has no motion at all
     none = jnp.any(at_start)
     return Located(jnp.where(none, t0, located.t), jax.tree.map(lambda a, b: jnp.where(none, a, b), y0, located.y)), event
-
-
-def _smallest_pivot(scene, form, inputs, ts, q, u, end) -> Float[Array, ""]:
-    """How near the motion came to where the privileged speeds do not determine the others: over the saved times and the end."""
-    if form.independent is None:
-        return jnp.ones((), q.dtype)
-
-    def pivot(t, q, u):
-        return partition_pivot(scene, form.independent, t, q, u, inputs(t))
-
-    along = jax.vmap(pivot)(ts, q, u)
-    at_end = pivot(end.t, end.y.q, form.unpack(scene, end.t, end.y, inputs(end.t)))
-    # fmin passes over NaN, which stands for times that were not reached, and for an end that is lost already
-    return jnp.fmin(jnp.min(jnp.where(jnp.isnan(along), jnp.inf, along), initial=jnp.inf), at_end)
 
 
 def _result(outcome, event, y_end: Integrated, start: State, pivot):

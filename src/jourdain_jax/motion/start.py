@@ -45,13 +45,19 @@ def consistent(scene: Scene, t, q: Float[Array, "coordinates"], u: Float[Array, 
     """
     t, q, u = jnp.asarray(t, jnp.result_type(float)), jnp.asarray(q), jnp.asarray(u)
     _check_shapes(scene, q, u)
-    free_q = jnp.array([name not in held for name in scene.coordinate_names.entries], bool)
-    free_u = jnp.array([name not in held for name in scene.speed_names.entries], bool)
-    near_q = project_positions(scene, t, q, free=free_q)
-    near_u = project_speeds(scene, t, near_q, u, inputs, free=free_u)
+    inputs = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else inputs
+    free_q, free_u = (np.array([name not in held for name in names.entries], bool) for names in (scene.coordinate_names, scene.speed_names))
+    near_q, near_u, moved_q, moved_u, residual = _put_onto_constraints(scene, t, q, u, inputs, free_q, free_u)
+    return State(t, near_q, near_u, moved_q, moved_u, residual, (scene.coordinate_names, scene.speed_names))
+
+
+@eqx.filter_jit  # one program for every choice of what is held
+def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u):
+    """q and u on the constraints; the largest changes of both and the largest residual."""
+    near_q = project_positions(scene, t, q, free=jnp.asarray(free_q))
+    near_u = project_speeds(scene, t, near_q, u, inputs, free=jnp.asarray(free_u))
     left = jnp.concatenate([closure_residual(scene, t, near_q), velocity_residual(scene, t, near_q, near_u, inputs)])
-    largest = lambda x: jnp.max(jnp.abs(x), initial=0.0)  # noqa: E731
-    return State(t, near_q, near_u, largest(near_q - q), largest(near_u - u), largest(left), (scene.coordinate_names, scene.speed_names))
+    return near_q, near_u, *(jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
 
 
 def start(scene: Scene, *, t0: float | Float[Array, ""] = 0.0, **values) -> State:
@@ -63,7 +69,7 @@ def start(scene: Scene, *, t0: float | Float[Array, ""] = 0.0, **values) -> Stat
     """
     q, u, given = scene.named(**values)
     _check_finite(values)
-    state = _consistent(scene, jnp.asarray(t0, jnp.result_type(float)), q, u, (*given, *_resting(scene, given)))
+    state = consistent(scene, t0, q, u, held=(*given, *_resting(scene, given)))
     _check_residual(scene, state, given)
     return state
 
@@ -75,9 +81,6 @@ def _resting(scene: Scene, given: tuple[str, ...]) -> tuple[str, ...]:
     if any(name in names and name not in privileged for name in given):
         return ()
     return tuple(name for name in privileged if name not in given)
-
-
-_consistent = eqx.filter_jit(lambda scene, t, q, u, held: consistent(scene, t, q, u, held=held))
 
 
 def _check_shapes(scene: Scene, q, u) -> None:

@@ -10,9 +10,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.equations.accelerations import Baumgarte, bare_accelerations, speeds_from_privileged
-from jourdain_jax.equations.kinematics import coordinate_rates
-from jourdain_jax.equations.power import power_of_nonconservative
+from jourdain_jax.equations.accelerations import Baumgarte, bare_accelerations
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.minimal import minimal_accelerations, speeds_and_pivot, speeds_from_privileged
+from jourdain_jax.equations.power import power
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Privileged
 from jourdain_jax.scene.scene import Scene
@@ -41,6 +42,11 @@ class StateForm(eqx.Module):
         """ "minimal" or "full"."""
         return "full" if self.independent is None else "minimal"
 
+    @property
+    def _by_appell(self) -> bool:
+        """Whether the reduction uses the same privileged speeds as the state."""
+        return isinstance(self.reduction, Privileged) and self.reduction.independent == self.independent and self.stabilisation is None
+
     def pack(self, q, u) -> Integrated:
         """The integrated state of (q, u)."""
         v = u if self.independent is None else u[jnp.array(self.independent, jnp.int32)]
@@ -50,13 +56,20 @@ class StateForm(eqx.Module):
         """All speeds u."""
         return y.v if self.independent is None else speeds_from_privileged(scene, self.independent, t, y.q, y.v, inputs)
 
+    def unpack_with_pivot(self, scene: Scene, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+        """All speeds, and how well the privileged ones determine the others (1 for the full state, which has none)."""
+        return (y.v, jnp.ones((), y.v.dtype)) if self.independent is None else speeds_and_pivot(scene, self.independent, t, y.q, y.v, inputs)
+
     def rates(self, scene: Scene, t, y: Integrated, inputs) -> Integrated:
         """Time derivative of the integrated state."""
-        u = self.unpack(scene, t, y, inputs)
-        motion = bare_accelerations(scene, t, y.q, u, inputs, reduction=self.reduction, stabilisation=self.stabilisation)
-        v = motion.udot if self.independent is None else motion.udot[jnp.array(self.independent, jnp.int32)]
-        power = power_of_nonconservative(scene, t, y.q, u, inputs, motion) if self.with_work else None
-        return Integrated(coordinate_rates(scene, t, y.q, u), v, power)
+        if self.independent is not None and self._by_appell:
+            _, motion, found = minimal_accelerations(scene, self.independent, t, y.q, y.v, inputs)
+        else:
+            u = self.unpack(scene, t, y, inputs)
+            motion = motion_at(scene, t, y.q, u, inputs)
+            found = bare_accelerations(scene, t, y.q, u, inputs, reduction=self.reduction, stabilisation=self.stabilisation)
+        v = found.udot if self.independent is None else found.udot[jnp.array(self.independent, jnp.int32)]
+        return Integrated(motion.qdot.array, v, power(scene, motion, found).total if self.with_work else None)
 
     def project(self, scene: Scene, t, y: Integrated, inputs, iterations: int = 2) -> Integrated:
         """The state put back onto geometric rows, quaternion norms and (full state) velocity rows."""

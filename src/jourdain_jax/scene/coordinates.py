@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import quaternion_rate
@@ -51,11 +52,10 @@ class Coordinates:
     quaternions: tuple[tuple[int, int], ...]  # first coordinate, first speed
     plain: tuple[tuple[int, int], ...]  # coordinate, speed
 
-    def reference(self) -> Float[Array, "coordinates"]:
+    def reference(self) -> Float[np.ndarray, "coordinates"]:
         """The reference configuration: zero, and the identity for every quaternion."""
-        q = jnp.zeros(len(self.names))
-        for first, _ in self.quaternions:
-            q = q.at[first].set(1.0)
+        q = np.zeros(len(self.names), jnp.result_type(float))
+        q[[first for first, _ in self.quaternions]] = 1.0
         return q
 
     def default_rates(self, q: Float[Array, "coordinates"], u: Float[Array, "speeds"]) -> Float[Array, "coordinates"]:

@@ -6,7 +6,9 @@ from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.scene.bodies import Body
@@ -113,27 +115,36 @@ class Scene(eqx.Module):
 
         A quaternion or its angular velocity may be given whole, by its own name.
         """
-        q, u = self.coordinates.reference(), jnp.zeros(len(self.speed_names))
+        q, u = list(self.coordinates.reference()), [0.0] * len(self.speed_names)
         given: list[str] = []
         for name, value in values.items():
-            q, q_hit = _put(self.coordinate_names, q, name, value)
-            u, u_hit = _put(self.speed_names, u, name, value)
-            if not q_hit + u_hit:
+            hits = _put(self.coordinate_names, q, name, value) + _put(self.speed_names, u, name, value)
+            if not hits:
                 valid = self.coordinate_names.entries + self.speed_names.entries
                 raise ValueError(f"scene `{type(self).__name__}` has no coordinate or speed `{name}`; {nearest(name, valid)}")
-            given += q_hit + u_hit
-        return q, u, tuple(given)
+            given += hits
+        return _vector(q), _vector(u), tuple(given)
 
 
-def _put(names: Names, array, name: str, value):
-    value = jnp.asarray(value, array.dtype)
+def _put(names: Names, entries: list, name: str, value) -> list[str]:
+    """Put a value, or a run of values, where `name` says; the names of the entries that were set."""
+    shape = np.shape(value)
     if name in names.entries:
-        if value.shape != ():
-            raise ValueError(f"`{name}` was given an array of shape {value.shape}, expected one number; use `jax.vmap` or `rollout` for many")
-        return array.at[names.entries.index(name)].set(value), [name]
+        if shape != ():
+            raise ValueError(f"`{name}` was given an array of shape {shape}, expected one number; use `jax.vmap` or `rollout` for many")
+        entries[names.entries.index(name)] = value
+        return [name]
     for group, first, length in names.groups:
         if group == name:
-            if value.shape != (length,):
-                raise ValueError(f"`{name}` was given an array of shape {value.shape}, expected ({length},)")
-            return array.at[first : first + length].set(value), list(names.entries[first : first + length])
-    return array, []
+            if shape != (length,):
+                raise ValueError(f"`{name}` was given an array of shape {shape}, expected ({length},)")
+            entries[first : first + length] = [value[i] for i in range(length)]
+            return list(names.entries[first : first + length])
+    return []
+
+
+def _vector(entries: list) -> Float[Array, "entries"]:
+    real = jnp.result_type(float)
+    if any(isinstance(value, jax.core.Tracer) for value in entries):
+        return jnp.stack([jnp.asarray(value, real) for value in entries])
+    return jnp.asarray(np.array([np.asarray(value) for value in entries], real))  # at once: no small programs to compile

@@ -1,0 +1,75 @@
+"""One instant of a scene: all velocities and rows, and their derivatives in the speeds and along the motion, worked out together.
+
+    v, omega, phi              at (t, q, u)
+    beta, gamma, A             their derivatives in u             (for rows affine in u they do not depend on u)
+    a_0, alpha_0, drift        their rates at udot = 0
+
+Poses are the costly part of a scene, and all of these come from the same ones.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.equations.kinematics import Inertias, Velocities, coordinate_rates, inertias_of, motion_at, velocities_of
+from jourdain_jax.equations.rows import ConstraintRows, flatten_rows, names_of_rows, velocity_rows
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.scene import Scene
+
+
+class VelocityLevel(eqx.Module):
+    """Velocities of the bodies and residuals of the rows, or a derivative of both."""
+
+    bodies: Velocities
+    rows: Float[Array, "rows *directions"]
+
+
+class Instant(eqx.Module):
+    """A scene at (t, q, u), ready for the equations of motion."""
+
+    motion: Motion
+    weights: Inertias
+    value: VelocityLevel  # v, omega, phi
+    by_speeds: VelocityLevel  # beta, gamma, A
+    rate: VelocityLevel  # a_0, alpha_0, drift
+
+
+def instant_at(scene: Scene, t, q, u, inputs=None) -> Instant:
+    """Everything the equations of motion need of a scene at (t, q, u)."""
+    by_speeds, _, _ = derivatives_in_speeds(scene, t, q, u, inputs)
+    value, rate, motion = rates_along_motion(scene, t, q, u, inputs)
+    return Instant(motion, inertias_of(motion), value, by_speeds, rate)
+
+
+def rows_of(scene: Scene, instant: Instant) -> ConstraintRows:
+    """The rows of an instant."""
+    return ConstraintRows(instant.value.rows, instant.by_speeds.rows, instant.rate.rows, names_of_rows(scene))
+
+
+def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
+    """phi, `A = d phi/du` and the drift `d phi/dt` at `udot = 0`."""
+    return rows_of(scene, instant_at(scene, t, q, u, inputs))
+
+
+def derivatives_in_speeds(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
+    """`beta`, `gamma` and `A`; the velocities and residuals themselves; and the motion they belong to."""
+
+    def level(u):
+        value, motion = _velocity_level(scene, t, q, u, inputs)
+        return value, (value, motion)
+
+    by_speeds, (value, motion) = jax.jacfwd(level, has_aux=True)(u)
+    return by_speeds, value, motion
+
+
+def rates_along_motion(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
+    """Velocities and residuals; `a_0`, `alpha_0` and the drift: their derivatives along `(1, qdot, 0)`; and the motion."""
+    t = jnp.asarray(t, jnp.result_type(float))
+    qdot = coordinate_rates(scene, t, q, u)
+    return jax.jvp(lambda t, q: _velocity_level(scene, t, q, u, inputs), (t, q), (jnp.ones_like(t), qdot), has_aux=True)
+
+
+def _velocity_level(scene: Scene, t, q, u, inputs) -> tuple[VelocityLevel, Motion]:
+    motion = motion_at(scene, t, q, u, inputs)
+    return VelocityLevel(velocities_of(motion), flatten_rows(velocity_rows(scene, motion), q.dtype)), motion

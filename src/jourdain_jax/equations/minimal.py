@@ -1,0 +1,68 @@
+"""Appell's equations in the minimal state (q, y), y the privileged speeds, for rows linear or affine in the speeds.
+
+    u    = C y + c                     from the rows themselves, which so hold exactly                   (25)-(31)
+    udot = C ydot + c'                 from their rates
+    C' (M (C ydot + c') + h - Q) = 0   Jourdain's principle for the virtual velocities C dy             (41)
+
+A, C and the partial velocities do not depend on u: they are worked out once, at `u = (y, 0)`, and serve both levels.
+Source: Wang and Pao (2003), sections III and IV.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.equations.instant import Instant, VelocityLevel, derivatives_in_speeds, rates_along_motion
+from jourdain_jax.equations.kinematics import Inertias, inertias_of
+from jourdain_jax.equations.reductions import Partition, Reduced, appell, reduced
+from jourdain_jax.equations.scaling import row_scale, speed_scale
+from jourdain_jax.equations.virtual_power import equations_of, mass_matrix
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.scene import Scene
+
+
+class MinimalKinematics(eqx.Module):
+    """All speeds from the privileged ones, with what was needed on the way."""
+
+    u: Float[Array, "speeds"]
+    partial: VelocityLevel  # beta, gamma, A
+    weights: Inertias
+    split: Partition  # of the scaled rows d A c
+    c: Float[Array, "speeds"]
+    d: Float[Array, "rows"]
+
+
+def minimal_kinematics(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> MinimalKinematics:
+    """`u = C y + c`."""
+    at_rest = jnp.zeros(len(scene.speed_names), q.dtype).at[jnp.array(independent, jnp.int32)].set(y)
+    partial, value, motion = derivatives_in_speeds(scene, t, q, at_rest, inputs)
+    weights = inertias_of(motion)
+    c = speed_scale(mass_matrix(weights, partial.bodies))
+    d = row_scale(partial.rows * c)
+    split = Partition(d[:, None] * partial.rows * c, independent)
+    # A (u - at_rest) = -phi(at_rest), with a difference in the dependent speeds only
+    return MinimalKinematics(at_rest + c * split.particular(-d * value.rows), partial, weights, split, c, d)
+
+
+def speeds_from_privileged(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> Float[Array, "speeds"]:
+    """All speeds from the independent ones, `u = C y + c`."""
+    return minimal_kinematics(scene, independent, t, q, y, inputs).u
+
+
+def speeds_and_pivot(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+    """All speeds, and the smallest singular value of the scaled A_z: near zero where these privileged speeds do not serve."""
+    found = minimal_kinematics(scene, independent, t, q, y, inputs)
+    return found.u, jax.lax.stop_gradient(found.split.pivot())
+
+
+def minimal_accelerations(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> tuple[Float[Array, "speeds"], Motion, Reduced]:
+    """All speeds, the motion they make, and the accelerations with the constraint force."""
+    known = minimal_kinematics(scene, independent, t, q, y, inputs)
+    value, rate, motion = rates_along_motion(scene, t, q, known.u, inputs)
+    equations = equations_of(scene, Instant(motion, known.weights, value, known.partial, rate))
+    c = known.c
+    # in scaled speeds, where definiteness has no units
+    M, f = c[:, None] * equations.M * c, c * (equations.Q - equations.h)
+    w, pivot, applicable = appell(M, f, known.split.C, known.split.particular(-known.d * rate.rows), known.split.pivot())
+    return known.u, motion, reduced(c * w, pivot, applicable, equations)

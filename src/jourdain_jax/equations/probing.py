@@ -1,0 +1,91 @@
+"""Looking at a scene with numbers in it, also while its parameters are being traced.
+
+What holds of a scene at every state (the rank of its rows, which speeds are independent) is a static choice: it must be known before
+anything is compiled, and it is found by evaluating the scene at a few states.
+"""
+
+from collections.abc import Callable
+from functools import lru_cache, wraps
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.scene import Scene
+
+
+def probed_once(probe):
+    """A function of a scene that runs on concrete parameters, also while they are traced, and once per class and values."""
+    cached = lru_cache(maxsize=512)(lambda wrapped: probe(wrapped.scene))
+
+    @wraps(probe)
+    def of(scene: Scene):
+        concrete = concretised(scene)
+        leaves, treedef = jax.tree.flatten(concrete)
+        key = tuple((np.asarray(x).tobytes(), np.shape(x), str(np.asarray(x).dtype)) for x in leaves)
+        return cached(_Hashable(concrete, (treedef, key, type(scene))))
+
+    return of
+
+
+class _Hashable:
+    """A scene with the key it is cached by."""
+
+    def __init__(self, scene, key):
+        self.scene, self.key = scene, key
+
+    def __hash__(self):
+        return hash(self.key)
+
+    def __eq__(self, other):
+        return self.key == other.key
+
+
+def concretised(scene: Scene) -> Scene:
+    """The scene with numbers in place of traced parameters: generic ones near the class's defaults, else near one.
+
+    Generic, because a default of zero (a tilt, a rate) must not pass for a term that is absent.
+    """
+    if not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(scene)):
+        return scene
+    for name, value, _ in parameters_of(scene):
+        if isinstance(value, jax.core.Tracer):
+            default = scene.__dataclass_fields__[name].default
+            usable = isinstance(default, int | float) or hasattr(default, "shape")
+            number = _generic(np.broadcast_to(np.asarray(default, value.dtype), value.shape)) if usable else _near_one(value)
+            scene = eqx.tree_at(lambda s, name=name: getattr(s, name), scene, number)
+    return jax.tree.map(lambda x: _near_one(x) if isinstance(x, jax.core.Tracer) else x, scene)
+
+
+def _generic(x: np.ndarray) -> np.ndarray:
+    return np.asarray(np.where(x == 0, 0.1, x) * (1.0 + 0.01 * np.random.default_rng(0).uniform(size=x.shape)), x.dtype)
+
+
+def _near_one(x) -> np.ndarray:
+    return np.asarray(1.0 + 0.1 * np.random.default_rng(0).uniform(size=x.shape), x.dtype)
+
+
+def on_numbers(f: Callable) -> Callable:
+    """`f`, compiled ahead of time and run at once on concrete arguments: NumPy arrays out, also while something else is being traced."""
+
+    @lru_cache(maxsize=32)
+    def program(treedef, leaves, shapes, x64):
+        rest = jax.tree.unflatten(treedef, leaves)
+        numbers = jax.tree.unflatten(jax.tree.structure(rest, is_leaf=_is_none), [None if s is None else jax.ShapeDtypeStruct(*s) for s in shapes])
+        # ahead of time, because an ordinary jitted call would become part of what is being traced
+        return jax.jit(lambda numbers: f(*eqx.combine(numbers, rest))).lower(numbers).compile()
+
+    @wraps(f)
+    def run(*arguments):
+        arguments = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array_like(x) else x, arguments)
+        numbers, rest = eqx.partition(arguments, eqx.is_array)
+        leaves, treedef = jax.tree.flatten(rest, is_leaf=_is_none)
+        shapes = tuple(None if x is None else (x.shape, x.dtype) for x in jax.tree.leaves(numbers, is_leaf=_is_none))
+        return jax.tree.map(np.asarray, program(treedef, tuple(leaves), shapes, jax.config.jax_enable_x64)(numbers))
+
+    return run
+
+
+def _is_none(x) -> bool:
+    return x is None

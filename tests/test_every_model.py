@@ -1,0 +1,90 @@
+"""What holds of every model: its equations agree with each other, also for other parameters; derivatives through its simulation are right.
+
+The whole set takes minutes; by default a part of it runs, all of it with `-m ''`.
+"""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from tolerances import tolerance
+
+import jourdain_jax as jj
+from jourdain_jax.models import MODELS
+from jourdain_jax.scene.parameters import parameters_of
+
+DRAWS, STATES = 5, 20
+QUICK_GRADIENTS = {"skate", "chaplygin-sleigh", "tilting-disc"}
+SPAN = 0.4
+
+
+def other_parameters(name: str, seed: int) -> jj.Scene:
+    """The model with all parameters changed by up to a tenth; those that are zero, by up to 0.1."""
+    scene, generator = MODELS[name](), np.random.default_rng(seed)
+    shift = lambda x: generator.uniform(-0.1, 0.1, x.shape) * np.where(np.asarray(x) == 0, 1.0, np.asarray(x))  # noqa: E731
+    return scene.replace(**{key: value + shift(value) for key, value, metadata in parameters_of(scene) if not metadata["non_negative"] or np.all(value > 0)})
+
+
+@eqx.filter_jit
+@eqx.filter_vmap(in_axes=(eqx.if_array(0), 0, 0, 0))
+@eqx.filter_vmap(in_axes=(None, 0, 0, 0))
+def _solved(scene, t, q, u):
+    equations = jj.unconstrained_equations(scene, t, q, u)
+    found = {name: jj.accelerations(scene, t, q, u, reduction=name) for name in jj.reductions(scene)}
+    return equations.Q - equations.h, {name: (x.udot, x.constraint_force, x.applicable) for name, x in found.items()}
+
+
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_all_reductions_agree_at_100_random_states_with_random_parameters(name):
+    scenes = [other_parameters(name, seed) for seed in range(DRAWS)]
+    states = [jj.sample_states(scene, STATES, seed) for seed, scene in enumerate(scenes)]
+    assert min(len(t) for t, _, _ in states) == STATES  # every draw was assembled
+    arrays, rest = zip(*(eqx.partition(scene, eqx.is_array) for scene in scenes), strict=True)
+    stacked = eqx.combine(jax.tree.map(lambda *x: jnp.stack(x), *arrays), rest[0])
+    impressed, found = _solved(stacked, *(jnp.stack([jnp.asarray(state[i]) for state in states]) for i in range(3)))
+    udot, force, applies = found["qr"]
+    assert np.all(applies)
+    size = lambda *x: jnp.sum(jnp.stack([jnp.max(jnp.abs(y), axis=-1, keepdims=True) for y in x]), axis=0)  # noqa: E731
+    sizes = (size(udot), size(force, impressed))
+    if name == "heisenberg-particle":  # no acceleration, no force: nothing to be relative to
+        sizes = (1.0, 1.0)
+    for way, (*values, applicable) in found.items():
+        works = np.asarray(applicable)
+        assert works.mean() >= 0.9, f"`{way}` applies at {works.sum()} of {works.size} states"
+        for value, reference, relative_to in zip(values, (udot, force), sizes, strict=True):
+            assert np.max(np.asarray(jnp.abs(value - reference) / relative_to)[works]) <= tolerance("round_off"), way
+
+
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_verification_passes(name):
+    scene = MODELS[name]()
+    found = jj.verify(scene, jj.start(scene, **scene.example))
+    assert found.passed, str(found)
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK_GRADIENTS else pytest.mark.slow) for name in sorted(MODELS)])
+def test_derivatives_through_simulation_by_every_parameter(name):
+    scene = MODELS[name]()
+    flat, unravel = ravel_pytree({key: value for key, value, _ in parameters_of(scene)})
+
+    def end(flat, adjoint):
+        own = scene.replace(**unravel(flat))
+        start = jj.start(own, **scene.example)
+        motion = jj.simulate(own, start, ts=jnp.array([SPAN]), rtol=1e-11, atol=1e-11, adjoint=adjoint, work=False, events=False)
+        return jnp.concatenate([motion.q_end, motion.u_end])
+
+    forward = np.asarray(jax.jit(jax.jacfwd(lambda x: end(x, diffrax.ForwardMode())))(flat))
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=forward.shape[0]))
+    reverse = np.asarray(jax.jit(jax.grad(lambda x: weights @ end(x, diffrax.RecursiveCheckpointAdjoint())))(flat))
+    # fourth-order central differences, all in one batch
+    steps = 1e-3 * np.where(np.asarray(flat) == 0, 1.0, np.abs(flat))
+    points = jnp.stack([flat + k * np.diag(steps) for k in (-2, -1, 1, 2)])
+    ends = np.asarray(jax.jit(jax.vmap(jax.vmap(lambda x: end(x, diffrax.ForwardMode()))))(points))
+    differences = ((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * steps[:, None])).T
+    relative_steps = np.where(np.asarray(flat) == 0, 1.0, np.abs(flat))
+    size = np.max(np.abs(forward * relative_steps)) + 1e-3 * np.max(np.abs(ends))
+    assert np.max(np.abs((forward - differences) * relative_steps)) <= tolerance("gradient_simulation") * size
+    assert np.max(np.abs((np.asarray(weights) @ forward - reverse) * relative_steps)) <= tolerance("gradient_simulation") * size
