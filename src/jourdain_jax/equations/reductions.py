@@ -166,6 +166,11 @@ class Partition(eqx.Module):
             return jnp.ones((), A_z.dtype)
         return singular_values(A_z)[-1] if A_z.shape[0] >= A_z.shape[1] else jnp.zeros((), A_z.dtype)
 
+    def signed_pivot(self) -> Float[Array, ""]:
+        """The pivot with the sign of det A_z where A_z is square: a change of sign along a motion means that A_z was singular in between."""
+        square = self.A.shape[0] == len(self.dependent) > 0
+        return self.pivot() * jnp.linalg.slogdet(self._A_z)[0] if square else self.pivot()
+
     @property
     def _A_z(self):
         return self.A[:, np.array(self.dependent, int)]

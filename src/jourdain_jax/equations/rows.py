@@ -89,12 +89,21 @@ def flatten_rows(rows: dict[str, Array], dtype) -> Float[Array, "rows"]:
 
 def position_residual(scene: Scene, t, q) -> Float[Array, "geometric_rows"]:
     """`g(t, q)` of all geometric rows."""
-    t = jnp.asarray(t, jnp.result_type(float))
+    return _position_residual(scene, jnp.asarray(t, jnp.result_type(float)), q)
+
+
+@eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
+def _position_residual(scene: Scene, t: Float[Array, ""], q):
     return flatten_rows(position_rows(scene, pose_at(scene, t, q)), q.dtype)
 
 
 def velocity_residual(scene: Scene, t, q, u, inputs=None) -> Float[Array, "rows"]:
     """`phi(t, q, u)` of all rows."""
+    return _velocity_residual(scene, jnp.asarray(t, jnp.result_type(float)), q, u, inputs)
+
+
+@eqx.filter_jit
+def _velocity_residual(scene: Scene, t: Float[Array, ""], q, u, inputs):
     return flatten_rows(velocity_rows(scene, motion_at(scene, t, q, u, inputs)), q.dtype)
 
 

@@ -61,9 +61,10 @@ class Structure:
 
 def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Random admissible states (t, q, u) from the scene's domain, on the rows; scene parameters must be concrete."""
-    t, q, u = _random_states(scene, count, np.random.default_rng(seed))
+    drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
+    t, q, u = _random_states(scene, drawn, np.random.default_rng(seed))
     q, u, miss = _projected(scene, t, q, u)
-    good = _assembled(scene, miss, np.ones(count, bool))
+    good = np.flatnonzero(_assembled(scene, miss, np.ones(drawn, bool)))[:count]
     return t[good], q[good], u[good]
 
 

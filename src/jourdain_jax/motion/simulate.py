@@ -30,7 +30,7 @@ from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
 DEFAULT_SAMPLES = 201
-SINGULAR = 0.02  # a pivot below it at a saved time means that the partition into privileged and dependent speeds is lost
+SINGULAR = 1e-3  # a pivot below it, or a change of its sign, means that the partition into privileged and dependent speeds is lost
 _STATE_FORMS = ("auto", "minimal", "full")
 
 
@@ -280,8 +280,8 @@ def _integrate(original, start, inputs, t0, t1, saved, form, solver, controller,
     # the end state as one more saved one, so that all this is compiled once
     with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (ts, solution.ys[0], valid), (end.t, end.y, jnp.array(True)))
     (q, u, work), pivots = jax.vmap(saved_state)(*with_end)
-    # fmin passes over NaN, which stands for an end that is lost already
-    pivot = jax.lax.reduce(pivots, jnp.inf, jnp.fmin, (0,))
+    # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
+    pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.inf, jnp.fmin, (0,))
     return Trajectory(
         scene=original,
         ts=ts,

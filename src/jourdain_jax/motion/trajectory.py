@@ -33,7 +33,7 @@ class Trajectory(eqx.Module):
     rejected: Int[Array, ""]
     moved_q: Float[Array, ""]  # how far the start was moved onto the constraints
     moved_u: Float[Array, ""]
-    smallest_pivot: Float[Array, ""]  # of the partition into privileged and dependent speeds, over the saved times; 1 for the full state
+    smallest_pivot: Float[Array, ""]  # of the privileged speeds, over the saved times; negative if it changed sign; 1 for the full state
     inputs: Inputs
     state_form: str = eqx.field(static=True)  # "minimal" or "full"
     reduction: str = eqx.field(static=True)

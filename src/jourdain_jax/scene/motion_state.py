@@ -34,21 +34,21 @@ class BodyPose(eqx.Module):
     body: Body
 
     @property
-    def mass(self) -> Float[Array, ""]:
+    def mass(self) -> Float[Array, "*times"]:
         """Mass in kg."""
         return self.body.mass
 
     @property
-    def position(self) -> Float[Array, "3"]:
+    def position(self) -> Float[Array, "*times 3"]:
         """Position of the mass centre, m, inertial frame."""
         return self.body.position
 
     @property
-    def orientation(self) -> Float[Array, "3 3"]:
+    def orientation(self) -> Float[Array, "*times 3 3"]:
         """Rotation matrix, body to space; the identity for a particle."""
         return self.body.orientation if isinstance(self.body, RigidBody) else jnp.eye(3, dtype=self.body.position.dtype)
 
-    def place(self, local) -> Float[Array, "3"]:
+    def place(self, local) -> Float[Array, "*times 3"]:
         """Position (inertial frame) of the point with body-frame coordinates `local` (m, relative to the mass centre)."""
         return self.position + self.orientation @ jnp.asarray(local)
 
@@ -67,9 +67,9 @@ class BodyMotion(eqx.Module):
     place = BodyPose.place
 
     @property
-    def angular_velocity_body(self) -> Float[Array, "3"]:
+    def angular_velocity_body(self) -> Float[Array, "*times 3"]:
         """Angular velocity in body components, rad/s."""
-        return self.orientation.T @ self.angular_velocity
+        return jnp.einsum("...ji,...j->...i", self.orientation, self.angular_velocity)
 
     def velocity_at(self, position: Float[Array, "3"]) -> Float[Array, "3"]:
         """Velocity of the material point that is at `position` (inertial frame): `v + omega x (position - r)`."""
