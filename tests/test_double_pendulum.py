@@ -3,7 +3,6 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from agreement import disagreement
 from oracles import double_pendulum as oracle
 from tolerances import relative_error, tolerance
 
@@ -21,13 +20,6 @@ CARTESIAN |= {
     f"{axis}{k}_rate": EXPECTED[f"v{oracle_axis}{k}"][0] for k in (1, 2) for axis, oracle_axis in (("x", "x"), ("z", "y"))
 }
 SIZE = 1.8  # m, the reach
-
-
-@pytest.mark.parametrize("scene", [ANGLES, RODS], ids=lambda s: type(s).__name__)
-def test_all_reductions_agree(scene):
-    apart = disagreement(scene)
-    assert set(apart) == {"privileged", "svd", "kkt", "udwadia-kalaba", "gibbs-appell"}
-    assert max(apart.values()) <= tolerance("round_off"), apart
 
 
 def test_defaults_are_those_of_the_reference_run():

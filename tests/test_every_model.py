@@ -17,7 +17,7 @@ from jourdain_jax.models import MODELS
 from jourdain_jax.scene.parameters import parameters_of
 
 DRAWS, STATES = 5, 20
-QUICK_GRADIENTS = {"skate", "chaplygin-sleigh", "tilting-disc"}
+QUICK = {"skate", "chaplygin-sleigh", "tilting-disc"}
 SPAN = 0.4
 
 
@@ -58,14 +58,17 @@ def test_all_reductions_agree_at_100_random_states_with_random_parameters(name):
             assert np.max(np.asarray(jnp.abs(value - reference) / relative_to)[works]) <= tolerance("round_off"), way
 
 
-@pytest.mark.parametrize("name", sorted(MODELS))
+some_models = pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in sorted(MODELS)])
+
+
+@some_models
 def test_verification_passes(name):
     scene = MODELS[name]()
     found = jj.verify(scene, jj.start(scene, **scene.example))
     assert found.passed, str(found)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK_GRADIENTS else pytest.mark.slow) for name in sorted(MODELS)])
+@some_models
 def test_derivatives_through_simulation_by_every_parameter(name):
     scene = MODELS[name]()
     flat, unravel = ravel_pytree({key: value for key, value, _ in parameters_of(scene)})

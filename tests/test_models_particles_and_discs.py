@@ -3,7 +3,6 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from tolerances import tolerance
 
@@ -47,35 +46,6 @@ every_scene = pytest.mark.parametrize(("scene", "freedoms"), SCENES, ids=[type(s
 
 def _states(scene, count):
     return tuple(jnp.asarray(x) for x in jj.sample_states(scene, count))
-
-
-@every_scene
-def test_all_reductions_give_the_same_accelerations_and_constraint_forces(scene, freedoms):
-    reductions = jj.reductions(scene)
-    t, q, u = _states(scene, 20)
-
-    @jax.jit
-    @jax.vmap
-    def solve(t, q, u):
-        equations = jj.unconstrained_equations(scene, t, q, u)
-        found = {name: jj.accelerations(scene, t, q, u, reduction=reduction) for name, reduction in reductions.items()}
-        return equations.Q - equations.h, found
-
-    impressed, found = solve(t, q, u)
-    reference = found["qr"]
-    sizes = {
-        "udot": jnp.max(jnp.abs(reference.udot), axis=1, keepdims=True),
-        "constraint_force": jnp.max(jnp.abs(reference.constraint_force) + jnp.abs(impressed), axis=1, keepdims=True),
-    }
-    if isinstance(scene, HeisenbergParticle):  # no acceleration, no force: nothing to be relative to
-        sizes = dict.fromkeys(sizes, 1.0)
-    assert np.all(reference.applicable)
-    for name, solved in found.items():
-        works = np.asarray(solved.applicable)
-        assert works.mean() >= 0.9, f"`{name}` applies at {works.sum()} of 20 states"
-        for quantity, size in sizes.items():
-            apart = jnp.abs(getattr(solved, quantity) - getattr(reference, quantity)) / size
-            assert jnp.max(apart[works]) <= tolerance("round_off"), f"{quantity} by `{name}`"
 
 
 @every_scene

@@ -26,6 +26,8 @@ from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.equations.scaling import ScaledProblem, scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations
 
+SMALLEST_PIVOT = 1e-3  # of the scaled A_z, for privileged speeds to count as independent: errors grow as its inverse
+
 
 class Accelerations(eqx.Module):
     """Accelerations of one state, with what is needed to trust them."""
@@ -127,7 +129,7 @@ class Privileged(Reduction):
 def appell(M, f, C, c, pivot):
     """`udot = C yddot + c` from `C' M C yddot = C' (f - M c)`, the pivot, and whether both serve (eq. (41))."""
     yddot, definite = solve_definite(C.T @ M @ C, C.T @ (f - M @ c))
-    return C @ yddot + c, pivot, definite & (pivot > 1e-7)
+    return C @ yddot + c, pivot, definite & (pivot > SMALLEST_PIVOT)
 
 
 class Partition(eqx.Module):

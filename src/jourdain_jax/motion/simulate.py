@@ -17,6 +17,7 @@ from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.equations.accelerations import Baumgarte, as_reduction
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.motion import results
 from jourdain_jax.motion.event_location import Located, locate
@@ -30,7 +31,6 @@ from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
 DEFAULT_SAMPLES = 201
-SINGULAR = 1e-3  # a pivot below it, or a change of its sign, means that the partition into privileged and dependent speeds is lost
 _STATE_FORMS = ("auto", "minimal", "full")
 
 
@@ -335,6 +335,7 @@ def _result(outcome, event, y_end: Integrated, start: State, pivot):
     code = jnp.where(outcome == diffrax.RESULTS.successful, results.SUCCESS, code)
     code = jnp.where(event >= 0, results.EVENT, code)
     code = jnp.where(finite, code, results.NOT_FINITE)
-    code = jnp.where(pivot < SINGULAR, results.SINGULAR_PARTITION, code)
+    # a change of sign, or so small, means that the partition into privileged and dependent speeds was lost
+    code = jnp.where(pivot < SMALLEST_PIVOT, results.SINGULAR_PARTITION, code)
     tolerance = 1e3 * jnp.sqrt(jnp.finfo(start.q.dtype).eps)
     return jnp.where(start.residual <= tolerance, code, results.INCONSISTENT_START).astype(jnp.int32)
