@@ -32,20 +32,21 @@ def locate(rates: Callable, value: Callable, t_f, y_f: PyTree, args: PyTree, hap
     `rates(t, y, args)` is the vector field; `longest` bounds how far back the event can lie (s, signed like the motion).
     """
     t_f = jax.lax.stop_gradient(t_f)
+    earliest, latest = jnp.minimum(-longest, 0.0), jnp.maximum(-longest, 0.0)
 
-    def newton(tau, _):
-        # tau is a number to differentiation; its last, vanishing, correction is not, and carries the derivative of the event time
-        tau = jax.lax.stop_gradient(tau)
+    def corrected(tau, y_f, args):
+        """One Newton step from `t_f + tau`: by how much, and the time and state it leads to."""
         y, f = _moved(rates, t_f, y_f, args, tau)
         c, c_dot = jax.jvp(lambda t, y: value(t, y, args), (t_f + tau, y), (jnp.ones_like(t_f), f))
         usable = happened & (c_dot != 0) & jnp.isfinite(c) & jnp.isfinite(c_dot)
         shift = jnp.where(usable, -c / jnp.where(usable, c_dot, 1.0), 0.0)
-        end = Located(t_f + tau + shift, jax.tree.map(lambda a, b: a + shift * b, y, f))
-        return jnp.clip(tau + shift, jnp.minimum(-longest, 0.0), jnp.maximum(-longest, 0.0)), end
+        return shift, Located(t_f + tau + shift, jax.tree.map(lambda a, b: a + shift * b, y, f))
 
-    # every pass works out the end it would give; the last one is taken, so that the vector field is compiled once
-    start = (jnp.zeros_like(t_f), Located(t_f, y_f))
-    return jax.lax.scan(lambda carry, _: (newton(carry[0], None), None), start, length=_NEWTON_STEPS)[0][1]
+    # tau* is a number to differentiation; one last, vanishing, correction is not, and carries the derivative of the event time
+    y_held, args_held = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (y_f, args))
+    newton = lambda tau, _: (jnp.clip(tau + corrected(tau, y_held, args_held)[0], earliest, latest), None)  # noqa: E731
+    tau, _ = jax.lax.scan(newton, jnp.zeros_like(t_f), length=_NEWTON_STEPS)
+    return corrected(jax.lax.stop_gradient(tau), y_f, args)[1]
 
 
 def _moved(rates: Callable, t_f, y_f, args, tau):
