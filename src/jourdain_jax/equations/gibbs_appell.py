@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.equations.kinematics import bias_accelerations, inertias, velocities
-from jourdain_jax.equations.reductions import SMALLEST_PIVOT, Partition, Reduced, reduced, solve_definite
+from jourdain_jax.equations.reductions import APPLICABLE_PIVOT, Partition, Reduced, reduced, solve_definite
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces
@@ -54,4 +54,4 @@ class GibbsAppell(eqx.Module):
         C, c, pivot = split.C, split.particular(problem.b), split.pivot()
         gradient, hessian = _gradient_and_hessian(lambda yddot: gibbs_function(scene, t, q, u, problem.c * (C @ yddot + c)), jnp.zeros(C.shape[1], u.dtype))
         yddot, definite = solve_definite(hessian, C.T @ (problem.c * equations.Q) - gradient)
-        return reduced(problem.c * (C @ yddot + c), pivot, definite & (pivot > SMALLEST_PIVOT), equations)
+        return reduced(problem.c * (C @ yddot + c), pivot, definite & (pivot > APPLICABLE_PIVOT), equations)

@@ -17,6 +17,11 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     project: Callable = eqx.field(static=False)
 
     @property
+    def scan_kind(self):
+        """As the wrapped solver. diffrax sets it on a Runge-Kutta solver itself, but not through a wrapper: see `for_adjoint`."""
+        return self.solver.scan_kind
+
+    @property
     def term_structure(self):
         """As the wrapped solver."""
         return self.solver.term_structure
@@ -55,3 +60,11 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     def func(self, terms, t0, y0, args):
         """As the wrapped solver."""
         return self.solver.func(terms, t0, y0, args)
+
+
+def for_adjoint(solver: diffrax.AbstractSolver, adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractSolver:
+    """The solver with the loop over its stages that the adjoint can differentiate."""
+    kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
+    if type(adjoint) in kinds and getattr(solver, "scan_kind", "none of its own") is None:
+        return eqx.tree_at(lambda s: s.scan_kind, solver, kinds[type(adjoint)], is_leaf=lambda x: x is None)
+    return solver

@@ -22,7 +22,7 @@ from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.motion import results
 from jourdain_jax.motion.event_location import Located, locate
 from jourdain_jax.motion.inputs import as_inputs
-from jourdain_jax.motion.projected_solver import ProjectedSolver
+from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.motion.state_form import Integrated, StateForm, default_reduction
@@ -252,7 +252,7 @@ def _integrate(original, start, inputs, t0, t1, saved, form, solver, controller,
     moving = form.projects_positions or form.projects_speeds
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(_rates),
-        ProjectedSolver(solver, _project) if moving else solver,
+        ProjectedSolver(for_adjoint(solver, adjoint), _project) if moving else solver,
         t0,
         t1,
         dt0,

@@ -1,48 +1,78 @@
-"""Named quantities of a motion against time."""
+"""Named quantities of a motion against time; of many motions, the bands that hold given parts of them."""
 
 import os
 
 import numpy as np
 
+from jourdain_jax.motion import results
+from jourdain_jax.motion.rollout import Rollout
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
 from jourdain_jax.scene.names import nearest
 
 ENERGIES = ("energy", "kinetic energy", "potential energy")
+_BANDS = ((0.025, 0.975, 0.2), (0.25, 0.75, 0.4))  # lower and upper quantile, opacity
 
 
-def plot(trajectory: Trajectory, *names: str, path: str | os.PathLike | None = None, axes=None):
+def plot(motion: Trajectory | Rollout, *names: str, path: str | os.PathLike | None = None, axes=None):
     """Plot named quantities against time, one panel each: coordinates, speeds, `"energy"`, `"kinetic energy"`, `"potential energy"`.
+
+    Of a rollout, coordinates and speeds: the median of all lanes that are still under way, and the bands that hold half and 95 % of them.
 
     Returns the matplotlib figure; written to `path` (.png, .svg, .pdf) where one is given. `axes`: existing axes, one per name.
     KeyError for an unknown name, with the nearest valid one.
     """
-    if not names:
-        names = trajectory.scene.coordinate_names.entries
-    values = [_values(trajectory, name) for name in names]
+    scene = motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
+    names = names or scene.coordinate_names.entries
+    values = [_values(motion, name) for name in names]
     plt = pyplot()
     if axes is None:
         figure, axes = plt.subplots(len(names), 1, sharex=True, figsize=(7.0, 1.0 + 1.4 * len(names)), squeeze=False, layout="constrained")
         axes = axes[:, 0]
     axes = np.atleast_1d(axes)
     for axis, name, y in zip(axes, names, values, strict=True):
-        axis.plot(np.asarray(trajectory.ts), y, lw=1.5)
+        if isinstance(motion, Rollout):
+            _draw_bands(axis, np.asarray(motion.lanes.ts[0]), y)
+        else:
+            axis.plot(np.asarray(motion.ts), y, lw=1.5)
         axis.set_ylabel(name)
         axis.grid(alpha=0.3)
     axes[-1].set_xlabel("t in s")
     figure = axes[0].figure
+    if isinstance(motion, Rollout):
+        axes[0].set_title(_how_many(motion), fontsize="medium", loc="left")
+        axes[0].legend(loc="upper right", fontsize="small", ncols=3)
     if path is not None:
         figure.savefig(path, dpi=150)
         plt.close(figure)
     return figure
 
 
-def _values(trajectory: Trajectory, name: str) -> np.ndarray:
+def _draw_bands(axis, ts: np.ndarray, quantiles: np.ndarray) -> None:
+    """The median and the bands around it; `quantiles` as in `_levels`."""
+    for k, (low, high, opacity) in enumerate(_BANDS):
+        axis.fill_between(ts, quantiles[2 * k], quantiles[2 * k + 1], color="C0", alpha=opacity, lw=0, label=f"{100 * (high - low):.0f} % of lanes")
+    axis.plot(ts, quantiles[-1], color="C0", lw=1.5, label="median")
+
+
+def _levels() -> list[float]:
+    return [level for low, high, _ in _BANDS for level in (low, high)] + [0.5]
+
+
+def _how_many(rollout: Rollout) -> str:
+    stopped = int(np.sum(rollout.result == results.EVENT))
+    return f"{len(rollout)} lanes; {stopped} stopped at an event, {rollout.failed.size} failed"
+
+
+def _values(motion: Trajectory | Rollout, name: str) -> np.ndarray:
+    many = isinstance(motion, Rollout)
+    scene = motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
+    valid = (*scene.coordinate_names.entries, *scene.speed_names.entries, *(() if many else ENERGIES))
+    if name not in valid:
+        raise KeyError(f"nothing named `{name}` to plot; {nearest(name, valid)}")
+    if isinstance(motion, Rollout):
+        return motion.quantiles(name, _levels())
     if name in ENERGIES:
-        energies = trajectory.energies()
+        energies = motion.energies()
         return np.asarray({"energy": energies.balance, "kinetic energy": energies.kinetic, "potential energy": energies.potential}[name])
-    valid = (*trajectory.scene.coordinate_names.entries, *trajectory.scene.speed_names.entries, *ENERGIES)
-    try:
-        return np.asarray(trajectory[name])
-    except KeyError:
-        raise KeyError(f"nothing named `{name}` to plot; {nearest(name, valid)}") from None
+    return np.asarray(motion[name])
