@@ -17,7 +17,7 @@ from jourdain_jax.models import MODELS
 from jourdain_jax.scene.parameters import parameters_of
 
 DRAWS, STATES = 5, 20
-QUICK = {"skate", "chaplygin-sleigh", "tilting-disc"}
+QUICK = {"skate", "chaplygin-sleigh"}  # a full state with projection, a minimal state
 SPAN = 0.4
 
 
