@@ -5,8 +5,11 @@ Exit codes: 0 all went well; 1 something ran and failed its check (a verificatio
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
+
+import jaxlib
 
 from jourdain_jax.cli.bicycle_verbs import add as add_bicycle_verbs
 from jourdain_jax.cli.model_verbs import add as add_model_verbs
@@ -29,6 +32,12 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+def _compile_quickly() -> None:
+    """Spend less on compiling: a command runs each of its programs once. The flag belongs to this series of jaxlib; another may not know it."""
+    if jaxlib.__version__.startswith("0.10."):
+        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
@@ -36,6 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"jourdain-jax: unknown verb `{arguments[0]}`; {nearest(arguments[0], VERBS)}", file=sys.stderr)
         return USAGE
     options = parser().parse_args(arguments)
+    _compile_quickly()
     try:
         return OK if options.run(options) else FAILED
     except ValueError as error:
