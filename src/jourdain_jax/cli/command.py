@@ -33,9 +33,9 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _compile_quickly() -> None:
-    """Spend less on compiling: a command runs each of its programs once. The flag belongs to this series of jaxlib; another may not know it."""
+    """Spend less on compiling: a command runs each of its programs once. The flags belong to this series of jaxlib; another may not know them."""
     if jaxlib.__version__.startswith("0.10."):
-        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
+        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
