@@ -1,6 +1,9 @@
 """The command line: machine-readable answers, documented exit codes, unknown names answered with the nearest ones."""
 
 import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -76,3 +79,8 @@ def test_wrong_commands_exit_with_2_and_say_what_to_do(arguments, sentence, caps
     code, out = run(capsys, *arguments)
     assert code == 2
     assert sentence in out.err
+
+
+def test_importing_computes_nothing_so_that_compiler_flags_still_count():
+    check = "import jax, jourdain_jax.cli; jax.config.update('jax_num_cpu_devices', 2); assert jax.device_count() == 2"
+    subprocess.run([sys.executable, "-c", check], check=True, env=os.environ | {"JAX_PLATFORMS": "cpu"})

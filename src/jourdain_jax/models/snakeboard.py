@@ -9,6 +9,7 @@ Source: A. Lewis, J. Ostrowski, R. Murray and J. Burdick, Proc. IEEE Int. Conf. 
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import rot_z
@@ -70,6 +71,6 @@ def _about_z(moment) -> Float[Array, "3"]:
     return moment * jnp.ones(3)  # only the one about z matters
 
 
-_BOARD = jnp.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-_ROTOR = jnp.array([[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]])
-_AXLE = jnp.array([[0.0, -0.4, 0.0], [0.0, 0.4, 0.0]])
+_BOARD = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+_ROTOR = np.array([[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]])
+_AXLE = np.array([[0.0, -0.4, 0.0], [0.0, 0.4, 0.0]])
