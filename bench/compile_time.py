@@ -25,7 +25,7 @@ clock, laps = time.perf_counter, {}
 def lap(name, f):
     begin = clock(); result = jax.block_until_ready(f()); laps[name] = clock() - begin
     return result
-lap("structure", lambda: (jj.structure_of(scene), 0)[1])
+lap("structure", lambda: jj.structure_of(scene))
 start = lap("start", lambda: jj.start(scene, **scene.example))
 run = lambda: jj.simulate(scene, start, ts=jnp.linspace(0.0, 1.0, 101)).q_end
 lap("simulate", run)

@@ -22,7 +22,7 @@ SPAN = 0.4
 
 
 def other_parameters(name: str, seed: int) -> jj.Scene:
-    """The model with all parameters changed by up to a tenth; those that are zero, by up to 0.1."""
+    """The model with all parameters changed by up to a tenth; those that are zero, by up to 0.1, unless they must not be negative."""
     scene, generator = MODELS[name](), np.random.default_rng(seed)
     shift = lambda x: generator.uniform(-0.1, 0.1, x.shape) * np.where(np.asarray(x) == 0, 1.0, np.asarray(x))  # noqa: E731
     return scene.replace(**{key: value + shift(value) for key, value, metadata in parameters_of(scene) if not metadata["non_negative"] or np.all(value > 0)})
@@ -51,9 +51,11 @@ def test_all_reductions_agree_at_100_random_states_with_random_parameters(name):
     sizes = (size(udot), size(force, impressed))
     if name == "heisenberg-particle":  # no acceleration, no force: nothing to be relative to
         sizes = (1.0, 1.0)
+    # where the privileged speeds serve in the whole domain, every reduction must apply at every state
+    needed = 1.0 if all(jj.structure_of(scene).well_conditioned for scene in scenes) else 0.9
     for way, (*values, applicable) in found.items():
         works = np.asarray(applicable)
-        assert works.mean() >= 0.9, f"`{way}` applies at {works.sum()} of {works.size} states"
+        assert works.mean() >= needed, f"`{way}` applies at {works.sum()} of {works.size} states"
         for value, reference, relative_to in zip(values, (udot, force), sizes, strict=True):
             assert np.max(np.asarray(jnp.abs(value - reference) / relative_to)[works]) <= tolerance("round_off"), way
 
@@ -83,11 +85,11 @@ def test_derivatives_through_simulation_by_every_parameter(name):
     weights = jnp.asarray(np.random.default_rng(0).normal(size=forward.shape[0]))
     reverse = np.asarray(jax.jit(jax.grad(lambda x: weights @ end(x, diffrax.RecursiveCheckpointAdjoint())))(flat))
     # fourth-order central differences, all in one batch
-    steps = 1e-3 * np.where(np.asarray(flat) == 0, 1.0, np.abs(flat))
+    unit = np.where(np.asarray(flat) == 0, 1.0, np.abs(flat))
+    steps = 1e-3 * unit
     points = jnp.stack([flat + k * np.diag(steps) for k in (-2, -1, 1, 2)])
     ends = np.asarray(jax.jit(jax.vmap(jax.vmap(lambda x: end(x, diffrax.ForwardMode()))))(points))
     differences = ((ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * steps[:, None])).T
-    relative_steps = np.where(np.asarray(flat) == 0, 1.0, np.abs(flat))
-    size = np.max(np.abs(forward * relative_steps)) + 1e-3 * np.max(np.abs(ends))
-    assert np.max(np.abs((forward - differences) * relative_steps)) <= tolerance("gradient_simulation") * size
-    assert np.max(np.abs((np.asarray(weights) @ forward - reverse) * relative_steps)) <= tolerance("gradient_simulation") * size
+    size = np.max(np.abs(forward * unit)) + 1e-3 * np.max(np.abs(ends))
+    assert np.max(np.abs((forward - differences) * unit)) <= tolerance("gradient_simulation") * size
+    assert np.max(np.abs((np.asarray(weights) @ forward - reverse) * unit)) <= tolerance("gradient_simulation") * size

@@ -54,7 +54,6 @@ def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
 
 def derivatives_in_speeds(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
     """`beta`, `gamma` and `A`; the velocities and residuals themselves; and the motion they belong to."""
-
     t = jnp.asarray(t, jnp.result_type(float))
 
     def level(u):

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from jourdain_jax.motion import results
 from jourdain_jax.motion.simulate import saved_times, simulate

@@ -93,7 +93,7 @@ def simulate(
     inputs = as_inputs(scene, inputs)
     start = consistent(scene, t0, start.q, start.u, inputs(t0)) if projection else start
     arguments = (inputs, t0, t1, saved)
-    options = (solver, controller, dt0, adjoint, max_steps, names, projection)
+    options = (solver, controller, dt0, adjoint, max_steps, names)
     motion = _integrate(scene, start, *arguments, form, *options)
     if state == "auto" and not isinstance(motion.result, jax.core.Tracer) and int(motion.result) == results.SINGULAR_PARTITION:
         # the motion left the domain in which the partition was found to serve
@@ -246,7 +246,7 @@ def _mark_outputs(adjoint, tree):
 
 
 @eqx.filter_jit
-def _integrate(original, start, inputs, t0, t1, saved, form, solver, controller, dt0, adjoint, max_steps, names, projection) -> Trajectory:
+def _integrate(original, start, inputs, t0, t1, saved, form, solver, controller, dt0, adjoint, max_steps, names) -> Trajectory:
     scene, start, inputs = _mark_inputs(adjoint, (original, start, inputs))
     args = (form, scene, inputs)
     moving = form.projects_positions or form.projects_speeds
