@@ -1,5 +1,7 @@
 """The baselines of `bench/` give the accelerations of the engine, and their operations are counted right."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,7 @@ import jourdain_jax as jj
 from jourdain_jax.scene.parameters import parameters_of
 
 hand_derived = pytest.importorskip("baselines.hand_derived", reason="the scripts of `bench/` are not here")
-from baselines import count, dense, disc_run, flat  # noqa: E402
+from baselines import count, dense, disc_run, flat, heyoka_disc  # noqa: E402
 
 STATES = 20
 ALTERNATIVES = {
@@ -36,6 +38,7 @@ def _engine(scene, t, q, u):
     return jax.vmap(lambda t, q, u: (jj.coordinate_rates(scene, t, q, u), jj.accelerations(scene, t, q, u).udot))(t, q, u)
 
 
+@functools.cache
 def _solved(name: str):
     """A scene, states of it, and the engine's rates there."""
     scene = _with_random_parameters(name)
@@ -99,9 +102,19 @@ def test_the_dense_scripts_have_the_parameters_of_the_models():
 
 def test_dense_and_flat_equations_run_the_disc_to_the_same_end():
     starts, end = disc_run.starts(3), 0.5
-    run = jax.jit(lambda rates, y: dense.integrate(rates, dense.DISC_PARAMETERS, y, end, "Dopri8", 1e-11)[0], static_argnums=0)
+    run = jax.jit(lambda rates, y: dense.integrate(rates, dense.DISC_PARAMETERS, y, end, "Dopri8", 1e-11), static_argnums=0)
     by_hand = run(flat.disc_rates, starts)
     assert relative_error(run(dense.disc_rates, disc_run.with_all_speeds(starts))[:, disc_run.MINIMAL], by_hand) < tolerance("closed_form")
+
+
+@pytest.mark.parametrize("width", [1, 4])
+def test_heyoka_runs_the_disc_to_the_same_end(width):
+    starts = disc_run.starts(4)
+    if heyoka_disc.heyoka is None:
+        with pytest.raises(ImportError, match="pip install heyoka"):
+            heyoka_disc.final_states(1e-13, width)
+        pytest.skip(heyoka_disc.MISSING)
+    assert disc_run.error(heyoka_disc.final_states(1e-13, width)(starts), disc_run.reference(starts)) < tolerance("closed_form")
 
 
 def test_operations_are_counted_after_common_subexpressions():

@@ -7,7 +7,6 @@ deviation). States are minimal, y = (x, y, yaw, lean, spin, yaw_rate, lean_rate,
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from . import dense, flat
@@ -30,10 +29,28 @@ def with_all_speeds(y: np.ndarray, radius: float = dense.DISC_PARAMETERS["radius
     return np.concatenate([y[:, :5], (forward * np.cos(y[:, 2]))[:, None], (forward * np.sin(y[:, 2]))[:, None], y[:, 5:]], axis=1)
 
 
-def reference(y: np.ndarray, end: float = END) -> np.ndarray:
+def final_states(method: str, solver: str = "Dopri8") -> Callable[[float, np.ndarray], np.ndarray]:
+    """A compiled function `(tolerance, starts)` of initial minimal states to final ones, by diffrax.
+
+    **Arguments:** `method`, "dense" or "flat"; `solver`, a name in `dense.SOLVERS`.
+    """
+    rates = {"dense": dense.disc_rates, "flat": flat.disc_rates}[method]
+
+    @jax.jit
+    def integrated(tolerance, y):
+        return dense.integrate(rates, dense.DISC_PARAMETERS, y, END, solver, tolerance)
+
+    def run(tolerance, starts):
+        if method == "flat":
+            return np.asarray(integrated(tolerance, starts))
+        return np.asarray(integrated(tolerance, with_all_speeds(starts)))[:, MINIMAL]
+
+    return run
+
+
+def reference(starts: np.ndarray) -> np.ndarray:
     """Final minimal states, with a tolerance of 1e-14."""
-    run = jax.jit(lambda y: dense.integrate(flat.disc_rates, dense.DISC_PARAMETERS, y, end, "Dopri8", 1e-14)[0])
-    return np.asarray(run(jnp.asarray(y)))
+    return final_states("flat")(1e-14, starts)
 
 
 def error(found: np.ndarray, expected: np.ndarray) -> float:
@@ -41,15 +58,14 @@ def error(found: np.ndarray, expected: np.ndarray) -> float:
     return float(np.max(np.abs(found - expected)))
 
 
-def loosest(final: Callable[[float], np.ndarray], expected: np.ndarray, wanted: float = 1e-8, per_decade: int = 4) -> tuple[float, float]:
-    """The loosest tolerance on a grid whose final states have the error wanted, and that error.
+def loosest(final: Callable[[float], np.ndarray], expected: np.ndarray, first: float = 1e-6, wanted: float = 1e-8) -> tuple[float, float]:
+    """The loosest tolerance whose final states have the error wanted, and that error, on a grid of four per decade from `first` down.
 
     **Arguments:** `final(tolerance)`, final minimal states; `expected`, the reference.
     **Raises:** `ValueError` if no tolerance down to 1e-15 does.
     """
-    for k in range(6 * per_decade, 15 * per_decade + 1):
-        tolerance = 10.0 ** (-k / per_decade)
-        found = error(final(tolerance), expected)
+    for tolerance in 10.0 ** -np.arange(-np.log10(first), 15.01, 0.25):
+        found = error(final(float(tolerance)), expected)
         if found <= wanted:
-            return tolerance, found
-    raise ValueError(f"no tolerance down to 1e-15 gives a final error of {wanted:.0e}")
+            return float(tolerance), found
+    raise ValueError(f"no tolerance from {first:.0e} down to 1e-15 gives a final error of {wanted:.0e}")
