@@ -4,7 +4,8 @@
     [A 0 ] [lambda] = [-drift]      v = Jv qdot, omega = Jw qdot, rows A qdot = 0;    a0, alpha0, drift: their rates at qddot = 0
 
 Poses are written by hand, everything else is differentiated. The state of one lane is the flat array y = (q, qdot).
-Frozen: this file is the mark to beat, so it stays as it is; it imports nothing of the package.
+Frozen: this file is the mark to beat, so it stays as it is; it imports nothing of the package. Double precision is switched on by whoever imports
+it (`JAX_ENABLE_X64=1`, or `import jourdain_jax` first).
 """
 
 from typing import NamedTuple
@@ -47,7 +48,7 @@ def rot_z(angle):
     return jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def slip(centre, axle, radius, velocity, angular_velocity):
+def slip(axle, radius, velocity, angular_velocity):
     """Velocity of the material point of a wheel at its lowest point; its third entry is also the rate of that point's height."""
     up = jnp.array([0.0, 0.0, 1.0]) - axle[2] * axle
     return velocity - jnp.cross(angular_velocity, radius * up / jnp.sqrt(up @ up))
@@ -99,7 +100,7 @@ def disc_poses(p, q):
 
 def disc_rows(p, here, v, omega):
     """No slip in the plane; the height is in the coordinates."""
-    return slip(here.position[0], here.orientation[0, :, 1], p["radius"], v[0], omega[0])[:2]
+    return slip(here.orientation[0, :, 1], p["radius"], v[0], omega[0])[:2]
 
 
 def disc_rates(p, t, y):
@@ -133,7 +134,7 @@ def bicycle_poses(p, q):
 
 def bicycle_rows(p, here, v, omega):
     """Neither wheel slips; the front contact stays at its height."""
-    rear, front = (slip(here.position[b], here.orientation[b, :, 1], radius, v[b], omega[b]) for b, radius in ((0, p["rR"]), (3, p["rF"])))
+    rear, front = (slip(here.orientation[b, :, 1], radius, v[b], omega[b]) for b, radius in ((0, p["rR"]), (3, p["rF"])))
     return jnp.concatenate([rear[:2], front])
 
 

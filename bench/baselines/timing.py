@@ -8,7 +8,7 @@ import jax
 _STEP = 1e-6  # s, so short that the states stay where they start
 
 
-def seconds_per_evaluation(rates: Callable, state, lanes: int, evaluations: int = 100, repeats: int = 9) -> float:
+def seconds_per_evaluation(rates: Callable, state, lanes: int, evaluations: int = 20, repeats: int = 60) -> float:
     """Fastest of some repeats, in seconds per lane.
 
     **Arguments:** `rates(state)`, of the whole batch, with the structure of `state`; `evaluations` per compiled loop of explicit Euler steps
