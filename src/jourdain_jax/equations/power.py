@@ -55,6 +55,11 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
     )
 
 
+def explicit_power(scene: Scene, motion: Motion) -> Float[Array, ""]:
+    """The part that needs no accelerations: of loads without a potential, and of potentials that depend on time; W."""
+    return power_of_loads(scene, motion, conservative=False) + _explicit_rate_of_potential(scene, motion)
+
+
 def power_of_loads(scene: Scene, motion: Motion, *, conservative: bool | None = None) -> Float[Array, ""]:
     """`sum F.v + L.omega + Q_k u_k` in W; only loads with (`conservative=True`) or without a potential (`False`) if asked."""
     loads = resultants(scene, motion, conservative=conservative)

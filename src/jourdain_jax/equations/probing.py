@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jourdain_jax.program.uncompiled import uncompiled
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -25,6 +26,21 @@ def probed_once(probe):
         leaves, treedef = jax.tree.flatten(concrete)
         key = tuple((np.asarray(x).tobytes(), np.shape(x), str(np.asarray(x).dtype)) for x in leaves)
         return cached(_Hashable(concrete, (treedef, key, type(scene))))
+
+    return of
+
+
+def described_once(describe: Callable) -> Callable:
+    """A function of a scene whose answer depends on its class and the shapes of its parameters only: worked out once."""
+    known: dict = {}
+
+    @wraps(describe)
+    def of(scene: Scene):
+        leaves, treedef = jax.tree.flatten(scene)
+        key = (treedef, tuple(np.shape(x) for x in leaves), jax.config.jax_enable_x64)
+        if key not in known:
+            known[key] = describe(scene)
+        return known[key]
 
     return of
 
@@ -67,22 +83,18 @@ def _near_one(x) -> np.ndarray:
 
 
 def on_numbers(f: Callable) -> Callable:
-    """`f`, compiled ahead of time and run at once on concrete arguments: NumPy arrays out, also while something else is being traced."""
+    """`f` run at once on concrete arguments, uncompiled: NumPy arrays out, also while something else is being traced."""
 
     @lru_cache(maxsize=32)
-    def program(treedef, leaves, shapes, x64):
-        rest = jax.tree.unflatten(treedef, leaves)
-        numbers = jax.tree.unflatten(jax.tree.structure(rest, is_leaf=_is_none), [None if s is None else jax.ShapeDtypeStruct(*s) for s in shapes])
-        # ahead of time, because an ordinary jitted call would become part of what is being traced
-        return jax.jit(lambda numbers: f(*eqx.combine(numbers, rest))).lower(numbers).compile()
+    def program(treedef, rest, x64):
+        return uncompiled(lambda numbers: f(*eqx.combine(numbers, jax.tree.unflatten(treedef, rest))))
 
     @wraps(f)
     def run(*arguments):
         arguments = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array_like(x) else x, arguments)
-        numbers, rest = eqx.partition(arguments, eqx.is_array)
-        leaves, treedef = jax.tree.flatten(rest, is_leaf=_is_none)
-        shapes = tuple(None if x is None else (x.shape, x.dtype) for x in jax.tree.leaves(numbers, is_leaf=_is_none))
-        return jax.tree.map(np.asarray, program(treedef, tuple(leaves), shapes, jax.config.jax_enable_x64)(numbers))
+        numbers, others = eqx.partition(arguments, eqx.is_array)
+        rest, treedef = jax.tree.flatten(others, is_leaf=_is_none)
+        return program(treedef, tuple(rest), jax.config.jax_enable_x64)(numbers)
 
     return run
 

@@ -122,11 +122,16 @@ def generalized_forces(scene: Scene, t, q, u, inputs=None) -> Float[Array, "spee
 
 
 def _generalized_forces(scene: Scene, motion: Motion, partial: Velocities) -> Float[Array, "speeds"]:
+    loads = impressed(scene, motion)
+    return jnp.einsum("bik,bi->k", partial.linear, loads.force) + jnp.einsum("bik,bi->k", partial.angular, loads.torque) + loads.direct
+
+
+def impressed(scene: Scene, motion: Motion) -> Resultants:
+    """All impressed forces, the torques in body axes, and on the speeds also `-N' dV/dq` of the scene's own potential."""
     loads = resultants(scene, motion)
     orientation = jnp.stack([body.orientation for body in motion.bodies.values()])
-    torque = jnp.einsum("bji,bj->bi", orientation, loads.torque)  # in body axes
-    Q = jnp.einsum("bik,bi->k", partial.linear, loads.force) + jnp.einsum("bik,bi->k", partial.angular, torque) + loads.direct
-    return Q - _potential_gradient(scene, motion)
+    torque = jnp.einsum("bji,bj->bi", orientation, loads.torque)
+    return Resultants(loads.force, torque, loads.direct - _potential_gradient(scene, motion))
 
 
 def _potential_gradient(scene: Scene, motion: Motion) -> Float[Array, "speeds"]:

@@ -7,30 +7,30 @@ domain and the rows are linear or affine; otherwise the full one (coordinates an
 import warnings
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.equations.accelerations import Baumgarte, as_reduction
 from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.probing import described_once
 from jourdain_jax.equations.projection import closure_residual
-from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.equations.structure import Structure, structure_of
+from jourdain_jax.lowering.lower import lowered
+from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion import results
-from jourdain_jax.motion.event_location import Located, locate
 from jourdain_jax.motion.inputs import as_inputs
-from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
+from jourdain_jax.motion.integration import Options, integrate
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.start import start as consistent_start
-from jourdain_jax.motion.state_form import Integrated, StateForm, default_reduction
+from jourdain_jax.motion.state_form import StateForm, default_reduction
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
 DEFAULT_SAMPLES = 201
+LARGEST_UNROLLED = 150  # operations of a program whose stages are written out one after another
 _STATE_FORMS = ("auto", "minimal", "full")
 
 
@@ -57,6 +57,8 @@ def simulate(
     events: bool = True,
     work: bool = True,
     land_on_ts: bool = True,
+    lowering: bool = True,
+    batch: bool = False,
 ) -> Trajectory:
     """Integrate a scene's equations of motion from `start` over [t0, t1].
 
@@ -72,6 +74,8 @@ def simulate(
     - `stabilisation`: Baumgarte terms, for comparison; `inputs`: name -> number, function of time, or `Sampled`.
     - `land_on_ts`: end a step at every saved time. With False, values between steps come from the solver's dense output: fewer steps, but
       its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
+    - `lowering`: integrate the scene's scalar program (`jj.lower`) where it has one and neither `reduction` nor `stabilisation` is given; with False,
+      the dense matrices. `batch`: write the program for many lanes (under `vmap`; `rollout` does): faster there, slower to compile.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
 
     **Returns** a `Trajectory`, with a result code instead of an exception; `trajectory.raise_if_failed()` raises `SimulationError`.
@@ -81,24 +85,27 @@ def simulate(
     """
     start, t0, ts, t1 = _span_and_start(scene, start, t0, t1, ts)
     structure = structure_of(scene)
-    form = state_form(scene, structure, state, reduction, stabilisation, projection, work)
+    form = state_form(scene, structure, state, reduction, stabilisation, projection, work, lowering, batch)
     _warn_float32(start.q.dtype, rtol)
-    controller = _controller(rtol, atol, t0, t1) if stepsize_controller is None else stepsize_controller
-    controller = diffrax.ClipStepSizeController(controller, step_ts=ts) if land_on_ts else controller
-    solver = (diffrax.Tsit5() if rtol >= 1e-6 else diffrax.Dopri8()) if solver is None else solver
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-    saved = diffrax.SaveAt(ts=ts) if saveat is None else _checked_saveat(saveat)
-    names = _event_names(scene) if events else ()
-    dt0 = 1e-4 * (t1 - t0) if dt0 is None else dt0  # diffrax's own guess costs two more copies of the vector field to compile
+    options = Options(
+        solver=(diffrax.Tsit5() if rtol >= 1e-6 else diffrax.Dopri8()) if solver is None else solver,
+        controller=stepsize_controller,
+        tolerances=(rtol, atol),
+        dt0=1e-4 * (t1 - t0) if dt0 is None else dt0,  # diffrax's own guess costs two more copies of the vector field to compile
+        adjoint=adjoint,
+        max_steps=max_steps,
+        land=land_on_ts,
+        saveat=None if saveat is None else _checked_saveat(saveat),
+        event_names=event_names(scene) if events else (),
+    )
     inputs = as_inputs(scene, inputs)
     start = consistent(scene, t0, start.q, start.u, inputs(t0)) if projection else start
-    arguments = (inputs, t0, t1, saved)
-    options = (solver, controller, dt0, adjoint, max_steps, names)
-    motion = _integrate(scene, start, *arguments, form, *options)
-    if state == "auto" and not isinstance(motion.result, jax.core.Tracer) and int(motion.result) == results.SINGULAR_PARTITION:
+    motion = integrate(scene, start, inputs, t0, t1, ts, form, options)
+    if state == "auto" and not isinstance(motion.result, jax.core.Tracer) and int(motion.result) in lost_codes(form):
         # the motion left the domain in which the partition was found to serve
-        form = state_form(scene, structure, "full", reduction, stabilisation, projection, work)
-        motion = _integrate(scene, start, *arguments, form, *options)
+        form = state_form(scene, structure, "full", reduction, stabilisation, projection, work, lowering=False)
+        motion = integrate(scene, start, inputs, t0, t1, ts, form, options)
     return motion
 
 
@@ -151,7 +158,7 @@ def _warn_float32(dtype, rtol) -> None:
         )
 
 
-def state_form(scene: Scene, structure: Structure, state="auto", reduction=None, stabilisation=None, projection=True, work=True) -> StateForm:
+def state_form(scene: Scene, structure: Structure, state="auto", reduction=None, stabilisation=None, projection=True, work=True, lowering=True, batch=False) -> StateForm:
     """How the scene's state is integrated, given what was asked."""
     if state not in _STATE_FORMS:
         raise ValueError(f"unknown state form `{state}`; {nearest(state, _STATE_FORMS)}")
@@ -159,16 +166,26 @@ def state_form(scene: Scene, structure: Structure, state="auto", reduction=None,
         raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use state='full'")
     minimal = state == "minimal" or (state == "auto" and structure.affine and structure.well_conditioned)
     independent = structure.independent if minimal else None
+    with_work = work and _needs_work(scene, structure)
+    plain = minimal and lowering and reduction is None and stabilisation is None and not (with_work and structure.driven)
+    program = lowered(scene) if plain else None
     reduction = as_reduction(scene, default_reduction(independent) if reduction is None else reduction)
-    closed = jax.eval_shape(lambda s: closure_residual(s, 0.0, s.named()[0]), scene).shape[0] > 0
     return StateForm(
         independent=independent,
         reduction=reduction,
         stabilisation=stabilisation,
-        with_work=work and _needs_work(scene, structure),
-        projects_positions=projection and closed,
+        with_work=with_work,
+        projects_positions=projection and _is_closed(scene),
         projects_speeds=projection and not minimal and bool(structure.row_names),
+        lowered=program if isinstance(program, Lowered) else None,
+        as_scalars=batch and isinstance(program, Lowered) and program.operations <= LARGEST_UNROLLED,
     )
+
+
+def lost_codes(form: StateForm) -> tuple[int, ...]:
+    """Result codes after which another form of the state may do better."""
+    guarded = form.lowered is not None and (form.lowered.guards or form.lowered.pivots)
+    return (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL, results.NOT_FINITE) if guarded else (results.SINGULAR_PARTITION,)
 
 
 def _needs_work(scene: Scene, structure: Structure) -> bool:
@@ -176,6 +193,11 @@ def _needs_work(scene: Scene, structure: Structure) -> bool:
     if structure.rheonomic or not structure.homogeneous or not structure.affine:
         return True
 
+    return _has_loads_without_potential(scene)
+
+
+@described_once
+def _has_loads_without_potential(scene: Scene) -> bool:
     def loads(scene):
         q, u, _ = scene.named()
         return tuple(load.potential is None for load in scene.loads(motion_at(scene, 0.0, q, u)))
@@ -185,157 +207,14 @@ def _needs_work(scene: Scene, structure: Structure) -> bool:
     return any(flags)
 
 
-def _controller(rtol, atol, t0, t1) -> diffrax.PIDController:
-    shortest = 1e-14 * jnp.maximum(jnp.abs(t1 - t0), jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
-    return diffrax.PIDController(rtol=rtol, atol=atol, norm=_StateNorm(), dtmin=shortest, force_dtmin=False)
+@described_once
+def _is_closed(scene: Scene) -> bool:
+    """Whether there are geometric rows or quaternion norms to keep."""
+    return jax.eval_shape(lambda s: closure_residual(s, 0.0, s.named()[0]), scene).shape[0] > 0
 
 
-class _StateNorm(eqx.Module):
-    """Root mean square over coordinates and speeds; the work that rides along does not decide the step size.
-
-    What is not a number counts as infinite: the step shrinks and the motion ends, where NaN would be tried until the last allowed step.
-    """
-
-    def __call__(self, y: Integrated) -> Float[Array, ""]:
-        squared = jnp.mean(jnp.concatenate([y.q, y.v]) ** 2)
-        squared = jnp.where(jnp.isnan(squared), jnp.inf, squared)
-        return jnp.where(squared == 0, 0.0, jnp.sqrt(jnp.where(squared == 0, 1.0, squared)))
-
-
-@eqx.filter_jit  # traced once, not once per stage and derivative
-def _rates(t, y, args):
-    form, scene, inputs = args
-    return form.rates(scene, t, y, inputs(t))
-
-
-@eqx.filter_jit  # traced once, not once per stage and derivative
-def _project(t, y, args):
-    form, scene, inputs = args
-    return form.project(scene, t, y, inputs(t))
-
-
-@eqx.filter_jit
-def _event_values(t, y, args):
-    form, scene, inputs = args
-    values = scene.events(motion_at(scene, t, y.q, form.unpack(scene, t, y, inputs(t)), inputs(t)))
-    return {name: jnp.asarray(value) for name, value in values.items()}
-
-
-class _EventValue(eqx.Module):
-    """Value of one named event of the scene, in the signature of diffrax."""
-
-    name: str = eqx.field(static=True)
-
-    def __call__(self, t, y, args, **kwargs):
-        return _event_values(t, y, args)[self.name]
-
-
-def _event_names(scene: Scene) -> tuple[str, ...]:
+@described_once
+def event_names(scene: Scene) -> tuple[str, ...]:
+    """Names of the stop events, in order."""
     q, u, _ = scene.named()
     return tuple(jax.eval_shape(lambda s: s.events(motion_at(s, 0.0, q, u)), scene))
-
-
-def _mark_inputs(adjoint, tree):
-    """Inputs of the integration: forward mode through a reverse-only adjoint raises our own error."""
-    return reverse_only(tree) if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) else tree
-
-
-def _mark_outputs(adjoint, tree):
-    """Outputs of the integration: reverse mode, which comes to them first, through a forward-only adjoint raises our own error."""
-    return forward_only(tree) if isinstance(adjoint, diffrax.ForwardMode) else tree
-
-
-@eqx.filter_jit
-def _integrate(original, start, inputs, t0, t1, saved, form, solver, controller, dt0, adjoint, max_steps, names) -> Trajectory:
-    scene, start, inputs = _mark_inputs(adjoint, (original, start, inputs))
-    args = (form, scene, inputs)
-    moving = form.projects_positions or form.projects_speeds
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(_rates),
-        ProjectedSolver(for_adjoint(solver, adjoint), _project) if moving else solver,
-        t0,
-        t1,
-        dt0,
-        form.pack(start.q, start.u),
-        args,
-        saveat=diffrax.SaveAt(subs=[saved.subs, diffrax.SubSaveAt(t1=True)]),
-        stepsize_controller=controller,
-        adjoint=adjoint,
-        event=diffrax.Event({name: _EventValue(name) for name in names}, direction=False) if names else None,
-        max_steps=max_steps,
-        throw=False,
-    )
-    solution = eqx.tree_at(lambda s: s.ys, solution, _mark_outputs(adjoint, solution.ys))
-    end, event = _end(solution, args, t0, form.pack(start.q, start.u), names)
-    ts = solution.ts[0]
-    valid = (ts - t0) * jnp.sign(t1 - t0) <= (end.t - t0) * jnp.sign(t1 - t0)
-
-    def saved_state(t, y, valid):
-        # times never reached hold infinities: compute at the end state instead, then mark
-        t, y = jnp.where(valid, t, end.t), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, end.y)
-        y = _project(t, y, args) if moving else y
-        u, pivot = form.unpack_with_pivot(scene, t, y, inputs(t))
-        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, y.work)), pivot
-
-    # the end state as one more saved one, so that all this is compiled once
-    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (ts, solution.ys[0], valid), (end.t, end.y, jnp.array(True)))
-    (q, u, work), pivots = jax.vmap(saved_state)(*with_end)
-    # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
-    pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.inf, jnp.fmin, (0,))
-    return Trajectory(
-        scene=original,
-        ts=ts,
-        q=q[:-1],
-        u=u[:-1],
-        work=None if work is None else work[:-1],
-        t_end=end.t,
-        q_end=q[-1],
-        u_end=u[-1],
-        result=_result(solution.result, event, end.y, start, pivot),
-        event=event,
-        accepted=solution.stats["num_accepted_steps"],
-        rejected=solution.stats["num_rejected_steps"],
-        moved_q=start.moved_q,
-        moved_u=start.moved_u,
-        smallest_pivot=pivot,
-        inputs=inputs,
-        state_form=form.name,
-        reduction=form.reduction.name,
-        solver=type(solver).__name__,
-        projected=moving,
-        event_names=names,
-    )
-
-
-def _end(solution, args, t0, y0, names):
-    """Time and state at the end of the motion, and the index of the event that ended it (-1: none)."""
-    t_f, y_f = solution.ts[1][0], jax.tree.map(lambda x: x[0], solution.ys[1])
-    if not names:
-        return Located(t_f, y_f), jnp.full((), -1, jnp.int32)
-    happened = jnp.stack([solution.event_mask[name] for name in names])
-    values = _event_values(t0, y0, args)
-    at_start = jnp.stack([values[name] <= 0 for name in names])
-    index = jnp.argmax(happened | at_start)
-    event = jnp.where(jnp.any(happened | at_start), index, -1).astype(jnp.int32)
-
-    def value(t, y, args):
-        values = _event_values(t, y, args)
-        return jnp.stack([values[name] for name in names])[index]
-
-    located = locate(_rates, value, t_f, y_f, args, jnp.any(happened), t_f - t0)
-    # a motion that starts beyond an event has no motion at all
-    none = jnp.any(at_start)
-    return Located(jnp.where(none, t0, located.t), jax.tree.map(lambda a, b: jnp.where(none, a, b), y0, located.y)), event
-
-
-def _result(outcome, event, y_end: Integrated, start: State, pivot):
-    """Our result code from diffrax's."""
-    finite = jnp.all(jnp.isfinite(y_end.q)) & jnp.all(jnp.isfinite(y_end.v))
-    code = jnp.where(outcome == diffrax.RESULTS.max_steps_reached, results.MAX_STEPS, results.STEP_TOO_SMALL)
-    code = jnp.where(outcome == diffrax.RESULTS.successful, results.SUCCESS, code)
-    code = jnp.where(event >= 0, results.EVENT, code)
-    code = jnp.where(finite, code, results.NOT_FINITE)
-    # a change of sign, or so small, means that the partition into privileged and dependent speeds was lost
-    code = jnp.where(pivot < SMALLEST_PIVOT, results.SINGULAR_PARTITION, code)
-    tolerance = 1e3 * jnp.sqrt(jnp.finfo(start.q.dtype).eps)
-    return jnp.where(start.residual <= tolerance, code, results.INCONSISTENT_START).astype(jnp.int32)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.structure import structure_of
@@ -47,17 +48,34 @@ def consistent(scene: Scene, t, q: Float[Array, "coordinates"], u: Float[Array, 
     _check_shapes(scene, q, u)
     inputs = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else inputs
     free_q, free_u = (np.array([name not in held for name in names.entries], bool) for names in (scene.coordinate_names, scene.speed_names))
-    near_q, near_u, moved_q, moved_u, residual = _put_onto_constraints(scene, t, q, u, inputs, free_q, free_u)
+    project = _uncompiled_projection if _seldom(scene, t, q, u, inputs) else _compiled_projection
+    near_q, near_u, moved_q, moved_u, residual = (jnp.asarray(x) for x in project(scene, t, q, u, inputs, free_q, free_u))
     return State(t, near_q, near_u, moved_q, moved_u, residual, (scene.coordinate_names, scene.speed_names))
 
 
-@eqx.filter_jit  # one program for every choice of what is held
+def _seldom(scene: Scene, *numbers) -> bool:
+    """Whether all numbers are known and this class of scene has not been put onto its constraints often: then compiling does not pay."""
+    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, numbers))):
+        return False
+    key = jax.tree.structure(scene)
+    _calls[key] = _calls.get(key, 0) + 1
+    return _calls[key] <= OFTEN
+
+
+OFTEN = 8
+_calls: dict = {}
+
+
 def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u):
     """q and u on the constraints; the largest changes of both and the largest residual."""
     near_q = project_positions(scene, t, q, free=jnp.asarray(free_q))
     near_u = project_speeds(scene, t, near_q, u, inputs, free=jnp.asarray(free_u))
     left = jnp.concatenate([closure_residual(scene, t, near_q), velocity_residual(scene, t, near_q, near_u, inputs)])
     return near_q, near_u, *(jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
+
+
+_compiled_projection = eqx.filter_jit(_put_onto_constraints)  # one program for every choice of what is held
+_uncompiled_projection = on_numbers(_put_onto_constraints)
 
 
 def start(scene: Scene, *, t0: float | Float[Array, ""] = 0.0, **values) -> State:

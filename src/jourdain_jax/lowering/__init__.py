@@ -1,0 +1,6 @@
+"""Lowering: a scene's equations as a lean scalar program.
+
+    scene -> jaxpr -> graph of scalars -> elimination of the rows -> normal forms -> straight-line code
+
+Structural zeros and ones, which XLA cannot remove from products of dense matrices, vanish here; so do coordinates on which nothing depends.
+"""

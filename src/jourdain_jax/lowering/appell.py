@@ -1,0 +1,322 @@
+"""Jourdain's equations in privileged speeds, built on the graph: rates of the minimal state (q, y) as scalar expressions.
+
+    A_z z = -(A_y y + phi_0)                         dependent speeds, by elimination                     (25)-(31)
+    v, omega;  beta, gamma = d(v, omega)/dy;  a_0, alpha_0 along the motion at ydot = 0
+    M = sum m beta' beta + gamma' I gamma,   f = sum beta' (F - m a_0) + gamma' (L - I alpha_0 - omega x I omega) + Q_direct
+    M ydot = f                                                                                             (41), (50), (56)
+
+Two ways lead there. *Explicit*: z, as an expression in (q, y), is put into the velocities before they are differentiated; best where z is
+simple. *Implicit*: speeds are differentiated as they stand, and the rates of z come from the rates of the rows; best where z is not.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from jourdain_jax.equations.structure import Structure
+from jourdain_jax.lowering.elimination import eliminate, solve_symmetric
+from jourdain_jax.lowering.trace import TracedScene, VelocityQuantities
+from jourdain_jax.program.derivative import derivatives
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.polynomial import NormalForms, TooLarge
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """How the equations are built; all give the same values."""
+
+    explicit: bool = True
+    keep_sines: bool = False
+    most_terms: int = 0  # of a normal form; 0: none are made
+    most_terms_of_equations: int = 0  # the same for the entries of M and f
+    by_determinants: bool = False  # the accelerations in normal form, by Cramer's rule
+    free_z: bool = False  # implicit only: normal forms are made while dependent speeds are symbols
+    held: tuple[int, ...] = ()  # ignorable coordinates, held at the reference in the accelerations
+
+
+@dataclass
+class Equations:
+    """Nodes of the rates of the minimal state."""
+
+    qdot: list[int]
+    ydot: list[int]
+    z: list[int]  # the dependent speeds
+    M: list[list[int]]
+    f: list[int]
+    pivots: list[int]  # must not vanish
+    guards: list[int] = field(default_factory=list)  # must stay positive
+    power: int = 0  # d(T + V)/dt; for scenes that no prescribed pose drives
+
+
+class AppellOnGraph:
+    """The construction for one scene."""
+
+    def __init__(self, traced: TracedScene, structure: Structure, probes: Probes, reference: np.ndarray, quaternions: tuple[int, ...]):
+        self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
+        self.independent = list(structure.independent)
+        self.dependent = [k for k in range(len(traced.u)) if k not in structure.independent]
+        self.rows = [s for s, name in enumerate(structure.row_names) if name not in structure.redundant_rows]
+        self.reference, self.quaternions = reference, quaternions
+
+    def build(self, strategy: Strategy) -> Equations:
+        """The equations by one strategy."""
+        forms = self._forms(strategy.keep_sines, strategy.most_terms)
+        held = {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in strategy.held}
+        kinematics = _Kinematics(self, forms, held, strategy.explicit, strategy.free_z)
+        forms_of_equations = self._forms(strategy.keep_sines, strategy.most_terms_of_equations)
+        M, f = self._equations(kinematics, forms_of_equations)
+        ydot = self._solved(M, f, forms_of_equations if strategy.by_determinants else None)
+        z, qdot, pivots = self._true_rates(kinematics, forms) if held else (kinematics.z, kinematics.qdot, [])
+        guards = {node for made in (forms, forms_of_equations) if made is not None for node in made.guards}
+        power = self._power(kinematics, ydot)
+        if strategy.free_z:
+            *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
+            qdot = self.graph.substituted(qdot, kinematics.known)
+        if held:
+            true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
+            power = power if np.allclose(*self.probes([power, true_power]), rtol=1e-9, atol=1e-9) else true_power
+        return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots])), sorted(guards), power)
+
+    def _power(self, k: "_Kinematics", ydot: list[int]) -> int:
+        """Power of loads without a potential and of potentials in time, and `(A' lambda).u` where rows are not homogeneous.
+
+        `(A' lambda).u = sum (m a - F).(v - v_0) + (I alpha + omega x I omega - L).(omega - omega_0) - Q_direct.u`, v_0, omega_0: at u = 0.
+        """
+        g, at = self.graph, k.at
+        if self.structure.homogeneous:
+            return int(at.power)
+        still = dict.fromkeys(self.traced.u.tolist(), g.zero)
+        v_0, omega_0 = (g.substituted(g.substituted(x.ravel().tolist(), still), k.held) for x in (self.traced.at.v, self.traced.at.omega))
+        terms = [int(at.power)]
+        for b, (mass, inertia) in enumerate(zip(at.mass.tolist(), at.inertia.tolist(), strict=True)):
+            a = [g.add(a0, g.dot([beta[b][i] for beta in k.beta], ydot)) for i, a0 in enumerate(k.a0[b])]
+            alpha = [g.add(a0, g.dot([gamma[b][i] for gamma in k.gamma], ydot)) for i, a0 in enumerate(k.alpha0[b])]
+            omega = at.omega[b].tolist()
+            momentum, turning = [g.dot(row, omega) for row in inertia], [g.dot(row, alpha) for row in inertia]
+            gyroscopic = [g.sub(g.mul(omega[i - 2], momentum[i - 1]), g.mul(omega[i - 1], momentum[i - 2])) for i in range(3)]
+            for i in range(3):
+                force = g.sub(g.mul(mass, a[i]), int(at.force[b][i]))
+                torque = g.sub(g.add(turning[i], gyroscopic[i]), int(at.torque[b][i]))
+                terms.append(g.mul(force, g.sub(int(at.v[b][i]), v_0[3 * b + i])))
+                terms.append(g.mul(torque, g.sub(omega[i], omega_0[3 * b + i])))
+        u = dict(zip(self.dependent, k.z, strict=True)) | dict(zip(self.independent, k.y, strict=True))
+        return g.sub(g.total(terms), g.total(g.mul(int(at.direct[i]), n) for i, n in u.items()))
+
+    def _solved(self, M, f, forms) -> list[int]:
+        if forms is not None and 1 <= len(f) <= 3:
+            try:
+                return forms.cramer(M, f)
+            except TooLarge:
+                pass
+        return solve_symmetric(self.graph, M, f, self.probes)
+
+    def _true_rates(self, kinematics: "_Kinematics", forms) -> tuple[list[int], list[int], list[int]]:
+        """Dependent speeds and rates at the true coordinates: those that do not depend on held ones are taken over, the others follow."""
+        g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
+        simple = (lambda nodes: list(nodes)) if forms is None else (lambda nodes: [forms.simplified(n) for n in nodes])
+        phi = [int(at.phi[s]) for s in self.rows]
+        A = [list(row) for row in zip(*(derivatives(g, phi, {n: g.one}) for n in u), strict=True)]
+        phi_0 = g.substituted(phi, dict.fromkeys(u, g.zero))
+        y = {k: u[k] for k in self.independent}
+
+        def solved(columns, known):
+            right = [[g.neg(g.add(rest, g.total(g.mul(row[k], n) for k, n in known.items())))] for row, rest in zip(A, phi_0, strict=True)]
+            return eliminate(g, [[row[k] for k in columns] for row in A], right, self.probes)
+
+        true = self.probes([row[0] for row in solved(self.dependent, y).solution])
+        held = self.probes(kinematics.z)
+        same = np.all(np.isclose(true, held, rtol=1e-10, atol=1e-12) | ~np.isfinite(true), axis=1)
+        known = y | {k: n for k, n, s in zip(self.dependent, kinematics.z, same, strict=True) if s}
+        left = [k for k in self.dependent if k not in known]
+        A, phi_0 = [simple(row) for row in A], simple(phi_0)
+        found = solved(left, known)
+        known |= {k: row[0] for k, row in zip(left, (simple(r) for r in found.solution), strict=True)}
+        z = [known[k] for k in self.dependent]
+        return z, simple(g.substituted(at.qdot.tolist(), {u[k]: n for k, n in known.items() if k not in self.independent})), found.pivots
+
+    def _forms(self, keep_sines: bool, most_terms: int):
+        if most_terms == 0:
+            return None
+        squares = {}
+        for first in self.quaternions:
+            w, *xyz = (int(n) for n in self.traced.q[first : first + 4])
+            squares[w] = {(): 1.0} | {(n, n): -1.0 for n in xyz}
+        return NormalForms(self.graph, most_terms, keep_sines, self.probes.sign, squares)
+
+    def _equations(self, k: "_Kinematics", forms) -> tuple[list[list[int]], list[int]]:
+        g, at = self.graph, k.at
+        simple = (lambda node: node) if forms is None else forms.simplified
+        freedoms = range(len(self.independent))
+        inertia = at.inertia.tolist()
+        M = [[g.zero] * len(freedoms) for _ in freedoms]
+        f = [g.zero] * len(freedoms)
+        for i in freedoms:
+            f[i] = g.total([int(at.direct[self.independent[i]]), *(g.mul(row[i], int(at.direct[d])) for row, d in zip(k.B, self.dependent, strict=True))])
+        for b, mass in enumerate(at.mass.tolist()):
+            beta, gamma = [k.beta[i][b] for i in freedoms], [k.gamma[i][b] for i in freedoms]
+            omega = at.omega[b].tolist()
+            momentum = [g.dot(row, omega) for row in inertia[b]]
+            gyroscopic = [g.sub(g.mul(omega[i - 2], momentum[i - 1]), g.mul(omega[i - 1], momentum[i - 2])) for i in range(3)]
+            force = [g.sub(F, g.mul(mass, a)) for F, a in zip(at.force[b].tolist(), k.a0[b], strict=True)]
+            turning = [g.dot(row, k.alpha0[b]) for row in inertia[b]]
+            torque = [g.sub(L, g.add(i, w)) for L, i, w in zip(at.torque[b].tolist(), turning, gyroscopic, strict=True)]
+            for i in freedoms:
+                f[i] = g.total([f[i], g.dot(beta[i], force), g.dot(gamma[i], torque)])
+                turned = [g.dot(row, gamma[i]) for row in inertia[b]]
+                for j in range(i + 1):
+                    M[i][j] = g.total([M[i][j], g.mul(mass, g.dot(beta[i], beta[j])), g.dot(gamma[j], turned)])
+        for i in freedoms:
+            f[i] = simple(f[i])
+            for j in range(i + 1):
+                M[i][j] = M[j][i] = simple(M[i][j])
+        return M, f
+
+
+class _Kinematics:
+    """Velocities, partial velocities and accelerations at ydot = 0, with some coordinates held (after differentiation)."""
+
+    def __init__(self, build: AppellOnGraph, forms, held: dict[int, int], explicit: bool, free_z: bool = False):
+        self.build, self.graph, self.forms, self.held, self.free_z = build, build.graph, forms, held, free_z
+        self.u, self.y = build.traced.u.tolist(), [int(build.traced.u[k]) for k in build.independent]
+        self.phi = [int(build.traced.at.phi[s]) for s in build.rows]
+        (self._explicitly if explicit else self._implicitly)()
+
+    # Explicit: the dependent speeds are put into the velocities, which are then differentiated.
+
+    def _explicitly(self) -> None:
+        A = self._transposed([self._at(column) for column in self._by(self.phi, self.u)])
+        self._solve(A, self._at(self.graph.substituted(self.phi, dict.fromkeys(self.u, self.graph.zero))))
+        unheld = self.known if not self.held else _Kinematics(self.build, self.forms, {}, True).known
+        raw, simple = self._velocities(unheld)
+        self._quantities()
+        partial = [self._simple(column) for column in self._by(simple, self.y)]
+        self._shape(simple, partial, self._along(simple, raw, self.qdot))
+
+    # Implicit: speeds are differentiated as they stand; the rows are differentiated through the velocities of the bodies they are made of.
+
+    def _implicitly(self) -> None:
+        g, build, at = self.graph, self.build, self.build.traced.at
+        raw, simple = self._velocities({})
+        qdot = self._at(at.qdot.tolist())
+        by_speed = [self._simple(column) for column in self._by(simple, self.u)]
+        at_fixed_speeds = self._along(simple, raw, qdot)
+        value = self._parts(simple)
+        rotation = [self._simple(self._at(R.ravel().tolist())) for R in at.orientation]
+        turn = lambda parts: [self._turned(R, w) for R, w in zip(rotation, parts[1], strict=True)]  # noqa: E731  to space axes
+        omega = [self._smaller(direct, turned) for direct, turned in zip([self._at(w.tolist()) for w in at.turning], turn(value), strict=True)]
+        levels = [(at.v, value[0]), (at.turning, omega), (at.orientation, [np.reshape(R, (3, 3)).tolist() for R in rotation])]
+        put = self._cut(levels)
+        self._put = put
+
+        def rows_along(direction):
+            return self._at(g.substituted(derivatives(g, self.phi, direction), put))
+
+        A = []
+        for k, column in enumerate(by_speed):
+            parts = self._parts(column)
+            direction = self._cut([(at.v, parts[0]), (at.turning, turn(parts)), (at.orientation, None), (at.position, None)])
+            A.append(rows_along(direction | {self.u[k]: g.one}))
+        phi_0 = self._at(g.substituted(self.phi, dict.fromkeys(self.u, g.zero)))
+        self._solve(self._transposed(A), phi_0)
+        parts = self._parts(at_fixed_speeds)
+        spun = [[[g.sub(g.mul(w[i - 2], R[3 * (i - 1) + j]), g.mul(w[i - 1], R[3 * (i - 2) + j])) for j in range(3)] for i in range(3)]
+                for w, R in zip(omega, rotation, strict=True)]
+        direction = self._cut([(at.v, parts[0]), (at.turning, turn(parts)), (at.orientation, spun), (at.position, value[0])])
+        moving = {int(n): r for n, r in zip(build.traced.q, qdot, strict=True)}
+        drift = rows_along(moving | direction | {build.traced.t: g.one})
+        put_z = {} if self.free_z else self.known
+        known = lambda nodes: self._simple(g.substituted(nodes, put_z))  # noqa: E731
+        drift, at_fixed_speeds = known(drift), known(at_fixed_speeds)
+        zdot = self._simple([row[0] for row in eliminate(g, self._A_z, [[g.neg(d)] for d in drift], build.probes).solution])
+        dependent = [by_speed[k] for k in build.dependent]
+        partial = [
+            self._simple([g.add(d, g.total(g.mul(row[i], by_z[n]) for row, by_z in zip(self.B, dependent, strict=True))) for n, d in enumerate(by_speed[y])])
+            for i, y in enumerate(build.independent)
+        ]
+        rates = self._simple([g.add(a, g.total(g.mul(r, by_z[n]) for r, by_z in zip(zdot, dependent, strict=True))) for n, a in enumerate(at_fixed_speeds)])
+        self._quantities()
+        self._shape(known(simple), partial, rates)
+
+    def _solve(self, A, phi_0) -> None:
+        """`z = B y + b` from `A_z z = -(A_y y + phi_0)`."""
+        g, build = self.graph, self.build
+        right = [[*(g.neg(row[i]) for i in build.independent), g.neg(rest)] for row, rest in zip(A, phi_0, strict=True)]
+        self._A_z = [[row[d] for d in build.dependent] for row in A]
+        eliminated = eliminate(g, self._A_z, right, build.probes)
+        self.pivots = eliminated.pivots
+        solution = [self._simple(row) for row in eliminated.solution]
+        self.B, self.b = [row[:-1] for row in solution], [row[-1] for row in solution]
+        self.z = self._simple([g.add(g.dot(B, self.y), b) for B, b in zip(self.B, self.b, strict=True)])
+        self.known = dict(zip([self.u[d] for d in build.dependent], self.z, strict=True))
+
+    # helpers
+
+    def _simple(self, nodes):
+        return list(nodes) if self.forms is None else [self.forms.simplified(n) for n in nodes]
+
+    def _at(self, nodes) -> list[int]:
+        """At the held coordinates, simplified."""
+        return self._simple(self.graph.substituted(nodes, self.held))
+
+    def _by(self, nodes, variables) -> list[list[int]]:
+        """Derivatives, one list per variable."""
+        return [derivatives(self.graph, nodes, {v: self.graph.one}) for v in variables]
+
+    def _transposed(self, columns) -> list[list[int]]:
+        return [[column[s] for column in columns] for s in range(len(self.phi))]
+
+    def _turned(self, R, w) -> list[int]:
+        return [self.graph.dot(R[3 * i : 3 * i + 3], w) for i in range(3)]
+
+    def _smaller(self, a, b) -> list[int]:
+        return a if self.graph.operations(a) <= self.graph.operations([*b]) else b
+
+    def _cut(self, levels) -> dict[int, int]:
+        """Traced nodes with what stands for them (zero where nothing is given); numbers stay numbers."""
+        pairs: dict[int, int] = {}
+        for nodes, values in levels:
+            flat = np.ravel(nodes).tolist()
+            new = [self.graph.zero] * len(flat) if values is None else np.ravel(np.array(values, np.int64)).tolist()
+            for n, v in zip(flat, new, strict=True):
+                if self.graph.op[n] == "neg":
+                    n, v = self.graph.args[n][0], self.graph.neg(v)
+                if self.graph.varies[n]:
+                    pairs[n] = v
+        return pairs
+
+    def _along(self, nodes, raw, qdot) -> list[int]:
+        """Rate of `nodes` (at the held coordinates) along the motion; `raw`: the same before any coordinate was held."""
+        g, traced = self.graph, self.build.traced
+        moving = {int(n): rate for n, rate in zip(traced.q, qdot, strict=True)}
+        rates = derivatives(g, nodes, {traced.t: g.one} | {n: r for n, r in moving.items() if n not in self.held})
+        for n in self.held:
+            by_held = self._at(derivatives(g, raw, {n: g.one}))
+            rates = [g.add(r, g.mul(moving[n], d)) for r, d in zip(rates, by_held, strict=True)]
+        return self._simple(rates)
+
+    def _velocities(self, replacement) -> tuple[list[int], list[int]]:
+        """v and omega in a row, raw and simplified at the held coordinates."""
+        at = self.build.traced.at
+        raw = self.graph.substituted([*at.v.ravel().tolist(), *at.omega.ravel().tolist()], replacement)
+        return raw, self._at(raw)
+
+    def _quantities(self) -> None:
+        """Everything traced, at the dependent speeds and the held coordinates."""
+        at, g = self.build.traced.at, self.graph
+
+        def put(nodes):
+            flat = self._at(g.substituted(nodes.ravel().tolist(), {} if self.free_z else self.known))
+            return np.array(flat, np.int64).reshape(nodes.shape)
+
+        self.at = VelocityQuantities(*(put(getattr(at, name)) for name in VelocityQuantities.__dataclass_fields__))
+        self.qdot = self.at.qdot.tolist()
+
+    def _parts(self, nodes) -> tuple[list, list]:
+        """Linear and angular parts, per body."""
+        rows = np.array(nodes, np.int64).reshape(2, len(self.build.traced.at.mass), 3).tolist()
+        return rows[0], rows[1]
+
+    def _shape(self, velocities, partial, rates) -> None:
+        self.at.v[...], self.at.omega[...] = self._parts(velocities)
+        self.beta, self.gamma = [self._parts(p)[0] for p in partial], [self._parts(p)[1] for p in partial]
+        self.a0, self.alpha0 = self._parts(rates)

@@ -1,0 +1,166 @@
+"""From a scene to its lowered equations: candidates are built in several ways, compared with each other and with the dense path, and the
+one with the fewest operations is kept. A scene that cannot be lowered says why.
+"""
+
+import itertools
+import time
+from collections.abc import Iterator
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.equations.probing import concretised
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT
+from jourdain_jax.equations.structure import Structure, sample_states, structure_of, symmetric_states
+from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
+from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
+from jourdain_jax.lowering.trace import named_values, traced_scene
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.interpret import Unsupported
+from jourdain_jax.scene.scene import Scene
+
+PROBES = 32
+MOST_OPERATIONS = 20_000  # of the program before simplification: beyond, the dense path is taken
+MOST_TERMS = 200  # of one normal form
+SMALL = 600  # operations: below, further ways are tried
+AGREEMENT = 1e-9  # between programs at the probes, relative to the size of the rates
+
+
+class NotLowered(Exception):
+    """Why a scene is not lowered."""
+
+
+def lowered(scene: Scene) -> Lowered | NotLowered:
+    """The lowered equations of the scene's class, or the reason why there are none. Built once per class, shapes and privileged speeds."""
+    try:
+        structure = structure_of(scene)
+        return _lowered(_Key(concretised(scene), structure))
+    except NotLowered as reason:
+        return reason
+
+
+class _Key:
+    """What the program depends on: not on the values of parameters."""
+
+    def __init__(self, scene: Scene, structure: Structure):
+        self.scene, self.structure = scene, structure
+        leaves, treedef = jax.tree.flatten(scene)
+        kept = (structure.independent, structure.redundant_rows, structure.affine, structure.well_conditioned, structure.driven)
+        self.key = (treedef, tuple(np.shape(x) for x in leaves), kept, jnp.result_type(float))
+
+    def __hash__(self):
+        return hash(self.key)
+
+    def __eq__(self, other):
+        return self.key == other.key
+
+
+@lru_cache(maxsize=256)
+def _lowered(key: _Key) -> Lowered:
+    begin = time.perf_counter()
+    scene, structure = key.scene, key.structure
+    if not structure.affine:
+        raise NotLowered("its rows are nonlinear in the speeds")
+    if not structure.well_conditioned:
+        raise NotLowered("no privileged speeds serve everywhere in its domain")
+    try:
+        traced = traced_scene(scene)
+        probes = _probes(scene, traced.graph)
+        builder = AppellOnGraph(traced, structure, probes, scene.coordinates.reference(), tuple(first for first, _ in scene.coordinates.quaternions))
+        return _best(scene, structure, builder, begin)
+    except Unsupported as reason:
+        raise NotLowered(f"{reason} has no scalar form") from None
+    except ZeroDivisionError:
+        raise NotLowered("its rows are dependent in a way that no elimination order avoids") from None
+
+
+def _probes(scene: Scene, graph) -> Probes:
+    """Admissible states, random and symmetric ones, and parameters off their values, so that what is zero or equal by chance does not count."""
+    t, q, u = (np.concatenate(parts) for parts in zip(sample_states(scene, PROBES), symmetric_states(scene), strict=True))
+    generator = np.random.default_rng(1)
+    varied = jax.tree.map(lambda x: np.where(x == 0, 0.05, np.asarray(x)) * (1 + 0.1 * generator.uniform(size=(len(t), *np.shape(x)))), scene)
+    inputs = generator.normal(size=(len(t), len(scene.inputs)))
+    values = named_values(scene, t, q, u, inputs)
+    values |= {f"p{k}_{i}": column for k, leaf in enumerate(jax.tree.leaves(varied)) for i, column in enumerate(np.reshape(leaf, (len(t), -1)).T)}
+    return Probes(graph, values)
+
+
+def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: float) -> Lowered:
+    graph, probes = builder.graph, builder.probes
+    plain = {explicit: builder.build(Strategy(explicit)) for explicit in (False, True)}
+    counts = {explicit: graph.operations(_rates(found)) for explicit, found in plain.items()}
+    reference = plain[False]
+    if counts[False] > MOST_OPERATIONS:
+        raise NotLowered(f"its scalar program has {counts[False]} operations, more than {MOST_OPERATIONS}")
+    expected = _values(reference, probes)
+    held = _ignorable(scene, builder, reference, expected)
+    stages = [Stage("scalar program: zeros, ones and repeated parts removed", counts[False])]
+    best, fewest = reference, counts[False]
+    for strategy in _strategies(held, counts):
+        candidate = builder.build(strategy)
+        count = graph.operations(graph.with_quotients(_rates(candidate)))
+        if count < fewest and _agree(_values(candidate, probes), expected):
+            best, fewest = candidate, count
+    names = scene.coordinate_names.entries
+    if held:
+        stages.append(Stage("ignorable coordinates held, normal forms", fewest))
+    outputs = graph.with_quotients([*best.qdot, *best.ydot, *best.z, *best.pivots, *best.guards, best.power])
+    parts = np.cumsum([len(best.qdot), len(best.ydot), len(best.z), len(best.pivots), len(best.guards)])
+    qdot, ydot, z, pivots, guards, (power,) = (tuple(int(n) for n in part) for part in np.split(np.array(outputs, np.int64), parts))
+    typical = np.nanmedian(np.abs(probes(pivots)), axis=1) if pivots else np.zeros(0)
+    dependent = tuple(builder.dependent)
+    return Lowered(
+        builder.traced, names, structure.independent, dependent, qdot, ydot, z, pivots, tuple(typical.tolist()), guards,
+        None if structure.driven else power, tuple(names[i] for i in held), tuple(stages),
+        time.perf_counter() - begin, fixed_nodes(graph, outputs),
+    )  # fmt: skip
+
+
+def _rates(found: Equations) -> list[int]:
+    return [*found.qdot, *found.ydot]
+
+
+def _strategies(held: tuple[int, ...], counts: dict[bool, int]) -> Iterator[Strategy]:
+    """Ways worth trying: more of them where the program is small."""
+    fewest = min(counts.values())
+    if fewest < SMALL:
+        for keep_sines, by_determinants, free_z in itertools.product((False, True), repeat=3):
+            yield Strategy(False, keep_sines, MOST_TERMS, MOST_TERMS, by_determinants, free_z, held)
+    else:
+        yield Strategy(False, False, MOST_TERMS, 0, False, False, held)
+    if counts[True] <= 1.35 * fewest:
+        for terms in (MOST_TERMS, 0):
+            yield Strategy(True, False, MOST_TERMS, terms, terms > 0, False, held)
+
+
+def _values(found: Equations, probes: Probes) -> np.ndarray:
+    """Rates at all probes, NaN where a pivot is small: there the program does not serve."""
+    pivots = np.abs(probes(found.pivots))
+    good = np.all(pivots > SMALLEST_PIVOT * np.nanmedian(pivots, axis=1, keepdims=True), axis=0)
+    return np.where(good, probes(_rates(found)), np.nan)
+
+
+def _agree(values: np.ndarray, expected: np.ndarray) -> bool:
+    """Whether two programs agree wherever the second serves."""
+    usable = np.all(np.isfinite(expected), axis=0)
+    size = 1 + np.max(np.abs(expected[:, usable]), axis=0, initial=0.0)
+    return bool(np.count_nonzero(usable) >= PROBES // 2 and np.all(np.abs(values - expected)[:, usable] <= AGREEMENT * size))
+
+
+def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:
+    """Coordinates (quaternions as a whole) whose value the privileged accelerations do not depend on, at any probe."""
+    probes, q = builder.probes, builder.traced.q
+    attitudes = [tuple(range(first, first + 4)) for first, _ in scene.coordinates.quaternions]
+    single = [(i,) for i in range(len(q)) if not any(i in attitude for attitude in attitudes)]
+    here = expected[len(equations.qdot) :]
+    reference = scene.coordinates.reference()
+    held: list[int] = []
+    for group in [*single, *attitudes]:
+        changed = {f"q_{i}": np.roll(probes.inputs[f"q_{i}"], 1) for i in group}
+        at_reference = {f"q_{i}": np.full(probes.count, reference[i]) for i in group}
+        there = [_values(equations, probes.with_inputs(change))[len(equations.qdot) :] for change in (changed, at_reference)]
+        if all(_agree(values, np.where(np.isfinite(values), here, np.nan)) for values in there):
+            held += group
+    return tuple(sorted(held))

@@ -1,0 +1,104 @@
+"""The lowered equations of a scene: which program was chosen, what it computes, and how it runs in JAX."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.lowering.trace import TracedScene
+from jourdain_jax.program.emit import run
+from jourdain_jax.program.graph import Graph
+from jourdain_jax.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of lowering, for the summary."""
+
+    name: str
+    operations: int
+
+
+@dataclass(frozen=True, eq=False)
+class Lowered:
+    """Rates of the minimal state (q, y) of one class of scenes as a scalar program; parameters are inputs of it.
+
+    Compared by identity, so that it can be a static argument of compiled functions.
+    """
+
+    traced: TracedScene
+    coordinates: tuple[str, ...]
+    independent: tuple[int, ...]
+    dependent: tuple[int, ...]
+    qdot: tuple[int, ...]  # nodes
+    ydot: tuple[int, ...]
+    z: tuple[int, ...]  # dependent speeds
+    pivots: tuple[int, ...]  # must not vanish
+    typical: tuple[float, ...]  # their magnitude at the probes
+    guards: tuple[int, ...]  # must stay positive
+    power: int | None  # d(T + V)/dt where it is not zero by structure; None where poses are driven
+    held: tuple[str, ...]  # ignorable coordinates, set to the reference in the accelerations
+    stages: tuple[Stage, ...]
+    seconds: float  # that lowering took
+    fixed: tuple[int, ...]  # nodes that depend on parameters alone, computed once per motion
+
+    @property
+    def graph(self) -> Graph:
+        """The graph all nodes belong to."""
+        return self.traced.graph
+
+    @property
+    def operations(self) -> int:
+        """Operations per evaluation of all rates."""
+        return self.graph.operations([*self.qdot, *self.ydot])
+
+    def fixed_values(self, scene: Scene) -> tuple[Float[Array, ""], ...]:
+        """What depends on parameters alone."""
+        known = {}
+        for nodes, leaf in zip(self.traced.parameters, jax.tree.leaves(scene), strict=True):
+            flat = jnp.reshape(leaf, -1)
+            known |= {int(n): flat[i] for i, n in enumerate(np.ravel(nodes))}
+        return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known))
+
+    def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Float[Array, ""] | None]:
+        """`qdot` and `ydot`, tuples of scalars, and the power where asked; NaN where a guard is not positive."""
+        wanted = [*self.qdot, *self.ydot, *([self.power] if with_power else [])]
+        out = run(self.graph, [*wanted, *self.guards], self._known(fixed, t, q, y, inputs))
+        rates, guards = out[: len(wanted)], out[len(wanted) :]
+        for guard in guards:
+            rates[0] = jnp.where(guard > 0, rates[0], jnp.nan)
+        real = jnp.result_type(*q)
+        rates = [jnp.broadcast_to(jnp.asarray(r, real), jnp.shape(q[0])) for r in rates]
+        at = len(self.qdot)
+        return tuple(rates[:at]), tuple(rates[at : at + len(self.ydot)]), rates[-1] if with_power else None
+
+    def speeds_and_pivot(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+        """All speeds, and the smallest pivot relative to its usual size: it changes sign where the elimination does not serve."""
+        out = run(self.graph, [*self.z, *self.pivots], self._known(fixed, t, q, y, inputs))
+        order = np.argsort([*self.independent, *self.dependent])
+        every = [*y, *out[: len(self.z)]]
+        real = jnp.result_type(*q)
+        u = jnp.stack([jnp.asarray(every[i], real) for i in order])
+        pivot = jnp.ones((), real)
+        for value, size in zip(out[len(self.z) :], self.typical, strict=True):
+            ratio = jax.lax.stop_gradient(value) / size
+            pivot = jnp.sign(pivot) * jnp.sign(ratio) * jnp.minimum(jnp.abs(pivot), jnp.abs(ratio))
+        return u, pivot
+
+    def _known(self, fixed, t, q, y, inputs) -> dict[int, Float[Array, ""]]:
+        traced = self.traced
+        known = dict(zip(self.fixed, fixed, strict=True)) | {traced.t: t}
+        known |= dict(zip(traced.q.tolist(), q, strict=True)) | {int(traced.u[k]): v for k, v in zip(self.independent, y, strict=True)}
+        return known | {int(n): inputs[i] for i, n in enumerate(traced.inputs)}
+
+
+def fixed_nodes(graph: Graph, outputs) -> tuple[int, ...]:
+    """Nodes that depend on parameters alone and are used by varying ones."""
+    found = set()
+    for node in graph.reachable(outputs):
+        if graph.varies[node]:
+            found.update(a for a in graph.args[node] if not graph.varies[a] and graph.op[a] != "const")
+    return tuple(sorted(found | {n for n in outputs if not graph.varies[n] and graph.op[n] != "const"}))

@@ -1,0 +1,179 @@
+"""The loop over steps of an explicit Runge-Kutta method with an embedded error estimate, with little besides: for the default options.
+
+    k_i = f(t + c_i h, y + h sum_j a_ij k_j),   y_1 = y + h sum b_i k_i,   e = h sum b^err_i k_i
+    |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts;   h <- h clip(0.9 |e|^(-1/order), 0.2, 10)
+
+The state is any tree of arrays; a lowered scene's is a tuple of scalars, which a batch makes a structure of arrays. A step ends at every
+time asked for; the step size found before such a shortened step is remembered. Every lane carries its own result code, and a lane that has
+ended stands still. `diffrax` serves all other solvers, controllers and ways of saving.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jourdain_jax.motion import results
+
+RUNNING = -1
+SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
+
+
+@dataclass(frozen=True)
+class Method:
+    """A tableau, and how its stages are written: one after another in the program, or as a loop (one copy of the vector field)."""
+
+    A: np.ndarray
+    b: np.ndarray
+    b_error: np.ndarray
+    c: np.ndarray
+    order: int
+    unrolled: bool
+
+    @property
+    def last_is_next_first(self) -> bool:
+        """Whether the last stage is taken at y_1."""
+        return bool(np.array_equal(self.A[-1], self.b) and self.c[-1] == 1.0)
+
+
+def method_of(solver: diffrax.AbstractERK, unrolled: bool) -> Method:
+    """The tableau of a diffrax solver."""
+    tableau = solver.tableau
+    stages = len(tableau.b_sol)
+    A = np.zeros((stages, stages))
+    for i, row in enumerate(tableau.a_lower):
+        A[i + 1, : i + 1] = row
+    return Method(A, np.asarray(tableau.b_sol), np.asarray(tableau.b_error), np.concatenate([[0.0], tableau.c]), solver.order(None), unrolled)
+
+
+class Progress(eqx.Module):
+    """Where a lane is."""
+
+    t: Float[Array, ""]
+    y: PyTree
+    k: PyTree  # f(t, y)
+    h: Float[Array, ""]  # the next step, positive
+    code: Int[Array, ""]  # RUNNING, or the result
+    accepted: Int[Array, ""]
+    rejected: Int[Array, ""]
+    event: Int[Array, ""]  # index of the event that ended the motion, or -1
+
+
+class Problem(eqx.Module):
+    """What is integrated and how well."""
+
+    rates: Callable  # (t, y, args) -> dy/dt
+    args: PyTree
+    project: Callable | None  # (t, y, args) -> y
+    events: Callable | None  # (t, y, args) -> values, (events,)
+    norm: Callable
+    rtol: Float[Array, ""]
+    atol: Float[Array, ""]
+    shortest: Float[Array, ""]
+    max_steps: int = eqx.field(static=True)
+
+
+def integrate(problem: Problem, method: Method, y0: PyTree, t0, goals: Float[Array, "times"], dt0, kind: str) -> tuple[PyTree, Bool[Array, "times"], Progress]:
+    """States at the goals (monotonic; what was not reached repeats the last state), which were reached, and where the lane ended.
+
+    `kind`: "lax" (no reverse mode), "checkpointed" (reverse mode), as in `equinox.internal.while_loop`.
+    """
+    direction = jnp.sign(goals[-1] - t0)
+    none = jnp.full((), -1, jnp.int32)
+    zero = jnp.zeros((), jnp.int32)
+    code = jnp.full((), RUNNING, jnp.int32)
+    first = problem.rates(t0, y0, problem.args) if method.unrolled else y0
+    start = Progress(t0, y0, first, jnp.abs(dt0), code, zero, zero, none)
+    if problem.events is not None:
+        start = _stopped_by_event(problem, start, jnp.array(True))
+
+    def to_goal(progress: Progress, goal):
+        def running(p):
+            return (p.code == RUNNING) & (p.t != goal)
+
+        def step(p):
+            return jax.tree.map(lambda new, old: jnp.where(running(p), new, old), _step(problem, method, p, goal, goals[-1], direction), p)
+
+        checkpoints = None if kind == "lax" else max(8, -(-512 // goals.shape[0]))
+        end = eqxi.while_loop(running, step, progress, max_steps=None if kind == "lax" else problem.max_steps, kind=kind, checkpoints=checkpoints)
+        return end, (end.y, end.t == goal)
+
+    end, (ys, reached) = jax.lax.scan(to_goal, start, goals)
+    return ys, reached, eqx.tree_at(lambda p: p.code, end, jnp.where(end.code == RUNNING, results.SUCCESS, end.code))
+
+
+def _step(problem: Problem, method: Method, p: Progress, goal, last_goal, direction) -> Progress:
+    rest = jnp.abs(goal - p.t)
+    lands = p.h >= 0.999 * rest
+    size = jnp.where(lands, rest, jnp.where(2 * p.h > rest, 0.5 * rest, p.h))
+    shortened = size < p.h
+    h = direction * size
+    t1 = jnp.where(lands, goal, p.t + h)
+    y1, error, last = _stages(problem, method, p, h)
+    if problem.project is not None:
+        y1 = problem.project(t1, y1, problem.args)
+        last = problem.rates(t1, y1, problem.args) if method.unrolled else last
+    scale = jax.tree.map(lambda a, b: problem.atol + problem.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), p.y, y1)
+    size_of_error = jax.lax.stop_gradient(problem.norm(jax.tree.map(lambda e, s: e / s, error, scale)))
+    accept = size_of_error <= 1
+    factor = SAFETY * jnp.where(size_of_error > 0, size_of_error, 1e-30) ** (-1 / method.order)
+    factor = jnp.clip(jnp.where(jnp.isfinite(size_of_error), factor, 0.0), LEAST_FACTOR, jnp.where(accept, LARGEST_FACTOR, 1.0))
+    proposed = size * factor
+    next_h = jnp.where(accept & shortened, jnp.maximum(proposed, p.h), proposed)
+    accepted, rejected = p.accepted + accept.astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
+    code = jnp.where(next_h < problem.shortest, results.STEP_TOO_SMALL, RUNNING)
+    code = jnp.where((code == RUNNING) & (accepted + rejected >= problem.max_steps) & ~(accept & (t1 == last_goal)), results.MAX_STEPS, code).astype(jnp.int32)
+    y, k = (jax.tree.map(lambda a, b: jnp.where(accept, _as(a, b), b), new, old) for new, old in ((y1, p.y), (last, p.k)))
+    moved = Progress(jnp.where(accept, t1, p.t), y, k, jax.lax.stop_gradient(next_h), code, accepted, rejected, p.event)
+    return moved if problem.events is None else _stopped_by_event(problem, moved, accept)
+
+
+def _stages(problem: Problem, method: Method, p: Progress, h) -> tuple[PyTree, PyTree, PyTree]:
+    """y_1, the error estimate and, where stages are unrolled, f(t_1, y_1)."""
+    leaves, treedef = jax.tree.flatten(p.y)
+    if method.unrolled:
+        slopes = [jax.tree.leaves(p.k)]
+        for i in range(1, len(method.c)):
+            at = _moved(leaves, h, method.A[i], slopes)
+            slopes.append(jax.tree.leaves(problem.rates(p.t + method.c[i] * h, treedef.unflatten(at), problem.args)))
+        y1 = _moved(leaves, h, method.b, slopes)
+        error = _moved([0.0 * y for y in leaves], h, method.b_error, slopes)
+        last = treedef.unflatten(slopes[-1]) if method.last_is_next_first else problem.rates(p.t + h, treedef.unflatten(y1), problem.args)
+        return treedef.unflatten(y1), treedef.unflatten(error), last
+
+    def stage(slopes, row):
+        A, c, i = row
+        at = [y + _as(h, y) * jnp.tensordot(_as(A, y), k, 1) for y, k in zip(leaves, slopes, strict=True)]
+        found = jax.tree.leaves(problem.rates(p.t + c * h, treedef.unflatten(at), problem.args))
+        return [k.at[i].set(_as(f, k)) for k, f in zip(slopes, found, strict=True)], None
+
+    count = len(method.c) - (method.last_is_next_first and method.b_error[-1] == 0)  # a last stage that nothing else needs
+    slopes = [jnp.zeros((len(method.c), *y.shape), y.dtype) for y in leaves]
+    rows = (jnp.asarray(method.A[:count]), jnp.asarray(method.c[:count]), jnp.arange(count))
+    slopes, _ = jax.lax.scan(stage, slopes, rows)
+    y1 = [y + _as(h, y) * jnp.tensordot(_as(method.b, y), k, 1) for y, k in zip(leaves, slopes, strict=True)]
+    error = [_as(h, k) * jnp.tensordot(_as(method.b_error, k), k, 1) for k in slopes]
+    return treedef.unflatten(y1), treedef.unflatten(error), p.k
+
+
+def _moved(leaves, h, weights, slopes) -> list:
+    """`y + h sum w_i k_i`"""
+    return [y + _as(h, y) * sum(float(w) * k[n] for w, k in zip(weights, slopes, strict=False) if w != 0) for n, y in enumerate(leaves)]
+
+
+def _as(x, like) -> Array:
+    """In the precision of the state: time keeps its own."""
+    return jnp.asarray(x, like.dtype)
+
+
+def _stopped_by_event(problem: Problem, p: Progress, accepted) -> Progress:
+    values = problem.events(p.t, p.y, problem.args)
+    happened = accepted & (p.code == RUNNING) & jnp.any(values <= 0)
+    code = jnp.where(happened, results.EVENT, p.code).astype(jnp.int32)
+    return eqx.tree_at(lambda p: (p.code, p.event), p, (code, jnp.where(happened, jnp.argmax(values <= 0), p.event).astype(jnp.int32)))

@@ -1,0 +1,78 @@
+"""Values of nodes on NumPy arrays, all probes at once: nothing is compiled."""
+
+from collections.abc import Callable, Iterable, Mapping
+
+import numpy as np
+
+from jourdain_jax.program.graph import Graph
+
+
+class Probes:
+    """Values of the nodes of a graph at sample inputs; what was computed once is kept."""
+
+    def __init__(self, graph: Graph, inputs: Mapping[str, np.ndarray]):
+        self.graph, self.inputs = graph, dict(inputs)
+        self.count = max((np.size(x) for x in self.inputs.values()), default=1)
+        self._values: dict[int, np.ndarray | float] = {}
+
+    def __call__(self, nodes: Iterable[int]) -> np.ndarray:
+        """Values, shape (nodes, probes)."""
+        nodes = list(nodes)
+        self._compute(nodes)
+        return np.array([np.broadcast_to(self._values[n], self.count) for n in nodes], float).reshape(len(nodes), self.count)
+
+    def with_inputs(self, changes: Mapping[str, np.ndarray]) -> "Probes":
+        """The same probes with some inputs changed."""
+        return Probes(self.graph, self.inputs | dict(changes))
+
+    def sign(self, node: int) -> int:
+        """1 or -1 where the node has this sign at every probe, 0 otherwise."""
+        value = self([node])[0]
+        finite = value[np.isfinite(value)]
+        return 0 if not finite.size or np.any(finite == 0) else int(np.sign(finite[0])) if np.all(np.sign(finite) == np.sign(finite[0])) else 0
+
+    def _compute(self, nodes) -> None:
+        graph, values = self.graph, self._values
+        stack, wanted = [n for n in nodes if n not in values], set()
+        while stack:
+            node = stack.pop()
+            if node not in wanted:
+                wanted.add(node)
+                stack.extend(a for a in graph.args[node] if a not in values and a not in wanted)
+        with np.errstate(all="ignore"):
+            for node in sorted(wanted):
+                op = graph.op[node]
+                if op == "const":
+                    values[node] = graph.value[node]
+                elif op == "input":
+                    values[node] = self.inputs[graph.value[node]]
+                else:
+                    values[node] = FUNCTIONS[op](*(values[a] for a in graph.args[node]))
+
+
+FUNCTIONS: dict[str, Callable] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "neg": np.negative,
+    "sqrt": np.sqrt,
+    "atan2": np.arctan2,
+    "asin": np.arcsin,
+    "acos": np.arccos,
+    "atan": np.arctan,
+    "max": np.maximum,
+    "min": np.minimum,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "and": np.logical_and,
+    "or": np.logical_or,
+    "not": np.logical_not,
+    "is_finite": np.isfinite,
+    "select": lambda c, a, b: np.where(c, b, a),
+    **{name: getattr(np, name) for name in ("sin", "cos", "tan", "exp", "log", "tanh", "sinh", "cosh", "sign", "abs")},
+}

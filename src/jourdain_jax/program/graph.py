@@ -1,0 +1,280 @@
+"""A hash-consed graph of scalar expressions: equal expressions are one node, and what can be known while building is folded.
+
+Folded: constants, 0 + x, 0 x, 1 x, signs (pulled outwards, so that a - (-b) = a + b), x - x, squares of square roots, sin(-x), cos(-x).
+Arguments of sums and products are ordered, so that a b and b a are one node.
+"""
+
+import math
+from collections.abc import Iterable, Mapping
+
+OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
+
+
+class Graph:
+    """Nodes are integers; `op[n]`, `args[n]` say what node n is, `value[n]` is the number of a constant or the name of an input."""
+
+    def __init__(self):
+        self.op: list[str] = []
+        self.args: list[tuple[int, ...]] = []
+        self.value: list = []
+        self.varies: list[bool] = []  # depends on time, state or inputs; what does not is computed once per motion
+        self._known: dict = {}
+        self.zero, self.one = self.const(0.0), self.const(1.0)
+
+    def _node(self, op: str, args: tuple[int, ...] = (), value=None, varies: bool | None = None) -> int:
+        key = (op, args, value)
+        node = self._known.get(key)
+        if node is None:
+            node = self._known[key] = len(self.op)
+            self.op.append(op)
+            self.args.append(args)
+            self.value.append(value)
+            self.varies.append(any(self.varies[a] for a in args) if varies is None else varies)
+        return node
+
+    # leaves
+
+    def const(self, value) -> int:
+        """A number."""
+        value = float(value)
+        return self._node("const", (), 0.0 if value == 0 else value, False)
+
+    def input(self, name: str, varies: bool) -> int:
+        """A named input: a parameter, or (`varies`) time, a coordinate, a speed, an input of the scene."""
+        return self._node("input", (), name, varies)
+
+    def is_const(self, node: int) -> bool:
+        """Whether a node is a number."""
+        return self.op[node] == "const"
+
+    # arithmetic
+
+    def neg(self, a: int) -> int:
+        """-a"""
+        op, args = self.op[a], self.args[a]
+        if op == "const":
+            return self.const(-self.value[a])
+        if op == "neg":
+            return args[0]
+        if op == "sub":
+            return self._node("sub", (args[1], args[0]))
+        return self._node("neg", (a,))
+
+    def add(self, a: int, b: int) -> int:
+        """a + b"""
+        if a == self.zero:
+            return b
+        if b == self.zero:
+            return a
+        if self.op[a] == "const" and self.op[b] == "const":
+            return self.const(self.value[a] + self.value[b])
+        if self.op[b] == "neg":
+            return self.sub(a, self.args[b][0])
+        if self.op[a] == "neg":
+            return self.sub(b, self.args[a][0])
+        if self.op[a] == "sub" and self.args[a][1] == b:  # (x - b) + b
+            return self.args[a][0]
+        if self.op[b] == "sub" and self.args[b][1] == a:
+            return self.args[b][0]
+        return self._node("add", (a, b) if a < b else (b, a))
+
+    def sub(self, a: int, b: int) -> int:
+        """a - b"""
+        if b == self.zero:
+            return a
+        if a == self.zero:
+            return self.neg(b)
+        if a == b:
+            return self.zero
+        if self.op[a] == "const" and self.op[b] == "const":
+            return self.const(self.value[a] - self.value[b])
+        if self.op[b] == "neg":
+            return self.add(a, self.args[b][0])
+        if self.op[a] == "neg":
+            return self.neg(self.add(self.args[a][0], b))
+        if self.op[a] == "sub" and self.args[a][0] == b:  # (b - x) - b
+            return self.neg(self.args[a][1])
+        if self.op[a] == "add" and b in self.args[a]:  # (b + x) - b
+            return self.args[a][1 - self.args[a].index(b)]
+        if self.op[b] == "sub" and self.args[b][0] == a:  # a - (a - x)
+            return self.args[b][1]
+        if self.op[b] == "add" and a in self.args[b]:  # a - (a + x)
+            return self.neg(self.args[b][1 - self.args[b].index(a)])
+        return self._node("sub", (a, b))
+
+    def mul(self, a: int, b: int) -> int:
+        """a b"""
+        if a == self.zero or b == self.zero:
+            return self.zero
+        if a == self.one:
+            return b
+        if b == self.one:
+            return a
+        op_a, op_b = self.op[a], self.op[b]
+        if op_a == "const" and op_b == "const":
+            return self.const(self.value[a] * self.value[b])
+        if op_a == "neg":
+            return self.neg(self.mul(self.args[a][0], b))
+        if op_b == "neg":
+            return self.neg(self.mul(a, self.args[b][0]))
+        if op_a == "const" and self.value[a] < 0:
+            return self.neg(self.mul(self.const(-self.value[a]), b))
+        if op_b == "const" and self.value[b] < 0:
+            return self.neg(self.mul(a, self.const(-self.value[b])))
+        if a == b and op_a == "sqrt":
+            return self.args[a][0]
+        if op_a == "const" and op_b == "mul" and self.op[self.args[b][0]] == "const":
+            return self.mul(self.const(self.value[a] * self.value[self.args[b][0]]), self.args[b][1])
+        if op_b == "const" and op_a == "mul" and self.op[self.args[a][0]] == "const":
+            return self.mul(self.const(self.value[b] * self.value[self.args[a][0]]), self.args[a][1])
+        if op_b == "const" or (op_a != "const" and a > b):
+            a, b = b, a
+        return self._node("mul", (a, b))
+
+    def div(self, a: int, b: int) -> int:
+        """a / b"""
+        if self.op[b] == "const" and self.value[b] != 0:
+            return self.mul(a, self.const(1 / self.value[b])) if self.op[a] != "const" else self.const(self.value[a] / self.value[b])
+        if a == self.zero:
+            return a
+        if self.op[a] == "neg":
+            return self.neg(self.div(self.args[a][0], b))
+        if self.op[b] == "neg":
+            return self.neg(self.div(a, self.args[b][0]))
+        if self.op[a] == "const" and self.value[a] < 0:
+            return self.neg(self.div(self.const(-self.value[a]), b))
+        if self.varies[a] and not self.varies[b]:
+            return self.mul(a, self.div(self.one, b))  # the reciprocal is computed once per motion
+        return self._node("div", (a, b))
+
+    def power(self, a: int, exponent: int) -> int:
+        """a^exponent for an integer exponent, by repeated multiplication."""
+        if exponent < 0:
+            return self.div(self.one, self.power(a, -exponent))
+        result, square = self.one, a
+        while exponent:
+            if exponent & 1:
+                result = self.mul(result, square)
+            exponent >>= 1
+            square = self.mul(square, square) if exponent else square
+        return result
+
+    def call(self, op: str, *args: int) -> int:
+        """Any other function of scalars, by name; folded where all arguments are numbers."""
+        if op in _ARITHMETIC:
+            return getattr(self, op)(*args)
+        if all(self.op[a] == "const" for a in args) and op in _FOLDED:
+            try:
+                return self.const(_FOLDED[op](*(self.value[a] for a in args)))
+            except (ValueError, OverflowError, ZeroDivisionError):
+                pass  # not a number at build time: left to the program
+        a = args[0]
+        if op == "sin" and self.op[a] == "neg":
+            return self.neg(self.call("sin", self.args[a][0]))
+        if op in ("cos", "abs") and self.op[a] == "neg":
+            return self.call(op, self.args[a][0])
+        if op == "sqrt" and self.op[a] == "mul" and self.args[a][0] == self.args[a][1]:
+            return self.call("abs", self.args[a][0])
+        if op == "select" and args[1] == args[2]:
+            return args[1]
+        return self._node(op, args)
+
+    def total(self, terms: Iterable[int]) -> int:
+        """The sum of nodes."""
+        result = self.zero
+        for term in terms:
+            result = self.add(result, term)
+        return result
+
+    def dot(self, a: Iterable[int], b: Iterable[int]) -> int:
+        """sum a_i b_i"""
+        return self.total(self.mul(x, y) for x, y in zip(a, b, strict=True))
+
+    def substituted(self, outputs: Iterable[int], replacement: Mapping[int, int]) -> list[int]:
+        """The outputs with some nodes replaced by others."""
+        outputs = list(outputs)
+        new: dict[int, int] = {}
+        for node in self.reachable(outputs):
+            if node in replacement:
+                new[node] = replacement[node]
+            elif not self.args[node] or all(new[a] == a for a in self.args[node]):
+                new[node] = node
+            else:
+                new[node] = self.call(self.op[node], *(new[a] for a in self.args[node]))
+        return [new[n] for n in outputs]
+
+    # what is in the graph
+
+    def reachable(self, outputs: Iterable[int]) -> list[int]:
+        """All nodes that the outputs need, in an order in which they can be computed."""
+        seen: set[int] = set()
+        stack = list(outputs)
+        while stack:
+            node = stack.pop()
+            if node not in seen:
+                seen.add(node)
+                stack.extend(self.args[node])
+        return sorted(seen)  # arguments are older than what uses them
+
+    def needed(self, outputs: Iterable[int], known) -> list[int]:
+        """What must be computed for the outputs where the nodes in `known` are known, in order."""
+        seen: set[int] = set()
+        stack = [n for n in outputs if n not in known]
+        while stack:
+            node = stack.pop()
+            if node not in seen:
+                seen.add(node)
+                stack.extend(a for a in self.args[node] if a not in known)
+        return sorted(seen)
+
+    def with_quotients(self, outputs: Iterable[int]) -> list[int]:
+        """The outputs with `a (1/b)` as one division, where `1/b` serves only once."""
+        outputs = list(outputs)
+        uses: dict[int, int] = {}
+        for node in self.reachable(outputs):
+            for a in self.args[node]:
+                uses[a] = uses.get(a, 0) + 1
+        new: dict[int, int] = {}
+        for node in self.reachable(outputs):
+            args = self.args[node]
+            divided = [(a, self.args[b][1]) for a, b in (args, args[::-1]) if self._serves_once(b, uses, outputs)] if self._is_product(node) else []
+            if divided:
+                new[node] = self._node("div", (new[divided[0][0]], new[divided[0][1]]))
+            else:
+                new[node] = self._node(self.op[node], tuple(new[a] for a in args)) if args else node
+        return [new[n] for n in outputs]
+
+    def _is_product(self, node: int) -> bool:
+        return self.op[node] == "mul" and self.varies[node]
+
+    def _serves_once(self, node: int, uses: dict[int, int], outputs: list[int]) -> bool:
+        """Whether a node is a varying reciprocal with one use."""
+        reciprocal = self.op[node] == "div" and self.args[node][0] == self.one and self.varies[node]
+        return reciprocal and uses[node] == 1 and node not in outputs
+
+    def operations(self, outputs: Iterable[int]) -> int:
+        """How many operations on varying quantities the outputs need; expressions of parameters alone do not count."""
+        return sum(self.varies[n] and self.op[n] in OPERATIONS for n in self.reachable(outputs))
+
+
+_ARITHMETIC = {"add", "sub", "mul", "div", "neg"}
+_FOLDED = {
+    "sin": math.sin,
+    "cos": math.cos,
+    "tan": math.tan,
+    "sqrt": math.sqrt,
+    "exp": math.exp,
+    "log": math.log,
+    "tanh": math.tanh,
+    "abs": abs,
+    "sign": lambda x: math.copysign(1.0, x) if x else 0.0,
+    "max": max,
+    "min": min,
+    "lt": lambda a, b: a < b,
+    "le": lambda a, b: a <= b,
+    "gt": lambda a, b: a > b,
+    "ge": lambda a, b: a >= b,
+    "eq": lambda a, b: a == b,
+    "ne": lambda a, b: a != b,
+    "select": lambda c, a, b: b if c else a,
+}

@@ -1,0 +1,309 @@
+"""A jaxpr run over scalars: every array is an array of nodes of a `Graph`, every primitive acts on its entries.
+
+Integers and booleans that do not depend on inputs (indices, shapes, masks) stay NumPy arrays. A primitive without a rule raises
+`Unsupported`, and the scene is then not lowered.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Literal
+
+from jourdain_jax.program.graph import Graph
+
+LARGEST = 200_000  # scalars in one array
+
+
+class Unsupported(Exception):
+    """What was traced cannot become a scalar program; the text says why."""
+
+
+class Nodes:
+    """An array of nodes."""
+
+    __slots__ = ("ids",)
+
+    def __init__(self, ids):
+        self.ids = np.asarray(ids, dtype=np.int64)
+
+
+Value = Nodes | np.ndarray
+
+
+def interpret(graph: Graph, closed, arguments: list[Value]) -> list[Value]:
+    """Outputs of a closed jaxpr at the given arguments."""
+    return _run(graph, closed.jaxpr, [_known(c) for c in closed.consts], arguments)
+
+
+def as_nodes(graph: Graph, value: Value) -> np.ndarray:
+    """The nodes of a value; numbers become constants."""
+    if isinstance(value, Nodes):
+        return value.ids
+    if value.size > LARGEST:
+        raise Unsupported(f"an array of {value.size} numbers")
+    return np.array([graph.const(x) for x in np.ravel(value)], dtype=np.int64).reshape(np.shape(value))
+
+
+def _known(constant) -> np.ndarray:
+    return np.asarray(constant)
+
+
+def _run(graph: Graph, jaxpr, constants, arguments) -> list[Value]:
+    environment: dict = dict(zip(jaxpr.constvars, constants, strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
+
+    def read(atom):
+        return np.asarray(atom.val) if isinstance(atom, Literal) else environment[atom]
+
+    for equation in jaxpr.eqns:
+        name, inputs = equation.primitive.name, [read(x) for x in equation.invars]
+        results = _apply(graph, name, equation, inputs)
+        for variable, result in zip(equation.outvars, results, strict=True):
+            environment[variable] = result
+    return [read(x) for x in jaxpr.outvars]
+
+
+def _apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
+    inner = _inner_jaxpr(name, equation.params)
+    if inner is not None:
+        return _run(graph, inner.jaxpr, [_known(c) for c in inner.consts], inputs) if hasattr(inner, "jaxpr") else _run(graph, inner, [], inputs)
+    symbolic = any(isinstance(x, Nodes) for x in inputs)
+    out = equation.outvars[0].aval
+    if name in _STRUCTURAL:
+        rule = _STRUCTURAL[name]
+        if symbolic and name in _MIXED:
+            inputs = [Nodes(as_nodes(graph, x)) if i in _MIXED[name](len(inputs)) else x for i, x in enumerate(inputs)]
+        return _boxed(rule(graph, inputs, equation.params, out), symbolic)
+    if not symbolic:
+        return [np.asarray(x) for x in _bind_concretely(equation, inputs)]
+    if name in _REDUCTIONS:
+        return [_reduce(graph, inputs[0], equation.params["axes"], _REDUCTIONS[name])]
+    if name == "dot_general":
+        return [_dot_general(graph, *inputs, equation.params)]
+    if name in _ELEMENTWISE:
+        arrays = np.broadcast_arrays(*(as_nodes(graph, x) for x in inputs)) if len(inputs) > 1 else [as_nodes(graph, inputs[0])]
+        flat = [np.ravel(a).tolist() for a in arrays]
+        result = [_ELEMENTWISE[name](graph, equation.params, *entries) for entries in zip(*flat, strict=True)]
+        return [Nodes(np.array(result, dtype=np.int64).reshape(arrays[0].shape))]
+    raise Unsupported(f"the operation `{name}`")
+
+
+def _inner_jaxpr(name: str, params):
+    if name in ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"):
+        return params["jaxpr"]
+    if name == "custom_jvp_call":
+        return params["call_jaxpr"]
+    if name in ("custom_vjp_call", "custom_vjp_call_jaxpr"):
+        return params.get("call_jaxpr", params.get("fun_jaxpr"))
+    return None
+
+
+def _bind_concretely(equation, inputs):
+    with jax.ensure_compile_time_eval():
+        result = equation.primitive.bind(*(jnp.asarray(x) for x in inputs), **equation.params)
+    return result if equation.primitive.multiple_results else [result]
+
+
+def _boxed(result, symbolic: bool) -> list[Value]:
+    results = result if isinstance(result, list) else [result]
+    return [Nodes(r) if symbolic else r for r in results]
+
+
+# Primitives that move entries about. ---------------------------------------------------------------------------------
+
+
+def _ids(x) -> np.ndarray:
+    return x.ids if isinstance(x, Nodes) else np.asarray(x)
+
+
+def _broadcast_in_dim(graph, inputs, params, out):
+    x, axes = _ids(inputs[0]), params["broadcast_dimensions"]
+    shape = [1] * len(params["shape"])
+    for axis, place in enumerate(axes):
+        shape[place] = x.shape[axis]
+    return np.broadcast_to(x.reshape(shape), params["shape"])
+
+
+def _slice(graph, inputs, params, out):
+    strides = params["strides"] or (1,) * len(params["start_indices"])
+    return _ids(inputs[0])[tuple(slice(*s) for s in zip(params["start_indices"], params["limit_indices"], strides, strict=True))]
+
+
+def _index(value) -> int:
+    if isinstance(value, Nodes):
+        raise Unsupported("an index that depends on the state")
+    return int(np.asarray(value))
+
+
+def _dynamic_slice(graph, inputs, params, out):
+    x, sizes = _ids(inputs[0]), params["slice_sizes"]
+    starts = [min(max(_index(i), 0), n - size) for i, n, size in zip(inputs[1:], x.shape, sizes, strict=True)]
+    return x[tuple(slice(i, i + size) for i, size in zip(starts, sizes, strict=True))]
+
+
+def _dynamic_update_slice(graph, inputs, params, out):
+    x, update = _ids(inputs[0]).copy(), _ids(inputs[1])
+    starts = [min(max(_index(i), 0), n - size) for i, n, size in zip(inputs[2:], x.shape, update.shape, strict=True)]
+    x[tuple(slice(i, i + size) for i, size in zip(starts, update.shape, strict=True))] = update
+    return x
+
+
+def _places(x, primitive, *operands, **params):
+    """Where each entry of a gather comes from (or a scatter goes to): the primitive itself run on the positions."""
+    positions = np.arange(x.size, dtype=np.int32).reshape(x.shape)
+    with jax.ensure_compile_time_eval():
+        return np.asarray(primitive.bind(jnp.asarray(positions), *(jnp.asarray(o) for o in operands), **params))
+
+
+def _gather(graph, inputs, params, out):
+    if isinstance(inputs[1], Nodes):
+        raise Unsupported("an index that depends on the state")
+    x = _ids(inputs[0])
+    params = dict(params, fill_value=-1) if params.get("fill_value") is not None or "fill_value" in params else params
+    places = _places(x, jax.lax.gather_p, inputs[1], **params)
+    if np.any(places < 0):
+        raise Unsupported("an index out of bounds")
+    return np.ravel(x)[places]
+
+
+def _scatter(graph, inputs, params, out):
+    x, indices, update = inputs
+    if isinstance(indices, Nodes):
+        raise Unsupported("an index that depends on the state")
+    x, update = _ids(x), _ids(update)
+    count = x.size
+    with jax.ensure_compile_time_eval():
+        base = jnp.arange(count, dtype=jnp.int32).reshape(x.shape)
+        source = jnp.arange(count, count + update.size, dtype=jnp.int32).reshape(update.shape)
+        keep = {k: v for k, v in params.items() if k not in ("update_jaxpr", "update_consts")}
+        places = np.asarray(jax.lax.scatter_p.bind(base, jnp.asarray(indices), source, update_jaxpr=None, update_consts=(), **keep))
+    return np.concatenate([np.ravel(x), np.ravel(update)])[places]
+
+
+def _scatter_add(graph, inputs, params, out):
+    x, indices, update = inputs
+    if not isinstance(x, Nodes):
+        raise Unsupported("the operation `scatter-add` on numbers")
+    target = _scatter(graph, [np.full(_ids(x).shape, -1), indices, np.arange(_ids(update).size).reshape(_ids(update).shape)], params, out)
+    hit = np.ravel(target)
+    if len(set(hit[hit >= 0].tolist())) != _ids(update).size:
+        raise Unsupported("the operation `scatter-add` with repeated places")
+    flat, added = np.ravel(_ids(x)).copy(), np.ravel(_ids(update))
+    for place, source in enumerate(hit.tolist()):
+        if source >= 0:
+            flat[place] = graph.add(int(flat[place]), int(added[source]))
+    return flat.reshape(_ids(x).shape)
+
+
+def _pad(graph, inputs, params, out):
+    x, fill = _ids(inputs[0]), _ids(inputs[1])
+    if any(interior or low < 0 or high < 0 for low, high, interior in params["padding_config"]):
+        raise Unsupported("the operation `pad` with gaps")
+    return np.pad(x, [(low, high) for low, high, _ in params["padding_config"]], constant_values=fill.item())
+
+
+def _split(graph, inputs, params, out):
+    return np.split(_ids(inputs[0]), np.cumsum(params["sizes"])[:-1], axis=params["axis"])
+
+
+def _same(graph, inputs, params, out):
+    return _ids(inputs[0])
+
+
+def _convert(graph, inputs, params, out):
+    x = inputs[0]
+    if isinstance(x, Nodes):
+        if np.dtype(params["new_dtype"]).kind != "f" and np.dtype(params["new_dtype"]) != bool:
+            raise Unsupported("an integer that depends on the state")
+        return x.ids
+    return np.asarray(x).astype(params["new_dtype"])
+
+
+_STRUCTURAL: dict[str, Callable] = {
+    "broadcast_in_dim": _broadcast_in_dim,
+    "reshape": lambda g, x, p, out: _ids(x[0]).reshape(out.shape),
+    "squeeze": lambda g, x, p, out: _ids(x[0]).reshape(out.shape),
+    "expand_dims": lambda g, x, p, out: _ids(x[0]).reshape(out.shape),
+    "transpose": lambda g, x, p, out: np.transpose(_ids(x[0]), p["permutation"]),
+    "rev": lambda g, x, p, out: np.flip(_ids(x[0]), p["dimensions"]),
+    "concatenate": lambda g, x, p, out: np.concatenate([_ids(y) for y in x], axis=p["dimension"]),
+    "stack": lambda g, x, p, out: np.stack([_ids(y) for y in x], axis=p["axis"]),
+    "slice": _slice,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "gather": _gather,
+    "scatter": _scatter,
+    "scatter-add": _scatter_add,
+    "pad": _pad,
+    "split": _split,
+    "copy": _same,
+    "copy_p": _same,
+    "stop_gradient": _same,
+    "optimization_barrier": lambda g, x, p, out: [_ids(y) for y in x],
+    "convert_element_type": _convert,
+}
+
+# Which arguments hold entries, where the others are indices: numbers among them become constants as soon as one is a node.
+_MIXED: dict[str, Callable] = {
+    "concatenate": range,
+    "stack": range,
+    "pad": range,
+    "scatter": lambda n: (0, 2),
+    "scatter-add": lambda n: (0, 2),
+    "dynamic_update_slice": lambda n: (0, 1),
+}
+
+# Primitives on entries. ----------------------------------------------------------------------------------------------
+
+
+def _call(op: str) -> Callable:
+    return lambda graph, params, *args: graph.call(op, *args)
+
+
+def _select(graph: Graph, params, which, *cases):
+    if len(cases) != 2:
+        raise Unsupported("a choice among more than two")
+    if graph.is_const(which):
+        return cases[int(graph.value[which])]
+    return graph.call("select", which, *cases)
+
+
+_ELEMENTWISE: dict[str, Callable] = {
+    **{name: _call(name) for name in ("add", "sub", "mul", "div", "neg", "sin", "cos", "tan", "sqrt", "exp", "log", "tanh", "abs", "sign", "max", "min")},
+    **{name: _call(name) for name in ("lt", "le", "gt", "ge", "eq", "ne", "atan2", "and", "or", "not", "asin", "acos", "atan", "sinh", "cosh", "is_finite")},
+    "add_any": _call("add"),
+    "square": lambda graph, params, x: graph.mul(x, x),
+    "rsqrt": lambda graph, params, x: graph.div(graph.one, graph.call("sqrt", x)),
+    "integer_pow": lambda graph, params, x: graph.power(x, params["y"]),
+    "select_n": _select,
+}
+
+_REDUCTIONS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul"}
+
+
+def _reduce(graph: Graph, x: Value, axes, op: str) -> Nodes:
+    ids = as_nodes(graph, x)
+    kept = [a for a in range(ids.ndim) if a not in axes]
+    rows = np.transpose(ids, (*kept, *axes)).reshape([ids.shape[a] for a in kept] + [-1])
+    result = np.empty(rows.shape[:-1], np.int64)
+    for place in np.ndindex(result.shape):
+        entries = rows[place].tolist()
+        total = entries[0] if entries else graph.zero
+        for entry in entries[1:]:
+            total = graph.call(op, total, entry)
+        result[place] = total
+    return Nodes(result)
+
+
+def _dot_general(graph: Graph, a: Value, b: Value, params) -> Nodes:
+    (over_a, over_b), (batch_a, batch_b) = params["dimension_numbers"]
+    x, y = as_nodes(graph, a), as_nodes(graph, b)
+    free_a = [i for i in range(x.ndim) if i not in (*over_a, *batch_a)]
+    free_b = [i for i in range(y.ndim) if i not in (*over_b, *batch_b)]
+    batch = [x.shape[i] for i in batch_a]
+    left = np.transpose(x, (*batch_a, *free_a, *over_a)).reshape(int(np.prod(batch)), int(np.prod([x.shape[i] for i in free_a])), -1)
+    right = np.transpose(y, (*batch_b, *free_b, *over_b)).reshape(left.shape[0], int(np.prod([y.shape[i] for i in free_b])), -1)
+    result = [[[graph.dot(row, column) for column in rights] for row in lefts] for lefts, rights in zip(left.tolist(), right.tolist(), strict=True)]
+    shape = batch + [x.shape[i] for i in free_a] + [y.shape[i] for i in free_b]
+    return Nodes(np.array(result, dtype=np.int64).reshape(shape))

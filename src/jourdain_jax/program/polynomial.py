@@ -1,0 +1,317 @@
+"""Normal forms: a node as a polynomial in atoms, modulo sin^2 + cos^2 = 1 and sqrt(x)^2 = x, and back to a lean node.
+
+Atoms are inputs and everything that is not +, -, *: sines, cosines, square roots, reciprocals. Expanding cancels what is equal; going back,
+terms are gathered by their varying part, whose coefficient (a polynomial in parameters alone) is computed once per motion, and common
+factors are taken out greedily (Horner's scheme in several variables).
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+
+from jourdain_jax.program.graph import Graph
+
+Monomial = tuple[int, ...]  # atoms in order, repeated as often as they occur
+Polynomial = dict[Monomial, float]
+
+
+class TooLarge(Exception):
+    """The expansion has more terms than allowed."""
+
+
+class NormalForms:
+    """Normal forms of nodes of one graph.
+
+    - `keep_sines`: squares of cosines are replaced, instead of those of sines.
+    - `sign`: 1, -1 or 0 (unknown) for a node: |x| becomes x or -x where it is known, and x is noted in `guards` (with its sign).
+    - `squares`: atoms whose squares are other polynomials (one entry of a unit quaternion).
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        most_terms: int,
+        keep_sines: bool = False,
+        sign: Callable[[int], int] = lambda node: 0,
+        squares: Mapping[int, Polynomial] | None = None,
+    ):
+        self.graph, self.most_terms, self._sign = graph, most_terms, sign
+        self.guards: set[int] = set()  # nodes that must stay positive
+        self._square_of, self._square_into = ("cos", "sin") if keep_sines else ("sin", "cos")
+        self._expanded: dict[int, Polynomial | None] = {graph.zero: {}}
+        self._squares: dict[int, Polynomial] = dict(squares or {})
+        self._simplified: dict[int, int] = {}
+
+    def simplified(self, node: int) -> int:
+        """The node in normal form where that takes fewer operations, otherwise the node with its parts simplified."""
+        if node not in self._simplified:
+            self._simplified[node] = self._smaller(node)
+        return self._simplified[node]
+
+    def _smaller(self, node: int) -> int:
+        if self.graph.op[node] in ("const", "input"):
+            return node
+        try:
+            form = self.rebuilt(self.expanded(node))
+        except TooLarge:
+            return node
+        return form if self.graph.operations([form]) <= self.graph.operations([node]) else node
+
+    # expansion
+
+    def expanded(self, node: int) -> Polynomial:
+        """The polynomial of a node."""
+        if node not in self._expanded:
+            for part in self.graph.reachable([node]):  # arguments first: no deep recursion
+                if part not in self._expanded:
+                    try:
+                        self._expanded[part] = self._expand(part)
+                    except TooLarge:
+                        self._expanded[part] = None
+        found = self._expanded[node]
+        if found is None:
+            raise TooLarge
+        return found
+
+    def _expand(self, node: int) -> Polynomial:
+        graph = self.graph
+        op, args = graph.op[node], graph.args[node]
+        if op == "const":
+            return {(): graph.value[node]}
+        if op == "input":
+            return {(node,): 1.0}
+        parts = [self._expanded[a] for a in args]
+        if any(p is None for p in parts):
+            raise TooLarge
+        if op == "add":
+            return _sum(parts[0], parts[1], 1.0)
+        if op == "sub":
+            return _sum(parts[0], parts[1], -1.0)
+        if op == "neg":
+            return {m: -c for m, c in parts[0].items()}
+        if op == "mul":
+            return self.product(parts[0], parts[1])
+        if op == "div":
+            return self.product(parts[0], self._reciprocal(parts[1]))
+        if op == "sqrt":
+            return self._root(parts[0])
+        if op == "abs":
+            return self._magnitude(self.rebuilt(parts[0]))
+        atom = graph.call(op, *(self.rebuilt(p) for p in parts))
+        return self._atom(atom) if graph.op[atom] == op else self.expanded(atom)
+
+    def _root(self, p: Polynomial) -> Polynomial:
+        """sqrt p: |x| comes out of x^2 y, and |sin x| out of y (1 - cos(x)^2)."""
+        rooted = self._rooted(p)
+        if rooted is None:
+            atom = self.graph.call("sqrt", self.rebuilt(p))
+            return self._atom(atom) if self.graph.op[atom] == "sqrt" else self.expanded(atom)
+        outside, inside = rooted
+        result = self._root(inside) if inside != {(): 1.0} else inside
+        for atom in outside:
+            result = self.product(result, self._magnitude(atom))
+        return result
+
+    def _rooted(self, p: Polynomial) -> tuple[list[int], Polynomial] | None:
+        """Atoms to take out of the root, and what stays inside; None where nothing comes out."""
+        if len(p) == 1:
+            ((monomial, c),) = p.items()
+            inside, outside = list(monomial), []
+            for atom in set(monomial):
+                pairs = monomial.count(atom) // 2
+                outside += [atom] * pairs
+                for _ in range(2 * pairs):
+                    inside.remove(atom)
+            return (outside, {tuple(inside): c}) if outside else None
+        if len(p) == 2:
+            (small, c), (large, d) = sorted(p.items(), key=lambda item: len(item[0]))
+            extra = list(large)
+            if c == -d and all(a in extra and not extra.remove(a) for a in small) and len(extra) == 2 and extra[0] == extra[1]:
+                if self.graph.op[extra[0]] == self._square_into:
+                    return [self.graph.call(self._square_of, self.graph.args[extra[0]][0])], {small: c}
+        return None
+
+    def _magnitude(self, node: int) -> Polynomial:
+        sign = self._sign(node)
+        if sign == 0:
+            return self._atom(self.graph.call("abs", node))
+        if not self.graph.is_const(node):
+            self.guards.add(node if sign > 0 else self.graph.neg(node))
+        return self.expanded(node if sign > 0 else self.graph.neg(node))
+
+    def _reciprocal(self, p: Polynomial) -> Polynomial:
+        if len(p) == 1:
+            ((monomial, c),) = p.items()
+            result: Polynomial = {(): 1 / c}
+            for atom in monomial:
+                result = self.product(result, self._inverse_atom(atom))
+            return result
+        return {(self.graph.div(self.graph.one, self.rebuilt(p)),): 1.0}
+
+    def _inverse_atom(self, atom: int) -> Polynomial:
+        graph = self.graph
+        if graph.op[atom] == "div" and graph.args[atom][0] == graph.one:
+            return self.expanded(graph.args[atom][1])
+        return {(graph.div(graph.one, atom),): 1.0}
+
+    def _atom(self, atom: int) -> Polynomial:
+        graph, op = self.graph, self.graph.op[atom]
+        if op == self._square_of and atom not in self._squares:
+            other = graph.call(self._square_into, graph.args[atom][0])
+            self._squares[atom] = {(): 1.0, (other, other): -1.0}
+        elif op == "sqrt" and atom not in self._squares:
+            self._squares[atom] = self.expanded(graph.args[atom][0])
+        elif op == "abs" and atom not in self._squares:
+            x = self.expanded(graph.args[atom][0])
+            self._squares[atom] = self.product(x, x)
+        return {(atom,): 1.0}
+
+    def product(self, p: Polynomial, q: Polynomial) -> Polynomial:
+        """p q, with squares replaced."""
+        if len(p) * len(q) > 8 * self.most_terms:
+            raise TooLarge
+        result: Polynomial = {}
+        for m, a in p.items():
+            for n, b in q.items():
+                monomial = self._cancelled(tuple(sorted(m + n))) if m and n else m or n
+                square = next((x for x, y in zip(monomial, monomial[1:], strict=False) if x == y and x in self._squares), None)
+                if square is None:
+                    _put(result, monomial, a * b)
+                else:
+                    at = monomial.index(square)
+                    rest: Polynomial = {monomial[:at] + monomial[at + 2 :]: a * b}
+                    for k, c in self.product(rest, self._squares[square]).items():
+                        _put(result, k, c)
+        if len(result) > self.most_terms:
+            raise TooLarge
+        return result
+
+    def _cancelled(self, monomial: Monomial) -> Monomial:
+        """Without pairs x, 1/x."""
+        for atom in monomial:
+            if self.graph.op[atom] == "div" and self.graph.args[atom][0] == self.graph.one and self.graph.args[atom][1] in monomial:
+                return self._cancelled(_without(_without(monomial, atom), self.graph.args[atom][1]))
+        return monomial
+
+    # and back
+
+    def rebuilt(self, p: Polynomial, divisor: int | None = None) -> int:
+        """A node for the polynomial, divided by `divisor` (of parameters alone), with few operations."""
+        graph = self.graph
+        terms = []
+        for varying, coefficient in self._gathered(p).items():
+            positive = next(iter(sorted(coefficient.items())))[1] > 0
+            node = self._coefficient(coefficient if positive else {m: -c for m, c in coefficient.items()})
+            node = node if divisor is None else graph.div(node, divisor)
+            factors = varying if node == graph.one else tuple(sorted((*varying, node)))
+            terms.append((factors, positive))
+        return self._horner(terms)
+
+    def _gathered(self, p: Polynomial) -> dict[Monomial, Polynomial]:
+        """Coefficients (polynomials in parameters) by varying monomial."""
+        gathered: dict[Monomial, Polynomial] = {}
+        for monomial, c in p.items():
+            varying = tuple(x for x in monomial if self.graph.varies[x])
+            gathered.setdefault(varying, {})[tuple(x for x in monomial if not self.graph.varies[x])] = c
+        return gathered
+
+    def quotient(self, p: Polynomial, q: Polynomial) -> int:
+        """A node for p/q. What all varying terms of q have in common is cancelled term by term."""
+        graph = self.graph
+        if not p:
+            return graph.zero
+        parts = self._gathered(q)
+        common = list(min(parts, key=len))
+        for varying in parts:
+            common = [x for k, x in enumerate(common) if common[: k + 1].count(x) <= varying.count(x)]
+        for atom in common:
+            p = self.product(p, self._inverse_atom(atom))
+        rest = {m: c for m, c in q.items()}
+        for atom in common:
+            rest = {_without(m, atom): c for m, c in rest.items()}
+        divisor = self.rebuilt(rest)
+        return graph.div(self.rebuilt(p), divisor) if graph.varies[divisor] else self.rebuilt(p, None if divisor == graph.one else divisor)
+
+    def cramer(self, M: list[list[int]], f: list[int]) -> list[int]:
+        """`M^-1 f` by determinants, in normal form; for up to three unknowns."""
+        A, b = [[self.expanded(x) for x in row] for row in M], [self.expanded(x) for x in f]
+        determinant = self._determinant(A)
+        replaced = [[[b[i] if j == k else A[i][j] for j in range(len(b))] for i in range(len(b))] for k in range(len(b))]
+        return [self.quotient(self._determinant(R), determinant) for R in replaced]
+
+    def _determinant(self, A: list[list[Polynomial]]) -> Polynomial:
+        if len(A) == 1:
+            return A[0][0]
+        total: Polynomial = {}
+        for k, first in enumerate(A[0]):
+            if first:
+                minor = self._determinant([[*row[:k], *row[k + 1 :]] for row in A[1:]])
+                total = _sum(total, self.product(first, minor), 1.0 if k % 2 == 0 else -1.0)
+        if len(total) > self.most_terms:
+            raise TooLarge
+        return total
+
+    def _coefficient(self, p: Polynomial) -> int:
+        """A polynomial in parameters alone: how many operations it takes does not matter."""
+        graph = self.graph
+        total = graph.zero
+        for monomial, c in sorted(p.items()):
+            product = graph.one
+            for atom in monomial:
+                product = graph.mul(product, atom)
+            total = graph.add(total, graph.mul(graph.const(c), product))
+        return total
+
+    def _horner(self, terms: list[tuple[Monomial, bool]]) -> int:
+        graph = self.graph
+        if not terms:
+            return graph.zero
+        if len(terms) == 1:
+            factors, positive = terms[0]
+            return self._signed(self._product(factors), positive)
+        counts: Counter[int] = Counter()
+        for factors, _ in terms:
+            counts.update(set(factors))
+        factor, count = max(counts.items(), key=lambda item: (item[1], graph.varies[item[0]], item[0]), default=(None, 0))
+        if count < 2:
+            total = graph.zero
+            for factors, positive in sorted(terms):
+                total = graph.add(total, self._signed(self._product(factors), positive))
+            return total
+        inside = [(_without(f, factor), s) for f, s in terms if factor in f]
+        outside = [(f, s) for f, s in terms if factor not in f]
+        return graph.add(graph.mul(factor, self._horner(inside)), self._horner(outside))
+
+    def _product(self, factors: Monomial) -> int:
+        graph = self.graph
+        fixed = [f for f in factors if not graph.varies[f]]
+        product = graph.one
+        for factor in [*fixed, *(f for f in factors if graph.varies[f])]:
+            product = graph.mul(product, factor)
+        return product
+
+    def _signed(self, node: int, positive: bool) -> int:
+        return node if positive else self.graph.neg(node)
+
+
+def _without(factors: Monomial, factor: int) -> Monomial:
+    at = factors.index(factor)
+    return factors[:at] + factors[at + 1 :]
+
+
+def _put(p: Polynomial, monomial: Monomial, c: float) -> None:
+    old = p.get(monomial)
+    if old is None:
+        p[monomial] = c
+        return
+    new = old + c
+    if abs(new) <= 1e-13 * abs(c):  # cancelled, up to the round-off of the numbers in the scene
+        del p[monomial]
+    else:
+        p[monomial] = new
+
+
+def _sum(p: Polynomial, q: Polynomial, sign: float) -> Polynomial:
+    result = dict(p)
+    for monomial, c in q.items():
+        _put(result, monomial, sign * c)
+    return result
