@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.analysis.bijections import Bijection
+from jourdain_jax.calculus.reals import Number
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.scene.names import nearest
@@ -59,7 +60,7 @@ class Measurements(eqx.Module):
         unknown_start: Mapping | Iterable[str] = (),
         inputs: "dict | Inputs | None" = None,
         functions: Mapping[str, Callable] | None = None,
-        t0: float | Array | None = None,
+        t0: Number | None = None,
     ):
         real = jnp.result_type(float)
         self.ts = jnp.asarray(ts, real)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.analysis.tangent import flow_of, privileged_speeds
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
+from jourdain_jax.calculus.reals import Number, Numbers
 from jourdain_jax.equations.cyclic import ignorable_coordinates
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.motion.start import State
@@ -46,8 +47,8 @@ def steady(
     *,
     held: tuple[str, ...] = (),
     moving: tuple[str, ...] | None = None,
-    t0: float = 0.0,
-    inputs: Float[Array, "inputs"] | None = None,
+    t0: Number = 0.0,
+    inputs: Numbers | None = None,
     privileged: tuple[str, ...] | None = None,
     max_steps: int = 60,
 ) -> SteadyMotion:

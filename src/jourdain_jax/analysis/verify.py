@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.null_space import null_space_svd
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
+from jourdain_jax.calculus.reals import Numbers, as_real
 from jourdain_jax.equations.accelerations import reductions
 from jourdain_jax.equations.gibbs_appell import GibbsAppell, gibbs_equations
 from jourdain_jax.equations.instant import constraint_rows
@@ -90,7 +91,7 @@ class Verification(eqx.Module):
         return "\n".join(lines)
 
 
-def verify(scene: Scene, state: State, inputs: Float[Array, "inputs"] | None = None, *, seed: int = 0) -> Verification:
+def verify(scene: Scene, state: State, inputs: Numbers | None = None, *, seed: int = 0) -> Verification:
     """Check the equations of a scene at a consistent state; every check has a threshold, and a failed one names its culprit.
 
     Values are relative to the size of what is compared. Directions for the gradients are random: admissible in the coordinates, free in the
@@ -98,7 +99,7 @@ def verify(scene: Scene, state: State, inputs: Float[Array, "inputs"] | None = N
     derivative there and are left out, with a note.
     """
     t, q, u = state.t, state.q, state.u
-    inputs = jnp.zeros(len(scene.inputs)) if inputs is None else inputs
+    inputs = jnp.zeros(len(scene.inputs)) if inputs is None else as_real(inputs)
     found = jax.tree.map(np.asarray, _evaluate(scene, t, q, u, inputs))
     applicable = [name for name, ok in found["applicable"].items() if ok]
     checks = [_reductions(found, applicable), *_forms(found), _virtual_power(found, applicable, names_of_rows(scene)), _newton(scene, found), _energy(found)]

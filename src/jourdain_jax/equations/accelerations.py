@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.reductions import (
     Accelerations,
@@ -33,8 +34,8 @@ class Baumgarte(eqx.Module):
     Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1. Projection (the default of `simulate`) is more accurate.
     """
 
-    alpha: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=5.0)
-    beta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=5.0)
+    alpha: Float[Array, ""] = eqx.field(converter=as_real, default=5.0)
+    beta: Float[Array, ""] = eqx.field(converter=as_real, default=5.0)
 
 
 def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:

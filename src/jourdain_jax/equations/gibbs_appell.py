@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.equations.kinematics import bias_accelerations, inertias, velocities
 from jourdain_jax.equations.reductions import APPLICABLE_PIVOT, Partition, Reduced, reduced, solve_definite
 from jourdain_jax.equations.rows import ConstraintRows
@@ -22,6 +23,7 @@ from jourdain_jax.scene.scene import Scene
 
 def gibbs_function(scene: Scene, t, q, u, udot) -> Float[Array, ""]:
     """G(t, q, u, udot) in kg m^2/s^4, up to terms without accelerations."""
+    u, udot = as_real(u), as_real(udot)
     velocity, bias = bias_accelerations(scene, t, q, u)
     _, partial = jax.jvp(lambda u: velocities(scene, t, q, u), (u,), (udot,))  # beta udot, gamma udot
     a, alpha, omega = bias.linear + partial.linear, bias.angular + partial.angular, velocity.angular
@@ -32,7 +34,7 @@ def gibbs_function(scene: Scene, t, q, u, udot) -> Float[Array, ""]:
 
 def gibbs_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
     """M and h as Hessian and gradient of the Gibbs function at `udot = 0`, and Q."""
-    zero = jnp.zeros_like(u)
+    zero = jnp.zeros_like(as_real(u))
     h, M = _gradient_and_hessian(lambda a: gibbs_function(scene, t, q, u, a), zero)
     return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs))
 

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import Inertias, Velocities, bias_accelerations, coordinate_rates, inertias, motion_at, partial_velocities, pose_at
@@ -168,6 +169,7 @@ def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
 
     Impressed forces that a scene states on its speeds, not on bodies, cannot be told apart from constraint forces here.
     """
+    udot = as_real(udot)
     partial, weights = partial_velocities(scene, t, q, u), inertias(scene, t, q)
     velocity, bias = bias_accelerations(scene, t, q, u)
     acceleration = Velocities(bias.linear + partial.linear @ udot, bias.angular + partial.angular @ udot)
@@ -184,4 +186,4 @@ def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) ->
     Zero for every virtual velocity with `A delta u = 0` if and only if `udot` is the constrained acceleration.
     """
     equations = unconstrained_equations(scene, t, q, u, inputs)
-    return virtual_velocity @ (equations.M @ udot + equations.h - equations.Q)
+    return as_real(virtual_velocity) @ (equations.M @ as_real(udot) + equations.h - equations.Q)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Number, Numbers, as_real
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.structure import structure_of
@@ -38,14 +39,14 @@ class State(eqx.Module):
         return f"State at t = {self.t:.6g} s: " + ", ".join(pairs) + f"\n{moved}"
 
 
-def consistent(scene: Scene, t, q: Float[Array, "coordinates"], u: Float[Array, "speeds"], inputs=None, *, held: tuple[str, ...] = ()) -> State:
+def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tuple[str, ...] = ()) -> State:
     """The state on the constraints nearest to (q, u): positions by Gauss-Newton, speeds M-orthogonally; `held` names do not move.
 
     Differentiable in any mode. What cannot be met stays in `residual` (no error: this also runs inside jit and vmap).
     """
-    t, q, u = jnp.asarray(t, jnp.result_type(float)), jnp.asarray(q), jnp.asarray(u)
+    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u)
     _check_shapes(scene, q, u)
-    inputs = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else inputs
+    inputs = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else as_real(inputs)
     free_q, free_u = (np.array([name not in held for name in names.entries], bool) for names in (scene.coordinate_names, scene.speed_names))
     near_q, near_u, moved_q, moved_u, residual = _put_onto_constraints(scene, t, q, u, inputs, free_q, free_u)
     return State(t, near_q, near_u, moved_q, moved_u, residual, (scene.coordinate_names, scene.speed_names))
@@ -60,7 +61,7 @@ def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u):
     return near_q, near_u, *(jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
 
 
-def start(scene: Scene, *, t0: float | Float[Array, ""] = 0.0, **values) -> State:
+def start(scene: Scene, *, t0: Number = 0.0, **values) -> State:
     """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`.
 
     Values that are given are kept. Privileged speeds that are not given stay zero and the dependent speeds follow from the rows; where dependent

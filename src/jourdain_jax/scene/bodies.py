@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
+
 _AXES = {"x": 0, "y": 1, "z": 2}
 
 
@@ -18,8 +20,8 @@ class Particle(eqx.Module):
     position: Float[Array, "3"]  # m, inertial frame
 
     def __init__(self, mass, position):
-        self.mass = jnp.asarray(mass)
-        self.position = jnp.asarray(position)
+        self.mass = as_real(mass)
+        self.position = as_real(position)
 
     def __check_init__(self):
         _check_shape("position of a particle", self.position, (3,))
@@ -36,12 +38,12 @@ class RigidBody(eqx.Module):
     outline: Float[Array, "points 3"]  # m, body frame, relative to the mass centre; for drawing only
 
     def __init__(self, mass, inertia, position, orientation, outline=None):
-        inertia = jnp.asarray(inertia)
-        self.mass = jnp.asarray(mass)
+        inertia = as_real(inertia)
+        self.mass = as_real(mass)
         self.inertia = jnp.diag(inertia) if inertia.ndim == 1 else inertia
-        self.position = jnp.asarray(position)
-        self.orientation = jnp.asarray(orientation)
-        self.outline = jnp.zeros((0, 3)) if outline is None else jnp.asarray(outline)
+        self.position = as_real(position)
+        self.orientation = as_real(orientation)
+        self.outline = jnp.zeros((0, 3)) if outline is None else as_real(outline)
 
     def __check_init__(self):
         _check_shape("mass of a rigid body", self.mass, ())

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Vector, as_real
 from jourdain_jax.scene.bodies import _axis_index
 from jourdain_jax.scene.motion_state import BodyPose
 
@@ -28,19 +29,19 @@ class Plane(eqx.Module):
         """The plane z = 0, turned by `tilt` (rad) about the y axis so that positive tilt slopes down along x."""
         c, s = jnp.cos(jnp.asarray(tilt, jnp.result_type(float))), jnp.sin(jnp.asarray(tilt, jnp.result_type(float)))
         o, i = jnp.zeros_like(c), jnp.ones_like(c)
-        self.origin = jnp.asarray(origin)
+        self.origin = as_real(origin)
         self.normal = jnp.stack([s, o, c])
         self.tangents = jnp.stack([jnp.stack([c, o, -s]), jnp.stack([o, i, o])])
-        self.velocity = jnp.asarray(velocity)
-        self.angular_velocity = jnp.asarray(angular_velocity)
+        self.velocity = as_real(velocity)
+        self.angular_velocity = as_real(angular_velocity)
 
-    def velocity_at(self, position: Float[Array, "3"]) -> Float[Array, "3"]:
+    def velocity_at(self, position: Vector) -> Float[Array, "3"]:
         """Velocity of the plane's material point at `position`, m/s."""
-        return self.velocity + jnp.cross(self.angular_velocity, position - self.origin)
+        return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.origin)
 
-    def height_of(self, position: Float[Array, "3"]) -> Float[Array, ""]:
+    def height_of(self, position: Vector) -> Float[Array, ""]:
         """Signed distance of a point from the plane, m."""
-        return self.normal @ (position - self.origin)
+        return self.normal @ (as_real(position) - self.origin)
 
 
 class Contact(eqx.Module):

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.scene.motion_state import Motion, Point
 from jourdain_jax.scene.names import nearest
 
@@ -16,28 +17,32 @@ from jourdain_jax.scene.names import nearest
 class Load(eqx.Module):
     """One impressed force system: resultants per body, and forces on speeds by name."""
 
-    forces: dict[str, Float[Array, "3"]] = eqx.field(default_factory=dict)  # N, inertial frame, at the mass centre
-    torques: dict[str, Float[Array, "3"]] = eqx.field(default_factory=dict)  # N m, inertial frame, about the mass centre
-    generalized: dict[str, Float[Array, ""]] = eqx.field(default_factory=dict)  # N or N m, on the named speed
-    potential: Float[Array, ""] | None = None  # J
+    forces: dict[str, Float[Array, "3"]]  # N, inertial frame, at the mass centre
+    torques: dict[str, Float[Array, "3"]]  # N m, inertial frame, about the mass centre
+    generalized: dict[str, Float[Array, ""]]  # N or N m, on the named speed
+    potential: Float[Array, ""] | None  # J; None: not conservative, its work is integrated along the motion
+
+    def __init__(self, forces=None, torques=None, generalized=None, potential=None):
+        self.forces, self.torques, self.generalized = ({name: as_real(x) for name, x in (part or {}).items()} for part in (forces, torques, generalized))
+        self.potential = None if potential is None else as_real(potential)
 
 
 def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
     """Uniform gravity `m g e` on every body; `strength` g in m/s^2, `direction` e a unit vector of the inertial frame."""
-    g = strength * jnp.asarray(direction)
+    g = as_real(strength) * as_real(direction)
     forces = {name: body.mass * g for name, body in motion.bodies.items()}
     potential = -sum(body.mass * (g @ body.position) for body in motion.bodies.values())
-    return Load(forces=forces, potential=jnp.asarray(potential))
+    return Load(forces=forces, potential=potential)
 
 
 def point_force(point: Point, force) -> Load:
     """A force (N, inertial frame) on a point of a body, `motion["body"].point(local)`."""
-    return _on_point(point, jnp.asarray(force), None)
+    return _on_point(point, as_real(force), None)
 
 
 def torque(motion: Motion, body: str, moment, *, reaction: str | None = None) -> Load:
     """A torque (N m, inertial frame) on `body`, with the opposite torque on the body `reaction` where one is named."""
-    moment = jnp.asarray(moment)
+    moment = as_real(moment)
     names = [body] if reaction is None else [body, reaction]
     for name in names:
         if name not in motion.bodies:
@@ -65,7 +70,7 @@ def generalized_force(motion: Motion, **forces) -> Load:
     for name in forces:
         if name not in motion.u:
             raise ValueError(f"generalized force on unknown speed `{name}`; {nearest(name, motion.u.keys())}")
-    return Load(generalized={name: jnp.asarray(value) for name, value in forces.items()})
+    return Load(generalized=forces)
 
 
 def _line(a: Point, b: Point):

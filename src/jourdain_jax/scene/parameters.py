@@ -4,15 +4,10 @@ from collections.abc import Iterator
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-
-def _as_leaf(value) -> Array:
-    array = jnp.asarray(value)
-    dtype = array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else jnp.result_type(float)
-    return jnp.asarray(array, dtype)  # never weakly typed, so that one trace serves defaults and other values alike
+from jourdain_jax.calculus.reals import as_real
 
 
 def parameter(default=..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = ""):
@@ -22,7 +17,7 @@ def parameter(default=..., *, unit: str = "", positive: bool = False, non_negati
     """
     options = {} if default is ... else {"default": default}
     metadata = {"parameter": True, "unit": unit, "positive": positive, "non_negative": non_negative, "about": about}
-    return eqx.field(converter=_as_leaf, metadata=metadata, **options)
+    return eqx.field(converter=as_real, metadata=metadata, **options)
 
 
 def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:
