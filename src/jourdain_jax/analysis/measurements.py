@@ -108,7 +108,7 @@ class Measurements(eqx.Module):
         return sum(jnp.sum(jnp.isfinite(self.sigma_of(name))) for name in self.values)
 
     def sigma_of(self, name: str) -> Float[Array, "times *channel"]:
-        """Sigma of each measured value of a channel."""
+        """Sigma of each measured value of the channel `name`, in its unit, shape (times, *channel)."""
         sigma, values = self.sigma[name], self.values[name]
         # one sigma per time acts on all components of the channel
         aligned = sigma.reshape(sigma.shape + (1,) * (values.ndim - sigma.ndim)) if sigma.ndim else sigma

@@ -20,6 +20,7 @@ from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
 _FLOOR = {"float64": 1e-4, "float32": 1e-2}  # SI units; what is smaller is not told from round-off in a difference
+_KINK = 1e-3  # a kink is a jump of order one, and its estimate is of lower order than the difference
 
 
 def statement_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], seed: int) -> list[Check]:
@@ -129,7 +130,7 @@ def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
         # 2 s(h) - s(2h) with s(h) = (f(h) - 2 f(0) + f(-h))/h: of third order where f is smooth, the jump of the slope at a kink
         kink = (2 * (ends[1] + ends[2]) - 4 * f) / h - (ends[0] + ends[3] - 2 * f) / (2 * h)
         size = np.max(np.abs(f), initial=0.0) + np.max(np.abs(slope), initial=0.0) + _FLOOR[kind]
-        error = np.maximum(np.abs(slope - central_difference(ends, h)), np.abs(kink))
+        error = np.maximum(np.abs(slope - central_difference(ends, h)), _KINK * np.abs(kink))
         values[f"{name}: its derivative"] = float(np.max(error, initial=0.0) / size)
     return check("derivatives", values, q.dtype)
 

@@ -14,7 +14,7 @@ from jourdain_jax.calculus.reals import Number, Vector, as_real
 
 
 def rot_x(angle: Number) -> Float[Array, "3 3"]:
-    """Rotation by `angle` (rad) about the x axis."""
+    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the x axis."""
     angle = as_real(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     o, i = jnp.zeros_like(c), jnp.ones_like(c)
@@ -22,7 +22,7 @@ def rot_x(angle: Number) -> Float[Array, "3 3"]:
 
 
 def rot_y(angle: Number) -> Float[Array, "3 3"]:
-    """Rotation by `angle` (rad) about the y axis."""
+    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the y axis."""
     angle = as_real(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     o, i = jnp.zeros_like(c), jnp.ones_like(c)
@@ -30,7 +30,7 @@ def rot_y(angle: Number) -> Float[Array, "3 3"]:
 
 
 def rot_z(angle: Number) -> Float[Array, "3 3"]:
-    """Rotation by `angle` (rad) about the z axis."""
+    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the z axis."""
     angle = as_real(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     o, i = jnp.zeros_like(c), jnp.ones_like(c)
@@ -50,7 +50,7 @@ def vee(S: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 
 def quaternion_to_matrix(quaternion: Real[Array | np.ndarray, "4"] | Sequence[Number]) -> Float[Array, "3 3"]:
-    """Rotation matrix of a quaternion `(w, x, y, z)` of any non-zero norm (the formula divides by the squared norm)."""
+    """Rotation matrix (3, 3), body to space, of a `quaternion` (w, x, y, z) of any norm but zero (the formula divides by the squared norm)."""
     quaternion = as_real(quaternion)
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     # R = 1 + 2 (w [v]x + [v]x^2) / (w^2 + v.v): unchanged by the norm, so that a drifting norm never scales an inertia.
@@ -84,6 +84,6 @@ def quaternion_product(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Arra
 
 
 def quaternion_from_axis_angle(axis: Vector, angle: Number) -> Float[Array, "4"]:
-    """The unit quaternion of a rotation by `angle` (rad) about the unit vector `axis`."""
+    """The unit quaternion (w, x, y, z) `(cos(angle/2), sin(angle/2) axis)` of a turn by `angle` (rad) about the unit vector `axis`."""
     half = as_real(angle) / 2
     return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * as_real(axis)])

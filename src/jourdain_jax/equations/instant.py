@@ -49,7 +49,10 @@ def rows_of(scene: Scene, instant: Instant) -> ConstraintRows:
 
 
 def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
-    """phi, `A = d phi/du` and the drift `d phi/dt` at `udot = 0`."""
+    """phi, `A = d phi/du` and the drift `d phi/dt` at `udot = 0` of all rows, with their names: `A udot = -drift`; eqs. (5)-(9), (25).
+
+    `inputs`: values of the scene's inputs (default: zero). Geometric rows enter by their rate and come first.
+    """
     return rows_of(scene, instant_at(scene, t, q, u, inputs))
 
 

@@ -34,19 +34,19 @@ class Inertias(eqx.Module):
 
 
 def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> Float[Array, "coordinates"]:
-    """`qdot = N(q,t) u + nu(q,t)`."""
+    """`qdot = N(q,t) u + nu(q,t)`, shape (coordinates,), per s; eq. (53)."""
     t = jnp.asarray(t, jnp.result_type(float))
     return jnp.asarray(scene.coordinate_rates(t, scene.coordinate_names.view(as_real(q)), scene.speed_names.view(as_real(u))))
 
 
 def pose_at(scene: Scene, t, q: Numbers) -> Pose:
-    """Poses of all bodies, sorted by name: the order in which JAX returns dictionaries, so that it is the same everywhere."""
+    """Poses of all bodies (m, inertial frame), sorted by name: the order in which JAX returns dictionaries, so that it is the same everywhere."""
     t, named = jnp.asarray(t, jnp.result_type(float)), scene.coordinate_names.view(as_real(q))
     return Pose(t, named, {name: BodyPose(name, body) for name, body in sorted(scene.bodies(t, named).items())})
 
 
 def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
-    """Poses and velocities of all bodies at one instant."""
+    """Poses and velocities (inertial frame) of all bodies at one instant. `inputs`: values of the scene's inputs (default: zero)."""
     t = jnp.asarray(t, jnp.result_type(float))
     q, u = as_real(q), as_real(u)
     inputs = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else as_real(inputs)
@@ -81,7 +81,7 @@ def velocities_of(motion: Motion) -> Velocities:
 
 
 def partial_velocities(scene: Scene, t, q, u) -> Velocities:
-    """`beta = dv/du` and `gamma = d omega_body/du`, shape (bodies, 3, speeds)."""
+    """`beta = dv/du` (inertial frame) and `gamma = d omega/du` (body axes), shape (bodies, 3, speeds), bodies sorted by name; eqs. (26)-(31), (49)."""
     return jax.jacfwd(lambda u: velocities(scene, t, q, u))(as_real(u))
 
 

@@ -12,7 +12,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Sampled(eqx.Module):
-    """Values at given times, linear in between, constant beyond the ends."""
+    """An input as `values` at given times `ts` (s, increasing), linear in between, constant beyond the ends."""
 
     ts: Float[Array, "samples"] = eqx.field(converter=as_real)  # s, increasing
     values: Float[Array, "samples"] = eqx.field(converter=as_real)

@@ -18,7 +18,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class State(eqx.Module):
-    """A state on the constraints, and how far the guess was from it."""
+    """A state on the constraints, and how far the guess was from it; `state["yaw"]`, `print(state)`.
+
+    q and u in the units of the scene's coordinates and speeds (SI, rad).
+    """
 
     t: Float[Array, ""]  # s
     q: Float[Array, "coordinates"]
@@ -40,9 +43,11 @@ class State(eqx.Module):
 
 
 def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tuple[str, ...] = ()) -> State:
-    """The state on the constraints nearest to (q, u): positions by Gauss-Newton, speeds M-orthogonally; `held` names do not move.
+    """The state on the constraints nearest to (q, u): positions by Gauss-Newton, speeds M-orthogonally; g(t, q) = 0, phi(t, q, u) = 0.
 
-    Differentiable in any mode. What cannot be met stays in `residual` (no error: this also runs inside jit and vmap).
+    `inputs`: values of the scene's inputs (default: zero). `held`: names of coordinates and speeds that do not move.
+
+    Differentiable in any mode. What cannot be met stays in `residual` (no error: this also runs inside jit and vmap). ValueError for wrong shapes.
     """
     t, q, u = jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u)
     _check_shapes(scene, q, u)
@@ -64,9 +69,9 @@ def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u):
 def start(scene: Scene, *, t0: Number = 0.0, **values) -> State:
     """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`.
 
-    Values that are given are kept. Privileged speeds that are not given stay zero and the dependent speeds follow from the rows; where dependent
-    speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
-    Errors (ValueError, where values are known): an unknown name, a value that is not finite, given values that contradict the constraints.
+    `values` that are given are kept, at time `t0` (s). Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;
+    where dependent speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
+    ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
     """
     q, u, given = scene.named(**values)
     _check_finite(values)

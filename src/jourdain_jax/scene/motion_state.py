@@ -23,7 +23,7 @@ class Point(eqx.Module):
 
 
 def fixed_point(position) -> Point:
-    """A point at rest in the inertial frame, for springs, dampers and rods."""
+    """A point at rest at `position` (3,) (m, inertial frame), for springs, dampers and rods."""
     position = as_real(position)
     return Point(position, jnp.zeros_like(position), jnp.zeros_like(position))
 
@@ -73,7 +73,7 @@ class BodyMotion(eqx.Module):
         return jnp.einsum("...ji,...j->...i", self.orientation, self.angular_velocity)
 
     def velocity_at(self, position: Vector) -> Float[Array, "3"]:
-        """Velocity of the material point that is at `position` (inertial frame): `v + omega x (position - r)`."""
+        """Velocity (m/s, inertial frame) of the material point at `position` (m, inertial frame): `v + omega x (position - r)`."""
         return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.position)
 
     def point(self, local=(0.0, 0.0, 0.0)) -> Point:

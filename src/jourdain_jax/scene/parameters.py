@@ -13,7 +13,8 @@ from jourdain_jax.calculus.reals import as_real
 def parameter(default=..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = ""):
     """A field of a scene that is a physical parameter: converted to a floating-point array, so that it is a differentiable leaf.
 
-    `unit` and `about` describe it; `positive` and `non_negative` are checked when the scene is built with known values.
+    - `default`: a number or an array; without it the parameter must be given. `unit` and `about` describe it.
+    - `positive`, `non_negative`: checked (ValueError, as are numbers that are not finite) when the scene is built with known values.
     """
     options = {} if default is ... else {"default": default}
     metadata = {"parameter": True, "unit": unit, "positive": positive, "non_negative": non_negative, "about": about}
