@@ -194,3 +194,33 @@ def test_the_result_for_machines_has_no_numbers_that_json_lacks():
     assert not found.as_dict()["passed"]
     assert {"name", "value", "threshold", "passed", "culprit", "note"} == set(found.as_dict()["checks"][0])
     assert any(check["value"] is None for check in found.as_dict()["checks"])
+
+
+class TwoBlades(jj.Scene):
+    """A particle held twice along the same line: the rows are dependent as long as the slopes are equal."""
+
+    slopes: object = jj.parameter((0.5, 0.5))
+    mass: object = jj.parameter(1.0)
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def velocity_constraints(self, motion):
+        return {"blades": motion.u.y_rate - self.slopes * motion.u.x_rate}
+
+
+@pytest.mark.parametrize(
+    ("change", "exists"),
+    [({"slopes": [1.0, 1.0], "mass": 0.0}, True), ({"slopes": [1.0, 0.0], "mass": 0.0}, False), ({"slopes": [0.0, 0.0], "mass": 1.0}, True)],
+)
+def test_a_derivative_that_splits_dependent_rows_does_not_exist(change, exists):
+    scene = TwoBlades()
+    assert jj.derivative_exists(scene, 0.0, [0.1, 0.2], [1.0, 0.5], scene.replace(**change), [0.0, 0.0]) == exists
+
+
+def test_verification_leaves_out_a_derivative_that_does_not_exist_and_says_so():
+    scene = TwoBlades()
+    found = jj.verify(scene, jj.consistent(scene, 0.0, [0.1, 0.2], [1.0, 0.5]))
+    assert found.passed
+    assert "parameters left out" in str(found)
