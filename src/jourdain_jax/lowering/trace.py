@@ -21,7 +21,6 @@ from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.scene.scene import Scene
 
-
 Entries = Array | np.ndarray
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Number
 from jourdain_jax.equations.accelerations import Baumgarte, as_reduction
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.probing import described_once
@@ -38,15 +39,15 @@ def simulate(
     scene: Scene,
     start=None,
     *,
-    t0: float | Float[Array, ""] = 0.0,
-    t1: float | Float[Array, ""] | None = None,
+    t0: Number = 0.0,
+    t1: Number | None = None,
     ts=None,
     saveat: diffrax.SaveAt | None = None,
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
+    rtol: Number = 1e-8,
+    atol: Number = 1e-8,
     solver: diffrax.AbstractSolver | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
-    dt0: float | None = None,
+    dt0: Number | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     max_steps: int = 100_000,
     state: str = "auto",
@@ -62,9 +63,12 @@ def simulate(
 ) -> Trajectory:
     """Integrate a scene's equations of motion from `start` over [t0, t1].
 
+        motion = simulate(disc, {"lean": 0.3, "spin_rate": -3.0}, t1=5.0)
+
     **Arguments**
     - `start`: a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
-    - `t1`, `ts`: end of the span (s) and times to save at (default: 201 even ones); `ts` alone sets the span. `saveat`: a `diffrax.SaveAt` instead.
+    - `t0`, `t1`: ends of the span (s; defaults: 0 and the scene's `example_span` after it); `ts`: times to save at (default: 201 even ones), which
+      alone set the span. `saveat`: a `diffrax.SaveAt` instead.
     - `rtol`, `atol`, `solver`, `stepsize_controller`, `dt0` (default: 1e-4 of the span), `adjoint`, `max_steps`: as in
       `diffrax.diffeqsolve`. Default solver: Tsit5 for
       rtol >= 1e-6, Dopri8 below. Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`
