@@ -17,7 +17,4 @@ def end_error(scene: jj.Scene, start: dict, expected: Callable[[np.ndarray], dic
     times = np.linspace(0.0, span, 101)
     ends = jnp.asarray([0.0, span])  # no time between, where the solver interpolates less accurately than it steps
     trajectory = jj.simulate(scene, start, ts=ends, rtol=1e-12, atol=1e-12).raise_if_failed()
-    return max(
-        relative_error(trajectory[name][-1], values[-1], size=float(np.max(np.abs(values))))
-        for name, values in expected(times).items()
-    )
+    return max(relative_error(trajectory[name][-1], values[-1], size=float(np.max(np.abs(values)))) for name, values in expected(times).items())

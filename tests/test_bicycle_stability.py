@@ -34,10 +34,12 @@ def _matrices(parameters):
 def _growth_rates(matrices, speed):
     """Ascending real parts of numpy's eigenvalues of the first-order system, and their imaginary parts."""
     M, C1, K0, K2, g = (np.asarray(matrix) for matrix in matrices)
-    system = np.block([
-        [np.zeros((2, 2)), np.eye(2)],
-        [-np.linalg.solve(M, g * K0 + speed**2 * K2), -np.linalg.solve(M, speed * C1)],
-    ])
+    system = np.block(
+        [
+            [np.zeros((2, 2)), np.eye(2)],
+            [-np.linalg.solve(M, g * K0 + speed**2 * K2), -np.linalg.solve(M, speed * C1)],
+        ]
+    )
     values = np.linalg.eigvals(system)
     return values[np.lexsort((values.imag, values.real))]
 

@@ -40,9 +40,7 @@ def test_on_a_circle_each_trailer_runs_inside_the_one_ahead():
     scene = TrailerChain(trailers=3, length=jnp.array(lengths), **WEIGHTLESS)
     times = np.linspace(0.0, 30.0, 4)
     motion = simulate(scene, scene.towing([0.0, 0.0, 0.0, 0.0], forward=SPEED, turn=TURN), times)
-    expected = oracle.chain(
-        times, lengths=lengths, speed=lambda t: SPEED, yaw_rate=lambda t: TURN, headings0=[0.0, 0.0, 0.0, 0.0]
-    )
+    expected = oracle.chain(times, lengths=lengths, speed=lambda t: SPEED, yaw_rate=lambda t: TURN, headings0=[0.0, 0.0, 0.0, 0.0])
     found = np.stack([motion[f"heading{i}"] for i in range(4)], axis=1)
     assert relative_error(found, expected["headings"]) <= tolerance("closed_form")
     radii = [np.hypot(motion[f"x{i}"][-1], motion[f"y{i}"][-1] - SPEED / TURN) for i in range(1, 4)]

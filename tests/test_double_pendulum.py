@@ -16,9 +16,7 @@ CHAIN = PendulumChain(links=2, mass=jnp.array([1.0, 0.7]), length=jnp.array([1.0
 TIMES = np.linspace(0.0, oracle.RUN["t_end"], 6)
 EXPECTED = oracle.motion(TIMES, **oracle.RUN)
 CARTESIAN = {f"{axis}{k}": EXPECTED[f"{oracle_axis}{k}"][0] for k in (1, 2) for axis, oracle_axis in (("x", "x"), ("z", "y"))}
-CARTESIAN |= {
-    f"{axis}{k}_rate": EXPECTED[f"v{oracle_axis}{k}"][0] for k in (1, 2) for axis, oracle_axis in (("x", "x"), ("z", "y"))
-}
+CARTESIAN |= {f"{axis}{k}_rate": EXPECTED[f"v{oracle_axis}{k}"][0] for k in (1, 2) for axis, oracle_axis in (("x", "x"), ("z", "y"))}
 SIZE = 1.8  # m, the reach
 
 

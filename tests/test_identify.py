@@ -36,9 +36,7 @@ def sleigh_data(seed: int, repeats: tuple[int, ...] = ()) -> Measurements:
     motion = sleigh_oracle.motion(ts, **parameters)
     noise = np.random.default_rng(seed)
     exact = {"x": motion["x"], "y": motion["y"], "heading": motion["th"]}
-    return Measurements(
-        ts, {k: v + SIGMA * noise.normal(size=(*repeats, 41)) for k, v in exact.items()}, SIGMA, start=SLEIGH_START
-    )
+    return Measurements(ts, {k: v + SIGMA * noise.normal(size=(*repeats, 41)) for k, v in exact.items()}, SIGMA, start=SLEIGH_START)
 
 
 @pytest.fixture(scope="module")
@@ -81,9 +79,7 @@ def test_covariance_is_that_of_central_differences(sleigh_fit):
         apart = [simulate(scene.replace(**{name: value * (1 + sign * step)})) for sign in (1, -1)]
         columns.append(np.ravel(apart[0] - apart[1]) / (2 * value * step * SIGMA))
     J = np.stack(columns, axis=1)
-    np.testing.assert_allclose(
-        sleigh_fit.covariance, np.linalg.inv(J.T @ J), rtol=1e-4
-    )  # simulation at 1e-8, differences at 1e-5
+    np.testing.assert_allclose(sleigh_fit.covariance, np.linalg.inv(J.T @ J), rtol=1e-4)  # simulation at 1e-8, differences at 1e-5
     np.testing.assert_allclose(sleigh_fit.correlation[0, 1], sleigh_fit.covariance[0, 1] / np.prod(sleigh_fit.standard_errors))
 
 

@@ -57,9 +57,7 @@ def test_the_scene_has_its_degrees_of_freedom(scene, freedoms):
     assert scene.privileged is None or chosen == scene.privileged
 
 
-@pytest.mark.parametrize(
-    "scene", [scene for scene, _ in SCENES if type(scene).invariants is not jj.Scene.invariants], ids=lambda x: type(x).__name__
-)
+@pytest.mark.parametrize("scene", [scene for scene, _ in SCENES if type(scene).invariants is not jj.Scene.invariants], ids=lambda x: type(x).__name__)
 def test_known_integrals_do_not_change_along_the_motion(scene):
     t, q, u = _states(scene, 20)
 

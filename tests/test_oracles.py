@@ -122,9 +122,7 @@ def test_two_wheel_axle_solves_the_multiplier_equations(phi_rate):
     rates = [exact[f"{name}_rate"][0] for name in ("psi1", "psi2", "phi")]
     c, s = np.cos(start[6]), np.sin(start[6])
     v0 = [a * c * rates[0], a * s * rates[0], rates[0], a * c * rates[1], a * s * rates[1], rates[1], rates[2]]
-    motion = constrained_motion(
-        [m, m, spin, m, m, spin, spin], rows, bias, lambda *_: [push, 0, 0, push, 0, 0, 0], start, v0, times
-    )
+    motion = constrained_motion([m, m, spin, m, m, spin, spin], rows, bias, lambda *_: [push, 0, 0, push, 0, 0, 0], start, v0, times)
     assert_same(columns(exact, *names), motion[:, :7])
     assert_same(exact["psi1_rate"], motion[:, 9])
     assert_same(np.hypot(exact["x2"] - exact["x1"], exact["y2"] - exact["y1"]), np.full(9, length))
@@ -159,9 +157,7 @@ def test_heavy_axle_solves_the_multiplier_equations(th_rate):
     push = total * p["gravity"] * np.sin(p["slope"])
     u0, w = p["u0"], th_rate
     v0 = [u0 * np.cos(0.2), u0 * np.sin(0.2), w, (u0 - b * w) / r, (u0 + b * w) / r]
-    motion = constrained_motion(
-        [total, total, 0.37, spin, spin], rows, bias, lambda *_: [push, 0, 0, 0, 0], [0, 0, 0.2, 0, 0], v0, times
-    )
+    motion = constrained_motion([total, total, 0.37, spin, spin], rows, bias, lambda *_: [push, 0, 0, 0, 0], [0, 0, 0.2, 0, 0], v0, times)
     assert_same(columns(exact, "x", "y", "th", "p1", "p2"), motion[:, :5])
 
 
@@ -190,9 +186,7 @@ def test_skate_solves_the_multiplier_equations():
     exact = skate.motion(times, **p)
     rows, bias = _edge(0.0)
     push = p["mass"] * p["gravity"] * np.sin(p["slope"])
-    motion = constrained_motion(
-        [p["mass"], p["mass"], p["inertia"]], rows, bias, lambda *_: [push, 0, 0], [0, 0, 0], [0, 0, p["th_rate"]], times
-    )
+    motion = constrained_motion([p["mass"], p["mass"], p["inertia"]], rows, bias, lambda *_: [push, 0, 0], [0, 0, 0], [0, 0, p["th_rate"]], times)
     assert_same(columns(exact, "x", "y", "th"), motion[:, :3])
     rate = p["th_rate"]
     assert_same(exact["x"], p["gravity"] * np.sin(p["slope"]) / (2 * rate**2) * np.sin(rate * times) ** 2)
@@ -413,9 +407,7 @@ def test_rolling_disc_starts_with_the_rates_given():
 def test_rolling_disc_keeps_energy_and_the_legendre_constants(inertia):
     times = np.linspace(0, 10, 15)
     exact = rolling_disc.motion_yaw_lean_spin(times, **rolling_disc.RUN, inertia=inertia)
-    first, second = rolling_disc.legendre_constants(
-        exact["theta"], exact["w2"], exact["w3"], mass=1.0, radius=0.5, inertia=inertia
-    )
+    first, second = rolling_disc.legendre_constants(exact["theta"], exact["w2"], exact["w3"], mass=1.0, radius=0.5, inertia=inertia)
     for constant in (first, second, exact["energy"]):
         assert_same(constant, np.full(15, constant[0]), 1e-13)
 

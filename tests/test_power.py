@@ -69,8 +69,6 @@ def test_prescribed_coordinates_and_moving_springs_each_do_work_of_their_own():
     assert all(jnp.abs(part) > 1e-3 for part in (found.loads, found.rows, found.potential))
 
 
-
-
 @pytest.mark.parametrize(
     ("scene", "changed_by"),
     [

@@ -38,9 +38,7 @@ def test_the_contact_point_is_on_the_ellipsoid_where_its_normal_is_vertical():
     squares = np.array([oracle.RUN[axis] ** 2 for axis in "abc"])
     for down in np.random.default_rng(3).normal(size=(10, 3)):
         down /= np.linalg.norm(down)
-        point = np.asarray(STONE.contact_arm(jnp.asarray(down))) + np.array(
-            [0.0, 0.0, oracle.RUN["h"]]
-        )  # from the ellipsoid's centre
+        point = np.asarray(STONE.contact_arm(jnp.asarray(down))) + np.array([0.0, 0.0, oracle.RUN["h"]])  # from the ellipsoid's centre
         normal = point / squares
         assert abs(point @ normal - 1) <= tolerance("round_off")
         assert relative_error(normal / np.linalg.norm(normal), down) <= tolerance("round_off")

@@ -46,6 +46,8 @@ from jourdain_jax.equations.virtual_power import (
     unconstrained_equations,
     virtual_power,
 )
+from jourdain_jax.lowering.lower import NotLowered, lower
+from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.diagnostics import diagnose
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.results import SimulationError

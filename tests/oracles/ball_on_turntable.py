@@ -23,9 +23,7 @@ RUN = {
 RUN_FLAT = {**RUN, "tilt": 0.0}
 
 
-def motion(
-    t, *, radius, turn_rate, tilt, gravity, inertia_ratio, x0, y0, vx0, vy0, wz=0.0, mass=None, t_end=None
-) -> dict[str, np.ndarray]:
+def motion(t, *, radius, turn_rate, tilt, gravity, inertia_ratio, x0, y0, vx0, vy0, wz=0.0, mass=None, t_end=None) -> dict[str, np.ndarray]:
     """x, y, vx, vy of the centre and the angular velocity wx, wy, wz."""
     t = np.asarray(t, float)
     n = turn_rate * inertia_ratio / (1 + inertia_ratio)

@@ -97,9 +97,7 @@ def integral(function: Callable, times: Sequence, panel: float = 0.25) -> np.nda
     return np.array(sums)
 
 
-def constrained_motion(
-    masses: Sequence, rows: Callable, bias: Callable, force: Callable, q0: Sequence, v0: Sequence, times: Sequence
-) -> np.ndarray:
+def constrained_motion(masses: Sequence, rows: Callable, bias: Callable, force: Callable, q0: Sequence, v0: Sequence, times: Sequence) -> np.ndarray:
     """Motion with multipliers, m q'' = force + A' lambda, A q'' = -bias, for constant diagonal masses and full row rank.
 
     **Arguments:** `rows(t, q)` gives A; `bias(t, q, v)` gives Adot v (plus the time derivative of an affine part);

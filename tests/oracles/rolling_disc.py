@@ -37,9 +37,7 @@ def uniform_inertia(mass: float, radius: float) -> tuple[float, float]:
     return mass * radius**2 / 4, mass * radius**2 / 2
 
 
-def motion(
-    t, *, mass, radius, gravity, theta, psi=0.0, phi=0.0, w1, w2, w3, x0=0.0, y0=0.0, inertia=None
-) -> dict[str, np.ndarray]:
+def motion(t, *, mass, radius, gravity, theta, psi=0.0, phi=0.0, w1, w2, w3, x0=0.0, y0=0.0, inertia=None) -> dict[str, np.ndarray]:
     """theta, psi, phi, w1, w2, w3, contact x, y, centre cx, cy, cz, and energy, integrated at about 1e-16 per step.
 
     `inertia` is (A, C), the uniform disc's by default. Leaves theta in (0, pi) alone: no flat disc.

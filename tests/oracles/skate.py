@@ -11,9 +11,7 @@ from .turning import push_while_turning
 RUN = {"slope": 0.3, "mass": 1.0, "inertia": 0.2, "gravity": 9.81, "u0": 0.0, "th0": 0.0, "th_rate": 1.3, "t_end": 10.0}
 
 
-def motion(
-    t, *, slope, gravity, u0, th0, th_rate, x0=0.0, y0=0.0, mass=None, inertia=None, t_end=None
-) -> dict[str, np.ndarray]:
+def motion(t, *, slope, gravity, u0, th0, th_rate, x0=0.0, y0=0.0, mass=None, inertia=None, t_end=None) -> dict[str, np.ndarray]:
     """x, y, th, u; mass and inertia do not matter."""
     path = push_while_turning(t, u0, gravity * np.sin(slope), th0, th_rate)
     return {"x": x0 + path["x"], "y": y0 + path["y"], "th": path["heading"], "u": path["u"]}

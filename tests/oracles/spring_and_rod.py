@@ -25,9 +25,7 @@ RUN = {
 }
 
 
-def newton(
-    t, *, masses: Sequence, force: Callable, r0, v0, rods: Sequence = (), anchors: Sequence = ()
-) -> dict[str, np.ndarray]:
+def newton(t, *, masses: Sequence, force: Callable, r0, v0, rods: Sequence = (), anchors: Sequence = ()) -> dict[str, np.ndarray]:
     """Positions `r` and velocities `v` (times, particles, dimensions) and rod `tensions` (times, rods + anchors, > 0 pulls).
 
     **Arguments:** `force(t, r, v)` -> (particles, dimensions), long double kept; `rods`, pairs of particle numbers; `anchors`,
@@ -83,9 +81,7 @@ def spring(p, q, stiffness, natural_length, relative_velocity=None, damping=0.0)
     return -pull * d / length
 
 
-def motion(
-    t, *, masses, stiffness, natural_length, damping, gravity, anchor, rods, r0, v0, t_end=None
-) -> dict[str, np.ndarray]:
+def motion(t, *, masses, stiffness, natural_length, damping, gravity, anchor, rods, r0, v0, t_end=None) -> dict[str, np.ndarray]:
     """The example of RUN: particle 0 on a spring to the anchor, the rods between the particles; with `energy`."""
     down = np.zeros(len(anchor), LONG)
     down[1] = -gravity

@@ -39,9 +39,7 @@ RUN_HEAVY_AXLE = {
 }
 
 
-def motion(
-    t, *, radius, length, mass, rim_mass, slope, gravity, phi0, phi_rate, psi1_rate, x1=0.0, y1=0.0, psi1=0.0, psi2=0.0, **_
-) -> dict[str, np.ndarray]:
+def motion(t, *, radius, length, mass, rim_mass, slope, gravity, phi0, phi_rate, psi1_rate, x1=0.0, y1=0.0, psi1=0.0, psi2=0.0, **_) -> dict[str, np.ndarray]:
     """x1, y1, z1, psi1, x2, y2, z2, psi2, phi and the rates psi1_rate, psi2_rate, phi_rate (S11)."""
     k = mass * gravity * np.sin(slope) / (mass + rim_mass)  # a psi1'' = k cos(phi)
     path = push_while_turning(t, radius * psi1_rate, k, phi0, phi_rate)
@@ -63,9 +61,7 @@ def motion(
     }
 
 
-def motion_heavy_axle(
-    t, *, radius, half_track, wheel_mass, axle_mass, slope, gravity, u0, th0, th_rate, t_end=None
-) -> dict[str, np.ndarray]:
+def motion_heavy_axle(t, *, radius, half_track, wheel_mass, axle_mass, slope, gravity, u0, th0, th_rate, t_end=None) -> dict[str, np.ndarray]:
     """x, y (middle of the axle), th, p1, p2 and u, with rows c xd + s yd -+ b thd = R p1d, R p2d (B1). Starts at zero."""
     k = gravity * np.sin(slope) * (2 * wheel_mass + axle_mass) / (3 * wheel_mass + axle_mass)
     path = push_while_turning(t, u0, k, th0, th_rate)

@@ -11,9 +11,7 @@ from .turning import push_while_turning
 RUN = {"mass": 1.0, "radius": 1.0, "phi0": 0.0, "phi_rate": 2.0, "th_rate": 1.0, "t_end": 1.0}
 
 
-def motion(
-    t, *, radius, phi0, phi_rate, th_rate, th0=0.0, x0=0.0, y0=0.0, mass=1.0, t_end=None
-) -> dict[str, np.ndarray]:
+def motion(t, *, radius, phi0, phi_rate, th_rate, th0=0.0, x0=0.0, y0=0.0, mass=1.0, t_end=None) -> dict[str, np.ndarray]:
     """x, y, phi, th and the multipliers l1, l2; regular at phi_rate = 0."""
     path = push_while_turning(t, radius * th_rate, 0.0, phi0, phi_rate)
     size = mass * phi_rate * radius * th_rate

@@ -54,9 +54,7 @@ class Positive(Bijection):
         return jnp.zeros_like(value, bool)
 
     def refusal(self, guess):
-        return (
-            "" if np.all(guess > 0) else "expected a first guess above zero; or leave it free to change sign with `unbounded()`"
-        )
+        return "" if np.all(guess > 0) else "expected a first guess above zero; or leave it free to change sign with `unbounded()`"
 
 
 class Bounded(Bijection):
@@ -118,10 +116,7 @@ def bounds(low: Number, high: Number) -> Bounded:
     Raises ValueError unless both are finite and low < high.
     """
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise ValueError(
-            f"bounds({low}, {high}): expected finite numbers low < high; "
-            "for one bound at zero use `positive()`, for none `unbounded()`"
-        )
+        raise ValueError(f"bounds({low}, {high}): expected finite numbers low < high; for one bound at zero use `positive()`, for none `unbounded()`")
     return Bounded(jnp.asarray(low, jnp.result_type(float)), jnp.asarray(high, jnp.result_type(float)))
 
 

@@ -83,9 +83,7 @@ def fit_batch(
     problem = _problem(scene, data, free, repeats=True)
     counts = {values.shape[0] for run in problem.measured() for values in run.values()}
     if len(counts) != 1 or 0 in counts:
-        raise ValueError(
-            f"the channels hold {sorted(counts)} repeats; give every channel of every run the same leading axis, of one or more"
-        )
+        raise ValueError(f"the channels hold {sorted(counts)} repeats; give every channel of every run the same leading axis, of one or more")
     return _fit_batch(problem, problem.measured(), simulation, cutoff, tolerance, max_iterations)
 
 
@@ -112,8 +110,7 @@ def _problem(scene: Scene, data, free, *, repeats: bool) -> _Problem:
     samples = sum(math.prod(values.shape[int(repeats) :]) for run in runs for values in run.values.values())
     if samples < len(unknowns.labels):
         raise ValueError(
-            f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns; measure more, or free fewer of "
-            f"{', '.join(unknowns.labels)}"
+            f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns; measure more, or free fewer of {', '.join(unknowns.labels)}"
         )
     return _Problem(scene, runs, unknowns)
 
@@ -131,9 +128,7 @@ def _fit(problem: _Problem, values, simulation, cutoff, tolerance, max_iteration
     def flat_residuals(z, numbers):
         return jnp.concatenate([jnp.ravel(r) for r in jax.tree.leaves(eqx.combine(numbers, rest).residuals(z, simulation))])
 
-    solution = least_squares(
-        flat_residuals, problem.unknowns.first_guess(), numbers, tolerance=tolerance, max_steps=max_iterations
-    )
+    solution = least_squares(flat_residuals, problem.unknowns.first_guess(), numbers, tolerance=tolerance, max_steps=max_iterations)
     return _result(problem, solution, cutoff)
 
 
@@ -172,7 +167,5 @@ def _by_channel(runs: Sequence[Measurements], flat: Float[Array, "samples"]) -> 
     """The flat residuals by run and channel; NaN where a sample is missing."""
     sigmas, structure = jax.tree.flatten(tuple({name: run.sigma_of(name) for name in run.values} for run in runs))
     parts = jnp.split(flat, np.cumsum([sigma.size for sigma in sigmas])[:-1])
-    found = [
-        jnp.where(jnp.isfinite(sigma), part.reshape(sigma.shape), jnp.nan) for part, sigma in zip(parts, sigmas, strict=True)
-    ]
+    found = [jnp.where(jnp.isfinite(sigma), part.reshape(sigma.shape), jnp.nan) for part, sigma in zip(parts, sigmas, strict=True)]
     return jax.tree.unflatten(structure, found)

@@ -109,10 +109,7 @@ class Fit(eqx.Module):
             return "no minimum was found; raise `max_iterations`, or start nearer to it"
         # chi-square has mean n and variance 2 n
         if self.reduced_chi_square > 1 + 5 * np.sqrt(2 / max(int(self.degrees_of_freedom), 1)):
-            return (
-                "the residuals are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, "
-                "or sigmas that are too small"
-            )
+            return "the residuals are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, or sigmas that are too small"
         return ""
 
     def residual_summary(self) -> tuple[ChannelResiduals, ...]:

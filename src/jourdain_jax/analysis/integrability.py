@@ -218,10 +218,7 @@ class _Fields:
         count = len(x)
         padded = -count % BATCH
         x, direction = (np.pad(a, ((0, padded), (0, 0)), mode="edge") for a in (x, direction))
-        batches = [
-            _fields_along(self.scene, self.with_time, self.u, x[i : i + BATCH], direction[i : i + BATCH])
-            for i in range(0, len(x), BATCH)
-        ]
+        batches = [_fields_along(self.scene, self.with_time, self.u, x[i : i + BATCH], direction[i : i + BATCH]) for i in range(0, len(x), BATCH)]
         values, derivatives = (np.concatenate([np.asarray(batch[k]) for batch in batches]) for k in (0, 1))
         return values[:count], derivatives[:count]
 

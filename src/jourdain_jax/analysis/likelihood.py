@@ -39,15 +39,11 @@ def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **
         for name, r in weighted.items():
             sigma = run.sigma_of(name)
             counted = jnp.isfinite(sigma)
-            total = total - jnp.sum(
-                jnp.where(counted, 0.5 * r**2 + jnp.log(jnp.where(counted, sigma, 1.0) * jnp.sqrt(2 * jnp.pi)), 0.0)
-            )
+            total = total - jnp.sum(jnp.where(counted, 0.5 * r**2 + jnp.log(jnp.where(counted, sigma, 1.0) * jnp.sqrt(2 * jnp.pi)), 0.0))
     return jnp.where(jnp.isfinite(total), total, -jnp.inf)
 
 
-def residuals(
-    scene: Scene, runs: Sequence[Measurements], simulate: Callable, simulation: dict
-) -> list[dict[str, Float[Array, "..."]]]:
+def residuals(scene: Scene, runs: Sequence[Measurements], simulate: Callable, simulation: dict) -> list[dict[str, Float[Array, "..."]]]:
     """`(prediction - value) / sigma`, shape (times, *channel), by run and channel; runs of equal shapes are one batch."""
     found: dict[int, dict] = {}
     for group in _alike(runs):
@@ -56,9 +52,7 @@ def residuals(
             continue
         parts = [eqx.partition(runs[i], eqx.is_array) for i in group]
         stacked = jax.tree.map(lambda *xs: jnp.stack(xs), *(arrays for arrays, _ in parts))
-        together = jax.vmap(lambda arrays, rest=parts[0][1]: _residuals(scene, eqx.combine(arrays, rest), simulate, simulation))(
-            stacked
-        )
+        together = jax.vmap(lambda arrays, rest=parts[0][1]: _residuals(scene, eqx.combine(arrays, rest), simulate, simulation))(stacked)
         found |= {i: {name: r[k] for name, r in together.items()} for k, i in enumerate(group)}
     return [found[i] for i in range(len(runs))]
 

@@ -77,8 +77,7 @@ class Measurements(eqx.Module):
     def __check_init__(self):
         if not _holds(lambda t: (t[0] <= t[1]) & (t[0] < t[2]), jnp.stack([self.t0, self.ts[0], self.ts[-1]])):
             raise ValueError(
-                f"the start at t0 = {self.t0} s comes after the first sample ({self.ts[0]} s), or not before the last "
-                f"({self.ts[-1]} s); give an earlier `t0`"
+                f"the start at t0 = {self.t0} s comes after the first sample ({self.ts[0]} s), or not before the last ({self.ts[-1]} s); give an earlier `t0`"
             )
         if not self.values:
             raise ValueError("`values` is empty; give at least one channel: name -> measured values")
@@ -88,9 +87,7 @@ class Measurements(eqx.Module):
                 raise ValueError(f"function `{name}` has no measured values; {nearest(name, self.values)}")
         for name in self.unknown_start:
             if name not in self.start:
-                raise ValueError(
-                    f"unknown start value `{name}` has no first guess; give one in `start`. {nearest(name, self.start)}"
-                )
+                raise ValueError(f"unknown start value `{name}` has no first guess; give one in `start`. {nearest(name, self.start)}")
         for name, value in self.values.items():
             if not _holds(np.isfinite, value):
                 raise ValueError(
@@ -99,9 +96,7 @@ class Measurements(eqx.Module):
                 )
         for name, value in self.sigma.items():
             if not _holds(lambda x: x > 0, value):
-                raise ValueError(
-                    f"sigma of channel `{name}` must be above zero (and not NaN); give the standard deviation of its noise"
-                )
+                raise ValueError(f"sigma of channel `{name}` must be above zero (and not NaN); give the standard deviation of its noise")
 
     def counted(self) -> Int[Array, ""]:
         """Number of samples with a finite sigma, each component of a channel counted by itself."""
@@ -157,9 +152,7 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
             hint = "; many repeats go to `fit_batch`" if values.shape[1:] == shape and not repeats else ""
             raise ValueError(f"channel `{name}` of {where} has shape {values.shape}, expected {expected} for {times} times{hint}")
         if run.sigma[name].shape not in ((), (times,), shape):
-            raise ValueError(
-                f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, expected (), {(times,)} or {shape}"
-            )
+            raise ValueError(f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, expected (), {(times,)} or {shape}")
     return eqx.tree_at(lambda r: r.inputs, run, as_inputs(scene, run.inputs), is_leaf=lambda x: x is None)
 
 

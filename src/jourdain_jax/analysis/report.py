@@ -5,6 +5,8 @@ from dataclasses import asdict, dataclass
 from jourdain_jax.analysis.integrability import growth_vector, row_integrability
 from jourdain_jax.equations.cyclic import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.lowering.lower import lowered
+from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.scene.scene import Scene
 
 _LABEL = 26  # width of the first column
@@ -38,6 +40,7 @@ class Report:
     ignorable_coordinates: tuple[str, ...]
     privileged_velocities: tuple[str, ...]
     privileged_by_user: bool
+    lowering: str  # operations of the scalar program that is integrated, or why there is none
     worst_pivot: float  # smallest singular value of the scaled A_z over all probed states; zero: singular somewhere
     typical_pivot: float
     rank_losses: tuple[str, ...]  # probed configurations where the rows lose rank
@@ -45,9 +48,7 @@ class Report:
     def as_dict(self) -> dict:
         """The report for machines: the fields by name; what has no finite value is None."""
         facts = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
-        facts["frobenius_violations"] = {
-            row: size if size < float("inf") else None for row, size in self.frobenius_violations.items()
-        }
+        facts["frobenius_violations"] = {row: size if size < float("inf") else None for row, size in self.frobenius_violations.items()}
         return facts
 
     def __str__(self) -> str:
@@ -65,6 +66,7 @@ class Report:
             "ignorable coordinates": _listed(self.ignorable_coordinates),
             "privileged velocities": _listed(self.privileged_velocities),
             "chosen by": "the scene" if self.privileged_by_user else "the engine",
+            "lowered to": self.lowering,
             "their conditioning": self._conditioning(),
             "rank is lost at": "none of the probed configurations" if not self.rank_losses else "; ".join(self.rank_losses[:4]),
         }
@@ -75,9 +77,7 @@ class Report:
 
     def _no_redundant_rows(self) -> str:
         if self.rank < len(self.rows):
-            return (
-                f"none may be left out, though {len(self.rows)} rows have rank {self.rank}: each is needed at some configuration"
-            )
+            return f"none may be left out, though {len(self.rows)} rows have rank {self.rank}: each is needed at some configuration"
         return "none"
 
     def _growth(self) -> str:
@@ -125,6 +125,7 @@ def report(scene: Scene, *, depth: int = 4) -> Report:
         ignorable_coordinates=ignorable_coordinates(scene),
         privileged_velocities=tuple(scene.speed_names.entries[i] for i in structure.independent),
         privileged_by_user=structure.chosen_by_user,
+        lowering=_lowering(scene),
         worst_pivot=structure.worst_pivot,
         typical_pivot=structure.typical_pivot,
         rank_losses=structure.rank_losses,
@@ -143,3 +144,8 @@ def _wrapped(label: str, text: str) -> list[str]:
             lines.append("")
         lines[-1] += f" {word}" if lines[-1] else word
     return [f"  {label if i == 0 else '':<{_LABEL - 2}}{line}" for i, line in enumerate(lines)]
+
+
+def _lowering(scene: Scene) -> str:
+    found = lowered(scene)
+    return f"a scalar program of {found.operations} operations" if isinstance(found, Lowered) else f"not lowered: {found}"

@@ -63,9 +63,7 @@ class Unknowns(eqx.Module):
         """Which entries lie at a bound."""
         return jnp.concatenate([jnp.ravel(e.bijection.at_bound(part)) for e, part in self._parts(theta)])
 
-    def put_into(
-        self, scene: Scene, runs: Sequence[Measurements], theta: Float[Array, "unknowns"]
-    ) -> tuple[Scene, tuple[Measurements, ...]]:
+    def put_into(self, scene: Scene, runs: Sequence[Measurements], theta: Float[Array, "unknowns"]) -> tuple[Scene, tuple[Measurements, ...]]:
         """The scene and the runs with these values."""
         parameters: dict[str, Array] = {}
         starts: list[dict[str, Array]] = [{} for _ in runs]
@@ -74,9 +72,7 @@ class Unknowns(eqx.Module):
             target[entry.name] = part
         if parameters:
             scene = eqx.tree_at(lambda s: [getattr(s, name) for name in parameters], scene, list(parameters.values()))
-        return scene, tuple(
-            eqx.tree_at(lambda r: r.start, run, run.start | known) for run, known in zip(runs, starts, strict=True)
-        )
+        return scene, tuple(eqx.tree_at(lambda r: r.start, run, run.start | known) for run, known in zip(runs, starts, strict=True))
 
     def _parts(self, flat):
         """Each unknown with its part of a flat vector, in its own shape."""
@@ -98,9 +94,7 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
     entries = []
     for name, bijection in (free if isinstance(free, Mapping) else dict.fromkeys(free)).items():
         if name not in parameters:
-            raise ValueError(
-                f"`free` names `{name}`, which is no parameter of `{type(scene).__name__}`; {nearest(name, parameters)}"
-            )
+            raise ValueError(f"`free` names `{name}`, which is no parameter of `{type(scene).__name__}`; {nearest(name, parameters)}")
         value, about = parameters[name]
         default = positive() if about["positive"] or about["non_negative"] else unbounded()
         entries.append(Unknown(name, None, about["unit"], value, _chosen(name, bijection, default, value)))
@@ -109,10 +103,7 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
             guess = run.start[name]
             entries.append(Unknown(name, index, "", guess, _chosen(f"run {index}: {name}", bijection, unbounded(), guess)))
     if not entries:
-        raise ValueError(
-            f"nothing is free; name parameters in `free` ({', '.join(f'`{name}`' for name in parameters)}), "
-            "or `unknown_start` values of a run"
-        )
+        raise ValueError(f"nothing is free; name parameters in `free` ({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
     return Unknowns(tuple(entries))
 
 
@@ -140,9 +131,5 @@ def check_starts(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns)
             try:
                 consistent_start(moved, t0=run.t0, **run.start)
             except ValueError as error:
-                why = (
-                    "no longer meets the constraints when the unknowns change: the values in `start` depend on each other"
-                    if changed
-                    else "is not admissible"
-                )
+                why = "no longer meets the constraints when the unknowns change: the values in `start` depend on each other" if changed else "is not admissible"
                 raise ValueError(f"the start of run {index} {why}. {error}") from None

@@ -17,9 +17,7 @@ _NEWTON_STEPS = 4  # from a bracketed root two reach round-off
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def implicit_root(
-    residual: Callable, guess: Float[Array, " n"], parameters: PyTree, present: Bool[Array, ""]
-) -> Float[Array, " n"]:
+def implicit_root(residual: Callable, guess: Float[Array, " n"], parameters: PyTree, present: Bool[Array, ""]) -> Float[Array, " n"]:
     """x with `residual(x, parameters) = 0` near `guess`.
 
     **Arguments:** `residual`, a function defined at module level, (n,) and parameters -> (n,); `guess`, close to the

@@ -69,10 +69,7 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
 
     missing = [name for name in PARAMETER_NAMES if name not in values]
     if missing:
-        raise ValueError(
-            f"{path}: missing {_listed(missing)}; a bicycle needs all of {' '.join(PARAMETER_NAMES)}. "
-            f"Add a line {_FORMAT} for each."
-        )
+        raise ValueError(f"{path}: missing {_listed(missing)}; a bicycle needs all of {' '.join(PARAMETER_NAMES)}. Add a line {_FORMAT} for each.")
     known = {name: values[name] for name in PARAMETER_NAMES}
     broken = [sentence for sentence, is_broken in violations(known).items() if is_broken]
     if broken:
@@ -112,9 +109,7 @@ def _read_text(path: Path) -> str:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(
-            f"{path}: not UTF-8 text (byte {error.start} is {content[error.start]:#04x}). Expected lines {_FORMAT}."
-        ) from None
+        raise ValueError(f"{path}: not UTF-8 text (byte {error.start} is {content[error.start]:#04x}). Expected lines {_FORMAT}.") from None
     if "\0" in text:
         raise ValueError(f"{path}: a binary file (it contains zero bytes). Expected text lines {_FORMAT}.")
     if not text.strip():
@@ -131,20 +126,14 @@ def _read_line(line: str, where: str) -> tuple[str, float, float | None]:
         lower_case = {known.lower(): known for known in reversed(PARAMETER_NAMES)}
         near = difflib.get_close_matches(name.lower(), lower_case, 1, cutoff=0.0)
         nearest = lower_case[near[0]] if near else PARAMETER_NAMES[0]
-        raise ValueError(
-            f"{where}: unknown parameter {_clipped(name)}; the nearest valid name is `{nearest}`. "
-            f"Valid names: {' '.join(PARAMETER_NAMES)}."
-        )
+        raise ValueError(f"{where}: unknown parameter {_clipped(name)}; the nearest valid name is `{nearest}`. Valid names: {' '.join(PARAMETER_NAMES)}.")
     value_text, separator, sigma_text = right.replace("±", "+/-").partition("+/-")
     value = _read_number(value_text, f"value of `{name}`", where)
     if not separator:
         return name, value, None
     sigma = _read_number(sigma_text, f"sigma of `{name}`", where)
     if sigma < 0:
-        raise ValueError(
-            f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0. "
-            f"Give its size, or leave `+/-` out if it is not known."
-        )
+        raise ValueError(f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0. Give its size, or leave `+/-` out if it is not known.")
     return name, value, sigma
 
 
@@ -167,9 +156,7 @@ def _is_known(name: str) -> bool:
 def _ignored_but_telling(values: dict[str, float]) -> tuple[str, ...]:
     """Warnings where an ignored value contradicts the symmetry that the model assumes."""
     found = [
-        f"`{name}` = {values[name]:g} is ignored: the Whipple bicycle is symmetric about its plane"
-        for name in _OUT_OF_PLANE
-        if values.get(name, 0.0) != 0.0
+        f"`{name}` = {values[name]:g} is ignored: the Whipple bicycle is symmetric about its plane" for name in _OUT_OF_PLANE if values.get(name, 0.0) != 0.0
     ]
     for name, twin in _REPEATED.items():
         if values.get(name, values[twin]) != values[twin]:

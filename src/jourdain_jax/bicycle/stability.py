@@ -212,9 +212,7 @@ def _double_root(matrices: BicycleMatrices, fixed: BicycleMatrices, below: Scala
     return jnp.where(present, s, jnp.nan), jnp.where(present, v, jnp.nan)
 
 
-def _widest_stable_range(
-    matrices: BicycleMatrices, crossings: Float[Array, " crossings"], top: Scalar
-) -> tuple[Scalar, Scalar]:
+def _widest_stable_range(matrices: BicycleMatrices, crossings: Float[Array, " crossings"], top: Scalar) -> tuple[Scalar, Scalar]:
     """The widest interval between neighbouring crossings where all eigenvalues decay; NaN if there is none."""
     ends = jnp.concatenate([jnp.zeros_like(top)[None], crossings, top[None]])
     ends = jnp.sort(jnp.where(jnp.isnan(ends), top, ends))

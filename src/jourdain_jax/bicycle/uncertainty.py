@@ -42,9 +42,7 @@ class Interval(eqx.Module):
     fraction: Scalar  # of the samples counted, those that have the quantity
 
 
-def sample_parameters(
-    bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Array, "2"], count: int
-) -> ParameterSamples:
+def sample_parameters(bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Array, "2"], count: int) -> ParameterSamples:
     """Draw `count` bicycles from independent normal distributions with the measured values and sigmas.
 
         samples = sample_parameters(bicycle, jax.random.key(0), 2000)

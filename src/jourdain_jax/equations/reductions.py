@@ -128,7 +128,7 @@ class Privileged(Reduction):
 
     def solve(self, problem):
         split = Partition(problem.A, self.independent)
-        return *appell(problem.M, problem.f, split.C, split.particular(problem.b), split.pivot()),
+        return (*appell(problem.M, problem.f, split.C, split.particular(problem.b), split.pivot()),)
 
 
 def appell(M, f, C, c, pivot):

@@ -33,6 +33,13 @@ class Strategy:
     free_z: bool = False  # implicit only: normal forms are made while dependent speeds are symbols
     held: tuple[int, ...] = ()  # ignorable coordinates, held at the reference in the accelerations
 
+    @property
+    def description(self) -> str:
+        """In words."""
+        way = "dependent speeds put in before differentiation" if self.explicit else "rows differentiated through the bodies' velocities"
+        solved = "accelerations by determinants in normal form" if self.by_determinants else "accelerations by elimination"
+        return f"{way}, {solved}"
+
 
 @dataclass
 class Equations:
@@ -219,8 +226,10 @@ class _Kinematics:
         phi_0 = self._at(g.substituted(self.phi, dict.fromkeys(self.u, g.zero)))
         self._solve(self._transposed(A), phi_0)
         parts = self._parts(at_fixed_speeds)
-        spun = [[[g.sub(g.mul(w[i - 2], R[3 * (i - 1) + j]), g.mul(w[i - 1], R[3 * (i - 2) + j])) for j in range(3)] for i in range(3)]
-                for w, R in zip(omega, rotation, strict=True)]
+        spun = [
+            [[g.sub(g.mul(w[i - 2], R[3 * (i - 1) + j]), g.mul(w[i - 1], R[3 * (i - 2) + j])) for j in range(3)] for i in range(3)]
+            for w, R in zip(omega, rotation, strict=True)
+        ]
         direction = self._cut([(at.v, parts[0]), (at.turning, turn(parts)), (at.orientation, spun), (at.position, value[0])])
         moving = {int(n): r for n, r in zip(build.traced.q, qdot, strict=True)}
         drift = rows_along(moving | direction | {build.traced.t: g.one})

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.equations.probing import concretised
+from jourdain_jax.equations.minimal import minimal_accelerations
+from jourdain_jax.equations.probing import concretised, on_numbers
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.equations.structure import Structure, sample_states, structure_of, symmetric_states
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
@@ -24,7 +25,8 @@ from jourdain_jax.scene.scene import Scene
 PROBES = 32
 MOST_OPERATIONS = 20_000  # of the program before simplification: beyond, the dense path is taken
 MOST_TERMS = 200  # of one normal form
-SMALL = 600  # operations: below, further ways are tried
+SMALL = 1000  # operations: below, further ways are tried
+TO_DENSE = 1e-8  # between the program and the dense path at the probes, relative to the size of the rates
 AGREEMENT = 1e-9  # between programs at the probes, relative to the size of the rates
 
 
@@ -39,6 +41,18 @@ def lowered(scene: Scene) -> Lowered | NotLowered:
         return _lowered(_Key(concretised(scene), structure))
     except NotLowered as reason:
         return reason
+
+
+def lower(scene: Scene) -> Lowered:
+    """The lowered equations of `scene`'s class: the scalar program that `simulate` and `rollout` integrate. Raises `NotLowered` with the reason.
+
+    print(jj.lower(disc))                     operations after each step, what was dropped and why
+    print(jj.lower(disc).python_source())     the equations, readable; also c_source(), expressions() and latex() (SymPy)
+    """
+    found = lowered(scene)
+    if isinstance(found, NotLowered):
+        raise NotLowered(f"`{type(scene).__name__}` is not lowered: {found}") from None
+    return found
 
 
 class _Key:
@@ -91,46 +105,94 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     graph, probes = builder.graph, builder.probes
     plain = {explicit: builder.build(Strategy(explicit)) for explicit in (False, True)}
     counts = {explicit: graph.operations(_rates(found)) for explicit, found in plain.items()}
-    reference = plain[False]
-    if counts[False] > MOST_OPERATIONS:
-        raise NotLowered(f"its scalar program has {counts[False]} operations, more than {MOST_OPERATIONS}")
-    expected = _values(reference, probes)
-    held = _ignorable(scene, builder, reference, expected)
-    stages = [Stage("scalar program: zeros, ones and repeated parts removed", counts[False])]
-    best, fewest = reference, counts[False]
-    for strategy in _strategies(held, counts):
+    best, fewest, way = plain[False], counts[False], Strategy(False)
+    if fewest > MOST_OPERATIONS:
+        raise NotLowered(f"its scalar program has {fewest} operations, more than {MOST_OPERATIONS}")
+    expected = _values(best, probes)
+    _check_against_dense(scene, structure, probes, best, expected)
+    held = _ignorable(scene, builder, best, expected)
+    stages = [Stage("scalar program: structural zeros and ones removed, repeated parts shared", fewest)]
+    plainly_held = graph.operations(_rates(builder.build(Strategy(False, held=held))))
+    stages.append(Stage("ignorable coordinates held in the accelerations", plainly_held))
+    for strategy in _strategies(held, plainly_held < SMALL, counts[True] / counts[False]):
         candidate = builder.build(strategy)
         count = graph.operations(graph.with_quotients(_rates(candidate)))
         if count < fewest and _agree(_values(candidate, probes), expected):
-            best, fewest = candidate, count
+            best, fewest, way = candidate, count, strategy
+    stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
+    groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power]]
+    outputs = graph.with_quotients([n for group in groups for n in group])
+    ends = np.cumsum([len(group) for group in groups])
+    qdot, ydot, z, pivots, guards, power = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
     names = scene.coordinate_names.entries
-    if held:
-        stages.append(Stage("ignorable coordinates held, normal forms", fewest))
-    outputs = graph.with_quotients([*best.qdot, *best.ydot, *best.z, *best.pivots, *best.guards, best.power])
-    parts = np.cumsum([len(best.qdot), len(best.ydot), len(best.z), len(best.pivots), len(best.guards)])
-    qdot, ydot, z, pivots, guards, (power,) = (tuple(int(n) for n in part) for part in np.split(np.array(outputs, np.int64), parts))
-    typical = np.nanmedian(np.abs(probes(pivots)), axis=1) if pivots else np.zeros(0)
-    dependent = tuple(builder.dependent)
     return Lowered(
-        builder.traced, names, structure.independent, dependent, qdot, ydot, z, pivots, tuple(typical.tolist()), guards,
-        None if structure.driven else power, tuple(names[i] for i in held), tuple(stages),
-        time.perf_counter() - begin, fixed_nodes(graph, outputs),
-    )  # fmt: skip
+        traced=builder.traced,
+        scene_name=type(scene).__name__,
+        parameters=tuple(jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(scene)[0]),
+        coordinates=names,
+        speeds=scene.speed_names.entries,
+        inputs=scene.inputs.entries,
+        independent=structure.independent,
+        dependent=tuple(builder.dependent),
+        qdot=qdot,
+        ydot=ydot,
+        z=z,
+        pivots=pivots,
+        typical=tuple(np.nanmedian(np.abs(probes(pivots)), axis=1).tolist()),
+        guards=guards,
+        power=None if structure.driven else power[0],
+        held=tuple(names[i] for i in held),
+        stages=tuple(stages),
+        way=way.description,
+        seconds=time.perf_counter() - begin,
+        fixed=fixed_nodes(graph, outputs),
+    )
+
+
+def _check_against_dense(scene: Scene, structure: Structure, probes: Probes, found: Equations, values: np.ndarray) -> None:
+    """The scalar program against JAX's own derivatives and a dense solution, at the probes; the reason, with a name, where they differ."""
+    leaves, treedef = jax.tree.flatten(scene)
+    columns = [[probes.inputs[f"p{k}_{i}"] for i in range(np.size(leaf))] for k, leaf in enumerate(leaves)]
+    parameters = jax.tree.unflatten(treedef, [np.stack(c, -1).reshape(-1, *np.shape(leaf)) for c, leaf in zip(columns, leaves, strict=True)])
+    t = np.broadcast_to(probes.inputs["t_0"], probes.count)
+    sizes = (len(scene.coordinate_names), len(scene.speed_names), len(scene.inputs))
+    q, u, inputs = (np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0)) for p, n in zip("qui", sizes, strict=True))
+    dense = _dense_rates(structure.independent)(parameters, t, q, u, inputs)
+    expected = np.concatenate(dense, axis=1).T
+    names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in structure.independent)]
+    usable = np.all(np.isfinite(values), axis=0) & np.all(np.isfinite(expected), axis=0)
+    size = 1 + np.max(np.abs(expected[:, usable]), axis=0, initial=0.0)
+    error = np.max(np.abs(values - expected)[:, usable] / size, axis=1, initial=0.0)
+    if usable.sum() < PROBES // 2:
+        raise NotLowered("its scalar program serves at too few of the probed states")
+    if np.max(error) > TO_DENSE:
+        worst = names[int(np.argmax(error))]
+        raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: a body, load or row has a derivative of its own there")
+
+
+@lru_cache(maxsize=64)
+def _dense_rates(independent: tuple[int, ...]):
+    """`(scene, t, q, u, inputs) -> qdot, ydot` by dense matrices, for many states and parameters, uncompiled."""
+
+    def one(scene, t, q, y, inputs):
+        _, motion, found = minimal_accelerations(scene, independent, t, q, y, inputs)
+        return motion.qdot.array, found.udot[np.array(independent, int)]
+
+    return on_numbers(lambda scene, t, q, u, inputs: jax.vmap(one)(scene, t, q, u[:, np.array(independent, int)], inputs))
 
 
 def _rates(found: Equations) -> list[int]:
     return [*found.qdot, *found.ydot]
 
 
-def _strategies(held: tuple[int, ...], counts: dict[bool, int]) -> Iterator[Strategy]:
+def _strategies(held: tuple[int, ...], small: bool, explicit_to_implicit: float) -> Iterator[Strategy]:
     """Ways worth trying: more of them where the program is small."""
-    fewest = min(counts.values())
-    if fewest < SMALL:
+    if small:
         for keep_sines, by_determinants, free_z in itertools.product((False, True), repeat=3):
             yield Strategy(False, keep_sines, MOST_TERMS, MOST_TERMS, by_determinants, free_z, held)
     else:
         yield Strategy(False, False, MOST_TERMS, 0, False, False, held)
-    if counts[True] <= 1.35 * fewest:
+    if explicit_to_implicit <= 1.35 or small:
         for terms in (MOST_TERMS, 0):
             yield Strategy(True, False, MOST_TERMS, terms, terms > 0, False, held)
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.lowering import export
 from jourdain_jax.lowering.trace import TracedScene
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph
@@ -30,7 +31,11 @@ class Lowered:
     """
 
     traced: TracedScene
+    scene_name: str
+    parameters: tuple[str, ...]  # names of the scene's leaves
     coordinates: tuple[str, ...]
+    speeds: tuple[str, ...]
+    inputs: tuple[str, ...]
     independent: tuple[int, ...]
     dependent: tuple[int, ...]
     qdot: tuple[int, ...]  # nodes
@@ -42,6 +47,7 @@ class Lowered:
     power: int | None  # d(T + V)/dt where it is not zero by structure; None where poses are driven
     held: tuple[str, ...]  # ignorable coordinates, set to the reference in the accelerations
     stages: tuple[Stage, ...]
+    way: str  # which way of building it took fewest operations
     seconds: float  # that lowering took
     fixed: tuple[int, ...]  # nodes that depend on parameters alone, computed once per motion
 
@@ -54,6 +60,29 @@ class Lowered:
     def operations(self) -> int:
         """Operations per evaluation of all rates."""
         return self.graph.operations([*self.qdot, *self.ydot])
+
+    def summary(self) -> str:
+        """Operations after each step, what was dropped and why, the chosen privileged speeds."""
+        return export.summary(self)
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def python_source(self) -> str:
+        """The program as readable Python: `fixed(parameters)` and `rates(fixed, t, state)`."""
+        return export.python_source(self)
+
+    def c_source(self, name: str = "rates") -> str:
+        """The program as one C function `name`."""
+        return export.c_source(self, name)
+
+    def expressions(self) -> dict:
+        """Name -> SymPy expression of every rate; needs SymPy. For small scenes: large ones give pages."""
+        return export.expressions(self)
+
+    def latex(self) -> str:
+        """One equation per rate, for an `align` environment; needs SymPy."""
+        return export.latex(self)
 
     def fixed_values(self, scene: Scene) -> tuple[Float[Array, ""], ...]:
         """What depends on parameters alone."""

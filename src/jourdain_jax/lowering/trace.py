@@ -1,8 +1,8 @@
 """A scene at the level of velocities, traced to a graph of scalars: what Jourdain's principle needs, before any derivative is taken.
 
-    v, omega (body axes), phi, qdot      of (t, q, u)
-    F, L (body axes), Q_direct, power    impressed forces
-    m, I                                 inertias
+v, omega (body axes), phi, qdot      of (t, q, u)
+F, L (body axes), Q_direct, power    impressed forces
+m, I                                 inertias
 """
 
 from dataclasses import dataclass

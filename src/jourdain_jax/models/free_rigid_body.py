@@ -25,9 +25,7 @@ class FreeRigidBody(Scene):
     i3: Float[Array, ""] = parameter(2.5, unit="kg m^2", positive=True)
 
     coordinates = coordinates("x y z", quaternion("attitude"))
-    conventions = (
-        "Right-handed inertial axes; attitude takes body to space; i1, i2, i3 about body x, y, z through the mass centre."
-    )
+    conventions = "Right-handed inertial axes; attitude takes body to space; i1, i2, i3 about body x, y, z through the mass centre."
     example = {"attitude_omega_x": 0.9, "attitude_omega_y": 0.4, "attitude_omega_z": -0.7}
     example_span = 20.0
 

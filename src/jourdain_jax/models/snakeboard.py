@@ -48,12 +48,8 @@ class Snakeboard(Scene):
         return {
             "board": RigidBody(self.mass, _about_z(self.board_inertia), middle, board, self.half_length * _BOARD),
             "rotor": RigidBody(nothing, _about_z(self.rotor_inertia), middle, board @ rot_z(q.rotor), self.half_length * _ROTOR),
-            "front": RigidBody(
-                nothing, _about_z(self.wheel_inertia), middle + reach, board @ rot_z(q.steer), self.half_length * _AXLE
-            ),
-            "back": RigidBody(
-                nothing, _about_z(self.wheel_inertia), middle - reach, board @ rot_z(-q.steer), self.half_length * _AXLE
-            ),
+            "front": RigidBody(nothing, _about_z(self.wheel_inertia), middle + reach, board @ rot_z(q.steer), self.half_length * _AXLE),
+            "back": RigidBody(nothing, _about_z(self.wheel_inertia), middle - reach, board @ rot_z(-q.steer), self.half_length * _AXLE),
         }
 
     def loads(self, motion):

@@ -27,9 +27,7 @@ class Suslov(Scene):
 
     coordinates = coordinates(quaternion("attitude"))
     privileged = ("attitude_omega_x", "attitude_omega_y")
-    conventions = (
-        "Fixed point at the origin; attitude takes body to space; i13 is the entry of the matrix, minus the integral of x z."
-    )
+    conventions = "Fixed point at the origin; attitude takes body to space; i13 is the entry of the matrix, minus the integral of x z."
     example = {"attitude_omega_x": 0.6, "attitude_omega_y": 0.8}
     example_span = 10.0
 

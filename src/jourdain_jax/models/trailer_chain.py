@@ -83,8 +83,7 @@ class TrailerChain(Scene):
         tongues = jnp.append(0.0, self._per_trailer(self.length))
         places = [jnp.stack([q[f"x{i}"], q[f"y{i}"], jnp.zeros_like(q.x0)]) for i in range(self.trailers + 1)]
         return {
-            _name(i): RigidBody(masses[i], moments[i] * jnp.ones(3), place, rot_z(q[f"heading{i}"]), _outline(tongues[i]))
-            for i, place in enumerate(places)
+            _name(i): RigidBody(masses[i], moments[i] * jnp.ones(3), place, rot_z(q[f"heading{i}"]), _outline(tongues[i])) for i, place in enumerate(places)
         }
 
     def coordinate_rates(self, t, q, u):

@@ -36,6 +36,16 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         """As the wrapped solver."""
         return self.solver.term_compatible_contr_kwargs
 
+    @property
+    def root_finder(self):
+        """As the wrapped solver, where it is implicit."""
+        return self.solver.root_finder
+
+    @property
+    def root_find_max_steps(self):
+        """As the wrapped solver, where it is implicit."""
+        return self.solver.root_find_max_steps
+
     def order(self, terms):
         """As the wrapped solver."""
         return self.solver.order(terms)

@@ -12,8 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
+from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.motion import results
-from jourdain_jax.motion.simulate import saved_times, simulate
+from jourdain_jax.motion.simulate import lost_codes, simulate, state_form
+from jourdain_jax.motion.span import saved_times
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.motion.trajectory import Trajectory
@@ -29,6 +31,7 @@ class Rollout(eqx.Module):
     """Many motions of one scene: a `Trajectory` whose arrays have a leading axis of lanes."""
 
     lanes: Trajectory
+    continued: tuple[int, ...] = eqx.field(static=True, default=())  # lanes that lost their privileged speeds and were run again with the full state
 
     def __len__(self) -> int:
         return self.lanes.q.shape[0]
@@ -77,6 +80,8 @@ class Rollout(eqx.Module):
             elif code != results.SUCCESS:
                 named = ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
             lines.append(f"  {lanes.size} {message}{named}")
+        if self.continued:
+            lines.append(f"  {len(self.continued)} left the domain of their privileged speeds and were run with the full state")
         steps = np.asarray(self.lanes.accepted)
         lines.append(f"  steps accepted: {steps.min()} to {steps.max()}, median {int(np.median(steps))}")
         return "\n".join(lines)
@@ -106,6 +111,7 @@ def rollout(
     chunk = _chunk(scene, count, chunk, options)
     if options.get("ts") is not None:
         options["ts"] = saved_times(options["ts"])
+    options = {"batch": True} | options
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, fixed, varied, parameters))):
         return Rollout(_together(scene, fixed, options, varied, parameters))  # being differentiated or batched: one piece, no host loop
     pieces = []
@@ -117,7 +123,36 @@ def rollout(
         pieces.append(jax.tree.map(lambda x, kept=kept: np.asarray(x)[:kept], piece))
         bar.update(kept)
     bar.close()
-    return Rollout(jax.tree.map(lambda *parts: jnp.asarray(np.concatenate(parts)), *pieces))
+    lanes = jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
+    lost = _lost(scene, lanes, options)
+    for first in range(0, len(lost), chunk):
+        index = lost[np.minimum(np.arange(first, first + min(chunk, _round_up(len(lost)))), len(lost) - 1)]
+        again = _together(scene, fixed, options | {"state": "full", "lowering": False}, *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+        lanes = _replaced(lanes, again, index)
+    return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(lost.tolist()))
+
+
+def _lost(scene: Scene, lanes: Trajectory, options: dict) -> np.ndarray:
+    """Lanes that another form of the state may bring to their end."""
+    if options.get("state", "auto") != "auto":
+        return np.zeros(0, int)
+    how = {name: options[name] for name in ("reduction", "stabilisation", "projection", "work", "lowering") if name in options}
+    form = state_form(scene, structure_of(scene), **how)
+    return np.flatnonzero(np.isin(lanes.result, lost_codes(form))) if form.name == "minimal" else np.zeros(0, int)
+
+
+def _round_up(count: int) -> int:
+    """The next power of two, at least 8: few programs to compile."""
+    return max(8, 1 << (count - 1).bit_length())
+
+
+def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajectory:
+    """`lanes` with those at `index` from another run."""
+    leaves, treedef = jax.tree.flatten(lanes)
+    new = [np.array(x) for x in leaves]
+    for old, y in zip(new, jax.tree.leaves(again), strict=True):
+        old[index] = np.asarray(y)
+    return jax.tree.unflatten(treedef, new)
 
 
 @eqx.filter_jit
@@ -128,9 +163,14 @@ def _together(scene, fixed, options, varied, parameters) -> Trajectory:
         own = scene.replace(**parameters) if parameters else scene
         if isinstance(varied, State):
             return simulate(own, varied, **options)
-        return simulate(own, consistent_start(own, t0=options.get("t0", 0.0), **fixed, **varied), **options)
+        return simulate(own, consistent_start(own, t0=_first_time(options), **fixed, **varied), **options)
 
     return jax.vmap(lane)(varied, parameters)
+
+
+def _first_time(options: dict):
+    t0, ts = options.get("t0"), options.get("ts")
+    return t0 if t0 is not None else 0.0 if ts is None else ts[0]
 
 
 def _lanes(scene: Scene, starts, parameters: dict):

@@ -7,10 +7,9 @@ domain and the rows are linear or affine; otherwise the full one (coordinates an
 import warnings
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Number
 from jourdain_jax.equations.accelerations import Baumgarte, as_reduction
@@ -23,14 +22,13 @@ from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion import results
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import Options, integrate
+from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
-from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.motion.state_form import StateForm, default_reduction
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
-DEFAULT_SAMPLES = 201
 LARGEST_UNROLLED = 150  # operations of a program whose stages are written out one after another
 _STATE_FORMS = ("auto", "minimal", "full")
 
@@ -39,7 +37,7 @@ def simulate(
     scene: Scene,
     start=None,
     *,
-    t0: Number = 0.0,
+    t0: Number | None = None,
     t1: Number | None = None,
     ts=None,
     saveat: diffrax.SaveAt | None = None,
@@ -67,8 +65,8 @@ def simulate(
 
     **Arguments**
     - `start`: a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
-    - `t0`, `t1`: ends of the span (s; defaults: 0 and the scene's `example_span` after it); `ts`: times to save at (default: 201 even ones), which
-      alone set the span. `saveat`: a `diffrax.SaveAt` instead.
+    - `t0`, `t1`: ends of the span (s; defaults: the time of a `State`, otherwise the first of `ts` or 0; the last of `ts`, or the scene's
+      `example_span` after t0); `ts`: times to save at (default: 201 even ones). `saveat`: a `diffrax.SaveAt` instead.
     - `rtol`, `atol`, `solver`, `stepsize_controller`, `dt0` (default: 1e-4 of the span), `adjoint`, `max_steps`: as in
       `diffrax.diffeqsolve`. Default solver: Tsit5 for
       rtol >= 1e-6, Dopri8 below. Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`
@@ -87,7 +85,8 @@ def simulate(
     **Raises** ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` where the adjoint does not
     support the mode of differentiation.
     """
-    start, t0, ts, t1 = _span_and_start(scene, start, t0, t1, ts)
+    start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts)
+    _check_adjoint(adjoint)
     structure = structure_of(scene)
     form = state_form(scene, structure, state, reduction, stabilisation, projection, work, lowering, batch)
     _warn_float32(start.q.dtype, rtol)
@@ -104,7 +103,7 @@ def simulate(
         event_names=event_names(scene) if events else (),
     )
     inputs = as_inputs(scene, inputs)
-    start = consistent(scene, t0, start.q, start.u, inputs(t0)) if projection else start
+    start = _on_constraints(scene, t0, start, inputs(t0)) if projection else start
     motion = integrate(scene, start, inputs, t0, t1, ts, form, options)
     if state == "auto" and not isinstance(motion.result, jax.core.Tracer) and int(motion.result) in lost_codes(form):
         # the motion left the domain in which the partition was found to serve
@@ -113,45 +112,25 @@ def simulate(
     return motion
 
 
-def _span_and_start(scene, start, t0, t1, ts):
-    real = jnp.result_type(float)
-    if ts is not None:
-        ts = saved_times(ts)
-        t1 = ts[-1] if t1 is None else t1
-    elif t1 is None:
-        t1 = t0 + scene.example_span
-    if start is None:
-        start = dict(scene.example)
-    if isinstance(start, dict):
-        start = consistent_start(scene, t0=t0, **start)
-    if not isinstance(start, State):
-        raise ValueError(f"`start` is a {type(start).__name__}, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None")
-    if start.q.ndim != 1:
-        raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
-    t0, t1 = jnp.asarray(t0, real), jnp.asarray(t1, real)
-    known = not isinstance(t0, jax.core.Tracer) and not isinstance(t1, jax.core.Tracer)
-    if known and (not (np.isfinite(t0) and np.isfinite(t1)) or t0 == t1):
-        raise ValueError(f"the span from t0 = {t0} to t1 = {t1} s is empty or not finite; give a finite `t1` different from `t0`")
-    ts = t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, DEFAULT_SAMPLES) if ts is None else ts
-    return start, t0, ts, t1
-
-
-def saved_times(ts) -> Float[Array, "times"]:
-    """Times to save at, as an array; a ValueError where they are no monotonic vector of finite numbers."""
-    ts = jnp.asarray(ts, jnp.result_type(float))
-    if ts.ndim != 1 or ts.shape[0] == 0:
-        raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
-    if not isinstance(ts, jax.core.Tracer):
-        steps = np.diff(np.asarray(ts))
-        if not np.all(np.isfinite(np.asarray(ts))) or not (np.all(steps > 0) or np.all(steps < 0)):
-            raise ValueError("`ts` must be finite and strictly increasing (or decreasing, for reversed time); sort it and drop repeated times")
-    return ts
-
-
 def _checked_saveat(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
     if not isinstance(saveat.subs, diffrax.SubSaveAt) or saveat.subs.fn is not diffrax.SubSaveAt(t1=True).fn or saveat.dense:
         raise ValueError("`saveat` must be a plain `diffrax.SaveAt(t0=, t1=, ts=, steps=)`: a trajectory holds whole states; take what you need from it")
     return saveat
+
+
+def _check_adjoint(adjoint) -> None:
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "`adjoint` is a diffrax.BacksolveAdjoint, which solves the motion backwards: it leaves the constraints and loses digits; use "
+            "diffrax.RecursiveCheckpointAdjoint() (the default), diffrax.ForwardMode() or diffrax.DirectAdjoint()"
+        )
+
+
+def _on_constraints(scene: Scene, t0, start: State, inputs) -> State:
+    """The start on the constraints, with how far it has moved in all, when it was made included."""
+    state = consistent(scene, t0, start.q, start.u, inputs)
+    moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
+    return eqx.tree_at(lambda s: (s.moved_q, s.moved_u), state, tuple(moved))
 
 
 def _warn_float32(dtype, rtol) -> None:
@@ -162,7 +141,9 @@ def _warn_float32(dtype, rtol) -> None:
         )
 
 
-def state_form(scene: Scene, structure: Structure, state="auto", reduction=None, stabilisation=None, projection=True, work=True, lowering=True, batch=False) -> StateForm:
+def state_form(
+    scene: Scene, structure: Structure, state="auto", reduction=None, stabilisation=None, projection=True, work=True, lowering=True, batch=False
+) -> StateForm:
     """How the scene's state is integrated, given what was asked."""
     if state not in _STATE_FORMS:
         raise ValueError(f"unknown state form `{state}`; {nearest(state, _STATE_FORMS)}")
@@ -189,7 +170,7 @@ def state_form(scene: Scene, structure: Structure, state="auto", reduction=None,
 def lost_codes(form: StateForm) -> tuple[int, ...]:
     """Result codes after which another form of the state may do better."""
     guarded = form.lowered is not None and (form.lowered.guards or form.lowered.pivots)
-    return (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL, results.NOT_FINITE) if guarded else (results.SINGULAR_PARTITION,)
+    return (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL) if guarded else (results.SINGULAR_PARTITION,)
 
 
 def _needs_work(scene: Scene, structure: Structure) -> bool:

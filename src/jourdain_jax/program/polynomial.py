@@ -5,6 +5,7 @@ terms are gathered by their varying part, whose coefficient (a polynomial in par
 factors are taken out greedily (Horner's scheme in several variables).
 """
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping
 
@@ -125,9 +126,9 @@ class NormalForms:
         if len(p) == 2:
             (small, c), (large, d) = sorted(p.items(), key=lambda item: len(item[0]))
             extra = list(large)
-            if c == -d and all(a in extra and not extra.remove(a) for a in small) and len(extra) == 2 and extra[0] == extra[1]:
-                if self.graph.op[extra[0]] == self._square_into:
-                    return [self.graph.call(self._square_of, self.graph.args[extra[0]][0])], {small: c}
+            inside = c == -d and all(a in extra and not extra.remove(a) for a in small) and len(extra) == 2 and extra[0] == extra[1]
+            if inside and self.graph.op[extra[0]] == self._square_into:
+                return [self.graph.call(self._square_of, self.graph.args[extra[0]][0])], {small: c}
         return None
 
     def _magnitude(self, node: int) -> Polynomial:
@@ -173,7 +174,7 @@ class NormalForms:
         for m, a in p.items():
             for n, b in q.items():
                 monomial = self._cancelled(tuple(sorted(m + n))) if m and n else m or n
-                square = next((x for x, y in zip(monomial, monomial[1:], strict=False) if x == y and x in self._squares), None)
+                square = next((x for x, y in itertools.pairwise(monomial) if x == y and x in self._squares), None)
                 if square is None:
                     _put(result, monomial, a * b)
                 else:
@@ -215,18 +216,18 @@ class NormalForms:
         return gathered
 
     def quotient(self, p: Polynomial, q: Polynomial) -> int:
-        """A node for p/q. What all varying terms of q have in common is cancelled term by term."""
+        """A node for p/q. What all terms of q have in common is cancelled term by term."""
         graph = self.graph
         if not p:
             return graph.zero
-        parts = self._gathered(q)
-        common = list(min(parts, key=len))
-        for varying in parts:
-            common = [x for k, x in enumerate(common) if common[: k + 1].count(x) <= varying.count(x)]
+        common = list(min(q, key=len))
+        for monomial in q:
+            common = [x for k, x in enumerate(common) if common[: k + 1].count(x) <= monomial.count(x)]
+        scale = next(iter(q.values()))
+        rest = {m: c / scale for m, c in q.items()}
+        p = {m: c / scale for m, c in p.items()}
         for atom in common:
             p = self.product(p, self._inverse_atom(atom))
-        rest = {m: c for m, c in q.items()}
-        for atom in common:
             rest = {_without(m, atom): c for m, c in rest.items()}
         divisor = self.rebuilt(rest)
         return graph.div(self.rebuilt(p), divisor) if graph.varies[divisor] else self.rebuilt(p, None if divisor == graph.one else divisor)

@@ -226,6 +226,12 @@ def _triangular_solve(equation, A, b):
     return np.where(singular, np.nan, x)
 
 
+def _iota(equation, *dynamic):
+    shape, axis = equation.params["shape"], equation.params["dimension"]
+    along = [-1 if i == axis else 1 for i in range(len(shape))]
+    return np.broadcast_to(np.arange(shape[axis], dtype=equation.params["dtype"]).reshape(along), shape)
+
+
 def _reduced(function: Callable, of_nothing=None) -> Callable:
     def reduced(equation, x):
         start = {} if of_nothing is None or x.dtype.kind != "f" else {"initial": of_nothing}
@@ -250,10 +256,7 @@ _RULES: dict[str, Callable] = {
     "dynamic_update_slice": _dynamic_update_slice,
     "select_n": lambda e, which, *cases: np.where(np.asarray(which, bool), cases[1], cases[0]) if len(cases) == 2 else np.choose(which, cases),
     "integer_pow": lambda e, x: np.asarray(x ** e.params["y"] if e.params["y"] >= 0 else 1 / x ** -e.params["y"]),
-    "iota": lambda e: np.broadcast_to(
-        np.arange(e.params["shape"][e.params["dimension"]], dtype=e.params["dtype"]).reshape([-1 if i == e.params["dimension"] else 1 for i in range(len(e.params["shape"]))]),
-        e.params["shape"],
-    ),
+    "iota": _iota,
     "pad": _pad,
     "svd": _svd,
     "cholesky": _cholesky,

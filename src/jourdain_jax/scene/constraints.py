@@ -41,9 +41,7 @@ def pin(a: Vector, b: Vector, *, axes: str = "xyz") -> Float[Array, "axes"]:
     return (as_real(b) - as_real(a))[jnp.array(["xyz".index(axis) for axis in axes])]
 
 
-def weld(
-    first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_second=(0.0, 0.0, 0.0), turn=None
-) -> Float[Array, "6"]:
+def weld(first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_second=(0.0, 0.0, 0.0), turn=None) -> Float[Array, "6"]:
     """Geometric rows (6,) of a weld of two bodies `first`, `second` (`pose["name"]`).
 
     The points `at_first`, `at_second` (m, body frames, from the mass centres) coincide, and `R_second = R_first turn` (`turn`: (3, 3), the

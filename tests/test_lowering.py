@@ -1,0 +1,168 @@
+"""What lowering does to a scene, what it says where it does not, and derivatives through the program.
+
+That its numbers are those of the dense path, for every model, is tested in `test_every_model`.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from baselines.hand_derived import HAND_DERIVED, operations
+
+import jourdain_jax as jj
+from jourdain_jax.equations.minimal import speeds_from_privileged
+from jourdain_jax.lowering import lower as module
+from jourdain_jax.lowering.lower import lowered
+from jourdain_jax.models import MODELS
+from jourdain_jax.motion import results
+
+HAND = [name for name in HAND_DERIVED if name != "skate"]  # the skate has no privileged speeds that serve at every heading
+
+
+@pytest.mark.parametrize("name", HAND)
+def test_the_program_is_nearly_as_short_as_the_equations_by_hand(name):
+    assert jj.lower(MODELS[name]()).operations <= 1.5 * operations(name)
+
+
+def test_the_bicycle_takes_no_more_than_2500_operations():
+    assert jj.lower(MODELS["whipple-bicycle"]()).operations <= 2500
+
+
+def test_the_summary_says_what_was_dropped_and_chosen():
+    text = str(jj.lower(MODELS["tilting-disc"]()))
+    for part in ("privileged speeds: yaw_rate, lean_rate, spin_rate", "eliminated: x_rate, y_rate", "x, y, yaw, spin", "operations"):
+        assert part in text
+
+
+def test_the_readable_source_computes_the_rates():
+    scene = MODELS["tilting-disc"]()
+    program = jj.lower(scene)
+    scope: dict = {}
+    exec(program.python_source(), scope)
+    t, q, u = (x[0] for x in jj.sample_states(scene, 1))
+    y = u[list(program.independent)]
+    found = scope["rates"](scope["fixed"](*(float(x) for x in jax.tree.leaves(scene))), t, *q, *y)
+    udot = jj.accelerations(scene, t, q, u).udot
+    np.testing.assert_allclose(found, [*u, *udot[jnp.array(program.independent)]], rtol=1e-12, atol=1e-12)
+    assert "void rates(" in program.c_source()
+
+
+def test_expressions_and_latex_are_there_for_small_scenes():
+    pytest.importorskip("sympy")
+    program = jj.lower(MODELS["two-wheel-axle-coordinates"]())
+    found = program.expressions()
+    assert found["d_phi_rate"] == 0
+    assert {"phi", "gravity", "slope"} <= {str(s) for s in found["d_psi1_rate"].free_symbols}
+    assert r"\dot{" in program.latex()
+
+
+class Steered(jj.Scene):
+    """A point driven by a control law that iterates: no scalar form."""
+
+    mass: jnp.ndarray = jj.parameter(1.0, positive=True)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"point": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        newton = lambda v: v - (v**3 + v - motion.q.x) / (3 * v * v + 1)  # noqa: E731
+        root = jax.lax.while_loop(lambda v: jnp.abs(newton(v) - v) > 1e-12, newton, jnp.zeros_like(motion.q.x))
+        return (jj.generalized_force(motion, x_rate=-root),)
+
+
+class Mistaken(Steered):
+    """A spring force whose own derivative rule is wrong: the dense path believes the rule."""
+
+    def bodies(self, t, q):
+        return {"point": jj.Particle(self.mass, jnp.stack([_half_believed(q.x), 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return ()
+
+
+@jax.custom_jvp
+def _half_believed(x):
+    return jnp.sin(x)
+
+
+@_half_believed.defjvp
+def _half_believed_jvp(primals, tangents):
+    return jnp.sin(primals[0]), _wrong_slope(primals[0]) * tangents[0]
+
+
+@jax.custom_jvp
+def _wrong_slope(x):
+    return jnp.cos(x)
+
+
+@_wrong_slope.defjvp
+def _wrong_slope_jvp(primals, tangents):
+    return jnp.cos(primals[0]), 3.0 * tangents[0]
+
+
+def test_a_scene_without_scalar_form_runs_and_the_report_says_why():
+    scene = Steered()
+    with pytest.raises(jj.NotLowered, match="`Steered` is not lowered: the operation `while` has no scalar form"):
+        jj.lower(scene)
+    assert jj.report(scene).lowering.startswith("not lowered: the operation `while`")
+    motion = jj.simulate(scene, {"x": 1.0}, t1=1.0)
+    assert int(motion.result) == results.SUCCESS
+
+
+def test_a_scene_whose_program_differs_from_the_dense_path_is_not_lowered_and_the_rate_is_named():
+    with pytest.raises(jj.NotLowered, match=r"the rate of `x_rate` differs from the dense path by .*: a body, load or row has a derivative of its own"):
+        jj.lower(Mistaken())
+
+
+def test_a_program_that_grows_past_the_budget_is_not_lowered(monkeypatch):
+    monkeypatch.setattr(module, "MOST_OPERATIONS", 50)
+    module._lowered.cache_clear()
+    found = lowered(MODELS["rattleback"]())
+    module._lowered.cache_clear()
+    assert isinstance(found, jj.NotLowered)
+    assert "more than 50" in str(found)
+
+
+def test_derivatives_through_the_program_agree_with_the_dense_path_in_first_and_second_order():
+    scene = MODELS["tilting-disc"]()
+    program = jj.lower(scene)
+    t, q, u = (x[0] for x in jj.sample_states(scene, 1))
+    independent = np.array(program.independent)
+
+    def by_program(x):
+        own = scene.replace(mass=x[0], radius=x[1], gravity=x[2])
+        qdot, ydot, _ = program.rates(program.fixed_values(own), t, list(x[3:8]), list(x[8:]), jnp.zeros(0))
+        return jnp.sin(jnp.stack([*qdot, *ydot])).sum()
+
+    def dense(x):
+        own = scene.replace(mass=x[0], radius=x[1], gravity=x[2])
+        u = speeds_from_privileged(own, program.independent, t, x[3:8], x[8:])
+        return jnp.sin(jnp.concatenate([jj.coordinate_rates(own, t, x[3:8], u), jj.accelerations(own, t, x[3:8], u).udot[independent]])).sum()
+
+    x = jnp.concatenate([jnp.array([1.1, 0.4, 9.7]), q, u[independent]])
+    direction = jnp.asarray(np.random.default_rng(0).normal(size=x.shape))
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(*(jax.jit(derivative(f))(x) for f in (by_program, dense)), rtol=1e-10, atol=1e-10)
+    second = [jax.jit(lambda x, f=f: jax.jvp(jax.grad(f), (x,), (direction,))[1])(x) for f in (by_program, dense)]
+    np.testing.assert_allclose(*second, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["tilting-disc", "ball-on-turntable"])
+def test_the_lowered_motion_is_the_dense_one(name):
+    scene = MODELS[name]()
+    options = {"t1": 2.0, "rtol": 1e-10, "atol": 1e-10}
+    program, dense = jj.simulate(scene, **options), jj.simulate(scene, lowering=False, **options)
+    assert int(program.result) == int(dense.result) == results.SUCCESS
+    np.testing.assert_allclose(program.q, dense.q, atol=1e-8)
+    np.testing.assert_allclose(program.u, dense.u, atol=1e-7)
+    if dense.work is not None:
+        np.testing.assert_allclose(program.work, dense.work, atol=1e-8)
+
+
+def test_a_batch_written_for_batches_is_the_same_motion():
+    scene = MODELS["tilting-disc"]()
+    leans = np.linspace(0.1, 0.4, 3)
+    lanes = jj.rollout(scene, {"lean": leans, "spin_rate": -3.0}, t1=1.0, rtol=1e-10, atol=1e-10)
+    alone = jj.simulate(scene, {"lean": leans[1], "spin_rate": -3.0}, t1=1.0, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(lanes.lanes.q[1], alone.q, atol=1e-9)

@@ -1,0 +1,231 @@
+"""The scalar program: graph, derivatives, normal forms, values, code."""
+
+import itertools
+import math
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jourdain_jax.program.derivative import derivatives
+from jourdain_jax.program.emit import run, sine_and_cosine
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.interpret import Nodes, Unsupported, as_nodes, interpret
+from jourdain_jax.program.polynomial import NormalForms, TooLarge
+from jourdain_jax.program.source import PYTHON, C, statements, sympy_expressions
+from jourdain_jax.program.uncompiled import uncompiled
+
+
+@pytest.fixture
+def graph():
+    return Graph()
+
+
+def _x(graph, *names):
+    return [graph.input(name, True) for name in names]
+
+
+def test_equal_expressions_are_one_node(graph):
+    x, y = _x(graph, "x", "y")
+    assert graph.mul(x, y) == graph.mul(y, x)
+    assert graph.add(graph.mul(x, y), x) == graph.add(x, graph.mul(y, x))
+
+
+def test_what_is_known_while_building_is_folded(graph):
+    (x,) = _x(graph, "x")
+    two = graph.const(2.0)
+    assert graph.mul(graph.zero, x) == graph.zero
+    assert graph.add(graph.zero, x) == x
+    assert graph.mul(graph.one, x) == x
+    assert graph.sub(x, x) == graph.zero
+    assert graph.add(x, graph.neg(x)) == graph.zero
+    assert graph.value[graph.call("sqrt", graph.mul(two, two))] == 2.0
+    assert graph.call("sin", graph.neg(x)) == graph.neg(graph.call("sin", x))
+    assert graph.call("cos", graph.neg(x)) == graph.call("cos", x)
+    assert graph.sub(graph.sub(x, two), x) == graph.neg(two)
+    root = graph.call("sqrt", x)
+    assert graph.mul(root, root) == x
+
+
+def test_only_operations_on_varying_quantities_count(graph):
+    (x,) = _x(graph, "x")
+    a = graph.input("a", False)
+    y = graph.add(graph.mul(graph.mul(a, a), x), graph.call("sin", x))
+    assert graph.operations([y]) == 3
+
+
+def test_a_reciprocal_that_serves_once_is_one_division(graph):
+    x, y = _x(graph, "x", "y")
+    once = graph.mul(x, graph.div(graph.one, y))
+    assert graph.operations(graph.with_quotients([once])) == 1
+    twice = [once, graph.mul(graph.add(x, graph.one), graph.div(graph.one, y))]
+    assert graph.operations(graph.with_quotients(twice)) == graph.operations(twice)
+
+
+FUNCTIONS = {
+    "smooth": lambda x, y: jnp.stack([jnp.sin(x) * jnp.exp(-y) + x / (1 + y * y), jnp.sqrt(1 + x * x) * jnp.tanh(y), jnp.arctan2(x, y) ** 3]),
+    "kinked": lambda x, y: jnp.stack([jnp.abs(x) * y, jnp.maximum(x, y) - jnp.minimum(x, y), jnp.where(x > y, x * x, y)]),
+    "matrices": lambda x, y: (jnp.array([[1.0, x], [y, 2.0]]) @ jnp.stack([x, y]))[::-1].at[0].add(y).at[1].set(x * y),
+    "powers": lambda x, y: jnp.stack([x**3, y**-2, jnp.prod(jnp.stack([x, y]))]),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_traced_function_and_its_derivative_are_those_of_jax(graph, name):
+    f = FUNCTIONS[name]
+    x, y = _x(graph, "x", "y")
+    (found,) = interpret(graph, jax.make_jaxpr(f)(1.0, 1.0), [Nodes(x), Nodes(y)])
+    nodes = np.ravel(as_nodes(graph, found)).tolist()
+    dots = derivatives(graph, nodes, {x: graph.const(0.3), y: graph.const(-1.7)})
+    points = np.random.default_rng(0).uniform(0.2, 2.0, (2, 20)) * [[1], [-1]]
+    probes = Probes(graph, {"x": points[0], "y": points[1]})
+    value, dot = jax.vmap(lambda x, y: jax.jvp(f, (x, y), (0.3, -1.7)))(*points)
+    np.testing.assert_allclose(probes(nodes).T, value, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(probes(dots).T, dot, rtol=1e-12, atol=1e-12)
+
+
+def test_an_operation_without_scalar_form_is_named(graph):
+    (x,) = _x(graph, "x")
+    with pytest.raises(Unsupported, match="while"):
+        interpret(graph, jax.make_jaxpr(lambda x: jax.lax.while_loop(lambda v: v < 10.0, lambda v: 2 * v, x))(1.0), [Nodes(x)])
+    with pytest.raises(Unsupported, match="depends on the state"):
+        interpret(graph, jax.make_jaxpr(lambda x: jnp.arange(3.0)[jnp.int32(x)])(1.0), [Nodes(x)])
+
+
+# Normal forms.
+
+
+def test_sines_and_cosines_are_reduced(graph):
+    x, y = _x(graph, "x", "y")
+    s, c = graph.call("sin", x), graph.call("cos", x)
+    forms = NormalForms(graph, 100)
+    total = graph.add(graph.mul(s, graph.mul(s, y)), graph.mul(c, graph.mul(c, y)))
+    assert forms.simplified(total) == y
+    difference = graph.sub(graph.mul(graph.add(x, y), graph.add(x, y)), graph.add(graph.mul(x, x), graph.mul(y, y)))
+    assert graph.operations([forms.simplified(difference)]) <= 3
+
+
+def test_a_root_of_a_square_is_a_magnitude_and_a_known_sign_a_guard(graph):
+    (x,) = _x(graph, "x")
+    s, c = graph.call("sin", x), graph.call("cos", x)
+    root = graph.call("sqrt", graph.sub(graph.one, graph.mul(s, s)))
+    assert NormalForms(graph, 100).simplified(root) == graph.call("abs", c)
+    probes = Probes(graph, {"x": np.linspace(-1.0, 1.0, 20)})
+    forms = NormalForms(graph, 100, sign=probes.sign)
+    assert forms.simplified(root) == c
+    assert forms.guards == {c}
+
+
+def test_coefficients_of_parameters_are_gathered(graph):
+    (x,) = _x(graph, "x")
+    a, b = graph.input("a", False), graph.input("b", False)
+    expression = graph.add(graph.mul(a, x), graph.add(graph.mul(b, x), graph.mul(graph.mul(a, b), x)))
+    assert graph.operations([NormalForms(graph, 100).simplified(expression)]) == 1
+
+
+def test_determinants_cancel_what_is_common(graph):
+    x, y = _x(graph, "x", "y")
+    a = graph.input("a", False)
+    c = graph.call("cos", x)
+    M = [[graph.mul(a, graph.mul(c, c)), graph.zero], [graph.zero, a]]
+    first, second = NormalForms(graph, 100).cramer(M, [graph.mul(a, graph.mul(c, y)), graph.mul(a, y)])
+    assert second == y
+    probes = Probes(graph, {"x": np.array([0.3]), "y": np.array([2.0]), "a": np.array([7.0])})
+    np.testing.assert_allclose(probes([first])[0], 2.0 / np.cos(0.3), rtol=1e-14)
+    assert graph.operations([first]) <= 3
+
+
+def test_an_expansion_that_grows_is_left_alone(graph):
+    names = _x(graph, *"abcdefgh")
+    product = graph.one
+    for first, second in itertools.pairwise(names):
+        product = graph.mul(product, graph.add(first, graph.mul(second, second)))
+    forms = NormalForms(graph, 20)
+    with pytest.raises(TooLarge):
+        forms.expanded(product)
+    assert forms.simplified(product) == product
+
+
+# Values and code.
+
+
+def test_sine_and_cosine_are_right_to_the_last_digits():
+    mpmath = pytest.importorskip("mpmath")
+    x = np.concatenate([np.random.default_rng(0).uniform(-1e3, 1e3, 400), np.arange(-20, 21) * (np.pi / 4), [0.0, 1e-300, 1e-9, 1e5]])
+    s, c = jax.jit(sine_and_cosine)(x)
+    exact = np.array([[float(mpmath.sin(mpmath.mpf(v))), float(mpmath.cos(mpmath.mpf(v)))] for v in x])
+    assert np.max(np.abs(np.stack([s, c], 1) - exact)) < 2.3e-16
+    assert np.isnan(sine_and_cosine(jnp.inf)[0])
+
+
+def test_sine_and_cosine_differentiate_to_second_order_in_both_modes():
+    for f, first, second in (
+        (lambda x: sine_and_cosine(x)[0], np.cos, lambda x: -np.sin(x)),
+        (lambda x: sine_and_cosine(x)[1], lambda x: -np.sin(x), lambda x: -np.cos(x)),
+    ):
+        for x in (0.0, 1.3, -40.0):
+            np.testing.assert_allclose(jax.grad(f)(x), first(x), atol=3e-16)
+            np.testing.assert_allclose(jax.jacfwd(jax.grad(f))(x), second(x), atol=3e-16)
+            np.testing.assert_allclose(jax.grad(jax.grad(f))(x), second(x), atol=3e-16)
+
+
+def _example(graph):
+    x, y = _x(graph, "x", "y")
+    a = graph.input("a", False)
+    r = graph.call("sqrt", graph.add(graph.mul(x, x), graph.const(1.0)))
+    first = graph.sub(graph.div(graph.mul(a, graph.call("sin", x)), r), graph.sub(y, graph.mul(graph.neg(x), r)))
+    second = graph.call("select", graph.call("gt", x, y), graph.call("max", x, r), graph.neg(graph.call("abs", y)))
+    return {"x": x, "y": y, "a": a}, [first, second]
+
+
+VALUES = {"x": 0.7, "y": -1.3, "a": 2.5}
+
+
+def test_jax_code_python_c_and_sympy_say_the_same(graph, tmp_path):
+    pytest.importorskip("sympy")
+    names, outputs = _example(graph)
+    expected = Probes(graph, {k: np.array([v]) for k, v in VALUES.items()})(outputs)[:, 0]
+    np.testing.assert_allclose(run(graph, outputs, {n: jnp.asarray(VALUES[k]) for k, n in names.items()}), expected, rtol=1e-15)
+    lines, last = statements(graph, outputs, {n: k for k, n in names.items()}, PYTHON)
+    scope = {"math": math}
+    exec("def f(x, y, a):\n" + "\n".join([*lines, f"    return {', '.join(last)}"]), scope)
+    np.testing.assert_allclose(scope["f"](**VALUES), expected, rtol=1e-15)
+    symbols = sympy_expressions(graph, outputs, {n: k for k, n in names.items()})
+    np.testing.assert_allclose([float(e.subs(VALUES)) for e in symbols], expected, rtol=1e-14)
+    lines, last = statements(graph, outputs, {n: k for k, n in names.items()}, C)
+    body = "\n".join([*lines, *(f'    printf("%.17g\\n", {e});' for e in last)])
+    source = f"#include <math.h>\n#include <stdio.h>\nint main(void) {{ const double x = 0.7, y = -1.3, a = 2.5;\n{body}\n return 0; }}\n"
+    (tmp_path / "f.c").write_text(source)
+    try:
+        subprocess.run(["cc", str(tmp_path / "f.c"), "-o", str(tmp_path / "f"), "-lm"], check=True, capture_output=True)
+    except FileNotFoundError:
+        pytest.skip("no C compiler")
+    out = subprocess.run([str(tmp_path / "f")], check=True, capture_output=True, text=True).stdout
+    np.testing.assert_allclose([float(v) for v in out.split()], expected, rtol=1e-14)
+
+
+def test_a_function_run_uncompiled_gives_what_jax_gives():
+    def f(A, x):
+        U, s, V = jnp.linalg.svd(A, full_matrices=False)
+        L = jnp.linalg.cholesky(A @ A.T + jnp.eye(3))
+        y = jax.lax.scan(lambda c, r: (c + r @ x, jnp.sin(c)), 0.0, A)
+        z = jax.lax.while_loop(lambda v: v[0] < 10.0, lambda v: (2 * v[0], v[1] + 1), (jnp.abs(x[0]) + 1.0, 0))
+        w = jax.scipy.linalg.solve_triangular(L, x, lower=True)
+        return (U * s) @ V, L, y, z, w, jax.lax.cond(x[0] > 0, lambda: 1.0, lambda: 2.0), jnp.max(x), jnp.argmax(x), jnp.flip(x).at[1].set(3.0)
+
+    rng = np.random.default_rng(0)
+    A, x = rng.normal(size=(3, 3)), rng.normal(size=3)
+    for found, expected in zip(jax.tree.leaves(uncompiled(f)(A, x)), jax.tree.leaves(f(A, x)), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+    batch = uncompiled(jax.vmap(f))(np.stack([A, 2 * A]), np.stack([x, -x]))
+    for found, expected in zip(jax.tree.leaves(batch), jax.tree.leaves(jax.vmap(f)(np.stack([A, 2 * A]), np.stack([x, -x]))), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-13)
+
+
+def test_a_singular_matrix_run_uncompiled_gives_nan_as_jax_does():
+    f = jax.vmap(jnp.linalg.cholesky)
+    A = np.stack([np.eye(2), -np.eye(2)])
+    np.testing.assert_array_equal(np.isnan(uncompiled(f)(A)), np.isnan(f(A)))
