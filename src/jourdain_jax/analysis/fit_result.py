@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.information import Information, hidden_combinations
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.scene import Scene
 
 
@@ -58,7 +58,7 @@ class Fit(eqx.Module):
 
     def __getitem__(self, name: str) -> Estimate:
         if name not in self.labels:
-            raise KeyError(f"`{name}` was not estimated; {nearest(name, self.labels)}")
+            raise UnknownNameError(f"`{name}` was not estimated; {nearest(name, self.labels)}")
         i = self.labels.index(name)
         return Estimate(self.values[..., i], self.standard_errors[..., i], self.low[..., i], self.high[..., i], self.units[i])
 

@@ -12,7 +12,7 @@ from jourdain_jax.motion import along, results
 from jourdain_jax.motion.diagnostics import Energies, energies_of, summary, summary_html
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.scene import Scene
 
 
@@ -51,7 +51,7 @@ class Trajectory(eqx.Module):
             if name in names.view(array):
                 return names.view(array)[name]
         valid = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries, "t")
-        raise KeyError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}")
+        raise UnknownNameError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}")
 
     @property
     def valid(self) -> Bool[Array, "times"]:

@@ -8,7 +8,7 @@ from jourdain_jax.motion import results
 from jourdain_jax.motion.rollout import Rollout
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import UnknownNameError, nearest
 
 ENERGIES = ("energy", "kinetic energy", "potential energy")
 _BANDS = ((0.025, 0.975, 0.2), (0.25, 0.75, 0.4))  # lower and upper quantile, opacity
@@ -69,7 +69,7 @@ def _values(motion: Trajectory | Rollout, name: str) -> np.ndarray:
     scene = motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
     valid = (*scene.coordinate_names.entries, *scene.speed_names.entries, *(() if many else ENERGIES))
     if name not in valid:
-        raise KeyError(f"nothing named `{name}` to plot; {nearest(name, valid)}")
+        raise UnknownNameError(f"nothing named `{name}` to plot; {nearest(name, valid)}")
     if isinstance(motion, Rollout):
         return motion.quantiles(name, _levels())
     if name in ENERGIES:

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.scene.bodies import Body, RigidBody
-from jourdain_jax.scene.names import Named, nearest
+from jourdain_jax.scene.names import Named, UnknownNameError, nearest
+from jourdain_jax.scene.numbers import as_real
 
 
 class Point(eqx.Module):
@@ -23,7 +24,7 @@ class Point(eqx.Module):
 
 def fixed_point(position) -> Point:
     """A point at rest in the inertial frame, for springs, dampers and rods."""
-    position = jnp.asarray(position, jnp.result_type(float))
+    position = as_real(position, "position of a fixed point", (3,), advice="give three components in the inertial frame, m")
     return Point(position, jnp.zeros_like(position), jnp.zeros_like(position))
 
 
@@ -50,7 +51,8 @@ class BodyPose(eqx.Module):
 
     def place(self, local) -> Float[Array, "*times 3"]:
         """Position (inertial frame) of the point with body-frame coordinates `local` (m, relative to the mass centre)."""
-        return self.position + self.orientation @ jnp.asarray(local)
+        local = as_real(local, f"point of body `{self.name}`", (3,), advice="give three components in its body frame, m")
+        return self.position + self.orientation @ local.astype(self.position.dtype)
 
 
 class BodyMotion(eqx.Module):
@@ -77,7 +79,7 @@ class BodyMotion(eqx.Module):
 
     def point(self, local=(0.0, 0.0, 0.0)) -> Point:
         """The material point with body-frame coordinates `local` (m, relative to the mass centre)."""
-        position = self.place(jnp.asarray(local, self.position.dtype))
+        position = self.place(local)
         return Point(position, self.velocity_at(position), position - self.position, self.name)
 
 
@@ -112,5 +114,5 @@ class Motion(eqx.Module):
 
 def _lookup(bodies: dict, name: str):
     if name not in bodies:
-        raise KeyError(f"no body `{name}` in this scene; {nearest(name, bodies)}")
+        raise UnknownNameError(f"no body `{name}` in this scene; {nearest(name, bodies)}")
     return bodies[name]

@@ -8,9 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jourdain_jax.scene.numbers import described
 
-def _as_leaf(value) -> Array:
-    array = jnp.asarray(value)
+
+def _as_leaf(value):
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError):
+        return value  # refused by name in `check_parameters`; a converter does not know the name
     dtype = array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else jnp.result_type(float)
     return jnp.asarray(array, dtype)  # never weakly typed, so that one trace serves defaults and other values alike
 
@@ -35,10 +40,12 @@ def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:
 def check_parameters(scene) -> None:
     """Raise a ValueError that names a parameter which is not finite or has the wrong sign; traced values are not checked."""
     for name, value, metadata in parameters_of(scene):
-        if isinstance(value, jax.core.Tracer) or not hasattr(value, "dtype"):
+        where = f"parameter `{name}` of `{type(scene).__name__}`"
+        if not hasattr(value, "dtype"):
+            raise ValueError(f"{where} is {described(value)}, expected a number{_in(metadata)} or an array of numbers")
+        if isinstance(value, jax.core.Tracer):
             continue
         numbers = np.asarray(value)
-        where = f"parameter `{name}` of `{type(scene).__name__}`"
         if not np.all(np.isfinite(numbers)):
             raise ValueError(f"{where} is {numbers}, expected finite numbers; check where it was computed")
         if metadata["positive"] and not np.all(numbers > 0):
