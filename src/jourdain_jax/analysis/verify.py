@@ -28,6 +28,7 @@ from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import equations_and_rows, kinetic_energy, newton_residual, potential_energy
 from jourdain_jax.motion.start import State
+from jourdain_jax.scene.answers import loads_of, potential_of
 from jourdain_jax.scene.scene import Scene
 
 THRESHOLDS = {"reductions": 1e-10, "forms": 1e-10, "virtual power": 1e-10, "Newton": 1e-10, "energy": 1e-9, "jvp against vjp": 1e-11, "differences": 1e-6}
@@ -207,8 +208,8 @@ def _acts_on_speeds(scene: Scene) -> bool:
 
     def look(scene):
         motion = motion_at(scene, 0.0, q, u)
-        flags.append(scene.potential(motion.pose()) is not None)
-        flags.extend(bool(load.generalized) for load in scene.loads(motion))
+        flags.append(potential_of(scene, motion.pose()) is not None)
+        flags.extend(bool(load.generalized) for load in loads_of(scene, motion))
 
     jax.eval_shape(look, scene)
     return any(flags)

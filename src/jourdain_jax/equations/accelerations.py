@@ -23,7 +23,9 @@ from jourdain_jax.equations.reductions import (
 from jourdain_jax.equations.rows import ConstraintRows, position_residual
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
+from jourdain_jax.scene.arguments import as_coordinates, as_scene, as_speeds
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
 
 
@@ -39,7 +41,7 @@ class Baumgarte(eqx.Module):
 
 def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
     """All reductions by short name, set up with the scene's privileged velocities."""
-    independent = structure_of(scene).independent
+    independent = structure_of(as_scene(scene)).independent
     return {
         "privileged": Privileged(independent),
         "qr": NullSpaceQR(),
@@ -59,6 +61,8 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
         if reduction not in known:
             raise ValueError(f"unknown reduction `{reduction}`; {nearest(reduction, known)}")
         return known[reduction]
+    if not isinstance(reduction, Reduction | GibbsAppell):
+        raise ValueError(f"`reduction` is {described(reduction)}, expected a name ({', '.join(reductions(scene))}) or an object such as `jj.NullSpaceQR()`")
     return reduction
 
 
@@ -78,6 +82,7 @@ def bare_accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, st
 
 
 def _reduced(scene: Scene, t, q, u, inputs, reduction, stabilisation) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
+    q, u = as_coordinates(scene, q), as_speeds(scene, u)
     reduction = as_reduction(scene, reduction)
     equations, rows = equations_and_rows(scene, t, q, u, inputs)
     if stabilisation is not None:

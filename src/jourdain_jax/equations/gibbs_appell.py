@@ -17,11 +17,13 @@ from jourdain_jax.equations.reductions import APPLICABLE_PIVOT, Partition, Reduc
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces
+from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.scene import Scene
 
 
 def gibbs_function(scene: Scene, t, q, u, udot) -> Float[Array, ""]:
     """G(t, q, u, udot) in kg m^2/s^4, up to terms without accelerations."""
+    q, u, udot = as_coordinates(scene, q), as_speeds(scene, u), as_speeds(scene, udot, "udot")
     velocity, bias = bias_accelerations(scene, t, q, u)
     _, partial = jax.jvp(lambda u: velocities(scene, t, q, u), (u,), (udot,))  # beta udot, gamma udot
     a, alpha, omega = bias.linear + partial.linear, bias.angular + partial.angular, velocity.angular
@@ -32,6 +34,7 @@ def gibbs_function(scene: Scene, t, q, u, udot) -> Float[Array, ""]:
 
 def gibbs_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
     """M and h as Hessian and gradient of the Gibbs function at `udot = 0`, and Q."""
+    q, u = as_coordinates(scene, q), as_speeds(scene, u)
     zero = jnp.zeros_like(u)
     h, M = _gradient_and_hessian(lambda a: gibbs_function(scene, t, q, u, a), zero)
     return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs))

@@ -27,6 +27,7 @@ from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.motion.state_form import Integrated, StateForm, default_reduction
 from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.scene.answers import events_of, loads_of
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
@@ -178,7 +179,7 @@ def _needs_work(scene: Scene, structure: Structure) -> bool:
 
     def loads(scene):
         q, u, _ = scene.named()
-        return tuple(load.potential is None for load in scene.loads(motion_at(scene, 0.0, q, u)))
+        return tuple(load.potential is None for load in loads_of(scene, motion_at(scene, 0.0, q, u)))
 
     flags: list[bool] = []
     jax.eval_shape(lambda s: flags.extend(loads(s)), scene)
@@ -217,8 +218,7 @@ def _project(t, y, args):
 @eqx.filter_jit
 def _event_values(t, y, args):
     form, scene, inputs = args
-    values = scene.events(motion_at(scene, t, y.q, form.unpack(scene, t, y, inputs(t)), inputs(t)))
-    return {name: jnp.asarray(value) for name, value in values.items()}
+    return events_of(scene, motion_at(scene, t, y.q, form.unpack(scene, t, y, inputs(t)), inputs(t)))
 
 
 class _EventValue(eqx.Module):
@@ -232,7 +232,7 @@ class _EventValue(eqx.Module):
 
 def _event_names(scene: Scene) -> tuple[str, ...]:
     q, u, _ = scene.named()
-    return tuple(jax.eval_shape(lambda s: s.events(motion_at(s, 0.0, q, u)), scene))
+    return tuple(jax.eval_shape(lambda s: events_of(s, motion_at(s, 0.0, q, u)), scene))
 
 
 def _mark_inputs(adjoint, tree):
