@@ -17,7 +17,11 @@ _HEIGHTS = ("coordinates", "row")
 
 
 class Plane(eqx.Module):
-    """A plane through `origin`, at rest or in rigid motion: velocity of its point at p is `velocity + angular_velocity x (p - origin)`."""
+    """A plane through `origin`, at rest or in rigid motion: velocity of its point at p is `velocity + angular_velocity x (p - origin)`.
+
+    A moving plane states its motion twice: `origin` and `tilt` as functions of time, and `velocity` and `angular_velocity`, their rates and
+    what moves within the plane itself (a belt, a turntable). Along the normal both must agree, which is checked when a scene is probed.
+    """
 
     origin: Float[Array, "3"]  # m
     normal: Float[Array, "3"]  # unit vector, out of the ground
