@@ -27,8 +27,11 @@ from jourdain_jax.equations.reductions import diagnosed, reduce
 from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import equations_and_rows, kinetic_energy, newton_residual, potential_energy
+from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.answers import loads_of, potential_of
+from jourdain_jax.scene.arguments import as_input_vector, as_scene
+from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 THRESHOLDS = {"reductions": 1e-10, "forms": 1e-10, "virtual power": 1e-10, "Newton": 1e-10, "energy": 1e-9, "jvp against vjp": 1e-11, "differences": 1e-6}
@@ -49,7 +52,7 @@ class Check(eqx.Module):
         return bool(self.value <= self.threshold)
 
 
-class Verification(eqx.Module):
+class Verification(Printed, eqx.Module):
     """All checks of one state."""
 
     scene: str = eqx.field(static=True)
@@ -81,7 +84,7 @@ class Verification(eqx.Module):
             ],
         }
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
         lines = [f"Verification of {self.scene}: {'passed' if self.passed else 'FAILED'}"]
         for check in self.checks:
             verdict = "ok" if check.passed else f"FAILED, look at {check.culprit}"
@@ -91,15 +94,16 @@ class Verification(eqx.Module):
         return "\n".join(lines)
 
 
-def verify(scene: Scene, state: State, inputs: Float[Array, "inputs"] | None = None, *, seed: int = 0) -> Verification:
+def verify(scene: Scene, state: State | dict | None = None, inputs: Float[Array, "inputs"] | dict | None = None, *, seed: int = 0) -> Verification:
     """Check the equations of a scene at a consistent state; every check has a threshold, and a failed one names its culprit.
 
     Values are relative to the size of what is compared. Directions for the gradients are random: admissible in the coordinates, free in the
     speeds, relative in the parameters; the Gibbs-Appell reduction is left out of them. Parameters that split rows which are dependent have no
     derivative there and are left out, with a note.
     """
+    state = as_state(as_scene(scene), state, what="state")
     t, q, u = state.t, state.q, state.u
-    inputs = jnp.zeros(len(scene.inputs)) if inputs is None else inputs
+    inputs = as_input_vector(scene, inputs)
     found = jax.tree.map(np.asarray, _evaluate(scene, t, q, u, inputs))
     applicable = [name for name, ok in found["applicable"].items() if ok]
     checks = [_reductions(found, applicable), *_forms(found), _virtual_power(found, applicable, names_of_rows(scene)), _newton(scene, found), _energy(found)]

@@ -20,14 +20,15 @@ from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.motion import results
+from jourdain_jax.motion.arguments import as_state, check_options
 from jourdain_jax.motion.event_location import Located, locate
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
 from jourdain_jax.motion.start import State, consistent
-from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.motion.state_form import Integrated, StateForm, default_reduction
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.answers import events_of, loads_of
+from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
@@ -80,6 +81,8 @@ def simulate(
     **Raises** ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` where the adjoint does not
     support the mode of differentiation.
     """
+    scene = as_scene(scene)
+    check_options(rtol=rtol, atol=atol, max_steps=max_steps, solver=solver, adjoint=adjoint, stepsize_controller=stepsize_controller, saveat=saveat)
     start, t0, ts, t1 = _span_and_start(scene, start, t0, t1, ts)
     structure = structure_of(scene)
     form = state_form(scene, structure, state, reduction, stabilisation, projection, work)
@@ -110,12 +113,7 @@ def _span_and_start(scene, start, t0, t1, ts):
         t1 = ts[-1] if t1 is None else t1
     elif t1 is None:
         t1 = t0 + scene.example_span
-    if start is None:
-        start = dict(scene.example)
-    if isinstance(start, dict):
-        start = consistent_start(scene, t0=t0, **start)
-    if not isinstance(start, State):
-        raise ValueError(f"`start` is a {type(start).__name__}, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None")
+    start = as_state(scene, start, t0=t0)
     if start.q.ndim != 1:
         raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
     t0, t1 = jnp.asarray(t0, real), jnp.asarray(t1, real)

@@ -14,6 +14,14 @@ ENERGIES = ("energy", "kinetic energy", "potential energy")
 _BANDS = ((0.025, 0.975, 0.2), (0.25, 0.75, 0.4))  # lower and upper quantile, opacity
 
 
+def check_format(path: str | os.PathLike) -> None:
+    """ValueError where matplotlib knows no picture with the suffix of this path."""
+    known = pyplot().FigureCanvasBase.get_supported_filetypes()
+    suffix = os.path.splitext(os.fspath(path))[1].removeprefix(".").lower()
+    if suffix not in known:
+        raise ValueError(f"cannot write `{path}`: a plot is a .png, .svg or .pdf file, and matplotlib knows no `{suffix or 'file without suffix'}`")
+
+
 def plot(motion: Trajectory | Rollout, *names: str, path: str | os.PathLike | None = None, axes=None):
     """Plot named quantities against time, one panel each: coordinates, speeds, `"energy"`, `"kinetic energy"`, `"potential energy"`.
 
@@ -22,6 +30,8 @@ def plot(motion: Trajectory | Rollout, *names: str, path: str | os.PathLike | No
     Returns the matplotlib figure; written to `path` (.png, .svg, .pdf) where one is given. `axes`: existing axes, one per name.
     KeyError for an unknown name, with the nearest valid one.
     """
+    if path is not None:
+        check_format(path)
     scene = motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
     names = names or scene.coordinate_names.entries
     values = [_values(motion, name) for name in names]

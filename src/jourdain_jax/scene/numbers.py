@@ -43,5 +43,7 @@ def described(value) -> str:
         return f"the text {value!r}"
     if isinstance(value, type):
         return f"the class `{value.__name__}`"
+    if hasattr(value, "dtype") and hasattr(value, "shape"):
+        return f"an array of shape {tuple(value.shape)}"
     name = type(value).__name__
     return f"an {name}" if name[0] in "aeioAEIO" else f"a {name}"
