@@ -125,7 +125,7 @@ def test_a_scene_with_an_init_of_its_own_takes_its_own_arguments():
             self.mass = weight / 9.81
 
     assert float(Heavy(weight=9.81).mass) == 1.0
-    with pytest.raises(ValueError, match="scene `Heavy` has no parameter `wait`; .*Valid names: `weight`"):
+    with pytest.raises(ValueError, match=r"scene `Heavy` has no parameter `wait`; .*Valid names: `weight`"):
         Heavy(wait=9.81)
 
 

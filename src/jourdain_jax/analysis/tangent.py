@@ -112,7 +112,7 @@ def eliminated(rows: Float[Array, "rows all"], dependent: Int[np.ndarray, "depen
     return basis.at[dependent].set(-below), pivot
 
 
-def privileged_speeds(scene: Scene, names: tuple[str, ...] | None = None) -> tuple[int, ...]:
+def privileged_speeds(scene: Scene, names: str | tuple[str, ...] | None = None) -> tuple[int, ...]:
     """Indices of the independent speeds: those named, else the scene's own choice, else the engine's."""
     names = scene.privileged if names is None else names
     if names is None:
