@@ -16,7 +16,7 @@ from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energ
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.scene.answers import invariants_of
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.numbers import as_real
+from jourdain_jax.scene.numbers import checked_real
 from jourdain_jax.scene.scene import Scene
 
 
@@ -64,7 +64,7 @@ def motions(record: Record) -> Motion:
 
 def path(record: Record, body: str, local) -> Float[Array, "times 3"]:
     """Path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m, from the mass centre)."""
-    local = as_real(local, f"point of body `{body}`", (3,), advice="give three components in its body frame, m")
+    local = checked_real(local, f"point of body `{body}`", (3,), advice="give three components in its body frame, m")
     return along(_Point(body, local.astype(record.q.dtype)), record)
 
 

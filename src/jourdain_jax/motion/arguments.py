@@ -7,7 +7,7 @@ import diffrax
 import numpy as np
 
 from jourdain_jax.motion.start import State, start
-from jourdain_jax.scene.numbers import as_real, described, is_traced
+from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.scene import Scene
 
 _KINDS = {
@@ -33,7 +33,7 @@ def as_state(scene: Scene, given, *, what: str = "start", t0=0.0) -> State:
 def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, **objects) -> None:
     """ValueError for tolerances that are no positive numbers, and for `solver`, `adjoint`, ... that are no objects of their kind (None is let pass)."""
     for name, value in (("rtol", rtol), ("atol", atol)):
-        number = as_real(value, f"`{name}`", (), advice="give one number, such as 1e-8")
+        number = checked_real(value, f"`{name}`", (), advice="give one number, such as 1e-8")
         if not is_traced(number) and not 0 < float(number) < np.inf:
             raise ValueError(f"`{name}` is {float(number):g}, expected a positive finite number; give a tolerance such as 1e-8")
     if max_steps is not None and (not isinstance(max_steps, int | np.integer) or max_steps < 1):

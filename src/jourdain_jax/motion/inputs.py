@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import as_real, described, is_traced
+from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.scene import Scene
 
 
@@ -19,8 +19,8 @@ class Sampled(eqx.Module):
     values: Float[Array, "samples"]
 
     def __init__(self, ts, values):
-        self.ts = as_real(ts, "`ts` of `Sampled`", advice="give times in s")
-        self.values = as_real(values, "`values` of `Sampled`", advice="give one number per time")
+        self.ts = checked_real(ts, "`ts` of `Sampled`", advice="give times in s")
+        self.values = checked_real(values, "`values` of `Sampled`", advice="give one number per time")
         if self.ts.ndim != 1 or self.ts.shape[0] == 0 or self.values.shape != self.ts.shape:
             raise ValueError(
                 f"`Sampled` was given times of shape {self.ts.shape} and values of shape {self.values.shape}, expected two vectors of one length; "
@@ -73,5 +73,5 @@ def as_inputs(scene: Scene, given) -> Inputs:
     for name in scene.inputs.entries:
         value = given.get(name, 0.0)
         advice = "give a number, a function of time, or `jj.Sampled(ts, values)`"
-        channels.append(value if callable(value) else Constant(as_real(value, f"input `{name}` of `{type(scene).__name__}`", (), advice=advice)))
+        channels.append(value if callable(value) else Constant(checked_real(value, f"input `{name}` of `{type(scene).__name__}`", (), advice=advice)))
     return Inputs(tuple(channels))

@@ -13,7 +13,7 @@ from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named
-from jourdain_jax.scene.numbers import as_real, described
+from jourdain_jax.scene.numbers import checked_real, described
 from jourdain_jax.scene.scene import Scene
 
 
@@ -31,7 +31,7 @@ def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
 def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> Float[Array, "coordinates"]:
     """The rates of all coordinates."""
     names = scene.coordinate_names.entries
-    return as_real(
+    return checked_real(
         scene.coordinate_rates(t, q, u),
         f"what `coordinate_rates` of `{_name(scene)}` returned",
         (len(names),),
@@ -53,24 +53,24 @@ def _checked_load(scene: Scene, i: int, load) -> Load:
     if not isinstance(load, Load):
         raise ValueError(f"{where} is {described(load)}, expected a load, such as jj.point_force(...) or jj.Load(forces=...)")
     return Load(
-        forces={body: as_real(value, f"force of {where} on body `{body}`", (3,)) for body, value in load.forces.items()},
-        torques={body: as_real(value, f"torque of {where} on body `{body}`", (3,)) for body, value in load.torques.items()},
-        generalized={speed: as_real(value, f"force of {where} on speed `{speed}`", ()) for speed, value in load.generalized.items()},
-        potential=None if load.potential is None else as_real(load.potential, f"potential of {where}", ()),
+        forces={body: checked_real(value, f"force of {where} on body `{body}`", (3,)) for body, value in load.forces.items()},
+        torques={body: checked_real(value, f"torque of {where} on body `{body}`", (3,)) for body, value in load.torques.items()},
+        generalized={speed: checked_real(value, f"force of {where} on speed `{speed}`", ()) for speed, value in load.generalized.items()},
+        potential=None if load.potential is None else checked_real(load.potential, f"potential of {where}", ()),
     )
 
 
 def potential_of(scene: Scene, pose: Pose) -> Float[Array, ""] | None:
     """The scene's own potential energy, J; None where it has none."""
     V = scene.potential(pose)
-    return None if V is None else as_real(V, f"what `potential` of `{_name(scene)}` returned", (), advice="return the energy in J, or None")
+    return None if V is None else checked_real(V, f"what `potential` of `{_name(scene)}` returned", (), advice="return the energy in J, or None")
 
 
 def prescribed_of(scene: Scene, t) -> dict[str, Float[Array, ""]]:
     """Prescribed coordinates and their values."""
     given = _dictionary(scene, "prescribed", scene.prescribed(t), '{"x": 0.1 * jnp.sin(t)}')
     advice = "prescribe every coordinate by its own name"
-    return {name: as_real(value, f"prescribed value of `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in given.items()}
+    return {name: checked_real(value, f"prescribed value of `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in given.items()}
 
 
 def geometric_constraints_of(scene: Scene, pose: Pose) -> dict[str, Array]:
@@ -86,7 +86,7 @@ def velocity_constraints_of(scene: Scene, motion: Motion) -> dict[str, Array]:
 def _rows(scene: Scene, method: str, given) -> dict[str, Array]:
     rows = _dictionary(scene, method, given, '{"edge": value}')
     advice = "return numbers that vanish where the constraint is met"
-    return {name: as_real(value, f"row `{name}` of `{_name(scene)}`", advice=advice) for name, value in rows.items()}
+    return {name: checked_real(value, f"row `{name}` of `{_name(scene)}`", advice=advice) for name, value in rows.items()}
 
 
 def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
@@ -102,14 +102,14 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
     """Values of the stop events by name."""
     events = _dictionary(scene, "events", scene.events(motion), '{"fallen": 1.4 - motion.q.lean}')
     advice = "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; give every condition a name of its own"
-    return {name: as_real(value, f"event `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in events.items()}
+    return {name: checked_real(value, f"event `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in events.items()}
 
 
 def invariants_of(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
     """Values of the conserved quantities by name."""
     given = _dictionary(scene, "invariants", scene.invariants(motion), '{"momentum x": body.mass * body.velocity[0]}')
     advice = "give every component a name of its own"
-    return {name: as_real(value, f"invariant `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in given.items()}
+    return {name: checked_real(value, f"invariant `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in given.items()}
 
 
 def _dictionary(scene: Scene, method: str, given, example: str) -> dict:

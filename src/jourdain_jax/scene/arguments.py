@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import as_real, described
+from jourdain_jax.scene.numbers import checked_real, described
 from jourdain_jax.scene.scene import Scene
 
 
@@ -38,7 +38,7 @@ def _as_vector(scene: Scene, what: str, x, names: Names) -> Array:
     if isinstance(x, Mapping):
         raise ValueError(f"`{what}` of `{type(scene).__name__}` is a dictionary, expected a vector of {listed}; `jj.start(scene, **values)` makes one by name")
     advice = f"one number for each of {listed}; use `jax.vmap` or `rollout` for many states"
-    return as_real(x, f"`{what}` of `{type(scene).__name__}`", (len(names),), advice=advice)
+    return checked_real(x, f"`{what}` of `{type(scene).__name__}`", (len(names),), advice=advice)
 
 
 def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
@@ -48,10 +48,10 @@ def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
         return jnp.zeros(len(names), dtype)
     if not isinstance(inputs, Mapping):
         listed = ", ".join(names) or "none: the scene has no inputs"
-        return as_real(inputs, f"`inputs` of `{type(scene).__name__}`", (len(names),), advice=f"one number for each of {listed}")
+        return checked_real(inputs, f"`inputs` of `{type(scene).__name__}`", (len(names),), advice=f"one number for each of {listed}")
     for name in inputs:
         if name not in names:
             raise ValueError(f"`{type(scene).__name__}` has no input `{name}`; {nearest(name, names)}")
     advice = "a function of time is for `simulate`; here give its value at this instant"
-    values = [as_real(inputs.get(name, 0.0), f"input `{name}` of `{type(scene).__name__}`", (), advice=advice) for name in names]
+    values = [checked_real(inputs.get(name, 0.0), f"input `{name}` of `{type(scene).__name__}`", (), advice=advice) for name in names]
     return jnp.stack(values) if values else jnp.zeros(0, dtype)

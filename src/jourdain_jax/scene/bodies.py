@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.scene.numbers import as_real
+from jourdain_jax.scene.numbers import checked_real
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -20,8 +20,8 @@ class Particle(eqx.Module):
     position: Float[Array, "3"]  # m, inertial frame
 
     def __init__(self, mass, position):
-        self.mass = as_real(mass, "mass of a particle", ())
-        self.position = as_real(position, "position of a particle", (3,))
+        self.mass = checked_real(mass, "mass of a particle", ())
+        self.position = checked_real(position, "position of a particle", (3,))
 
 
 class RigidBody(eqx.Module):
@@ -34,11 +34,11 @@ class RigidBody(eqx.Module):
     outline: Float[Array, "points 3"]  # m, body frame, relative to the mass centre; for drawing only
 
     def __init__(self, mass, inertia, position, orientation, outline=None):
-        self.mass = as_real(mass, "mass of a rigid body", ())
+        self.mass = checked_real(mass, "mass of a rigid body", ())
         self.inertia = _as_inertia(inertia)
-        self.position = as_real(position, "position of a rigid body", (3,))
-        self.orientation = as_real(orientation, "orientation of a rigid body", (3, 3), advice="give a rotation matrix, body to space, such as jj.rot_z(q.yaw)")
-        self.outline = jnp.zeros((0, 3)) if outline is None else as_real(outline, "outline of a rigid body")
+        self.position = checked_real(position, "position of a rigid body", (3,))
+        self.orientation = checked_real(orientation, "orientation of a rigid body", (3, 3), advice="give a rotation matrix, body to space, such as jj.rot_z(q.yaw)")
+        self.outline = jnp.zeros((0, 3)) if outline is None else checked_real(outline, "outline of a rigid body")
         if self.outline.ndim != 2 or self.outline.shape[1] != 3:
             raise ValueError(f"outline of a rigid body has shape {self.outline.shape}, expected (points, 3); give points of a line in its body frame, m")
 
@@ -92,10 +92,10 @@ def _axis_index(axis: str) -> int:
 def _as_inertia(inertia) -> Float[Array, "3 3"]:
     """Central inertia from a matrix or three principal moments."""
     what = "inertia of a rigid body"
-    matrix = as_real(inertia, what, advice="give three principal moments or a 3x3 matrix, kg m^2")
+    matrix = checked_real(inertia, what, advice="give three principal moments or a 3x3 matrix, kg m^2")
     if matrix.shape == (3,):
         return jnp.diag(matrix)
-    return as_real(matrix, what, (3, 3), advice="give three principal moments or a 3x3 matrix, kg m^2, about the mass centre")
+    return checked_real(matrix, what, (3, 3), advice="give three principal moments or a 3x3 matrix, kg m^2, about the mass centre")
 
 
 def _wheel_outline(k: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.scene.bodies import _axis_index
 from jourdain_jax.scene.motion_state import BodyPose
-from jourdain_jax.scene.numbers import as_real
+from jourdain_jax.scene.numbers import checked_real
 
 _HEIGHTS = ("coordinates", "row")
 
@@ -31,14 +31,14 @@ class Plane(eqx.Module):
 
     def __init__(self, origin=(0.0, 0.0, 0.0), tilt=0.0, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
         """The plane z = 0, turned by `tilt` (rad) about the y axis so that positive tilt slopes down along x."""
-        tilt = as_real(tilt, "tilt of a plane", (), advice="give one angle in rad")
+        tilt = checked_real(tilt, "tilt of a plane", (), advice="give one angle in rad")
         c, s = jnp.cos(tilt), jnp.sin(tilt)
         o, i = jnp.zeros_like(c), jnp.ones_like(c)
-        self.origin = as_real(origin, "origin of a plane", (3,))
+        self.origin = checked_real(origin, "origin of a plane", (3,))
         self.normal = jnp.stack([s, o, c])
         self.tangents = jnp.stack([jnp.stack([c, o, -s]), jnp.stack([o, i, o])])
-        self.velocity = as_real(velocity, "velocity of a plane", (3,))
-        self.angular_velocity = as_real(angular_velocity, "angular velocity of a plane", (3,))
+        self.velocity = checked_real(velocity, "velocity of a plane", (3,))
+        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a plane", (3,))
 
     def velocity_at(self, position: Float[Array, "3"]) -> Float[Array, "3"]:
         """Velocity of the plane's material point at `position`, m/s."""

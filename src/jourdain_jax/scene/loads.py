@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.scene.motion_state import Motion, Point
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import as_real
+from jourdain_jax.scene.numbers import checked_real
 
 
 class Load(eqx.Module):
@@ -25,7 +25,7 @@ class Load(eqx.Module):
 
 def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
     """Uniform gravity `m g e` on every body; `strength` g in m/s^2, `direction` e a unit vector of the inertial frame."""
-    g = as_real(strength, "strength of gravity", ()) * as_real(direction, "direction of gravity", (3,))
+    g = checked_real(strength, "strength of gravity", ()) * checked_real(direction, "direction of gravity", (3,))
     forces = {name: body.mass * g for name, body in motion.bodies.items()}
     potential = -sum(body.mass * (g @ body.position) for body in motion.bodies.values())
     return Load(forces=forces, potential=jnp.asarray(potential))
@@ -33,12 +33,12 @@ def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
 
 def point_force(point: Point, force) -> Load:
     """A force (N, inertial frame) on a point of a body, `motion["body"].point(local)`."""
-    return _on_point(point, as_real(force, f"force on a point of `{point.body}`", (3,), advice="give three components in the inertial frame, N"), None)
+    return _on_point(point, checked_real(force, f"force on a point of `{point.body}`", (3,), advice="give three components in the inertial frame, N"), None)
 
 
 def torque(motion: Motion, body: str, moment, *, reaction: str | None = None) -> Load:
     """A torque (N m, inertial frame) on `body`, with the opposite torque on the body `reaction` where one is named."""
-    moment = as_real(moment, f"torque on `{body}`", (3,), advice="give three components in the inertial frame, N m")
+    moment = checked_real(moment, f"torque on `{body}`", (3,), advice="give three components in the inertial frame, N m")
     names = [body] if reaction is None else [body, reaction]
     for name in names:
         if name not in motion.bodies:
@@ -66,7 +66,7 @@ def generalized_force(motion: Motion, **forces) -> Load:
     for name in forces:
         if name not in motion.u:
             raise ValueError(f"generalized force on unknown speed `{name}`; {nearest(name, motion.u.keys())}")
-    return Load(generalized={name: as_real(value, f"generalized force on `{name}`", ()) for name, value in forces.items()})
+    return Load(generalized={name: checked_real(value, f"generalized force on `{name}`", ()) for name, value in forces.items()})
 
 
 def _line(a: Point, b: Point):

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.scene.bodies import Body, RigidBody
 from jourdain_jax.scene.names import Named, UnknownNameError, nearest
-from jourdain_jax.scene.numbers import as_real
+from jourdain_jax.scene.numbers import checked_real
 
 
 class Point(eqx.Module):
@@ -24,7 +24,7 @@ class Point(eqx.Module):
 
 def fixed_point(position) -> Point:
     """A point at rest in the inertial frame, for springs, dampers and rods."""
-    position = as_real(position, "position of a fixed point", (3,), advice="give three components in the inertial frame, m")
+    position = checked_real(position, "position of a fixed point", (3,), advice="give three components in the inertial frame, m")
     return Point(position, jnp.zeros_like(position), jnp.zeros_like(position))
 
 
@@ -51,7 +51,7 @@ class BodyPose(eqx.Module):
 
     def place(self, local) -> Float[Array, "*times 3"]:
         """Position (inertial frame) of the point with body-frame coordinates `local` (m, relative to the mass centre)."""
-        local = as_real(local, f"point of body `{self.name}`", (3,), advice="give three components in its body frame, m")
+        local = checked_real(local, f"point of body `{self.name}`", (3,), advice="give three components in its body frame, m")
         return self.position + self.orientation @ local.astype(self.position.dtype)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 
-def as_real(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is put together") -> Array:
+def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is put together") -> Array:
     """`value` as a floating-point array.
 
     **Arguments**
