@@ -25,6 +25,7 @@ from jourdain_jax.analysis.tangent import (
     perturbations,
     privileged_speeds,
 )
+from jourdain_jax.calculus.reals import Numbers
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.arguments import as_input_vector, as_scene
@@ -93,7 +94,7 @@ def linearize(
     state: State | dict | None,
     coordinates: str | tuple[str, ...] | None = None,
     *,
-    inputs: Float[Array, "inputs"] | dict | None = None,
+    inputs: Numbers | dict | None = None,
     dependent: str | tuple[str, ...] | None = None,
     privileged: str | tuple[str, ...] | None = None,
 ) -> Linearization:

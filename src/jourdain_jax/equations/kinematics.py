@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Numbers, as_real
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.scene.answers import bodies_of, coordinate_rates_of
 from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_speeds
@@ -34,20 +35,20 @@ class Inertias(eqx.Module):
     inertia: Float[Array, "bodies 3 3"]  # kg m^2
 
 
-def coordinate_rates(scene: Scene, t, q: Float[Array, "coordinates"], u: Float[Array, "speeds"]) -> Float[Array, "coordinates"]:
-    """`qdot = N(q,t) u + nu(q,t)`."""
+def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> Float[Array, "coordinates"]:
+    """`qdot = N(q,t) u + nu(q,t)`, shape (coordinates,), per s; eq. (53)."""
     t, q, u = jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u)
     return coordinate_rates_of(scene, t, scene.coordinate_names.view(q), scene.speed_names.view(u))
 
 
-def pose_at(scene: Scene, t, q: Float[Array, "coordinates"]) -> Pose:
-    """Poses of all bodies, sorted by name: the order in which JAX returns dictionaries, so that it is the same everywhere."""
+def pose_at(scene: Scene, t, q: Numbers) -> Pose:
+    """Poses of all bodies (m, inertial frame), sorted by name: the order in which JAX returns dictionaries, so that it is the same everywhere."""
     t, named = jnp.asarray(t, jnp.result_type(float)), scene.coordinate_names.view(as_coordinates(scene, q))
     return Pose(t, named, {name: BodyPose(name, body) for name, body in sorted(bodies_of(scene, t, named).items())})
 
 
 def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
-    """Poses and velocities of all bodies at one instant."""
+    """Poses and velocities (inertial frame) of all bodies at one instant. `inputs`: values of the scene's inputs (default: zero)."""
     t, q, u = jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u)
     inputs = as_input_vector(scene, inputs, q.dtype)
     qdot = coordinate_rates(scene, t, q, u)
@@ -66,7 +67,7 @@ def _space_angular_velocity(body, rate) -> Float[Array, "3"]:
 
 def velocities(scene: Scene, t, q, u) -> Velocities:
     """Velocities of the mass centres and body angular velocities, affine in u."""
-    return _velocities(scene, jnp.asarray(t, jnp.result_type(float)), q, u)
+    return _velocities(scene, jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u))
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
@@ -81,7 +82,7 @@ def velocities_of(motion: Motion) -> Velocities:
 
 
 def partial_velocities(scene: Scene, t, q, u) -> Velocities:
-    """`beta = dv/du` and `gamma = d omega_body/du`, shape (bodies, 3, speeds)."""
+    """`beta = dv/du` (inertial frame) and `gamma = d omega/du` (body axes), shape (bodies, 3, speeds), bodies sorted by name; eqs. (26)-(31), (49)."""
     return jax.jacfwd(lambda u: velocities(scene, t, q, u))(as_speeds(scene, u))
 
 

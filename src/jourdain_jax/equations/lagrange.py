@@ -15,7 +15,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
-    """M, h and Q from derivatives of the kinetic energy; a ValueError where the speeds are not the coordinate rates."""
+    """M, h and Q of `M udot + h = Q` from derivatives of the kinetic energy: `d/dt dT/dqdot - dT/dq = Q`; eq. (11).
+
+    `inputs`: values of the scene's inputs (default: zero). ValueError where the speeds are not the coordinate rates.
+    """
     if not speeds_are_rates(scene):
         raise ValueError(
             f"Lagrange's equations hold for coordinate rates, and the speeds of `{type(scene).__name__}` are quasi-velocities; use Appell's equations"

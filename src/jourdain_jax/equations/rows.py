@@ -90,7 +90,7 @@ def flatten_rows(rows: dict[str, Array], dtype) -> Float[Array, "rows"]:
 
 
 def position_residual(scene: Scene, t, q) -> Float[Array, "geometric_rows"]:
-    """`g(t, q)` of all geometric rows."""
+    """`g(t, q)` of all geometric rows, shape (geometric rows,), in their own units; zero on the constraints. Eq. (5)."""
     return _position_residual(scene, jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q))
 
 
@@ -100,7 +100,10 @@ def _position_residual(scene: Scene, t: Float[Array, ""], q):
 
 
 def velocity_residual(scene: Scene, t, q, u, inputs=None) -> Float[Array, "rows"]:
-    """`phi(t, q, u)` of all rows."""
+    """`phi(t, q, u)` of all rows, shape (rows,), in their own units per s; zero on the constraints. Eqs. (6)-(9).
+
+    `inputs`: values of the scene's inputs (default: zero).
+    """
     return _velocity_residual(scene, jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u), inputs)
 
 

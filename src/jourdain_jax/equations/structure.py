@@ -65,7 +65,10 @@ class Structure:
 
 
 def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Random admissible states (t, q, u) from the scene's domain, on the rows; scene parameters must be concrete."""
+    """At most `count` random admissible states (t, q, u) from the scene's domain, on the rows, each with a leading axis of states.
+
+    `seed`: of the generator. Scene parameters must be concrete. ValueError where no state meets the geometric rows.
+    """
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
     t, q, u = _random_states(scene, drawn, np.random.default_rng(seed))
     q, u, miss = _projected(scene, t, q, u)
@@ -157,7 +160,12 @@ def _probe(scene, t, q, u, u_other):
 
 
 def structure_of(scene: Scene) -> Structure:
-    """Static facts about a scene; probed once per class and parameter values. ValueError where its bodies cannot be (not while it is traced)."""
+    """Static facts about a scene: rank of its rows, privileged velocities and their conditioning, kinds of rows; eqs. (25)-(31).
+
+    Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers stand in for traced parameters.
+    ValueError where no admissible state is found, or `privileged` names unknown or too few speeds; for known parameters also where
+    numbers of its bodies or planes cannot be.
+    """
     structure = _probed_structure(as_scene(scene))
     if structure.faults and not is_traced(scene):  # numbers that stand in for traced parameters prove nothing
         raise ValueError(structure.faults[0])

@@ -7,16 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.scene import Scene
 
 
 class Sampled(eqx.Module):
-    """Values at given times, linear in between, constant beyond the ends."""
+    """An input as `values` at given times `ts` (s, increasing), linear in between, constant beyond the ends."""
 
-    ts: Float[Array, "samples"]  # s, increasing
-    values: Float[Array, "samples"]
+    ts: Float[Array, "samples"] = eqx.field(converter=as_real)  # s, increasing
+    values: Float[Array, "samples"] = eqx.field(converter=as_real)
 
     def __init__(self, ts, values):
         self.ts = checked_real(ts, "`ts` of `Sampled`", advice="give times in s")

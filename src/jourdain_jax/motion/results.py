@@ -14,4 +14,4 @@ MESSAGES = {
 
 
 class SimulationError(RuntimeError):
-    """A motion did not reach its end; raised on request only (`trajectory.raise_if_failed()`)."""
+    """A motion did not reach its end; raised on request only (`trajectory.raise_if_failed()`), with the reason and the time."""

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Vector, as_real
 from jourdain_jax.scene.bodies import _axis_index
 from jourdain_jax.scene.motion_state import BodyPose
 from jourdain_jax.scene.numbers import checked_real
@@ -17,7 +18,10 @@ _HEIGHTS = ("coordinates", "row")
 
 
 class Plane(eqx.Module):
-    """A plane through `origin`, at rest or in rigid motion: velocity of its point at p is `velocity + angular_velocity x (p - origin)`.
+    """A plane through `origin` (m), at rest or in rigid motion: velocity of its point at p is `velocity + angular_velocity x (p - origin)`.
+
+    `Plane(origin, tilt, velocity, angular_velocity)`: the plane z = 0, turned by `tilt` (rad) about the y axis so that positive tilt slopes down
+    along x. `velocity` in m/s, `angular_velocity` in rad/s; all vectors in the inertial frame.
 
     A moving plane states its motion twice: `origin` and `tilt` as functions of time, and `velocity` and `angular_velocity`, their rates and
     what moves within the plane itself (a belt, a turntable). Along the normal both must agree, which is checked when a scene is probed.
@@ -40,13 +44,13 @@ class Plane(eqx.Module):
         self.velocity = checked_real(velocity, "velocity of a plane", (3,))
         self.angular_velocity = checked_real(angular_velocity, "angular velocity of a plane", (3,))
 
-    def velocity_at(self, position: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Velocity of the plane's material point at `position`, m/s."""
-        return self.velocity + jnp.cross(self.angular_velocity, position - self.origin)
+    def velocity_at(self, position: Vector) -> Float[Array, "3"]:
+        """Velocity (m/s, inertial frame) of the plane's material point at `position` (m, inertial frame)."""
+        return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.origin)
 
-    def height_of(self, position: Float[Array, "3"]) -> Float[Array, ""]:
-        """Signed distance of a point from the plane, m."""
-        return self.normal @ (position - self.origin)
+    def height_of(self, position: Vector) -> Float[Array, ""]:
+        """Signed distance (m) of the point at `position` (m, inertial frame) from the plane, positive along the normal."""
+        return self.normal @ (as_real(position) - self.origin)
 
 
 class Contact(eqx.Module):
@@ -66,10 +70,16 @@ class Contact(eqx.Module):
 def disc_contact(
     body: BodyPose, radius, *, axis: str = "y", plane: Plane | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None
 ) -> Contact:
-    """Rolling of the edge of a thin disc (centre: the mass centre; axis: a body axis) on a plane.
+    """Rolling of the edge of a thin disc (centre: the mass centre) on a plane, without slip.
 
     The contact is the lowest point of the circle, `r - a (n - (n.k) k)/|n - (n.k) k|` with plane normal n and disc axis k. Undefined for
-    a disc lying flat. `carried` names the bodies that this contact holds up, for the normal force where `height="coordinates"`.
+    a disc lying flat.
+
+    - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z".
+    - `plane`: default z = 0 at rest. `height`: "coordinates" where they keep the body on the plane by themselves, "row" for a geometric row.
+    - `carried`: names of the bodies that this contact holds up (default: all), for the normal force where `height="coordinates"`.
+
+    Two velocity rows (m/s), along the plane's tangents; ValueError for an unknown axis or height.
     """
     _check_height(height)
     plane = Plane() if plane is None else plane
@@ -80,7 +90,14 @@ def disc_contact(
 
 
 def ball_contact(body: BodyPose, radius, *, plane: Plane | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None) -> Contact:
-    """Rolling of a ball (centre: the mass centre) on a plane; the contact point is `r - a n`."""
+    """Rolling of a ball (centre: the mass centre) on a plane, without slip; the contact point is `r - a n`.
+
+    - `body`: `pose["name"]`; `radius` a in m.
+    - `plane`: default z = 0 at rest. `height`: "coordinates" where they keep the body on the plane by themselves, "row" for a geometric row.
+    - `carried`: names of the bodies that this contact holds up (default: all), for the normal force where `height="coordinates"`.
+
+    Two velocity rows (m/s), along the plane's tangents; ValueError for an unknown height.
+    """
     _check_height(height)
     plane = Plane() if plane is None else plane
     return Contact(body.name, body.position - radius * plane.normal, plane, height, carried)

@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jourdain_jax.calculus.reals import as_real
+
 
 def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is put together") -> Array:
     """`value` as a floating-point array.
@@ -20,14 +22,12 @@ def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advi
         array = jnp.asarray(value)
     except (TypeError, ValueError):
         raise ValueError(f"{what} is {described(value)}, expected real numbers; {advice}") from None
-    if jnp.issubdtype(array.dtype, jnp.integer):
-        array = array.astype(jnp.result_type(float))
-    if not jnp.issubdtype(array.dtype, jnp.floating):
+    if not jnp.issubdtype(array.dtype, jnp.integer) and not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(f"{what} is of type {array.dtype}, expected real numbers; {advice}")
     if shape is not None and array.shape != shape:
         expected = "one number" if shape == () else str(shape)
         raise ValueError(f"{what} has shape {array.shape}, expected {expected}; {advice}")
-    return array
+    return as_real(array)
 
 
 def is_traced(*trees) -> bool:

@@ -4,26 +4,27 @@ from collections.abc import Iterator
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.scene.numbers import described
 
 
 def _as_leaf(value):
+    """A parameter as a floating-point array; what is no number is left, to be refused by name: a converter does not know the name."""
     try:
-        array = jnp.asarray(value)
+        return as_real(value)
     except (TypeError, ValueError):
-        return value  # refused by name in `check_parameters`; a converter does not know the name
-    dtype = array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else jnp.result_type(float)
-    return jnp.asarray(array, dtype)  # never weakly typed, so that one trace serves defaults and other values alike
+        return value
+
 
 
 def parameter(default=..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = ""):
     """A field of a scene that is a physical parameter: converted to a floating-point array, so that it is a differentiable leaf.
 
-    `unit` and `about` describe it; `positive` and `non_negative` are checked when the scene is built with known values.
+    - `default`: a number or an array; without it the parameter must be given. `unit` and `about` describe it.
+    - `positive`, `non_negative`: checked (ValueError, as are numbers that are not finite) when the scene is built with known values.
     """
     options = {} if default is ... else {"default": default}
     metadata = {"parameter": True, "unit": unit, "positive": positive, "non_negative": non_negative, "about": about}
