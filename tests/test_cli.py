@@ -73,12 +73,64 @@ def test_simulate_writes_what_it_was_asked_for(capsys, tmp_path):
         (["simulate", "skate", "--samples", "1"], "--samples is 1, expected at least 2"),
         (["simulate", "skate", "--out", "nowhere/run.npz"], "there is no folder `nowhere`"),
         (["bicycle", "Rigid", "--samples", "0"], "--samples is 0"),
+        (["simulate", "skate", "--out", "."], "cannot write `.`: it is a folder; give the name of a file in it"),
+        (["simulate", "skate", "--animate", "run.mp4"], "cannot write `run.mp4`: an animation is a .gif file"),
+        (["simulate", "skate", "--plot", "run.xyz"], "cannot write `run.xyz`: a plot is a .png, .svg or .pdf file, and matplotlib knows no `xyz`"),
+        (["simulate", "skate", "--rtol", "-1"], "`rtol` is -1, expected a positive finite number"),
+        (["simulate", "skate", "--atol", "nan"], "`atol` is nan, expected a positive finite number"),
+        (["report", "pendulum-chain", "--set", "links=1.5"], "--set links=1.5: `links` of `pendulum-chain` is a count, expected a whole number"),
+        (["report", "pendulum-chain", "--set", "links=0"], "`links` of `PendulumChain` is 0, expected a whole number of particles >= 1"),
+        (["report", "pendulum-chain", "--set", "link=2"], "model `pendulum-chain` has no parameter `link`; did you mean `links`"),
     ],
 )
 def test_wrong_commands_exit_with_2_and_say_what_to_do(arguments, sentence, capsys):
     code, out = run(capsys, *arguments)
     assert code == 2
     assert sentence in out.err
+
+
+def test_a_file_that_cannot_be_written_is_answered_without_a_traceback(capsys, tmp_path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(13, "Permission denied", str(tmp_path / "run.npz"))
+
+    monkeypatch.setattr("jourdain_jax.cli.model_verbs.save", refuse)
+    code, out = run(capsys, "simulate", "chaplygin-sleigh", "--t1", "0.1", "--samples", "2", "--out", str(tmp_path / "run.npz"))
+    assert code == 2
+    assert f"cannot read or write `{tmp_path / 'run.npz'}`: Permission denied; check the path and its permissions" in out.err
+
+
+def test_the_number_of_bodies_is_set_as_a_parameter_is(capsys):
+    code, out = run(capsys, "report", "pendulum-chain", "--set", "links=2", "mass=0.5", "--json")
+    assert code == 0
+    assert json.loads(out.out)["degrees_of_freedom"] == 2
+    rows = {row["name"]: row for row in json.loads(run(capsys, "models", "--json")[1].out)}
+    assert rows["pendulum-chain"]["counts"] == {"links": {"value": 5}}
+    assert rows["trailer-chain"]["counts"] == {"trailers": {"value": 3}}
+    assert rows["skate"]["counts"] == {}
+    assert rows["tilting-disc"]["events"] == ["fallen"]
+    assert set(rows["tilting-disc"]["domain"]) <= {*rows["tilting-disc"]["coordinates"], *rows["tilting-disc"]["speeds"]}
+
+
+def test_a_simulation_for_machines_has_all_that_the_printed_one_has(capsys):
+    code, out = run(capsys, "simulate", "tilting-disc", "--t1", "0.2", "--samples", "3", "--json")
+    found = json.loads(out.out)
+    assert code == 0
+    contact = found["contacts"]["rim"]
+    assert 0 < contact["lowest_normal"] <= contact["highest_normal"]
+    assert contact["friction_needed"] > 0
+    assert contact["pulls"] is False
+    assert contact["determined"] is True
+    assert found["smallest_singular_value"] > 0
+    assert found["rank"] == [2, 2]
+    assert found["start_moved"].keys() == {"coordinates", "speeds"}
+    assert found["invariant_drifts"] == {}
+
+
+def test_the_version_is_told(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith("jourdain-jax ")
 
 
 def test_importing_computes_nothing_so_that_compiler_flags_still_count():

@@ -15,7 +15,7 @@ SOURCE = Path(__file__).parents[1] / "src" / PACKAGE
 LAYERS = ("calculus", "program", "scene", "equations", "lowering", "motion", "analysis", "models", "bicycle", "plotting", "cli")
 ENTRY_MODULES = ("__init__", "__main__")  # above every layer
 OWNERS = {"diffrax": ("motion",)}  # third-party packages that only the named layers know
-OPTIONAL = ("matplotlib", "IPython", "tqdm", "scipy")  # may be imported inside a function
+OPTIONAL = ("matplotlib", "IPython", "tqdm", "scipy", "sympy")  # may be imported inside a function
 VAGUE_NAMES = ("utils", "util", "misc", "common", "helpers", "helper")
 LONGEST = 400
 

@@ -2,6 +2,7 @@
 
 import json
 
+import jax.numpy as jnp
 import pytest
 
 import jourdain_jax as jj
@@ -60,6 +61,61 @@ def test_an_isolated_loss_of_rank_is_seen_at_the_configuration_where_it_happens(
     assert "steer = 1.571" in found.rank_losses
     assert found.worst_pivot == 0.0
     assert "steer = 1.571" in str(found)
+
+
+class Drifting(jj.Scene):
+    """A bead that is carried along x and free along y: a relation between coordinates that no row states."""
+
+    coordinates = jj.coordinates("x y")
+    speeds = jj.speeds("across")
+    domain = {"y": (-1.0, 2.0)}
+    conventions = "x along the belt."
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def coordinate_rates(self, t, q, u):
+        return jnp.stack([1.0 + 0.0 * u.across, u.across])
+
+    def events(self, motion):
+        return {"off the belt": 2.0 - motion.q.y}
+
+
+class Held(jj.Scene):
+    """A bead that is driven and has no freedom left."""
+
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def geometric_constraints(self, pose):
+        return {"held": pose.q.x - 0.3 * jnp.sin(pose.t)}
+
+
+def test_relations_that_the_rates_contain_are_no_rows():
+    found = report(Drifting())
+    assert found.rows == ()
+    assert found.growth_vector == (1,)
+    assert found.holonomic_rows_together == 0
+    assert "taken together" not in str(found)
+    assert "(1), closed; the motion stays on a manifold of dimension 1" in " ".join(str(found).split())
+
+
+def test_a_scene_without_freedom_says_so_and_nothing_of_conditioning():
+    text = " ".join(str(report(Held())).split())
+    assert "growth vector (0), no freedom left" in text
+    assert "their conditioning nothing to choose, no freedom left" in text
+
+
+def test_the_report_tells_stop_events_domain_and_conventions():
+    found = report(Drifting())
+    text = " ".join(str(found).split())
+    assert "stops at 1: off the belt" in text
+    assert "probed in y -1 to 2; otherwise coordinates -3.2 to 3.2, speeds -1 to 1" in text
+    assert "conventions x along the belt." in text
+    facts = json.loads(json.dumps(found.as_dict()))
+    assert (facts["events"], facts["domain"], facts["conventions"]) == (["off the belt"], {"y": [-1.0, 2.0]}, "x along the belt.")
 
 
 @pytest.mark.parametrize("scene", [IsokineticParticle(), Skate()], ids=lambda s: type(s).__name__)

@@ -1,13 +1,13 @@
 """The result of a fit: estimates with their uncertainty, residuals, the fitted scene, and what the measurements cannot tell."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.information import Information, hidden_combinations
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.analysis.table import table
+from jourdain_jax.scene.names import UnknownNameError, nearest
+from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 
@@ -32,7 +32,7 @@ class ChannelResiduals(eqx.Module):
     largest: float  # in magnitude
 
 
-class Fit(eqx.Module):
+class Fit(Printed, eqx.Module):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene; `print(fit)` shows a table.
 
     From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too.
@@ -58,7 +58,7 @@ class Fit(eqx.Module):
 
     def __getitem__(self, name: str) -> Estimate:
         if name not in self.labels:
-            raise KeyError(f"`{name}` was not estimated; {nearest(name, self.labels)}")
+            raise UnknownNameError(f"`{name}` was not estimated; {nearest(name, self.labels)}")
         i = self.labels.index(name)
         return Estimate(self.values[..., i], self.standard_errors[..., i], self.low[..., i], self.high[..., i], self.units[i])
 
@@ -116,7 +116,7 @@ class Fit(eqx.Module):
         """Count, mean, rms and largest residual per run and channel."""
         return tuple(_summary(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
         return _batch_text(self) if self.values.ndim > 1 else _text(self)
 
 
@@ -137,14 +137,14 @@ def _text(fit: Fit) -> str:
         error = f"{e.standard_error:.2g}" if np.isfinite(e.standard_error) else "-"
         interval = f"[{e.low:.6g}, {e.high:.6g}]" if np.isfinite(e.low) else "none"
         rows.append((name, e.unit, f"{e.value:.6g}", error, interval))
-    lines += _table(rows)
+    lines += table(rows)
     if fit.not_identifiable:
         lines.append(f"singular values below {fit.cutoff:g} of the largest count as zero:")
         lines += [f"  {sentence}" for sentence in fit.not_identifiable]
     rows = [("run", "channel", "samples", "mean", "rms", "largest residual (in sigmas)")]
     for s in fit.residual_summary():
         rows.append((str(s.run), s.channel, str(s.samples), f"{s.mean:.2g}", f"{s.rms:.3g}", f"{s.largest:.3g}"))
-    return "\n".join(lines + _table(rows))
+    return "\n".join(lines + table(rows))
 
 
 def _batch_text(fit: Fit) -> str:
@@ -155,9 +155,4 @@ def _batch_text(fit: Fit) -> str:
         some = good.sum() > 1
         numbers = (f"{values.mean():.6g}", f"{values.std(ddof=1):.2g}", f"{errors.mean():.2g}") if some else ("-", "-", "-")
         rows.append((name, e.unit, *numbers))
-    return "\n".join([f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} converged", *_table(rows)])
-
-
-def _table(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join([f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} converged", *table(rows)])

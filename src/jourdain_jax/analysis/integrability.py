@@ -50,7 +50,7 @@ class Growth:
     closed: bool  # brackets to the given depth bring nothing new, or everything is reached
     depth: int  # the largest number of fields in one bracket
     tolerance: float  # relative size below which a bracket counts as nothing new
-    holonomic_rows_together: int | None  # all coordinates less the last dimension; None where not closed
+    holonomic_rows_together: int | None  # all coordinates less the last dimension, at most the rank; None where not closed
 
 
 def row_integrability(scene: Scene, *, points: int = 6, seed: int = 0) -> RowIntegrability:
@@ -134,7 +134,8 @@ def growth_vector(scene: Scene, *, depth: int = 4, points: int = 2, seed: int = 
     with_time = structure.rheonomic or structure.driven or not structure.homogeneous
     states = zip(*sample_states(scene, points, seed), strict=True)
     vector, closed = max(_grow(_Fields(scene, with_time, u), t, q, reachable, depth, tolerance) for t, q, u in states)
-    return Growth(vector, closed, depth, tolerance, reachable - vector[-1] if closed else None)
+    # relations that the coordinate rates contain by themselves are no rows
+    return Growth(vector, closed, depth, tolerance, min(reachable - vector[-1], structure.rank) if closed else None)
 
 
 def _grow(fields: "_Fields", t, q, reachable: int, depth: int, tolerance: float) -> tuple[tuple[int, ...], bool]:

@@ -12,11 +12,13 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.measurements import Measurements, checked
 from jourdain_jax.motion.simulate import simulate
+from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.scene import Scene
 
 
 def as_runs(scene: Scene, data: Measurements | Sequence[Measurements], *, repeats: bool = False) -> tuple[Measurements, ...]:
     """One run or several, checked against the scene; ValueError as in `checked`, and where there is no run."""
+    as_scene(scene)
     runs = (data,) if isinstance(data, Measurements) else tuple(data)
     if not runs or not all(isinstance(run, Measurements) for run in runs):
         raise ValueError("`data` must be a `Measurements` or a sequence of at least one")

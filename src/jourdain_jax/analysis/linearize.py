@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from jourdain_jax.analysis.table import linearization_text
 from jourdain_jax.analysis.tangent import (
     Flow,
     carried_along,
@@ -25,7 +26,11 @@ from jourdain_jax.analysis.tangent import (
     privileged_speeds,
 )
 from jourdain_jax.calculus.reals import Numbers
+from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State
+from jourdain_jax.scene.arguments import as_input_vector, as_scene
+from jourdain_jax.scene.names import as_names
+from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 
@@ -36,7 +41,7 @@ class Modes(eqx.Module):
     shapes: Complex[Array, "parts modes"]  # one column per mode, its largest entry 1
 
 
-class Linearization(eqx.Module):
+class Linearization(Printed, eqx.Module):
     """Equations of small motions about a state; see the module's head."""
 
     A: Float[Array, "states states"]
@@ -52,6 +57,9 @@ class Linearization(eqx.Module):
     states: tuple[str, ...] = eqx.field(static=True)  # names of the entries of x
     inputs: tuple[str, ...] = eqx.field(static=True)
     coordinates: tuple[str, ...] = eqx.field(static=True)  # names of p
+
+    def _text(self) -> str:
+        return linearization_text(self)
 
     def eigenvalues(self) -> Complex[Array, "modes"]:
         """Roots of `det(M s^2 + C s + K) = 0`, 1/s, by ascending real part. Differentiable where distinct."""
@@ -83,12 +91,12 @@ class Linearization(eqx.Module):
 
 def linearize(
     scene: Scene,
-    state: State,
-    coordinates: tuple[str, ...] | None = None,
+    state: State | dict | None,
+    coordinates: str | tuple[str, ...] | None = None,
     *,
-    inputs: Numbers | None = None,
-    dependent: tuple[str, ...] | None = None,
-    privileged: tuple[str, ...] | None = None,
+    inputs: Numbers | dict | None = None,
+    dependent: str | tuple[str, ...] | None = None,
+    privileged: str | tuple[str, ...] | None = None,
 ) -> Linearization:
     """Linear equations of small motions about a steady `state`, with the residual of its steadiness.
 
@@ -109,10 +117,12 @@ def linearize(
 
     **Raises** ValueError: an unknown coordinate or speed, a coordinate that is both named and dependent, or whose rate is no privileged speed.
     """
-    f = jnp.zeros(len(scene.inputs), state.q.dtype) if inputs is None else jnp.asarray(inputs, state.q.dtype)
+    state = as_state(as_scene(scene), state, what="state")
+    f = as_input_vector(scene, inputs, state.q.dtype).astype(state.q.dtype)
+    coordinates = None if coordinates is None else as_names(coordinates)
     y = privileged_speeds(scene, privileged)
-    dependent_s = dependent_coordinates(scene, state, coordinates or (), dependent)
-    return _linearize(scene, state, f, y, tuple(dependent_s.tolist()), None if coordinates is None else tuple(coordinates))
+    dependent_s = dependent_coordinates(scene, state, coordinates or (), None if dependent is None else as_names(dependent))
+    return _linearize(scene, state, f, y, tuple(dependent_s.tolist()), coordinates)
 
 
 @eqx.filter_jit

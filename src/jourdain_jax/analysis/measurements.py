@@ -15,7 +15,7 @@ from jourdain_jax.analysis.bijections import Bijection
 from jourdain_jax.calculus.reals import Number
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.inputs import Inputs, as_inputs
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene
 
 
@@ -69,7 +69,7 @@ class Measurements(eqx.Module):
         given = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.values, sigma)
         self.sigma = {name: jnp.asarray(value, real) for name, value in given.items()}
         self.start = {name: jnp.asarray(value, real) for name, value in start.items()}
-        self.unknown_start = dict(unknown_start) if isinstance(unknown_start, Mapping) else dict.fromkeys(unknown_start)
+        self.unknown_start = dict(unknown_start) if isinstance(unknown_start, Mapping) else dict.fromkeys(as_names(unknown_start))
         self.inputs = inputs
         self.functions = dict(functions or {})
         self.t0 = self.ts[0] if t0 is None else jnp.asarray(t0, real)

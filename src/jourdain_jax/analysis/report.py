@@ -4,17 +4,20 @@ from dataclasses import asdict, dataclass
 
 from jourdain_jax.analysis.integrability import growth_vector, row_integrability
 from jourdain_jax.equations.cyclic import cyclic_coordinates, ignorable_coordinates
-from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.event_names import names_of_events
+from jourdain_jax.equations.structure import COORDINATE_DOMAIN, SPEED_DOMAIN, structure_of
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 _LABEL = 26  # width of the first column
 _LINE = 120
 
 
-@dataclass(frozen=True)
-class Report:
+@dataclass(frozen=True, repr=False)
+class Report(Printed):
     """Facts about a scene, found by probing at random and symmetric states of its domain; `print(report)` shows a table.
 
     Row by row and taken together: eqs. (5)-(9), Frobenius; privileged velocities (25)-(31); cyclic coordinates (42).
@@ -44,14 +47,18 @@ class Report:
     worst_pivot: float  # smallest singular value of the scaled A_z over all probed states; zero: singular somewhere
     typical_pivot: float
     rank_losses: tuple[str, ...]  # probed configurations where the rows lose rank
+    events: tuple[str, ...]  # names of the stop events
+    domain: dict[str, tuple[float, float]]  # where states were probed, as the scene states it
+    conventions: str
 
     def as_dict(self) -> dict:
         """The report for machines: the fields by name; what has no finite value is None."""
         facts = {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
+        facts["domain"] = {name: list(bounds) for name, bounds in self.domain.items()}
         facts["frobenius_violations"] = {row: size if size < float("inf") else None for row, size in self.frobenius_violations.items()}
         return facts
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
         facts = {
             "coordinates": _listed(self.coordinates),
             "speeds": _listed(self.speeds),
@@ -69,6 +76,9 @@ class Report:
             "lowered to": self.lowering,
             "their conditioning": self._conditioning(),
             "rank is lost at": "none of the probed configurations" if not self.rank_losses else "; ".join(self.rank_losses[:4]),
+            "stops at": _listed(self.events),
+            "probed in": self._probed(),
+            "conventions": self.conventions,
         }
         lines = [f"Report on {self.scene}"]
         for label, text in facts.items():
@@ -84,13 +94,22 @@ class Report:
         if not self.growth_vector:
             return "none: rows are nonlinear in the speeds"
         sizes = f"({', '.join(map(str, self.growth_vector))})"
+        if self.degrees_of_freedom == 0:
+            return f"{sizes}, no freedom left"
         if not self.closed:
             return f"{sizes}, still growing at brackets of {self.bracket_depth} fields"
         count = self.holonomic_rows_together
-        together = f"rows that are holonomic taken together: {count or 'none'}"
-        return f"{sizes}, closed; {together}; the motion stays on a manifold of dimension {self.growth_vector[-1]}"
+        together = f"rows that are holonomic taken together: {count or 'none'}; " if self.rows else ""
+        return f"{sizes}, closed; {together}the motion stays on a manifold of dimension {self.growth_vector[-1]}"
+
+    def _probed(self) -> str:
+        stated = ", ".join(f"{name} {low:.4g} to {high:.4g}" for name, (low, high) in self.domain.items())
+        rest = "" if set(self.domain) >= {*self.coordinates, *self.speeds} else f"coordinates {_span(COORDINATE_DOMAIN)}, speeds {_span(SPEED_DOMAIN)}"
+        return f"{stated}; otherwise {rest}" if stated and rest else stated or rest
 
     def _conditioning(self) -> str:
+        if self.degrees_of_freedom == 0:
+            return "nothing to choose, no freedom left"
         worst = f"smallest pivot {self.worst_pivot:.2g}" if self.worst_pivot > 1e-9 else "singular at some probed configuration"
         return f"{worst}, typically {self.typical_pivot:.2g} (1 is best)"
 
@@ -102,7 +121,7 @@ def report(scene: Scene, *, depth: int = 4) -> Report:
     for machines. Found numerically at random states of the scene's `domain` and at symmetric configurations (zero and right
     angles): what holds at all of them is taken to hold everywhere.
     """
-    structure = structure_of(scene)
+    structure = structure_of(as_scene(scene))
     by_row, growth = row_integrability(scene), growth_vector(scene, depth=depth)
     return Report(
         scene=type(scene).__name__,
@@ -129,7 +148,14 @@ def report(scene: Scene, *, depth: int = 4) -> Report:
         worst_pivot=structure.worst_pivot,
         typical_pivot=structure.typical_pivot,
         rank_losses=structure.rank_losses,
+        events=names_of_events(scene),
+        domain={name: (float(low), float(high)) for name, (low, high) in scene.domain.items()},
+        conventions=scene.conventions,
     )
+
+
+def _span(bounds: tuple[float, float]) -> str:
+    return f"{bounds[0]:.4g} to {bounds[1]:.4g}"
 
 
 def _listed(names: tuple[str, ...]) -> str:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.verification import DIFFERENCE_STEP, Check, central_difference, check
 from jourdain_jax.equations.kinematics import Velocities, coordinate_rates, motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.rows import position_rows, velocity_rows
+from jourdain_jax.scene.answers import loads_of, potential_of
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion
@@ -56,13 +57,13 @@ def _inertia(motion: Motion) -> dict[str, Float[Array, ""]]:
 
 def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Float[Array, ""]]:
     t, q, u, inputs = motion.t, motion.q.array, motion.u.array, motion.inputs.array
-    loads = scene.loads(motion)
+    loads = loads_of(scene, motion)
     stated = [i for i, load in enumerate(loads) if load.potential is not None]
     if not stated:
         return {}
 
     def V(q):
-        at = scene.loads(motion_at(scene, t, q, u, inputs))
+        at = loads_of(scene, motion_at(scene, t, q, u, inputs))
         return jnp.stack([at[i].potential for i in stated])
 
     dV = jax.jacfwd(V)(q) @ jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
@@ -103,12 +104,12 @@ def _pieces(scene: Scene, t, q, u, inputs) -> dict[str, Array]:
         pieces |= {f"body `{name}`: its mass": body.mass, f"body `{name}`: its position": body.position}
         if isinstance(body, RigidBody):
             pieces |= {f"body `{name}`: its inertia": body.inertia, f"body `{name}`: its orientation": body.orientation}
-    for i, load in enumerate(scene.loads(motion)):
+    for i, load in enumerate(loads_of(scene, motion)):
         for kind, part in (("force", load.forces), ("torque", load.torques), ("force", load.generalized)):
             pieces |= {f"{_name(i, load)}: its {kind} on `{name}`": value for name, value in part.items()}
         if load.potential is not None:
             pieces[f"{_name(i, load)}: its potential"] = load.potential
-    potential = scene.potential(pose)
+    potential = potential_of(scene, pose)
     if potential is not None:
         pieces["the scene's `potential`"] = jnp.asarray(potential)
     pieces |= {f"row `{name}`": value for name, value in velocity_rows(scene, motion).items()}

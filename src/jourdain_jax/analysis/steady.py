@@ -6,6 +6,8 @@ Whether what was found is steady is then judged without that list, by dy/dt and 
 Levenberg-Marquardt from the guess (J. Nocedal and S. Wright, Numerical Optimization, 2006, section 10.3).
 """
 
+from collections.abc import Mapping
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,13 +20,16 @@ from jourdain_jax.calculus.reals import Number, Numbers
 from jourdain_jax.equations.cyclic import ignorable_coordinates
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.motion.start import State
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.arguments import as_input_vector, as_scene
+from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.numbers import described
+from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 _FINAL_STEPS = 3
 
 
-class SteadyMotion(eqx.Module):
+class SteadyMotion(Printed, eqx.Module):
     """A state of steady motion, and how steady it is."""
 
     state: State
@@ -36,7 +41,9 @@ class SteadyMotion(eqx.Module):
         """A coordinate, speed, quaternion or angular velocity by name."""
         return self.state[name]
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
+        if self.residual.ndim:
+            return f"{int(self.converged.sum())} of {self.converged.size} steady motions found\n{self.state}"
         found = "steady motion" if self.converged else "no steady motion found near the guess"
         return f"{found}: residual {self.residual:.1e} (accelerations {self.acceleration:.1e})\n{self.state}"
 
@@ -45,11 +52,11 @@ def steady(
     scene: Scene,
     guess: "State | dict",
     *,
-    held: tuple[str, ...] = (),
-    moving: tuple[str, ...] | None = None,
+    held: str | tuple[str, ...] = (),
+    moving: str | tuple[str, ...] | None = None,
     t0: Number = 0.0,
-    inputs: Numbers | None = None,
-    privileged: tuple[str, ...] | None = None,
+    inputs: Numbers | dict | None = None,
+    privileged: str | tuple[str, ...] | None = None,
     max_steps: int = 60,
 ) -> SteadyMotion:
     """The steady motion near a guess: `g = 0, phi = 0, dy/dt = 0`, and only coordinates move that do not matter.
@@ -70,17 +77,28 @@ def steady(
 
     **Raises** ValueError: an unknown name.
     """
-    t, q, u = (guess.t, guess.q, guess.u) if isinstance(guess, State) else (jnp.asarray(t0, jnp.result_type(float)), *scene.named(**guess)[:2])
-    f = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else jnp.asarray(inputs, q.dtype)
+    t, q, u = _guessed(as_scene(scene), guess, t0)
+    f = as_input_vector(scene, inputs, q.dtype).astype(q.dtype)
+    held = as_names(held)
     names = scene.coordinate_names.entries + scene.speed_names.entries
     _check_names(scene, held, names)
-    moving = ignorable_coordinates(scene) if moving is None else moving
+    moving = ignorable_coordinates(scene) if moving is None else as_names(moving)
     groups = {group: scene.coordinate_names.entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
     _check_names(scene, moving, (*scene.coordinate_names.entries, *groups))
     carried = {entry for name in moving for entry in groups.get(name, (name,))}
     resting = tuple(i for i, name in enumerate(scene.coordinate_names.entries) if name not in carried)
     free = jnp.array([name not in held for name in names], bool)
     return _solve(_Problem(scene, t, f, privileged_speeds(scene, privileged), resting), q, u, free, max_steps)
+
+
+def _guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
+    """t, q, u of a guess."""
+    if isinstance(guess, State):
+        return guess.t, guess.q, guess.u
+    if not isinstance(guess, Mapping):
+        raise ValueError(f"`guess` is {described(guess)}, expected a State or a dictionary of named values; those not named start from zero")
+    q, u, _ = scene.named(**guess)
+    return jnp.asarray(t0, jnp.result_type(float)), q, u
 
 
 def _check_names(scene: Scene, given: tuple[str, ...], valid: tuple[str, ...]) -> None:

@@ -22,7 +22,7 @@ from jourdain_jax.equations.scaling import row_scale, scaled
 from jourdain_jax.equations.structure import sample_states, structure_of
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.motion.start import State
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene
 
 
@@ -112,12 +112,12 @@ def eliminated(rows: Float[Array, "rows all"], dependent: Int[np.ndarray, "depen
     return basis.at[dependent].set(-below), pivot
 
 
-def privileged_speeds(scene: Scene, names: tuple[str, ...] | None = None) -> tuple[int, ...]:
+def privileged_speeds(scene: Scene, names: str | tuple[str, ...] | None = None) -> tuple[int, ...]:
     """Indices of the independent speeds: those named, else the scene's own choice, else the engine's."""
     names = scene.privileged if names is None else names
     if names is None:
         return structure_of(scene).independent
-    return tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in names)
+    return tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(names))
 
 
 def dependent_coordinates(scene: Scene, state: State, named: tuple[str, ...], dependent: tuple[str, ...] | None) -> Int[np.ndarray, "dependent"]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.analysis.bijections import Bijection, positive, unbounded
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.motion.start import start as consistent_start
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -90,9 +90,8 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
     Raises ValueError for unknown names, for guesses outside their bounds, and where nothing is free.
     """
     parameters = {name: (value, about) for name, value, about in parameters_of(scene)}
-    free = {free: None} if isinstance(free, str) else free
     entries = []
-    for name, bijection in (free if isinstance(free, Mapping) else dict.fromkeys(free)).items():
+    for name, bijection in (free if isinstance(free, Mapping) else dict.fromkeys(as_names(free))).items():
         if name not in parameters:
             raise ValueError(f"`free` names `{name}`, which is no parameter of `{type(scene).__name__}`; {nearest(name, parameters)}")
         value, about = parameters[name]

@@ -3,6 +3,8 @@
 import equinox as eqx
 import numpy as np
 
+from jourdain_jax.scene.printing import Printed
+
 # Relative to the size of what is compared, by floating-point type.
 THRESHOLDS: dict[str, dict[str, float]] = {
     "float64": {
@@ -67,7 +69,7 @@ def central_difference(along: list, h: float):
     return (along[0] - 8 * along[1] + 8 * along[2] - along[3]) / (12 * h)
 
 
-class Verification(eqx.Module):
+class Verification(Printed, eqx.Module):
     """All checks of one state; `print` shows them as a table."""
 
     scene: str = eqx.field(static=True)
@@ -96,7 +98,7 @@ class Verification(eqx.Module):
             "checks": [check.as_dict() for check in self.checks],
         }
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
         lines = [f"Verification of {self.scene}: {'passed' if self.passed else 'FAILED'}"]
         for check in self.checks:
             verdict = "ok" if check.passed else f"FAILED, look at {check.culprit}"

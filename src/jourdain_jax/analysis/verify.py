@@ -20,7 +20,7 @@ from jourdain_jax.analysis.gradients import by_reduction, gradient_checks
 from jourdain_jax.analysis.statements import statement_checks
 from jourdain_jax.analysis.verification import Check, Verification, check
 from jourdain_jax.calculus.null_space import null_space_svd
-from jourdain_jax.calculus.reals import Numbers, as_real
+from jourdain_jax.calculus.reals import Numbers
 from jourdain_jax.equations.accelerations import reductions
 from jourdain_jax.equations.gibbs_appell import gibbs_equations
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities
@@ -31,11 +31,14 @@ from jourdain_jax.equations.reductions import diagnosed
 from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import equations_and_rows, kinetic_energy, newton_residual, potential_energy
+from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State
+from jourdain_jax.scene.answers import loads_of, potential_of
+from jourdain_jax.scene.arguments import as_input_vector, as_scene
 from jourdain_jax.scene.scene import Scene
 
 
-def verify(scene: Scene, state: State, inputs: Numbers | None = None, *, seed: int = 0) -> Verification:
+def verify(scene: Scene, state: State | dict | None = None, inputs: Numbers | dict | None = None, *, seed: int = 0) -> Verification:
     """Check the equations of a scene, and what it states, at a consistent state; a failed check names its culprit.
 
         print(verify(disc, start(disc, lean=0.3, spin_rate=-3.0)))
@@ -43,16 +46,18 @@ def verify(scene: Scene, state: State, inputs: Numbers | None = None, *, seed: i
     Values are relative to the size of what is compared; thresholds go with the floating-point type (`analysis.verification`).
 
     **Arguments**
-    - `state`: on the constraints, from `start` or `consistent`; generic, for a symmetric one hides errors.
-    - `inputs`: values of the scene's inputs (default: zero).
+    - `state`: on the constraints, from `start` or `consistent`, or named values as for `start` (default: the scene's example); generic, for a
+      symmetric one hides errors.
+    - `inputs`: values of the scene's inputs, a vector or by name (default: zero).
     - `seed`: of the random directions for derivatives. Those of accelerations are admissible in the coordinates, free in the speeds, relative in
       the parameters; the Gibbs-Appell reduction is left out of them. Parameters that split rows which are dependent have no derivative there
       and are left out, with a note (`derivative_exists`).
 
     **Returns** a `Verification`. Nothing is raised for a failed check; not under jit or vmap.
     """
+    state = as_state(as_scene(scene), state, what="state")
     t, q, u = state.t, state.q, state.u
-    inputs = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else as_real(inputs)
+    inputs = as_input_vector(scene, inputs)
     found = jax.tree.map(np.asarray, _evaluate(scene, t, q, u, inputs))
     applicable = [name for name, ok in found["applicable"].items() if ok]
     Z = jnp.asarray(found["directions"])
@@ -147,8 +152,8 @@ def _acts_on_speeds(scene: Scene) -> bool:
 
     def look(scene):
         motion = motion_at(scene, 0.0, q, u)
-        flags.append(scene.potential(motion.pose()) is not None)
-        flags.extend(bool(load.generalized) for load in scene.loads(motion))
+        flags.append(potential_of(scene, motion.pose()) is not None)
+        flags.extend(bool(load.generalized) for load in loads_of(scene, motion))
 
     jax.eval_shape(look, scene)
     return any(flags)

@@ -13,6 +13,7 @@ import jaxlib
 
 from jourdain_jax.cli.bicycle_verbs import add as add_bicycle_verbs
 from jourdain_jax.cli.model_verbs import add as add_model_verbs
+from jourdain_jax.motion.versions import version_of
 from jourdain_jax.scene.names import nearest
 
 OK, FAILED, USAGE = 0, 1, 2
@@ -26,6 +27,7 @@ def parser() -> argparse.ArgumentParser:
         description="Dynamics of holonomic and nonholonomic mechanical systems.",
         epilog="exit codes: 0 well; 1 a check failed, a motion did not reach its end, or a file was refused; 2 wrong usage or unknown name",
     )
+    top.add_argument("--version", action="version", version=f"%(prog)s {version_of('jourdain-jax')}")
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
     add_model_verbs(verbs)
     add_bicycle_verbs(verbs)
@@ -54,3 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output (head, less) has gone
         sys.stderr.close()
         return OK
+    except OSError as error:
+        where = f"`{error.filename}`: " if error.filename else ""
+        print(f"jourdain-jax: cannot read or write {where}{error.strerror or error}; check the path and its permissions", file=sys.stderr)
+        return USAGE

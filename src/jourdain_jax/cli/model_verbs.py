@@ -7,15 +7,16 @@ import numpy as np
 
 from jourdain_jax.analysis.report import report
 from jourdain_jax.analysis.verify import verify
-from jourdain_jax.models.registry import MODELS, model
-from jourdain_jax.motion.diagnostics import diagnose
+from jourdain_jax.equations.event_names import names_of_events
+from jourdain_jax.models.registry import MODELS, counts_of, known_model, model
+from jourdain_jax.motion.diagnostics import ContactExtremes, diagnose
 from jourdain_jax.motion.results import EVENT, SUCCESS
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import start
 from jourdain_jax.motion.storage import save
 from jourdain_jax.motion.trajectory import Trajectory
-from jourdain_jax.plotting.animation import animate
-from jourdain_jax.plotting.quantities import plot
+from jourdain_jax.plotting.animation import animate, check_suffix
+from jourdain_jax.plotting.quantities import check_format, plot
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -50,7 +51,7 @@ def add(verbs) -> None:
 
 def _model_options(parser) -> None:
     parser.add_argument("model", help="name, see `jourdain-jax models`")
-    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="parameters")
+    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="parameters, and counts such as links=7")
     parser.add_argument("--json", action="store_true", help="machine-readable")
 
 
@@ -72,7 +73,14 @@ def _pairs(words: list[str], what: str) -> dict[str, float]:
 
 
 def _scene(options) -> Scene:
-    return model(options.model, **_pairs(options.set, "--set"))
+    values = _pairs(options.set, "--set")
+    kind = known_model(options.model)
+    for name in counts_of(kind):
+        if name in values:
+            if not values[name].is_integer():
+                raise ValueError(f"--set {name}={values[name]:g}: `{name}` of `{options.model}` is a count, expected a whole number")
+            values[name] = int(values[name])
+    return model(options.model, **values)
 
 
 def _state(scene: Scene, options):
@@ -91,10 +99,13 @@ def _models(options) -> bool:
 
 def _model_row(name: str) -> dict:
     scene = MODELS[name]()
+    counts = {key: {"value": getattr(scene, key)} for key in counts_of(type(scene))}
     about = (type(scene).__doc__ or "").strip().splitlines()[0]
     parameters = {key: {"value": np.asarray(value).tolist(), "unit": meta["unit"]} for key, value, meta in parameters_of(scene)}
     names = {"coordinates": scene.coordinate_names.entries, "speeds": scene.speed_names.entries, "inputs": scene.inputs.entries}
-    return {"name": name, "about": about, **names, "parameters": parameters, "conventions": scene.conventions}
+    domain = {key: [float(bound) for bound in bounds] for key, bounds in scene.domain.items()}
+    more = {"events": names_of_events(scene), "domain": domain, "conventions": scene.conventions}
+    return {"name": name, "about": about, **names, "parameters": parameters, "counts": counts, **more}
 
 
 def _report(options) -> bool:
@@ -115,7 +126,7 @@ def _simulate(options) -> bool:
     t1 = scene.example_span if options.t1 is None else options.t1
     if options.samples < 2:
         raise ValueError(f"--samples is {options.samples}, expected at least 2")
-    _check_folders(options)
+    _check_files(options)
     trajectory = simulate(scene, _state(scene, options), ts=np.linspace(0.0, t1, options.samples), rtol=options.rtol, atol=options.atol)
     if options.out:
         save(trajectory, options.out)
@@ -130,12 +141,29 @@ def _simulate(options) -> bool:
     return int(trajectory.result) in (SUCCESS, EVENT)
 
 
-def _check_folders(options) -> None:
+def _check_files(options) -> None:
     """Before a long run, not after it: the files can be written."""
     for path in (options.out, options.plot, options.animate):
         folder = os.path.dirname(path or "") or "."
         if not os.path.isdir(folder):
             raise ValueError(f"cannot write `{path}`: there is no folder `{folder}`; make it first")
+        if path and os.path.isdir(path):
+            raise ValueError(f"cannot write `{path}`: it is a folder; give the name of a file in it")
+    if options.plot:
+        check_format(options.plot)
+    if options.animate:
+        check_suffix(options.animate)
+
+
+def _contact_row(contact: ContactExtremes) -> dict:
+    friction = float(contact.friction_needed)
+    return {
+        "lowest_normal": float(contact.lowest_normal),
+        "highest_normal": float(contact.highest_normal),
+        "friction_needed": friction if np.isfinite(friction) else None,  # None: infinite
+        "pulls": not contact.honest,
+        "determined": bool(contact.determined),
+    }
 
 
 def _motion_row(name: str, trajectory: Trajectory) -> dict:
@@ -154,5 +182,10 @@ def _motion_row(name: str, trajectory: Trajectory) -> dict:
         "energy_kind": found.energy_kind,
         "position_residual": float(found.position_residual),
         "velocity_residual": float(found.velocity_residual),
+        "smallest_singular_value": float(found.smallest_singular_value),
+        "rank": [int(rank) for rank in found.rank],
+        "start_moved": {"coordinates": float(trajectory.moved_q), "speeds": float(trajectory.moved_u)},
+        "invariant_drifts": {key: float(drift) for key, drift in found.invariant_drifts.items()},
+        "contacts": {key: _contact_row(contact) for key, contact in found.contacts.items()},
         "final": final,
     }

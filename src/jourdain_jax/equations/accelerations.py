@@ -24,7 +24,9 @@ from jourdain_jax.equations.reductions import (
 from jourdain_jax.equations.rows import ConstraintRows, position_residual
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
+from jourdain_jax.scene.arguments import as_coordinates, as_scene, as_speeds
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
 
 
@@ -44,7 +46,7 @@ def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
 
     Names: "privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
     """
-    independent = structure_of(scene).independent
+    independent = structure_of(as_scene(scene)).independent
     return {
         "privileged": Privileged(independent),
         "qr": NullSpaceQR(),
@@ -64,6 +66,8 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
         if reduction not in known:
             raise ValueError(f"unknown reduction `{reduction}`; {nearest(reduction, known)}")
         return known[reduction]
+    if not isinstance(reduction, Reduction | GibbsAppell):
+        raise ValueError(f"`reduction` is {described(reduction)}, expected a name ({', '.join(reductions(scene))}) or an object such as `jj.NullSpaceQR()`")
     return reduction
 
 
@@ -88,6 +92,7 @@ def bare_accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, st
 
 
 def _reduced(scene: Scene, t, q, u, inputs, reduction, stabilisation) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
+    q, u = as_coordinates(scene, q), as_speeds(scene, u)
     reduction = as_reduction(scene, reduction)
     equations, rows = equations_and_rows(scene, t, q, u, inputs)
     if stabilisation is not None:

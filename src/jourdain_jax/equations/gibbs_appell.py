@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.equations.kinematics import bias_accelerations, inertias, velocities
 from jourdain_jax.equations.reductions import APPLICABLE_PIVOT, Partition, Reduced, reduced, solve_definite
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces
+from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.scene import Scene
 
 
@@ -26,7 +26,7 @@ def gibbs_function(scene: Scene, t, q, u, udot) -> Float[Array, ""]:
 
     `udot`: accelerations of all speeds, free: they need not obey the rows.
     """
-    u, udot = as_real(u), as_real(udot)
+    q, u, udot = as_coordinates(scene, q), as_speeds(scene, u), as_speeds(scene, udot, "udot")
     velocity, bias = bias_accelerations(scene, t, q, u)
     _, partial = jax.jvp(lambda u: velocities(scene, t, q, u), (u,), (udot,))  # beta udot, gamma udot
     a, alpha, omega = bias.linear + partial.linear, bias.angular + partial.angular, velocity.angular
@@ -40,7 +40,8 @@ def gibbs_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquation
 
     `inputs`: values of the scene's inputs (default: zero).
     """
-    zero = jnp.zeros_like(as_real(u))
+    q, u = as_coordinates(scene, q), as_speeds(scene, u)
+    zero = jnp.zeros_like(u)
     h, M = _gradient_and_hessian(lambda a: gibbs_function(scene, t, q, u, a), zero)
     return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs))
 

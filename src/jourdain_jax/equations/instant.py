@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.equations.kinematics import Inertias, Velocities, coordinate_rates, inertias_of, motion_at, velocities_of
 from jourdain_jax.equations.rows import ConstraintRows, flatten_rows, names_of_rows, velocity_rows
+from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
@@ -38,6 +39,7 @@ class Instant(eqx.Module):
 
 def instant_at(scene: Scene, t, q, u, inputs=None) -> Instant:
     """Everything the equations of motion need of a scene at (t, q, u)."""
+    q, u = as_coordinates(scene, q), as_speeds(scene, u)
     by_speeds, _, _ = derivatives_in_speeds(scene, t, q, u, inputs)
     value, rate, motion = rates_along_motion(scene, t, q, u, inputs)
     return Instant(motion, inertias_of(motion), value, by_speeds, rate)

@@ -19,9 +19,10 @@ from jourdain_jax.equations.reductions import Accelerations
 from jourdain_jax.equations.rows import flatten_rows, names_of_rows, velocity_residual, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.equations.virtual_power import newton_residual
+from jourdain_jax.scene.answers import contacts_of
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, Motion
-from jourdain_jax.scene.names import Named, nearest
+from jourdain_jax.scene.names import Named, UnknownNameError, nearest
 from jourdain_jax.scene.scene import Scene
 
 
@@ -46,7 +47,7 @@ class RowReactions(eqx.Module):
 
     def _by_row(self, values, body):
         if body not in self.body_names:
-            raise KeyError(f"no body `{body}` in this scene; {nearest(body, self.body_names)}")
+            raise UnknownNameError(f"no body `{body}` in this scene; {nearest(body, self.body_names)}")
         return {row: values[s, self.body_names.index(body)] for s, row in enumerate(self.row_names)}
 
 
@@ -108,7 +109,7 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
     such contacts that carry the same body share a sum that nothing here can split; they are marked as not determined.
     """
     motion = motion_at(scene, t, q, u, inputs)
-    contacts = scene.contacts(motion.pose())
+    contacts = contacts_of(scene, motion.pose())
     if not contacts:
         return {}
     rows = row_reactions(scene, t, q, u, accelerations, inputs)

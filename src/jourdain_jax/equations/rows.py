@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.equations.kinematics import motion_at, pose_at
+from jourdain_jax.scene.answers import contacts_of, geometric_constraints_of, prescribed_of, velocity_constraints_of
+from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.scene import Scene
@@ -31,21 +32,21 @@ class ConstraintRows(eqx.Module):
 
 def position_rows(scene: Scene, pose: Pose) -> dict[str, Array]:
     """Values of all geometric rows by name: prescribed coordinates, geometric constraints, contact heights."""
-    rows = {f"prescribed {name}": pose.q[_coordinate(scene, name)] - value for name, value in scene.prescribed(pose.t).items()}
-    rows |= {name: jnp.asarray(value) for name, value in scene.geometric_constraints(pose).items()}
-    return rows | {f"{name} height": contact.gap() for name, contact in scene.contacts(pose).items() if contact.height == "row"}
+    rows = {f"prescribed {name}": pose.q[_coordinate(scene, name)] - value for name, value in prescribed_of(scene, pose.t).items()}
+    rows |= geometric_constraints_of(scene, pose)
+    return rows | {f"{name} height": contact.gap() for name, contact in contacts_of(scene, pose).items() if contact.height == "row"}
 
 
 def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
     """Values of all rows at the level of velocities, by name."""
     rows = _rates_of_position_rows(scene, motion)
-    for name, contact in scene.contacts(motion.pose()).items():
+    for name, contact in contacts_of(scene, motion.pose()).items():
         slip = motion[contact.body].velocity_at(contact.point) - contact.plane.velocity_at(contact.point)
         rows[f"{name} slip"] = contact.plane.tangents @ slip
-    for name, value in scene.velocity_constraints(motion).items():
+    for name, value in velocity_constraints_of(scene, motion).items():
         if name in rows:
             raise ValueError(f"row name `{name}` of `{type(scene).__name__}` is used twice; give every constraint a name of its own")
-        rows[name] = jnp.asarray(value)
+        rows[name] = value
     return rows
 
 
@@ -90,7 +91,7 @@ def flatten_rows(rows: dict[str, Array], dtype) -> Float[Array, "rows"]:
 
 def position_residual(scene: Scene, t, q) -> Float[Array, "geometric_rows"]:
     """`g(t, q)` of all geometric rows, shape (geometric rows,), in their own units; zero on the constraints. Eq. (5)."""
-    return _position_residual(scene, jnp.asarray(t, jnp.result_type(float)), as_real(q))
+    return _position_residual(scene, jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q))
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
@@ -103,7 +104,7 @@ def velocity_residual(scene: Scene, t, q, u, inputs=None) -> Float[Array, "rows"
 
     `inputs`: values of the scene's inputs (default: zero).
     """
-    return _velocity_residual(scene, jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u), inputs)
+    return _velocity_residual(scene, jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u), inputs)
 
 
 @eqx.filter_jit

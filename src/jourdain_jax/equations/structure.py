@@ -13,11 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.equations.kinematics import coordinate_rates, velocities
+from jourdain_jax.equations.plausibility import implausible, pose_numbers
 from jourdain_jax.equations.probing import on_numbers, probed_once
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_rows, velocity_residual
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import mass_matrix_at
+from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.names import as_names
+from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 
 RANDOM_PROBES = 24
@@ -47,6 +51,7 @@ class Structure:
     rheonomic: bool  # rows, poses or coordinate rates depend on time
     driven: bool  # bodies or coordinates move while all speeds are zero
     chosen_by_user: bool
+    faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, as sentences
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -159,26 +164,35 @@ def _probe(scene, t, q, u, u_other):
         )
         at_rest = velocities(scene, t, q, jnp.zeros_like(u))
         moving = jnp.concatenate([at_rest.linear.ravel(), at_rest.angular.ravel(), coordinate_rates(scene, t, q, jnp.zeros_like(u))])
-        return scaled, jnp.max(jnp.abs(still), initial=0.0), curved, jnp.any(timed != 0), jnp.any(moving != 0), _miss(scene, t, q)
+        return scaled, jnp.max(jnp.abs(still), initial=0.0), curved, jnp.any(timed != 0), jnp.any(moving != 0), _miss(scene, t, q), pose_numbers(scene, t, q)
 
     return jax.vmap(one)(t, q, u, u_other)
 
 
-@probed_once
 def structure_of(scene: Scene) -> Structure:
     """Static facts about a scene: rank of its rows, privileged velocities and their conditioning, kinds of rows; eqs. (25)-(31).
 
     Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers stand in for traced parameters.
-    ValueError where no admissible state is found, or `privileged` names unknown or too few speeds.
+    ValueError where no admissible state is found, or `privileged` names unknown or too few speeds; for known parameters also where
+    numbers of its bodies or planes cannot be.
     """
+    structure = _probed_structure(as_scene(scene))
+    if structure.faults and not is_traced(scene):  # numbers that stand in for traced parameters prove nothing
+        raise ValueError(structure.faults[0])
+    return structure
+
+
+@probed_once
+def _probed_structure(scene: Scene) -> Structure:
     names = names_of_rows(scene)
     count = len(scene.speed_names)
     t, q, u = _random_states(scene, RANDOM_PROBES, np.random.default_rng(0))
     symmetric = _symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
-    scaled, still, curved, timed, moving, miss = _probe(scene, t, q, u, -u[::-1])
+    scaled, still, curved, timed, moving, miss, numbers = _probe(scene, t, q, u, -u[::-1])
     generic = np.arange(len(t)) < RANDOM_PROBES
-    usable = np.all(np.isfinite(scaled), axis=(1, 2)) & _assembled(scene, miss, generic)
+    on_rows = _assembled(scene, miss, generic)
+    usable = np.all(np.isfinite(scaled), axis=(1, 2)) & on_rows
     q, scaled, still, curved, timed, moving = (x[usable] for x in (q, scaled, still, curved, timed, moving))
     ranks = [_rank(A) for A in scaled]
     rank = max((r for r, is_generic in zip(ranks, generic[usable], strict=True) if is_generic), default=0)
@@ -202,6 +216,7 @@ def structure_of(scene: Scene) -> Structure:
         rheonomic=bool(timed.any()),
         driven=bool(moving.any()),
         chosen_by_user=by_user,
+        faults=implausible(scene, jax.tree.map(lambda x: x[on_rows], numbers)),
     )
 
 
@@ -227,7 +242,7 @@ def _describe(scene: Scene, q: np.ndarray) -> str:
 def _user_choice(scene: Scene, freedoms: int) -> tuple[int, ...] | None:
     if scene.privileged is None:
         return None
-    chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in scene.privileged)
+    chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(scene.privileged))
     if len(chosen) != freedoms:
         raise ValueError(
             f"`privileged` of `{type(scene).__name__}` names {len(chosen)} speeds, but the scene has {freedoms} degrees of freedom; "

@@ -14,11 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import Inertias, Velocities, bias_accelerations, coordinate_rates, inertias, motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.rows import ConstraintRows
+from jourdain_jax.scene.answers import loads_of, potential_of
+from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.names import nearest
@@ -46,7 +47,7 @@ def resultants(scene: Scene, motion: Motion, *, conservative: bool | None = None
     force = {name: jnp.zeros_like(body.position) for name, body in motion.bodies.items()}
     torque = dict(force)
     direct = {name: jnp.zeros_like(motion.t) for name in scene.speed_names.entries}
-    for load in scene.loads(motion):
+    for load in loads_of(scene, motion):
         if conservative is not None and conservative != (load.potential is not None):
             continue
         for total, part, kind in ((force, load.forces, "body"), (torque, load.torques, "body"), (direct, load.generalized, "speed")):
@@ -64,15 +65,16 @@ def _rows(vectors: dict) -> Float[Array, "bodies 3"]:
 def potential_energy(scene: Scene, motion: Motion) -> Float[Array, ""]:
     """V in J at a `motion`: the potentials of the loads and of the scene."""
     V = jnp.zeros_like(motion.t)
-    for load in scene.loads(motion):
+    for load in loads_of(scene, motion):
         if load.potential is not None:
             V = V + load.potential
-    extra = scene.potential(motion.pose())
+    extra = potential_of(scene, motion.pose())
     return V if extra is None else V + extra
 
 
 def kinetic_energy(scene: Scene, t, q, u) -> Float[Array, ""]:
     """T = sum m v.v/2 + omega.I omega/2 in J."""
+    q, u = as_coordinates(scene, q), as_speeds(scene, u)
     from_bodies = inertias(scene, t, q)
     bodies = motion_at(scene, t, q, u).bodies.values()
     v, w = jnp.stack([b.velocity for b in bodies]), jnp.stack([b.angular_velocity_body for b in bodies])
@@ -125,6 +127,7 @@ def generalized_forces(scene: Scene, t, q, u, inputs=None) -> Float[Array, "spee
 
     `inputs`: values of the scene's inputs (default: zero).
     """
+    q, u = as_coordinates(scene, q), as_speeds(scene, u)
     return _generalized_forces(scene, motion_at(scene, t, q, u, inputs), partial_velocities(scene, t, q, u))
 
 
@@ -144,9 +147,9 @@ def impressed(scene: Scene, motion: Motion) -> Resultants:
 def _potential_gradient(scene: Scene, motion: Motion) -> Float[Array, "speeds"]:
     """`N' dV/dq` of the scene's own potential."""
     t, q, u = motion.t, motion.q.array, motion.u.array
-    if scene.potential(motion.pose()) is None:
+    if potential_of(scene, motion.pose()) is None:
         return jnp.zeros_like(u)
-    dV = jax.grad(lambda q: scene.potential(pose_at(scene, t, q)))(q)
+    dV = jax.grad(lambda q: potential_of(scene, pose_at(scene, t, q)))(q)
     N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
     return dV @ N
 
@@ -155,12 +158,12 @@ def potential_resultants(scene: Scene, motion: Motion) -> Resultants:
     """The scene's own potential as forces `-dV/dr`, torques `-dV/dtheta` on the bodies, and `-N' dV/dq` at fixed poses on the speeds."""
     t, q, u, pose = motion.t, motion.q.array, motion.u.array, motion.pose()
     zero = jnp.zeros((len(pose.bodies), 3), q.dtype)
-    if scene.potential(pose) is None:
+    if potential_of(scene, pose) is None:
         return Resultants(zero, zero, jnp.zeros_like(u))
 
     def V(shift, turn, q):
         bodies = {name: _displaced(body, shift[j], turn[j]) for j, (name, body) in enumerate(pose.bodies.items())}
-        return scene.potential(Pose(t, scene.coordinate_names.view(q), bodies))
+        return potential_of(scene, Pose(t, scene.coordinate_names.view(q), bodies))
 
     force, moment, direct = jax.grad(V, argnums=(0, 1, 2))(zero, zero, q)
     N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
@@ -181,7 +184,7 @@ def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
     Shape (bodies, 3), inertial frame, bodies sorted by name. `udot`: the accelerations. `inputs`: values of the scene's inputs (default: zero).
     Impressed forces that a scene states on its speeds, not on bodies, cannot be told apart from constraint forces here.
     """
-    udot = as_real(udot)
+    q, u, udot = as_coordinates(scene, q), as_speeds(scene, u), as_speeds(scene, udot, "udot")
     partial, weights = partial_velocities(scene, t, q, u), inertias(scene, t, q)
     velocity, bias = bias_accelerations(scene, t, q, u)
     acceleration = Velocities(bias.linear + partial.linear @ udot, bias.angular + partial.angular @ udot)
@@ -199,4 +202,5 @@ def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) ->
     Zero for every virtual velocity with `A delta u = 0` if and only if `udot` is the constrained acceleration.
     """
     equations = unconstrained_equations(scene, t, q, u, inputs)
-    return as_real(virtual_velocity) @ (equations.M @ as_real(udot) + equations.h - equations.Q)
+    udot, virtual_velocity = as_speeds(scene, udot, "udot"), as_speeds(scene, virtual_velocity, "virtual_velocity")
+    return virtual_velocity @ (equations.M @ udot + equations.h - equations.Q)

@@ -30,8 +30,8 @@ class PendulumChain(Scene):
     example_span = 3.0
 
     def __check_init__(self):
-        if self.links < 1:
-            raise ValueError(f"`links` of `PendulumChain` is {self.links}, expected a number of particles >= 1")
+        if not isinstance(self.links, int) or self.links < 1:
+            raise ValueError(f"`links` of `PendulumChain` is {self.links!r}, expected a whole number of particles >= 1")
 
     @property
     def coordinates(self):

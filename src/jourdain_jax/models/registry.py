@@ -1,5 +1,7 @@
 """All models by name."""
 
+from dataclasses import fields
+
 from jourdain_jax.models.ball_on_turntable import BallOnTurntable
 from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
 from jourdain_jax.models.double_pendulum_angles import DoublePendulumAngles
@@ -57,6 +59,21 @@ MODELS: dict[str, type[Scene]] = {
 
 def model(name: str, **parameters) -> Scene:
     """A model by name, with parameters changed by name; a ValueError that lists the valid names otherwise."""
+    kind = known_model(name)
+    valid = [field.name for field in fields(kind)]
+    for given in parameters:
+        if given not in valid:
+            raise ValueError(f"model `{name}` has no parameter `{given}`; {nearest(given, valid)}")
+    return kind(**parameters)
+
+
+def known_model(name: str) -> type[Scene]:
+    """The class of a model; a ValueError with the nearest name where there is none."""
     if name not in MODELS:
         raise ValueError(f"unknown model `{name}`; {nearest(name, MODELS)}")
-    return MODELS[name]().replace(**parameters)
+    return MODELS[name]
+
+
+def counts_of(kind: type[Scene]) -> tuple[str, ...]:
+    """Names of the whole numbers that decide what a scene consists of, such as a number of links."""
+    return tuple(field.name for field in fields(kind) if field.metadata.get("static") and isinstance(field.default, int))

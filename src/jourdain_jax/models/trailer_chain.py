@@ -43,8 +43,8 @@ class TrailerChain(Scene):
     example_span = 5.0
 
     def __check_init__(self):
-        if self.trailers < 0:
-            raise ValueError(f"`trailers` of `TrailerChain` is {self.trailers}, expected a number >= 0")
+        if not isinstance(self.trailers, int) or self.trailers < 0:
+            raise ValueError(f"`trailers` of `TrailerChain` is {self.trailers!r}, expected a whole number >= 0")
 
     @property
     def coordinates(self):

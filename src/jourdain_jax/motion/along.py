@@ -14,7 +14,9 @@ from jourdain_jax.equations.reactions import ContactForce, RowReactions, contact
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy
 from jourdain_jax.motion.inputs import Inputs
+from jourdain_jax.scene.answers import invariants_of
 from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.numbers import checked_real
 from jourdain_jax.scene.scene import Scene
 
 
@@ -62,7 +64,8 @@ def motions(record: Record) -> Motion:
 
 def path(record: Record, body: str, local) -> Float[Array, "times 3"]:
     """Path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m, from the mass centre)."""
-    return along(_Point(body, jnp.asarray(local, record.q.dtype)), record)
+    local = checked_real(local, f"point of body `{body}`", (3,), advice="give three components in its body frame, m")
+    return along(_Point(body, local.astype(record.q.dtype)), record)
 
 
 def energies(record: Record) -> tuple[Float[Array, "times"], Float[Array, "times"]]:
@@ -124,4 +127,4 @@ def _residuals(scene, t, q, u, inputs):
 
 
 def _invariants(scene, t, q, u, inputs):
-    return scene.invariants(motion_at(scene, t, q, u, inputs))
+    return invariants_of(scene, motion_at(scene, t, q, u, inputs))

@@ -1,13 +1,15 @@
 """Inputs of a scene as functions of time: constants, callables by name, or samples with linear interpolation in between."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.scene import Scene
 
 
@@ -16,6 +18,20 @@ class Sampled(eqx.Module):
 
     ts: Float[Array, "samples"] = eqx.field(converter=as_real)  # s, increasing
     values: Float[Array, "samples"] = eqx.field(converter=as_real)
+
+    def __init__(self, ts, values):
+        self.ts = checked_real(ts, "`ts` of `Sampled`", advice="give times in s")
+        self.values = checked_real(values, "`values` of `Sampled`", advice="give one number per time")
+        if self.ts.ndim != 1 or self.ts.shape[0] == 0 or self.values.shape != self.ts.shape:
+            raise ValueError(
+                f"`Sampled` was given times of shape {self.ts.shape} and values of shape {self.values.shape}, expected two vectors of one length; "
+                "give one value per time, and one `Sampled` per input"
+            )
+        if not is_traced(self.ts) and not (np.all(np.isfinite(self.ts)) and np.all(np.diff(np.asarray(self.ts)) > 0)):
+            raise ValueError("the times of `Sampled` must be finite and increase from one to the next; sort the samples by time and merge repeated ones")
+        if not is_traced(self.values) and not np.all(np.isfinite(self.values)):
+            first = int(np.argmin(np.isfinite(self.values)))
+            raise ValueError(f"value {first} of `Sampled` is {float(self.values[first])}, expected finite numbers; leave samples out that were not measured")
 
     def __call__(self, t):
         """Value at time t."""
@@ -45,13 +61,18 @@ class Inputs(eqx.Module):
 def as_inputs(scene: Scene, given) -> Inputs:
     """Inputs from a dictionary of name -> number, function of time or `Sampled`; what is not named is zero."""
     if isinstance(given, Inputs):
+        if len(given.channels) != len(scene.inputs):
+            raise ValueError(f"`inputs` has {len(given.channels)} channels, but `{type(scene).__name__}` has {len(scene.inputs)} inputs; give them by name")
         return given
-    given = {} if given is None else dict(given)
+    if given is not None and not isinstance(given, Mapping):
+        raise ValueError(f"`inputs` is {described(given)}, expected a dictionary: name -> number, function of time, or `jj.Sampled`")
+    given = {} if given is None else given
     for name in given:
         if name not in scene.inputs.entries:
             raise ValueError(f"`{type(scene).__name__}` has no input `{name}`; {nearest(name, scene.inputs.entries)}")
     channels = []
     for name in scene.inputs.entries:
         value = given.get(name, 0.0)
-        channels.append(value if callable(value) else Constant(jnp.asarray(value, jnp.result_type(float))))
+        advice = "give a number, a function of time, or `jj.Sampled(ts, values)`"
+        channels.append(value if callable(value) else Constant(checked_real(value, f"input `{name}` of `{type(scene).__name__}`", (), advice=advice)))
     return Inputs(tuple(channels))

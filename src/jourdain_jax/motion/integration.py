@@ -20,6 +20,7 @@ from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
 from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.scene.answers import events_of
 from jourdain_jax.scene.scene import Scene
 
 LEAN_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
@@ -222,8 +223,7 @@ def _project(t, y, args):
 @eqx.filter_jit
 def _event_values(t, y, args):
     form, scene, inputs, fixed = args
-    values = scene.events(motion_at(scene, t, *form.unpack(scene, fixed, t, y, inputs(t)), inputs(t)))
-    return {name: jnp.asarray(value) for name, value in values.items()}
+    return events_of(scene, motion_at(scene, t, *form.unpack(scene, fixed, t, y, inputs(t)), inputs(t)))
 
 
 def _stacked_events(t, y, args) -> Float[Array, "events"]:

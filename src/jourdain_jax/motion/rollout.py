@@ -19,15 +19,17 @@ from jourdain_jax.motion.span import saved_times
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 CHUNK = 1024
 MEMORY = 2**30  # bytes of saved states per chunk, at most
 
 
-class Rollout(eqx.Module):
+class Rollout(Printed, eqx.Module):
     """Many motions of one scene: a `Trajectory` whose arrays have a leading axis of lanes."""
 
     lanes: Trajectory
@@ -67,7 +69,7 @@ class Rollout(eqx.Module):
         out[:, reached] = np.nanquantile(values[:, reached], levels, axis=0)
         return out
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
         lines = [f"Rollout of {type(self.lanes.scene).__name__}: {len(self)} lanes"]
         for code, message in results.MESSAGES.items():
             lanes = np.flatnonzero(self.result == code)
@@ -105,7 +107,7 @@ def rollout(
 
     Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`.
     """
-    starts = dict(scene.example) if starts is None else starts
+    starts = dict(as_scene(scene).example) if starts is None else starts
     parameters = {} if parameters is None else {name: jnp.asarray(value) for name, value in parameters.items()}
     fixed, varied, count = _lanes(scene, starts, parameters)
     chunk = _chunk(scene, count, chunk, options)

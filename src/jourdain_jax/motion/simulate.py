@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from jourdain_jax.calculus.reals import Number
 from jourdain_jax.equations.accelerations import Baumgarte, as_reduction
+from jourdain_jax.equations.event_names import names_of_events
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.probing import described_once
 from jourdain_jax.equations.projection import closure_residual
@@ -20,12 +21,15 @@ from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion import results
+from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import Options, integrate
 from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.state_form import StateForm, default_reduction
 from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.scene.answers import loads_of
+from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
@@ -85,8 +89,10 @@ def simulate(
     **Raises** ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` where the adjoint does not
     support the mode of differentiation.
     """
-    start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts)
+    scene = as_scene(scene)
+    check_options(rtol=rtol, atol=atol, max_steps=max_steps, solver=solver, adjoint=adjoint, stepsize_controller=stepsize_controller, saveat=saveat)
     _check_adjoint(adjoint)
+    start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts)
     structure = structure_of(scene)
     form = state_form(scene, structure, state, reduction, stabilisation, projection, work, lowering, batch)
     _warn_float32(start.q.dtype, rtol)
@@ -100,7 +106,7 @@ def simulate(
         max_steps=max_steps,
         land=land_on_ts,
         saveat=None if saveat is None else _checked_saveat(saveat),
-        event_names=event_names(scene) if events else (),
+        event_names=names_of_events(scene) if events else (),
     )
     inputs = as_inputs(scene, inputs)
     start = _on_constraints(scene, t0, start, inputs(t0)) if projection else start
@@ -185,7 +191,7 @@ def _needs_work(scene: Scene, structure: Structure) -> bool:
 def _has_loads_without_potential(scene: Scene) -> bool:
     def loads(scene):
         q, u, _ = scene.named()
-        return tuple(load.potential is None for load in scene.loads(motion_at(scene, 0.0, q, u)))
+        return tuple(load.potential is None for load in loads_of(scene, motion_at(scene, 0.0, q, u)))
 
     flags: list[bool] = []
     jax.eval_shape(lambda s: flags.extend(loads(s)), scene)
@@ -196,10 +202,3 @@ def _has_loads_without_potential(scene: Scene) -> bool:
 def _is_closed(scene: Scene) -> bool:
     """Whether there are geometric rows or quaternion norms to keep."""
     return jax.eval_shape(lambda s: closure_residual(s, 0.0, s.named()[0]), scene).shape[0] > 0
-
-
-@described_once
-def event_names(scene: Scene) -> tuple[str, ...]:
-    """Names of the stop events, in order."""
-    q, u, _ = scene.named()
-    return tuple(jax.eval_shape(lambda s: s.events(motion_at(s, 0.0, q, u)), scene))

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State
-from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.scene import Scene
 
 DEFAULT_SAMPLES = 201
@@ -20,12 +20,7 @@ def span_and_start(scene: Scene, start, t0, t1, ts):
         t0 = start.t if isinstance(start, State) else 0.0 if ts is None else ts[0]
     if t1 is None:
         t1 = t0 + scene.example_span if ts is None else ts[-1]
-    if start is None:
-        start = dict(scene.example)
-    if isinstance(start, dict):
-        start = consistent_start(scene, t0=t0, **start)
-    if not isinstance(start, State):
-        raise ValueError(f"`start` is a {type(start).__name__}, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None")
+    start = as_state(scene, start, t0=t0)
     if start.q.ndim != 1:
         raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
     t0, t1 = jnp.asarray(t0, real), jnp.asarray(t1, real)

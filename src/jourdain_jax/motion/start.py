@@ -9,16 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Number, Numbers, as_real
+from jourdain_jax.calculus.reals import Number, Numbers
 from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
+from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 
-class State(eqx.Module):
+class State(Printed, eqx.Module):
     """A state on the constraints, and how far the guess was from it; `state["yaw"]`, `print(state)`.
 
     q and u in the units of the scene's coordinates and speeds (SI, rad).
@@ -37,7 +39,9 @@ class State(eqx.Module):
         coordinates, speeds = (names.view(x) for names, x in zip(self.names, (self.q, self.u), strict=True))
         return coordinates[name] if name in coordinates else speeds[name]
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
+        if self.q.ndim > 1:
+            return f"States of shape {self.q.shape[:-1]}: {', '.join((*self.names[0].entries, *self.names[1].entries))}"
         pairs = [f"{n} = {v:.6g}" for names, x in zip(self.names, (self.q, self.u), strict=True) for n, v in zip(names.entries, np.asarray(x), strict=True)]
         moved = f"moved by {self.moved_q:.2e} (q), {self.moved_u:.2e} (u) onto the constraints; residual {self.residual:.1e}"
         return f"State at t = {self.t:.6g} s: " + ", ".join(pairs) + f"\n{moved}"
@@ -50,9 +54,8 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
 
     Differentiable in any mode. What cannot be met stays in `residual` (no error: this also runs inside jit and vmap). ValueError for wrong shapes.
     """
-    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u)
-    _check_shapes(scene, q, u)
-    inputs = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else as_real(inputs)
+    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u)
+    inputs = as_input_vector(scene, inputs, q.dtype)
     free_q, free_u = (np.array([name not in held for name in names.entries], bool) for names in (scene.coordinate_names, scene.speed_names))
     project = _uncompiled_projection if _seldom(scene, t, q, u, inputs) else _compiled_projection
     near_q, near_u, moved_q, moved_u, residual = (jnp.asarray(x) for x in project(scene, t, q, u, inputs, free_q, free_u))
@@ -91,7 +94,7 @@ def start(scene: Scene, *, t0: Number = 0.0, **values) -> State:
     where dependent speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
     """
-    q, u, given = scene.named(**values)
+    q, u, given = as_scene(scene).named(**values)
     _check_finite(values)
     state = consistent(scene, t0, q, u, held=(*given, *_resting(scene, given)))
     _check_residual(scene, state, given)
@@ -105,15 +108,6 @@ def _resting(scene: Scene, given: tuple[str, ...]) -> tuple[str, ...]:
     if any(name in names and name not in privileged for name in given):
         return ()
     return tuple(name for name in privileged if name not in given)
-
-
-def _check_shapes(scene: Scene, q, u) -> None:
-    for what, x, names in (("q", q, scene.coordinate_names), ("u", u, scene.speed_names)):
-        if x.shape != (len(names),):
-            raise ValueError(
-                f"{what} of `{type(scene).__name__}` has shape {x.shape}, expected ({len(names)},) for {', '.join(names.entries)}; "
-                "use `jax.vmap` or `rollout` for many states"
-            )
 
 
 def _check_finite(values: dict) -> None:

@@ -10,7 +10,6 @@ import json
 import os
 import zipfile
 from dataclasses import fields
-from importlib.metadata import PackageNotFoundError, version
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,9 @@ import numpy as np
 
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.motion.versions import version_of
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -28,6 +29,7 @@ _TEXTS = ("state_form", "reduction", "solver", "projected")
 
 def save(trajectory: Trajectory, path: str | os.PathLike) -> None:
     """Write a `trajectory` to `path` (`.npz`, format 1 above). Inputs are stored as samples at the saved times."""
+    _check_saved(trajectory, path)
     scene = trajectory.scene
     arrays = {name: np.asarray(getattr(trajectory, name)) for name in _ARRAYS}
     if trajectory.work is not None:
@@ -43,10 +45,22 @@ def save(trajectory: Trajectory, path: str | os.PathLike) -> None:
         "units": {name: metadata["unit"] for name, _, metadata in parameters_of(scene)},
         "static": {name: getattr(scene, name) for name in _static_fields(scene)},
         "event_names": trajectory.event_names,
-        "versions": {name: _version(name) for name in ("jourdain-jax", "jax", "diffrax", "numpy")},
+        "versions": {name: version_of(name) for name in ("jourdain-jax", "jax", "diffrax", "numpy")},
     }
     with open(path, "wb") as file:  # a handle, so that numpy does not append a suffix to the name
         np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+
+
+def _check_saved(trajectory, path) -> None:
+    """One motion, and a path that can be written."""
+    if hasattr(trajectory, "lane"):
+        raise ValueError("`save` takes one motion and was given a rollout; save its lanes one by one: jj.save(rollout.lane(0), 'lane-0.npz')")
+    if not isinstance(trajectory, Trajectory):
+        raise ValueError(f"`save` was given {described(trajectory)}, expected a `Trajectory` from `jj.simulate`")
+    if trajectory.q.ndim != 2:
+        raise ValueError(f"`save` takes one motion and was given a batch of shape {trajectory.q.shape[:-2]}; save them one by one")
+    if os.path.isdir(path):
+        raise ValueError(f"cannot write `{os.fspath(path)}`: it is a folder; give the name of a file in it, such as motion.npz")
 
 
 def load(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
@@ -64,7 +78,8 @@ def load(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
     if unknown:
         raise ValueError(f"`{path}` has a parameter `{unknown[0]}` that `{kind.__name__}` has not; {nearest(unknown[0], known)}")
     rebuilt = kind(**values, **header["static"])
-    inputs = Inputs(tuple(Sampled(jnp.asarray(arrays["ts"]), jnp.asarray(column)) for column in arrays["inputs"].T))
+    forward = np.argsort(arrays["ts"])  # of a motion in reversed time
+    inputs = Inputs(tuple(Sampled(arrays["ts"][forward], column[forward]) for column in arrays["inputs"].T))
     return Trajectory(
         scene=rebuilt,
         work=jnp.asarray(arrays["work"]) if "work" in arrays else None,
@@ -96,10 +111,3 @@ def _static_fields(scene: Scene) -> list[str]:
     """Fields that are plain numbers or texts, such as a number of bodies."""
     parameters = {name for name, _, _ in parameters_of(scene)}
     return [field.name for field in fields(scene) if field.name not in parameters and isinstance(getattr(scene, field.name), int | float | str | bool)]
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "unknown"

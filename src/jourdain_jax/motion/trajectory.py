@@ -1,7 +1,5 @@
 """A motion in time, with named access and everything needed to trust it."""
 
-import html
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -12,7 +10,9 @@ from jourdain_jax.motion import along, results
 from jourdain_jax.motion.diagnostics import Energies, energies_of, summary, summary_html
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import UnknownNameError, nearest
+from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.printing import preformatted, shapes_of
 from jourdain_jax.scene.scene import Scene
 
 
@@ -51,7 +51,7 @@ class Trajectory(eqx.Module):
             if name in names.view(array):
                 return names.view(array)[name]
         valid = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries, "t")
-        raise KeyError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}")
+        raise UnknownNameError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}")
 
     @property
     def valid(self) -> Bool[Array, "times"]:
@@ -93,10 +93,19 @@ class Trajectory(eqx.Module):
         return along.invariants(self)
 
     def __str__(self) -> str:
-        return summary(self, self.message) if self.q.ndim == 2 else f"Trajectories of {type(self.scene).__name__}, lanes {self.q.shape[:-2]}"
+        return summary(self, self.message) if self._is_known_motion else self._outline
 
     def _repr_html_(self) -> str:
-        return summary_html(self, self.message) if self.q.ndim == 2 else html.escape(str(self))
+        return summary_html(self, self.message) if self._is_known_motion else preformatted(self._outline)
+
+    @property
+    def _is_known_motion(self) -> bool:
+        return self.q.ndim == 2 and not is_traced(self)
+
+    @property
+    def _outline(self) -> str:
+        """What is shown of many motions, and of one whose numbers are not known."""
+        return shapes_of(self) if is_traced(self) else f"Trajectories of {type(self.scene).__name__}, lanes {self.q.shape[:-2]}"
 
     # How it ended. -------------------------------------------------------------------------------------------------
 

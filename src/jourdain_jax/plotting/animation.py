@@ -8,6 +8,7 @@ import numpy as np
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
 from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.numbers import described
 
 FRAMES = 60
 
@@ -36,6 +37,12 @@ class _Figure:
         return points.min(axis=0), points.max(axis=0)
 
 
+def check_suffix(path: str | os.PathLike) -> None:
+    """ValueError where an animation cannot be written to a file of this name."""
+    if not str(path).lower().endswith(".gif"):
+        raise ValueError(f"cannot write `{path}`: an animation is a .gif file")
+
+
 def animate(
     trajectory: Trajectory,
     path: str | os.PathLike,
@@ -55,8 +62,10 @@ def animate(
 
     ValueError for another suffix than .gif, or a motion that reached none of its times; ImportError without matplotlib.
     """
-    if not str(path).lower().endswith(".gif"):
-        raise ValueError(f"cannot write `{path}`: an animation is a .gif file")
+    if not isinstance(trajectory, Trajectory) or trajectory.q.ndim != 2:
+        what = described(trajectory)
+        raise ValueError(f"`animate` was given {what}, expected one motion; of a rollout take one lane: jj.animate(rollout.lane(0), 'lane-0.gif')")
+    check_suffix(path)
     plt = pyplot()
     from matplotlib.animation import FuncAnimation, PillowWriter
 

@@ -8,10 +8,18 @@ from jourdain_jax.motion import results
 from jourdain_jax.motion.rollout import Rollout
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import UnknownNameError, nearest
 
 ENERGIES = ("energy", "kinetic energy", "potential energy")
 _BANDS = ((0.025, 0.975, 0.2), (0.25, 0.75, 0.4))  # lower and upper quantile, opacity
+
+
+def check_format(path: str | os.PathLike) -> None:
+    """ValueError where matplotlib knows no picture with the suffix of this path."""
+    known = pyplot().FigureCanvasBase.get_supported_filetypes()
+    suffix = os.path.splitext(os.fspath(path))[1].removeprefix(".").lower()
+    if suffix not in known:
+        raise ValueError(f"cannot write `{path}`: a plot is a .png, .svg or .pdf file, and matplotlib knows no `{suffix or 'file without suffix'}`")
 
 
 def plot(motion: Trajectory | Rollout, *names: str, path: str | os.PathLike | None = None, axes=None):
@@ -23,6 +31,8 @@ def plot(motion: Trajectory | Rollout, *names: str, path: str | os.PathLike | No
 
     Returns the matplotlib figure. KeyError for an unknown name, with the nearest valid one; ImportError without matplotlib.
     """
+    if path is not None:
+        check_format(path)
     scene = motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
     names = names or scene.coordinate_names.entries
     values = [_values(motion, name) for name in names]
@@ -70,7 +80,7 @@ def _values(motion: Trajectory | Rollout, name: str) -> np.ndarray:
     scene = motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
     valid = (*scene.coordinate_names.entries, *scene.speed_names.entries, *(() if many else ENERGIES))
     if name not in valid:
-        raise KeyError(f"nothing named `{name}` to plot; {nearest(name, valid)}")
+        raise UnknownNameError(f"nothing named `{name}` to plot; {nearest(name, valid)}")
     if isinstance(motion, Rollout):
         return motion.quantiles(name, _levels())
     if name in ENERGIES:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import as_real
+from jourdain_jax.scene.numbers import checked_real
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -23,12 +23,8 @@ class Particle(eqx.Module):
     position: Float[Array, "3"]  # m, inertial frame
 
     def __init__(self, mass, position):
-        self.mass = as_real(mass)
-        self.position = as_real(position)
-
-    def __check_init__(self):
-        _check_shape("position of a particle", self.position, (3,))
-        _check_shape("mass of a particle", self.mass, ())
+        self.mass = checked_real(mass, "mass of a particle", ())
+        self.position = checked_real(position, "position of a particle", (3,))
 
 
 class RigidBody(eqx.Module):
@@ -48,18 +44,13 @@ class RigidBody(eqx.Module):
     outline: Float[Array, "points 3"]  # m, body frame, relative to the mass centre; for drawing only
 
     def __init__(self, mass, inertia, position, orientation, outline=None):
-        inertia = as_real(inertia)
-        self.mass = as_real(mass)
-        self.inertia = jnp.diag(inertia) if inertia.ndim == 1 else inertia
-        self.position = as_real(position)
-        self.orientation = as_real(orientation)
-        self.outline = jnp.zeros((0, 3)) if outline is None else as_real(outline)
-
-    def __check_init__(self):
-        _check_shape("mass of a rigid body", self.mass, ())
-        _check_shape("inertia of a rigid body (a 3x3 matrix or three principal moments)", self.inertia, (3, 3))
-        _check_shape("position of a rigid body", self.position, (3,))
-        _check_shape("orientation of a rigid body", self.orientation, (3, 3))
+        self.mass = checked_real(mass, "mass of a rigid body", ())
+        self.inertia = _as_inertia(inertia)
+        self.position = checked_real(position, "position of a rigid body", (3,))
+        self.orientation = checked_real(orientation, "orientation of a rigid body", (3, 3), advice="give a rotation matrix, body to space: jj.rot_z(q.yaw)")
+        self.outline = jnp.zeros((0, 3)) if outline is None else checked_real(outline, "outline of a rigid body")
+        if self.outline.ndim != 2 or self.outline.shape[1] != 3:
+            raise ValueError(f"outline of a rigid body has shape {self.outline.shape}, expected (points, 3); give points of a line in its body frame, m")
 
     @staticmethod
     def thin_disc(mass, radius, *, axis: str, position, orientation, axial=None, diametral=None) -> "RigidBody":
@@ -122,9 +113,13 @@ def _axis_index(axis: str) -> int:
     return _AXES[axis]
 
 
-def _check_shape(what: str, array, shape: tuple[int, ...]) -> None:
-    if jnp.shape(array) != shape:
-        raise ValueError(f"{what} has shape {jnp.shape(array)}, expected {shape}; check how it is put together")
+def _as_inertia(inertia) -> Float[Array, "3 3"]:
+    """Central inertia from a matrix or three principal moments."""
+    what = "inertia of a rigid body"
+    matrix = checked_real(inertia, what, advice="give three principal moments or a 3x3 matrix, kg m^2")
+    if matrix.shape == (3,):
+        return jnp.diag(matrix)
+    return checked_real(matrix, what, (3, 3), advice="give three principal moments or a 3x3 matrix, kg m^2, about the mass centre")
 
 
 def _wheel_outline(k: int) -> np.ndarray:

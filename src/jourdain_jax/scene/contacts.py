@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Vector, as_real
 from jourdain_jax.scene.bodies import _axis_index
 from jourdain_jax.scene.motion_state import BodyPose
+from jourdain_jax.scene.numbers import checked_real
 
 _HEIGHTS = ("coordinates", "row")
 
@@ -21,6 +22,9 @@ class Plane(eqx.Module):
 
     `Plane(origin, tilt, velocity, angular_velocity)`: the plane z = 0, turned by `tilt` (rad) about the y axis so that positive tilt slopes down
     along x. `velocity` in m/s, `angular_velocity` in rad/s; all vectors in the inertial frame.
+
+    A moving plane states its motion twice: `origin` and `tilt` as functions of time, and `velocity` and `angular_velocity`, their rates and
+    what moves within the plane itself (a belt, a turntable). Along the normal both must agree, which is checked when a scene is probed.
     """
 
     origin: Float[Array, "3"]  # m
@@ -31,13 +35,14 @@ class Plane(eqx.Module):
 
     def __init__(self, origin=(0.0, 0.0, 0.0), tilt=0.0, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
         """The plane z = 0, turned by `tilt` (rad) about the y axis so that positive tilt slopes down along x."""
-        c, s = jnp.cos(jnp.asarray(tilt, jnp.result_type(float))), jnp.sin(jnp.asarray(tilt, jnp.result_type(float)))
+        tilt = checked_real(tilt, "tilt of a plane", (), advice="give one angle in rad")
+        c, s = jnp.cos(tilt), jnp.sin(tilt)
         o, i = jnp.zeros_like(c), jnp.ones_like(c)
-        self.origin = as_real(origin)
+        self.origin = checked_real(origin, "origin of a plane", (3,))
         self.normal = jnp.stack([s, o, c])
         self.tangents = jnp.stack([jnp.stack([c, o, -s]), jnp.stack([o, i, o])])
-        self.velocity = as_real(velocity)
-        self.angular_velocity = as_real(angular_velocity)
+        self.velocity = checked_real(velocity, "velocity of a plane", (3,))
+        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a plane", (3,))
 
     def velocity_at(self, position: Vector) -> Float[Array, "3"]:
         """Velocity (m/s, inertial frame) of the plane's material point at `position` (m, inertial frame)."""

@@ -9,9 +9,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.scene.motion_state import Motion, Point
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import checked_real
 
 
 class Load(eqx.Module):
@@ -28,8 +28,12 @@ class Load(eqx.Module):
     potential: Float[Array, ""] | None  # J; None: not conservative, its work is integrated along the motion
 
     def __init__(self, forces=None, torques=None, generalized=None, potential=None):
-        self.forces, self.torques, self.generalized = ({name: as_real(x) for name, x in (part or {}).items()} for part in (forces, torques, generalized))
-        self.potential = None if potential is None else as_real(potential)
+        self.forces, self.torques, self.generalized = (_real_parts(part or {}) for part in (forces, torques, generalized))
+        self.potential = None if potential is None else checked_real(potential, "potential of a load")
+
+
+def _real_parts(parts: dict) -> dict[str, Array]:
+    return {name: checked_real(value, f"load on `{name}`") for name, value in parts.items()}
 
 
 def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
@@ -37,7 +41,7 @@ def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
 
     `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame.
     """
-    g = as_real(strength) * as_real(direction)
+    g = checked_real(strength, "strength of gravity", ()) * checked_real(direction, "direction of gravity", (3,))
     forces = {name: body.mass * g for name, body in motion.bodies.items()}
     potential = -sum(body.mass * (g @ body.position) for body in motion.bodies.values())
     return Load(forces=forces, potential=potential)
@@ -45,7 +49,7 @@ def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
 
 def point_force(point: Point, force) -> Load:
     """A `force` (3,) (N, inertial frame) on a `point` of a body, `motion["body"].point(local)`; no potential."""
-    return _on_point(point, as_real(force), None)
+    return _on_point(point, checked_real(force, f"force on a point of `{point.body}`", (3,), advice="give three components in the inertial frame, N"), None)
 
 
 def torque(motion: Motion, body: str, moment, *, reaction: str | None = None) -> Load:
@@ -53,7 +57,7 @@ def torque(motion: Motion, body: str, moment, *, reaction: str | None = None) ->
 
     No potential. ValueError for an unknown body.
     """
-    moment = as_real(moment)
+    moment = checked_real(moment, f"torque on `{body}`", (3,), advice="give three components in the inertial frame, N m")
     names = [body] if reaction is None else [body, reaction]
     for name in names:
         if name not in motion.bodies:
@@ -90,7 +94,7 @@ def generalized_force(motion: Motion, **forces) -> Load:
     for name in forces:
         if name not in motion.u:
             raise ValueError(f"generalized force on unknown speed `{name}`; {nearest(name, motion.u.keys())}")
-    return Load(generalized=forces)
+    return Load(generalized={name: checked_real(value, f"generalized force on `{name}`", ()) for name, value in forces.items()})
 
 
 def _line(a: Point, b: Point):

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Vector, as_real
 from jourdain_jax.scene.bodies import Body, RigidBody
-from jourdain_jax.scene.names import Named, nearest
+from jourdain_jax.scene.names import Named, UnknownNameError, nearest
+from jourdain_jax.scene.numbers import checked_real
 
 
 class Point(eqx.Module):
@@ -24,7 +25,7 @@ class Point(eqx.Module):
 
 def fixed_point(position) -> Point:
     """A point at rest at `position` (3,) (m, inertial frame), for springs, dampers and rods."""
-    position = as_real(position)
+    position = checked_real(position, "position of a fixed point", (3,), advice="give three components in the inertial frame, m")
     return Point(position, jnp.zeros_like(position), jnp.zeros_like(position))
 
 
@@ -51,7 +52,8 @@ class BodyPose(eqx.Module):
 
     def place(self, local) -> Float[Array, "*times 3"]:
         """Position (inertial frame) of the point with body-frame coordinates `local` (m, relative to the mass centre)."""
-        return self.position + self.orientation @ as_real(local)
+        local = checked_real(local, f"point of body `{self.name}`", (3,), advice="give three components in its body frame, m")
+        return self.position + self.orientation @ local.astype(self.position.dtype)
 
 
 class BodyMotion(eqx.Module):
@@ -78,7 +80,7 @@ class BodyMotion(eqx.Module):
 
     def point(self, local=(0.0, 0.0, 0.0)) -> Point:
         """The material point with body-frame coordinates `local` (m, relative to the mass centre)."""
-        position = self.place(jnp.asarray(local, self.position.dtype))
+        position = self.place(local)
         return Point(position, self.velocity_at(position), position - self.position, self.name)
 
 
@@ -113,5 +115,5 @@ class Motion(eqx.Module):
 
 def _lookup(bodies: dict, name: str):
     if name not in bodies:
-        raise KeyError(f"no body `{name}` in this scene; {nearest(name, bodies)}")
+        raise UnknownNameError(f"no body `{name}` in this scene; {nearest(name, bodies)}")
     return bodies[name]

@@ -7,12 +7,24 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 
+class UnknownNameError(KeyError):
+    """A name that does not exist; unlike a plain KeyError it prints its message as it is, without quotes around it."""
+
+    def __str__(self) -> str:
+        return str(self.args[0]) if self.args else ""
+
+
 def nearest(name: str, valid: Iterable[str]) -> str:
     """The end of an error message: the nearest valid name, if any is near, and all valid names."""
     valid = list(valid)
     match = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
     hint = f"did you mean `{match[0]}`? " if match else ""
     return f"{hint}Valid names: {', '.join(f'`{v}`' for v in valid) or 'none'}."
+
+
+def as_names(names: "str | Iterable[str]") -> tuple[str, ...]:
+    """Names as a tuple; a text is one name."""
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 class Named(eqx.Module):
@@ -25,7 +37,7 @@ class Named(eqx.Module):
         for slot, first, length in self.slots:
             if slot == name:
                 return self.array[..., first] if length == 0 else self.array[..., first : first + length]
-        raise KeyError(f"no `{name}` here; {nearest(name, [slot for slot, _, _ in self.slots])}")
+        raise UnknownNameError(f"no `{name}` here; {nearest(name, [slot for slot, _, _ in self.slots])}")
 
     def __getattr__(self, name: str):
         if name.startswith("__"):

@@ -8,6 +8,15 @@ import numpy as np
 from jaxtyping import Array
 
 from jourdain_jax.calculus.reals import as_real
+from jourdain_jax.scene.numbers import described
+
+
+def _as_leaf(value):
+    """A parameter as a floating-point array; what is no number is left, to be refused by name: a converter does not know the name."""
+    try:
+        return as_real(value)
+    except (TypeError, ValueError):
+        return value
 
 
 def parameter(default=..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = ""):
@@ -18,7 +27,7 @@ def parameter(default=..., *, unit: str = "", positive: bool = False, non_negati
     """
     options = {} if default is ... else {"default": default}
     metadata = {"parameter": True, "unit": unit, "positive": positive, "non_negative": non_negative, "about": about}
-    return eqx.field(converter=as_real, metadata=metadata, **options)
+    return eqx.field(converter=_as_leaf, metadata=metadata, **options)
 
 
 def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:
@@ -31,10 +40,12 @@ def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:
 def check_parameters(scene) -> None:
     """Raise a ValueError that names a parameter which is not finite or has the wrong sign; traced values are not checked."""
     for name, value, metadata in parameters_of(scene):
-        if isinstance(value, jax.core.Tracer) or not hasattr(value, "dtype"):
+        where = f"parameter `{name}` of `{type(scene).__name__}`"
+        if not hasattr(value, "dtype"):
+            raise ValueError(f"{where} is {described(value)}, expected a number{_in(metadata)} or an array of numbers")
+        if isinstance(value, jax.core.Tracer):
             continue
         numbers = np.asarray(value)
-        where = f"parameter `{name}` of `{type(scene).__name__}`"
         if not np.all(np.isfinite(numbers)):
             raise ValueError(f"{where} is {numbers}, expected finite numbers; check where it was computed")
         if metadata["positive"] and not np.all(numbers > 0):

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
+from jourdain_jax.scene.description import check_description, checked_arguments
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
@@ -43,9 +44,15 @@ class Scene(eqx.Module):
     example: ClassVar[dict[str, float]] = {}
     example_span: ClassVar[float] = 5.0
 
+    def __new__(cls, *args, **kwargs):
+        """Before any field is set: the arguments are parameters of the scene."""
+        checked_arguments(cls, kwargs)
+        return super().__new__(cls)
+
     def __check_init__(self):
         if not isinstance(getattr(self, "coordinates", None), Coordinates):
             raise ValueError(f"scene `{type(self).__name__}` has no `coordinates`; state them as a class attribute: coordinates = jj.coordinates('x y ...')")
+        check_description(self, Scene)
         check_parameters(self)
 
     # What a scene says. -------------------------------------------------------------------------------------------

@@ -1,0 +1,40 @@
+"""Tables as text: columns side by side, matrices with the names of their rows."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def table(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """Lines with the cells of all rows in columns, indented by two blanks."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def matrix(name: str, values, row_names: Sequence[str], column_names: Sequence[str]) -> list[str]:
+    """A matrix under the names of its columns."""
+    values = np.asarray(values)
+    return table([(name, *column_names), *((row, *(f"{x:.6g}" for x in line)) for row, line in zip(row_names, values, strict=True))])
+
+
+def complex_number(s) -> str:
+    """`-0.5+2.1i`."""
+    return f"{s.real:.6g}{s.imag:+.6g}i" if abs(s.imag) > 0 else f"{s.real:.6g}"
+
+
+def linearization_text(found) -> str:
+    """M, C, K and F of the named coordinates with their eigenvalues; A and B where none are named."""
+    if found.A.ndim != 2:
+        return f"Linearizations of shape {found.A.shape[:-2]}; named coordinates: {', '.join(found.coordinates) or 'none'}"
+    lines = [f"Small motions: residual {float(found.residual):.1e} (zero if the motion is steady), pivot {float(found.pivot):.2g}"]
+    names = found.coordinates
+    if names:
+        lines += [line for what in ("M", "C", "K") for line in matrix(what, getattr(found, what), names, names)]
+        lines += matrix("F", found.F, names, found.inputs) if found.inputs else []
+        lines.append(f"  coupling to what is not named {float(found.coupling):.1e}")
+        values = found.eigenvalues()
+    else:
+        lines += matrix("A", found.A, found.states, found.states)
+        lines += matrix("B", found.B, found.states, found.inputs) if found.inputs else []
+        values = found.state_eigenvalues()
+    return "\n".join([*lines, "  eigenvalues in 1/s: " + ", ".join(complex_number(s) for s in np.asarray(values))])

@@ -1,0 +1,114 @@
+"""Whether the numbers that a scene gives for its bodies and planes can be those of bodies and planes; looked at while it is probed.
+
+m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
+d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's motion, stated twice: by o(t), n(t) and by v, w
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.equations.kinematics import pose_at
+from jourdain_jax.scene.answers import contacts_of
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.motion_state import Pose
+from jourdain_jax.scene.scene import Scene
+
+_TOLERANCE = 1e-4  # relative: constants may be typed with a few digits, mistakes are larger
+
+
+class PoseNumbers(eqx.Module):
+    """Numbers of all bodies and contacts at one state (or, with a leading axis, at many), by name."""
+
+    mass: dict[str, Float[Array, "*states"]]
+    inertia: dict[str, Float[Array, "*states 3 3"]]  # of rigid bodies only
+    orientation: dict[str, Float[Array, "*states 3 3"]]
+    planes: dict[str, Float[Array, "*states 3"]]  # normal velocity by origin and tilt, by velocity and angular velocity; size of both, m/s
+
+
+def pose_numbers(scene: Scene, t, q) -> PoseNumbers:
+    """What the scene gives for its bodies and planes at (t, q)."""
+    pose = pose_at(scene, t, q)
+    rigid = {name: body.body for name, body in pose.bodies.items() if isinstance(body.body, RigidBody)}
+    return PoseNumbers(
+        mass={name: body.mass for name, body in pose.bodies.items()},
+        inertia={name: body.inertia for name, body in rigid.items()},
+        orientation={name: body.orientation for name, body in rigid.items()},
+        planes=_normal_velocities(scene, pose),
+    )
+
+
+def _normal_velocities(scene: Scene, pose: Pose) -> dict[str, Float[Array, "3"]]:
+    """Velocity of every contact's plane along its normal at the contact point, twice; and how large either could be."""
+
+    def planes(t):
+        contacts = contacts_of(scene, Pose(t, pose.q, pose.bodies))
+        return {name: (contact.plane.normal, contact.plane.origin) for name, contact in contacts.items()}
+
+    found = {}
+    _, rates = jax.jvp(planes, (pose.t,), (jnp.ones_like(pose.t),))
+    for name, contact in contacts_of(scene, pose).items():
+        plane, arm, (normal_rate, origin_rate) = contact.plane, contact.point - contact.plane.origin, rates[name]
+        by_pose = plane.normal @ origin_rate - normal_rate @ arm
+        by_velocity = plane.normal @ plane.velocity_at(contact.point)
+        lengths = [jnp.sum(jnp.abs(x)) for x in (origin_rate, plane.velocity, arm, normal_rate, plane.angular_velocity)]
+        found[name] = jnp.stack([by_pose, by_velocity, lengths[0] + lengths[1] + lengths[2] * (lengths[3] + lengths[4])])
+    return found
+
+
+def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
+    """What cannot be, one sentence each; `numbers` at many states, those that are not finite are passed over."""
+    who = type(scene).__name__
+    sentences = [_of_mass(f"body `{name}` of `{who}`", mass) for name, mass in numbers.mass.items()]
+    sentences += [_of_inertia(f"body `{name}` of `{who}`", I) for name, I in numbers.inertia.items()]
+    sentences += [_of_orientation(f"body `{name}` of `{who}`", R) for name, R in numbers.orientation.items()]
+    sentences += [_of_plane(f"the plane of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.planes.items()]
+    return tuple(sentence for sentence in sentences if sentence)
+
+
+def _of_mass(what: str, mass: np.ndarray) -> str:
+    lowest = np.min(_finite(mass), initial=0.0)
+    return f"{what} has a mass of {lowest:.4g} kg, expected a number that is not negative; check what its mass is computed from" if lowest < 0 else ""
+
+
+def _of_inertia(what: str, I: np.ndarray) -> str:
+    I = _finite(I)
+    size = np.max(np.abs(I), axis=(1, 2), initial=np.finfo(float).tiny)
+    if np.any(np.max(np.abs(I - np.swapaxes(I, 1, 2)), axis=(1, 2), initial=0.0) > _TOLERANCE * size):
+        return f"{what} has an inertia that is not symmetric; give the same products of inertia above and below the diagonal"
+    least = np.linalg.eigvalsh(I)[:, 0]
+    if np.any(least < -_TOLERANCE * size):
+        return f"{what} has a principal moment of inertia of {least.min():.4g} kg m^2, expected none below zero; check signs and products of inertia"
+    return ""
+
+
+def _of_orientation(what: str, R: np.ndarray) -> str:
+    R = _finite(R)
+    off = np.max(np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)), initial=0.0)
+    if off > _TOLERANCE:
+        return (
+            f"{what} has an orientation R that is no rotation: R' R differs from the identity by {off:.2g}; build it from jj.rot_x, jj.rot_y, jj.rot_z "
+            "or jj.quaternion_to_matrix"
+        )
+    if np.any(np.linalg.det(R) < 0):
+        return f"{what} has an orientation of determinant -1, a reflection and no rotation; turn one of its axes round"
+    return ""
+
+
+def _of_plane(what: str, speeds: np.ndarray) -> str:
+    by_pose, by_velocity, size = _finite(speeds).T
+    off = np.abs(by_pose - by_velocity) - _TOLERANCE * size
+    if not np.any(off > 0):
+        return ""
+    k = int(np.argmax(off))
+    return (
+        f"{what} moves along its normal at {by_pose[k]:.4g} m/s by `origin` and `tilt`, but at {by_velocity[k]:.4g} m/s by `velocity` and "
+        "`angular_velocity`; state the motion in both: velocity = d origin/dt, angular_velocity = (0, d tilt/dt, 0)"
+    )
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    """The states at which all entries are finite, with a leading axis of states."""
+    return values[np.all(np.isfinite(values.reshape(len(values), -1)), axis=1)]

@@ -1,0 +1,126 @@
+"""What the methods of a scene return, checked: of the right kind and shape, or a ValueError that names the method and what to return.
+
+The checks look at kinds and shapes, which are known while a scene is traced: no compiled program contains any of them.
+"""
+
+from collections.abc import Iterable
+from typing import get_args
+
+from jaxtyping import Array, Float
+
+from jourdain_jax.scene.bodies import Body
+from jourdain_jax.scene.contacts import Contact
+from jourdain_jax.scene.loads import Load
+from jourdain_jax.scene.motion_state import Motion, Pose
+from jourdain_jax.scene.names import Named
+from jourdain_jax.scene.numbers import checked_real, described
+from jourdain_jax.scene.scene import Scene
+
+
+def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
+    """The bodies of a scene by name."""
+    bodies = _dictionary(scene, "bodies", scene.bodies(t, q), '{"disc": jj.RigidBody(...)}')
+    if not bodies:
+        raise ValueError(f'`bodies` of `{_name(scene)}` returned no body; return at least one by name, such as {{"disc": jj.RigidBody(...)}}')
+    for name, body in bodies.items():
+        if not isinstance(body, get_args(Body)):
+            raise ValueError(f"body `{name}` of `{_name(scene)}` is {described(body)}, expected a `jj.Particle` or a `jj.RigidBody`")
+    return bodies
+
+
+def coordinate_rates_of(scene: Scene, t, q: Named, u: Named) -> Float[Array, "coordinates"]:
+    """The rates of all coordinates."""
+    names = scene.coordinate_names.entries
+    return checked_real(
+        scene.coordinate_rates(t, q, u),
+        f"what `coordinate_rates` of `{_name(scene)}` returned",
+        (len(names),),
+        advice=f"return one rate for each of {', '.join(names)}, in this order, such as jnp.stack([...])",
+    )
+
+
+def loads_of(scene: Scene, motion: Motion) -> tuple[Load, ...]:
+    """The loads of a scene; a single one counts as a tuple of one."""
+    given = scene.loads(motion)
+    loads = (given,) if isinstance(given, Load) else tuple(given) if isinstance(given, Iterable) and not isinstance(given, dict | str) else None
+    if loads is None:
+        raise ValueError(f"`loads` of `{_name(scene)}` returned {described(given)}, expected a tuple of loads; write return (jj.gravity(motion, 9.81),)")
+    return tuple(_checked_load(scene, i, load) for i, load in enumerate(loads))
+
+
+def _checked_load(scene: Scene, i: int, load) -> Load:
+    where = f"load {i} of `{_name(scene)}`"
+    if not isinstance(load, Load):
+        raise ValueError(f"{where} is {described(load)}, expected a load, such as jj.point_force(...) or jj.Load(forces=...)")
+    return Load(
+        forces={body: checked_real(value, f"force of {where} on body `{body}`", (3,)) for body, value in load.forces.items()},
+        torques={body: checked_real(value, f"torque of {where} on body `{body}`", (3,)) for body, value in load.torques.items()},
+        generalized={speed: checked_real(value, f"force of {where} on speed `{speed}`", ()) for speed, value in load.generalized.items()},
+        potential=None if load.potential is None else checked_real(load.potential, f"potential of {where}", ()),
+    )
+
+
+def potential_of(scene: Scene, pose: Pose) -> Float[Array, ""] | None:
+    """The scene's own potential energy, J; None where it has none."""
+    V = scene.potential(pose)
+    return None if V is None else checked_real(V, f"what `potential` of `{_name(scene)}` returned", (), advice="return the energy in J, or None")
+
+
+def prescribed_of(scene: Scene, t) -> dict[str, Float[Array, ""]]:
+    """Prescribed coordinates and their values."""
+    given = _dictionary(scene, "prescribed", scene.prescribed(t), '{"x": 0.1 * jnp.sin(t)}')
+    advice = "prescribe every coordinate by its own name"
+    return {name: checked_real(value, f"prescribed value of `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in given.items()}
+
+
+def geometric_constraints_of(scene: Scene, pose: Pose) -> dict[str, Array]:
+    """Values of the scene's own geometric rows."""
+    return _rows(scene, "geometric_constraints", scene.geometric_constraints(pose))
+
+
+def velocity_constraints_of(scene: Scene, motion: Motion) -> dict[str, Array]:
+    """Values of the scene's own velocity rows."""
+    return _rows(scene, "velocity_constraints", scene.velocity_constraints(motion))
+
+
+def _rows(scene: Scene, method: str, given) -> dict[str, Array]:
+    rows = _dictionary(scene, method, given, '{"edge": value}')
+    advice = "return numbers that vanish where the constraint is met"
+    return {name: checked_real(value, f"row `{name}` of `{_name(scene)}`", advice=advice) for name, value in rows.items()}
+
+
+def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
+    """Rolling contacts by name."""
+    contacts = _dictionary(scene, "contacts", scene.contacts(pose), '{"rim": jj.disc_contact(pose["disc"], radius)}')
+    for name, contact in contacts.items():
+        if not isinstance(contact, Contact):
+            raise ValueError(f"contact `{name}` of `{_name(scene)}` is {described(contact)}, expected a `jj.disc_contact(...)` or `jj.ball_contact(...)`")
+    return contacts
+
+
+def events_of(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
+    """Values of the stop events by name."""
+    events = _dictionary(scene, "events", scene.events(motion), '{"fallen": 1.4 - motion.q.lean}')
+    advice = "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; give every condition a name of its own"
+    return {name: checked_real(value, f"event `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in events.items()}
+
+
+def invariants_of(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
+    """Values of the conserved quantities by name."""
+    given = _dictionary(scene, "invariants", scene.invariants(motion), '{"momentum x": body.mass * body.velocity[0]}')
+    advice = "give every component a name of its own"
+    return {name: checked_real(value, f"invariant `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in given.items()}
+
+
+def _dictionary(scene: Scene, method: str, given, example: str) -> dict:
+    """What a method returned, which must be a dictionary by name."""
+    if not isinstance(given, dict):
+        raise ValueError(f"`{method}` of `{_name(scene)}` returned {described(given)}, expected a dictionary by name; write return {example}")
+    for name in given:
+        if not isinstance(name, str):
+            raise ValueError(f"`{method}` of `{_name(scene)}` returned a dictionary with the key {name!r}, expected names (texts) as keys")
+    return given
+
+
+def _name(scene: Scene) -> str:
+    return type(scene).__name__

@@ -1,0 +1,57 @@
+"""What is handed to a public function besides the scene's description: the scene itself, vectors of q and u, inputs. Checked by name.
+
+Kinds and shapes are known while a function is traced: no compiled program contains these checks.
+"""
+
+from collections.abc import Mapping
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.scene.coordinates import Names
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import checked_real, described
+from jourdain_jax.scene.scene import Scene
+
+
+def as_scene(scene) -> Scene:
+    """The scene itself; a ValueError where it is none, or the class and not one of its instances."""
+    if isinstance(scene, Scene):
+        return scene
+    if isinstance(scene, type) and issubclass(scene, Scene):
+        raise ValueError(f"`scene` is the class `{scene.__name__}`, expected a scene of it; write `{scene.__name__}()`, with parameters in the parentheses")
+    raise ValueError(f"`scene` is {described(scene)}, expected a scene: an instance of a subclass of `jj.Scene`")
+
+
+def as_coordinates(scene: Scene, q) -> Float[Array, "coordinates"]:
+    """q as a vector of the scene's coordinates."""
+    return _as_vector(scene, "q", q, as_scene(scene).coordinate_names)
+
+
+def as_speeds(scene: Scene, u, what: str = "u") -> Float[Array, "speeds"]:
+    """u (or another vector over the speeds, named by `what`) as a vector of the scene's speeds."""
+    return _as_vector(scene, what, u, as_scene(scene).speed_names)
+
+
+def _as_vector(scene: Scene, what: str, x, names: Names) -> Array:
+    listed = ", ".join(names.entries)
+    if isinstance(x, Mapping):
+        raise ValueError(f"`{what}` of `{type(scene).__name__}` is a dictionary, expected a vector of {listed}; `jj.start(scene, **values)` makes one by name")
+    advice = f"one number for each of {listed}; use `jax.vmap` or `rollout` for many states"
+    return checked_real(x, f"`{what}` of `{type(scene).__name__}`", (len(names),), advice=advice)
+
+
+def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
+    """Values of the scene's inputs at one instant: from a vector, a dictionary (what is not named is zero), or None for all zero."""
+    names = scene.inputs.entries
+    if inputs is None:
+        return jnp.zeros(len(names), dtype)
+    if not isinstance(inputs, Mapping):
+        listed = ", ".join(names) or "none: the scene has no inputs"
+        return checked_real(inputs, f"`inputs` of `{type(scene).__name__}`", (len(names),), advice=f"one number for each of {listed}")
+    for name in inputs:
+        if name not in names:
+            raise ValueError(f"`{type(scene).__name__}` has no input `{name}`; {nearest(name, names)}")
+    advice = "a function of time is for `simulate`; here give its value at this instant"
+    values = [checked_real(inputs.get(name, 0.0), f"input `{name}` of `{type(scene).__name__}`", (), advice=advice) for name in names]
+    return jnp.stack(values) if values else jnp.zeros(0, dtype)

@@ -1,0 +1,115 @@
+"""Whether a scene's class says what its author meant: names of methods spelt right, names of coordinates that exist, ordered bounds.
+
+A method with a misspelt name would be left out without a word, and with it a force or a row.
+"""
+
+import difflib
+import inspect
+from dataclasses import fields
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from jourdain_jax.scene.coordinates import Names
+from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.numbers import described, is_traced
+
+METHODS = (
+    "bodies",
+    "coordinate_rates",
+    "loads",
+    "potential",
+    "prescribed",
+    "geometric_constraints",
+    "velocity_constraints",
+    "contacts",
+    "events",
+    "invariants",
+)
+ATTRIBUTES = ("coordinates", "speeds", "inputs", "privileged", "domain", "conventions", "example", "example_span")
+_ALIKE = 0.85  # of two names: `load` and `loads` are, `contact_arm` and `contacts` are not
+
+
+def check_description(scene, base: Any) -> None:
+    """A ValueError that names what is wrong with the description of `scene`, a subclass of `base`; traced values are not looked at."""
+    kind: Any = type(scene)
+    misspelt = _misspelt(kind, base)
+    if misspelt:
+        raise ValueError(misspelt)
+    for what in ("speeds", "inputs"):
+        names = getattr(scene, what)
+        if names is not None and not isinstance(names, Names):
+            raise ValueError(f"`{what}` of `{kind.__name__}` is {described(names)}, expected names; write {what} = jj.{what}('a b c')")
+    if scene.speeds is not None and kind.coordinate_rates is base.coordinate_rates:
+        raise ValueError(
+            f"`{kind.__name__}` has speeds of its own ({', '.join(scene.speeds.entries)}) but does not say how they move its coordinates; "
+            "define `coordinate_rates(self, t, q, u)`, which returns the rates of all coordinates"
+        )
+    _check_one_meaning(scene)
+    _check_domain(scene)
+    example = inspect.getattr_static(kind, "example")
+    if isinstance(example, dict):
+        valid = [name for names in (scene.coordinate_names, scene.speed_names) for name in (*names.entries, *(group for group, _, _ in names.groups))]
+        _check_keys(kind, "example", example, valid)
+
+
+def checked_arguments(kind: type, given: dict) -> None:
+    """A ValueError with the nearest valid name where a scene is built with an argument that it does not take."""
+    known = {field.name for field in fields(kind) if field.init}
+    unknown = [name for name in given if name not in known]
+    if not unknown:
+        return
+    taken = list(inspect.signature(kind.__init__).parameters.values())  # type: ignore[misc]
+    valid = [parameter.name for parameter in taken][1:]
+    if any(parameter.kind is inspect.Parameter.VAR_KEYWORD for parameter in taken):
+        return
+    for name in unknown:
+        if name not in valid:
+            raise ValueError(f"scene `{kind.__name__}` has no parameter `{name}`; {nearest(name, valid)}")
+
+
+@lru_cache(maxsize=512)
+def _misspelt(kind: type, base: type) -> str:
+    """What is wrong with the names of a class's methods and attributes, in words; empty where nothing is."""
+    own = {field.name for field in fields(kind)}
+    for owner in kind.__mro__:
+        if owner in base.__mro__:
+            continue
+        for name, member in vars(owner).items():
+            known = name.startswith("_") or name in own or name in (*METHODS, *ATTRIBUTES) or hasattr(base, name)
+            if known or isinstance(member, type | staticmethod | classmethod):
+                continue
+            callable_ = callable(member) or isinstance(member, property)
+            near = difflib.get_close_matches(name, (*METHODS, *ATTRIBUTES) if callable_ else ATTRIBUTES, n=1, cutoff=_ALIKE)
+            if near and near[0] not in vars(owner):  # beside the real one it is a helper
+                what = "a method" if callable_ else "an attribute"
+                return (
+                    f"`{kind.__name__}` has {what} `{name}`, which nothing calls; did you mean `{near[0]}`? "
+                    f"Rename it, or begin its name with an underscore (`_{name}`) if it is your own"
+                )
+    return ""
+
+
+def _check_one_meaning(scene) -> None:
+    for name in scene.speed_names.entries:
+        if name in scene.coordinate_names.entries:
+            raise ValueError(f"`{type(scene).__name__}` has a coordinate and a speed of the name `{name}`; give one of them another name")
+
+
+def _check_domain(scene) -> None:
+    kind, domain = type(scene), scene.domain
+    _check_keys(kind, "domain", domain, (*scene.coordinate_names.entries, *scene.speed_names.entries))
+    for name, pair in domain.items():
+        if is_traced(pair):
+            continue
+        if np.shape(pair) != (2,) or not np.all(np.isfinite(np.asarray(pair, float))) or pair[0] > pair[1]:
+            raise ValueError(f"`domain` of `{kind.__name__}` gives {pair} for `{name}`, expected two finite numbers (low, high) with low <= high")
+
+
+def _check_keys(kind: type, what: str, given, valid) -> None:
+    if not isinstance(given, dict):
+        raise ValueError(f"`{what}` of `{kind.__name__}` is {described(given)}, expected a dictionary of coordinate or speed names")
+    for name in as_names(given):
+        if name not in valid:
+            raise ValueError(f"`{what}` of `{kind.__name__}` names `{name}`, which is no coordinate or speed; {nearest(name, valid)}")

@@ -1,0 +1,95 @@
+"""Numbers that no body and no moving plane can have are refused by name where they are known, and left alone where they are traced."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.models import MODELS
+
+
+class Top(jj.Scene):
+    """A body that turns about z, with everything about it open to mistakes."""
+
+    mass: object = jj.parameter(1.0)
+    moments: object = jj.parameter((1.0, 2.0, 2.5))
+    product: object = jj.parameter(0.0)
+    lopsided: object = jj.parameter(0.0)
+    stretch: object = jj.parameter(1.0)
+    mirror: object = jj.parameter(1.0)
+    coordinates = jj.coordinates("x turn")
+
+    def bodies(self, t, q):
+        inertia = jnp.diag(self.moments) + self.product * (jnp.ones((3, 3)) - jnp.eye(3)) + self.lopsided * jnp.eye(3, k=1)
+        turned = jj.rot_z(q.turn) @ jnp.diag(jnp.stack([self.mirror, self.stretch, self.stretch]))
+        return {"top": jj.RigidBody(self.mass, inertia, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]), turned)}
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"mass": -1.0}, "body `top` of `Top` has a mass of -1 kg, expected a number that is not negative"),
+        ({"moments": (1.0, -2.0, 1.0)}, r"body `top` of `Top` has a principal moment of inertia of -2 kg m\^2, expected none below zero"),
+        ({"product": 3.0}, "body `top` of `Top` has a principal moment of inertia of -.*; check signs and products of inertia"),
+        ({"lopsided": 0.1}, "body `top` of `Top` has an inertia that is not symmetric; give the same products of inertia above and below"),
+        ({"stretch": 2.0}, "body `top` of `Top` has an orientation R that is no rotation: R' R differs from the identity by 3; build it from jj.rot_x"),
+        ({"mirror": -1.0}, "body `top` of `Top` has an orientation of determinant -1, a reflection and no rotation; turn one of its axes round"),
+    ],
+)
+def test_a_body_that_cannot_be_is_named_when_its_scene_is_looked_at(values, sentence):
+    scene = Top(**values)
+    for look in (jj.structure_of, lambda s: jj.simulate(s, {}, t1=0.1), jj.report):
+        with pytest.raises(ValueError, match=sentence):
+            look(scene)
+
+
+def test_a_rod_and_a_massless_frame_can_be():
+    assert jj.structure_of(Top(moments=(0.0, 2.0, 2.0))).faults == ()
+    assert all(jj.structure_of(model()).faults == () for model in MODELS.values())
+
+
+def test_traced_parameters_are_not_judged_by_the_numbers_that_stand_in_for_them():
+    # the stand-in of `product` is 0.1, that of a scene without defaults could be anything
+    slope = jax.grad(lambda p: jnp.sum(jj.simulate(Top(moments=(0.05, 0.05, 0.05), product=p), {"turn_rate": 1.0}, t1=0.1).q_end))(0.01)
+    assert np.isfinite(slope)
+
+
+class BallOnPlate(jj.Scene):
+    """A ball on a plate that rises and tilts as given functions of time, its motion stated again as velocities."""
+
+    rise: object = jj.parameter(0.0)
+    stated_rise: object = jj.parameter(0.0)
+    turn: object = jj.parameter(0.0)
+    stated_turn: object = jj.parameter(0.0)
+    belt: object = jj.parameter(0.0)
+    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+    domain = {"x": (-1.0, 1.0), "y": (-1.0, 1.0), "z": (0.0, 1.0)}
+
+    def bodies(self, t, q):
+        return {"ball": jj.RigidBody.ball(1.0, 0.1, position=jnp.stack([q.x, q.y, q.z]), orientation=jj.quaternion_to_matrix(q.attitude))}
+
+    def contacts(self, pose):
+        o = 0.0 * pose.t
+        velocity = jnp.stack([o, o + self.belt, o + self.stated_rise])
+        plate = jj.Plane(jnp.stack([o, o, self.rise * pose.t]), self.turn * pose.t, velocity, jnp.stack([o, o + self.stated_turn, o]))
+        return {"plate": jj.ball_contact(pose["ball"], 0.1, plane=plate, height="row")}
+
+
+@pytest.mark.parametrize("motion", [{}, {"belt": 1.0}, {"rise": 0.3, "stated_rise": 0.3}, {"turn": 0.2, "stated_turn": 0.2}])
+def test_a_moving_plane_whose_velocities_are_the_rates_of_its_pose_is_accepted(motion):
+    assert jj.structure_of(BallOnPlate(**motion)).faults == ()
+
+
+@pytest.mark.parametrize(
+    ("motion", "sentence"),
+    [
+        ({"rise": 0.3}, "the plane of contact `plate` of `BallOnPlate` moves along its normal at 0.3 m/s by `origin` and `tilt`, but at 0 m/s by `velocity`"),
+        ({"stated_rise": 0.3}, "at 0 m/s by `origin` and `tilt`, but at 0.3 m/s by `velocity` and `angular_velocity`; state the motion in both"),
+        ({"turn": 0.2}, r"the plane of contact `plate` .* angular_velocity = \(0, d tilt/dt, 0\)"),
+        ({"turn": 0.2, "stated_turn": -0.2}, "the plane of contact `plate`"),
+    ],
+)
+def test_a_moving_plane_whose_velocities_are_not_the_rates_of_its_pose_is_refused(motion, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        jj.structure_of(BallOnPlate(**motion))

@@ -1,0 +1,98 @@
+"""Results show the same text when printed, in a console and in a notebook, and say what they are while they are being traced."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.models import ChaplyginSleigh, TiltingDisc, TrailerChain
+
+SLEIGH = ChaplyginSleigh()
+RUN = {"t1": 0.2, "ts": jnp.linspace(0.0, 0.2, 5)}
+
+
+def fitted():
+    motion = jj.simulate(SLEIGH, {"x_rate": 0.6, "heading_rate": 0.9}, **RUN)
+    data = jj.Measurements(motion.ts, {"heading": motion["heading"], "x": motion["x"]}, 0.01, start={"x_rate": 0.6, "heading_rate": 0.9})
+    return jj.fit(SLEIGH, data, "offset")
+
+
+RESULTS = {
+    "State": (lambda: jj.start(SLEIGH, heading_rate=0.5), "State at t = 0 s: x = 0"),
+    "Report": (lambda: jj.report(SLEIGH), "Report on ChaplyginSleigh"),
+    "Verification": (lambda: jj.verify(SLEIGH, {"heading_rate": 0.5}), "Verification of ChaplyginSleigh: passed"),
+    "Rollout": (lambda: jj.rollout(SLEIGH, {"heading_rate": np.array([0.5, 0.6])}, progress=False, **RUN), "Rollout of ChaplyginSleigh: 2 lanes"),
+    "Fit": (fitted, "Fit of ChaplyginSleigh: converged"),
+    "SteadyMotion": (lambda: jj.steady(TiltingDisc(), {"spin_rate": -3.0}, held="spin_rate"), "steady motion: residual"),
+    "Linearization": (lambda: jj.linearize(TiltingDisc(), {"spin_rate": -3.0}, "lean"), "Small motions: residual"),
+}
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_result_shows_its_text_wherever_it_is_shown(name):
+    make, begins = RESULTS[name]
+    result = make()
+    assert type(result).__name__ == name
+    assert str(result).startswith(begins)
+    assert repr(result) == str(result)
+    assert result._repr_html_().startswith("<pre>")
+    assert result._repr_html_().endswith("</pre>")
+
+
+def test_a_linearization_prints_its_matrices_by_name_and_its_eigenvalues():
+    chain = jj.linearize(TrailerChain(trailers=0), {"forward0": 1.0}, ())
+    text = str(chain)
+    for part in ("A ", "B ", "forward0", "turn0", "drive", "eigenvalues in 1/s: "):
+        assert part in text
+    disc = jj.linearize(TiltingDisc(), {"spin_rate": -3.0}, ("lean", "yaw"))
+    for part in ("M ", "C ", "K ", "lean", "yaw", "eigenvalues in 1/s: "):
+        assert part in str(disc)
+    small = jax.vmap(lambda s: jj.linearize(TiltingDisc(), jj.start(TiltingDisc(), spin_rate=s), ("lean",)))(jnp.array([-3.0, -4.0]))
+    assert str(small) == "Linearizations of shape (2,); named coordinates: lean"
+
+
+def test_a_batch_of_states_lists_its_names():
+    states = jax.vmap(lambda x: jj.start(SLEIGH, x=x))(jnp.arange(3.0))
+    assert str(states).startswith("States of shape (3,): x, y, heading")
+
+
+def test_printing_a_traced_result_says_its_shapes():
+    texts = []
+
+    @jax.jit
+    def traced(turning):
+        motion = jj.simulate(SLEIGH, {"heading_rate": turning}, **RUN)
+        texts.extend([str(motion), motion._repr_html_(), str(jj.start(SLEIGH, heading_rate=turning))])
+        return motion.q_end
+
+    traced(0.5)
+    assert texts[0].startswith("Trajectory, being traced: ")
+    assert "the largest of shape (5, 3); print it outside of `jax.jit`, or use `jax.debug.print`" in texts[0]
+    assert texts[1] == f"<pre>{texts[0]}</pre>"
+    assert texts[2].startswith("State, being traced: ")
+
+
+def test_an_unknown_name_is_answered_without_quotes_around_the_answer():
+    motion = jj.simulate(SLEIGH, {}, **RUN)
+    with pytest.raises(KeyError) as caught:
+        motion["headin"]
+    assert str(caught.value).startswith("a trajectory of `ChaplyginSleigh` has no `headin`; did you mean `heading`? Valid names:")
+
+
+def test_starts_inputs_and_names_are_given_alike_everywhere():
+    chain = TrailerChain(trailers=0)
+    named, vector = jj.verify(chain, chain.example, {"turn": 2.0}), jj.verify(chain, None, jnp.array([0.0, 2.0]))
+    assert str(named) == str(vector)
+    one, many = (jj.linearize(TiltingDisc(), {"spin_rate": -3.0}, names) for names in ("lean", ("lean",)))
+    np.testing.assert_array_equal(one.K, many.K)
+    by_name, by_vector = (jj.linearize(chain, None, (), inputs=inputs, privileged=("forward0", "turn0")) for inputs in ({"drive": 1.0}, jnp.array([1.0, 0.0])))
+    np.testing.assert_array_equal(by_name.A, by_vector.A)
+
+
+def test_a_motion_in_reversed_time_comes_back_from_its_file_with_its_inputs(tmp_path):
+    chain = TrailerChain(trailers=0)
+    back = jj.simulate(chain, {"forward0": 1.0}, t0=1.0, ts=[1.0, 0.5, 0.0], inputs={"turn": jj.Sampled([0, 1], [0, 2])})
+    jj.save(back, tmp_path / "back.npz")
+    loaded = jj.load(tmp_path / "back.npz", TrailerChain)
+    np.testing.assert_allclose([loaded.inputs(t)[1] for t in (0.0, 0.25, 1.0)], [0.0, 0.5, 2.0])

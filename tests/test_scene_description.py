@@ -1,0 +1,136 @@
+"""A scene's class is read for misspelt methods, names that do not exist and arguments it does not take, before anything is computed."""
+
+import inspect
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.models import MODELS
+from jourdain_jax.scene import description
+
+
+class Bead(jj.Scene):
+    """A bead on a plane."""
+
+    mass: object = jj.parameter(1.0, unit="kg", positive=True)
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+
+def described(**members):
+    """The bead with some members added."""
+    return type("Described", (Bead,), members)
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("velocity_constraint", "velocity_constraints"),
+        ("geometric_constaints", "geometric_constraints"),
+        ("load", "loads"),
+        ("contact", "contacts"),
+        ("event", "events"),
+        ("potencial", "potential"),
+        ("prescribe", "prescribed"),
+        ("coordinate_rate", "coordinate_rates"),
+        ("invariant", "invariants"),
+    ],
+)
+def test_a_method_whose_name_is_misspelt_does_not_drop_physics_silently(name, meant):
+    with pytest.raises(ValueError, match=f"`Described` has a method `{name}`, which nothing calls; did you mean `{meant}`\\? Rename it, or begin its name"):
+        described(**{name: lambda self, motion: {}})()
+
+
+def test_an_attribute_whose_name_is_misspelt_is_named():
+    with pytest.raises(ValueError, match=r"`Described` has an attribute `priviledged`, which nothing calls; did you mean `privileged`\?"):
+        described(priviledged=("x_rate",))()
+    with pytest.raises(ValueError, match=r"has a method `exemple`, .* did you mean `example`\?"):
+        described(exemple=property(lambda self: {}))()
+
+
+def test_own_methods_parameters_and_helpers_beside_the_real_method_are_left_alone():
+    class Own(Bead):
+        load: object = jj.parameter(2.0, unit="N")  # a parameter, not a method
+
+        def loads(self, motion):
+            return (self.loads_of_wind(motion),)
+
+        def loads_of_wind(self, motion):
+            return jj.generalized_force(motion, x_rate=self.load)
+
+        def contact_arm(self):
+            return 1.0
+
+        def _event(self):
+            return 1.0
+
+        @classmethod
+        def potentials(cls):
+            return cls()
+
+    assert float(Own().load) == 2.0
+
+
+def test_the_list_of_methods_is_that_of_the_base_class():
+    methods = [name for name, member in vars(jj.Scene).items() if inspect.isfunction(inspect.unwrap(member)) and not name.startswith("_")]
+    assert set(description.METHODS) == set(methods) - {"replace", "named"}
+    assert set(description.ATTRIBUTES) == {name for name in jj.Scene.__annotations__ if not name.startswith("_")}
+
+
+@pytest.mark.parametrize(
+    ("members", "sentence"),
+    [
+        ({"domain": {"xx": (0.0, 1.0)}}, "`domain` of `Described` names `xx`, which is no coordinate or speed; did you mean `x`"),
+        ({"domain": {"x": (1.0, -1.0)}}, r"`domain` of `Described` gives \(1.0, -1.0\) for `x`, expected two finite numbers \(low, high\) with low <= high"),
+        ({"domain": {"x": 1.0}}, "gives 1.0 for `x`, expected two finite numbers"),
+        ({"domain": {"x": (0.0, jnp.inf)}}, "for `x`, expected two finite numbers"),
+        ({"domain": ("x", 0.0, 1.0)}, "`domain` of `Described` is a tuple, expected a dictionary"),
+        ({"example": {"x_rat": 1.0}}, "`example` of `Described` names `x_rat`, which is no coordinate or speed; did you mean `x_rate`"),
+        ({"speeds": jj.speeds("a b c")}, r"`Described` has speeds of its own \(a, b, c\) but .*; define `coordinate_rates\(self, t, q, u\)`"),
+        ({"speeds": "a b"}, r"`speeds` of `Described` is the text 'a b', expected names; write speeds = jj.speeds\('a b c'\)"),
+        ({"inputs": ("drive",)}, r"`inputs` of `Described` is a tuple, expected names; write inputs = jj.inputs"),
+        (
+            {"speeds": jj.speeds("x w"), "coordinate_rates": lambda self, t, q, u: u.array},
+            "has a coordinate and a speed of the name `x`; give one of them another name",
+        ),
+    ],
+)
+def test_what_a_class_says_wrongly_is_named_when_a_scene_is_made_of_it(members, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        described(**members)()
+
+
+@pytest.mark.parametrize(
+    ("build", "sentence"),
+    [
+        (lambda: Bead(mas=1.0), "scene `Bead` has no parameter `mas`; did you mean `mass`"),
+        (lambda: Bead(coordinates="x"), "scene `Bead` has no parameter `coordinates`"),
+        (lambda: Bead(mass="heavy"), "parameter `mass` of `Bead` is the text 'heavy', expected a number in kg"),
+        (lambda: Bead(mass=None), "parameter `mass` of `Bead` is `None`, expected a number in kg"),
+        (lambda: Bead().replace(mass="heavy"), "parameter `mass` of `Bead` is the text 'heavy'"),
+    ],
+)
+def test_a_scene_is_not_made_of_arguments_it_does_not_take(build, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        build()
+
+
+def test_a_scene_with_an_init_of_its_own_takes_its_own_arguments():
+    class Heavy(Bead):
+        def __init__(self, weight):
+            self.mass = weight / 9.81
+
+    assert float(Heavy(weight=9.81).mass) == 1.0
+    with pytest.raises(ValueError, match=r"scene `Heavy` has no parameter `wait`; .*Valid names: `weight`"):
+        Heavy(wait=9.81)
+
+
+def test_every_model_is_described_rightly_and_no_check_is_in_a_traced_program():
+    for model in MODELS.values():
+        model()
+    plain = jax.make_jaxpr(lambda mass: 2.0 * Bead(mass=mass).mass)(1.0)
+    assert {equation.primitive.name for equation in plain.eqns} <= {"convert_element_type", "mul"}
