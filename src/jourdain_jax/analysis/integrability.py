@@ -102,7 +102,7 @@ def _forms_at(scene: Scene, t, q, u):
         N, nu = _rates(scene, t, q, u)
         frame = jnp.concatenate([jnp.concatenate([jnp.ones(1), nu])[:, None], jnp.pad(N, ((1, 0), (0, 0)))], axis=1)
         (A, _), (A_other, _) = _linear_rows(scene, t, q, u), _linear_rows(scene, t, q, -0.7 * u[::-1])
-        curved = jnp.max(jnp.abs(A - A_other), axis=1) > 1e-9 * (1 + jnp.max(jnp.abs(A), axis=1))
+        curved = jnp.max(jnp.abs(A - A_other), axis=1) > jnp.sqrt(jnp.finfo(A.dtype).eps) * (1 + jnp.max(jnp.abs(A), axis=1))
         return forms(x), jax.jacfwd(forms)(x), frame, curved
 
     return jax.vmap(one)(t, q, u)
@@ -131,7 +131,7 @@ def growth_vector(scene: Scene, *, depth: int = 4, points: int = 2, seed: int = 
     tolerance = 1e-6 if jnp.result_type(float) == jnp.float64 else 1e-2
     if not structure.affine:
         return Growth((), False, depth, tolerance, None)
-    with_time = structure.rheonomic or structure.driven or not structure.homogeneous
+    with_time = structure.timed_kinematics or structure.driven or not structure.homogeneous
     states = zip(*sample_states(scene, points, seed), strict=True)
     vector, closed = max(_grow(_Fields(scene, with_time, u), t, q, reachable, depth, tolerance) for t, q, u in states)
     return Growth(vector, closed, depth, tolerance, reachable - vector[-1] if closed else None)

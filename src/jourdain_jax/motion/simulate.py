@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.equations.accelerations import Baumgarte, as_reduction
 from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.power import needs_work
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.equations.structure import Structure, structure_of
@@ -165,24 +166,10 @@ def state_form(scene: Scene, structure: Structure, state="auto", reduction=None,
         independent=independent,
         reduction=reduction,
         stabilisation=stabilisation,
-        with_work=work and _needs_work(scene, structure),
+        with_work=work and needs_work(scene, structure),
         projects_positions=projection and closed,
         projects_speeds=projection and not minimal and bool(structure.row_names),
     )
-
-
-def _needs_work(scene: Scene, structure: Structure) -> bool:
-    """Whether anything does work that no potential accounts for."""
-    if structure.rheonomic or not structure.homogeneous or not structure.affine:
-        return True
-
-    def loads(scene):
-        q, u, _ = scene.named()
-        return tuple(load.potential is None for load in scene.loads(motion_at(scene, 0.0, q, u)))
-
-    flags: list[bool] = []
-    jax.eval_shape(lambda s: flags.extend(loads(s)), scene)
-    return any(flags)
 
 
 def _controller(rtol, atol, t0, t1) -> diffrax.PIDController:
