@@ -72,11 +72,16 @@ class Rollout(eqx.Module):
                 events = np.asarray(self.lanes.event)[lanes]
                 named = " " + ", ".join(f"`{self.lanes.event_names[i]}` {int(np.sum(events == i))}" for i in np.unique(events))
             elif code != results.SUCCESS:
-                named = ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
+                named = self._wrong_parameters(lanes[:10]) if code == results.BAD_PARAMETER else ""
+                named += ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
             lines.append(f"  {lanes.size} {message}{named}")
         steps = np.asarray(self.lanes.accepted)
         lines.append(f"  steps accepted: {steps.min()} to {steps.max()}, median {int(np.median(steps))}")
         return "\n".join(lines)
+
+    def _wrong_parameters(self, lanes: np.ndarray) -> str:
+        names = dict.fromkeys(name for i in lanes for name in self.lane(int(i)).wrong_parameters)
+        return f" ({', '.join(f'`{name}`' for name in names)})"
 
 
 def rollout(

@@ -29,6 +29,7 @@ from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.motion.state_form import Integrated, StateForm, default_reduction
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
 DEFAULT_SAMPLES = 201
@@ -234,6 +235,7 @@ def _mark_outputs(adjoint, tree):
 
 @eqx.filter_jit
 def _integrate(original, start, inputs, t0, t1, saved, form, solver, controller, dt0, adjoint, max_steps, names) -> Trajectory:
+    right, start = _without_faults(original, start)
     scene, start, inputs = _mark_inputs(adjoint, (original, start, inputs))
     args = (form, scene, inputs)
     moving = form.projects_positions or form.projects_speeds
@@ -278,7 +280,12 @@ def _integrate(original, start, inputs, t0, t1, saved, form, solver, controller,
         t_end=end.t,
         q_end=q[-1],
         u_end=u[-1],
-        result=_result(solution.result, event, end.y, start, pivot),
+        result=results.with_causes(
+            _result(solution.result, event, end.y, start, pivot),
+            parameters=right,
+            start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
+            moved=solution.stats["num_accepted_steps"] > 0,
+        ),
         event=event,
         accepted=solution.stats["num_accepted_steps"],
         rejected=solution.stats["num_rejected_steps"],
@@ -292,6 +299,12 @@ def _integrate(original, start, inputs, t0, t1, saved, form, solver, controller,
         projected=moving,
         event_names=names,
     )
+
+
+def _without_faults(scene: Scene, start: State):
+    """Whether all parameters are right, and the start: NaN where they are not, so that such a lane ends at once."""
+    right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values()]))
+    return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 
 def _end(solution, args, t0, y0, names):
