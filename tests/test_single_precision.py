@@ -1,4 +1,4 @@
-"""Single precision finds the same static facts about a scene as double: ranks, freedoms, kinds of rows."""
+"""Single precision finds the same static facts about a scene as double: ranks, freedoms, kinds of rows, growth."""
 
 import json
 import os
@@ -10,6 +10,7 @@ from small_scenes import AffineRows, DrivenPendulum
 from timed_scenes import DrivenOrientation, LosingMass
 
 import jourdain_jax as jj
+from jourdain_jax.analysis.integrability import growth_vector
 from jourdain_jax.models import BallOnTurntable, DoublePendulumRods, IsokineticParticle, TiltingDiscQuaternion, TwoWheelAxleRedundant
 
 SCENES = (
@@ -29,7 +30,7 @@ import json, sys
 sys.path[:0] = {path!r}
 import jax, test_single_precision as here
 assert not jax.config.jax_enable_x64
-print(json.dumps([here.facts(scene) for scene in here.SCENES]))
+print(json.dumps([[here.facts(scene) for scene in here.SCENES], here.growth_vector(here.TwoWheelAxleRedundant()).vector]))
 """
 
 
@@ -55,4 +56,8 @@ def in_single_precision():
 
 @pytest.mark.parametrize("number", range(len(SCENES)), ids=[scene.__name__ for scene in SCENES])
 def test_a_scenes_structure_does_not_depend_on_the_precision(in_single_precision, number):
-    assert in_single_precision[number] == json.loads(json.dumps(facts(SCENES[number])))
+    assert in_single_precision[0][number] == json.loads(json.dumps(facts(SCENES[number])))
+
+
+def test_the_growth_vector_of_dependent_rows_does_not_depend_on_the_precision(in_single_precision):
+    assert tuple(in_single_precision[1]) == growth_vector(TwoWheelAxleRedundant()).vector == (2, 3, 4)

@@ -29,7 +29,7 @@ from jourdain_jax.equations.structure import sample_states, structure_of
 from jourdain_jax.scene.scene import Scene
 
 INTEGRABLE = 1e-9  # size of dw on the velocities that w admits, relative to the derivatives of w
-STEP = 0.02  # of the differences, along unit directions
+STEP = {"float64": 0.02, "float32": 0.1}  # of the differences, along unit directions
 BATCH = 32  # points evaluated together
 
 
@@ -199,8 +199,9 @@ def _brackets(fields: "_Fields", x: np.ndarray, parts: np.ndarray) -> tuple[np.n
 def _differences(f, x: np.ndarray, direction: np.ndarray, parts: np.ndarray) -> np.ndarray:
     """Derivative of `f(x, parts)` along a direction, by central differences of eighth order."""
     length = np.linalg.norm(direction, axis=1, keepdims=True)
-    steps = STEP * np.array([1, 2, 3, 4, -1, -2, -3, -4])
-    weights = np.array([672, -168, 32, -3, -672, 168, -32, 3]) / (840 * STEP)
+    step = STEP[x.dtype.name]
+    steps = step * np.array([1, 2, 3, 4, -1, -2, -3, -4], x.dtype)
+    weights = np.array([672, -168, 32, -3, -672, 168, -32, 3], x.dtype) / (840 * step)
     unit = direction / np.where(length > 0, length, 1)
     points = x + steps[:, None, None] * unit
     values = f(points.reshape(-1, x.shape[1]), np.tile(parts, (len(steps), 1, 1)))
