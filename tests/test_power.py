@@ -9,7 +9,6 @@ from timed_scenes import TIMED
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.energy import energy, energy_balance
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.power import power, power_of_nonconservative
 from jourdain_jax.models import BallOnTurntable, ChaplyginSleigh, IsokineticParticle, TiltingDisc, TwoWheelAxleCoordinates
@@ -89,7 +88,7 @@ def test_prescribed_coordinates_and_moving_springs_each_do_work_of_their_own():
     ids=lambda x: type(x).__name__ if isinstance(x, jj.Scene) else "",
 )
 def test_what_changes_the_energy_of_a_scene_is_named(scene, changed_by):
-    balance = energy_balance(scene)
+    balance = jj.energy_balance(scene)
     assert balance.changed_by == changed_by
     assert balance.conserved == (not changed_by)
 
@@ -97,7 +96,7 @@ def test_what_changes_the_energy_of_a_scene_is_named(scene, changed_by):
 def test_energy_is_kinetic_and_potential():
     scene = TiltingDisc(mass=2.0, radius=0.5)
     q, u, _ = scene.named(lean=0.4, lean_rate=1.5)
-    found = energy(scene, 0.0, q, u)
+    found = jj.energy(scene, 0.0, q, u)
     # a tilt about the rim: A + m a^2 with A = m a^2/4; height a cos(lean)
     assert jnp.allclose(found.kinetic, 0.5 * 1.25 * 2.0 * 0.5**2 * 1.5**2, rtol=tolerance("round_off"))
     assert jnp.allclose(found.potential, 2.0 * 9.81 * 0.5 * jnp.cos(0.4), rtol=tolerance("round_off"))

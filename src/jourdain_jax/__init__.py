@@ -18,13 +18,16 @@ if not {"PJRT_NPROC", "NPROC"} & _os.environ.keys():
 
 from jourdain_jax import models
 from jourdain_jax.analysis.bijections import bounds, positive, unbounded
+from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
 from jourdain_jax.analysis.fit import fit, fit_batch
+from jourdain_jax.analysis.gradients import derivative_exists
 from jourdain_jax.analysis.likelihood import log_likelihood
 from jourdain_jax.analysis.linearize import Linearization, linearize
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.report import Report, report
 from jourdain_jax.analysis.steady import steady
-from jourdain_jax.analysis.verify import Verification, verify
+from jourdain_jax.analysis.verification import Verification
+from jourdain_jax.analysis.verify import verify
 from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.equations.accelerations import Accelerations, Baumgarte, accelerations, reductions

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.calculus.reals import Number
+
 
 class Bijection(eqx.Module):
     """How an unknown follows from its free coordinate z; all functions work entry by entry."""
@@ -110,7 +112,7 @@ def positive() -> Positive:
     return Positive()
 
 
-def bounds(low: float, high: float) -> Bounded:
+def bounds(low: Number, high: Number) -> Bounded:
     """The unknown stays between `low` and `high`, in its own unit: `free={"mass": jj.bounds(0.1, 10)}`.
 
     Raises ValueError unless both are finite and low < high.
@@ -123,7 +125,7 @@ def bounds(low: float, high: float) -> Bounded:
     return Bounded(jnp.asarray(low, jnp.result_type(float)), jnp.asarray(high, jnp.result_type(float)))
 
 
-def unbounded(scale: float | None = None) -> Unbounded:
+def unbounded(scale: Number | None = None) -> Unbounded:
     """The unknown may be any number; `scale`, in its unit, is a typical change: state it where the first guess is zero.
 
     Raises ValueError unless the scale is positive and finite.

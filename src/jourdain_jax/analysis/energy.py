@@ -28,7 +28,7 @@ _ORIGINS = {
 
 
 class Energy(eqx.Module):
-    """Energy of one state, in J."""
+    """Energy of one state, in J: `kinetic` T, `potential` V and their `total`."""
 
     kinetic: Float[Array, ""]
     potential: Float[Array, ""]  # of all loads and of the scene that have one; loads without one are not in it
@@ -51,14 +51,15 @@ class EnergyBalance:
 
 
 def energy(scene: Scene, t, q, u, inputs=None) -> Energy:
-    """Kinetic and potential energy at (t, q, u)."""
+    """Kinetic and potential energy (J) at (t, q, u). `inputs`: values of the scene's inputs (default: zero)."""
     return Energy(kinetic_energy(scene, t, q, u), potential_energy(scene, motion_at(scene, t, q, u, inputs)))
 
 
 def energy_balance(scene: Scene, *, points: int = 8, seed: int = 0) -> EnergyBalance:
-    """Whether T + V is conserved: the powers that change it, at random admissible states and with random inputs, are all zero.
+    """Whether T + V is conserved, and what changes it otherwise; the powers are those of eqs. (71)-(73).
 
-    A power counts as zero below 1e-9 of the powers at hand (1e-4 in single precision).
+    Judged at `points` random admissible states with random inputs (`seed`), where a power counts as zero below 1e-9 of the powers at hand (1e-4 in
+    single precision). Scene parameters must be concrete.
     """
     t, q, u = (jnp.asarray(x) for x in sample_states(scene, points, seed))
     inputs = jnp.asarray(np.random.default_rng(seed).normal(size=(len(t), len(scene.inputs))))

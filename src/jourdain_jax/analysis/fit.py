@@ -76,8 +76,9 @@ def fit_batch(
 ) -> Fit:
     """`fit` for many repeats of the same experiment, as one batch.
 
-    Every array in `values` has a leading axis `repeats`; all else is shared. **Returns** a `Fit` whose arrays have the leading
-    axis; a repeat that fails has `converged` False and harms no other. **Raises** as `fit`.
+    Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free`, `cutoff`, `tolerance`, `max_iterations` and
+    `simulation` as in `fit`. **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has `converged` False and harms no other.
+    **Raises** as `fit`.
     """
     problem = _problem(scene, data, free, repeats=True)
     counts = {values.shape[0] for run in problem.measured() for values in run.values()}

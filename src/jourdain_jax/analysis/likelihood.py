@@ -24,7 +24,7 @@ def as_runs(scene: Scene, data: Measurements | Sequence[Measurements], *, repeat
 
 
 def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **simulation) -> Float[Array, ""]:
-    """Logarithm of the probability density of the measurements: `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
+    """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
     Differentiable in scene, start values, measured values and sigmas (reverse mode, unless `adjoint` says otherwise); -inf where
     the motion fails. `simulation`: options of `simulate`. Samples with an infinite sigma do not count.

@@ -24,6 +24,7 @@ from jourdain_jax.analysis.tangent import (
     perturbations,
     privileged_speeds,
 )
+from jourdain_jax.calculus.reals import Numbers
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.scene import Scene
 
@@ -85,7 +86,7 @@ def linearize(
     state: State,
     coordinates: tuple[str, ...] | None = None,
     *,
-    inputs: Float[Array, "inputs"] | None = None,
+    inputs: Numbers | None = None,
     dependent: tuple[str, ...] | None = None,
     privileged: tuple[str, ...] | None = None,
 ) -> Linearization:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.analysis.bijections import Bijection
+from jourdain_jax.calculus.reals import Number
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.scene.names import nearest
@@ -59,7 +60,7 @@ class Measurements(eqx.Module):
         unknown_start: Mapping | Iterable[str] = (),
         inputs: "dict | Inputs | None" = None,
         functions: Mapping[str, Callable] | None = None,
-        t0: float | Array | None = None,
+        t0: Number | None = None,
     ):
         real = jnp.result_type(float)
         self.ts = jnp.asarray(ts, real)
@@ -107,7 +108,7 @@ class Measurements(eqx.Module):
         return sum(jnp.sum(jnp.isfinite(self.sigma_of(name))) for name in self.values)
 
     def sigma_of(self, name: str) -> Float[Array, "times *channel"]:
-        """Sigma of each measured value of a channel."""
+        """Sigma of each measured value of the channel `name`, in its unit, shape (times, *channel)."""
         sigma, values = self.sigma[name], self.values[name]
         # one sigma per time acts on all components of the channel
         aligned = sigma.reshape(sigma.shape + (1,) * (values.ndim - sigma.ndim)) if sigma.ndim else sigma

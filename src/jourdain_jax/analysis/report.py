@@ -13,7 +13,10 @@ _LINE = 120
 
 @dataclass(frozen=True)
 class Report:
-    """Facts about a scene, found by probing at random and symmetric states of its domain."""
+    """Facts about a scene, found by probing at random and symmetric states of its domain; `print(report)` shows a table.
+
+    Row by row and taken together: eqs. (5)-(9), Frobenius; privileged velocities (25)-(31); cyclic coordinates (42).
+    """
 
     scene: str
     coordinates: tuple[str, ...]

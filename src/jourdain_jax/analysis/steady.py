@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.analysis.tangent import flow_of, privileged_speeds
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
+from jourdain_jax.calculus.reals import Number, Numbers
 from jourdain_jax.equations.cyclic import ignorable_coordinates
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.motion.start import State
@@ -46,22 +47,23 @@ def steady(
     *,
     held: tuple[str, ...] = (),
     moving: tuple[str, ...] | None = None,
-    t0: float = 0.0,
-    inputs: Float[Array, "inputs"] | None = None,
+    t0: Number = 0.0,
+    inputs: Numbers | None = None,
     privileged: tuple[str, ...] | None = None,
     max_steps: int = 60,
 ) -> SteadyMotion:
-    """The steady motion near a guess.
+    """The steady motion near a guess: `g = 0, phi = 0, dy/dt = 0`, and only coordinates move that do not matter.
 
         steady(disc, {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0}, held=("lean", "yaw_rate"))["spin_rate"]
 
     **Arguments**
-    - `guess`: a `State`, or named values (the rest zero). It need not meet the constraints.
+    - `guess`: a `State`, or named values (the rest zero) at time `t0` (s). It need not meet the constraints.
     - `held`: names of coordinates and speeds that keep the guess's value; all others are solved for. Where many steady motions meet this,
       the result is one near the guess.
     - `moving`: names of the coordinates that may keep moving; default: those that the scene's accelerations do not depend on (`ignorable`).
     - `inputs`: values of the scene's inputs (default: zero); `privileged`: names of the speeds that are to be constant (default: the scene's
       own). Choose speeds in which the motion is steady: rates of yaw, lean and spin, say, not velocities along fixed axes.
+    - `max_steps`: of the search, at most.
 
     **Returns** a `SteadyMotion`; look at `converged` and `residual`, nothing is raised where none is found. Differentiable in any mode in the
     scene's parameters and in the held values, where the steady motion is a smooth function of them.

@@ -29,7 +29,10 @@ REVERSE_MESSAGE = (
 
 
 class DifferentiationModeError(TypeError):
-    """The adjoint given to `simulate` does not support the mode of differentiation that was asked."""
+    """The adjoint given to `simulate` does not support the mode of differentiation that was asked; the text says which adjoint does.
+
+    Raised where the derivative is taken, evaluated or compiled.
+    """
 
 
 def _raise_forward(*args, **kwargs):

@@ -4,26 +4,34 @@ A rotation matrix `R` takes body components to space components, `r_space = R r_
 `omega_body = vee(R' Rdot)`, its space angular velocity `omega = vee(Rdot R') = R omega_body`. Quaternions are `(w, x, y, z)`.
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Real
+
+from jourdain_jax.calculus.reals import Number, Vector, as_real
 
 
-def rot_x(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Rotation by `angle` (rad) about the x axis."""
+def rot_x(angle: Number) -> Float[Array, "3 3"]:
+    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the x axis."""
+    angle = as_real(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     o, i = jnp.zeros_like(c), jnp.ones_like(c)
     return jnp.stack([jnp.stack([i, o, o]), jnp.stack([o, c, -s]), jnp.stack([o, s, c])])
 
 
-def rot_y(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Rotation by `angle` (rad) about the y axis."""
+def rot_y(angle: Number) -> Float[Array, "3 3"]:
+    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the y axis."""
+    angle = as_real(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     o, i = jnp.zeros_like(c), jnp.ones_like(c)
     return jnp.stack([jnp.stack([c, o, s]), jnp.stack([o, i, o]), jnp.stack([-s, o, c])])
 
 
-def rot_z(angle: Float[Array, ""]) -> Float[Array, "3 3"]:
-    """Rotation by `angle` (rad) about the z axis."""
+def rot_z(angle: Number) -> Float[Array, "3 3"]:
+    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the z axis."""
+    angle = as_real(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     o, i = jnp.zeros_like(c), jnp.ones_like(c)
     return jnp.stack([jnp.stack([c, -s, o]), jnp.stack([s, c, o]), jnp.stack([o, o, i])])
@@ -41,8 +49,9 @@ def vee(S: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return 0.5 * jnp.stack([S[2, 1] - S[1, 2], S[0, 2] - S[2, 0], S[1, 0] - S[0, 1]])
 
 
-def quaternion_to_matrix(quaternion: Float[Array, "4"]) -> Float[Array, "3 3"]:
-    """Rotation matrix of a quaternion `(w, x, y, z)` of any non-zero norm (the formula divides by the squared norm)."""
+def quaternion_to_matrix(quaternion: Real[Array | np.ndarray, "4"] | Sequence[Number]) -> Float[Array, "3 3"]:
+    """Rotation matrix (3, 3), body to space, of a `quaternion` (w, x, y, z) of any norm but zero (the formula divides by the squared norm)."""
+    quaternion = as_real(quaternion)
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     # R = 1 + 2 (w [v]x + [v]x^2) / (w^2 + v.v): unchanged by the norm, so that a drifting norm never scales an inertia.
     two = 2.0 / (w * w + x * x + y * y + z * z)
@@ -74,6 +83,7 @@ def quaternion_product(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Arra
     )
 
 
-def quaternion_from_axis_angle(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "4"]:
-    """The unit quaternion of a rotation by `angle` (rad) about the unit vector `axis`."""
-    return jnp.concatenate([jnp.cos(angle / 2)[None], jnp.sin(angle / 2) * axis])
+def quaternion_from_axis_angle(axis: Vector, angle: Number) -> Float[Array, "4"]:
+    """The unit quaternion (w, x, y, z) `(cos(angle/2), sin(angle/2) axis)` of a turn by `angle` (rad) about the unit vector `axis`."""
+    half = as_real(angle) / 2
+    return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * as_real(axis)])

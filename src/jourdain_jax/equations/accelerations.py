@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.reductions import (
     Accelerations,
@@ -28,17 +29,21 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Baumgarte(eqx.Module):
-    """Stabilisation terms: `A udot = -drift - 2 a phi - b^2 g` on geometric rows, `- a phi` on velocity rows (a, b in 1/s).
+    """Stabilisation terms: `A udot = -drift - 2 a phi - b^2 g` on geometric rows, `- a phi` on velocity rows.
 
-    Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1. Projection (the default of `simulate`) is more accurate.
+    `alpha` a, `beta` b in 1/s. Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1. Projection (the default of `simulate`) is more
+    accurate.
     """
 
-    alpha: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=5.0)
-    beta: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=5.0)
+    alpha: Float[Array, ""] = eqx.field(converter=as_real, default=5.0)
+    beta: Float[Array, ""] = eqx.field(converter=as_real, default=5.0)
 
 
 def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
-    """All reductions by short name, set up with the scene's privileged velocities."""
+    """All reductions by short name, set up with the scene's privileged velocities.
+
+    Names: "privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
+    """
     independent = structure_of(scene).independent
     return {
         "privileged": Privileged(independent),
@@ -65,9 +70,14 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
 def accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None) -> Accelerations:
     """Accelerations, multipliers and diagnostics of a scene at (t, q, u).
 
-    `reduction` is a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt", "udwadia-kalaba", "gibbs-appell";
-    `stabilisation` adds Baumgarte terms. Pure: works under any nesting of jit, vmap, jvp and vjp, with right derivatives
-    wherever the rank of the rows is constant.
+        M udot + h = Q + A' lambda,   A udot = -drift
+
+    - `inputs`: values of the scene's inputs (default: zero).
+    - `reduction`: a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
+    - `stabilisation`: Baumgarte terms (default: none).
+
+    Pure: works under any nesting of jit, vmap, jvp and vjp, with right derivatives wherever the rank of the rows is constant. Look at `applicable`
+    and `residual`: nothing is raised for a state that a reduction cannot serve. ValueError for an unknown reduction. Eqs. (41), (68)-(70).
     """
     return diagnosed(*_reduced(scene, t, q, u, inputs, reduction, stabilisation))
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.equations.kinematics import bias_accelerations, inertias, velocities
 from jourdain_jax.equations.reductions import APPLICABLE_PIVOT, Partition, Reduced, reduced, solve_definite
 from jourdain_jax.equations.rows import ConstraintRows
@@ -21,7 +22,11 @@ from jourdain_jax.scene.scene import Scene
 
 
 def gibbs_function(scene: Scene, t, q, u, udot) -> Float[Array, ""]:
-    """G(t, q, u, udot) in kg m^2/s^4, up to terms without accelerations."""
+    """The Gibbs function `G = sum m a.a/2 + alpha.I alpha/2 + alpha.(omega x I omega)` in kg m^2/s^4, up to terms without accelerations; (12)-(14).
+
+    `udot`: accelerations of all speeds, free: they need not obey the rows.
+    """
+    u, udot = as_real(u), as_real(udot)
     velocity, bias = bias_accelerations(scene, t, q, u)
     _, partial = jax.jvp(lambda u: velocities(scene, t, q, u), (u,), (udot,))  # beta udot, gamma udot
     a, alpha, omega = bias.linear + partial.linear, bias.angular + partial.angular, velocity.angular
@@ -31,8 +36,11 @@ def gibbs_function(scene: Scene, t, q, u, udot) -> Float[Array, ""]:
 
 
 def gibbs_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
-    """M and h as Hessian and gradient of the Gibbs function at `udot = 0`, and Q."""
-    zero = jnp.zeros_like(u)
+    """M, h and Q of `M udot + h = Q` from the Gibbs function: its Hessian, and its gradient at `udot = 0`; (12)-(17).
+
+    `inputs`: values of the scene's inputs (default: zero).
+    """
+    zero = jnp.zeros_like(as_real(u))
     h, M = _gradient_and_hessian(lambda a: gibbs_function(scene, t, q, u, a), zero)
     return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs))
 
@@ -42,13 +50,16 @@ def _gradient_and_hessian(f, x):
 
 
 class GibbsAppell(eqx.Module):
-    """The Gibbs-Appell equations `dG/d(yddot_k) = Q_k` in the privileged accelerations `independent`."""
+    """The reduction by the Gibbs-Appell equations `dG/d(yddot_k) = Q_k` (17) in the privileged accelerations.
+
+    `independent`: indices of the privileged speeds. Not applicable where they do not determine the others.
+    """
 
     independent: tuple[int, ...] = eqx.field(static=True)
     name = "Gibbs-Appell"
 
     def accelerations(self, scene: Scene, t, q, u, equations: UnconstrainedEquations, rows: ConstraintRows) -> Reduced:
-        """Accelerations; of `equations`, only Q is used for them."""
+        """Accelerations on the `rows`; of `equations`, only Q is used for them."""
         problem = scaled(equations, rows)
         split = Partition(problem.A, self.independent)
         C, c, pivot = split.C, split.particular(problem.b), split.pivot()

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.equations.kinematics import Inertias, Velocities, coordinate_rates, inertias_of, motion_at, velocities_of
 from jourdain_jax.equations.rows import ConstraintRows, flatten_rows, names_of_rows, velocity_rows
 from jourdain_jax.scene.motion_state import Motion
@@ -48,13 +49,16 @@ def rows_of(scene: Scene, instant: Instant) -> ConstraintRows:
 
 
 def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
-    """phi, `A = d phi/du` and the drift `d phi/dt` at `udot = 0`."""
+    """phi, `A = d phi/du` and the drift `d phi/dt` at `udot = 0` of all rows, with their names: `A udot = -drift`; eqs. (5)-(9), (25).
+
+    `inputs`: values of the scene's inputs (default: zero). Geometric rows enter by their rate and come first.
+    """
     return rows_of(scene, instant_at(scene, t, q, u, inputs))
 
 
 def derivatives_in_speeds(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
     """`beta`, `gamma` and `A`; the velocities and residuals themselves; and the motion they belong to."""
-    t = jnp.asarray(t, jnp.result_type(float))
+    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u)
 
     def level(u):
         value, motion = _velocity_level(scene, t, q, u, inputs)
@@ -66,7 +70,7 @@ def derivatives_in_speeds(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityL
 
 def rates_along_motion(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
     """Velocities and residuals; `a_0`, `alpha_0` and the drift: their derivatives along `(1, qdot, 0)`; and the motion."""
-    t = jnp.asarray(t, jnp.result_type(float))
+    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u)
     qdot = coordinate_rates(scene, t, q, u)
     return jax.jvp(lambda t, q: _velocity_level(scene, t, q, u, inputs), (t, q), (jnp.ones_like(t), qdot), has_aux=True)
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Numbers, as_real
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Pose
@@ -32,22 +33,23 @@ class Inertias(eqx.Module):
     inertia: Float[Array, "bodies 3 3"]  # kg m^2
 
 
-def coordinate_rates(scene: Scene, t, q: Float[Array, "coordinates"], u: Float[Array, "speeds"]) -> Float[Array, "coordinates"]:
-    """`qdot = N(q,t) u + nu(q,t)`."""
+def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> Float[Array, "coordinates"]:
+    """`qdot = N(q,t) u + nu(q,t)`, shape (coordinates,), per s; eq. (53)."""
     t = jnp.asarray(t, jnp.result_type(float))
-    return jnp.asarray(scene.coordinate_rates(t, scene.coordinate_names.view(q), scene.speed_names.view(u)))
+    return jnp.asarray(scene.coordinate_rates(t, scene.coordinate_names.view(as_real(q)), scene.speed_names.view(as_real(u))))
 
 
-def pose_at(scene: Scene, t, q: Float[Array, "coordinates"]) -> Pose:
-    """Poses of all bodies, sorted by name: the order in which JAX returns dictionaries, so that it is the same everywhere."""
-    t, named = jnp.asarray(t, jnp.result_type(float)), scene.coordinate_names.view(q)
+def pose_at(scene: Scene, t, q: Numbers) -> Pose:
+    """Poses of all bodies (m, inertial frame), sorted by name: the order in which JAX returns dictionaries, so that it is the same everywhere."""
+    t, named = jnp.asarray(t, jnp.result_type(float)), scene.coordinate_names.view(as_real(q))
     return Pose(t, named, {name: BodyPose(name, body) for name, body in sorted(scene.bodies(t, named).items())})
 
 
 def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
-    """Poses and velocities of all bodies at one instant."""
+    """Poses and velocities (inertial frame) of all bodies at one instant. `inputs`: values of the scene's inputs (default: zero)."""
     t = jnp.asarray(t, jnp.result_type(float))
-    inputs = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else inputs
+    q, u = as_real(q), as_real(u)
+    inputs = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else as_real(inputs)
     qdot = coordinate_rates(scene, t, q, u)
     poses, rates = jax.jvp(lambda t, q: pose_at(scene, t, q).bodies, (t, q), (jnp.ones_like(t), qdot))
     bodies = {
@@ -64,7 +66,7 @@ def _space_angular_velocity(body, rate) -> Float[Array, "3"]:
 
 def velocities(scene: Scene, t, q, u) -> Velocities:
     """Velocities of the mass centres and body angular velocities, affine in u."""
-    return _velocities(scene, jnp.asarray(t, jnp.result_type(float)), q, u)
+    return _velocities(scene, jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u))
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
@@ -79,14 +81,14 @@ def velocities_of(motion: Motion) -> Velocities:
 
 
 def partial_velocities(scene: Scene, t, q, u) -> Velocities:
-    """`beta = dv/du` and `gamma = d omega_body/du`, shape (bodies, 3, speeds)."""
-    return jax.jacfwd(lambda u: velocities(scene, t, q, u))(u)
+    """`beta = dv/du` (inertial frame) and `gamma = d omega/du` (body axes), shape (bodies, 3, speeds), bodies sorted by name; eqs. (26)-(31), (49)."""
+    return jax.jacfwd(lambda u: velocities(scene, t, q, u))(as_real(u))
 
 
 def bias_accelerations(scene: Scene, t, q, u) -> tuple[Velocities, Velocities]:
     """Velocities, and accelerations at `udot = 0`: the derivative of the velocities along `(1, qdot, 0)`."""
     t = jnp.asarray(t, jnp.result_type(float))
-    qdot = coordinate_rates(scene, t, q, u)
+    q, qdot = as_real(q), coordinate_rates(scene, t, q, u)
     return jax.jvp(lambda t, q: velocities(scene, t, q, u), (t, q), (jnp.ones_like(t), qdot))
 
 

@@ -9,17 +9,21 @@ Source: Wang and Pao (2003), eq. (11).
 import jax
 import jax.numpy as jnp
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces, kinetic_energy
 from jourdain_jax.scene.scene import Scene
 
 
 def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
-    """M, h and Q from derivatives of the kinetic energy; a ValueError where the speeds are not the coordinate rates."""
+    """M, h and Q of `M udot + h = Q` from derivatives of the kinetic energy: `d/dt dT/dqdot - dT/dq = Q`; eq. (11).
+
+    `inputs`: values of the scene's inputs (default: zero). ValueError where the speeds are not the coordinate rates.
+    """
     if not speeds_are_rates(scene):
         raise ValueError(
             f"Lagrange's equations hold for coordinate rates, and the speeds of `{type(scene).__name__}` are quasi-velocities; use Appell's equations"
         )
-    t = jnp.asarray(t, jnp.result_type(float))
+    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u)
 
     def momentum(t, q, u):
         return jax.grad(kinetic_energy, argnums=3)(scene, t, q, u)

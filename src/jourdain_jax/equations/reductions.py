@@ -33,7 +33,10 @@ SMALLEST_PIVOT = 1e-3  # below it, privileged speeds do not serve as the state o
 
 
 class Accelerations(eqx.Module):
-    """Accelerations of one state, with what is needed to trust them."""
+    """Accelerations of one state, with what is needed to trust them: `M udot + h = Q + A' lambda`, `A udot = -drift`.
+
+    Units are those of the speeds (per s) and of the rows; a `constraint_force` is per speed, in N or N m.
+    """
 
     udot: Float[Array, "speeds"]
     multipliers: Float[Array, "rows"]  # lambda of minimum norm: the constraint force on the speeds is A' lambda
@@ -51,7 +54,7 @@ class Reduction(eqx.Module):
 
     @abc.abstractmethod
     def solve(self, problem: ScaledProblem) -> tuple[Float[Array, "speeds"], Float[Array, ""], Bool[Array, ""]]:
-        """Scaled accelerations, the reduction's smallest pivot, and whether it applies."""
+        """Scaled accelerations of the scaled `problem`, the reduction's smallest pivot, and whether it applies."""
 
 
 class Reduced(eqx.Module):
@@ -197,7 +200,10 @@ def _by_null_space(problem: ScaledProblem, Z):
 
 
 class NullSpaceQR(Reduction):
-    """Null space of the rows from a column-pivoted QR decomposition. Applies wherever `Z'MZ` is positive definite."""
+    """Null space of the rows from a column-pivoted QR decomposition: `udot = udot_p + Z zeta`, `(Z'MZ) zeta = Z'(Q - h - M udot_p)`.
+
+    Applies wherever `Z'MZ` is positive definite. Independent of the choice of Z: geometrically, `F - m a` is orthogonal to it, (71)-(73).
+    """
 
     name = "null space (QR)"
 
@@ -206,7 +212,7 @@ class NullSpaceQR(Reduction):
 
 
 class NullSpaceSVD(Reduction):
-    """Null space of the rows from the singular value decomposition. Applies wherever `Z'MZ` is positive definite."""
+    """The same as `NullSpaceQR` with a null space from the singular value decomposition."""
 
     name = "null space (SVD)"
 
@@ -221,7 +227,10 @@ def _refined(inverse, A, b):
 
 
 class Multipliers(Reduction):
-    """Lagrange multipliers: the saddle-point system `[[M, -A'], [A, 0]] [udot, lambda] = [f, b]`, truncated where rows are dependent."""
+    """Lagrange multipliers: the saddle-point system `[[M, -A'], [A, 0]] [udot, lambda] = [f, b]`, truncated where rows are dependent; (68)-(70).
+
+    With `f = Q - h`, `b = -drift`. M may be singular where no admissible velocity is without inertia.
+    """
 
     name = "multipliers (KKT)"
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.bodies import RigidBody
@@ -88,8 +89,8 @@ def flatten_rows(rows: dict[str, Array], dtype) -> Float[Array, "rows"]:
 
 
 def position_residual(scene: Scene, t, q) -> Float[Array, "geometric_rows"]:
-    """`g(t, q)` of all geometric rows."""
-    return _position_residual(scene, jnp.asarray(t, jnp.result_type(float)), q)
+    """`g(t, q)` of all geometric rows, shape (geometric rows,), in their own units; zero on the constraints. Eq. (5)."""
+    return _position_residual(scene, jnp.asarray(t, jnp.result_type(float)), as_real(q))
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
@@ -98,8 +99,11 @@ def _position_residual(scene: Scene, t: Float[Array, ""], q):
 
 
 def velocity_residual(scene: Scene, t, q, u, inputs=None) -> Float[Array, "rows"]:
-    """`phi(t, q, u)` of all rows."""
-    return _velocity_residual(scene, jnp.asarray(t, jnp.result_type(float)), q, u, inputs)
+    """`phi(t, q, u)` of all rows, shape (rows,), in their own units per s; zero on the constraints. Eqs. (6)-(9).
+
+    `inputs`: values of the scene's inputs (default: zero).
+    """
+    return _velocity_residual(scene, jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u), inputs)
 
 
 @eqx.filter_jit

@@ -75,7 +75,10 @@ class Structure:
 
 
 def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Random admissible states (t, q, u) from the scene's domain, on the rows; scene parameters must be concrete."""
+    """At most `count` random admissible states (t, q, u) from the scene's domain, on the rows, each with a leading axis of states.
+
+    `seed`: of the generator. Scene parameters must be concrete. ValueError where no state meets the geometric rows.
+    """
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
     t, q, u = _random_states(scene, drawn, np.random.default_rng(seed))
     q, u, miss = _projected(scene, t, q, u)
@@ -209,10 +212,11 @@ def _moves(rates) -> Bool[Array, ""]:
 
 @probed_once
 def structure_of(scene: Scene) -> Structure:
-    """Static facts about a scene; probed once per class and parameter values.
+    """Static facts about a scene: rank of its rows, privileged velocities and their conditioning, kinds of rows; eqs. (25)-(31).
 
-    Raises ValueError where no state of the domain can be assembled, where a motion that the rows leave free has no inertia, and for wrong
-    `privileged` speeds.
+    Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers stand in for traced parameters.
+    ValueError where no admissible state is found, where a motion that the rows leave free has no inertia, or `privileged` names unknown or too few
+    speeds.
     """
     names = names_of_rows(scene)
     count = len(scene.speed_names)

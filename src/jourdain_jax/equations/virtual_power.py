@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import Inertias, Velocities, bias_accelerations, coordinate_rates, inertias, motion_at, partial_velocities, pose_at
@@ -61,7 +62,7 @@ def _rows(vectors: dict) -> Float[Array, "bodies 3"]:
 
 
 def potential_energy(scene: Scene, motion: Motion) -> Float[Array, ""]:
-    """V in J: the potentials of the loads and of the scene."""
+    """V in J at a `motion`: the potentials of the loads and of the scene."""
     V = jnp.zeros_like(motion.t)
     for load in scene.loads(motion):
         if load.potential is not None:
@@ -79,7 +80,10 @@ def kinetic_energy(scene: Scene, t, q, u) -> Float[Array, ""]:
 
 
 def unconstrained_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
-    """M, h and Q of `M udot + h = Q`."""
+    """M, h and Q of `M udot + h = Q`, the equations without constraint forces; eqs. (50), (56).
+
+    M: (speeds, speeds), kg or kg m^2; h, Q: (speeds,), N or N m. `inputs`: values of the scene's inputs (default: zero).
+    """
     return equations_of(scene, instant_at(scene, t, q, u, inputs))
 
 
@@ -117,7 +121,10 @@ def _inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: V
 
 
 def generalized_forces(scene: Scene, t, q, u, inputs=None) -> Float[Array, "speeds"]:
-    """`Q = sum beta' F + gamma' L + Q_direct - N' dV/dq`."""
+    """`Q = sum beta' F + gamma' L + Q_direct - N' dV/dq`, shape (speeds,), in N or N m; eq. (41).
+
+    `inputs`: values of the scene's inputs (default: zero).
+    """
     return _generalized_forces(scene, motion_at(scene, t, q, u, inputs), partial_velocities(scene, t, q, u))
 
 
@@ -164,10 +171,12 @@ def _displaced(pose: BodyPose, shift, turn) -> BodyPose:
 
 
 def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
-    """The constraint force and torque on each body, `R = m a - F` and `I alpha + omega x I omega - L` (row S1; inertial frame).
+    """The constraint force and torque on each body, `R = m a - F` (N) and `I alpha + omega x I omega - L` (N m, about the mass centre); (1)-(3).
 
+    Shape (bodies, 3), inertial frame, bodies sorted by name. `udot`: the accelerations. `inputs`: values of the scene's inputs (default: zero).
     Impressed forces that a scene states on its speeds, not on bodies, cannot be told apart from constraint forces here.
     """
+    udot = as_real(udot)
     partial, weights = partial_velocities(scene, t, q, u), inertias(scene, t, q)
     velocity, bias = bias_accelerations(scene, t, q, u)
     acceleration = Velocities(bias.linear + partial.linear @ udot, bias.angular + partial.angular @ udot)
@@ -179,9 +188,10 @@ def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
 
 
 def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) -> Float[Array, ""]:
-    """Jourdain's variational equation (18) as a residual: `sum (m a - F) . delta_1 v` for any virtual `delta u` (row S6), in W.
+    """Jourdain's variational equation (18) as a residual: `sum (m a - F) . delta_1 v = delta u . (M udot + h - Q)`, in W.
 
+    `udot`: the accelerations; `virtual_velocity`: `delta u`, any, shape (speeds,). `inputs`: values of the scene's inputs (default: zero).
     Zero for every virtual velocity with `A delta u = 0` if and only if `udot` is the constrained acceleration.
     """
     equations = unconstrained_equations(scene, t, q, u, inputs)
-    return virtual_velocity @ (equations.M @ udot + equations.h - equations.Q)
+    return as_real(virtual_velocity) @ (equations.M @ as_real(udot) + equations.h - equations.Q)

@@ -64,7 +64,10 @@ def energies_of(record: Record, work) -> Energies:
 
 
 def diagnose(trajectory: Record) -> Diagnostics:
-    """Drifts, residuals, conditioning and contact extremes of one motion (not of a batch: use `jax.vmap` or `rollout.lane(i)`)."""
+    """Drifts, residuals, conditioning and contact extremes of one `trajectory` (not of a batch: use `jax.vmap` or `rollout.lane(i)`).
+
+    Times that were not reached do not count.
+    """
     energy = energies_of(trajectory, trajectory.work)
     geometric, rows = residuals(trajectory)
     motion = accelerations_along(trajectory)

@@ -6,15 +6,16 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
 
 class Sampled(eqx.Module):
-    """Values at given times, linear in between, constant beyond the ends."""
+    """An input as `values` at given times `ts` (s, increasing), linear in between, constant beyond the ends."""
 
-    ts: Float[Array, "samples"]  # s, increasing
-    values: Float[Array, "samples"]
+    ts: Float[Array, "samples"] = eqx.field(converter=as_real)  # s, increasing
+    values: Float[Array, "samples"] = eqx.field(converter=as_real)
 
     def __call__(self, t):
         """Value at time t."""

@@ -28,4 +28,4 @@ def with_causes(code, *, parameters: Bool[Array, ""], start: Bool[Array, ""], mo
 
 
 class SimulationError(RuntimeError):
-    """A motion did not reach its end; raised on request only (`trajectory.raise_if_failed()`)."""
+    """A motion did not reach its end; raised on request only (`trajectory.raise_if_failed()`), with the reason and the time."""

@@ -38,14 +38,14 @@ class Rollout(eqx.Module):
         return jax.vmap(lambda lane: lane[name])(self.lanes)
 
     def lane(self, index: int) -> Trajectory:
-        """The motion of one lane."""
+        """The motion of the lane with number `index`, as a `Trajectory`; IndexError where there is none."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"lane {index} does not exist; this rollout has {len(self)} lanes, 0 to {len(self) - 1}")
         return jax.tree.map(lambda x: x[index], self.lanes)
 
     @property
     def result(self) -> np.ndarray:
-        """Result code of every lane."""
+        """Result code of every lane, shape (lanes,); see `jourdain_jax.motion.results`."""
         return np.asarray(self.lanes.result)
 
     @property
@@ -54,7 +54,10 @@ class Rollout(eqx.Module):
         return np.flatnonzero((self.result != results.SUCCESS) & (self.result != results.EVENT))
 
     def quantiles(self, name: str, levels: Sequence[float] = (0.025, 0.5, 0.975)) -> np.ndarray:
-        """Quantiles over lanes of a named quantity at all times, shape (levels, times); lanes that ended are left out from then on."""
+        """Quantiles over lanes of the coordinate or speed `name` at all times, for the given `levels` (0 to 1), shape (levels, times).
+
+        Lanes that ended are left out from then on; NaN where none is left.
+        """
         values = np.asarray(self[name])
         out = np.full((len(levels), *values.shape[1:]), np.nan)
         reached = np.isfinite(values).any(axis=0)
@@ -98,7 +101,7 @@ def rollout(
     - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a `State` with a leading axis of lanes.
     - `parameters`: parameter name -> array with a leading axis of lanes, where lanes differ in parameters.
     - `chunk`: lanes that run together (default: 1024, less where saved states would pass 1 GiB); `progress`: a bar (default: with several chunks).
-    - further options as in `simulate`.
+    - `options`: further ones as in `simulate`.
 
     Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`.
     """

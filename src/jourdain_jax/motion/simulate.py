@@ -62,9 +62,12 @@ def simulate(
 ) -> Trajectory:
     """Integrate a scene's equations of motion from `start` over [t0, t1].
 
+        motion = simulate(disc, {"lean": 0.3, "spin_rate": -3.0}, t1=5.0)
+
     **Arguments**
     - `start`: a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
-    - `t1`, `ts`: end of the span (s) and times to save at (default: 201 even ones); `ts` alone sets the span. `saveat`: a `diffrax.SaveAt` instead.
+    - `t0`, `t1`: ends of the span (s; defaults: 0 and the scene's `example_span` after it); `ts`: times to save at (default: 201 even ones), which
+      alone set the span. `saveat`: a `diffrax.SaveAt` instead.
     - `rtol`, `atol`, `solver`, `stepsize_controller`, `dt0` (default: 1e-4 of the span), `adjoint`, `max_steps`: as in
       `diffrax.diffeqsolve`. Default solver: Tsit5 for
       rtol >= 1e-6, Dopri8 below. Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`

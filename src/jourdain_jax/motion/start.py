@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Number, Numbers, as_real
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.structure import structure_of
@@ -17,7 +18,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class State(eqx.Module):
-    """A state on the constraints, and how far the guess was from it."""
+    """A state on the constraints, and how far the guess was from it; `state["yaw"]`, `print(state)`.
+
+    q and u in the units of the scene's coordinates and speeds (SI, rad).
+    """
 
     t: Float[Array, ""]  # s
     q: Float[Array, "coordinates"]
@@ -38,14 +42,16 @@ class State(eqx.Module):
         return f"State at t = {self.t:.6g} s: " + ", ".join(pairs) + f"\n{moved}"
 
 
-def consistent(scene: Scene, t, q: Float[Array, "coordinates"], u: Float[Array, "speeds"], inputs=None, *, held: tuple[str, ...] = ()) -> State:
-    """The state on the constraints nearest to (q, u): positions by Gauss-Newton, speeds M-orthogonally; `held` names do not move.
+def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tuple[str, ...] = ()) -> State:
+    """The state on the constraints nearest to (q, u): positions by Gauss-Newton, speeds M-orthogonally; g(t, q) = 0, phi(t, q, u) = 0.
 
-    Differentiable in any mode. What cannot be met stays in `residual` (no error: this also runs inside jit and vmap).
+    `inputs`: values of the scene's inputs (default: zero). `held`: names of coordinates and speeds that do not move.
+
+    Differentiable in any mode. What cannot be met stays in `residual` (no error: this also runs inside jit and vmap). ValueError for wrong shapes.
     """
-    t, q, u = jnp.asarray(t, jnp.result_type(float)), jnp.asarray(q), jnp.asarray(u)
+    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u)
     _check_shapes(scene, q, u)
-    inputs = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else inputs
+    inputs = jnp.zeros(len(scene.inputs), q.dtype) if inputs is None else as_real(inputs)
     free_q, free_u = (np.array([name not in held for name in names.entries], bool) for names in (scene.coordinate_names, scene.speed_names))
     near_q, near_u, moved_q, moved_u, residual = _put_onto_constraints(scene, t, q, u, inputs, free_q, free_u)
     return State(t, near_q, near_u, moved_q, moved_u, residual, (scene.coordinate_names, scene.speed_names))
@@ -60,12 +66,12 @@ def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u):
     return near_q, near_u, *(jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
 
 
-def start(scene: Scene, *, t0: float | Float[Array, ""] = 0.0, **values) -> State:
+def start(scene: Scene, *, t0: Number = 0.0, **values) -> State:
     """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`.
 
-    Values that are given are kept. Privileged speeds that are not given stay zero and the dependent speeds follow from the rows; where dependent
-    speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
-    Errors (ValueError, where values are known): an unknown name, a value that is not finite, given values that contradict the constraints.
+    `values` that are given are kept, at time `t0` (s). Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;
+    where dependent speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
+    ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
     """
     q, u, given = scene.named(**values)
     _check_finite(values)

@@ -27,7 +27,7 @@ _TEXTS = ("state_form", "reduction", "solver", "projected")
 
 
 def save(trajectory: Trajectory, path: str | os.PathLike) -> None:
-    """Write a trajectory to `path` (`.npz`, format 1 above). Inputs are stored as samples at the saved times."""
+    """Write a `trajectory` to `path` (`.npz`, format 1 above). Inputs are stored as samples at the saved times."""
     scene = trajectory.scene
     arrays = {name: np.asarray(getattr(trajectory, name)) for name in _ARRAYS}
     if trajectory.work is not None:
@@ -50,7 +50,7 @@ def save(trajectory: Trajectory, path: str | os.PathLike) -> None:
 
 
 def load(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
-    """Read a trajectory written by `save`. `scene`: the scene's class, or any scene of that class; parameters come from the file.
+    """Read a trajectory written by `save` from `path`. `scene`: the scene's class, or any scene of that class; parameters come from the file.
 
     ValueError where the file cannot be read, is of another format, or belongs to another scene.
     """

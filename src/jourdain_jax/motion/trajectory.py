@@ -62,7 +62,7 @@ class Trajectory(eqx.Module):
     # Derived quantities. -------------------------------------------------------------------------------------------
 
     def motions(self) -> Motion:
-        """Poses and velocities of all bodies at all times (leading axis: times)."""
+        """Poses and velocities (inertial frame) of all bodies at all times (leading axis: times)."""
         return along.motions(self)
 
     def point(self, body: str, local=(0.0, 0.0, 0.0)) -> Float[Array, "times 3"]:
@@ -78,11 +78,11 @@ class Trajectory(eqx.Module):
         return along.accelerations_along(self)
 
     def constraint_forces(self) -> RowReactions:
-        """Constraint forces per row and per body at all times; `.forces_on("disc")` by row, in N."""
+        """Constraint forces per row and per body at all times, eqs. (68)-(70); `.forces_on("disc")` by row, in N, inertial frame."""
         return along.reactions_along(self)
 
     def contact_forces(self) -> dict[str, ContactForce]:
-        """Normal and tangential force (N) and friction coefficient needed, of every rolling contact at all times."""
+        """Normal and tangential force (N) on the body and friction coefficient needed, of every rolling contact at all times."""
         return along.contact_forces_along(self)
 
     def residuals(self) -> tuple[Float[Array, "times closures"], Float[Array, "times rows"]]:
@@ -90,7 +90,7 @@ class Trajectory(eqx.Module):
         return along.residuals(self)
 
     def invariants(self) -> dict[str, Float[Array, "times"]]:
-        """The quantities that the scene is known to conserve, at all times."""
+        """The quantities that the scene states to be conserved, by name at all times; without the energy."""
         return along.invariants(self)
 
     def __str__(self) -> str:

@@ -46,11 +46,12 @@ def animate(
     view: tuple[float, float] = (22.0, -60.0),
     title: str | None = None,
 ) -> None:
-    """Write an animation (.gif) of a motion, drawn from the scene's bodies.
+    """Write an animation of a `trajectory` to `path` (.gif), drawn from the scene's bodies.
 
     - `frames`: at most so many, evenly chosen from the saved times; the playing time is the motion's own, 2 to 12 s.
     - `paths`: (body, body-frame point in m) pairs to trace; default: the mass centre of every body.
     - `follow`: keep the view on the bodies as they move, instead of showing the whole path. `view`: elevation and azimuth in degrees.
+    - `title`: a line above the drawing (default: none).
 
     ValueError for another suffix than .gif, or a motion that reached none of its times; ImportError without matplotlib.
     """

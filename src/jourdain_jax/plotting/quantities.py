@@ -15,12 +15,13 @@ _BANDS = ((0.025, 0.975, 0.2), (0.25, 0.75, 0.4))  # lower and upper quantile, o
 
 
 def plot(motion: Trajectory | Rollout, *names: str, path: str | os.PathLike | None = None, axes=None):
-    """Plot named quantities against time, one panel each: coordinates, speeds, `"energy"`, `"kinetic energy"`, `"potential energy"`.
+    """Plot named quantities of a `motion` against time, one panel each.
 
-    Of a rollout, coordinates and speeds: the median of all lanes that are still under way, and the bands that hold half and 95 % of them.
+    - `names`: coordinates, speeds, `"energy"`, `"kinetic energy"`, `"potential energy"` (default: all coordinates). Of a rollout, coordinates
+      and speeds: the median of all lanes that are still under way, and the bands that hold half and 95 % of them.
+    - `path`: where to write it (.png, .svg, .pdf); `axes`: existing axes, one per name.
 
-    Returns the matplotlib figure; written to `path` (.png, .svg, .pdf) where one is given. `axes`: existing axes, one per name.
-    KeyError for an unknown name, with the nearest valid one.
+    Returns the matplotlib figure. KeyError for an unknown name, with the nearest valid one; ImportError without matplotlib.
     """
     scene = motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
     names = names or scene.coordinate_names.entries

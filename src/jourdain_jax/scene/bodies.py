@@ -8,18 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
+
 _AXES = {"x": 0, "y": 1, "z": 2}
 
 
 class Particle(eqx.Module):
-    """A point mass."""
+    """A point mass: `mass` in kg, `position` (3,) in m, inertial frame.
+
+    ValueError for other shapes. Its velocity comes by differentiating the position.
+    """
 
     mass: Float[Array, ""]  # kg
     position: Float[Array, "3"]  # m, inertial frame
 
     def __init__(self, mass, position):
-        self.mass = jnp.asarray(mass)
-        self.position = jnp.asarray(position)
+        self.mass = as_real(mass)
+        self.position = as_real(position)
 
     def __check_init__(self):
         _check_shape("position of a particle", self.position, (3,))
@@ -27,7 +32,14 @@ class Particle(eqx.Module):
 
 
 class RigidBody(eqx.Module):
-    """A rigid body: mass, central inertia in body axes, position of the mass centre, orientation (body to space)."""
+    """A rigid body.
+
+    - `mass` in kg; `inertia`: (3, 3), or three principal moments, in kg m^2, about the mass centre, body axes.
+    - `position` (3,) of the mass centre in m, inertial frame; `orientation` (3, 3): body components to space components.
+    - `outline`: (points, 3) in m, a line in the body frame, relative to the mass centre; for drawing only (default: none).
+
+    ValueError for other shapes. Velocities come by differentiating the pose.
+    """
 
     mass: Float[Array, ""]  # kg
     inertia: Float[Array, "3 3"]  # kg m^2, about the mass centre, body axes
@@ -36,12 +48,12 @@ class RigidBody(eqx.Module):
     outline: Float[Array, "points 3"]  # m, body frame, relative to the mass centre; for drawing only
 
     def __init__(self, mass, inertia, position, orientation, outline=None):
-        inertia = jnp.asarray(inertia)
-        self.mass = jnp.asarray(mass)
+        inertia = as_real(inertia)
+        self.mass = as_real(mass)
         self.inertia = jnp.diag(inertia) if inertia.ndim == 1 else inertia
-        self.position = jnp.asarray(position)
-        self.orientation = jnp.asarray(orientation)
-        self.outline = jnp.zeros((0, 3)) if outline is None else jnp.asarray(outline)
+        self.position = as_real(position)
+        self.orientation = as_real(orientation)
+        self.outline = jnp.zeros((0, 3)) if outline is None else as_real(outline)
 
     def __check_init__(self):
         _check_shape("mass of a rigid body", self.mass, ())
@@ -51,7 +63,12 @@ class RigidBody(eqx.Module):
 
     @staticmethod
     def thin_disc(mass, radius, *, axis: str, position, orientation, axial=None, diametral=None) -> "RigidBody":
-        """A disc about the body axis `axis`: uniform, `C = m a^2/2` and `A = m a^2/4`, unless `axial` (C) and `diametral` (A) are given."""
+        """A disc of the given `radius` (m) about the body axis `axis` ("x", "y" or "z").
+
+        Uniform, `C = m a^2/2` and `A = m a^2/4`, unless `axial` (C) and `diametral` (A) are given, in kg m^2.
+        `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
+        ValueError for another axis.
+        """
         axial = mass * radius**2 / 2 if axial is None else axial
         diametral = mass * radius**2 / 4 if diametral is None else diametral
         k = _axis_index(axis)
@@ -61,13 +78,19 @@ class RigidBody(eqx.Module):
 
     @staticmethod
     def ball(mass, radius, *, position, orientation, factor=0.4) -> "RigidBody":
-        """A ball with central moment of inertia `factor m r^2` (2/5 when solid, 2/3 when hollow)."""
+        """A ball of the given `radius` (m) with central moment of inertia `factor m r^2` (2/5 when solid, 2/3 when hollow).
+
+        `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
+        """
         moment = factor * mass * radius**2
         return RigidBody(mass, _stack([moment] * 3), position, orientation, radius * _ball_outline())
 
     @staticmethod
     def rod(mass, length, *, axis: str, position, orientation) -> "RigidBody":
-        """A thin uniform rod of the given length along the body axis `axis`, `m l^2/12` about the others."""
+        """A thin uniform rod of the given `length` (m) along the body axis `axis` ("x", "y" or "z"), `m l^2/12` about the others.
+
+        `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`. ValueError for another axis.
+        """
         k = _axis_index(axis)
         moments = [mass * length**2 / 12] * 3
         moments[k] = jnp.zeros_like(jnp.asarray(moments[k]))
@@ -77,7 +100,10 @@ class RigidBody(eqx.Module):
 
     @staticmethod
     def box(mass, sides, *, position, orientation) -> "RigidBody":
-        """A uniform cuboid with the three `sides` (m) along the body axes."""
+        """A uniform cuboid with the three `sides` (m) along the body axes.
+
+        `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
+        """
         a, b, c = sides[0], sides[1], sides[2]
         moments = _stack([mass * (b**2 + c**2) / 12, mass * (a**2 + c**2) / 12, mass * (a**2 + b**2) / 12])
         return RigidBody(mass, moments, position, orientation, _box_outline() * jnp.asarray(sides))

@@ -8,38 +8,46 @@ Geometric rows are functions of a `Pose` and vanish; the engine differentiates t
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Number, Vector, as_real
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose
 
 
-def knife_edge(body: BodyMotion, contact: Float[Array, "3"], lateral: Float[Array, "3"]) -> Float[Array, ""]:
-    """Velocity row of a blade or skate: the body's material point at `contact` (m, inertial frame) does not move along `lateral`."""
-    return body.velocity_at(contact) @ lateral
+def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector) -> Float[Array, ""]:
+    """Velocity row of a blade or skate: `v(contact) . lateral`, in m/s. The point of `body` at `contact` does not move along `lateral`.
 
-
-def rod(a: Float[Array, "3"], b: Float[Array, "3"], length) -> Float[Array, ""]:
-    """Geometric row of a massless rod of the given length (m) between two points: `(|b - a|^2 - l^2)/(2 l)`, in m.
-
-    To first order the excess length; its multiplier is the thrust (positive) in the rod. Smooth also where the points meet.
+    - `body`: `motion["name"]`; `contact` (m) and the unit vector `lateral`, both in the inertial frame. Eq. (7).
     """
-    apart = b - a
+    return body.velocity_at(contact) @ as_real(lateral)
+
+
+def rod(a: Vector, b: Vector, length: Number) -> Float[Array, ""]:
+    """Geometric row of a massless rod of the given `length` (m) between two points `a`, `b` (m, inertial frame): `(|b - a|^2 - l^2)/(2 l)`, in m.
+
+    To first order the excess length; its multiplier is the thrust (positive, N) in the rod. Smooth also where the points meet. Eq. (5).
+    """
+    apart = as_real(b) - as_real(a)
     return (apart @ apart - length**2) / (2 * length)
 
 
-def pin(a: Float[Array, "3"], b: Float[Array, "3"], *, axes: str = "xyz") -> Float[Array, "axes"]:
-    """Geometric rows of a joint that keeps two points together (m), along the given axes of the inertial frame (`"xy"` in a plane)."""
+def pin(a: Vector, b: Vector, *, axes: str = "xyz") -> Float[Array, "axes"]:
+    """Geometric rows `b - a` of a joint that keeps two points `a`, `b` (m, inertial frame) together.
+
+    `axes`: letters of the inertial axes along which it holds (`"xy"` in a plane); ValueError for others. Eq. (5).
+    """
     unknown = set(axes) - set("xyz")
     if unknown or not axes:
         raise ValueError(f"pin along axes `{axes}`, expected letters out of `xyz`, such as `xyz` or `xy`")
-    return (b - a)[jnp.array(["xyz".index(axis) for axis in axes])]
+    return (as_real(b) - as_real(a))[jnp.array(["xyz".index(axis) for axis in axes])]
 
 
 def weld(
-    first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_second=(0.0, 0.0, 0.0), turn: Float[Array, "3 3"] | None = None
+    first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_second=(0.0, 0.0, 0.0), turn=None
 ) -> Float[Array, "6"]:
-    """Geometric rows of a weld: the points (body frames, m) coincide and `R_second = R_first turn` (the identity by default).
+    """Geometric rows (6,) of a weld of two bodies `first`, `second` (`pose["name"]`).
 
-    The rotation rows are `vee` of the antisymmetric part of `turn' R_first' R_second`, the rotation vector to first order.
+    The points `at_first`, `at_second` (m, body frames, from the mass centres) coincide, and `R_second = R_first turn` (`turn`: (3, 3), the
+    identity by default). The rotation rows are `vee` of the antisymmetric part of `turn' R_first' R_second`, the rotation vector to first order.
     """
-    turn = jnp.eye(3, dtype=first.position.dtype) if turn is None else turn
-    return jnp.concatenate([second.place(jnp.asarray(at_second)) - first.place(jnp.asarray(at_first)), vee(turn.T @ first.orientation.T @ second.orientation)])
+    turn = jnp.eye(3, dtype=first.position.dtype) if turn is None else as_real(turn)
+    return jnp.concatenate([second.place(at_second) - first.place(at_first), vee(turn.T @ first.orientation.T @ second.orientation)])

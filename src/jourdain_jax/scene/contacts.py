@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Vector, as_real
 from jourdain_jax.scene.bodies import _axis_index
 from jourdain_jax.scene.motion_state import BodyPose
 
@@ -16,7 +17,11 @@ _HEIGHTS = ("coordinates", "row")
 
 
 class Plane(eqx.Module):
-    """A plane through `origin`, at rest or in rigid motion: velocity of its point at p is `velocity + angular_velocity x (p - origin)`."""
+    """A plane through `origin` (m), at rest or in rigid motion: velocity of its point at p is `velocity + angular_velocity x (p - origin)`.
+
+    `Plane(origin, tilt, velocity, angular_velocity)`: the plane z = 0, turned by `tilt` (rad) about the y axis so that positive tilt slopes down
+    along x. `velocity` in m/s, `angular_velocity` in rad/s; all vectors in the inertial frame.
+    """
 
     origin: Float[Array, "3"]  # m
     normal: Float[Array, "3"]  # unit vector, out of the ground
@@ -28,19 +33,19 @@ class Plane(eqx.Module):
         """The plane z = 0, turned by `tilt` (rad) about the y axis so that positive tilt slopes down along x."""
         c, s = jnp.cos(jnp.asarray(tilt, jnp.result_type(float))), jnp.sin(jnp.asarray(tilt, jnp.result_type(float)))
         o, i = jnp.zeros_like(c), jnp.ones_like(c)
-        self.origin = jnp.asarray(origin)
+        self.origin = as_real(origin)
         self.normal = jnp.stack([s, o, c])
         self.tangents = jnp.stack([jnp.stack([c, o, -s]), jnp.stack([o, i, o])])
-        self.velocity = jnp.asarray(velocity)
-        self.angular_velocity = jnp.asarray(angular_velocity)
+        self.velocity = as_real(velocity)
+        self.angular_velocity = as_real(angular_velocity)
 
-    def velocity_at(self, position: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Velocity of the plane's material point at `position`, m/s."""
-        return self.velocity + jnp.cross(self.angular_velocity, position - self.origin)
+    def velocity_at(self, position: Vector) -> Float[Array, "3"]:
+        """Velocity (m/s, inertial frame) of the plane's material point at `position` (m, inertial frame)."""
+        return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.origin)
 
-    def height_of(self, position: Float[Array, "3"]) -> Float[Array, ""]:
-        """Signed distance of a point from the plane, m."""
-        return self.normal @ (position - self.origin)
+    def height_of(self, position: Vector) -> Float[Array, ""]:
+        """Signed distance (m) of the point at `position` (m, inertial frame) from the plane, positive along the normal."""
+        return self.normal @ (as_real(position) - self.origin)
 
 
 class Contact(eqx.Module):
@@ -60,10 +65,16 @@ class Contact(eqx.Module):
 def disc_contact(
     body: BodyPose, radius, *, axis: str = "y", plane: Plane | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None
 ) -> Contact:
-    """Rolling of the edge of a thin disc (centre: the mass centre; axis: a body axis) on a plane.
+    """Rolling of the edge of a thin disc (centre: the mass centre) on a plane, without slip.
 
     The contact is the lowest point of the circle, `r - a (n - (n.k) k)/|n - (n.k) k|` with plane normal n and disc axis k. Undefined for
-    a disc lying flat. `carried` names the bodies that this contact holds up, for the normal force where `height="coordinates"`.
+    a disc lying flat.
+
+    - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z".
+    - `plane`: default z = 0 at rest. `height`: "coordinates" where they keep the body on the plane by themselves, "row" for a geometric row.
+    - `carried`: names of the bodies that this contact holds up (default: all), for the normal force where `height="coordinates"`.
+
+    Two velocity rows (m/s), along the plane's tangents; ValueError for an unknown axis or height.
     """
     _check_height(height)
     plane = Plane() if plane is None else plane
@@ -74,7 +85,14 @@ def disc_contact(
 
 
 def ball_contact(body: BodyPose, radius, *, plane: Plane | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None) -> Contact:
-    """Rolling of a ball (centre: the mass centre) on a plane; the contact point is `r - a n`."""
+    """Rolling of a ball (centre: the mass centre) on a plane, without slip; the contact point is `r - a n`.
+
+    - `body`: `pose["name"]`; `radius` a in m.
+    - `plane`: default z = 0 at rest. `height`: "coordinates" where they keep the body on the plane by themselves, "row" for a geometric row.
+    - `carried`: names of the bodies that this contact holds up (default: all), for the normal force where `height="coordinates"`.
+
+    Two velocity rows (m/s), along the plane's tangents; ValueError for an unknown height.
+    """
     _check_height(height)
     plane = Plane() if plane is None else plane
     return Contact(body.name, body.position - radius * plane.normal, plane, height, carried)

@@ -34,7 +34,7 @@ class Names:
         return Named(array, tuple((name, i, 0) for i, name in enumerate(self.entries)) + self.groups)
 
     def index(self, name: str, kind: str) -> int:
-        """Position of `name`; a ValueError that lists the valid names otherwise."""
+        """Position of `name`; a ValueError that lists the valid names, and says what `kind` of name it is, otherwise."""
         if name not in self.entries:
             raise ValueError(f"unknown {kind} `{name}`; {nearest(name, self.entries)}")
         return self.entries.index(name)
@@ -66,14 +66,18 @@ class Coordinates:
 
 
 def quaternion(name: str) -> Quaternion:
-    """A quaternion coordinate, for use in `coordinates(...)`: `coordinates("x y z", quaternion("attitude"))`."""
+    """A quaternion coordinate called `name`, for use in `coordinates(...)`: four coordinates `name_w`, ..., three speeds `name_omega_x`, ...
+
+    The speeds are the body components of the angular velocity (rad/s), `d name/dt = 1/2 name (0, omega)`.
+    """
     return Quaternion(name)
 
 
 def coordinates(*parts: str | Quaternion) -> Coordinates:
-    """Names of a scene's coordinates: strings of names parted by blanks, and quaternions, in order.
+    """Names of a scene's coordinates from `parts`: strings of names parted by blanks, and quaternions, in order.
 
-    Example: `coordinates("x y z", quaternion("attitude"))` has 7 coordinates and 6 default speeds.
+    Example: `coordinates("x y z", quaternion("attitude"))` has 7 coordinates and 6 default speeds: `x_rate`, ..., `attitude_omega_z`.
+    ValueError for a name that is no identifier, is used twice or is taken.
     """
     names: list[str] = []
     speeds: list[str] = []
@@ -95,13 +99,16 @@ def coordinates(*parts: str | Quaternion) -> Coordinates:
 
 
 def speeds(names: str) -> Names:
-    """Names of user-defined generalized speeds (quasi-velocities), parted by blanks."""
+    """Names of user-defined generalized speeds (quasi-velocities), parted by blanks in `names`; eqs. (53)-(56).
+
+    The scene then states `coordinate_rates(t, q, u)`. ValueError as in `coordinates`.
+    """
     _check_names(names.split(), "speed")
     return Names(tuple(names.split()))
 
 
 def inputs(names: str) -> Names:
-    """Names of a scene's inputs (actuator torques, say), parted by blanks."""
+    """Names of a scene's inputs (actuator torques, say), parted by blanks in `names`; their unit is the scene's. ValueError as in `coordinates`."""
     _check_names(names.split(), "input")
     return Names(tuple(names.split()))
 

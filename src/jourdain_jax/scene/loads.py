@@ -9,35 +9,51 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.scene.motion_state import Motion, Point
 from jourdain_jax.scene.names import nearest
 
 
 class Load(eqx.Module):
-    """One impressed force system: resultants per body, and forces on speeds by name."""
+    """One impressed force system, with virtual power `sum F . dv + sum L . domega + sum Q_k du_k`.
 
-    forces: dict[str, Float[Array, "3"]] = eqx.field(default_factory=dict)  # N, inertial frame, at the mass centre
-    torques: dict[str, Float[Array, "3"]] = eqx.field(default_factory=dict)  # N m, inertial frame, about the mass centre
-    generalized: dict[str, Float[Array, ""]] = eqx.field(default_factory=dict)  # N or N m, on the named speed
-    potential: Float[Array, ""] | None = None  # J
+    - `forces`: body -> (3,) in N, inertial frame, at the mass centre; `torques`: body -> (3,) in N m, inertial frame, about the mass centre.
+    - `generalized`: speed -> force on it, in N or N m.
+    - `potential` in J, whose gradient it must be (`verify` looks); None: not conservative, its work is integrated along the motion.
+    """
+
+    forces: dict[str, Float[Array, "3"]]  # N, inertial frame, at the mass centre
+    torques: dict[str, Float[Array, "3"]]  # N m, inertial frame, about the mass centre
+    generalized: dict[str, Float[Array, ""]]  # N or N m, on the named speed
+    potential: Float[Array, ""] | None  # J; None: not conservative, its work is integrated along the motion
+
+    def __init__(self, forces=None, torques=None, generalized=None, potential=None):
+        self.forces, self.torques, self.generalized = ({name: as_real(x) for name, x in (part or {}).items()} for part in (forces, torques, generalized))
+        self.potential = None if potential is None else as_real(potential)
 
 
 def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
-    """Uniform gravity `m g e` on every body; `strength` g in m/s^2, `direction` e a unit vector of the inertial frame."""
-    g = strength * jnp.asarray(direction)
+    """Uniform gravity `m g e` on every body of a `motion`, with its potential `- sum m g e . r`.
+
+    `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame.
+    """
+    g = as_real(strength) * as_real(direction)
     forces = {name: body.mass * g for name, body in motion.bodies.items()}
     potential = -sum(body.mass * (g @ body.position) for body in motion.bodies.values())
-    return Load(forces=forces, potential=jnp.asarray(potential))
+    return Load(forces=forces, potential=potential)
 
 
 def point_force(point: Point, force) -> Load:
-    """A force (N, inertial frame) on a point of a body, `motion["body"].point(local)`."""
-    return _on_point(point, jnp.asarray(force), None)
+    """A `force` (3,) (N, inertial frame) on a `point` of a body, `motion["body"].point(local)`; no potential."""
+    return _on_point(point, as_real(force), None)
 
 
 def torque(motion: Motion, body: str, moment, *, reaction: str | None = None) -> Load:
-    """A torque (N m, inertial frame) on `body`, with the opposite torque on the body `reaction` where one is named."""
-    moment = jnp.asarray(moment)
+    """A torque `moment` (3,) (N m, inertial frame) on a `body` of a `motion`, with the opposite torque on `reaction` where that body is named.
+
+    No potential. ValueError for an unknown body.
+    """
+    moment = as_real(moment)
     names = [body] if reaction is None else [body, reaction]
     for name in names:
         if name not in motion.bodies:
@@ -46,7 +62,10 @@ def torque(motion: Motion, body: str, moment, *, reaction: str | None = None) ->
 
 
 def spring(a: Point, b: Point, stiffness, rest_length=0.0) -> Load:
-    """A linear spring between two points: tension `k (l - l0)`, potential `k (l - l0)^2 / 2` (N/m, m)."""
+    """A linear spring between two points `a`, `b`: tension `k (l - l0)`, potential `k (l - l0)^2 / 2`.
+
+    Points: `motion["body"].point(local)` or `fixed_point(position)`. `stiffness` k in N/m, `rest_length` l0 in m.
+    """
     apart, length, direction = _line(a, b)
     extension = length - rest_length
     # k (l - l0) e, written so that a spring of no natural length is smooth where its ends meet
@@ -55,17 +74,23 @@ def spring(a: Point, b: Point, stiffness, rest_length=0.0) -> Load:
 
 
 def damper(a: Point, b: Point, damping) -> Load:
-    """A linear damper between two points: tension `c dl/dt` along the line (N s/m)."""
+    """A linear damper between two points `a`, `b`: tension `c dl/dt` along the line; no potential.
+
+    Points: `motion["body"].point(local)` or `fixed_point(position)`. `damping` c in N s/m.
+    """
     _, _, direction = _line(a, b)
     return _between(a, b, damping * ((b.velocity - a.velocity) @ direction) * direction, None)
 
 
 def generalized_force(motion: Motion, **forces) -> Load:
-    """Forces on speeds by name, `generalized_force(motion, steer_rate=torque)`: power `sum Q_k u_k` (N or N m)."""
+    """Forces on speeds by name, `generalized_force(motion, steer_rate=torque)`: power `sum Q_k u_k`; no potential.
+
+    `forces`: speed -> force, in N or N m. ValueError for an unknown speed.
+    """
     for name in forces:
         if name not in motion.u:
             raise ValueError(f"generalized force on unknown speed `{name}`; {nearest(name, motion.u.keys())}")
-    return Load(generalized={name: jnp.asarray(value) for name, value in forces.items()})
+    return Load(generalized=forces)
 
 
 def _line(a: Point, b: Point):

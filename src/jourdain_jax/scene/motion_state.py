@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import Vector, as_real
 from jourdain_jax.scene.bodies import Body, RigidBody
 from jourdain_jax.scene.names import Named, nearest
 
@@ -22,8 +23,8 @@ class Point(eqx.Module):
 
 
 def fixed_point(position) -> Point:
-    """A point at rest in the inertial frame, for springs, dampers and rods."""
-    position = jnp.asarray(position, jnp.result_type(float))
+    """A point at rest at `position` (3,) (m, inertial frame), for springs, dampers and rods."""
+    position = as_real(position)
     return Point(position, jnp.zeros_like(position), jnp.zeros_like(position))
 
 
@@ -50,7 +51,7 @@ class BodyPose(eqx.Module):
 
     def place(self, local) -> Float[Array, "*times 3"]:
         """Position (inertial frame) of the point with body-frame coordinates `local` (m, relative to the mass centre)."""
-        return self.position + self.orientation @ jnp.asarray(local)
+        return self.position + self.orientation @ as_real(local)
 
 
 class BodyMotion(eqx.Module):
@@ -71,9 +72,9 @@ class BodyMotion(eqx.Module):
         """Angular velocity in body components, rad/s."""
         return jnp.einsum("...ji,...j->...i", self.orientation, self.angular_velocity)
 
-    def velocity_at(self, position: Float[Array, "3"]) -> Float[Array, "3"]:
-        """Velocity of the material point that is at `position` (inertial frame): `v + omega x (position - r)`."""
-        return self.velocity + jnp.cross(self.angular_velocity, position - self.position)
+    def velocity_at(self, position: Vector) -> Float[Array, "3"]:
+        """Velocity (m/s, inertial frame) of the material point at `position` (m, inertial frame): `v + omega x (position - r)`."""
+        return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.position)
 
     def point(self, local=(0.0, 0.0, 0.0)) -> Point:
         """The material point with body-frame coordinates `local` (m, relative to the mass centre)."""

@@ -8,21 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-
-def _as_leaf(value) -> Array:
-    array = jnp.asarray(value)
-    dtype = array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else jnp.result_type(float)
-    return jnp.asarray(array, dtype)  # never weakly typed, so that one trace serves defaults and other values alike
+from jourdain_jax.calculus.reals import as_real
 
 
 def parameter(default=..., *, unit: str = "", positive: bool = False, non_negative: bool = False, about: str = ""):
     """A field of a scene that is a physical parameter: converted to a floating-point array, so that it is a differentiable leaf.
 
-    `unit` and `about` describe it; `positive` and `non_negative` are checked when the scene is built with known values.
+    - `default`: a number or an array; without it the parameter must be given. `unit` and `about` describe it.
+    - `positive`, `non_negative`: checked (ValueError, as are numbers that are not finite) when the scene is built with known values.
     """
     options = {} if default is ... else {"default": default}
     metadata = {"parameter": True, "unit": unit, "positive": positive, "non_negative": non_negative, "about": about}
-    return eqx.field(converter=_as_leaf, metadata=metadata, **options)
+    return eqx.field(converter=as_real, metadata=metadata, **options)
 
 
 def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:

@@ -51,7 +51,7 @@ class Scene(eqx.Module):
     # What a scene says. -------------------------------------------------------------------------------------------
 
     def bodies(self, t: Float[Array, ""], q: Named) -> dict[str, Body]:
-        """Poses of all bodies at time t and coordinates q."""
+        """Poses of all bodies by name at time t (s) and coordinates q, `q.name`; in the inertial frame. Required."""
         raise NotImplementedError(f"scene `{type(self).__name__}` does not say where its bodies are; define `bodies(self, t, q)`")
 
     def coordinate_rates(self, t: Float[Array, ""], q: Named, u: Named) -> Float[Array, "coordinates"]:
@@ -59,11 +59,11 @@ class Scene(eqx.Module):
         return self.coordinates.default_rates(q.array, u.array)
 
     def loads(self, motion: Motion) -> tuple[Load, ...]:
-        """Impressed forces."""
+        """Impressed forces at a `motion` (t, q, u, inputs, velocities)."""
         return ()
 
     def potential(self, pose: Pose) -> Float[Array, ""] | None:
-        """Potential energy (J) besides that of the loads, a function of time and coordinates; None where there is none."""
+        """Potential energy (J) at a `pose` besides that of the loads, a function of time and coordinates; None where there is none."""
         return None
 
     def prescribed(self, t: Float[Array, ""]) -> dict[str, Float[Array, ""]]:
@@ -71,23 +71,23 @@ class Scene(eqx.Module):
         return {}
 
     def geometric_constraints(self, pose: Pose) -> dict[str, Array]:
-        """Geometric rows g(q, t) = 0 by name, each a scalar or a vector."""
+        """Geometric rows g(q, t) = 0 at a `pose`, by name, each a scalar or a vector; eq. (5)."""
         return {}
 
     def velocity_constraints(self, motion: Motion) -> dict[str, Array]:
-        """Velocity rows phi(q, u, t) = 0 by name, each a scalar or a vector: linear, affine or nonlinear in the speeds."""
+        """Velocity rows phi(q, u, t) = 0 at a `motion`, by name, each a scalar or a vector: linear, affine or nonlinear in u; (6)-(9)."""
         return {}
 
     def contacts(self, pose: Pose) -> dict[str, Contact]:
-        """Rolling contacts by name; each adds its no-slip rows, and its height row if it says so."""
+        """Rolling contacts at a `pose`, by name; each adds its no-slip rows, and its height row if it says so."""
         return {}
 
     def events(self, motion: Motion) -> dict[str, Float[Array, ""]]:
-        """Named stop events: positive while the motion may go on; the motion stops where a value falls through zero."""
+        """Named stop events at a `motion`: positive while it may go on; it stops where a value falls through zero."""
         return {}
 
     def invariants(self, motion: Motion) -> dict[str, Float[Array, ""]]:
-        """Named quantities that this scene is known to conserve, besides its energy; for checks and summaries."""
+        """Named quantities of a `motion` that this scene is known to conserve, besides its energy; for checks and summaries."""
         return {}
 
     # What can be asked of any scene. ------------------------------------------------------------------------------
@@ -103,7 +103,10 @@ class Scene(eqx.Module):
         return self.coordinates.default_speeds if self.speeds is None else self.speeds
 
     def replace(self, **changes) -> "Scene":
-        """The same scene with some parameters changed; unknown names raise a ValueError with the nearest valid name."""
+        """The same scene with some parameters changed: `changes`, name -> value in the parameter's unit.
+
+        ValueError for an unknown name (with the nearest valid one) or a value that the parameter does not allow.
+        """
         names = [name for name, _, _ in parameters_of(self)]
         for name in changes:
             if name not in self.__dataclass_fields__:
@@ -111,9 +114,9 @@ class Scene(eqx.Module):
         return replace(self, **changes)
 
     def named(self, **values) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"], tuple[str, ...]]:
-        """q and u with the named values, the rest at the reference; and the names that were given.
+        """q and u with the named `values`, the rest at the reference (zero; the identity for quaternions); and the names that were given.
 
-        A quaternion or its angular velocity may be given whole, by its own name.
+        A quaternion or its angular velocity may be given whole, by its own name. ValueError for an unknown name or a wrong shape.
         """
         q, u = list(self.coordinates.reference()), [0.0] * len(self.speed_names)
         given: list[str] = []

@@ -1,0 +1,146 @@
+"""What a scene states (bodies, loads, potentials, rows), checked piece by piece, so that a wrong one is named.
+
+inertia        m >= 0,  I = I' >= 0,  R'R = 1                         per body
+potentials     Z' (Q_i + N' dV_i/dq) = 0                              per load i that states a potential V_i
+derivatives    d/ds of every piece along one direction in (parameters, t, q, u): autodiff against central differences; no kink there
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.analysis.verification import DIFFERENCE_STEP, Check, central_difference, check
+from jourdain_jax.equations.kinematics import Velocities, coordinate_rates, motion_at, partial_velocities, pose_at
+from jourdain_jax.equations.rows import position_rows, velocity_rows
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.loads import Load
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.scene import Scene
+
+_FLOOR = {"float64": 1e-4, "float32": 1e-2}  # SI units; what is smaller is not told from round-off in a difference
+_KINK = 1e-3  # a kink is a jump of order one, and its estimate is of lower order than the difference
+
+
+def statement_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], seed: int) -> list[Check]:
+    """The three checks above; `Z` spans the admissible speeds."""
+    inertia, potentials = jax.tree.map(np.asarray, _evaluate(scene, t, q, u, inputs, Z))
+    return [
+        check("inertia", {name: float(value) for name, value in inertia.items()}, q.dtype),
+        check("potentials", {name: float(value) for name, value in potentials.items()}, q.dtype),
+        _derivatives(scene, t, q, u, inputs, seed),
+    ]
+
+
+@eqx.filter_jit
+def _evaluate(scene: Scene, t, q, u, inputs, Z) -> tuple[dict, dict]:
+    motion = motion_at(scene, t, q, u, inputs)
+    return _inertia(motion), _potentials(scene, motion, Z)
+
+
+def _inertia(motion: Motion) -> dict[str, Float[Array, ""]]:
+    values = {}
+    for name, moving in motion.bodies.items():
+        body = moving.body
+        values[f"body `{name}`: its mass is negative"] = jnp.maximum(-body.mass, 0.0) / jnp.maximum(jnp.abs(body.mass), jnp.finfo(body.mass.dtype).tiny)
+        if not isinstance(body, RigidBody):
+            continue
+        size = jnp.max(jnp.abs(body.inertia)) + jnp.finfo(body.inertia.dtype).tiny
+        moments = jnp.linalg.eigvalsh((body.inertia + body.inertia.T) / 2)
+        values[f"body `{name}`: its inertia is not symmetric"] = jnp.max(jnp.abs(body.inertia - body.inertia.T)) / size
+        values[f"body `{name}`: a principal moment of inertia is negative"] = jnp.maximum(-moments[0], 0.0) / size
+        values[f"body `{name}`: its orientation is no rotation matrix"] = jnp.max(jnp.abs(body.orientation.T @ body.orientation - jnp.eye(3)))
+    return values
+
+
+def _potentials(scene: Scene, motion: Motion, Z) -> dict[str, Float[Array, ""]]:
+    t, q, u, inputs = motion.t, motion.q.array, motion.u.array, motion.inputs.array
+    loads = scene.loads(motion)
+    stated = [i for i, load in enumerate(loads) if load.potential is not None]
+    if not stated:
+        return {}
+
+    def V(q):
+        at = scene.loads(motion_at(scene, t, q, u, inputs))
+        return jnp.stack([at[i].potential for i in stated])
+
+    dV = jax.jacfwd(V)(q) @ jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
+    partial = partial_velocities(scene, t, q, u)
+    values = {}
+    for i, slope in zip(stated, dV, strict=True):
+        Q = _generalized(loads[i], scene, motion, partial)
+        size = jnp.max(jnp.abs(Q)) + jnp.max(jnp.abs(slope)) + jnp.finfo(q.dtype).tiny
+        values[f"{_name(i, loads[i])}: its potential does not give its force"] = jnp.max(jnp.abs(Z.T @ (Q + slope)), initial=0.0) / size
+    return values
+
+
+def _generalized(load: Load, scene: Scene, motion: Motion, partial: Velocities) -> Float[Array, "speeds"]:
+    """`Q = beta' F + gamma' L + Q_direct` of one load."""
+    Q = jnp.zeros_like(motion.u.array)
+    for k, (name, body) in enumerate(motion.bodies.items()):
+        if name in load.forces:
+            Q = Q + partial.linear[k].T @ load.forces[name]
+        if name in load.torques:
+            Q = Q + partial.angular[k].T @ (body.orientation.T @ load.torques[name])
+    for name, force in load.generalized.items():
+        Q = Q.at[scene.speed_names.index(name, "speed")].add(force)
+    return Q
+
+
+def _name(i: int, load: Load) -> str:
+    on = dict.fromkeys([*load.forces, *load.torques, *load.generalized])
+    return f"load {i + 1}" + (f" (on {', '.join(f'`{name}`' for name in on)})" if on else "")
+
+
+def _pieces(scene: Scene, t, q, u, inputs) -> dict[str, Array]:
+    """All numbers that the scene states at (t, q, u), by what they are."""
+    # poses by themselves: out of a motion they come differentiated once already, and a rule of the user's own may be passed over
+    motion, pose = motion_at(scene, t, q, u, inputs), pose_at(scene, t, q)
+    pieces = {"the coordinate rates": coordinate_rates(scene, t, q, u)}
+    for name, placed in pose.bodies.items():
+        body = placed.body
+        pieces |= {f"body `{name}`: its mass": body.mass, f"body `{name}`: its position": body.position}
+        if isinstance(body, RigidBody):
+            pieces |= {f"body `{name}`: its inertia": body.inertia, f"body `{name}`: its orientation": body.orientation}
+    for i, load in enumerate(scene.loads(motion)):
+        for kind, part in (("force", load.forces), ("torque", load.torques), ("force", load.generalized)):
+            pieces |= {f"{_name(i, load)}: its {kind} on `{name}`": value for name, value in part.items()}
+        if load.potential is not None:
+            pieces[f"{_name(i, load)}: its potential"] = load.potential
+    potential = scene.potential(pose)
+    if potential is not None:
+        pieces["the scene's `potential`"] = jnp.asarray(potential)
+    pieces |= {f"row `{name}`": value for name, value in velocity_rows(scene, motion).items()}
+    return pieces | {f"row `{name}` (its position)": value for name, value in position_rows(scene, pose).items()}
+
+
+def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
+    generator, kind = np.random.default_rng(seed), q.dtype.name
+    moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
+    draw = lambda x: jnp.asarray(generator.normal(size=x.shape), x.dtype)  # noqa: E731
+    direction = (jax.tree.map(lambda x: draw(x) * jnp.where(x == 0, 1.0, x), moving), jnp.ones_like(t), draw(q), draw(u))
+    point = (moving, t, q, u)
+    value, change = _pushed(fixed, inputs, point, direction)
+    h = DIFFERENCE_STEP[kind] / (1 + float(jnp.max(jnp.abs(u), initial=0.0)))
+    along = [_at(fixed, inputs, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
+    values = {}
+    for name in value:
+        f, slope, ends = np.asarray(value[name]), np.asarray(change[name]), [np.asarray(x[name]) for x in along]
+        # 2 s(h) - s(2h) with s(h) = (f(h) - 2 f(0) + f(-h))/h: of third order where f is smooth, the jump of the slope at a kink
+        kink = (2 * (ends[1] + ends[2]) - 4 * f) / h - (ends[0] + ends[3] - 2 * f) / (2 * h)
+        size = np.max(np.abs(f), initial=0.0) + np.max(np.abs(slope), initial=0.0) + _FLOOR[kind]
+        error = np.maximum(np.abs(slope - central_difference(ends, h)), _KINK * np.abs(kink))
+        values[f"{name}: its derivative"] = float(np.max(error, initial=0.0) / size)
+    return check("derivatives", values, q.dtype)
+
+
+@eqx.filter_jit
+def _at(fixed, inputs, point) -> dict[str, Array]:
+    parameters, t, q, u = point
+    return _pieces(eqx.combine(parameters, fixed), t, q, u, inputs)
+
+
+@eqx.filter_jit
+def _pushed(fixed, inputs, point, direction) -> tuple[dict[str, Array], dict[str, Array]]:
+    return jax.jvp(lambda point: _at(fixed, inputs, point), (point,), (direction,))

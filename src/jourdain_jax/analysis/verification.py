@@ -1,0 +1,106 @@
+"""The result of a verification: comparisons, each with its size, its threshold and its culprit."""
+
+import equinox as eqx
+import numpy as np
+
+# Relative to the size of what is compared, by floating-point type.
+THRESHOLDS: dict[str, dict[str, float]] = {
+    "float64": {
+        "inertia": 1e-10,
+        "potentials": 1e-10,
+        "derivatives": 1e-6,
+        "reductions": 1e-10,
+        "forms": 1e-10,
+        "virtual power": 1e-10,
+        "Newton": 1e-10,
+        "energy": 1e-9,
+        "jvp against vjp": 1e-11,
+        "differences": 1e-6,
+    },
+    "float32": {
+        "inertia": 1e-5,
+        "potentials": 1e-4,
+        "derivatives": 1e-2,
+        "reductions": 1e-4,
+        "forms": 1e-4,
+        "virtual power": 1e-4,
+        "Newton": 1e-4,
+        "energy": 1e-4,
+        "jvp against vjp": 1e-4,
+        "differences": 2e-2,
+    },
+}
+DIFFERENCE_STEP = {"float64": 1e-3, "float32": 2e-2}  # of the fourth-order central differences
+
+
+class Check(eqx.Module):
+    """One comparison: its relative size, what it may be, and what it is about."""
+
+    name: str = eqx.field(static=True)
+    value: float
+    threshold: float
+    culprit: str = eqx.field(static=True)  # body, load, row, form or reduction with the largest value
+    note: str = eqx.field(static=True, default="")
+
+    @property
+    def passed(self) -> bool:
+        """Whether the value is within its threshold."""
+        return bool(self.value <= self.threshold)
+
+    def as_dict(self) -> dict:
+        """The check for machines; a value that is not finite is None."""
+        value = float(self.value) if np.isfinite(self.value) else None
+        return {"name": self.name, "value": value, "threshold": self.threshold, "passed": self.passed, "culprit": self.culprit, "note": self.note}
+
+
+def check(name: str, values: dict[str, float], dtype, note: str = "") -> Check:
+    """The check called `name` (a key of `THRESHOLDS`) from its value for every suspect; NaN counts as larger than any number."""
+    threshold = THRESHOLDS[np.dtype(dtype).name][name]
+    if not values:
+        return Check(name, 0.0, threshold, "nothing", note)
+    culprit = max(values, key=lambda key: np.inf if np.isnan(values[key]) else values[key])
+    return Check(name, float(values[culprit]), threshold, culprit, note)
+
+
+def central_difference(along: list, h: float):
+    """Fourth-order central difference from the values at -2h, -h, h, 2h."""
+    return (along[0] - 8 * along[1] + 8 * along[2] - along[3]) / (12 * h)
+
+
+class Verification(eqx.Module):
+    """All checks of one state; `print` shows them as a table."""
+
+    scene: str = eqx.field(static=True)
+    checks: tuple[Check, ...]
+    not_applicable: tuple[str, ...] = eqx.field(static=True)  # reductions that do not apply at this state
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check passed."""
+        return all(check.passed for check in self.checks)
+
+    def largest(self, *names: str) -> float:
+        """The largest value among the checks with these `names` (keys of `THRESHOLDS`); NaN where one is NaN, zero where there is none."""
+        values = [check.value for check in self.checks if check.name in names]
+        return float(np.max(values)) if values else 0.0
+
+    def as_dict(self) -> dict:
+        """The result for machines: the largest values by kind, and every check."""
+        return {
+            "max_disagreement": self.largest("reductions", "forms", "Newton"),
+            "virtual_power": self.largest("virtual power"),
+            "energy_balance": self.largest("energy", "potentials"),
+            "gradient_error": self.largest("jvp against vjp", "differences", "derivatives"),
+            "passed": self.passed,
+            "not_applicable": list(self.not_applicable),
+            "checks": [check.as_dict() for check in self.checks],
+        }
+
+    def __str__(self) -> str:
+        lines = [f"Verification of {self.scene}: {'passed' if self.passed else 'FAILED'}"]
+        for check in self.checks:
+            verdict = "ok" if check.passed else f"FAILED, look at {check.culprit}"
+            lines.append(f"  {check.name:<16} {check.value:9.1e}  (at most {check.threshold:.0e})  {verdict}" + (f"; {check.note}" if check.note else ""))
+        if self.not_applicable:
+            lines.append("  not applicable at this state: " + ", ".join(self.not_applicable))
+        return "\n".join(lines)

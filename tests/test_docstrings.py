@@ -1,0 +1,89 @@
+"""Everything public says what it is: names of arguments, and units where a number has one."""
+
+import inspect
+import re
+
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.analysis.fit_result import Fit
+from jourdain_jax.analysis.steady import SteadyMotion
+from jourdain_jax.analysis.verification import Check
+from jourdain_jax.equations.reactions import ContactForce, RowReactions
+from jourdain_jax.motion.diagnostics import Diagnostics, Energies
+from jourdain_jax.scene.contacts import Contact
+from jourdain_jax.scene.coordinates import Coordinates, Names
+from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Point, Pose
+from jourdain_jax.scene.names import Named
+
+# what a user is handed without having imported it
+HANDED_OUT = (Fit, SteadyMotion, Check, ContactForce, RowReactions, Diagnostics, Energies, Contact, Coordinates, Names, Named, BodyMotion, BodyPose, Motion)
+HANDED_OUT += (Point, Pose)
+PUBLIC = {name: value for name, value in vars(jj).items() if not name.startswith("_") and not inspect.ismodule(value)}
+FUNCTIONS = {name: value for name, value in PUBLIC.items() if inspect.isfunction(value)}
+CLASSES = {value.__name__: value for value in (*PUBLIC.values(), *HANDED_OUT) if inspect.isclass(value)}
+SELF_EVIDENT = {"self", "scene", "t", "q", "u"}
+# functions of a state or of numbers with a unit: their text must state one
+UNITS = re.compile(r"\b(kg|m|s|N|J|W|rad|rad/s|m/s)\b")
+WITH_UNITS = ("rot_x", "rod", "knife_edge", "spring", "damper", "gravity", "torque", "point_force", "generalized_force", "fixed_point")
+WITH_UNITS += ("disc_contact", "ball_contact", "start", "simulate", "kinetic_energy", "potential_energy", "virtual_power", "newton_residual")
+WITH_UNITS += ("generalized_forces", "unconstrained_equations", "energy", "pose_at")
+# functions that implement an equation of the paper say which
+WITH_SOURCE = ("accelerations", "gibbs_function", "gibbs_equations", "lagrange_equations", "virtual_power", "newton_residual", "generalized_forces")
+WITH_SOURCE += ("unconstrained_equations", "partial_velocities", "constraint_rows", "velocity_residual", "position_residual", "structure_of")
+
+
+def _methods(owner: type):
+    """Public methods and properties that a class of the package defines, by name."""
+    for name in dir(owner):
+        value = inspect.getattr_static(owner, name)
+        home = next((base for base in owner.__mro__ if name in vars(base)), object)
+        if name.startswith("_") or not home.__module__.startswith("jourdain_jax"):
+            continue
+        if isinstance(value, property):
+            yield name, value.fget
+        elif callable(value) or isinstance(value, staticmethod | classmethod):
+            yield name, getattr(owner, name)
+
+
+def _unsaid(function) -> list[str]:
+    """Parameters that a docstring does not name."""
+    text = inspect.getdoc(function) or ""
+    return [name for name in inspect.signature(function).parameters if name not in SELF_EVIDENT and not re.search(rf"\b{name}\b", text)]
+
+
+@pytest.mark.parametrize("name", sorted(FUNCTIONS))
+def test_a_public_function_says_what_its_arguments_are(name):
+    assert inspect.getdoc(FUNCTIONS[name]), f"`{name}` has no docstring"
+    assert _unsaid(FUNCTIONS[name]) == []
+
+
+@pytest.mark.parametrize("name", sorted(CLASSES))
+def test_a_public_class_and_its_methods_say_what_they_are(name):
+    own = vars(CLASSES[name]).get("__doc__")
+    assert own, f"`{name}` has no docstring"
+    assert not own.startswith(f"{name}("), f"`{name}` has only the docstring that its decorator made"
+    for method, function in _methods(CLASSES[name]):
+        assert inspect.getdoc(function), f"`{name}.{method}` has no docstring"
+        assert _unsaid(function) == [], f"{name}.{method}"
+
+
+@pytest.mark.parametrize("name", WITH_UNITS)
+def test_what_takes_or_gives_a_quantity_states_its_unit(name):
+    assert UNITS.search(inspect.getdoc(FUNCTIONS[name]))
+
+
+@pytest.mark.parametrize("name", WITH_SOURCE)
+def test_what_implements_an_equation_of_the_paper_says_which(name):
+    assert re.search(r"\(\d+\)", inspect.getdoc(FUNCTIONS[name]))
+
+
+def test_an_undocumented_argument_would_be_seen():
+    def wanting(scene, t, stiffness):
+        """A function of a `scene`."""
+
+    assert _unsaid(wanting) == ["stiffness"]
+
+
+def test_the_package_lists_every_public_name_once():
+    assert not [name for name, value in PUBLIC.items() if not value.__module__.startswith("jourdain_jax")]

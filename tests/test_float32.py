@@ -1,0 +1,169 @@
+"""In single precision: motions, accelerations and gradients are right to what float32 holds, and nothing turns into float64 on the way.
+
+The precision is chosen before JAX starts, so that all of it runs in one process of its own; its findings come back as JSON.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import chaplygin_sleigh, skate
+from tolerances import relative_error
+
+import jourdain_jax as jj
+from jourdain_jax.models import MODELS
+
+NAMES = ("skate", "chaplygin-sleigh", "tilting-disc", "tilting-disc-quaternion")
+WITH_GRADIENT = ("chaplygin-sleigh", "tilting-disc-quaternion")  # a minimal state, and one that is projected
+TS = np.linspace(0.1, 2.0, 20)
+SINGLE = 1e-4  # relative: rtol is 1e-5 per step, over some 30 steps
+GRADIENT = 1e-3
+
+PROGRAM = """
+import json, warnings
+import jax, jax.numpy as jnp, numpy as np
+import jourdain_jax as jj
+from jourdain_jax.models import MODELS
+from jourdain_jax.motion import results
+from jourdain_jax.scene.parameters import parameters_of
+
+names, with_gradient, ts = json.loads(input())
+
+
+def types(tree):
+    return sorted({str(x.dtype) for x in jax.tree.leaves(tree) if hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jnp.floating)})
+
+
+def motion_of(scene, start, **options):
+    return jj.simulate(scene, start, ts=jnp.asarray(ts), rtol=1e-5, atol=1e-6, **options)
+
+
+found = {}
+for name in names:
+    scene = MODELS[name]()
+    state = jj.start(scene, **scene.example)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        motion = motion_of(scene, state)
+    t, q, u = (jnp.asarray(x) for x in jj.sample_states(scene, 4))
+    solve = jax.jit(jax.vmap(lambda t, q, u: {way: jj.accelerations(scene, t, q, u, reduction=way) for way in jj.reductions(scene)}))
+    by_reduction = solve(t, q, u)
+    middle = by_reduction["svd"].udot
+    found[name] = {
+        "q": motion.q.tolist(),
+        "u": motion.u.tolist(),
+        "result": int(motion.result) == results.SUCCESS,
+        "types": types((scene, state, motion, motion.energies(), motion.accelerations(), motion.contact_forces(), by_reduction)),
+        "warnings": [str(w.message) for w in caught],
+        "drift": float(jj.diagnose(motion).energy_drift / motion.energies().kinetic[0]),
+        "states": [t.tolist(), q.tolist(), u.tolist()],
+        "udot": middle.tolist(),
+        "spread": {way: float(jnp.max(jnp.abs(a.udot - middle)) / (1 + jnp.max(jnp.abs(middle)))) for way, a in by_reduction.items()},
+        "applicable": bool(jnp.all(jnp.stack([a.applicable for a in by_reduction.values()]))),
+    }
+    if name in with_gradient:
+        by_scene, by_state = jax.grad(lambda pair: jnp.sum(motion_of(*pair, work=False).q_end[:3]))((scene, state))
+        found[name] |= {
+            "by_scene": {key: float(getattr(by_scene, key)) for key, _, _ in parameters_of(scene)},
+            "by_state": [by_state.q.tolist(), by_state.u.tolist()],
+            "types of gradients": types((by_scene, by_state)),
+        }
+
+sleigh = MODELS["chaplygin-sleigh"]()
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    tight = jj.simulate(sleigh, sleigh.example, t1=0.1, rtol=1e-8, atol=1e-8)
+found["tight"] = {"warnings": [str(w.message) for w in caught], "finite": bool(jnp.all(jnp.isfinite(tight.q)))}
+found["few steps"] = motion_of(sleigh, sleigh.example, max_steps=3).message
+found["verified"] = str(jj.verify(sleigh, jj.start(sleigh, **sleigh.example)))
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture(scope="module")
+def single():
+    """What the program above found in a process with 32-bit floats."""
+    source = Path(jj.__file__).parents[1]
+    environment = os.environ | {
+        "JAX_ENABLE_X64": "0",
+        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir or "",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
+        "PYTHONPATH": os.pathsep.join([str(source), os.environ.get("PYTHONPATH", "")]),
+    }
+    text = json.dumps([NAMES, WITH_GRADIENT, TS.tolist()])
+    run = subprocess.run([sys.executable, "-c", PROGRAM], input=text, env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    return json.loads(run.stdout.splitlines()[-1])
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def compared(request, single):
+    """The model's name, what 32-bit floats gave, and the scene and its motion with 64-bit floats."""
+    scene = MODELS[request.param]()
+    return request.param, single[request.param], scene, jj.simulate(scene, scene.example, ts=TS, rtol=1e-10, atol=1e-10)
+
+
+def test_single_precision_gives_nothing_but_single_precision(compared):
+    _, found, *_ = compared
+    assert found["types"] == ["float32"]
+    assert found["result"]
+    assert found["warnings"] == []
+
+
+def test_motions_in_single_precision_follow_those_in_double_precision(compared):
+    _, found, _, exact = compared
+    assert relative_error(found["q"], exact.q) <= SINGLE
+    assert relative_error(found["u"], exact.u) <= SINGLE
+    assert found["drift"] <= SINGLE
+
+
+def test_skate_and_sleigh_follow_their_closed_forms_in_single_precision(single):
+    times = np.concatenate([[0.0], TS])  # both models' defaults and examples are the runs of the oracles
+    for name, motion in (("skate", skate.motion(times, **skate.RUN)), ("chaplygin-sleigh", chaplygin_sleigh.motion(times, **chaplygin_sleigh.RUN))):
+        expected = np.stack([motion["x"], motion["y"], motion["th"]], axis=-1)[1:]
+        assert relative_error(single[name]["q"], expected) <= SINGLE, name
+
+
+def test_reductions_agree_in_single_precision(compared):
+    _, found, scene, _ = compared
+    assert found["applicable"]
+    assert max(found["spread"].values()) <= SINGLE
+    t, q, u = (jnp.asarray(x) for x in found["states"])
+    exact = jax.vmap(lambda t, q, u: jj.accelerations(scene, t, q, u).udot)(t, q, u)
+    assert relative_error(found["udot"], exact) <= SINGLE
+
+
+@pytest.mark.parametrize("name", WITH_GRADIENT)
+def test_gradients_in_single_precision_are_those_of_double_precision(name, single):
+    scene, found = MODELS[name](), single[name]
+
+    def end(pair):
+        return jnp.sum(jj.simulate(*pair, ts=TS, rtol=1e-6, atol=1e-8, work=False).q_end[:3])
+
+    by_scene, by_state = jax.grad(end)((scene, jj.start(scene, **scene.example)))
+    exact = {key: float(getattr(by_scene, key)) for key in found["by_scene"]}
+    size = max(map(abs, exact.values()))
+    for key, value in found["by_scene"].items():
+        assert abs(value - exact[key]) <= GRADIENT * size, key
+    for value, expected in zip(found["by_state"], (by_state.q, by_state.u), strict=True):
+        assert relative_error(value, expected) <= GRADIENT
+    assert found["types of gradients"] == ["float32"]
+
+
+def test_tolerances_below_single_precision_are_warned_of(single):
+    assert any("asks for more digits than float32 has" in text for text in single["tight"]["warnings"])
+    assert single["tight"]["finite"]
+
+
+def test_result_codes_hold_in_single_precision(single):
+    assert single["few steps"].startswith("ran out of steps")
+
+
+def test_verification_knows_what_single_precision_can_show(single):
+    assert "passed" in single["verified"].splitlines()[0], single["verified"]

@@ -1,0 +1,226 @@
+"""`verify` finds what is wrong in a scene that states something wrong, and names the body, load or row at fault."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+from small_scenes import BeadOnTurningWire, DiscWithHeightRow, DrivenPendulum
+
+import jourdain_jax as jj
+from jourdain_jax.analysis.statements import statement_checks
+from jourdain_jax.analysis.verification import Verification
+
+
+class Sledge(jj.Scene):
+    """A sprung body on a knife edge and a bead that a bar ties to it; right as it stands, its methods are replaced by wrong ones below."""
+
+    mass: object = jj.parameter(1.2, unit="kg", positive=True)
+    stiffness: object = jj.parameter(3.0, unit="N/m")
+    coordinates = jj.coordinates("x y yaw bead_x bead_y")
+    example = {"x": 0.4, "y": -0.3, "yaw": 0.5, "bead_x": 1.1, "bead_y": 0.6, "yaw_rate": 0.3}
+    domain = {"x": (0.2, 0.6), "y": (-0.6, -0.2), "yaw": (0.2, 0.8), "bead_x": (0.8, 1.2), "bead_y": (0.4, 0.9)}
+
+    def bodies(self, t, q):
+        zero = jnp.zeros_like(q.x)
+        sledge = jj.RigidBody(self.mass, self.inertia(), jnp.stack([q.x, q.y, zero]), jj.rot_z(q.yaw))
+        return {"bead": jj.Particle(0.3 * self.mass, jnp.stack([q.bead_x, q.bead_y, zero])), "sledge": sledge}
+
+    def inertia(self):
+        return jnp.diag(jnp.array([0.2, 0.3, 0.4]))
+
+    def loads(self, motion):
+        return (
+            jj.gravity(motion, 9.81, (0.0, -1.0, 0.0)),
+            jj.spring(motion["bead"].point(), jj.fixed_point((1, 0, 0)), self.stiffness, 0.4),
+            jj.damper(motion["sledge"].point((0.1, 0.2, 0.0)), jj.fixed_point((0, 1, 0)), 0.5),
+        )
+
+    def geometric_constraints(self, pose):
+        return {"bar": self.bar(pose["sledge"].place((0.2, 0.0, 0.0)), pose["bead"].position)}
+
+    def bar(self, a, b):
+        return jj.rod(a, b, 0.9)
+
+    def velocity_constraints(self, motion):
+        return {"blade": self.blade(motion)}
+
+    def blade(self, motion):
+        return jj.knife_edge(motion["sledge"], motion["sledge"].position, motion["sledge"].orientation[:, 1])
+
+
+def wrong(**methods) -> tuple[jj.Scene, jj.State]:
+    """The sledge with some methods replaced, and a state of it, with the bead at x = 1.1 m."""
+    scene = type("Wrong", (Sledge,), methods)()
+    return scene, jj.consistent(scene, 0.0, *scene.named(**scene.example)[:2], held=("bead_x",))
+
+
+def statements(scene: jj.Scene, state: jj.State) -> jj.Verification:
+    """Of the verification, the part that looks at what the scene states, piece by piece: the rest takes a quarter of a minute to compile."""
+    Z = jnp.eye(len(state.u))
+    return Verification("Wrong", tuple(statement_checks(scene, state.t, state.q, state.u, jnp.zeros(0), Z, 0)), ())
+
+
+def refused(found: jj.Verification, check: str, culprit: str) -> None:
+    """The verification failed in the named check, on the named culprit, and its text says so."""
+    assert not found.passed
+    lines = [line for line in str(found).splitlines() if line.startswith(f"  {check} ") and "FAILED" in line]
+    assert culprit in "\n".join(lines), str(found)
+
+
+def failed(found: jj.Verification) -> set[str]:
+    """Names of the checks that did not pass."""
+    return {check.name for check in found.checks if not check.passed}
+
+
+def with_slope(f, slope):
+    """`f` of one array with a derivative of the user's own making: `slope(x, dx)`."""
+    made = jax.custom_jvp(f)
+    made.defjvp(lambda primals, tangents: (f(*primals), slope(*primals, *tangents)))
+    return made
+
+
+@pytest.mark.parametrize("scene", [Sledge(), DiscWithHeightRow(), DrivenPendulum(), BeadOnTurningWire(damping=0.4)], ids=lambda s: type(s).__name__)
+def test_right_scenes_pass_at_random_states(scene):
+    t, q, u = (x[0] for x in jj.sample_states(scene, 1, seed=3))
+    found = jj.verify(scene, jj.consistent(scene, t, q, u))
+    assert found.passed, str(found)
+
+
+def test_a_potential_that_does_not_give_the_force_is_found_at_its_load():
+    def loads(self, motion):
+        gravity, spring, damper = Sledge.loads(self, motion)
+        return (gravity, damper, jj.Load(spring.forces, spring.torques, {}, 1.5 * spring.potential))
+
+    found = jj.verify(*wrong(loads=loads))
+    refused(found, "potentials", "load 3 (on `bead`)")
+    assert failed(found) == {"potentials", "energy"}
+
+
+@pytest.mark.parametrize(
+    "energy",
+    [
+        with_slope(lambda x: 2.0 * x**2, lambda x, dx: 2.2 * x * dx),  # wrong by a factor
+        lambda x: 2.0 * jax.lax.stop_gradient(x) * x,  # part of it is missing
+        lambda x: jnp.abs(x - 1.1),  # a kink just here
+        lambda x: jnp.sqrt((x - 1.1) ** 2),  # its gradient is not a number here
+        lambda x: jnp.floor(10 * (x - 1.1)),  # a step just here
+    ],
+    ids=["wrong factor", "stopped gradient", "kink", "not a number", "step"],
+)
+def test_a_potential_without_the_right_gradient_is_found(energy):
+    refused(statements(*wrong(potential=lambda self, pose: energy(pose["bead"].position[0]))), "derivatives", "the scene's `potential`")
+
+
+def test_a_potential_with_a_wrong_gradient_fails_the_whole_verification():
+    energy = with_slope(lambda x: 2.0 * x**2, lambda x, dx: 2.2 * x * dx)
+    refused(jj.verify(*wrong(potential=lambda self, pose: energy(pose["bead"].position[0]))), "derivatives", "the scene's `potential`")
+
+
+def test_a_force_with_a_wrong_derivative_is_found_at_its_load_and_body():
+    push = with_slope(lambda x: 1.0 + 0.3 * jnp.sin(x), lambda x, dx: 0.3 * jnp.sin(x) * dx)
+
+    def loads(self, motion):
+        along = jnp.stack([push(motion.q.bead_x), 0.2 * push(motion.u.x_rate), 0.0 * motion.t])
+        return (*Sledge.loads(self, motion), jj.point_force(motion["bead"].point(), along))
+
+    found = jj.verify(*wrong(loads=loads))
+    refused(found, "derivatives", "load 4 (on `bead`): its force on `bead`")
+    assert failed(found) == {"derivatives", "differences"}
+
+
+def test_a_generalized_force_with_a_wrong_derivative_is_found_at_its_speed():
+    brake = with_slope(lambda u: -jnp.tanh(u), lambda u, du: -du)
+    found = wrong(loads=lambda self, motion: (jj.generalized_force(motion, yaw_rate=brake(motion.u.yaw_rate)),))
+    refused(statements(*found), "derivatives", "its force on `yaw_rate`")
+
+
+def test_a_velocity_row_with_a_wrong_drift_is_found_by_name():
+    turned = with_slope(lambda x: jnp.stack([-jnp.sin(x), jnp.cos(x), 0 * x]), lambda x, dx: 0.5 * jnp.stack([-jnp.cos(x), -jnp.sin(x), 0 * x]) * dx)
+    found = wrong(blade=lambda self, motion: motion["sledge"].velocity @ turned(motion.q.yaw))
+    refused(jj.verify(*found), "derivatives", "row `blade`")
+
+
+def test_a_geometric_row_with_a_wrong_gradient_is_found_by_name():
+    length = with_slope(lambda d: jnp.sqrt(d @ d), lambda d, dd: jnp.array([1.0, 0.7, 1.0]) * d @ dd / jnp.sqrt(d @ d))
+    found = wrong(bar=lambda self, a, b: length(b - a) - 0.9)
+    refused(statements(*found), "derivatives", "row `bar`")
+
+
+def test_a_pose_with_a_wrong_derivative_is_found_at_its_body():
+    bent = with_slope(jnp.sin, lambda x, dx: 0.9 * jnp.cos(x) * dx)
+
+    def bodies(self, t, q):
+        found = Sledge.bodies(self, t, q)
+        return found | {"bead": jj.Particle(0.3, jnp.stack([bent(q.bead_x), q.bead_y, 0.0 * q.x]))}
+
+    refused(statements(*wrong(bodies=bodies)), "derivatives", "body `bead`: its position")
+
+
+@pytest.mark.parametrize(
+    ("inertia", "sentence"),
+    [
+        ([[0.2, 0.05, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]], "body `sledge`: its inertia is not symmetric"),
+        ([[0.2, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, -0.1]], "body `sledge`: a principal moment of inertia is negative"),
+        ([[0.2, 0.5, 0.0], [0.5, 0.3, 0.0], [0.0, 0.0, 0.4]], "body `sledge`: a principal moment of inertia is negative"),
+        ([[0.2, 0.0, 0.0], [0.0, jnp.nan, 0.0], [0.0, 0.0, 0.4]], "body `sledge`"),
+    ],
+)
+def test_an_inertia_that_no_body_has_is_found_at_its_body(inertia, sentence):
+    refused(statements(*wrong(inertia=lambda self: jnp.array(inertia))), "inertia", sentence)
+
+
+def test_an_inertia_that_is_not_symmetric_fails_the_whole_verification():
+    tensor = jnp.array([[0.2, 0.0, 0.0], [0.05, 0.3, 0.0], [0.0, 0.0, 0.4]])
+    refused(jj.verify(*wrong(inertia=lambda self: tensor)), "inertia", "body `sledge`: its inertia is not symmetric")
+
+
+def test_a_negative_mass_is_found_at_its_body():
+    def bodies(self, t, q):
+        return Sledge.bodies(self, t, q) | {"bead": jj.Particle(-0.3, jnp.stack([q.bead_x, q.bead_y, 0.0 * q.x]))}
+
+    refused(statements(*wrong(bodies=bodies)), "inertia", "body `bead`: its mass is negative")
+
+
+def test_an_orientation_that_is_no_rotation_is_found_at_its_body():
+    def bodies(self, t, q):
+        sledge = Sledge.bodies(self, t, q)["sledge"]
+        stretched = jj.RigidBody(sledge.mass, sledge.inertia, sledge.position, 1.1 * sledge.orientation)
+        return Sledge.bodies(self, t, q) | {"sledge": stretched}
+
+    refused(statements(*wrong(bodies=bodies)), "inertia", "body `sledge`: its orientation is no rotation matrix")
+
+
+def test_the_result_for_machines_has_no_numbers_that_json_lacks():
+    found = statements(*wrong(inertia=lambda self: jnp.full((3, 3), jnp.nan)))
+    assert not found.as_dict()["passed"]
+    assert {"name", "value", "threshold", "passed", "culprit", "note"} == set(found.as_dict()["checks"][0])
+    assert any(check["value"] is None for check in found.as_dict()["checks"])
+
+
+class TwoBlades(jj.Scene):
+    """A particle held twice along the same line: the rows are dependent as long as the slopes are equal."""
+
+    slopes: object = jj.parameter((0.5, 0.5))
+    mass: object = jj.parameter(1.0)
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def velocity_constraints(self, motion):
+        return {"blades": motion.u.y_rate - self.slopes * motion.u.x_rate}
+
+
+@pytest.mark.parametrize(
+    ("change", "exists"),
+    [({"slopes": [1.0, 1.0], "mass": 0.0}, True), ({"slopes": [1.0, 0.0], "mass": 0.0}, False), ({"slopes": [0.0, 0.0], "mass": 1.0}, True)],
+)
+def test_a_derivative_that_splits_dependent_rows_does_not_exist(change, exists):
+    scene = TwoBlades()
+    assert jj.derivative_exists(scene, 0.0, [0.1, 0.2], [1.0, 0.5], scene.replace(**change), [0.0, 0.0]) == exists
+
+
+def test_verification_leaves_out_a_derivative_that_does_not_exist_and_says_so():
+    scene = TwoBlades()
+    found = jj.verify(scene, jj.consistent(scene, 0.0, [0.1, 0.2], [1.0, 0.5]))
+    assert found.passed
+    assert "parameters left out" in str(found)
