@@ -107,3 +107,11 @@ def test_derivatives_at_a_state_with_inertia_are_finite_beside_the_guard():
 
     # azimuth'' = -2 polar' azimuth' cot(polar)
     np.testing.assert_allclose(jax.grad(azimuth)(0.7), 0.3 / np.sin(0.7) ** 2, rtol=1e-12)
+
+
+def test_verification_fails_where_no_acceleration_is_determined_and_says_so():
+    q, u, _ = OnSphere().named(azimuth_rate=0.5)
+    found = jj.verify(OnSphere(), jj.consistent(OnSphere(), 0.0, q, u))
+    assert not found.passed
+    assert "no reduction applies" in str(found)
+    assert set(found.not_applicable) == set(jj.reductions(OnSphere()))
