@@ -5,7 +5,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 import small_scenes as small
-from tolerances import tolerance
+from timed_scenes import TIMED
+from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.equations.kinematics import coordinate_rates
@@ -98,3 +99,30 @@ def test_energy_is_kinetic_and_potential():
     assert jnp.allclose(found.kinetic, 0.5 * 1.25 * 2.0 * 0.5**2 * 1.5**2, rtol=tolerance("round_off"))
     assert jnp.allclose(found.potential, 2.0 * 9.81 * 0.5 * jnp.cos(0.4), rtol=tolerance("round_off"))
     assert found.total == found.kinetic + found.potential
+
+
+@pytest.mark.parametrize("case", TIMED, ids=lambda case: type(case[0]).__name__)
+def test_the_work_that_time_does_is_integrated_and_is_that_of_the_closed_form(case):
+    scene, timed, driven = case
+    structure = jj.structure_of(scene)
+    assert (structure.timed, structure.driven) == (timed, driven)
+    assert structure.rheonomic == bool(timed)
+    ts = jnp.linspace(0.0, 1.5, 6)
+    inputs = {"speed": 0.6} if scene.inputs.entries else None
+    motion = jj.simulate(scene, ts=ts, rtol=1e-12, atol=1e-12, inputs=inputs).raise_if_failed()
+    assert motion.energies().kind == "T + V less the work done"
+    assert relative_error(motion.work, scene.work(ts)) <= tolerance("closed_form")
+    balance = motion.energies().balance
+    assert relative_error(balance, jnp.broadcast_to(balance[0], ts.shape), float(jnp.max(jnp.abs(motion.work)))) <= tolerance("closed_form")
+
+
+def test_what_changes_the_mass_is_named():
+    assert jj.energy_balance(TIMED[4][0]).changed_by == ("masses or inertias that change",)
+
+
+@pytest.mark.parametrize("scene", [TIMED[0][0], TIMED[3][0], TIMED[4][0]], ids=lambda s: type(s).__name__)
+def test_scenes_in_which_time_does_work_pass_verification(scene):
+    q, u, _ = scene.named(**scene.example)
+    found = jj.verify(scene, jj.consistent(scene, 0.7, q, u))
+    assert found.passed, str(found)
+    assert found.certifies

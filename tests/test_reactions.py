@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import small_scenes as small
 from tolerances import tolerance
@@ -18,6 +19,7 @@ from jourdain_jax.models import (
     VerticalDisc,
     WhippleBicycle,
 )
+from jourdain_jax.motion.diagnostics import diagnose
 
 SCENES = [
     TwoWheelAxleRedundant(),
@@ -117,6 +119,28 @@ def test_a_contact_that_would_have_to_pull_is_flagged(scene):
     assert contact.pulls
     assert contact.normal < 0
     assert jnp.isinf(contact.friction_needed)
+
+
+@pytest.mark.parametrize("scene", [VerticalDisc(gravity=0.0), small.DiscWithHeightRow(gravity=0.0)], ids=["Newton", "row"])
+def test_a_contact_without_any_load_bears_nothing_and_is_honest(scene):
+    roll = {"spin_rate": 3.0} if isinstance(scene, small.DiscWithHeightRow) else {"roll_rate": 3.0}
+    motion = jj.simulate(scene, roll, t1=1.0)  # straight on
+    found = diagnose(motion).contacts["rim"]
+    assert found.honest
+    assert max(abs(found.lowest_normal), abs(found.highest_normal)) <= tolerance("round_off")
+    assert found.friction_needed == 0.0
+    assert not np.any(motion.contact_forces()["rim"].pulls)
+    assert "PULL" not in str(motion)
+
+
+def test_a_contact_that_presses_nowhere_and_is_pushed_sideways_needs_infinite_friction():
+    # no gravity, a turn: centripetal force m w_heading R w_roll without a normal force
+    scene = VerticalDisc(mass=1.4, radius=0.7, gravity=0.0)
+    q, u, _ = scene.named(heading_rate=2.0, roll_rate=1.5, x_rate=1.05)
+    contact = contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))["rim"]
+    assert jnp.allclose(contact.tangential, 1.4 * 2.0 * 0.7 * 1.5 * jnp.array([0.0, 1.0]), atol=tolerance("round_off"))
+    assert jnp.isinf(contact.friction_needed)
+    assert not contact.pulls
 
 
 def test_the_wheels_of_a_standing_bicycle_carry_its_weight():

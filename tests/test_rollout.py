@@ -37,9 +37,21 @@ def test_bad_lanes_are_counted_and_named_and_harm_no_other(sleighs):
     good = np.setdiff1d(np.arange(7), lanes.failed)
     assert np.all(lanes.result[good] == results.SUCCESS)
     assert np.all(np.isfinite(np.asarray(lanes["x"])[good]))
-    assert "lanes 2, 5" in str(lanes)
+    assert lanes.result[[2, 5]].tolist() == [results.BAD_START, results.BAD_PARAMETER]
+    assert "1 the start is not finite; check where its values were computed: lanes 2" in str(lanes)
+    assert "1 a parameter is not finite or has the wrong sign (`offset`): lanes 5" in str(lanes)
     assert lanes.quantiles("heading", (0.5,)).shape == (1, 5)
     np.testing.assert_allclose(lanes.quantiles("heading", (0.5,))[0], np.median(np.asarray(lanes["heading"])[good], axis=0))
+
+
+def test_lanes_with_parameters_of_the_wrong_sign_end_at_once_and_say_which():
+    lanes = jj.rollout(ChaplyginSleigh(), parameters={"mass": np.array([1.0, -1.0, np.nan, 0.0])}, progress=False, **OPTIONS)
+    assert lanes.result.tolist() == [results.SUCCESS, *[results.BAD_PARAMETER] * 3]
+    assert "wrong sign (`mass`): lanes 1, 2, 3" in str(lanes)
+    assert lanes.lane(1).message.endswith("(`mass`); check where it was computed")
+    assert np.all(np.isnan(np.asarray(lanes["x"])[1:]))
+    assert np.all(np.asarray(lanes.lanes.t_end)[1:] == 0.0)
+    np.testing.assert_allclose(lanes.lane(0).q, jj.simulate(ChaplyginSleigh(mass=1.0), **OPTIONS).q, atol=1e-9)
 
 
 def test_a_lane_that_falls_stops_at_its_event_and_the_others_go_on():

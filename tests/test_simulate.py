@@ -12,6 +12,7 @@ from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
 from jourdain_jax.models.double_pendulum_rods import DoublePendulumRods
 from jourdain_jax.models.skate import Skate
 from jourdain_jax.motion import results
+from jourdain_jax.motion.event_location import locate
 
 
 class Falling(jj.Scene):
@@ -64,6 +65,32 @@ def test_the_derivative_of_an_event_time_is_that_of_the_closed_form(derivative, 
 
     dt = (flight_time(5.0 + 1e-6) - flight_time(5.0 - 1e-6)) / 2e-6
     np.testing.assert_allclose(derivative(landing)(5.0), [dt, 2 * dt, 1 - 9.81 * dt], rtol=1e-8)
+
+
+def test_the_second_derivative_of_an_event_time_and_state_is_that_of_the_closed_form():
+    def landing(speed):
+        options = {"rtol": 1e-10, "atol": 1e-10, "work": False, "adjoint": diffrax.ForwardMode()}
+        motion = jj.simulate(Falling(), {"z_rate": speed, "x_rate": 2.0}, t1=3.0, ts=jnp.array([0.0]), **options)
+        return jnp.stack([motion.t_end, motion.q_end[0], motion.u_end[1]])
+
+    # t = (v + r)/g with r = sqrt(v^2 + 2 g h):  t'' = (r^2 - v^2)/(g r^3) = 2 h/r^3
+    bent = 2 * 0.5 / (25 + 2 * 9.81 * 0.5) ** 1.5
+    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(landing))(5.0), [bent, 2 * bent, -9.81 * bent], rtol=1e-8)
+
+
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd])
+def test_an_event_is_located_with_derivatives_up_to_the_third(derivative):
+    g, t_f = 9.81, 0.8
+
+    def fall_time(height):
+        y_f = jnp.stack([height - 0.5 * g * t_f**2, jnp.asarray(-g * t_f)])  # dropped at t = 0, seen at t_f, below the ground
+        rates = lambda t, y, args: jnp.stack([y[1], jnp.asarray(-g)])  # noqa: E731
+        return locate(rates, lambda t, y, args: y[0], jnp.asarray(t_f), y_f, None, jnp.asarray(True), jnp.asarray(t_f)).t
+
+    height, exact = 2.0, np.sqrt(2 * 2.0 / g)
+    for expected in (exact, exact / (2 * height), -exact / (4 * height**2), 3 * exact / (8 * height**3)):
+        np.testing.assert_allclose(fall_time(height), expected, rtol=1e-12)
+        fall_time = derivative(fall_time)
 
 
 def test_a_motion_that_starts_beyond_an_event_does_not_start():

@@ -23,6 +23,7 @@ _ORIGINS = {
     "rows": "constraint rows that do real work",
     "driven": "poses driven as functions of time",
     "potential": "potentials that depend on time",
+    "inertia": "masses or inertias that change",
 }
 
 

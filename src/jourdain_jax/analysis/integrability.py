@@ -29,7 +29,7 @@ from jourdain_jax.equations.structure import sample_states, structure_of
 from jourdain_jax.scene.scene import Scene
 
 INTEGRABLE = 1e-9  # size of dw on the velocities that w admits, relative to the derivatives of w
-STEP = 0.02  # of the differences, along unit directions
+STEP = {"float64": 0.02, "float32": 0.1}  # of the differences, along unit directions
 BATCH = 32  # points evaluated together
 
 
@@ -102,7 +102,7 @@ def _forms_at(scene: Scene, t, q, u):
         N, nu = _rates(scene, t, q, u)
         frame = jnp.concatenate([jnp.concatenate([jnp.ones(1), nu])[:, None], jnp.pad(N, ((1, 0), (0, 0)))], axis=1)
         (A, _), (A_other, _) = _linear_rows(scene, t, q, u), _linear_rows(scene, t, q, -0.7 * u[::-1])
-        curved = jnp.max(jnp.abs(A - A_other), axis=1) > 1e-9 * (1 + jnp.max(jnp.abs(A), axis=1))
+        curved = jnp.max(jnp.abs(A - A_other), axis=1) > jnp.sqrt(jnp.finfo(A.dtype).eps) * (1 + jnp.max(jnp.abs(A), axis=1))
         return forms(x), jax.jacfwd(forms)(x), frame, curved
 
     return jax.vmap(one)(t, q, u)
@@ -131,7 +131,7 @@ def growth_vector(scene: Scene, *, depth: int = 4, points: int = 2, seed: int = 
     tolerance = 1e-6 if jnp.result_type(float) == jnp.float64 else 1e-2
     if not structure.affine:
         return Growth((), False, depth, tolerance, None)
-    with_time = structure.rheonomic or structure.driven or not structure.homogeneous
+    with_time = structure.timed_kinematics or structure.driven or not structure.homogeneous
     states = zip(*sample_states(scene, points, seed), strict=True)
     vector, closed = max(_grow(_Fields(scene, with_time, u), t, q, reachable, depth, tolerance) for t, q, u in states)
     # relations that the coordinate rates contain by themselves are no rows
@@ -200,8 +200,9 @@ def _brackets(fields: "_Fields", x: np.ndarray, parts: np.ndarray) -> tuple[np.n
 def _differences(f, x: np.ndarray, direction: np.ndarray, parts: np.ndarray) -> np.ndarray:
     """Derivative of `f(x, parts)` along a direction, by central differences of eighth order."""
     length = np.linalg.norm(direction, axis=1, keepdims=True)
-    steps = STEP * np.array([1, 2, 3, 4, -1, -2, -3, -4])
-    weights = np.array([672, -168, 32, -3, -672, 168, -32, 3]) / (840 * STEP)
+    step = STEP[x.dtype.name]
+    steps = step * np.array([1, 2, 3, 4, -1, -2, -3, -4], x.dtype)
+    weights = np.array([672, -168, 32, -3, -672, 168, -32, 3], x.dtype) / (840 * step)
     unit = direction / np.where(length > 0, length, 1)
     points = x + steps[:, None, None] * unit
     values = f(points.reshape(-1, x.shape[1]), np.tile(parts, (len(steps), 1, 1)))

@@ -37,7 +37,8 @@ class Report(Printed):
     closed: bool  # further brackets bring nothing new
     bracket_depth: int
     holonomic_rows_together: int | None  # None where the growth vector is not closed
-    rheonomic: bool  # rows, poses or rates depend on time
+    rheonomic: bool  # anything depends on time by itself
+    depends_on_time: tuple[str, ...]  # what: rows, poses, inertias, coordinate rates, loads, potential
     affine: bool  # rows are linear or affine in the speeds
     cyclic_coordinates: tuple[str, ...]
     ignorable_coordinates: tuple[str, ...]
@@ -68,7 +69,7 @@ class Report(Printed):
             "holonomic row by row": _listed(self.integrable_rows),
             "nonholonomic row by row": _listed(self.nonholonomic_rows),
             "growth vector": self._growth(),
-            "depends on time": "yes (rheonomic)" if self.rheonomic else "no (scleronomic)",
+            "depends on time": f"yes (rheonomic): {', '.join(self.depends_on_time)}" if self.rheonomic else "no (scleronomic)",
             "cyclic coordinates": _listed(self.cyclic_coordinates),
             "ignorable coordinates": _listed(self.ignorable_coordinates),
             "privileged velocities": _listed(self.privileged_velocities),
@@ -139,6 +140,7 @@ def report(scene: Scene, *, depth: int = 4) -> Report:
         bracket_depth=depth,
         holonomic_rows_together=growth.holonomic_rows_together,
         rheonomic=structure.rheonomic,
+        depends_on_time=structure.timed,
         affine=structure.affine,
         cyclic_coordinates=cyclic_coordinates(scene),
         ignorable_coordinates=ignorable_coordinates(scene),

@@ -77,6 +77,11 @@ class Verification(Printed, eqx.Module):
     not_applicable: tuple[str, ...] = eqx.field(static=True)  # reductions that do not apply at this state
 
     @property
+    def certifies(self) -> bool:
+        """Whether passing means agreement to round-off of double precision; single precision shows gross errors only."""
+        return all(check.threshold <= THRESHOLDS["float64"][check.name] for check in self.checks)
+
+    @property
     def passed(self) -> bool:
         """Whether every check passed."""
         return all(check.passed for check in self.checks)
@@ -94,6 +99,7 @@ class Verification(Printed, eqx.Module):
             "energy_balance": self.largest("energy", "potentials"),
             "gradient_error": self.largest("jvp against vjp", "differences", "derivatives"),
             "passed": self.passed,
+            "certifies": self.certifies,
             "not_applicable": list(self.not_applicable),
             "checks": [check.as_dict() for check in self.checks],
         }
@@ -103,6 +109,8 @@ class Verification(Printed, eqx.Module):
         for check in self.checks:
             verdict = "ok" if check.passed else f"FAILED, look at {check.culprit}"
             lines.append(f"  {check.name:<16} {check.value:9.1e}  (at most {check.threshold:.0e})  {verdict}" + (f"; {check.note}" if check.note else ""))
+        if not self.certifies:
+            lines.append("  single precision: gross errors show, but passing certifies nothing; verify in double precision (JAX_ENABLE_X64=1)")
         if self.not_applicable:
             lines.append("  not applicable at this state: " + ", ".join(self.not_applicable))
         return "\n".join(lines)

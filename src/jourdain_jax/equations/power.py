@@ -4,6 +4,7 @@
                 + (A' lambda).u                 rows that do real work: prescribed, nonhomogeneous or nonlinear in u
                 + sum R.v_0 + T.omega_0         what drives poses given as functions of time; v_0, omega_0: velocities at u = 0
                 + dV/dt at fixed poses          potentials that depend on time
+                + sum mdot v.v/2 + omega.(dI/dt omega)/2   masses and inertias that change: matter that joins a body at the body's own velocity
 
 A term that is zero at every state by the scene's structure is left out, not computed.
 Source: Wang and Pao (2003), eqs. (71)-(73).
@@ -14,10 +15,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
+from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at
+from jourdain_jax.equations.probing import described_once
 from jourdain_jax.equations.reductions import Accelerations, Reduced
-from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.equations.virtual_power import newton_residual, potential_energy, resultants
+from jourdain_jax.scene.answers import loads_of
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
@@ -29,11 +32,34 @@ class Power(eqx.Module):
     rows: Float[Array, ""]  # of constraint rows that do real work
     driven: Float[Array, ""]  # of whatever moves poses that are given functions of time
     potential: Float[Array, ""]  # explicit rate of potentials that depend on time
+    inertia: Float[Array, ""]  # of masses and inertias that change
 
     @property
     def total(self) -> Float[Array, ""]:
         """`d(T + V)/dt`."""
-        return self.loads + self.rows + self.driven + self.potential
+        return self.loads + self.rows + self.driven + self.potential + self.inertia
+
+
+def needs_work(scene: Scene, structure: Structure) -> bool:
+    """Whether anything changes T + V, so that the work done must be integrated beside the motion: any term above that is not zero by structure."""
+    by_structure = structure.driven or structure.varying_inertia or _rows_work(structure) or "potential" in structure.timed
+    return by_structure or _some_load_has_no_potential(scene)
+
+
+def _rows_work(structure: Structure) -> bool:
+    return not (structure.affine and structure.homogeneous)
+
+
+@described_once
+def _some_load_has_no_potential(scene: Scene) -> bool:
+    flags: list[bool] = []
+
+    def look(scene):
+        q, u, _ = scene.named()
+        flags.extend(load.potential is None for load in loads_of(scene, motion_at(scene, 0.0, q, u)))
+
+    jax.eval_shape(look, scene)
+    return any(flags)
 
 
 def power_of_nonconservative(scene: Scene, t, q, u, inputs, accelerations: Accelerations | Reduced) -> Float[Array, ""]:
@@ -45,13 +71,13 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
     """The same by origin."""
     structure = structure_of(scene)
     zero = jnp.zeros_like(motion.t)
-    works = not (structure.affine and structure.homogeneous)
     return Power(
         loads=power_of_loads(scene, motion, conservative=False),
         # lambda . (A u), which is lambda . phi = 0 for rows homogeneous and linear in u
-        rows=accelerations.constraint_force @ motion.u.array if works else zero,
+        rows=accelerations.constraint_force @ motion.u.array if _rows_work(structure) else zero,
         driven=_power_of_drives(scene, motion, accelerations.udot) if structure.driven else zero,
-        potential=_explicit_rate_of_potential(scene, motion),
+        potential=_explicit_rate_of_potential(scene, motion) if structure.driven or "potential" in structure.timed else zero,
+        inertia=_power_of_changing_inertia(scene, motion) if structure.varying_inertia else zero,
     )
 
 
@@ -87,3 +113,11 @@ def _explicit_rate_of_potential(scene: Scene, motion: Motion) -> Float[Array, ""
         return potential_energy(scene, held)
 
     return jax.jvp(V, (motion.t, q), (jnp.ones_like(motion.t), nu))[1]
+
+
+def _power_of_changing_inertia(scene: Scene, motion: Motion) -> Float[Array, ""]:
+    """`sum mdot v.v/2 + omega.(dI/dt omega)/2`, with dI/dt in body axes."""
+    t, q, bodies = motion.t, motion.q.array, motion.bodies.values()
+    _, rate = jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), motion.qdot.array))
+    v, w = jnp.stack([body.velocity for body in bodies]), jnp.stack([body.angular_velocity_body for body in bodies])
+    return 0.5 * (rate.mass @ jnp.sum(v * v, axis=1) + jnp.einsum("bi,bij,bj->", w, rate.inertia, w))

@@ -13,12 +13,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
+from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
 from jourdain_jax.equations.reductions import Accelerations
 from jourdain_jax.equations.rows import flatten_rows, names_of_rows, velocity_residual, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.equations.virtual_power import newton_residual
+from jourdain_jax.equations.virtual_power import newton_residual, resultants
 from jourdain_jax.scene.answers import contacts_of
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, Motion
@@ -56,8 +56,8 @@ class ContactForce(eqx.Module):
 
     normal: Float[Array, ""]  # N, along the plane's normal; negative where the contact would have to pull
     tangential: Float[Array, "2"]  # N, along the plane's tangents
-    friction_needed: Float[Array, ""]  # |tangential| / normal; infinite where the contact would have to pull
-    pulls: Bool[Array, ""]  # whether the normal force is negative: the body would lift off
+    friction_needed: Float[Array, ""]  # |tangential| / normal; infinite where the contact would have to pull, zero where it bears nothing
+    pulls: Bool[Array, ""]  # whether the normal force is negative beyond round-off: the body would lift off
     determined: Bool[Array, ""]  # whether the rows at hand determine these numbers
 
 
@@ -115,6 +115,7 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
     rows = row_reactions(scene, t, q, u, accelerations, inputs)
     total = newton_residual(scene, t, q, u, accelerations.udot, inputs).linear
     hidden = total - jnp.sum(rows.force, axis=0)  # what the coordinates hold by construction
+    margin = _round_off_of_forces(scene, motion, total)
     by_coordinates = {name: contact for name, contact in contacts.items() if contact.height == "coordinates"}
     carried = {name: _carried(contact, name, rows.body_names) for name, contact in by_coordinates.items()}
     forces = {}
@@ -128,8 +129,16 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
             normal = contact.plane.normal @ jnp.sum(hidden[jnp.array(carried[name])], axis=0)
             shared = any(set(carried[name]) & set(other) for rival, other in carried.items() if rival != name)
             determined = determined & (not shared)
-        forces[name] = _contact_force(normal, tangential, determined)
+        forces[name] = _contact_force(normal, tangential, determined, margin)
     return forces
+
+
+def _round_off_of_forces(scene: Scene, motion: Motion, total) -> Float[Array, ""]:
+    """Forces below this are round-off of those at hand: of `m a - F`, of F and of `m |v| |omega|` on the bodies (N)."""
+    size = jnp.max(jnp.abs(total)) + jnp.max(jnp.abs(resultants(scene, motion).force))
+    for body in motion.bodies.values():
+        size = size + body.mass * jnp.max(jnp.abs(body.velocity)) * jnp.max(jnp.abs(body.angular_velocity))
+    return jax.lax.stop_gradient(rank_cutoff(size.dtype) * size)
 
 
 def _carried(contact, name: str, bodies: tuple[str, ...]) -> tuple[int, ...]:
@@ -140,10 +149,10 @@ def _carried(contact, name: str, bodies: tuple[str, ...]) -> tuple[int, ...]:
     return tuple(range(len(bodies))) if contact.carried is None else tuple(bodies.index(body) for body in contact.carried)
 
 
-def _contact_force(normal, tangential, determined) -> ContactForce:
+def _contact_force(normal, tangential, determined, margin) -> ContactForce:
     squared = tangential @ tangential
     sliding = squared > 0
     size = jnp.where(sliding, jnp.sqrt(jnp.where(sliding, squared, 1.0)), 0.0)
-    pushes = normal > 0
-    friction = jnp.where(pushes, size / jnp.where(pushes, normal, 1.0), jnp.inf)
-    return ContactForce(normal, tangential, friction, normal < 0, determined)
+    pushes, idle = normal > margin, (jnp.abs(normal) <= margin) & (size <= margin)
+    friction = jnp.where(pushes, size / jnp.where(pushes, normal, 1.0), jnp.where(idle, 0.0, jnp.inf))
+    return ContactForce(normal, tangential, friction, normal < -margin, determined)

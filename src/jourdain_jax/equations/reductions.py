@@ -8,8 +8,9 @@
 - `UdwadiaKalaba`: Gauss's principle of least constraint, `min |udot - M^-1 (Q - h)|_M` over `A udot = -drift`
 - `GibbsAppell`: Hessian of the Gibbs function over the privileged accelerations (in `gibbs_appell.py`)
 
-All agree to round-off where they apply; `applicable` says whether one does. Dependent rows are allowed everywhere: the rank is found at
-every state, the multipliers are those of minimum norm.
+All agree to round-off where they apply; `applicable` says whether one does. Where accelerations are not determined (no inertia along a direction
+that the rows leave free) they are NaN, but for `Multipliers`, whose own test is too coarse near a loss of rank to act on. Dependent rows are
+allowed everywhere: the rank is found at every state, the multipliers are those of minimum norm.
 """
 
 import abc
@@ -111,9 +112,9 @@ def cholesky(M: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, "
 
 
 def solve_definite(M: Float[Array, "n n"], f: Float[Array, "n"]) -> tuple[Float[Array, "n"], Bool[Array, ""]]:
-    """`M^-1 f` by Cholesky, and whether M is positive definite."""
+    """`M^-1 f` by Cholesky, and whether M is positive definite; NaN where it is not, so that no invented number passes for a solution."""
     factor, definite = cholesky(M)
-    return jax.scipy.linalg.cho_solve((factor, True), f), definite
+    return jnp.where(definite, jax.scipy.linalg.cho_solve((factor, True), f), jnp.nan), definite
 
 
 class Privileged(Reduction):
@@ -257,4 +258,4 @@ class UdwadiaKalaba(Reduction):
         d = jax.lax.stop_gradient(1 / jnp.maximum(jnp.sqrt(jnp.sum(weighted**2, axis=1)), jnp.finfo(L.dtype).tiny))
         weighted = d[:, None] * weighted
         x = free + _refined(pseudo_inverse(weighted), weighted, d * problem.b - weighted @ free)
-        return jax.scipy.linalg.solve_triangular(L.T, x, lower=False), jnp.ones((), L.dtype), definite
+        return jnp.where(definite, jax.scipy.linalg.solve_triangular(L.T, x, lower=False), jnp.nan), jnp.ones((), L.dtype), definite

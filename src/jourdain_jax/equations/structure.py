@@ -8,17 +8,20 @@ parameters are traced (the class's default values stand in), so that the choice 
 import itertools
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
 
-from jourdain_jax.equations.kinematics import coordinate_rates, velocities
+from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
+from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, pose_at, velocities
 from jourdain_jax.equations.plausibility import implausible, pose_numbers
 from jourdain_jax.equations.probing import on_numbers, probed_once
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
-from jourdain_jax.equations.rows import names_of_rows, velocity_residual
+from jourdain_jax.equations.rows import names_of_rows, position_residual, velocity_residual
 from jourdain_jax.equations.scaling import row_scale, speed_scale
-from jourdain_jax.equations.virtual_power import mass_matrix_at
+from jourdain_jax.equations.virtual_power import mass_matrix_at, potential_energy, resultants
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.numbers import is_traced
@@ -30,6 +33,7 @@ SYMMETRIC_PROBES = 200
 COORDINATE_DOMAIN = (-3.2, 3.2)
 SPEED_DOMAIN = (-1.0, 1.0)
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
+TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")
 _EXHAUSTIVE = 3000
 _SHORTLIST = 40
 
@@ -48,10 +52,21 @@ class Structure:
     typical_pivot: float  # its median
     affine: bool  # rows are linear or affine in the speeds
     homogeneous: bool  # phi vanishes at u = 0
-    rheonomic: bool  # rows, poses or coordinate rates depend on time
-    driven: bool  # bodies or coordinates move while all speeds are zero
+    timed: tuple[str, ...]  # what depends on time by itself, out of `TIMED`
+    driven: bool  # bodies or coordinates move, or bodies turn, while all speeds are zero
+    varying_inertia: bool  # masses or central inertias change along the motion
     chosen_by_user: bool
     faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, as sentences
+
+    @property
+    def rheonomic(self) -> bool:
+        """Whether anything depends on time by itself: rows, poses, inertias, coordinate rates, loads or potentials."""
+        return bool(self.timed)
+
+    @property
+    def timed_kinematics(self) -> bool:
+        """Whether rows, poses or coordinate rates do."""
+        return not {"rows", "poses", "coordinate rates"}.isdisjoint(self.timed)
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -145,36 +160,79 @@ def _symmetric_configurations(scene: Scene) -> np.ndarray:
     return np.array(configurations).reshape(-1, len(low))
 
 
+class _Probed(eqx.Module):
+    """What is looked at, at one state."""
+
+    A: Float[Array, "rows speeds"]  # scaled rows in scaled speeds
+    M: Float[Array, "speeds speeds"]  # in scaled speeds
+    c: Float[Array, "speeds"]  # scales of the speeds
+    curved: Bool[Array, ""]  # A depends on the speeds
+    inhomogeneous: Bool[Array, ""]  # phi does not vanish at u = 0
+    timed: dict[str, Bool[Array, ""]]
+    driven: Bool[Array, ""]
+    varying_inertia: Bool[Array, ""]
+    miss: Float[Array, ""]  # of the geometric rows
+    numbers: PyTree  # of bodies and planes, for their plausibility
+
+
 @on_numbers
 def _probe(scene, t, q, u, u_other):
     def one(t, q, u, u_other):
         q = project_positions(scene, t, q)
+        inputs = jnp.linspace(0.5, 1.0, len(scene.inputs), dtype=q.dtype)  # generic, so that no term passes for absent
         M = mass_matrix_at(scene, t, q)
-        A, A_other = (jax.jacfwd(lambda v: velocity_residual(scene, t, q, v))(v) for v in (u, u_other))
+        A, A_other = (jax.jacfwd(lambda v: velocity_residual(scene, t, q, v, inputs))(v) for v in (u, u_other))
         c = speed_scale(M)
-        scaled = row_scale(A * c)[:, None] * A * c
-        still = velocity_residual(scene, t, q, jnp.zeros_like(u))
-        curved = jnp.max(jnp.abs(A - A_other), initial=0.0) > 1e-9 * (1 + jnp.max(jnp.abs(A), initial=0.0))
-        timed = jnp.concatenate(
-            [
-                jax.jacfwd(lambda t: velocity_residual(scene, t, q, u))(t),
-                jax.jacfwd(lambda t: coordinate_rates(scene, t, q, u))(t),
-                jax.jacfwd(lambda t: jnp.stack([b.position for b in scene.bodies(t, scene.coordinate_names.view(q)).values()]).ravel())(t),
-            ]
+        eps, size = jnp.finfo(q.dtype).eps, 1 + jnp.max(jnp.abs(A), initial=0.0)
+        at_rest = jnp.zeros_like(u)
+        qdot, nu = coordinate_rates(scene, t, q, u), coordinate_rates(scene, t, q, at_rest)
+        return _Probed(
+            A=row_scale(A * c)[:, None] * A * c,
+            M=c[:, None] * M * c,
+            c=c,
+            curved=jnp.max(jnp.abs(A - A_other), initial=0.0) > jnp.sqrt(eps) * size,
+            # near round-off: work that turns out as zero does less harm than work left out
+            inhomogeneous=jnp.max(jnp.abs(velocity_residual(scene, t, q, at_rest, inputs)), initial=0.0) > 32 * eps * size,
+            timed=_timed(scene, t, q, u, inputs),
+            driven=_moves((velocities(scene, t, q, at_rest), nu)),
+            varying_inertia=_moves(jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), qdot))[1]),
+            miss=_miss(scene, t, q),
+            numbers=pose_numbers(scene, t, q),
         )
-        at_rest = velocities(scene, t, q, jnp.zeros_like(u))
-        moving = jnp.concatenate([at_rest.linear.ravel(), at_rest.angular.ravel(), coordinate_rates(scene, t, q, jnp.zeros_like(u))])
-        return scaled, jnp.max(jnp.abs(still), initial=0.0), curved, jnp.any(timed != 0), jnp.any(moving != 0), _miss(scene, t, q), pose_numbers(scene, t, q)
 
     return jax.vmap(one)(t, q, u, u_other)
+
+
+def _timed(scene: Scene, t, q, u, inputs) -> dict[str, Bool[Array, ""]]:
+    """What changes in time while coordinates, speeds and inputs are held; forces at held poses too."""
+    motion = motion_at(scene, t, q, u, inputs)
+
+    def pieces(t):
+        held = eqx.tree_at(lambda m: m.t, motion, t)
+        return {
+            "rows": (velocity_residual(scene, t, q, u, inputs), position_residual(scene, t, q)),
+            "poses": [(body.position, body.orientation) for body in pose_at(scene, t, q).bodies.values()],
+            "inertias": inertias(scene, t, q),
+            "coordinate rates": coordinate_rates(scene, t, q, u),
+            "loads": resultants(scene, held),
+            "potential": potential_energy(scene, held),
+        }
+
+    rates = jax.jvp(pieces, (t,), (jnp.ones_like(t),))[1]
+    return {name: _moves(rates[name]) for name in TIMED}
+
+
+def _moves(rates) -> Bool[Array, ""]:
+    """Whether any rate is a number other than zero."""
+    return jnp.any(jnp.stack([jnp.any(jnp.isfinite(x) & (x != 0)) for x in jax.tree.leaves(rates)]))
 
 
 def structure_of(scene: Scene) -> Structure:
     """Static facts about a scene: rank of its rows, privileged velocities and their conditioning, kinds of rows; eqs. (25)-(31).
 
     Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers stand in for traced parameters.
-    ValueError where no admissible state is found, or `privileged` names unknown or too few speeds; for known parameters also where
-    numbers of its bodies or planes cannot be.
+    ValueError where no admissible state is found, where a motion that the rows leave free has no inertia, or `privileged` names unknown or too few
+    speeds; for known parameters also where numbers of its bodies or planes cannot be.
     """
     structure = _probed_structure(as_scene(scene))
     if structure.faults and not is_traced(scene):  # numbers that stand in for traced parameters prove nothing
@@ -189,15 +247,17 @@ def _probed_structure(scene: Scene) -> Structure:
     t, q, u = _random_states(scene, RANDOM_PROBES, np.random.default_rng(0))
     symmetric = _symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
-    scaled, still, curved, timed, moving, miss, numbers = _probe(scene, t, q, u, -u[::-1])
+    found = _probe(scene, t, q, u, -u[::-1])
     generic = np.arange(len(t)) < RANDOM_PROBES
-    on_rows = _assembled(scene, miss, generic)
-    usable = np.all(np.isfinite(scaled), axis=(1, 2)) & on_rows
-    q, scaled, still, curved, timed, moving = (x[usable] for x in (q, scaled, still, curved, timed, moving))
-    ranks = [_rank(A) for A in scaled]
-    rank = max((r for r, is_generic in zip(ranks, generic[usable], strict=True) if is_generic), default=0)
+    on_rows = _assembled(scene, found.miss, generic)
+    numbers = jax.tree.map(lambda x: x[on_rows], found.numbers)
+    usable = np.all(np.isfinite(found.A), axis=(1, 2)) & on_rows
+    q, generic, found = jax.tree.map(lambda x: x[usable], (q, generic, found))
+    ranks = [_rank(A) for A in found.A]
+    rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
+    _check_inertia(scene, jax.tree.map(lambda x: x[generic & (np.array(ranks) == rank)], found), rank)
     independent, by_user = _user_choice(scene, count - rank), True
-    candidates = scaled[[r == rank for r in ranks]]  # at isolated losses of rank no partition of generic size exists
+    candidates = found.A[[r == rank for r in ranks]]  # at isolated losses of rank no partition of generic size exists
     if independent is None:
         independent, by_user = _choose(candidates, count, rank), False
     pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
@@ -206,22 +266,46 @@ def _probed_structure(scene: Scene) -> Structure:
         row_names=names,
         rank=rank,
         ranks=tuple(ranks),
-        redundant_rows=_redundant_rows(scaled, ranks, names),
+        redundant_rows=_redundant_rows(found.A, ranks, names),
         rank_losses=tuple(_describe(scene, c) for c, r in zip(q, ranks, strict=True) if r < rank),
         independent=independent,
         worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
         typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
-        affine=not bool(curved.any()),
-        homogeneous=bool((still < 1e-12).all()),
-        rheonomic=bool(timed.any()),
-        driven=bool(moving.any()),
+        affine=not bool(found.curved.any()),
+        homogeneous=not bool(found.inhomogeneous.any()),
+        timed=tuple(name for name in TIMED if found.timed[name].any()),
+        driven=bool(found.driven.any()),
+        varying_inertia=bool(found.varying_inertia.any()),
         chosen_by_user=by_user,
-        faults=implausible(scene, jax.tree.map(lambda x: x[on_rows], numbers)),
+        faults=implausible(scene, numbers),
     )
 
 
 def _rank(A: np.ndarray) -> int:
-    return int(np.linalg.matrix_rank(A, tol=1e-9)) if A.size else 0
+    """Rank of scaled rows, by the cut-off that the accelerations use."""
+    if not A.size:
+        return 0
+    sigma = np.linalg.svd(A, compute_uv=False)
+    return int(np.sum(sigma > rank_cutoff(A.dtype) * sigma[0]))
+
+
+def _check_inertia(scene: Scene, found: _Probed, rank: int) -> None:
+    """Raise a ValueError that names the speeds along which the rows leave a motion free that no body's inertia resists, at every generic state."""
+    moved = []
+    for A, M, c in zip(found.A, found.M, found.c, strict=True):
+        free = np.linalg.svd(A)[2][rank:].T if A.size else np.eye(len(M))
+        sizes, directions = np.linalg.eigh(np.nan_to_num(free.T @ M @ free, nan=1.0))
+        if not sizes.size or sizes[0] > 16 * len(M) * np.finfo(M.dtype).eps:
+            return
+        moved.append(np.abs(c * (free @ directions[:, 0])))
+    if not moved:
+        return
+    share = np.median([x / x.max() for x in moved], axis=0)
+    names = ", ".join(f"`{name}`" for name, part in zip(scene.speed_names.entries, share, strict=True) if part > 1e-3)
+    raise ValueError(
+        f"nothing in `{type(scene).__name__}` has inertia along {names}: no mass moves with it and no row holds it, so that its acceleration is not "
+        "determined; give a body that moves with it a mass (or inertia), hold it by a row, or leave the coordinate out"
+    )
 
 
 def _redundant_rows(scaled: np.ndarray, ranks: list[int], names: tuple[str, ...]) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from jourdain_jax.lowering.elimination import eliminate, solve_symmetric
 from jourdain_jax.lowering.trace import TracedScene, VelocityQuantities
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.polynomial import NormalForms, TooLarge
+from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ class AppellOnGraph:
     def _forms(self, keep_sines: bool, most_terms: int):
         if most_terms == 0:
             return None
-        squares = {}
+        squares: dict[int, Polynomial] = {}
         for first in self.quaternions:
             w, *xyz = (int(n) for n in self.traced.q[first : first + 4])
             squares[w] = {(): 1.0} | {(n, n): -1.0 for n in xyz}

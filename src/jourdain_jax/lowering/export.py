@@ -25,7 +25,8 @@ def summary(lowered) -> str:
 
 def identifiers(lowered) -> dict[int, str]:
     """A readable name for every input of the program."""
-    traced, names = lowered.traced, {}
+    traced = lowered.traced
+    names: dict[int, str] = {}
     for nodes, name in zip(traced.parameters, lowered.parameters, strict=True):
         flat = np.ravel(nodes).tolist()
         names |= {n: _identifier(name if len(flat) == 1 else f"{name}_{i}") for i, n in enumerate(flat)}

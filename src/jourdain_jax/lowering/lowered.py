@@ -85,16 +85,19 @@ class Lowered:
         return export.latex(self)
 
     def fixed_values(self, scene: Scene) -> tuple[Float[Array, ""], ...]:
-        """What depends on parameters alone."""
-        known = {}
+        """The values of what depends on parameters alone, for the parameters of `scene`; computed once per motion."""
+        known: dict = {}
         for nodes, leaf in zip(self.traced.parameters, jax.tree.leaves(scene), strict=True):
             flat = jnp.reshape(leaf, -1)
             known |= {int(n): flat[i] for i, n in enumerate(np.ravel(nodes))}
         return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known))
 
     def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Float[Array, ""] | None]:
-        """`qdot` and `ydot`, tuples of scalars, and the power where asked; NaN where a guard is not positive."""
-        wanted = [*self.qdot, *self.ydot, *([self.power] if with_power else [])]
+        """`qdot` and `ydot`, tuples of scalars, and the power (W) where `with_power` asks for it; NaN where a guard is not positive.
+
+        `fixed`: from `fixed_values`; `q`, `y`: coordinates and privileged speeds, one scalar (or array of lanes) each; `inputs`: a vector.
+        """
+        wanted = [*self.qdot, *self.ydot, *([self.power] if with_power and self.power is not None else [])]
         out = run(self.graph, [*wanted, *self.guards], self._known(fixed, t, q, y, inputs))
         rates, guards = out[: len(wanted)], out[len(wanted) :]
         for guard in guards:
@@ -105,7 +108,10 @@ class Lowered:
         return tuple(rates[:at]), tuple(rates[at : at + len(self.ydot)]), rates[-1] if with_power else None
 
     def speeds_and_pivot(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
-        """All speeds, and the smallest pivot relative to its usual size: it changes sign where the elimination does not serve."""
+        """All speeds, and the smallest pivot relative to its usual size: it changes sign where the elimination does not serve.
+
+        `fixed`, `q`, `y`, `inputs`: as in `rates`.
+        """
         out = run(self.graph, [*self.z, *self.pivots], self._known(fixed, t, q, y, inputs))
         order = np.argsort([*self.independent, *self.dependent])
         every = [*y, *out[: len(self.z)]]
@@ -126,7 +132,7 @@ class Lowered:
 
 def fixed_nodes(graph: Graph, outputs) -> tuple[int, ...]:
     """Nodes that depend on parameters alone and are used by varying ones."""
-    found = set()
+    found: set[int] = set()
     for node in graph.reachable(outputs):
         if graph.varies[node]:
             found.update(a for a in graph.args[node] if not graph.varies[a] and graph.op[a] != "const")

@@ -6,6 +6,7 @@ m, I                                 inertias
 """
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -21,7 +22,7 @@ from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.scene.scene import Scene
 
-Entries = Array | np.ndarray
+Entries: TypeAlias = Array | np.ndarray
 
 
 class VelocityQuantities(eqx.Module):

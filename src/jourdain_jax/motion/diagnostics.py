@@ -49,12 +49,13 @@ class ContactExtremes(eqx.Module):
     lowest_normal: Float[Array, ""]  # N; negative: it would have had to pull
     highest_normal: Float[Array, ""]  # N
     friction_needed: Float[Array, ""]  # largest |tangential| / normal
+    pulls: Array  # whether it would have had to pull at any time, beyond round-off
     determined: Array  # whether the rows determine these forces all along
 
     @property
     def honest(self) -> bool:
-        """Whether the contact only ever pushed."""
-        return bool(self.lowest_normal > 0)
+        """Whether the contact only ever pushed, or bore nothing."""
+        return not bool(self.pulls)
 
 
 def energies_of(record: Record, work) -> Energies:
@@ -85,7 +86,7 @@ def diagnose(trajectory: Record) -> Diagnostics:
 
 def _extremes(force: ContactForce) -> ContactExtremes:
     friction = jnp.where(jnp.isnan(force.normal), 0.0, force.friction_needed)
-    return ContactExtremes(jnp.nanmin(force.normal), jnp.nanmax(force.normal), jnp.max(friction), jnp.all(force.determined))
+    return ContactExtremes(jnp.nanmin(force.normal), jnp.nanmax(force.normal), jnp.max(friction), jnp.any(force.pulls), jnp.all(force.determined))
 
 
 def _span(values) -> Float[Array, ""]:

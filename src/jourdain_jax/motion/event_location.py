@@ -2,9 +2,10 @@
 
 diffrax stops at the end of the step in which an event value c changed sign. From there the motion is integrated back to c = 0:
 
-    tau* by Newton on c(y(t_f + tau)) = 0 (held constant in differentiation),   then   t_e = t* - c / cdot,   y_e = y* - f c / cdot
+    tau* by Newton on c(y(t_f + tau)) = 0 (held constant in differentiation),   then   t_e = t* - c / cdot,   y_e = y* - f c / cdot   twice
 
-The last correction is zero in value, and carries the derivative of the event time and of the state at the event (the saltation term).
+The last corrections are zero in value, and carry the derivatives of the event time and of the state at the event (the saltation term). Newton's
+method doubles the order at which it is right: one correction gives first derivatives, two give the second and third ones too.
 """
 
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 _NEWTON_STEPS = 12
+_CORRECTIONS = 2  # differentiable ones
 
 
 class Located(eqx.Module):
@@ -42,11 +44,15 @@ def locate(rates: Callable, value: Callable, t_f, y_f: PyTree, args: PyTree, hap
         shift = jnp.where(usable, -c / jnp.where(usable, c_dot, 1.0), 0.0)
         return shift, Located(t_f + tau + shift, jax.tree.map(lambda a, b: a + shift * b, y, f))
 
-    # tau* is a number to differentiation; one last, vanishing, correction is not, and carries the derivative of the event time
-    y_held, args_held = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (y_f, args))
-    newton = lambda tau, _: (jnp.clip(tau + corrected(tau, y_held, args_held)[0], earliest, latest), None)  # noqa: E731
-    tau, _ = jax.lax.scan(newton, jnp.zeros_like(t_f), length=_NEWTON_STEPS)
-    return corrected(jax.lax.stop_gradient(tau), y_f, args)[1]
+    def step(tau, i):
+        # tau* is a number to differentiation; the last, vanishing, corrections are not, and carry the derivatives of the event time
+        tau = jnp.where(i <= _NEWTON_STEPS, jax.lax.stop_gradient(tau), tau)
+        shift, located = corrected(tau, y_f, args)
+        return jnp.where(i < _NEWTON_STEPS, jnp.clip(tau + shift, earliest, latest), tau + shift), located
+
+    # one loop for both: one copy of the vector field to compile
+    _, located = jax.lax.scan(step, jnp.zeros_like(t_f), jnp.arange(_NEWTON_STEPS + _CORRECTIONS))
+    return jax.tree.map(lambda x: x[-1], located)
 
 
 def _moved(rates: Callable, t_f, y_f, args, tau):

@@ -4,6 +4,8 @@ Both give states at the saved times, which of those were reached, and where and 
 out, and all is put into a `Trajectory`.
 """
 
+from typing import Literal
+
 import diffrax
 import equinox as eqx
 import jax
@@ -21,6 +23,7 @@ from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.answers import events_of
+from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
 LEAN_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
@@ -64,6 +67,7 @@ class Solved(eqx.Module):
 def integrate(original: Scene, start: State, inputs, t0, t1, ts, form: StateForm, options: Options) -> Trajectory:
     """The motion from `start`."""
     adjoint = options.adjoint
+    right, start = _without_faults(original, start)
     scene, start, inputs = _mark_inputs(adjoint, (original, start, inputs))
     args = (form, scene, inputs, form.fixed(scene))
     y0 = form.pack(start.q, start.u)
@@ -95,7 +99,12 @@ def integrate(original: Scene, start: State, inputs, t0, t1, ts, form: StateForm
         t_end=end.t,
         q_end=q[-1],
         u_end=u[-1],
-        result=_result(solved.code, end.y, start, pivot),
+        result=results.with_causes(
+            _result(solved.code, end.y, start, pivot),
+            parameters=right,
+            start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
+            moved=solved.accepted > 0,
+        ),
         event=solved.event,
         accepted=solved.accepted,
         rejected=solved.rejected,
@@ -104,11 +113,17 @@ def integrate(original: Scene, start: State, inputs, t0, t1, ts, form: StateForm
         smallest_pivot=pivot,
         inputs=inputs,
         state_form=form.name,
-        reduction=form.reduction.name,
+        reduction=form.reduction_name,
         solver=type(options.solver).__name__,
         projected=moving,
         event_names=options.event_names,
     )
+
+
+def _without_faults(scene: Scene, start: State):
+    """Whether all parameters are right, and the start: NaN where they are not, so that such a lane ends at once."""
+    right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values()]))
+    return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 
 def _by_lean_loop(form: StateForm, y0, t0, t1, ts, args, options: Options) -> Solved:
@@ -125,7 +140,7 @@ def _by_lean_loop(form: StateForm, y0, t0, t1, ts, args, options: Options) -> So
         shortest=_shortest(t0, t1),
         max_steps=options.max_steps,
     )
-    kind = "lax" if isinstance(options.adjoint, diffrax.ForwardMode) else "checkpointed"
+    kind: Literal["lax", "checkpointed"] = "lax" if isinstance(options.adjoint, diffrax.ForwardMode) else "checkpointed"
     ys, reached, end = lean_loop.integrate(problem, method, y0, t0, jnp.concatenate([ts, t1[None]]), options.dt0, kind)
     return Solved(ts, jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected)
 

@@ -10,6 +10,7 @@ ended stands still. `diffrax` serves all other solvers, controllers and ways of 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import diffrax
 import equinox as eqx
@@ -79,7 +80,9 @@ class Problem(eqx.Module):
     max_steps: int = eqx.field(static=True)
 
 
-def integrate(problem: Problem, method: Method, y0: PyTree, t0, goals: Float[Array, "times"], dt0, kind: str) -> tuple[PyTree, Bool[Array, "times"], Progress]:
+def integrate(
+    problem: Problem, method: Method, y0: PyTree, t0, goals: Float[Array, "times"], dt0, kind: Literal["lax", "checkpointed"]
+) -> tuple[PyTree, Bool[Array, "times"], Progress]:
     """States at the goals (monotonic; what was not reached repeats the last state), which were reached, and where the lane ended.
 
     `kind`: "lax" (no reverse mode), "checkpointed" (reverse mode), as in `equinox.internal.while_loop`.

@@ -1,16 +1,30 @@
 """How a motion ended: a code per lane, never an exception inside."""
 
-SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION = range(7)
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START = range(9)
 
 MESSAGES = {
     SUCCESS: "reached the end of its span",
     EVENT: "stopped at an event",
     MAX_STEPS: "ran out of steps; raise `max_steps`, loosen the tolerances, or look for a singularity near the last time",
     STEP_TOO_SMALL: "the step size shrank to nothing: a singularity, a discontinuity, or rows that cannot be met near the last time",
-    NOT_FINITE: "the accelerations are not finite; check the start, the parameters and the configuration with `accelerations` and `verify`",
+    NOT_FINITE: "the accelerations are not finite or not determined (no inertia along a free direction); look at the last state with "
+    "`accelerations` and `verify`",
     INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them",
     SINGULAR_PARTITION: "the privileged speeds came near a configuration where they do not determine the others; use state='full'",
+    BAD_PARAMETER: "a parameter is not finite or has the wrong sign",
+    BAD_START: "the start is not finite; check where its values were computed",
 }
+
+
+def with_causes(code, *, parameters: Bool[Array, ""], start: Bool[Array, ""], moved: Bool[Array, ""]) -> Int[Array, ""]:
+    """The code with the cause where one is known: whether the `parameters` are right, the `start` is finite, and any step was accepted (`moved`)."""
+    # no step, however short: the accelerations themselves are at fault
+    code = jnp.where((code == STEP_TOO_SMALL) & ~moved, NOT_FINITE, code)
+    code = jnp.where(start, code, BAD_START)
+    return jnp.where(parameters, code, BAD_PARAMETER).astype(jnp.int32)
 
 
 class SimulationError(RuntimeError):

@@ -80,13 +80,18 @@ class Rollout(Printed, eqx.Module):
                 events = np.asarray(self.lanes.event)[lanes]
                 named = " " + ", ".join(f"`{self.lanes.event_names[i]}` {int(np.sum(events == i))}" for i in np.unique(events))
             elif code != results.SUCCESS:
-                named = ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
+                named = self._wrong_parameters(lanes[:10]) if code == results.BAD_PARAMETER else ""
+                named += ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
             lines.append(f"  {lanes.size} {message}{named}")
         if self.continued:
             lines.append(f"  {len(self.continued)} left the domain of their privileged speeds and were run with the full state")
         steps = np.asarray(self.lanes.accepted)
         lines.append(f"  steps accepted: {steps.min()} to {steps.max()}, median {int(np.median(steps))}")
         return "\n".join(lines)
+
+    def _wrong_parameters(self, lanes: np.ndarray) -> str:
+        names = dict.fromkeys(name for i in lanes for name in self.lane(int(i)).wrong_parameters)
+        return f" ({', '.join(f'`{name}`' for name in names)})"
 
 
 def rollout(
@@ -171,8 +176,7 @@ def _together(scene, fixed, options, varied, parameters) -> Trajectory:
 
 
 def _first_time(options: dict):
-    t0, ts = options.get("t0"), options.get("ts")
-    return t0 if t0 is not None else 0.0 if ts is None else ts[0]
+    return 0.0 if options.get("t0") is None else options["t0"]
 
 
 def _lanes(scene: Scene, starts, parameters: dict):

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jourdain_jax.calculus.reals import Number
 from jourdain_jax.equations.accelerations import Baumgarte, as_reduction
 from jourdain_jax.equations.event_names import names_of_events
-from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.power import needs_work
 from jourdain_jax.equations.probing import described_once
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.structure import Structure, structure_of
@@ -28,7 +28,6 @@ from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.state_form import StateForm, default_reduction
 from jourdain_jax.motion.trajectory import Trajectory
-from jourdain_jax.scene.answers import loads_of
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
@@ -69,7 +68,7 @@ def simulate(
 
     **Arguments**
     - `start`: a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
-    - `t0`, `t1`: ends of the span (s; defaults: the time of a `State`, otherwise the first of `ts` or 0; the last of `ts`, or the scene's
+    - `t0`, `t1`: ends of the span (s; defaults: the time of a `State`, otherwise 0; the last of `ts`, or the scene's
       `example_span` after t0); `ts`: times to save at (default: 201 even ones). `saveat`: a `diffrax.SaveAt` instead.
     - `rtol`, `atol`, `solver`, `stepsize_controller`, `dt0` (default: 1e-4 of the span), `adjoint`, `max_steps`: as in
       `diffrax.diffeqsolve`. Default solver: Tsit5 for
@@ -92,6 +91,7 @@ def simulate(
     scene = as_scene(scene)
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, solver=solver, adjoint=adjoint, stepsize_controller=stepsize_controller, saveat=saveat)
     _check_adjoint(adjoint)
+    made_here = not isinstance(start, State)
     start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts)
     structure = structure_of(scene)
     form = state_form(scene, structure, state, reduction, stabilisation, projection, work, lowering, batch)
@@ -109,7 +109,7 @@ def simulate(
         event_names=names_of_events(scene) if events else (),
     )
     inputs = as_inputs(scene, inputs)
-    start = _on_constraints(scene, t0, start, inputs(t0)) if projection else start
+    start = _on_constraints(scene, t0, start, inputs(t0), made_here) if projection else start
     motion = integrate(scene, start, inputs, t0, t1, ts, form, options)
     if state == "auto" and not isinstance(motion.result, jax.core.Tracer) and int(motion.result) in lost_codes(form):
         # the motion left the domain in which the partition was found to serve
@@ -132,9 +132,11 @@ def _check_adjoint(adjoint) -> None:
         )
 
 
-def _on_constraints(scene: Scene, t0, start: State, inputs) -> State:
-    """The start on the constraints, with how far it has moved in all, when it was made included."""
+def _on_constraints(scene: Scene, t0, start: State, inputs, made_here: bool) -> State:
+    """The start on the constraints, with how far it has moved from what was given."""
     state = consistent(scene, t0, start.q, start.u, inputs)
+    if not made_here:
+        return state
     moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
     return eqx.tree_at(lambda s: (s.moved_q, s.moved_u), state, tuple(moved))
 
@@ -157,8 +159,8 @@ def state_form(
         raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use state='full'")
     minimal = state == "minimal" or (state == "auto" and structure.affine and structure.well_conditioned)
     independent = structure.independent if minimal else None
-    with_work = work and _needs_work(scene, structure)
-    plain = minimal and lowering and reduction is None and stabilisation is None and not (with_work and structure.driven)
+    with_work = work and needs_work(scene, structure)
+    plain = minimal and lowering and reduction is None and stabilisation is None and not (with_work and (structure.driven or structure.varying_inertia))
     program = lowered(scene) if plain else None
     reduction = as_reduction(scene, default_reduction(independent) if reduction is None else reduction)
     return StateForm(
@@ -177,25 +179,6 @@ def lost_codes(form: StateForm) -> tuple[int, ...]:
     """Result codes after which another form of the state may do better."""
     guarded = form.lowered is not None and (form.lowered.guards or form.lowered.pivots)
     return (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL) if guarded else (results.SINGULAR_PARTITION,)
-
-
-def _needs_work(scene: Scene, structure: Structure) -> bool:
-    """Whether anything does work that no potential accounts for."""
-    if structure.rheonomic or not structure.homogeneous or not structure.affine:
-        return True
-
-    return _has_loads_without_potential(scene)
-
-
-@described_once
-def _has_loads_without_potential(scene: Scene) -> bool:
-    def loads(scene):
-        q, u, _ = scene.named()
-        return tuple(load.potential is None for load in loads_of(scene, motion_at(scene, 0.0, q, u)))
-
-    flags: list[bool] = []
-    jax.eval_shape(lambda s: flags.extend(loads(s)), scene)
-    return any(flags)
 
 
 @described_once

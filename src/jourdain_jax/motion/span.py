@@ -17,7 +17,7 @@ def span_and_start(scene: Scene, start, t0, t1, ts):
     real = jnp.result_type(float)
     ts = None if ts is None else saved_times(ts)
     if t0 is None:
-        t0 = start.t if isinstance(start, State) else 0.0 if ts is None else ts[0]
+        t0 = start.t if isinstance(start, State) else 0.0
     if t1 is None:
         t1 = t0 + scene.example_span if ts is None else ts[-1]
     start = as_state(scene, start, t0=t0)

@@ -47,6 +47,11 @@ class StateForm(eqx.Module):
         return "full" if self.independent is None else "minimal"
 
     @property
+    def reduction_name(self) -> str:
+        """Name of the reduction, as it stands in a trajectory."""
+        return getattr(self.reduction, "name", "") + ("" if self.lowered is None else ", lowered")
+
+    @property
     def _by_appell(self) -> bool:
         """Whether the reduction uses the same privileged speeds as the state."""
         return isinstance(self.reduction, Privileged) and self.reduction.independent == self.independent and self.stabilisation is None
@@ -79,7 +84,7 @@ class StateForm(eqx.Module):
         """How well the privileged speeds determine the others, with a sign that changes where they do not (1 for the full state)."""
         if self.lowered is not None:
             return self.lowered.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[1]
-        return jnp.ones((), y.v.dtype) if self.independent is None else speeds_and_pivot(scene, self.independent, t, y.q, y.v, inputs)[1]
+        return jnp.ones(()) if self.independent is None else speeds_and_pivot(scene, self.independent, t, y.q, y.v, inputs)[1]
 
     def rates(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
         """Time derivative of the integrated state."""

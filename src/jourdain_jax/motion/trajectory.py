@@ -12,6 +12,7 @@ from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.printing import preformatted, shapes_of
 from jourdain_jax.scene.scene import Scene
 
@@ -112,8 +113,16 @@ class Trajectory(eqx.Module):
     @property
     def message(self) -> str:
         """How the motion ended, in words."""
-        text = results.MESSAGES[int(self.result)]
-        return f"{text} `{self.event_names[int(self.event)]}`" if int(self.result) == results.EVENT else text
+        code = int(self.result)
+        text = results.MESSAGES[code]
+        if code == results.BAD_PARAMETER:
+            return f"{text} ({', '.join(f'`{name}`' for name in self.wrong_parameters)}); check where it was computed"
+        return f"{text} `{self.event_names[int(self.event)]}`" if code == results.EVENT else text
+
+    @property
+    def wrong_parameters(self) -> tuple[str, ...]:
+        """Names of the scene's parameters that are not finite or have the wrong sign."""
+        return tuple(name for name, wrong in parameter_faults(self.scene).items() if bool(wrong))
 
     def raise_if_failed(self) -> "Trajectory":
         """The trajectory itself; a SimulationError with reason and time where it did not reach its end or an event."""

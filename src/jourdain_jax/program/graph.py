@@ -5,7 +5,7 @@ Arguments of sums and products are ordered, so that a b and b a are one node.
 """
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
 
@@ -13,7 +13,7 @@ OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what a
 class Graph:
     """Nodes are integers; `op[n]`, `args[n]` say what node n is, `value[n]` is the number of a constant or the name of an input."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.op: list[str] = []
         self.args: list[tuple[int, ...]] = []
         self.value: list = []
@@ -258,7 +258,7 @@ class Graph:
 
 
 _ARITHMETIC = {"add", "sub", "mul", "div", "neg"}
-_FOLDED = {
+_FOLDED: dict[str, Callable] = {
     "sin": math.sin,
     "cos": math.cos,
     "tan": math.tan,

@@ -5,6 +5,7 @@ Integers and booleans that do not depend on inputs (indices, shapes, masks) stay
 """
 
 from collections.abc import Callable
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +30,7 @@ class Nodes:
         self.ids = np.asarray(ids, dtype=np.int64)
 
 
-Value = Nodes | np.ndarray
+Value: TypeAlias = Nodes | np.ndarray
 
 
 def interpret(graph: Graph, closed, arguments: list[Value]) -> list[Value]:
@@ -80,7 +81,7 @@ def _apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
     if name in _REDUCTIONS:
         return [_reduce(graph, inputs[0], equation.params["axes"], _REDUCTIONS[name])]
     if name == "dot_general":
-        return [_dot_general(graph, *inputs, equation.params)]
+        return [_dot_general(graph, inputs[0], inputs[1], equation.params)]
     if name in _ELEMENTWISE:
         arrays = np.broadcast_arrays(*(as_nodes(graph, x) for x in inputs)) if len(inputs) > 1 else [as_nodes(graph, inputs[0])]
         flat = [np.ravel(a).tolist() for a in arrays]

@@ -80,8 +80,8 @@ class NormalForms:
             return {(): graph.value[node]}
         if op == "input":
             return {(node,): 1.0}
-        parts = [self._expanded[a] for a in args]
-        if any(p is None for p in parts):
+        parts = [p for p in (self._expanded[a] for a in args) if p is not None]
+        if len(parts) < len(args):
             raise TooLarge
         if op == "add":
             return _sum(parts[0], parts[1], 1.0)
@@ -125,9 +125,8 @@ class NormalForms:
             return (outside, {tuple(inside): c}) if outside else None
         if len(p) == 2:
             (small, c), (large, d) = sorted(p.items(), key=lambda item: len(item[0]))
-            extra = list(large)
-            inside = c == -d and all(a in extra and not extra.remove(a) for a in small) and len(extra) == 2 and extra[0] == extra[1]
-            if inside and self.graph.op[extra[0]] == self._square_into:
+            extra = _rest(large, small)
+            if c == -d and len(extra) == 2 and extra[0] == extra[1] and self.graph.op[extra[0]] == self._square_into:
                 return [self.graph.call(self._square_of, self.graph.args[extra[0]][0])], {small: c}
         return None
 
@@ -220,7 +219,7 @@ class NormalForms:
         graph = self.graph
         if not p:
             return graph.zero
-        common = list(min(q, key=len))
+        common = list(sorted(q, key=len)[0])
         for monomial in q:
             common = [x for k, x in enumerate(common) if common[: k + 1].count(x) <= monomial.count(x)]
         scale = next(iter(q.values()))
@@ -272,7 +271,7 @@ class NormalForms:
         counts: Counter[int] = Counter()
         for factors, _ in terms:
             counts.update(set(factors))
-        factor, count = max(counts.items(), key=lambda item: (item[1], graph.varies[item[0]], item[0]), default=(None, 0))
+        factor, count = max(counts.items(), key=lambda item: (item[1], graph.varies[item[0]], item[0]), default=(graph.one, 0))
         if count < 2:
             total = graph.zero
             for factors, positive in sorted(terms):
@@ -292,6 +291,15 @@ class NormalForms:
 
     def _signed(self, node: int, positive: bool) -> int:
         return node if positive else self.graph.neg(node)
+
+
+def _rest(large: Monomial, small: Monomial) -> Monomial:
+    """What is left of `large` without the factors of `small`; nothing where it does not hold them."""
+    for factor in small:
+        if factor not in large:
+            return ()
+        large = _without(large, factor)
+    return large
 
 
 def _without(factors: Monomial, factor: int) -> Monomial:

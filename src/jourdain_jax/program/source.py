@@ -82,10 +82,10 @@ def sympy_expressions(graph: Graph, outputs: Sequence[int], names: Mapping[int, 
     """The outputs as SymPy expressions; needs SymPy."""
     import sympy
 
-    functions = {"abs": sympy.Abs, "max": sympy.Max, "min": sympy.Min, "select": lambda c, a, b: sympy.Piecewise((b, c), (a, True))}
+    functions: dict = {"abs": sympy.Abs, "max": sympy.Max, "min": sympy.Min, "select": lambda c, a, b: sympy.Piecewise((b, c), (a, True))}
     functions |= {"add": lambda a, b: a + b, "sub": lambda a, b: a - b, "mul": lambda a, b: a * b, "div": lambda a, b: a / b, "neg": lambda a: -a}
     functions |= {"lt": sympy.Lt, "le": sympy.Le, "gt": sympy.Gt, "ge": sympy.Ge}
-    values = {n: sympy.Symbol(name) for n, name in names.items()}
+    values: dict = {n: sympy.Symbol(name) for n, name in names.items()}
     for node in graph.needed(outputs, values):
         op = graph.op[node]
         if op == "const":

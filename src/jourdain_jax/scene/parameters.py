@@ -4,8 +4,9 @@ from collections.abc import Iterator
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.scene.numbers import described
@@ -35,6 +36,17 @@ def parameters_of(scene) -> Iterator[tuple[str, Array, dict]]:
     for name, field in scene.__dataclass_fields__.items():
         if field.metadata.get("parameter"):
             yield name, getattr(scene, name), dict(field.metadata)
+
+
+def parameter_faults(scene) -> dict[str, Bool[Array, ""]]:
+    """Parameter name -> whether it is not finite or has the wrong sign; also under jit and vmap, where nothing can be raised."""
+    faults = {}
+    for name, value, metadata in parameters_of(scene):
+        right = jnp.isfinite(value)
+        if metadata["positive"] or metadata["non_negative"]:
+            right = right & (value > 0 if metadata["positive"] else value >= 0)
+        faults[name] = ~jnp.all(right)
+    return faults
 
 
 def check_parameters(scene) -> None:
