@@ -94,7 +94,7 @@ def _probes(scene: Scene, graph) -> Probes:
     """Admissible states, random and symmetric ones, and parameters off their values, so that what is zero or equal by chance does not count."""
     t, q, u = (np.concatenate(parts) for parts in zip(sample_states(scene, PROBES), symmetric_states(scene), strict=True))
     generator = np.random.default_rng(1)
-    varied = jax.tree.map(lambda x: np.where(x == 0, 0.05, np.asarray(x)) * (1 + 0.1 * generator.uniform(size=(len(t), *np.shape(x)))), scene)
+    varied = jax.tree.map(lambda x: np.where(np.asarray(x) == 0, 0.05, np.asarray(x)) * (1 + 0.1 * generator.uniform(size=(len(t), *np.shape(x)))), scene)
     inputs = generator.normal(size=(len(t), len(scene.inputs)))
     values = named_values(scene, t, q, u, inputs)
     values |= {f"p{k}_{i}": column for k, leaf in enumerate(jax.tree.leaves(varied)) for i, column in enumerate(np.reshape(leaf, (len(t), -1)).T)}

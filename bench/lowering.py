@@ -1,0 +1,231 @@
+"""Every figure about lowered equations, in one run on one core: operations, time per evaluation, whole motions, gradients, cold starts, growth.
+
+    taskset -c 0 python bench/lowering.py [--quick] [--json FILE] [--only NAME ...]
+
+Writes a list of {"figure", "model", "value", "required", "aim", "met"} (met: the required figure). float64, warm unless said; ratios come from
+one run, times are the fastest of some repeats. Baselines, frozen: `bench/baselines` (by hand, dense autodiff, flat arrays, heyoka).
+"""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from baselines import dense, disc_run, heyoka_disc
+from baselines.hand_derived import HAND_DERIVED, operations
+from baselines.timing import fastest, seconds_per_evaluation
+
+import jourdain_jax as jj
+
+Figure = dict
+BY_HAND_LANES, DENSE_LANES = 4096, 1024
+COLD = """
+import time; begin = time.perf_counter()
+import jax, sys, jourdain_jax as jj
+scene = jj.models.MODELS[sys.argv[1]]()
+motion = jj.simulate(scene, lowering=sys.argv[2] == "lowered")
+jax.block_until_ready(motion.q)
+print(time.perf_counter() - begin)
+"""
+
+
+def figure(name: str, model: str, value: float | None, required: float, aim: float, at_least: bool = False) -> Figure:
+    """One entry of the result; `value` None where it could not be measured."""
+    met = value is not None and (value >= required if at_least else value <= required)
+    return {"figure": name, "model": model, "value": value, "required": required, "aim": aim, "met": bool(met)}
+
+
+def states(name: str, lanes: int):
+    """A scene, its lowered program, and admissible states with privileged speeds, one array of lanes per scalar."""
+    scene = jj.models.MODELS[name]()
+    program = jj.lower(scene)
+    _, q, u = jj.sample_states(scene, lanes)
+    return scene, program, (tuple(map(jnp.asarray, q.T)), tuple(jnp.asarray(u[:, k]) for k in program.independent))
+
+
+def operation_ratios(quick: bool) -> Iterator[Figure]:
+    """Operations of the lowered right-hand side, relative to the one by hand."""
+    for name in HAND_DERIVED:
+        try:
+            value = jj.lower(jj.models.MODELS[name]()).operations / operations(name)
+        except jj.NotLowered:
+            value = None
+        yield figure("operations, lowered / by hand", name, value, 1.5, 1.1)
+    yield figure("operations", "whipple-bicycle", jj.lower(jj.models.MODELS["whipple-bicycle"]()).operations, 2500, 1200)
+
+
+def evaluation_time(name: str, lanes: int) -> float:
+    """Seconds per evaluation and lane of the lowered program."""
+    scene, program, state = states(name, lanes)
+    fixed, inputs = program.fixed_values(scene), jnp.zeros(len(scene.inputs))
+    one = lambda q, y: program.rates(fixed, 0.0, q, y, inputs)[:2]  # noqa: E731
+    return seconds_per_evaluation(lambda state: jax.vmap(one)(*state), state, len(state[0][0]), repeats=20)
+
+
+def evaluation_ratios(quick: bool) -> Iterator[Figure]:
+    """Time per evaluation in a batch, relative to hand-written equations in the same layout, and to dense ones."""
+    for name in ("tilting-disc",) if quick else [n for n in HAND_DERIVED if n != "skate"]:
+        known, (scene, _, state) = HAND_DERIVED[name], states(name, BY_HAND_LANES)
+        parameters = {key: getattr(scene, key) for key in known.parameters}
+        by_hand = seconds_per_evaluation(lambda y, known=known, p=parameters: known.rates(p, 0.0, *y), state, len(state[0][0]), repeats=20)
+        yield figure("time per evaluation in a batch of 4096, lowered / by hand", name, evaluation_time(name, BY_HAND_LANES) / by_hand, 1.5, 1.1)
+    scene = jj.models.MODELS["whipple-bicycle"]()
+    _, q, u = jj.sample_states(scene, DENSE_LANES)
+    rates = jax.vmap(lambda y: dense.bicycle_rates(dense.BICYCLE_PARAMETERS, 0.0, y))
+    by_dense = seconds_per_evaluation(rates, jnp.concatenate([q, u], axis=1), len(q), evaluations=10, repeats=10)
+    ratio = by_dense / evaluation_time("whipple-bicycle", DENSE_LANES)
+    yield figure("time per evaluation in a batch of 1024, dense / lowered", "whipple-bicycle", ratio, 15, 40, at_least=True)
+
+
+def our_disc(solver: diffrax.AbstractSolver, batch: bool = True) -> Callable:
+    """A compiled function `(tolerance, starts)` of initial minimal states to final ones, by `simulate`."""
+    scene = jj.models.MODELS["tilting-disc"]()
+    start = jj.start(scene)
+
+    def one(tolerance, y):
+        q, u = y[:5], jnp.concatenate([jnp.zeros(2), y[5:]])  # the contact point's speeds follow from the rows
+        given = jj.State(start.t, q, u, 0.0 * start.moved_q, 0.0 * start.moved_u, 0.0 * start.residual, start.names)
+        motion = jj.simulate(
+            scene, given, ts=jnp.array([disc_run.END]), rtol=tolerance, atol=tolerance, solver=solver, events=False, projection=False, batch=batch
+        )
+        return jnp.concatenate([motion.q_end, motion.u_end[2:]])
+
+    compiled = jax.jit(jax.vmap(one, in_axes=(None, 0)))
+    return lambda tolerance, starts: np.asarray(compiled(tolerance, starts))
+
+
+def disc_seconds(run: Callable, starts, expected, first: float, repeats: int) -> float:
+    """Seconds per trajectory at the loosest tolerance with a final error of 1e-8."""
+    tolerance, _ = disc_run.loosest(lambda tolerance: run(tolerance, starts), expected, first)
+    return fastest(lambda: run(tolerance, starts), repeats) / len(starts)
+
+
+def disc_motions(quick: bool) -> Iterator[Figure]:
+    """10 s of the tilting disc, 1024 lanes, at a final error of 1e-8."""
+    starts = disc_run.starts(128 if quick else disc_run.LANES)
+    expected = disc_run.reference(starts)
+    ours = disc_seconds(our_disc(diffrax.Dopri8()), starts, expected, 1e-9, 5)
+    print(f"  ours: {1e3 * ours:.3f} ms per trajectory in a batch of {len(starts)}", flush=True)
+    if not quick:
+        plain = disc_seconds(disc_run.final_states("dense", "Dopri8"), starts, expected, 1e-9, 2)
+        yield figure("10 s of the disc at error 1e-8, dense / ours", "tilting-disc", plain / ours, 15, 50, at_least=True)
+    flat = disc_seconds(disc_run.final_states("flat", "Dopri8"), starts, expected, 1e-9, 3)
+    yield figure("10 s of the disc at error 1e-8, by hand in a flat array / ours", "tilting-disc", flat / ours, 3, 10, at_least=True)
+    one = disc_run.START[None]
+    alone = disc_seconds(our_disc(diffrax.Dopri8()), one, disc_run.reference(one), 1e-9, 20)
+    print(f"  ours: {1e3 * alone:.3f} ms alone", flush=True)
+    names = [("throughput in the batch, ours / heyoka's", ours, 8, 0.15, 1), ("throughput alone, ours / heyoka's", alone, 1, 0.05, 0.5)]
+    for name, seconds, width, required, aim in names:
+        if heyoka_disc.heyoka is None:
+            print(heyoka_disc.MISSING)
+            yield figure(name, "tilting-disc", None, required, aim, at_least=True)
+            continue
+        tolerance, _ = disc_run.loosest(lambda tolerance, width=width: heyoka_disc.final_states(tolerance, width)(starts), expected)
+        theirs = heyoka_disc.seconds_per_trajectory(tolerance, width, lanes=len(starts))
+        yield figure(name, "tilting-disc", theirs / seconds, required, aim, at_least=True)
+
+
+def gradients(quick: bool) -> Iterator[Figure]:
+    """Gradient of a final-state loss by 8 numbers, best mode, relative to one forward solve at the same tolerance."""
+    scene, ends = jj.models.MODELS["tilting-disc"](), jnp.array([disc_run.END])
+    names = ("x", "y", "yaw", "lean", "spin", "x_rate", "y_rate", "yaw_rate", "lean_rate", "spin_rate")
+    values = jnp.array([1.0, 0.5, 9.81, *disc_run.START[[3, 5, 6, 7]], 0.0])
+
+    def loss(x, adjoint):
+        own = scene.replace(mass=x[0], radius=x[1], gravity=x[2])
+        y = dict(zip(("lean", "yaw_rate", "lean_rate", "spin_rate", "yaw"), x[3:], strict=True))
+        q, u, _ = own.named(**y)
+        start = jj.start(scene)
+        given = jj.State(start.t, q, u, *(0.0 * m for m in (start.moved_q, start.moved_u, start.residual)), start.names)
+        motion = jj.simulate(
+            own, given, ts=ends, rtol=1e-9, atol=1e-9, solver=diffrax.Dopri8(), events=False, projection=False, adjoint=adjoint, batch=True
+        )
+        return jnp.sum(motion.q_end**2)
+
+    assert names == (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    forward, reverse = diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()
+    modes = {"forward": jax.jacfwd(lambda x: loss(x, forward)), "reverse": jax.grad(lambda x: loss(x, reverse))}
+    for where, lanes, required, aim in (("alone", 1, 5, 3), ("batched", 128 if quick else 1024, 8, 4)):
+        x = values * (1 + 0.01 * np.random.default_rng(0).normal(size=(lanes, 8)))
+        timed = {}
+        for name, f in {"solve": lambda x: loss(x, forward), **modes}.items():
+            compiled = jax.jit(jax.vmap(f))
+            timed[name] = fastest(lambda compiled=compiled, x=x: jax.block_until_ready(compiled(x)), 3)
+        print(f"  {where}: " + ", ".join(f"{name} {1e3 * t / lanes:.3f} ms" for name, t in timed.items()), flush=True)
+        best = min(timed["forward"], timed["reverse"])
+        yield figure(f"gradient by 8 numbers / one solve, {where}", "tilting-disc", best / timed["solve"], required, aim)
+
+
+def cold_seconds(name: str, way: str) -> float:
+    """From a fresh process to the first trajectory: import, build, probe, compile, run."""
+    done = subprocess.run([sys.executable, "-c", COLD, name, way], capture_output=True, text=True, check=True)
+    return float(done.stdout.split()[-1])
+
+
+def cold_starts(quick: bool) -> Iterator[Figure]:
+    """Fresh processes."""
+    yield figure("fresh process to the first trajectory, s", "whipple-bicycle", cold_seconds("whipple-bicycle", "lowered"), 10, 4)
+    for name in () if quick else jj.models.MODELS:
+        ratio = cold_seconds(name, "lowered") / cold_seconds(name, "dense")
+        yield figure("fresh process, lowered / dense", name, ratio, 1.5, 1)
+
+
+def growth(quick: bool) -> Iterator[Figure]:
+    """Time per evaluation over n of a chain of trailers, and its compile time."""
+    from jourdain_jax.models.trailer_chain import TrailerChain
+
+    laps = {}
+    for n in (2, 4) if quick else (8, 64):
+        scene = TrailerChain(trailers=n)
+        begin = time.perf_counter()
+        try:
+            program = jj.lower(scene)
+        except jj.NotLowered as reason:
+            print(f"  trailer-chain, n = {n}: {reason}")
+            break
+        q, u, _ = scene.named()
+        state = tuple(jnp.asarray(x) for x in q), tuple(jnp.asarray(u[k]) for k in program.independent)
+        rates = lambda s, p=program, scene=scene: p.rates(p.fixed_values(scene), 0.0, *s, jnp.zeros(0))[:2]  # noqa: E731
+        laps[n] = seconds_per_evaluation(rates, state, 1, repeats=10) / n
+        compile_time = time.perf_counter() - begin
+        print(f"  trailer-chain, n = {n}: {program.operations} operations, {1e9 * laps[n]:.0f} ns per evaluation and trailer, built in {compile_time:.1f} s")
+    complete = len(laps) == 2
+    few, many = (2, 4) if quick else (8, 64)
+    yield figure(f"time per evaluation / n, n = {many} against n = {few}", "trailer-chain", laps[many] / laps[few] if complete else None, 3, 1.5)
+    yield figure(f"compile time at n = {many}, s", "trailer-chain", compile_time if complete else None, 60, 15)
+
+
+FIGURES = {f.__name__: f for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, cold_starts, growth)}
+
+
+def main() -> None:
+    """Measure, print, and write JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a reduced set, in about a minute")
+    parser.add_argument("--json", help="file to write")
+    parser.add_argument("--only", nargs="*", choices=FIGURES, default=list(FIGURES))
+    options = parser.parse_args()
+    print(f"jax {jax.__version__}, Python {platform.python_version()}, {platform.processor() or platform.machine()}, one core", flush=True)
+    found = []
+    for name in options.only:
+        for entry in FIGURES[name](options.quick):
+            found.append(entry)
+            value = "not measured" if entry["value"] is None else f"{entry['value']:.3g}"
+            print(f"{'met ' if entry['met'] else 'MISS'} {value:>12} (required {entry['required']}, aim {entry['aim']})  {entry['figure']}: {entry['model']}", flush=True)
+    if options.json:
+        with open(options.json, "w") as file:
+            json.dump(found, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()
