@@ -147,9 +147,7 @@ def gradients(quick: bool) -> Iterator[Figure]:
         q, u, _ = own.named(**y)
         start = jj.start(scene)
         given = jj.State(start.t, q, u, *(0.0 * m for m in (start.moved_q, start.moved_u, start.residual)), start.names)
-        motion = jj.simulate(
-            own, given, ts=ends, rtol=1e-9, atol=1e-9, solver=diffrax.Dopri8(), events=False, projection=False, adjoint=adjoint, batch=True
-        )
+        motion = jj.simulate(own, given, ts=ends, rtol=1e-9, atol=1e-9, solver=diffrax.Dopri8(), events=False, projection=False, adjoint=adjoint, batch=True)
         return jnp.sum(motion.q_end**2)
 
     assert names == (*scene.coordinate_names.entries, *scene.speed_names.entries)
@@ -221,7 +219,8 @@ def main() -> None:
         for entry in FIGURES[name](options.quick):
             found.append(entry)
             value = "not measured" if entry["value"] is None else f"{entry['value']:.3g}"
-            print(f"{'met ' if entry['met'] else 'MISS'} {value:>12} (required {entry['required']}, aim {entry['aim']})  {entry['figure']}: {entry['model']}", flush=True)
+            said = f"{value:>12} (required {entry['required']}, aim {entry['aim']})  {entry['figure']}: {entry['model']}"
+            print("met " if entry["met"] else "MISS", said, flush=True)
     if options.json:
         with open(options.json, "w") as file:
             json.dump(found, file, indent=1)

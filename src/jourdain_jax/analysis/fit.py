@@ -22,6 +22,7 @@ from jourdain_jax.analysis.least_squares import LeastSquaresSolution, least_squa
 from jourdain_jax.analysis.likelihood import as_runs, residuals
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.unknowns import Unknowns, check_starts, unknowns_of
+from jourdain_jax.equations.probing import standing_in
 from jourdain_jax.motion.forward_mode import simulate_forward
 from jourdain_jax.scene.scene import Scene
 
@@ -61,7 +62,8 @@ def fit(
     constraints.
     """
     problem = _problem(scene, data, free, repeats=False)
-    return _fit(problem, problem.measured(), simulation, cutoff, tolerance, max_iterations)
+    with standing_in(scene):
+        return _fit(problem, problem.measured(), simulation, cutoff, tolerance, max_iterations)
 
 
 def fit_batch(
@@ -84,7 +86,8 @@ def fit_batch(
     counts = {values.shape[0] for run in problem.measured() for values in run.values()}
     if len(counts) != 1 or 0 in counts:
         raise ValueError(f"the channels hold {sorted(counts)} repeats; give every channel of every run the same leading axis, of one or more")
-    return _fit_batch(problem, problem.measured(), simulation, cutoff, tolerance, max_iterations)
+    with standing_in(scene):
+        return _fit_batch(problem, problem.measured(), simulation, cutoff, tolerance, max_iterations)
 
 
 class _Problem(eqx.Module):

@@ -4,7 +4,9 @@ What holds of a scene at every state (the rank of its rows, which speeds are ind
 anything is compiled, and it is found by evaluating the scene at a few states.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache, wraps
 
 import equinox as eqx
@@ -58,13 +60,30 @@ class _Hashable:
         return self.key == other.key
 
 
+_STAND_IN: ContextVar[Scene | None] = ContextVar("stand_in", default=None)
+
+
+@contextmanager
+def standing_in(scene: Scene) -> Iterator[None]:
+    """Inside, numbers near those of `scene` stand in for the parameters of scenes of its class that are traced (as far as it has numbers)."""
+    token = _STAND_IN.set(scene)
+    try:
+        yield
+    finally:
+        _STAND_IN.reset(token)
+
+
 def concretised(scene: Scene) -> Scene:
-    """The scene with numbers in place of traced parameters: generic ones near the class's defaults, else near one.
+    """The scene with numbers in place of traced parameters: generic ones near those that stand in, the class's defaults, or one.
 
     Generic, because a default of zero (a tilt, a rate) must not pass for a term that is absent.
     """
     if not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(scene)):
         return scene
+    known = _STAND_IN.get()
+    if known is not None and jax.tree.structure(known) == jax.tree.structure(scene):
+        near = lambda x, y: _generic(np.asarray(y, x.dtype)) if _is_traced(x) and not _is_traced(y) and np.shape(x) == np.shape(y) else x  # noqa: E731
+        scene = jax.tree.map(near, scene, known)
     for name, value, _ in parameters_of(scene):
         if isinstance(value, jax.core.Tracer):
             default = scene.__dataclass_fields__[name].default
@@ -72,6 +91,10 @@ def concretised(scene: Scene) -> Scene:
             number = _generic(np.broadcast_to(np.asarray(default, value.dtype), value.shape)) if usable else _near_one(value)
             scene = eqx.tree_at(lambda s, name=name: getattr(s, name), scene, number)
     return jax.tree.map(lambda x: _near_one(x) if isinstance(x, jax.core.Tracer) else x, scene)
+
+
+def _is_traced(x) -> bool:
+    return isinstance(x, jax.core.Tracer)
 
 
 def _generic(x: np.ndarray) -> np.ndarray:

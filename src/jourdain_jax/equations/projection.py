@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.equations.reductions import cholesky
-from jourdain_jax.equations.rows import position_residual, velocity_residual
+from jourdain_jax.equations.rows import names_of_position_rows, position_residual, velocity_residual
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene
@@ -28,6 +28,8 @@ def project_positions(scene: Scene, t, q: Float[Array, "coordinates"], *, free: 
     """Coordinates on the geometric rows, near q; only coordinates that are `free` move."""
     if jax.eval_shape(lambda s, q: closure_residual(s, 0.0, q), scene, q).shape[0] == 0:
         return q
+    if free is None and not names_of_position_rows(scene):
+        return _normalised(scene, q)
     free = jnp.ones(q.shape, bool) if free is None else free
 
     def step(q, _):
@@ -37,6 +39,14 @@ def project_positions(scene: Scene, t, q: Float[Array, "coordinates"], *, free: 
         return q - pseudo_inverse(d[:, None] * G) @ (d * residual), None
 
     return jax.lax.scan(step, q, length=iterations)[0]
+
+
+def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "coordinates"]:
+    """Where there are unit norms only, what the iteration converges to: `q / |q|` of every quaternion."""
+    for first, _ in scene.coordinates.quaternions:
+        wxyz = q[first : first + 4]
+        q = q.at[first : first + 4].set(wxyz / jnp.sqrt(wxyz @ wxyz))
+    return q
 
 
 def project_speeds(scene: Scene, t, q, u: Float[Array, "speeds"], inputs=None, *, free: Bool[Array, "speeds"] | None = None, iterations: int = 8):

@@ -118,7 +118,8 @@ def _assembled(scene: Scene, miss: np.ndarray, generic: np.ndarray) -> np.ndarra
     if not good[generic].any():
         raise ValueError(
             f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by {np.min(miss[generic]):.1e} or "
-            "more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other"
+            "more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, the "
+            "class's default values stood in for them)"
         )
     return good
 
@@ -250,12 +251,13 @@ def _probed_structure(scene: Scene) -> Structure:
     found = _probe(scene, t, q, u, -u[::-1])
     generic = np.arange(len(t)) < RANDOM_PROBES
     on_rows = _assembled(scene, found.miss, generic)
-    numbers = jax.tree.map(lambda x: x[on_rows], found.numbers)
+    faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
     usable = np.all(np.isfinite(found.A), axis=(1, 2)) & on_rows
     q, generic, found = jax.tree.map(lambda x: x[usable], (q, generic, found))
     ranks = [_rank(A) for A in found.A]
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
-    _check_inertia(scene, jax.tree.map(lambda x: x[generic & (np.array(ranks) == rank)], found), rank)
+    if not faults:  # a negative mass is named as such
+        _check_inertia(scene, jax.tree.map(lambda x: x[generic & (np.array(ranks) == rank)], found), rank)
     independent, by_user = _user_choice(scene, count - rank), True
     candidates = found.A[[r == rank for r in ranks]]  # at isolated losses of rank no partition of generic size exists
     if independent is None:
@@ -277,7 +279,7 @@ def _probed_structure(scene: Scene) -> Structure:
         driven=bool(found.driven.any()),
         varying_inertia=bool(found.varying_inertia.any()),
         chosen_by_user=by_user,
-        faults=implausible(scene, numbers),
+        faults=faults,
     )
 
 

@@ -84,6 +84,17 @@ class AppellOnGraph:
             power = power if np.allclose(*self.probes([power, true_power]), rtol=1e-9, atol=1e-9) else true_power
         return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots])), sorted(guards), power)
 
+    def _not_needed(self, held: dict[int, int]) -> dict[int, int]:
+        """The held coordinates on whose value no dependent speed and no rate depends, at any probe."""
+        nodes = [*(int(self.traced.at.phi[s]) for s in self.rows), *self.traced.at.qdot.tolist()]
+        here = self.probes(nodes)
+
+        def unchanged(n, value):
+            there = self.probes(self.graph.substituted(nodes, {n: value}))
+            return np.allclose(there, here, rtol=1e-9, atol=1e-9, equal_nan=True)
+
+        return {n: value for n, value in held.items() if unchanged(n, value)}
+
     def _power(self, k: "_Kinematics", ydot: list[int]) -> int:
         """Power of loads without a potential and of potentials in time, and `(A' lambda).u` where rows are not homogeneous.
 
@@ -121,7 +132,7 @@ class AppellOnGraph:
         """Dependent speeds and rates at the true coordinates: those that do not depend on held ones are taken over, the others follow."""
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
         simple = (lambda nodes: list(nodes)) if forms is None else (lambda nodes: [forms.simplified(n) for n in nodes])
-        phi = [int(at.phi[s]) for s in self.rows]
+        phi = g.substituted([int(at.phi[s]) for s in self.rows], self._not_needed(kinematics.held))
         A = [list(row) for row in zip(*(derivatives(g, phi, {n: g.one}) for n in u), strict=True)]
         phi_0 = g.substituted(phi, dict.fromkeys(u, g.zero))
         y = {k: u[k] for k in self.independent}

@@ -191,7 +191,8 @@ def _strategies(held: tuple[int, ...], small: bool, explicit_to_implicit: float)
         for keep_sines, by_determinants, free_z in itertools.product((False, True), repeat=3):
             yield Strategy(False, keep_sines, MOST_TERMS, MOST_TERMS, by_determinants, free_z, held)
     else:
-        yield Strategy(False, False, MOST_TERMS, 0, False, False, held)
+        for keep_sines in (False, True):
+            yield Strategy(False, keep_sines, MOST_TERMS, 0, False, False, held)
     if explicit_to_implicit <= 1.35 or small:
         for terms in (MOST_TERMS, 0):
             yield Strategy(True, False, MOST_TERMS, terms, terms > 0, False, held)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
+from jourdain_jax.equations.probing import standing_in
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.motion import results
 from jourdain_jax.motion.simulate import lost_codes, simulate, state_form
@@ -21,7 +22,7 @@ from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.parameters import parameter_faults, parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -122,10 +123,12 @@ def rollout(
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, fixed, varied, parameters))):
         return Rollout(_together(scene, fixed, options, varied, parameters))  # being differentiated or batched: one piece, no host loop
     pieces = []
+    sound = _sound_lane(scene, parameters)
     bar = tqdm(total=count, unit="lane", disable=not (count > chunk if progress is None else progress))
     for first in range(0, count, chunk):
         index = np.minimum(np.arange(first, first + chunk), count - 1)  # the last chunk is filled up with copies of its last lane
-        piece = _together(scene, fixed, options, *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+        with standing_in(sound):
+            piece = _together(scene, fixed, options, *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
         kept = min(chunk, count - first)
         pieces.append(jax.tree.map(lambda x, kept=kept: np.asarray(x)[:kept], piece))
         bar.update(kept)
@@ -134,9 +137,20 @@ def rollout(
     lost = _lost(scene, lanes, options)
     for first in range(0, len(lost), chunk):
         index = lost[np.minimum(np.arange(first, first + min(chunk, _round_up(len(lost)))), len(lost) - 1)]
-        again = _together(scene, fixed, options | {"state": "full", "lowering": False}, *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+        with standing_in(sound):
+            lanes_again = jax.tree.map(lambda x, index=index: x[index], (varied, parameters))
+            again = _together(scene, fixed, options | {"state": "full", "lowering": False}, *lanes_again)
         lanes = _replaced(lanes, again, index)
     return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(lost.tolist()))
+
+
+def _sound_lane(scene: Scene, parameters: dict) -> Scene:
+    """The scene of the first lane whose parameters are right: what holds of its class is probed near its numbers."""
+    for lane in range(min(16, *(len(value) for value in parameters.values())) if parameters else 0):
+        own = scene.replace(**{name: value[lane] for name, value in parameters.items()})
+        if not any(bool(fault) for fault in parameter_faults(own).values()):
+            return own
+    return scene
 
 
 def _lost(scene: Scene, lanes: Trajectory, options: dict) -> np.ndarray:

@@ -142,8 +142,8 @@ def _dot_general(equation, a, b):
     free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*over_b, *batch_b)]
     batch, contracted = [a.shape[i] for i in batch_a], int(np.prod([a.shape[i] for i in over_a]))
-    left = np.transpose(a, (*batch_a, *free_a, *over_a)).reshape(*batch, -1, contracted)
-    right = np.transpose(b, (*batch_b, *over_b, *free_b)).reshape(*batch, contracted, -1)
+    left = np.transpose(a, (*batch_a, *free_a, *over_a)).reshape(*batch, int(np.prod([a.shape[i] for i in free_a])), contracted)
+    right = np.transpose(b, (*batch_b, *over_b, *free_b)).reshape(*batch, contracted, int(np.prod([b.shape[i] for i in free_b])))
     return (left @ right).reshape(equation.outvars[0].aval.shape)
 
 
