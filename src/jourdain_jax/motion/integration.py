@@ -127,7 +127,7 @@ def _without_faults(scene: Scene, start: State):
 
 
 def _by_lean_loop(form: StateForm, y0, t0, t1, ts, args, options: Options) -> Solved:
-    method = lean_loop.method_of(options.solver, unrolled=form.as_scalars)
+    method = lean_loop.method_of(options.solver)
     names = options.event_names
     problem = lean_loop.Problem(
         rates=_rates,

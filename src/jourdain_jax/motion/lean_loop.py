@@ -28,14 +28,15 @@ SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 
 @dataclass(frozen=True)
 class Method:
-    """A tableau, and how its stages are written: one after another in the program, or as a loop (one copy of the vector field)."""
+    """A tableau. Its stages run as a loop: one copy of the vector field to compile, and in a batch faster than stages written out, which XLA
+    computes anew wherever they are used.
+    """
 
     A: np.ndarray
     b: np.ndarray
     b_error: np.ndarray
     c: np.ndarray
     order: int
-    unrolled: bool
 
     @property
     def last_is_next_first(self) -> bool:
@@ -43,14 +44,14 @@ class Method:
         return bool(np.array_equal(self.A[-1], self.b) and self.c[-1] == 1.0)
 
 
-def method_of(solver: diffrax.AbstractERK, unrolled: bool) -> Method:
+def method_of(solver: diffrax.AbstractERK) -> Method:
     """The tableau of a diffrax solver."""
     tableau = solver.tableau
     stages = len(tableau.b_sol)
     A = np.zeros((stages, stages))
     for i, row in enumerate(tableau.a_lower):
         A[i + 1, : i + 1] = row
-    return Method(A, np.asarray(tableau.b_sol), np.asarray(tableau.b_error), np.concatenate([[0.0], tableau.c]), solver.order(None), unrolled)
+    return Method(A, np.asarray(tableau.b_sol), np.asarray(tableau.b_error), np.concatenate([[0.0], tableau.c]), solver.order(None))
 
 
 class Progress(eqx.Module):
@@ -58,7 +59,6 @@ class Progress(eqx.Module):
 
     t: Float[Array, ""]
     y: PyTree
-    k: PyTree  # f(t, y)
     h: Float[Array, ""]  # the next step, positive
     code: Int[Array, ""]  # RUNNING, or the result
     accepted: Int[Array, ""]
@@ -91,8 +91,7 @@ def integrate(
     none = jnp.full((), -1, jnp.int32)
     zero = jnp.zeros((), jnp.int32)
     code = jnp.full((), RUNNING, jnp.int32)
-    first = problem.rates(t0, y0, problem.args) if method.unrolled else y0
-    start = Progress(t0, y0, first, jnp.abs(dt0), code, zero, zero, none)
+    start = Progress(t0, y0, jnp.abs(dt0), code, zero, zero, none)
     if problem.events is not None:
         start = _stopped_by_event(problem, start, jnp.array(True))
 
@@ -118,10 +117,9 @@ def _step(problem: Problem, method: Method, p: Progress, goal, last_goal, direct
     shortened = size < p.h
     h = direction * size
     t1 = jnp.where(lands, goal, p.t + h)
-    y1, error, last = _stages(problem, method, p, h)
+    y1, error = _stages(problem, method, p, h)
     if problem.project is not None:
         y1 = problem.project(t1, y1, problem.args)
-        last = problem.rates(t1, y1, problem.args) if method.unrolled else last
     scale = jax.tree.map(lambda a, b: problem.atol + problem.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), p.y, y1)
     size_of_error = jax.lax.stop_gradient(problem.norm(jax.tree.map(lambda e, s: e / s, error, scale)))
     accept = size_of_error <= 1
@@ -132,23 +130,14 @@ def _step(problem: Problem, method: Method, p: Progress, goal, last_goal, direct
     accepted, rejected = p.accepted + accept.astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
     code = jnp.where(next_h < problem.shortest, results.STEP_TOO_SMALL, RUNNING)
     code = jnp.where((code == RUNNING) & (accepted + rejected >= problem.max_steps) & ~(accept & (t1 == last_goal)), results.MAX_STEPS, code).astype(jnp.int32)
-    y, k = (jax.tree.map(lambda a, b: jnp.where(accept, _as(a, b), b), new, old) for new, old in ((y1, p.y), (last, p.k)))
-    moved = Progress(jnp.where(accept, t1, p.t), y, k, jax.lax.stop_gradient(next_h), code, accepted, rejected, p.event)
+    y = jax.tree.map(lambda new, old: jnp.where(accept, _as(new, old), old), y1, p.y)
+    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, accepted, rejected, p.event)
     return moved if problem.events is None else _stopped_by_event(problem, moved, accept)
 
 
-def _stages(problem: Problem, method: Method, p: Progress, h) -> tuple[PyTree, PyTree, PyTree]:
-    """y_1, the error estimate and, where stages are unrolled, f(t_1, y_1)."""
+def _stages(problem: Problem, method: Method, p: Progress, h) -> tuple[PyTree, PyTree]:
+    """y_1 and the error estimate."""
     leaves, treedef = jax.tree.flatten(p.y)
-    if method.unrolled:
-        slopes = [jax.tree.leaves(p.k)]
-        for i in range(1, len(method.c)):
-            at = _moved(leaves, h, method.A[i], slopes)
-            slopes.append(jax.tree.leaves(problem.rates(p.t + method.c[i] * h, treedef.unflatten(at), problem.args)))
-        y1 = _moved(leaves, h, method.b, slopes)
-        error = _moved([0.0 * y for y in leaves], h, method.b_error, slopes)
-        last = treedef.unflatten(slopes[-1]) if method.last_is_next_first else problem.rates(p.t + h, treedef.unflatten(y1), problem.args)
-        return treedef.unflatten(y1), treedef.unflatten(error), last
 
     def stage(slopes, row):
         A, c, i = row
@@ -162,12 +151,7 @@ def _stages(problem: Problem, method: Method, p: Progress, h) -> tuple[PyTree, P
     slopes, _ = jax.lax.scan(stage, slopes, rows)
     y1 = [y + _as(h, y) * jnp.tensordot(_as(method.b, y), k, 1) for y, k in zip(leaves, slopes, strict=True)]
     error = [_as(h, k) * jnp.tensordot(_as(method.b_error, k), k, 1) for k in slopes]
-    return treedef.unflatten(y1), treedef.unflatten(error), p.k
-
-
-def _moved(leaves, h, weights, slopes) -> list:
-    """`y + h sum w_i k_i`"""
-    return [y + _as(h, y) * sum(float(w) * k[n] for w, k in zip(weights, slopes, strict=False) if w != 0) for n, y in enumerate(leaves)]
+    return treedef.unflatten(y1), treedef.unflatten(error)
 
 
 def _as(x, like) -> Array:

@@ -26,7 +26,7 @@ from jourdain_jax.scene.parameters import parameter_faults, parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
-CHUNK = 1024
+CHUNK = 512  # lanes whose stages fit the cache of a core
 MEMORY = 2**30  # bytes of saved states per chunk, at most
 
 
@@ -108,7 +108,7 @@ def rollout(
 
     - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a `State` with a leading axis of lanes.
     - `parameters`: parameter name -> array with a leading axis of lanes, where lanes differ in parameters.
-    - `chunk`: lanes that run together (default: 1024, less where saved states would pass 1 GiB); `progress`: a bar (default: with several chunks).
+    - `chunk`: lanes that run together (default: 512, less where saved states would pass 1 GiB); `progress`: a bar (default: with several chunks).
     - `options`: further ones as in `simulate`.
 
     Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`.

@@ -32,7 +32,6 @@ from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
-LARGEST_UNROLLED = 150  # operations of a program whose stages are written out one after another
 _STATE_FORMS = ("auto", "minimal", "full")
 
 
@@ -80,7 +79,7 @@ def simulate(
     - `land_on_ts`: end a step at every saved time. With False, values between steps come from the solver's dense output: fewer steps, but
       its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
     - `lowering`: integrate the scene's scalar program (`jj.lower`) where it has one and neither `reduction` nor `stabilisation` is given; with False,
-      the dense matrices. `batch`: write the program for many lanes (under `vmap`; `rollout` does): faster there, slower to compile.
+      the dense matrices. `batch`: lay the state out for many lanes (under `vmap`; `rollout` does).
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
 
     **Returns** a `Trajectory`, with a result code instead of an exception; `trajectory.raise_if_failed()` raises `SimulationError`.
@@ -171,7 +170,7 @@ def state_form(
         projects_positions=projection and _is_closed(scene),
         projects_speeds=projection and not minimal and bool(structure.row_names),
         lowered=program if isinstance(program, Lowered) else None,
-        as_scalars=batch and isinstance(program, Lowered) and program.operations <= LARGEST_UNROLLED,
+        as_scalars=batch and isinstance(program, Lowered),
     )
 
 
