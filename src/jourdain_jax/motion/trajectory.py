@@ -34,7 +34,8 @@ class Trajectory(eqx.Module):
     rejected: Int[Array, ""]
     moved_q: Float[Array, ""]  # how far the start was moved onto the constraints
     moved_u: Float[Array, ""]
-    smallest_pivot: Float[Array, ""]  # of the privileged speeds, over the saved times; negative if it changed sign; 1 for the full state
+    # of the privileged speeds, over the saved times (lowered: of the elimination, relative to its usual size); negative if it changed sign; 1: full state
+    smallest_pivot: Float[Array, ""]
     inputs: Inputs
     state_form: str = eqx.field(static=True)  # "minimal" or "full"
     reduction: str = eqx.field(static=True)
