@@ -36,11 +36,7 @@ class NotLowered(Exception):
 
 def lowered(scene: Scene) -> Lowered | NotLowered:
     """The lowered equations of the scene's class, or the reason why there are none. Built once per class, shapes and privileged speeds."""
-    try:
-        structure = structure_of(scene)
-        return _lowered(_Key(concretised(scene), structure))
-    except NotLowered as reason:
-        return reason
+    return _lowered(_Key(concretised(scene), structure_of(scene)))
 
 
 def lower(scene: Scene) -> Lowered:
@@ -72,7 +68,14 @@ class _Key:
 
 
 @lru_cache(maxsize=256)
-def _lowered(key: _Key) -> Lowered:
+def _lowered(key: _Key) -> Lowered | NotLowered:
+    try:
+        return _built(key)
+    except NotLowered as reason:
+        return NotLowered(str(reason))  # kept without its traceback
+
+
+def _built(key: _Key) -> Lowered:
     begin = time.perf_counter()
     scene, structure = key.scene, key.structure
     if not structure.affine:
