@@ -79,7 +79,10 @@ class AppellOnGraph:
         if strategy.free_z:
             *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
             qdot = self.graph.substituted(qdot, kinematics.known)
-        if held:
+        if self.structure.homogeneous:
+            true_z = {int(self.traced.u[k]): n for k, n in zip(self.dependent, z, strict=True)}
+            (power,) = self.graph.substituted([int(self.traced.at.power)], true_z)
+        elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
             power = power if np.allclose(*self.probes([power, true_power]), rtol=1e-9, atol=1e-9) else true_power
         return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots])), sorted(guards), power)
