@@ -59,7 +59,7 @@ def _apply(equation, inputs) -> list[np.ndarray]:
     if name in _ENTRYWISE:
         with_type = _ENTRYWISE[name](*inputs)
         return [np.asarray(with_type, equation.outvars[0].aval.dtype)]
-    if name in _RULES:
+    if name in _RULES and not any(params.get(flag) for flag in _WITHOUT_RULE):
         result = _RULES[name](equation, *inputs)
         return result if isinstance(result, list) else [result]
     with jax.ensure_compile_time_eval():
@@ -216,8 +216,6 @@ def _cholesky_or_nan(A):
 
 def _triangular_solve(equation, A, b):
     p = equation.params
-    if p["conjugate_a"] or p["unit_diagonal"]:
-        raise NotImplementedError
     A = np.tril(A) if p["lower"] else np.triu(A)
     A = np.swapaxes(A, -1, -2) if p["transpose_a"] else A
     singular = np.any(np.diagonal(A, axis1=-2, axis2=-1) == 0, axis=-1)[..., None, None]
@@ -240,6 +238,7 @@ def _reduced(function: Callable, of_nothing=None) -> Callable:
     return reduced
 
 
+_WITHOUT_RULE = ("conjugate_a", "unit_diagonal")  # variants of `triangular_solve` that are left to JAX
 _RULES: dict[str, Callable] = {
     "dot_general": _dot_general,
     "broadcast_in_dim": _broadcast_in_dim,
