@@ -177,7 +177,7 @@ def state_form(
 def lost_codes(form: StateForm) -> tuple[int, ...]:
     """Result codes after which another form of the state may do better."""
     guarded = form.lowered is not None and (form.lowered.guards or form.lowered.pivots)
-    return (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL) if guarded else (results.SINGULAR_PARTITION,)
+    return (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL, results.NOT_FINITE) if guarded else (results.SINGULAR_PARTITION,)
 
 
 @described_once
