@@ -87,20 +87,29 @@ def evaluation_ratios(quick: bool) -> Iterator[Figure]:
     yield figure("time per evaluation in a batch of 1024, dense / lowered", "whipple-bicycle", ratio, 15, 40, at_least=True)
 
 
-def our_disc(solver: diffrax.AbstractSolver, batch: bool = True) -> Callable:
-    """A compiled function `(tolerance, starts)` of initial minimal states to final ones, by `simulate`."""
+def our_starts(y) -> jj.State:
+    """States of discs, for minimal ones (lanes, 8): the contact point's speeds follow from the rows."""
+    start = jax.tree.map(lambda x: jnp.broadcast_to(0.0 * x, (len(y), *jnp.shape(x))), jj.start(jj.models.MODELS["tilting-disc"]()))
+    q, u = y[:, :5], jnp.concatenate([jnp.zeros((len(y), 2)), y[:, 5:]], axis=1)
+    return jj.State(start.t, q, u, start.moved_q, start.moved_u, start.residual, start.names)
+
+
+RUN = {"ts": jnp.array([disc_run.END]), "solver": diffrax.Dopri8(), "events": False, "projection": False}
+
+
+def our_disc(alone: bool = False) -> Callable:
+    """A compiled function `(tolerance, starts)` of initial minimal states to final ones, by `rollout` or `simulate`."""
     scene = jj.models.MODELS["tilting-disc"]()
-    start = jj.start(scene)
 
-    def one(tolerance, y):
-        q, u = y[:5], jnp.concatenate([jnp.zeros(2), y[5:]])  # the contact point's speeds follow from the rows
-        given = jj.State(start.t, q, u, 0.0 * start.moved_q, 0.0 * start.moved_u, 0.0 * start.residual, start.names)
-        motion = jj.simulate(
-            scene, given, ts=jnp.array([disc_run.END]), rtol=tolerance, atol=tolerance, solver=solver, events=False, projection=False, batch=batch
-        )
-        return jnp.concatenate([motion.q_end, motion.u_end[2:]])
+    @jax.jit
+    def compiled(tolerance, y):
+        starts, options = our_starts(y), RUN | {"rtol": tolerance, "atol": tolerance}
+        if alone:
+            motion = jj.simulate(scene, jax.tree.map(lambda x: x[0], starts), **options)
+            return jnp.concatenate([motion.q_end, motion.u_end[2:]])[None]
+        lanes = jj.rollout(scene, starts, **options).lanes
+        return jnp.concatenate([lanes.q_end, lanes.u_end[:, 2:]], axis=1)
 
-    compiled = jax.jit(jax.vmap(one, in_axes=(None, 0)))
     return lambda tolerance, starts: np.asarray(compiled(tolerance, starts))
 
 
@@ -114,7 +123,7 @@ def disc_motions(quick: bool) -> Iterator[Figure]:
     """10 s of the tilting disc, 1024 lanes, at a final error of 1e-8."""
     starts = disc_run.starts(128 if quick else disc_run.LANES)
     expected = disc_run.reference(starts)
-    ours = disc_seconds(our_disc(diffrax.Dopri8()), starts, expected, 1e-9, 5)
+    ours = disc_seconds(our_disc(), starts, expected, 1e-9, 5)
     print(f"  ours: {1e3 * ours:.3f} ms per trajectory in a batch of {len(starts)}", flush=True)
     if not quick:
         plain = disc_seconds(disc_run.final_states("dense", "Dopri8"), starts, expected, 1e-9, 2)
@@ -122,7 +131,7 @@ def disc_motions(quick: bool) -> Iterator[Figure]:
     flat = disc_seconds(disc_run.final_states("flat", "Dopri8"), starts, expected, 1e-9, 3)
     yield figure("10 s of the disc at error 1e-8, by hand in a flat array / ours", "tilting-disc", flat / ours, 3, 10, at_least=True)
     one = disc_run.START[None]
-    alone = disc_seconds(our_disc(diffrax.Dopri8()), one, disc_run.reference(one), 1e-9, 20)
+    alone = disc_seconds(our_disc(alone=True), one, disc_run.reference(one), 1e-9, 20)
     print(f"  ours: {1e3 * alone:.3f} ms alone", flush=True)
     names = [("throughput in the batch, ours / heyoka's", ours, 8, 0.15, 1), ("throughput alone, ours / heyoka's", alone, 1, 0.05, 0.5)]
     for name, seconds, width, required, aim in names:
@@ -137,28 +146,38 @@ def disc_motions(quick: bool) -> Iterator[Figure]:
 
 def gradients(quick: bool) -> Iterator[Figure]:
     """Gradient of a final-state loss by 8 numbers, best mode, relative to one forward solve at the same tolerance."""
-    scene, ends = jj.models.MODELS["tilting-disc"](), jnp.array([disc_run.END])
-    names = ("x", "y", "yaw", "lean", "spin", "x_rate", "y_rate", "yaw_rate", "lean_rate", "spin_rate")
-    values = jnp.array([1.0, 0.5, 9.81, *disc_run.START[[3, 5, 6, 7]], 0.0])
-
-    def loss(x, adjoint):
-        own = scene.replace(mass=x[0], radius=x[1], gravity=x[2])
-        y = dict(zip(("lean", "yaw_rate", "lean_rate", "spin_rate", "yaw"), x[3:], strict=True))
-        q, u, _ = own.named(**y)
-        start = jj.start(scene)
-        given = jj.State(start.t, q, u, *(0.0 * m for m in (start.moved_q, start.moved_u, start.residual)), start.names)
-        motion = jj.simulate(own, given, ts=ends, rtol=1e-9, atol=1e-9, solver=diffrax.Dopri8(), events=False, projection=False, adjoint=adjoint, batch=True)
-        return jnp.sum(motion.q_end**2)
-
-    assert names == (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    scene = jj.models.MODELS["tilting-disc"]()
+    values = np.array([1.0, 0.5, 9.81, *disc_run.START[[3, 5, 6, 7]], 0.0])
     forward, reverse = diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()
-    modes = {"forward": jax.jacfwd(lambda x: loss(x, forward)), "reverse": jax.grad(lambda x: loss(x, reverse))}
+
+    def losses(x, adjoint):
+        """Of every lane; by mass, radius, gravity, lean, yaw, lean and spin rates, yaw."""
+        zero = jnp.zeros(len(x))
+        y = jnp.stack([zero, zero, x[:, 7], x[:, 3], zero, *x[:, 4:7].T], axis=1)
+        options = RUN | {"rtol": 1e-9, "atol": 1e-9, "adjoint": adjoint}
+        if len(x) == 1:
+            own = scene.replace(mass=x[0, 0], radius=x[0, 1], gravity=x[0, 2])
+            return jnp.sum(jj.simulate(own, jax.tree.map(lambda x: x[0], our_starts(y)), **options).q_end ** 2)[None]
+        lanes = jj.rollout(scene, our_starts(y), parameters={"mass": x[:, 0], "radius": x[:, 1], "gravity": x[:, 2]}, **options).lanes
+        return jnp.sum(lanes.q_end**2, axis=1)
+
+    def by_forward_mode(x):
+        along = jnp.eye(8)[:, None, :] + jnp.zeros_like(x)
+        return jax.vmap(lambda v: jax.jvp(lambda x: losses(x, forward), (x,), (v,))[1])(along).T
+
+    ways = {
+        "solve": lambda x: losses(x, forward),
+        "forward": by_forward_mode,
+        "reverse": jax.grad(lambda x: jnp.sum(losses(x, reverse))),
+    }
     for where, lanes, required, aim in (("alone", 1, 5, 3), ("batched", 128 if quick else 1024, 8, 4)):
-        x = values * (1 + 0.01 * np.random.default_rng(0).normal(size=(lanes, 8)))
-        timed = {}
-        for name, f in {"solve": lambda x: loss(x, forward), **modes}.items():
-            compiled = jax.jit(jax.vmap(f))
+        x = jnp.asarray(values * (1 + 0.01 * np.random.default_rng(0).normal(size=(lanes, 8))))
+        timed, found = {}, {}
+        for name, f in ways.items():
+            compiled = jax.jit(f)
             timed[name] = fastest(lambda compiled=compiled, x=x: jax.block_until_ready(compiled(x)), 3)
+            found[name] = compiled(x)
+        np.testing.assert_allclose(found["forward"], found["reverse"], rtol=1e-5, atol=1e-5)
         print(f"  {where}: " + ", ".join(f"{name} {1e3 * t / lanes:.3f} ms" for name, t in timed.items()), flush=True)
         best = min(timed["forward"], timed["reverse"])
         yield figure(f"gradient by 8 numbers / one solve, {where}", "tilting-disc", best / timed["solve"], required, aim)

@@ -3,6 +3,7 @@
 That its numbers are those of the dense path, for every model, is tested in `test_every_model`.
 """
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +15,8 @@ from jourdain_jax.equations.minimal import speeds_from_privileged
 from jourdain_jax.lowering import lower as module
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion import results
+from jourdain_jax.motion import lockstep, results
+from jourdain_jax.program.emit import together
 
 HAND = [name for name in HAND_DERIVED if name != "skate"]  # the skate has no privileged speeds that serve at every heading
 
@@ -166,3 +168,34 @@ def test_a_batch_written_for_batches_is_the_same_motion():
     lanes = jj.rollout(scene, {"lean": leans, "spin_rate": -3.0}, t1=1.0, rtol=1e-10, atol=1e-10)
     alone = jj.simulate(scene, {"lean": leans[1], "spin_rate": -3.0}, t1=1.0, rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(lanes.lanes.q[1], alone.q, atol=1e-9)
+
+
+def disc_ends(x):
+    """Final coordinates of discs whose starts and parameters are given, (lanes, 4)."""
+    starts = dict(zip(("lean", "yaw_rate", "spin_rate"), x.T[:3], strict=True))
+    options = {"ts": jnp.array([0.5, 1.0]), "events": False, "adjoint": diffrax.ForwardMode()}
+    return jj.rollout(MODELS["tilting-disc"](), starts, parameters={"radius": x[:, 3]}, **options).lanes.q[:, -1]
+
+
+def test_lanes_that_do_not_fill_a_block_move_as_they_do_alone_and_so_do_their_derivatives():
+    lanes = lockstep.TOGETHER + 3  # the second block holds three lanes and copies
+    x = jnp.asarray(np.array([0.3, 0.5, -3.0, 0.5]) * (1 + 0.1 * np.random.default_rng(1).normal(size=(lanes, 4))))
+    along = jnp.ones_like(x)
+    found, slope = jax.jit(lambda x: jax.jvp(disc_ends, (x,), (along,)))(x)
+    alone, slope_alone = (np.concatenate(part) for part in zip(*(jax.jvp(disc_ends, (x[i : i + 1],), (along[:1],)) for i in (0, lanes - 1)), strict=True))
+    np.testing.assert_allclose(found[np.array([0, lanes - 1])], alone, rtol=1e-9)
+    np.testing.assert_allclose(slope[np.array([0, lanes - 1])], slope_alone, rtol=1e-9)
+
+
+def test_values_computed_together_are_the_same_and_have_the_same_derivatives():
+    both = lambda x: together((jnp.sin(x) * 2.0, jnp.sin(x) + x))  # noqa: E731
+    x = jnp.linspace(-2.0, 2.0, 7)
+    np.testing.assert_array_equal(jax.jit(both)(x)[1], jnp.sin(x) + x)
+    np.testing.assert_array_equal(jax.vmap(both)(x)[0], jnp.sin(x) * 2.0)
+    np.testing.assert_allclose(jax.grad(lambda x: jnp.sum(both(x)[0] + both(x)[1]))(x), 3 * jnp.cos(x) + 1, rtol=1e-14)
+    np.testing.assert_allclose(jax.hessian(lambda x: both(x)[0])(0.7), -2 * np.sin(0.7), rtol=1e-14)
+
+
+def test_loops_over_steps_are_compiled_into_one_function():
+    """Ten times the time per step hangs on it."""
+    assert lockstep.loops_are_single_functions()

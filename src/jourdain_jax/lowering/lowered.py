@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.lowering import export
 from jourdain_jax.lowering.trace import TracedScene
-from jourdain_jax.program.emit import run
+from jourdain_jax.program.emit import run, together
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.scene.scene import Scene
 
@@ -92,7 +92,7 @@ class Lowered:
             known |= {int(n): flat[i] for i, n in enumerate(np.ravel(nodes))}
         return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known))
 
-    def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Float[Array, ""] | None]:
+    def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Float[Array, "*lanes"] | None]:
         """`qdot` and `ydot`, tuples of scalars, and the power (W) where `with_power` asks for it; NaN where a guard is not positive.
 
         `fixed`: from `fixed_values`; `q`, `y`: coordinates and privileged speeds, one scalar (or array of lanes) each; `inputs`: a vector.
@@ -103,11 +103,11 @@ class Lowered:
         for guard in guards:
             rates[0] = jnp.where(guard > 0, rates[0], jnp.nan)
         real = jnp.result_type(*q)
-        rates = [jnp.broadcast_to(jnp.asarray(r, real), jnp.shape(q[0])) for r in rates]
+        rates = together(tuple(jnp.broadcast_to(jnp.asarray(r, real), jnp.shape(q[0])) for r in rates))
         at = len(self.qdot)
         return tuple(rates[:at]), tuple(rates[at : at + len(self.ydot)]), rates[-1] if with_power else None
 
-    def speeds_and_pivot(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+    def speeds_and_pivot(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds *lanes"], Float[Array, "*lanes"]]:
         """All speeds, and the smallest pivot relative to its usual size: it changes sign where the elimination does not serve.
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
@@ -123,7 +123,7 @@ class Lowered:
             pivot = jnp.sign(pivot) * jnp.sign(ratio) * jnp.minimum(jnp.abs(pivot), jnp.abs(ratio))
         return u, pivot
 
-    def _known(self, fixed, t, q, y, inputs) -> dict[int, Float[Array, ""]]:
+    def _known(self, fixed, t, q, y, inputs) -> dict[int, Float[Array, "*lanes"]]:
         traced = self.traced
         known = dict(zip(self.fixed, fixed, strict=True)) | {traced.t: t}
         known |= dict(zip(traced.q.tolist(), q, strict=True)) | {int(traced.u[k]): v for k, v in zip(self.independent, y, strict=True)}

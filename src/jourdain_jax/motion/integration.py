@@ -18,6 +18,7 @@ from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion import lean_loop, results
 from jourdain_jax.motion.event_location import Located, locate
 from jourdain_jax.motion.land_on import land_on
+from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
@@ -52,26 +53,73 @@ class Options(eqx.Module):
 class Solved(eqx.Module):
     """What either loop finds."""
 
-    ts: Float[Array, "times"]
+    ts: Float[Array, "times *lanes"]
     ys: PyTree
-    reached: Bool[Array, "times"]
-    t_end: Float[Array, ""]
+    reached: Bool[Array, "times *lanes"]
+    t_end: Float[Array, "*lanes"]
     y_end: PyTree
-    code: Int[Array, ""]
-    event: Int[Array, ""]  # index of the event that ended the motion, -1: none
-    accepted: Int[Array, ""]
-    rejected: Int[Array, ""]
+    code: Int[Array, "*lanes"]
+    event: Int[Array, "*lanes"]  # index of the event that ended the motion, -1: none
+    accepted: Int[Array, "*lanes"]
+    rejected: Int[Array, "*lanes"]
+
+
+class Setup(eqx.Module):
+    """A motion to be integrated; in a batch all arrays have a leading axis of lanes."""
+
+    scene: Scene
+    start: State
+    inputs: PyTree
+    t0: Float[Array, "*lanes"]
+    t1: Float[Array, "*lanes"]
+    ts: Float[Array, "*lanes times"]
+    form: StateForm
+    options: Options
+
+
+class Begun(eqx.Module):
+    """The start of the integration, marked for the adjoint."""
+
+    right: Bool[Array, ""]  # whether all parameters are
+    start: State
+    args: tuple  # form, scene, inputs, what the rates need of the scene
+    y0: Integrated
 
 
 @eqx.filter_jit
-def integrate(original: Scene, start: State, inputs, t0, t1, ts, form: StateForm, options: Options) -> Trajectory:
-    """The motion from `start`."""
-    adjoint = options.adjoint
-    right, start = _without_faults(original, start)
-    scene, start, inputs = _mark_inputs(adjoint, (original, start, inputs))
-    args = (form, scene, inputs, form.fixed(scene))
-    y0 = form.pack(start.q, start.u)
-    solved = (_by_lean_loop if options.lean else _by_diffrax)(form, y0, t0, t1, ts, args, options)
+def integrate(setup: Setup) -> Trajectory:
+    """The motion of one setup."""
+    begun = _begin(setup)
+    return _finish(setup, begun, _solved(setup, begun))
+
+
+@eqx.filter_jit
+def integrate_lanes(setups: Setup) -> Trajectory:
+    """The motions of all lanes: `lockstep.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
+    begun = eqx.filter_vmap(_begin)(setups)
+    program = setups.form.lowered
+    if setups.options.lean and program is not None:
+        solved = in_blocks(_lanes_by_lean_loop, width(program, setups.form.projects_positions), setups, begun)
+    else:
+        solved = eqx.filter_vmap(_solved)(setups, begun)
+    return eqx.filter_vmap(_finish)(setups, begun, solved)
+
+
+def _begin(setup: Setup) -> Begun:
+    right, start = _without_faults(setup.scene, setup.start)
+    scene, start, inputs = _mark_inputs(setup.options.adjoint, (setup.scene, start, setup.inputs))
+    form = setup.form
+    return Begun(right, start, (form, scene, inputs, form.fixed(scene)), form.pack(start.q, start.u))
+
+
+def _solved(setup: Setup, begun: Begun) -> Solved:
+    return (_by_lean_loop if setup.options.lean else _by_diffrax)(setup, begun)
+
+
+def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
+    t0, t1, form, options, adjoint = setup.t0, setup.t1, setup.form, setup.options, setup.options.adjoint
+    start, args = begun.start, begun.args
+    _, scene, inputs, fixed = args
     solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, _mark_outputs(adjoint, (solved.ys, solved.y_end)))
     end = _located_end(solved, args, t0, options.event_names)
     moving = form.projects_positions or form.projects_speeds
@@ -82,8 +130,8 @@ def integrate(original: Scene, start: State, inputs, t0, t1, ts, form: StateForm
         # what was never reached holds anything: compute at the end state instead, then mark
         t, y = jnp.where(valid, t, end.t), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, end.y)
         y = _project(t, y, args) if moving and not options.lean else y
-        q, u = form.unpack(scene, args[3], t, y, inputs(t))
-        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (q, u, y.work)), form.pivot(scene, args[3], t, y, inputs(t))
+        q, u = form.unpack(scene, fixed, t, y, inputs(t))
+        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (q, u, y.work)), form.pivot(scene, fixed, t, y, inputs(t))
 
     # the end state as one more saved one, so that all this is compiled once
     with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), (end.t, end.y, jnp.array(True)))
@@ -91,7 +139,7 @@ def integrate(original: Scene, start: State, inputs, t0, t1, ts, form: StateForm
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
     return Trajectory(
-        scene=original,
+        scene=setup.scene,
         ts=solved.ts,
         q=q[:-1],
         u=u[:-1],
@@ -101,7 +149,7 @@ def integrate(original: Scene, start: State, inputs, t0, t1, ts, form: StateForm
         u_end=u[-1],
         result=results.with_causes(
             _result(solved.code, end.y, start, pivot),
-            parameters=right,
+            parameters=begun.right,
             start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
             moved=solved.accepted > 0,
         ),
@@ -126,26 +174,57 @@ def _without_faults(scene: Scene, start: State):
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 
-def _by_lean_loop(form: StateForm, y0, t0, t1, ts, args, options: Options) -> Solved:
-    method = lean_loop.method_of(options.solver)
-    names = options.event_names
+def _by_lean_loop(setup: Setup, begun: Begun) -> Solved:
+    form, options = setup.form, setup.options
+    moving = form.projects_positions or form.projects_speeds
+    return _lean(setup, begun.y0, begun.args, setup.ts, _rates, _project if moving else None, _stacked_events if options.event_names else None)
+
+
+def _lanes_by_lean_loop(setups: Setup, begun: Begun) -> Solved:
+    """Lanes in lockstep: their axis comes first outside and last inside."""
+    form, options = setups.form, setups.options
+    moving = form.projects_positions or form.projects_speeds
+    events = _lane_by_lane(_stacked_events) if options.event_names else None
+    y0, ts = _lanes_last((begun.y0, setups.ts))
+    solved = _lean(setups, y0, begun.args, ts, _rates_of_lanes, _lane_by_lane(_project) if moving else None, events)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solved)
+
+
+def _lean(setup: Setup, y0, args, ts, rates, project, events) -> Solved:
+    options = setup.options
     problem = lean_loop.Problem(
-        rates=_rates,
+        rates=rates,
         args=args,
-        project=_project if form.projects_positions or form.projects_speeds else None,
-        events=_stacked_events if names else None,
+        project=project,
+        events=events,
         norm=_StateNorm(),
-        rtol=jnp.asarray(options.tolerances[0]),
-        atol=jnp.asarray(options.tolerances[1]),
-        shortest=_shortest(t0, t1),
+        rtol=jnp.broadcast_to(options.tolerances[0], setup.t0.shape),
+        atol=jnp.broadcast_to(options.tolerances[1], setup.t0.shape),
+        shortest=_shortest(setup.t0, setup.t1),
         max_steps=options.max_steps,
     )
     kind: Literal["lax", "checkpointed"] = "lax" if isinstance(options.adjoint, diffrax.ForwardMode) else "checkpointed"
-    ys, reached, end = lean_loop.integrate(problem, method, y0, t0, jnp.concatenate([ts, t1[None]]), options.dt0, kind)
+    goals = jnp.concatenate([ts, setup.t1[None]])
+    ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, setup.t0, goals, options.dt0, kind)
     return Solved(ts, jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected)
 
 
-def _by_diffrax(form: StateForm, y0, t0, t1, ts, args, options: Options) -> Solved:
+def _lanes_last(tree):
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
+
+
+def _lane_by_lane(function):
+    """A function `(t, y, args)` of one lane for states with lanes last and `args` with lanes first."""
+    return lambda t, y, args: eqx.filter_vmap(function, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(t, y, args)
+
+
+def _rates_of_lanes(t, y, args):
+    form, scene, inputs, fixed = args
+    return form.rates(scene, fixed, t, y, eqx.filter_vmap(lambda inputs, t: inputs(t), out_axes=-1)(inputs, t))
+
+
+def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
+    t0, t1, ts, form, options, args, y0 = setup.t0, setup.t1, setup.ts, setup.form, setup.options, begun.args, begun.y0
     names, (rtol, atol) = options.event_names, options.tolerances
     controller = options.controller
     if controller is None:
@@ -183,7 +262,7 @@ def _by_diffrax(form: StateForm, y0, t0, t1, ts, args, options: Options) -> Solv
     )
 
 
-def _shortest(t0, t1) -> Float[Array, ""]:
+def _shortest(t0, t1) -> Float[Array, "*lanes"]:
     return 1e-14 * jnp.maximum(jnp.abs(t1 - t0), jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
 
 
@@ -216,9 +295,9 @@ class _StateNorm(eqx.Module):
     What is not a number counts as infinite: the step shrinks and the motion ends, where NaN would be tried until the last allowed step.
     """
 
-    def __call__(self, y: Integrated) -> Float[Array, ""]:
+    def __call__(self, y: Integrated) -> Float[Array, "*lanes"]:
         parts = jax.tree.leaves((y.q, y.v))
-        squared = sum(jnp.sum(part**2) for part in parts) / sum(part.size for part in parts)
+        squared = sum(jnp.sum(part**2, axis=0) for part in parts) / sum(len(part) for part in parts)
         squared = jnp.where(jnp.isnan(squared), jnp.inf, squared)
         return jnp.where(squared == 0, 0.0, jnp.sqrt(jnp.where(squared == 0, 1.0, squared)))
 

@@ -3,9 +3,9 @@
     k_i = f(t + c_i h, y + h sum_j a_ij k_j),   y_1 = y + h sum b_i k_i,   e = h sum b^err_i k_i
     |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts;   h <- h clip(0.9 |e|^(-1/order), 0.2, 10)
 
-The state is any tree of arrays; a lowered scene's is a tuple of scalars, which a batch makes a structure of arrays. A step ends at every
-time asked for; the step size found before such a shortened step is remembered. Every lane carries its own result code, and a lane that has
-ended stands still. `diffrax` serves all other solvers, controllers and ways of saving.
+The state is any tree of arrays. A batch of lanes runs in lockstep: all arrays, times and step sizes among them, then have a last axis of lanes,
+which keeps neighbours in memory neighbours. A step ends at every time asked for; the step size found before such a shortened step is remembered.
+Every lane carries its own result code, and a lane that has ended stands still. `diffrax` serves all other solvers, controllers and ways of saving.
 """
 
 from collections.abc import Callable
@@ -28,9 +28,7 @@ SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 
 @dataclass(frozen=True)
 class Method:
-    """A tableau. Its stages run as a loop: one copy of the vector field to compile, and in a batch faster than stages written out, which XLA
-    computes anew wherever they are used.
-    """
+    """A tableau. Its stages run as a loop: one copy of the vector field to compile."""
 
     A: np.ndarray
     b: np.ndarray
@@ -55,15 +53,15 @@ def method_of(solver: diffrax.AbstractERK) -> Method:
 
 
 class Progress(eqx.Module):
-    """Where a lane is."""
+    """Where a motion is, or each of several lanes."""
 
-    t: Float[Array, ""]
+    t: Float[Array, "*lanes"]
     y: PyTree
-    h: Float[Array, ""]  # the next step, positive
-    code: Int[Array, ""]  # RUNNING, or the result
-    accepted: Int[Array, ""]
-    rejected: Int[Array, ""]
-    event: Int[Array, ""]  # index of the event that ended the motion, or -1
+    h: Float[Array, "*lanes"]  # the next step, positive
+    code: Int[Array, "*lanes"]  # RUNNING, or the result
+    accepted: Int[Array, "*lanes"]
+    rejected: Int[Array, "*lanes"]
+    event: Int[Array, "*lanes"]  # index of the event that ended the motion, or -1
 
 
 class Problem(eqx.Module):
@@ -72,26 +70,24 @@ class Problem(eqx.Module):
     rates: Callable  # (t, y, args) -> dy/dt
     args: PyTree
     project: Callable | None  # (t, y, args) -> y
-    events: Callable | None  # (t, y, args) -> values, (events,)
-    norm: Callable
-    rtol: Float[Array, ""]
-    atol: Float[Array, ""]
-    shortest: Float[Array, ""]
+    events: Callable | None  # (t, y, args) -> values, (events, *lanes)
+    norm: Callable  # of a state, one number per lane
+    rtol: Float[Array, "*lanes"]
+    atol: Float[Array, "*lanes"]
+    shortest: Float[Array, "*lanes"]
     max_steps: int = eqx.field(static=True)
 
 
 def integrate(
-    problem: Problem, method: Method, y0: PyTree, t0, goals: Float[Array, "times"], dt0, kind: Literal["lax", "checkpointed"]
-) -> tuple[PyTree, Bool[Array, "times"], Progress]:
+    problem: Problem, method: Method, y0: PyTree, t0, goals: Float[Array, "times *lanes"], dt0, kind: Literal["lax", "checkpointed"]
+) -> tuple[PyTree, Bool[Array, "times *lanes"], Progress]:
     """States at the goals (monotonic; what was not reached repeats the last state), which were reached, and where the lane ended.
 
     `kind`: "lax" (no reverse mode), "checkpointed" (reverse mode), as in `equinox.internal.while_loop`.
     """
     direction = jnp.sign(goals[-1] - t0)
-    none = jnp.full((), -1, jnp.int32)
-    zero = jnp.zeros((), jnp.int32)
-    code = jnp.full((), RUNNING, jnp.int32)
-    start = Progress(t0, y0, jnp.abs(dt0), code, zero, zero, none)
+    zero = jnp.zeros(jnp.shape(t0), jnp.int32)
+    start = Progress(t0, y0, jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0)), zero + RUNNING, zero, zero, zero - 1)
     if problem.events is not None:
         start = _stopped_by_event(problem, start, jnp.array(True))
 
@@ -102,8 +98,11 @@ def integrate(
         def step(p):
             return jax.tree.map(lambda new, old: jnp.where(running(p), new, old), _step(problem, method, p, goal, goals[-1], direction), p)
 
+        def any_running(p):
+            return jnp.any(running(p))
+
         checkpoints = None if kind == "lax" else max(8, -(-512 // goals.shape[0]))
-        end = eqxi.while_loop(running, step, progress, max_steps=None if kind == "lax" else problem.max_steps, kind=kind, checkpoints=checkpoints)
+        end = eqxi.while_loop(any_running, step, progress, max_steps=None if kind == "lax" else problem.max_steps, kind=kind, checkpoints=checkpoints)
         return end, (end.y, end.t == goal)
 
     end, (ys, reached) = jax.lax.scan(to_goal, start, goals)
@@ -139,19 +138,26 @@ def _stages(problem: Problem, method: Method, p: Progress, h) -> tuple[PyTree, P
     """y_1 and the error estimate."""
     leaves, treedef = jax.tree.flatten(p.y)
 
-    def stage(slopes, row):
-        A, c, i = row
-        at = [y + _as(h, y) * jnp.tensordot(_as(A, y), k, 1) for y, k in zip(leaves, slopes, strict=True)]
+    def stage(carried, row):
+        # k_i = f(y_i), then the next y_i: what is carried from stage to stage is computed once, whatever uses it
+        at, slopes = carried
+        c, i, next_A = row
         found = jax.tree.leaves(problem.rates(p.t + c * h, treedef.unflatten(at), problem.args))
-        return [k.at[i].set(_as(f, k)) for k, f in zip(slopes, found, strict=True)], None
+        slopes = [jax.lax.dynamic_update_index_in_dim(k, _as(f, k), i, 0) for k, f in zip(slopes, found, strict=True)]
+        return ([y + _as(h, y) * _weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes), None
 
     count = len(method.c) - (method.last_is_next_first and method.b_error[-1] == 0)  # a last stage that nothing else needs
+    rows = (jnp.asarray(method.c[:count]), jnp.arange(count), jnp.asarray([*method.A[1:count], method.b]))
     slopes = [jnp.zeros((len(method.c), *y.shape), y.dtype) for y in leaves]
-    rows = (jnp.asarray(method.A[:count]), jnp.asarray(method.c[:count]), jnp.arange(count))
-    slopes, _ = jax.lax.scan(stage, slopes, rows)
-    y1 = [y + _as(h, y) * jnp.tensordot(_as(method.b, y), k, 1) for y, k in zip(leaves, slopes, strict=True)]
-    error = [_as(h, k) * jnp.tensordot(_as(method.b_error, k), k, 1) for k in slopes]
+    (y1, slopes), _ = jax.lax.scan(stage, (leaves, slopes), rows)
+    error = [_as(h, k) * _weighted(method.b_error, k) for k in slopes]
     return treedef.unflatten(y1), treedef.unflatten(error)
+
+
+def _weighted(weights, slopes: Float[Array, "stages *shape"]) -> Float[Array, "*shape"]:
+    """sum_j w_j k_j, element by element."""
+    used = [j for j in range(len(slopes)) if isinstance(weights, jax.Array) or weights[j] != 0]
+    return sum((_as(weights[j], slopes) * slopes[j] for j in used[1:]), start=_as(weights[used[0]], slopes) * slopes[used[0]])
 
 
 def _as(x, like) -> Array:
@@ -161,6 +167,6 @@ def _as(x, like) -> Array:
 
 def _stopped_by_event(problem: Problem, p: Progress, accepted) -> Progress:
     values = problem.events(p.t, p.y, problem.args)
-    happened = accepted & (p.code == RUNNING) & jnp.any(values <= 0)
+    happened = accepted & (p.code == RUNNING) & jnp.any(values <= 0, axis=0)
     code = jnp.where(happened, results.EVENT, p.code).astype(jnp.int32)
-    return eqx.tree_at(lambda p: (p.code, p.event), p, (code, jnp.where(happened, jnp.argmax(values <= 0), p.event).astype(jnp.int32)))
+    return eqx.tree_at(lambda p: (p.code, p.event), p, (code, jnp.where(happened, jnp.argmax(values <= 0, axis=0), p.event).astype(jnp.int32)))

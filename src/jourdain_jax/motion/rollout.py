@@ -15,7 +15,8 @@ from tqdm import tqdm
 from jourdain_jax.equations.probing import standing_in
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.motion import results
-from jourdain_jax.motion.simulate import lost_codes, simulate, state_form
+from jourdain_jax.motion.integration import integrate_lanes
+from jourdain_jax.motion.simulate import lost_codes, set_up, state_form
 from jourdain_jax.motion.span import saved_times
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.start import start as consistent_start
@@ -119,7 +120,6 @@ def rollout(
     chunk = _chunk(scene, count, chunk, options)
     if options.get("ts") is not None:
         options["ts"] = saved_times(options["ts"])
-    options = {"batch": True} | options
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, fixed, varied, parameters))):
         return Rollout(_together(scene, fixed, options, varied, parameters))  # being differentiated or batched: one piece, no host loop
     pieces = []
@@ -182,11 +182,10 @@ def _together(scene, fixed, options, varied, parameters) -> Trajectory:
 
     def lane(varied, parameters):
         own = scene.replace(**parameters) if parameters else scene
-        if isinstance(varied, State):
-            return simulate(own, varied, **options)
-        return simulate(own, consistent_start(own, t0=_first_time(options), **fixed, **varied), **options)
+        start = varied if isinstance(varied, State) else consistent_start(own, t0=_first_time(options), **fixed, **varied)
+        return set_up(own, start, **options)
 
-    return jax.vmap(lane)(varied, parameters)
+    return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
 
 
 def _first_time(options: dict):

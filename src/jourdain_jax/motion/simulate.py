@@ -4,6 +4,8 @@ The default state is the minimal one (coordinates and privileged speeds) where t
 domain and the rows are linear or affine; otherwise the full one (coordinates and all speeds), projected after every step.
 """
 
+import dataclasses
+import inspect
 import warnings
 
 import diffrax
@@ -23,7 +25,7 @@ from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion import results
 from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.inputs import as_inputs
-from jourdain_jax.motion.integration import Options, integrate
+from jourdain_jax.motion.integration import Options, Setup, integrate
 from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.state_form import StateForm, default_reduction
@@ -59,7 +61,6 @@ def simulate(
     work: bool = True,
     land_on_ts: bool = True,
     lowering: bool = True,
-    batch: bool = False,
 ) -> Trajectory:
     """Integrate a scene's equations of motion from `start` over [t0, t1].
 
@@ -79,7 +80,7 @@ def simulate(
     - `land_on_ts`: end a step at every saved time. With False, values between steps come from the solver's dense output: fewer steps, but
       its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
     - `lowering`: integrate the scene's scalar program (`jj.lower`) where it has one and neither `reduction` nor `stabilisation` is given; with False,
-      the dense matrices. `batch`: lay the state out for many lanes (under `vmap`; `rollout` does).
+      the dense matrices.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
 
     **Returns** a `Trajectory`, with a result code instead of an exception; `trajectory.raise_if_failed()` raises `SimulationError`.
@@ -87,21 +88,39 @@ def simulate(
     **Raises** ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` where the adjoint does not
     support the mode of differentiation.
     """
+    setup = _set_up(**locals())
+    motion = integrate(setup)
+    if state == "auto" and not isinstance(motion.result, jax.core.Tracer) and int(motion.result) in lost_codes(setup.form):
+        # the motion left the domain in which the partition was found to serve
+        form = state_form(setup.scene, structure_of(setup.scene), "full", reduction, stabilisation, projection, work, lowering=False)
+        motion = integrate(dataclasses.replace(setup, form=form))
+    return motion
+
+
+def set_up(scene: Scene, start=None, **options) -> Setup:
+    """What `simulate` integrates for these arguments, which are its own."""
+    bound = inspect.signature(simulate).bind(scene, start, **options)
+    bound.apply_defaults()
+    return _set_up(**bound.arguments)
+
+
+def _set_up(
+    *, scene, start, t0, t1, ts, saveat, rtol, atol, solver, stepsize_controller, dt0, adjoint, max_steps, state, reduction, stabilisation,
+    projection, inputs, events, work, land_on_ts, lowering,
+) -> Setup:  # fmt: skip
     scene = as_scene(scene)
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, solver=solver, adjoint=adjoint, stepsize_controller=stepsize_controller, saveat=saveat)
     _check_adjoint(adjoint)
     made_here = not isinstance(start, State)
     start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts)
-    structure = structure_of(scene)
-    form = state_form(scene, structure, state, reduction, stabilisation, projection, work, lowering, batch)
+    form = state_form(scene, structure_of(scene), state, reduction, stabilisation, projection, work, lowering)
     _warn_float32(start.q.dtype, rtol)
-    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
     options = Options(
         solver=(diffrax.Tsit5() if rtol >= 1e-6 else diffrax.Dopri8()) if solver is None else solver,
         controller=stepsize_controller,
         tolerances=(rtol, atol),
         dt0=1e-4 * (t1 - t0) if dt0 is None else dt0,  # diffrax's own guess costs two more copies of the vector field to compile
-        adjoint=adjoint,
+        adjoint=diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         max_steps=max_steps,
         land=land_on_ts,
         saveat=None if saveat is None else _checked_saveat(saveat),
@@ -109,12 +128,7 @@ def simulate(
     )
     inputs = as_inputs(scene, inputs)
     start = _on_constraints(scene, t0, start, inputs(t0), made_here) if projection else start
-    motion = integrate(scene, start, inputs, t0, t1, ts, form, options)
-    if state == "auto" and not isinstance(motion.result, jax.core.Tracer) and int(motion.result) in lost_codes(form):
-        # the motion left the domain in which the partition was found to serve
-        form = state_form(scene, structure, "full", reduction, stabilisation, projection, work, lowering=False)
-        motion = integrate(scene, start, inputs, t0, t1, ts, form, options)
-    return motion
+    return Setup(scene, start, inputs, t0, t1, ts, form, options)
 
 
 def _checked_saveat(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
@@ -149,7 +163,7 @@ def _warn_float32(dtype, rtol) -> None:
 
 
 def state_form(
-    scene: Scene, structure: Structure, state="auto", reduction=None, stabilisation=None, projection=True, work=True, lowering=True, batch=False
+    scene: Scene, structure: Structure, state="auto", reduction=None, stabilisation=None, projection=True, work=True, lowering=True
 ) -> StateForm:
     """How the scene's state is integrated, given what was asked."""
     if state not in _STATE_FORMS:
@@ -170,7 +184,6 @@ def state_form(
         projects_positions=projection and _is_closed(scene),
         projects_speeds=projection and not minimal and bool(structure.row_names),
         lowered=program if isinstance(program, Lowered) else None,
-        as_scalars=batch and isinstance(program, Lowered),
     )
 
 

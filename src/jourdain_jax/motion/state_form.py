@@ -3,7 +3,7 @@
     minimal: qdot = N u + nu,  u = C y + c,  ydot = privileged rows of udot     (velocity rows hold exactly)
     full:    qdot = N u + nu,  udot                                               (kept on the rows by projection)
 
-In a batch the minimal state of a lowered scene is a tuple of scalars, a structure of arrays under `vmap`; all others are vectors.
+The rates of a lowered scene also take states with a last axis of lanes.
 Where some force or row does work that no potential accounts for, that work is integrated beside the state.
 """
 
@@ -24,9 +24,9 @@ from jourdain_jax.scene.scene import Scene
 class Integrated(eqx.Module):
     """The integrated state: coordinates, speeds (all, or the privileged ones), work done so far (J) where it is tracked."""
 
-    q: Float[Array, "coordinates"] | tuple[Float[Array, ""], ...]
-    v: Float[Array, "integrated_speeds"] | tuple[Float[Array, ""], ...]
-    work: Float[Array, ""] | None
+    q: Float[Array, "coordinates *lanes"]
+    v: Float[Array, "integrated_speeds *lanes"]
+    work: Float[Array, "*lanes"] | None
 
 
 class StateForm(eqx.Module):
@@ -39,7 +39,6 @@ class StateForm(eqx.Module):
     projects_positions: bool = eqx.field(static=True)
     projects_speeds: bool = eqx.field(static=True)
     lowered: Lowered | None = eqx.field(static=True, default=None)  # the scalar program of the rates; None: dense matrices
-    as_scalars: bool = eqx.field(static=True, default=False)  # the state of a lowered scene as a tuple of scalars: best for batches
 
     @property
     def name(self) -> str:
@@ -63,21 +62,12 @@ class StateForm(eqx.Module):
     def pack(self, q, u) -> Integrated:
         """The integrated state of (q, u)."""
         v = u if self.independent is None else u[jnp.array(self.independent, jnp.int32)]
-        return self._like_state(Integrated(q, v, jnp.zeros((), q.dtype) if self.with_work else None))
-
-    def _like_state(self, y: Integrated) -> Integrated:
-        return Integrated(tuple(y.q), tuple(y.v), y.work) if self.as_scalars else y
-
-    def vectors(self, y: Integrated) -> Integrated:
-        """The state with q and v as vectors."""
-        if not self.as_scalars:
-            return y
-        return Integrated(jnp.stack(y.q), jnp.stack(y.v) if y.v else jnp.zeros(0, y.q[0].dtype), y.work)
+        return Integrated(q, v, jnp.zeros((), q.dtype) if self.with_work else None)
 
     def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
         """Coordinates and all speeds."""
         if self.lowered is not None:
-            return self.vectors(y).q, self.lowered.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
+            return y.q, self.lowered.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
         return y.q, y.v if self.independent is None else speeds_from_privileged(scene, self.independent, t, y.q, y.v, inputs)
 
     def pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, ""]:
@@ -89,8 +79,8 @@ class StateForm(eqx.Module):
     def rates(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
         """Time derivative of the integrated state."""
         if self.lowered is not None:
-            found = Integrated(*self.lowered.rates(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work))
-            return found if self.as_scalars else Integrated(jnp.stack(found.q), jnp.stack(found.v) if found.v else y.v, found.work)
+            qdot, vdot, power_now = self.lowered.rates(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
+            return Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power_now)
         if self.independent is not None and self._by_appell:
             _, motion, found = minimal_accelerations(scene, self.independent, t, y.q, y.v, inputs)
         else:
@@ -102,10 +92,9 @@ class StateForm(eqx.Module):
 
     def project(self, scene: Scene, t, y: Integrated, inputs, iterations: int = 2) -> Integrated:
         """The state put back onto geometric rows, quaternion norms and (full state) velocity rows."""
-        y = self.vectors(y)
         q = project_positions(scene, t, y.q, iterations=iterations) if self.projects_positions else y.q
         v = project_speeds(scene, t, q, y.v, inputs, iterations=iterations) if self.projects_speeds else y.v
-        return self._like_state(Integrated(q, v, y.work))
+        return Integrated(q, v, y.work)
 
 
 def default_reduction(independent: tuple[int, ...] | None):

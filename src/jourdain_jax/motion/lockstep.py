@@ -1,0 +1,49 @@
+"""How many lanes of a batch run in lockstep.
+
+A step of a batch lasts until its slowest lane has ended, and what a step touches should stay in a core's fastest cache: so few lanes at a time
+are best, if a step of few lanes costs little beside its arithmetic. On a CPU it does where XLA compiles the whole loop over steps into one
+function, which it does for loops that touch little memory (see `jourdain_jax`); otherwise every operation is started on its own, and many lanes
+must share that cost.
+"""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from jourdain_jax.lowering.lowered import Lowered
+
+TOGETHER = 16  # lanes, where the loop is one function
+LARGEST_PROGRAM = 3000  # operations: beyond, the loop touches too much memory to become one function (the bicycle, 2144, is still one)
+
+
+def in_blocks(function: Callable, lanes_at_once: int, *trees: PyTree) -> PyTree:
+    """`function` of trees whose arrays have a leading axis of lanes, some lanes at a time; the last block is filled up with copies."""
+    arrays, rest = eqx.partition(trees, eqx.is_array)
+    count = jax.tree.leaves(arrays)[0].shape[0]
+    blocks = -(-count // lanes_at_once)
+    if blocks == 1:
+        return function(*trees)
+    index = jnp.minimum(jnp.arange(blocks * lanes_at_once), count - 1).reshape(blocks, lanes_at_once)
+    found = jax.lax.map(lambda arrays: function(*eqx.combine(arrays, rest)), jax.tree.map(lambda x: x[index], arrays))
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
+
+
+def width(program: Lowered, projected: bool) -> int:
+    """How many lanes of a lowered scene run in lockstep."""
+    small = not projected and program.operations <= LARGEST_PROGRAM
+    return TOGETHER if small and loops_are_single_functions() else 2**30
+
+
+@functools.cache
+def loops_are_single_functions() -> bool:
+    """Whether XLA compiles loops over steps into one function each, found by compiling one that touches some ten kilobytes."""
+    if jax.default_backend() != "cpu":
+        return False
+    with jax.ensure_compile_time_eval():
+        x = jnp.zeros(512)
+        loop = jax.jit(lambda x: jax.lax.while_loop(lambda s: s[0] < 9, lambda s: (s[0] + 1, jnp.sin(s[1]) + x), (0, x)))
+        return "xla_cpu_small_call" in loop.lower(x).compile().as_text()
