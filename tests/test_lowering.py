@@ -16,7 +16,8 @@ from jourdain_jax.lowering import lower as module
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion import lockstep, results
-from jourdain_jax.program.emit import together
+from jourdain_jax.program.emit import run
+from jourdain_jax.program.together import together
 
 HAND = [name for name in HAND_DERIVED if name != "skate"]  # the skate has no privileged speeds that serve at every heading
 
@@ -199,3 +200,32 @@ def test_values_computed_together_are_the_same_and_have_the_same_derivatives():
 def test_loops_over_steps_are_compiled_into_one_function():
     """Ten times the time per step hangs on it."""
     assert lockstep.loops_are_single_functions()
+
+
+def test_derivatives_by_the_jacobian_on_the_graph_are_those_of_jax():
+    scene = MODELS["tilting-disc"]()
+    program = jj.lower(scene)
+    fixed, (_, q, u) = program.fixed_values(scene), jj.sample_states(scene, 1)
+    x = jnp.concatenate([jnp.stack(fixed), q[0], u[0, jnp.array(program.independent)]])
+
+    def split(x):
+        n, m = len(fixed), len(program.coordinates)
+        return tuple(x[:n]), tuple(x[n : n + m]), tuple(x[n + m :])
+
+    def by_rule(x):
+        a, q, y = split(x)
+        return jnp.stack([r for part in program.rates(a, 0.0, q, y, jnp.zeros(0))[:2] for r in part])
+
+    def by_jax(x):
+        a, q, y = split(x)
+        known = dict(zip(program._variables, (*a, 0.0, *q, *y), strict=True))
+        return jnp.stack([jnp.asarray(r) for r in run(program.graph, [*program.qdot, *program.ydot], known)])
+
+    np.testing.assert_allclose(by_rule(x), by_jax(x), rtol=1e-15)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(by_rule)(x), derivative(by_jax)(x), rtol=1e-12, atol=1e-12)
+    v = jnp.linspace(-1, 1, len(x))
+    second = lambda f: jax.jvp(lambda x: jax.jvp(f, (x,), (v,))[1], (x,), (v,))[1]  # noqa: E731
+    np.testing.assert_allclose(second(by_rule), second(by_jax), rtol=1e-11, atol=1e-11)
+    pull = lambda f: jax.grad(lambda x: jnp.vdot(jax.grad(lambda x: jnp.sum(jnp.sin(f(x))))(x), v))(x)  # noqa: E731
+    np.testing.assert_allclose(pull(by_rule), pull(by_jax), rtol=1e-11, atol=1e-11)

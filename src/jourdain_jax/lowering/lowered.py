@@ -1,6 +1,7 @@
 """The lowered equations of a scene: which program was chosen, what it computes, and how it runs in JAX."""
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -9,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.lowering import export
+from jourdain_jax.lowering.jacobian import differentiable
 from jourdain_jax.lowering.trace import TracedScene
-from jourdain_jax.program.emit import run, together
+from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.scene.scene import Scene
 
@@ -97,15 +99,33 @@ class Lowered:
 
         `fixed`: from `fixed_values`; `q`, `y`: coordinates and privileged speeds, one scalar (or array of lanes) each; `inputs`: a vector.
         """
-        wanted = [*self.qdot, *self.ydot, *([self.power] if with_power and self.power is not None else [])]
-        out = run(self.graph, [*wanted, *self.guards], self._known(fixed, t, q, y, inputs))
-        rates, guards = out[: len(wanted)], out[len(wanted) :]
-        for guard in guards:
-            rates[0] = jnp.where(guard > 0, rates[0], jnp.nan)
-        real = jnp.result_type(*q)
-        rates = together(tuple(jnp.broadcast_to(jnp.asarray(r, real), jnp.shape(q[0])) for r in rates))
+        known = self._known(fixed, t, q, y, inputs)
+        found = list((self._with_power if with_power else self._without_power)(*known.values()))
+        count = len(found) - len(self.guards)
+        for guard in found[count:]:
+            found[0] = jnp.where(guard > 0, found[0], jnp.nan)
         at = len(self.qdot)
-        return tuple(rates[:at]), tuple(rates[at : at + len(self.ydot)]), rates[-1] if with_power else None
+        power = found[count - 1] if with_power and self.power is not None else None
+        return tuple(found[:at]), tuple(found[at : at + len(self.ydot)]), power
+
+    @functools.cached_property
+    def _without_power(self) -> Callable[..., tuple]:
+        return self._rates_and([])
+
+    @functools.cached_property
+    def _with_power(self) -> Callable[..., tuple]:
+        return self._rates_and([] if self.power is None else [self.power])
+
+    def _rates_and(self, more: list[int]) -> Callable[..., tuple]:
+        outputs = [*self.qdot, *self.ydot, *more, *self.guards]
+        return differentiable(self.graph, outputs, self._variables, like=len(self.fixed) + 1)
+
+    @property
+    def _variables(self) -> list[int]:
+        """All nodes that are given from outside."""
+        traced = self.traced
+        state = [*traced.q.tolist(), *(int(traced.u[k]) for k in self.independent)]
+        return [*self.fixed, traced.t, *state, *map(int, traced.inputs)]
 
     def speeds_and_pivot(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds *lanes"], Float[Array, "*lanes"]]:
         """All speeds, and the smallest pivot relative to its usual size: it changes sign where the elimination does not serve.
@@ -124,10 +144,7 @@ class Lowered:
         return u, pivot
 
     def _known(self, fixed, t, q, y, inputs) -> dict[int, Float[Array, "*lanes"]]:
-        traced = self.traced
-        known = dict(zip(self.fixed, fixed, strict=True)) | {traced.t: t}
-        known |= dict(zip(traced.q.tolist(), q, strict=True)) | {int(traced.u[k]): v for k, v in zip(self.independent, y, strict=True)}
-        return known | {int(n): inputs[i] for i, n in enumerate(traced.inputs)}
+        return dict(zip(self._variables, (*fixed, t, *q, *y, *inputs), strict=True))
 
 
 def fixed_nodes(graph: Graph, outputs) -> tuple[int, ...]:

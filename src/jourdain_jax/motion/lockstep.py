@@ -16,7 +16,7 @@ from jaxtyping import PyTree
 
 from jourdain_jax.lowering.lowered import Lowered
 
-TOGETHER = 16  # lanes, where the loop is one function
+TOGETHER = 8  # lanes, where the loop is one function
 LARGEST_PROGRAM = 3000  # operations: beyond, the loop touches too much memory to become one function (the bicycle, 2144, is still one)
 
 

@@ -1,7 +1,7 @@
 """A graph as JAX code: one array per scalar, so that a batch is a structure of arrays and nothing is stacked.
 
 Sines and cosines of one argument are computed together, in double precision by range reduction with pi/2 in three parts and polynomials
-(error about 2e-16; XLA on a CPU would call libm once per element, and again in every fusion). All results come `together`, out of one loop.
+(error about 2e-16; XLA on a CPU would call libm once per element, and again in every fusion).
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -29,29 +29,6 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
         else:
             values[node] = FUNCTIONS[op](*(values[a] for a in args))
     return [values[n] for n in outputs]
-
-
-@jax.custom_jvp
-def together(values: tuple) -> tuple:
-    """The same real values, all of one shape, computed in one loop over their elements: what they share is computed once.
-
-    XLA on a CPU gives each result a loop of its own and computes in each what it needs. A reduction over several operands is one loop; here
-    each is reduced with a zero beside it.
-    """
-    if len(values) < 2:
-        return values
-    return jax.lax.platform_dependent(values, cpu=_reduced_with_zeros, default=lambda values: values)
-
-
-@together.defjvp
-def _together_jvp(primals, tangents):
-    return together(*primals), tangents[0]
-
-
-def _reduced_with_zeros(values: tuple) -> tuple:
-    beside = [lax.pad(x[None], jnp.zeros((), x.dtype), [(0, 1, 0), *[(0, 0, 0)] * x.ndim]) for x in values]
-    zeros = [jnp.zeros((), x.dtype) for x in values]
-    return tuple(lax.reduce(beside, zeros, lambda a, b: [x + y for x, y in zip(a, b, strict=True)], (0,)))
 
 
 FUNCTIONS: dict[str, Callable] = {

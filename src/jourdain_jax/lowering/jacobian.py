@@ -1,0 +1,80 @@
+"""A program with its own rule of differentiation: tangents by its Jacobian, derived on the graph.
+
+    d o_i = sum_j J_ij d x_j          J_ij: nodes that share subexpressions with the program and with one another
+
+The entries are computed once, with the values and in the same loop, however many tangents there are; and reverse mode has to keep no more than
+them. Programs whose Jacobian is large, and those with an operation that has no rule on the graph, are differentiated by JAX.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from jourdain_jax.program.derivative import derivatives
+from jourdain_jax.program.emit import run
+from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.interpret import Unsupported
+from jourdain_jax.program.together import together
+
+LARGEST_WORK = 100_000  # operations times variables: beyond, deriving takes longer than it can save
+LARGEST_GROWTH = 8  # operations of values and Jacobian over those of the values
+
+
+def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int], like: int) -> Callable[..., tuple]:
+    """A function of the values of `variables` (all that the outputs depend on) that returns those of `outputs`, as arrays of one shape, in the precision
+    of the variable with number `like`.
+    """
+    graph, outputs, variables = _on_its_own(graph, outputs, variables)
+    entries = _entries(graph, outputs, variables)
+
+    def values_of(nodes, values) -> tuple:
+        shape, real = jnp.broadcast_shapes(*map(jnp.shape, values)), jnp.result_type(values[like])
+        found = run(graph, nodes, dict(zip(variables, values, strict=True)))
+        return together(tuple(jnp.broadcast_to(jnp.asarray(x, real), shape) for x in found))
+
+    def program(*values):
+        return values_of(outputs, values)
+
+    if entries is None:
+        return program
+    own = jax.custom_jvp(program)
+
+    @partial(own.defjvp, symbolic_zeros=True)
+    def rule(values, tangents):
+        moving = [not isinstance(v, jax.custom_derivatives.SymbolicZero) for v in tangents]
+        used = [(i, j, node) for i, j, node in entries if moving[j]]
+        varying = list(dict.fromkeys(node for *_, node in used if not graph.is_const(node)))
+        found = values_of([*outputs, *varying], values)
+        J = dict(zip(varying, found[len(outputs) :], strict=True))
+        # d o_i = sum_j J_ij d x_j
+        along = [jnp.zeros_like(x) for x in found[: len(outputs)]]
+        for i, j, node in used:
+            along[i] = along[i] + jnp.asarray(J.get(node, graph.value[node]) * tangents[j], along[i].dtype)
+        return found[: len(outputs)], tuple(along)
+
+    return own
+
+
+def _on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> tuple[Graph, list[int], list[int]]:
+    """The outputs on a new graph whose inputs are the variables: no simplification can look behind these."""
+    own = Graph()
+    inputs = [own.input(str(k), True) for k in range(len(variables))]
+    new = dict(zip(variables, inputs, strict=True))
+    for node in graph.needed(outputs, new):
+        new[node] = own.const(graph.value[node]) if graph.is_const(node) else own.call(graph.op[node], *(new[a] for a in graph.args[node]))
+    return own, [new[n] for n in outputs], inputs
+
+
+def _entries(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> list[tuple[int, int, int]] | None:
+    """Row, column and node of the entries that are not zero by structure; None where JAX does better."""
+    operations = graph.operations(outputs)
+    if operations * len(variables) > LARGEST_WORK:
+        return None
+    try:
+        columns = [derivatives(graph, outputs, dict.fromkeys(variables, graph.zero) | {variable: graph.one}) for variable in variables]
+    except Unsupported:
+        return None
+    entries = [(i, j, node) for j, column in enumerate(columns) for i, node in enumerate(column) if node != graph.zero]
+    return entries if graph.operations([*outputs, *(node for *_, node in entries)]) <= LARGEST_GROWTH * max(operations, 10) else None
