@@ -212,7 +212,7 @@ def growth(quick: bool) -> Iterator[Figure]:
             break
         q, u, _ = scene.named()
         state = tuple(jnp.asarray(x) for x in q), tuple(jnp.asarray(u[k]) for k in program.independent)
-        rates = lambda s, p=program, scene=scene: p.rates(p.fixed_values(scene), 0.0, *s, jnp.zeros(0))[:2]  # noqa: E731
+        rates = lambda s, p=program, scene=scene: p.rates(p.fixed_values(scene), 0.0, *s, jnp.zeros(len(scene.inputs)))[:2]  # noqa: E731
         laps[n] = seconds_per_evaluation(rates, state, 1, repeats=10) / n
         compile_time = time.perf_counter() - begin
         print(f"  trailer-chain, n = {n}: {program.operations} operations, {1e9 * laps[n]:.0f} ns per evaluation and trailer, built in {compile_time:.1f} s")

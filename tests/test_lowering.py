@@ -14,6 +14,7 @@ import jourdain_jax as jj
 from jourdain_jax.equations.minimal import speeds_from_privileged
 from jourdain_jax.lowering import lower as module
 from jourdain_jax.lowering.lower import lowered
+from jourdain_jax.lowering.trace import event_values
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion import lockstep, results
 from jourdain_jax.program.emit import run
@@ -229,3 +230,27 @@ def test_derivatives_by_the_jacobian_on_the_graph_are_those_of_jax():
     np.testing.assert_allclose(second(by_rule), second(by_jax), rtol=1e-11, atol=1e-11)
     pull = lambda f: jax.grad(lambda x: jnp.vdot(jax.grad(lambda x: jnp.sum(jnp.sin(f(x))))(x), v))(x)  # noqa: E731
     np.testing.assert_allclose(pull(by_rule), pull(by_jax), rtol=1e-11, atol=1e-11)
+
+
+class WatchedDisc(jj.models.TiltingDisc):
+    """Stops by a condition that has no scalar form."""
+
+    def events(self, motion):
+        return {"far": 0.5 - jnp.linalg.svd(jnp.stack([motion.q.x, motion.q.y])[None], compute_uv=False)[0]}
+
+
+def test_stop_events_are_part_of_the_program_or_stay_dense_alone():
+    scene = MODELS["tilting-disc"]()
+    program = jj.lower(scene)
+    (t,), (q,), (u,) = jj.sample_states(scene, 1)
+    y = u[np.array(program.independent)]
+    values = program.event_values(program.fixed_values(scene), t, tuple(q), tuple(y), jnp.zeros(0))
+    np.testing.assert_allclose(values, event_values(scene, jj.motion_at(scene, t, q, u)), rtol=1e-14)
+    watched = WatchedDisc()
+    assert jj.lower(watched).events == ()
+    assert jj.lower(watched).operations == program.operations
+    found = jj.simulate(watched, {"lean": 0.1, "spin_rate": -3.0}, t1=2.0)
+    assert found.result == results.EVENT
+    np.testing.assert_allclose(jnp.hypot(found.q_end[0], found.q_end[1]), 0.5, rtol=1e-9)
+    lanes = jj.rollout(watched, {"lean": np.full(3, 0.1), "spin_rate": -3.0}, t1=2.0)
+    np.testing.assert_allclose(lanes.lanes.t_end, found.t_end, rtol=1e-7)

@@ -53,6 +53,7 @@ class Equations:
     pivots: list[int]  # must not vanish
     guards: list[int] = field(default_factory=list)  # must stay positive
     power: int = 0  # d(T + V)/dt; for scenes that no prescribed pose drives
+    events: list[int] = field(default_factory=list)  # values of the stop events
 
 
 class AppellOnGraph:
@@ -79,13 +80,14 @@ class AppellOnGraph:
         if strategy.free_z:
             *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
             qdot = self.graph.substituted(qdot, kinematics.known)
+        true_z = {int(self.traced.u[k]): n for k, n in zip(self.dependent, z, strict=True)}
+        events = self.graph.substituted(self.traced.at.events.tolist(), true_z)
         if self.structure.homogeneous:
-            true_z = {int(self.traced.u[k]): n for k, n in zip(self.dependent, z, strict=True)}
             (power,) = self.graph.substituted([int(self.traced.at.power)], true_z)
         elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
             power = power if np.allclose(*self.probes([power, true_power]), rtol=1e-9, atol=1e-9) else true_power
-        return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots])), sorted(guards), power)
+        return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots])), sorted(guards), power, events)
 
     def _not_needed(self, held: dict[int, int]) -> dict[int, int]:
         """The held coordinates on whose value no dependent speed and no rate depends, at any probe."""

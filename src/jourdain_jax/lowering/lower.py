@@ -17,7 +17,7 @@ from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.equations.structure import Structure, sample_states, structure_of, symmetric_states
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
-from jourdain_jax.lowering.trace import named_values, traced_scene
+from jourdain_jax.lowering.trace import event_values, named_values, traced_scene
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.interpret import Unsupported
 from jourdain_jax.scene.scene import Scene
@@ -123,10 +123,10 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         if count < fewest and _agree(_values(candidate, probes), expected):
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
-    groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power]]
+    groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power], best.events]
     outputs = graph.with_quotients([n for group in groups for n in group])
     ends = np.cumsum([len(group) for group in groups])
-    qdot, ydot, z, pivots, guards, power = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
+    qdot, ydot, z, pivots, guards, power, events = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
     names = scene.coordinate_names.entries
     return Lowered(
         traced=builder.traced,
@@ -144,6 +144,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         typical=tuple(np.nanmedian(np.abs(probes(pivots)), axis=1).tolist()),
         guards=guards,
         power=None if structure.driven else power[0],
+        events=events,
         held=tuple(names[i] for i in held),
         stages=tuple(stages),
         way=way.description,
@@ -160,7 +161,7 @@ def _check_against_dense(scene: Scene, structure: Structure, probes: Probes, fou
     t = np.broadcast_to(probes.inputs["t_0"], probes.count)
     sizes = (len(scene.coordinate_names), len(scene.speed_names), len(scene.inputs))
     q, u, inputs = (np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0)) for p, n in zip("qui", sizes, strict=True))
-    dense = _dense_rates(structure.independent)(parameters, t, q, u, inputs)
+    *dense, dense_events = _dense_rates(structure.independent)(parameters, t, q, u, inputs)
     expected = np.concatenate(dense, axis=1).T
     names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in structure.independent)]
     usable = np.all(np.isfinite(values), axis=0) & np.all(np.isfinite(expected), axis=0)
@@ -171,15 +172,17 @@ def _check_against_dense(scene: Scene, structure: Structure, probes: Probes, fou
     if np.max(error) > TO_DENSE:
         worst = names[int(np.argmax(error))]
         raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: a body, load or row has a derivative of its own there")
+    if found.events and not np.allclose(probes(found.events)[:, usable], dense_events.T[:, usable], rtol=TO_DENSE, atol=TO_DENSE, equal_nan=True):
+        raise NotLowered("the value of a stop event differs from the dense path")
 
 
 @lru_cache(maxsize=64)
 def _dense_rates(independent: tuple[int, ...]):
-    """`(scene, t, q, u, inputs) -> qdot, ydot` by dense matrices, for many states and parameters, uncompiled."""
+    """`(scene, t, q, u, inputs) -> qdot, ydot, event values` by dense matrices, for many states and parameters, uncompiled."""
 
     def one(scene, t, q, y, inputs):
         _, motion, found = minimal_accelerations(scene, independent, t, q, y, inputs)
-        return motion.qdot.array, found.udot[np.array(independent, int)]
+        return motion.qdot.array, found.udot[np.array(independent, int)], event_values(scene, motion)
 
     return on_numbers(lambda scene, t, q, u, inputs: jax.vmap(one)(scene, t, q, u[:, np.array(independent, int)], inputs))
 

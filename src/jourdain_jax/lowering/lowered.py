@@ -47,6 +47,7 @@ class Lowered:
     typical: tuple[float, ...]  # their magnitude at the probes
     guards: tuple[int, ...]  # must stay positive
     power: int | None  # d(T + V)/dt where it is not zero by structure; None where poses are driven
+    events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
     held: tuple[str, ...]  # ignorable coordinates, set to the reference in the accelerations
     stages: tuple[Stage, ...]
     way: str  # which way of building it took fewest operations
@@ -142,6 +143,11 @@ class Lowered:
             ratio = jax.lax.stop_gradient(value) / size
             pivot = jnp.sign(pivot) * jnp.sign(ratio) * jnp.minimum(jnp.abs(pivot), jnp.abs(ratio))
         return u, pivot
+
+    def event_values(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "events *lanes"]:
+        """Values of the stop events, sorted by name; arguments as in `rates`."""
+        out = run(self.graph, self.events, self._known(fixed, t, q, y, inputs))
+        return jnp.stack([jnp.broadcast_to(jnp.asarray(c, jnp.result_type(*q)), jnp.shape(q[0])) for c in out])
 
     def _known(self, fixed, t, q, y, inputs) -> dict[int, Float[Array, "*lanes"]]:
         return dict(zip(self._variables, (*fixed, t, *q, *y, *inputs), strict=True))

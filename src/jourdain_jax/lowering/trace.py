@@ -3,6 +3,7 @@
 v, omega (body axes), phi, qdot      of (t, q, u)
 F, L (body axes), Q_direct, power    impressed forces
 m, I                                 inertias
+c                                    stop events
 """
 
 from dataclasses import dataclass
@@ -12,14 +13,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Num
+from jaxtyping import Array, Float, Num
 
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, velocities_of
 from jourdain_jax.equations.power import explicit_power
 from jourdain_jax.equations.rows import flatten_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import impressed
 from jourdain_jax.program.graph import Graph
-from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
+from jourdain_jax.program.interpret import Nodes, Unsupported, as_nodes, interpret
+from jourdain_jax.scene.answers import events_of
+from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
 Entries: TypeAlias = Array | np.ndarray
@@ -41,9 +44,10 @@ class VelocityQuantities(eqx.Module):
     torque: Num[Entries, "bodies 3"]  # body axes
     direct: Num[Entries, "speeds"]
     power: Num[Entries, ""]  # of loads without a potential, and of potentials that depend on time
+    events: Num[Entries, "events"]  # sorted by name
 
 
-def velocity_quantities(scene: Scene, t, q, u, inputs) -> VelocityQuantities:
+def velocity_quantities(scene: Scene, t, q, u, inputs, with_events: bool = True) -> VelocityQuantities:
     """The same on numbers."""
     motion = motion_at(scene, t, q, u, inputs)
     velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion)
@@ -61,7 +65,14 @@ def velocity_quantities(scene: Scene, t, q, u, inputs) -> VelocityQuantities:
         loads.torque,
         loads.direct,
         explicit_power(scene, motion),
+        event_values(scene, motion) if with_events else jnp.zeros(0),
     )
+
+
+def event_values(scene: Scene, motion: Motion) -> Float[Array, "events"]:
+    """Values of the stop events, sorted by name."""
+    events = events_of(scene, motion)
+    return jnp.stack([events[name] for name in sorted(events)]) if events else jnp.zeros(0)
 
 
 @dataclass
@@ -78,12 +89,23 @@ class TracedScene:
 
 
 def traced_scene(scene: Scene) -> TracedScene:
-    """The scene as a graph; `Unsupported` where it cannot be."""
+    """The scene as a graph, without its stop events where these alone cannot be; `Unsupported` where it cannot be."""
+    try:
+        return _traced(scene, True)
+    except Unsupported:
+        return _traced(scene, False)
+
+
+def _traced(scene: Scene, with_events: bool) -> TracedScene:
     leaves, treedef = jax.tree.flatten(scene)
     real = jnp.result_type(float)
     state = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),), (len(scene.inputs),))]
     numbers = [jax.ShapeDtypeStruct(np.shape(x), real) for x in leaves]
-    closed, shape = jax.make_jaxpr(lambda leaves, *state: velocity_quantities(jax.tree.unflatten(treedef, leaves), *state), return_shape=True)(numbers, *state)
+
+    def quantities(leaves, t, q, u, inputs):
+        return velocity_quantities(jax.tree.unflatten(treedef, leaves), t, q, u, inputs, with_events)
+
+    closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
     graph = Graph()
     parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(leaves)]
     t, q, u, inputs = (_inputs(graph, name, s.shape, True) for name, s in zip("tqui", state, strict=True))

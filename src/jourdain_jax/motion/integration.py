@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.calculus.guards import forward_only, reverse_only
-from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion import lean_loop, results
 from jourdain_jax.motion.event_location import Located, locate
@@ -23,7 +22,6 @@ from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
 from jourdain_jax.motion.trajectory import Trajectory
-from jourdain_jax.scene.answers import events_of
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
@@ -177,14 +175,14 @@ def _without_faults(scene: Scene, start: State):
 def _by_lean_loop(setup: Setup, begun: Begun) -> Solved:
     form, options = setup.form, setup.options
     moving = form.projects_positions or form.projects_speeds
-    return _lean(setup, begun.y0, begun.args, setup.ts, _rates, _project if moving else None, _stacked_events if options.event_names else None)
+    return _lean(setup, begun.y0, begun.args, setup.ts, _rates, _project if moving else None, _events if options.event_names else None)
 
 
 def _lanes_by_lean_loop(setups: Setup, begun: Begun) -> Solved:
     """Lanes in lockstep: their axis comes first outside and last inside."""
     form, options = setups.form, setups.options
     moving = form.projects_positions or form.projects_speeds
-    events = _lane_by_lane(_stacked_events) if options.event_names else None
+    events = _events_of_lanes if options.event_names else None
     y0, ts = _lanes_last((begun.y0, setups.ts))
     solved = _lean(setups, y0, begun.args, ts, _rates_of_lanes, _lane_by_lane(_project) if moving else None, events)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solved)
@@ -220,7 +218,11 @@ def _lane_by_lane(function):
 
 def _rates_of_lanes(t, y, args):
     form, scene, inputs, fixed = args
-    return form.rates(scene, fixed, t, y, eqx.filter_vmap(lambda inputs, t: inputs(t), out_axes=-1)(inputs, t))
+    return form.rates(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
+
+
+def _inputs_of_lanes(inputs, t) -> Float[Array, "inputs lanes"]:
+    return eqx.filter_vmap(lambda inputs, t: inputs(t), out_axes=-1)(inputs, t)
 
 
 def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
@@ -242,7 +244,7 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
         saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)]),
         stepsize_controller=land_on(ts, controller) if options.land else controller,
         adjoint=options.adjoint,
-        event=diffrax.Event({name: _EventValue(name) for name in names}, direction=False) if names else None,
+        event=diffrax.Event({name: _EventValue(i) for i, name in enumerate(names)}, direction=False) if names else None,
         max_steps=options.max_steps,
         throw=False,
     )
@@ -273,7 +275,7 @@ def _located_end(solved: Solved, args, t0, names) -> Located:
     happened = solved.event >= 0
 
     def value(t, y, args):
-        return _stacked_events(t, y, args)[solved.event]
+        return _events(t, y, args)[solved.event]
 
     # a motion that starts beyond an event has no motion at all
     return locate(_rates, value, solved.t_end, solved.y_end, args, happened & (solved.t_end != t0), solved.t_end - t0)
@@ -315,22 +317,25 @@ def _project(t, y, args):
 
 
 @eqx.filter_jit
-def _event_values(t, y, args):
+def _events(t, y, args) -> Float[Array, "events *lanes"]:
     form, scene, inputs, fixed = args
-    return events_of(scene, motion_at(scene, t, *form.unpack(scene, fixed, t, y, inputs(t)), inputs(t)))
+    return form.events(scene, fixed, t, y, inputs(t))
 
 
-def _stacked_events(t, y, args) -> Float[Array, "events"]:
-    return jnp.stack(list(_event_values(t, y, args).values()))
+def _events_of_lanes(t, y, args):
+    form, scene, inputs, fixed = args
+    if form.lowers_events:
+        return form.events(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
+    return _lane_by_lane(_events)(t, y, args)
 
 
 class _EventValue(eqx.Module):
     """Value of one named event of the scene, in the signature of diffrax."""
 
-    name: str = eqx.field(static=True)
+    index: int = eqx.field(static=True)
 
     def __call__(self, t, y, args, **kwargs):
-        return _event_values(t, y, args)[self.name]
+        return _events(t, y, args)[self.index]
 
 
 def _mark_inputs(adjoint, tree):

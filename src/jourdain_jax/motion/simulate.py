@@ -162,9 +162,7 @@ def _warn_float32(dtype, rtol) -> None:
         )
 
 
-def state_form(
-    scene: Scene, structure: Structure, state="auto", reduction=None, stabilisation=None, projection=True, work=True, lowering=True
-) -> StateForm:
+def state_form(scene: Scene, structure: Structure, state="auto", reduction=None, stabilisation=None, projection=True, work=True, lowering=True) -> StateForm:
     """How the scene's state is integrated, given what was asked."""
     if state not in _STATE_FORMS:
         raise ValueError(f"unknown state form `{state}`; {nearest(state, _STATE_FORMS)}")

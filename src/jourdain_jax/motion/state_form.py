@@ -18,6 +18,7 @@ from jourdain_jax.equations.power import power
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Privileged
 from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.lowering.trace import event_values
 from jourdain_jax.scene.scene import Scene
 
 
@@ -75,6 +76,17 @@ class StateForm(eqx.Module):
         if self.lowered is not None:
             return self.lowered.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[1]
         return jnp.ones(()) if self.independent is None else speeds_and_pivot(scene, self.independent, t, y.q, y.v, inputs)[1]
+
+    def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
+        """Values of the stop events, sorted by name; lanes only where `lowers_events`."""
+        if self.lowered is not None and self.lowered.events:
+            return self.lowered.event_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
+        return event_values(scene, motion_at(scene, t, *self.unpack(scene, fixed, t, y, inputs), inputs))
+
+    @property
+    def lowers_events(self) -> bool:
+        """Whether stop events are part of the scalar program."""
+        return self.lowered is not None and bool(self.lowered.events)
 
     def rates(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
         """Time derivative of the integrated state."""

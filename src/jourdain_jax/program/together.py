@@ -4,7 +4,6 @@ XLA on a CPU gives each result of a program a loop of its own and computes in ea
 loop, though; so each value is reduced with a zero beside it. To JAX this is the identity: linear, element by element.
 """
 
-
 import jax.numpy as jnp
 from jax import lax
 from jax.extend.core import Primitive
