@@ -184,7 +184,7 @@ def _together(scene, fixed, options, varied, parameters) -> Trajectory:
         own = scene.replace(**parameters) if parameters else scene
         if isinstance(varied, State):
             return simulate(own, varied, **options)
-        return simulate(own, consistent_start(own, t0=_first_time(options), **fixed, **varied), **options)
+        return simulate(own, consistent_start(own, t0=_first_time(options), inputs=options.get("inputs"), **fixed, **varied), **options)
 
     return jax.vmap(lane)(varied, parameters)
 

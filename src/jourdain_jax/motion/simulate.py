@@ -91,7 +91,8 @@ def simulate(
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, solver=solver, adjoint=adjoint, stepsize_controller=stepsize_controller, saveat=saveat)
     _check_adjoint(adjoint)
     made_here = not isinstance(start, State)
-    start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts)
+    inputs = as_inputs(scene, inputs)
+    start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs)
     structure = structure_of(scene)
     form = state_form(scene, structure, state, reduction, stabilisation, projection, work, lowering, batch)
     _warn_float32(start.q.dtype, rtol)
@@ -107,7 +108,6 @@ def simulate(
         saveat=None if saveat is None else _checked_saveat(saveat),
         event_names=names_of_events(scene) if events else (),
     )
-    inputs = as_inputs(scene, inputs)
     start = _on_constraints(scene, t0, start, inputs(t0), made_here) if projection else start
     motion = integrate(scene, start, inputs, t0, t1, ts, form, options)
     if state == "auto" and not isinstance(motion.result, jax.core.Tracer) and int(motion.result) in lost_codes(form):
