@@ -45,7 +45,7 @@ def test_a_start_meets_rows_that_depend_on_inputs_at_its_time(speed):
 def test_given_values_are_compared_with_the_rows_at_the_inputs():
     kept = jj.start(OnBelt(), y=0.5, x_rate=4.5, inputs={"speed": 3.0})
     assert (kept["x_rate"], kept["y"]) == (4.5, 0.5)
-    with pytest.raises(ValueError, match="contradicts row `belt`: residual 1.5 is left"):
+    with pytest.raises(ValueError, match=r"contradicts row `belt`: residual 1.5 is left"):
         jj.start(OnBelt(), y=0.5, x_rate=4.5, inputs={"speed": 2.0})
     with pytest.raises(ValueError, match=r"contradicts row `belt`: residual 4.5 is left"):
         jj.start(OnBelt(), y=0.5, x_rate=4.5)
