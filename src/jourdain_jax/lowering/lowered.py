@@ -44,7 +44,7 @@ class Lowered:
     pivots: tuple[int, ...]  # must not vanish
     typical: tuple[float, ...]  # their magnitude at the probes
     guards: tuple[int, ...]  # must stay positive
-    power: int | None  # d(T + V)/dt where it is not zero by structure; None where poses are driven
+    power: int | None  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated); None where poses are driven
     held: tuple[str, ...]  # ignorable coordinates, set to the reference in the accelerations
     stages: tuple[Stage, ...]
     way: str  # which way of building it took fewest operations

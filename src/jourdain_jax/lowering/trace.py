@@ -40,11 +40,11 @@ class VelocityQuantities(eqx.Module):
     force: Num[Entries, "bodies 3"]
     torque: Num[Entries, "bodies 3"]  # body axes
     direct: Num[Entries, "speeds"]
-    power: Num[Entries, ""]  # of loads without a potential, and of potentials that depend on time
+    power: Num[Entries, ""]  # of loads without a potential, and of potentials that depend on time or on inputs
 
 
-def velocity_quantities(scene: Scene, t, q, u, inputs) -> VelocityQuantities:
-    """The same on numbers."""
+def velocity_quantities(scene: Scene, t, q, u, inputs, of_inputs: tuple[int, ...] = ()) -> VelocityQuantities:
+    """The same on numbers; `of_inputs`: numbers of the loads whose potential depends on inputs."""
     motion = motion_at(scene, t, q, u, inputs)
     velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion)
     return VelocityQuantities(
@@ -60,7 +60,7 @@ def velocity_quantities(scene: Scene, t, q, u, inputs) -> VelocityQuantities:
         loads.force,
         loads.torque,
         loads.direct,
-        explicit_power(scene, motion),
+        explicit_power(scene, motion, of_inputs),
     )
 
 
@@ -77,13 +77,14 @@ class TracedScene:
     at: VelocityQuantities
 
 
-def traced_scene(scene: Scene) -> TracedScene:
-    """The scene as a graph; `Unsupported` where it cannot be."""
+def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
+    """The scene as a graph; `Unsupported` where it cannot be. `of_inputs`: numbers of the loads whose potential depends on inputs."""
     leaves, treedef = jax.tree.flatten(scene)
     real = jnp.result_type(float)
     state = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),), (len(scene.inputs),))]
     numbers = [jax.ShapeDtypeStruct(np.shape(x), real) for x in leaves]
-    closed, shape = jax.make_jaxpr(lambda leaves, *state: velocity_quantities(jax.tree.unflatten(treedef, leaves), *state), return_shape=True)(numbers, *state)
+    quantities = lambda leaves, *state: velocity_quantities(jax.tree.unflatten(treedef, leaves), *state, of_inputs)  # noqa: E731
+    closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
     graph = Graph()
     parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(leaves)]
     t, q, u, inputs = (_inputs(graph, name, s.shape, True) for name, s in zip("tqui", state, strict=True))

@@ -171,6 +171,7 @@ def state_form(
         projects_speeds=projection and not minimal and bool(structure.row_names),
         lowered=program if isinstance(program, Lowered) else None,
         as_scalars=batch and isinstance(program, Lowered),
+        of_inputs=structure.potentials_of_inputs,
     )
 
 
