@@ -2,7 +2,7 @@
 
 States are drawn from the scene's domain, together with the symmetric configurations (zero and right angles), where partitions that look
 well at random states are singular; all are projected onto the geometric rows. Probing runs on concrete numbers also while a scene's
-parameters are traced (the class's default values stand in), so that the choice is static.
+parameters are traced (numbers near the class's defaults stand in), so that the choice is static.
 """
 
 import itertools
@@ -120,8 +120,8 @@ def _assembled(scene: Scene, miss: np.ndarray, generic: np.ndarray) -> np.ndarra
     if not good[generic].any():
         raise ValueError(
             f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by {np.min(miss[generic]):.1e} or "
-            "more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, the "
-            "class's default values stood in for them)"
+            "more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, "
+            "numbers near their defaults stood in for them, or near one where they have none: give defaults near the values in use)"
         )
     return good
 
