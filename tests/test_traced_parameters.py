@@ -124,7 +124,7 @@ def test_defaults_at_which_rows_are_dependent_do_not_decide_for_traced_parameter
 
 
 def test_traced_parameters_at_which_rows_become_dependent_are_flagged_or_right():
-    eager, code = sliding(front=0.3, rear=0.3)
+    _, code = sliding(front=0.3, rear=0.3)
     assert int(code) == results.SUCCESS
     for same in (0.3, -0.2):
         q, code = jax.jit(lambda front, rear: sliding(front=front, rear=rear))(same, same)
