@@ -74,6 +74,20 @@ class Hanging(jj.Scene):
         return (jj.gravity(motion, 9.81),)
 
 
+class SmallLoop(jj.Scene):
+    """A bead on a small ring, in a domain of the ring's size; its radius has no default."""
+
+    radius: jnp.ndarray = jj.parameter(unit="m", positive=True)
+    coordinates = jj.coordinates("x z")
+    domain = {"x": (-0.03, 0.03), "z": (-0.03, 0.03)}
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(0.1, jnp.stack([q.x, 0.0 * q.x, q.z]))}
+
+    def geometric_constraints(self, pose):
+        return {"ring": jnp.sqrt(jnp.maximum(0.0025 - pose.q.x**2 - pose.q.z**2, 0.0)) - jnp.sqrt(0.0025 - self.radius**2)}
+
+
 OPTIONS = {"ts": jnp.array([0.0, 0.4, 0.8]), "rtol": 1e-10, "atol": 1e-10}
 
 
@@ -110,6 +124,12 @@ def test_parameters_without_defaults_may_be_traced():
     np.testing.assert_allclose(along[1], along[2], rtol=1e-9)  # only their sum counts
     np.testing.assert_allclose(along[0], 0.0, atol=1e-9)
     np.testing.assert_allclose(along[1], (end(0.3, 2.0 + 1e-4, 0.5) - end(0.3, 2.0 - 1e-4, 0.5)) / 2e-4, rtol=1e-6)
+
+
+def test_a_traced_parameter_without_default_that_fits_no_state_of_the_domain_is_refused():
+    assert jj.structure_of(SmallLoop(radius=0.02)).rank == 1
+    with pytest.raises(ValueError, match="numbers near their defaults stood in for them, or near one where they have none: give defaults near"):
+        jax.jit(lambda radius: jj.structure_of(SmallLoop(radius=radius)).rank)(0.02)
 
 
 def test_defaults_at_which_rows_are_dependent_do_not_decide_for_traced_parameters():
@@ -181,3 +201,10 @@ def test_stand_ins_of_parameters_with_equal_defaults_differ(kind):
     jax.eval_shape(look, *np.ones(len(names)))
     numbers = [float(x) for x in jax.tree.leaves(seen["scene"])]
     assert len(set(numbers)) == len(names)
+
+
+def test_a_program_made_where_rows_do_no_work_is_not_taken_where_they_do():
+    still, blown = (jj.simulate(Slope(slope=0.7, wind=wind), {"x": 0.5}, **OPTIONS) for wind in (0.0, 1.3))
+    assert still.work is None
+    assert blown.reduction.endswith("lowered")
+    np.testing.assert_allclose(blown.work[-1], 0.5 * 2.0 * 1.3**2 * ((1 + blown["x"][-1]) ** 2 - 1.5**2), rtol=1e-8)
