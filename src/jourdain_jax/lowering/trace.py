@@ -83,7 +83,7 @@ def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
     real = jnp.result_type(float)
     state = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),), (len(scene.inputs),))]
     numbers = [jax.ShapeDtypeStruct(np.shape(x), real) for x in leaves]
-    quantities = lambda leaves, *state: velocity_quantities(jax.tree.unflatten(treedef, leaves), *state, of_inputs)  # noqa: E731
+    quantities = lambda leaves, t, q, u, inputs: velocity_quantities(jax.tree.unflatten(treedef, leaves), t, q, u, inputs, of_inputs)  # noqa: E731
     closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
     graph = Graph()
     parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(leaves)]
