@@ -1,10 +1,19 @@
 """Build and compile time of every model, cold and with a warm compile cache.
 
-    python bench/compile_time.py [MODEL ...] [--out bench/results/compile_time.json]
+    taskset -c 0 python bench/compile_time.py [MODEL ...] [--quick] [--json FILE]
 
-Every model is measured in two fresh processes that share one compile cache: the first fills it ("cold"), the second reads it ("warm
-cache"). Columns, in seconds: `structure` probes rank and privileged velocities, `start` finds a consistent start, `simulate` is the first
-simulation of the model's example over 1 s, `again` the second one (nothing is compiled). Importing the package is not counted.
+Every model is measured in two fresh processes that share one compile cache, empty at first: the first process fills it ("cold", writing
+included), the second reads it ("warm cache"). In seconds, one after another in each process:
+
+    import      jax and the package
+    structure   probing of rank, privileged velocities and kinds of rows
+    lowering    the scalar program, or why there is none
+    start       the first consistent start, of the model's example
+    first       the first simulation: the example over its own span, 101 times saved
+    second      the same again, nothing is compiled
+    total       import to first simulation: what one waits for a first result
+
+`--json` writes {"about": ..., "seconds": [{"model", "lowered", "cold": {...}, "warm_cache": {...}}]}. `--quick`: three models.
 """
 
 import argparse
@@ -16,55 +25,95 @@ import sys
 import tempfile
 from pathlib import Path
 
+LAPS = ("import", "structure", "lowering", "start", "first", "second")
+QUICK = ("skate", "tilting-disc", "whipple-bicycle")
 PROBE = """
-import json, sys, time
+import time
+clock, laps = time.perf_counter, {}
+begin = clock()
+import json, sys
 import jax, jax.numpy as jnp
 import jourdain_jax as jj
-scene = jj.models.MODELS[sys.argv[1]]()
-clock, laps = time.perf_counter, {}
+laps["import"] = clock() - begin
+
 def lap(name, f):
-    begin = clock(); result = jax.block_until_ready(f()); laps[name] = clock() - begin
+    begin = clock()
+    result = f()
+    jax.block_until_ready(result)
+    laps[name] = clock() - begin
     return result
-lap("structure", lambda: jj.structure_of(scene))
+
+def lower():
+    try:
+        return jj.lower(scene) is not None
+    except jj.NotLowered:
+        return False
+
+scene = jj.models.MODELS[sys.argv[1]]()
+lap("structure", lambda: jj.structure_of(scene) and None)
+lowered = lap("lowering", lower)
 start = lap("start", lambda: jj.start(scene, **scene.example))
-run = lambda: jj.simulate(scene, start, ts=jnp.linspace(0.0, 1.0, 101)).q_end
-lap("simulate", run)
-lap("again", run)
-print(json.dumps(laps))
+run = lambda: jj.simulate(scene, start, ts=jnp.linspace(0.0, scene.example_span, 101))
+lap("first", run)
+motion = lap("second", run)
+motion.raise_if_failed()
+print(json.dumps({"lowered": bool(lowered), "laps": laps}))
 """
 
 
-def measured(name: str, cache: str) -> dict[str, float]:
+def measured(name: str, cache: str) -> dict:
     """Times of one model in a fresh process."""
-    environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    done = subprocess.run([sys.executable, "-c", PROBE, name], env=environment, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout.splitlines()[-1])
+    environment = os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": cache,
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+    }
+    done = subprocess.run([sys.executable, "-c", PROBE, name], env=environment, capture_output=True, text=True)
+    if done.returncode != 0:
+        raise RuntimeError(f"measuring `{name}` failed: {done.stderr.strip().splitlines()[-1] if done.stderr.strip() else done.returncode}")
+    found = json.loads(done.stdout.splitlines()[-1])
+    found["laps"]["total"] = sum(found["laps"][lap] for lap in LAPS[:-1])
+    return found
 
 
-def main() -> None:
-    """Measure, print a table, write a file."""
-    from jourdain_jax.models import MODELS
+def row(name: str, laps: dict[str, float]) -> str:
+    """One line of the table."""
+    return f"{name:<40}" + "".join(f"{laps[lap]:>11.4f}" if lap == "second" else f"{laps[lap]:>11.2f}" for lap in (*LAPS, "total"))
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", nargs="*", default=list(MODELS), metavar="MODEL")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "compile_time.json")
-    options = parser.parse_args()
-    results = {}
-    print(f"{'model':<28}{'structure':>10}{'start':>8}{'simulate':>10}{'again':>9}{'  | warm cache: structure':>26}{'start':>8}{'simulate':>10}")
-    for name in options.models:
-        with tempfile.TemporaryDirectory() as cache:
-            cold, warm = measured(name, cache), measured(name, cache)
-        results[name] = {"cold": cold, "warm_cache": warm}
-        columns = [f"{cold['structure']:10.2f}{cold['start']:8.2f}{cold['simulate']:10.2f}{cold['again']:9.4f}"]
-        columns.append(f"{warm['structure']:26.2f}{warm['start']:8.2f}{warm['simulate']:10.2f}")
-        print(f"{name:<28}{''.join(columns)}", flush=True)
+
+def main() -> int:
+    """Measure, print a table, write a file; 1 where a model failed."""
     import jax
     import jaxlib
 
-    about = {"jax": jax.__version__, "jaxlib": jaxlib.__version__, "python": platform.python_version(), "cores": os.cpu_count(), "precision": "float64"}
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps({"about": about, "seconds": results}, indent=1) + "\n", encoding="utf-8")
+    from jourdain_jax.models import MODELS
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("models", nargs="*", metavar="MODEL", help="names as in `jourdain-jax models` (default: all)")
+    parser.add_argument("--quick", action="store_true", help=f"only {', '.join(QUICK)}")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
+    options = parser.parse_args()
+    unknown = [name for name in options.models if name not in MODELS]
+    if unknown:
+        parser.error(f"no model `{unknown[0]}`; valid names: {', '.join(MODELS)}")
+    results, failures = [], 0
+    print(f"{'seconds':<40}" + "".join(f"{lap:>11}" for lap in (*LAPS, "total")))
+    for name in options.models or (QUICK if options.quick else MODELS):
+        try:
+            with tempfile.TemporaryDirectory() as cache:
+                cold, warm = measured(name, cache), measured(name, cache)
+        except RuntimeError as error:
+            failures += 1
+            print(error, file=sys.stderr, flush=True)
+            continue
+        results.append({"model": name, "lowered": cold["lowered"], "cold": cold["laps"], "warm_cache": warm["laps"]})
+        print(row(name + ("" if cold["lowered"] else " (dense)"), cold["laps"]))
+        print(row("  with a warm compile cache", warm["laps"]), flush=True)
+    if options.json:
+        about = {"jax": jax.__version__, "jaxlib": jaxlib.__version__, "python": platform.python_version(), "cores": os.cpu_count(), "precision": "float64"}
+        options.json.write_text(json.dumps({"about": about, "seconds": results}, indent=1) + "\n", encoding="utf-8")
+    return 1 if failures else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

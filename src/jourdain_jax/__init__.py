@@ -61,7 +61,7 @@ from jourdain_jax.motion.results import SimulationError
 from jourdain_jax.motion.rollout import Rollout, rollout
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import State, consistent, start
-from jourdain_jax.motion.storage import load, save
+from jourdain_jax.motion.storage import load, load_rollout, save
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.plotting.animation import animate
 from jourdain_jax.plotting.quantities import plot

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.equations.accelerations import bare_accelerations
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.power import power
-from jourdain_jax.equations.structure import sample_states
+from jourdain_jax.equations.structure import sample_states, structure_of
 from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy, unconstrained_equations
 from jourdain_jax.scene.scene import Scene
 
@@ -66,6 +66,7 @@ def energy_balance(scene: Scene, *, points: int = 8, seed: int = 0) -> EnergyBal
     powers, size = _powers(scene, t, q, u, inputs)
     limit = (1e-9 if q.dtype == jnp.float64 else 1e-4) * float(jnp.max(size))
     changed_by = tuple(text for name, text in _ORIGINS.items() if float(jnp.max(jnp.abs(getattr(powers, name)))) > limit)
+    changed_by += ("potentials that depend on inputs",) if structure_of(scene).potentials_of_inputs else ()
     return EnergyBalance(not changed_by, changed_by)
 
 

@@ -117,8 +117,9 @@ def linearize(
 
     **Raises** ValueError: an unknown coordinate or speed, a coordinate that is both named and dependent, or whose rate is no privileged speed.
     """
-    state = as_state(as_scene(scene), state, what="state")
-    f = as_input_vector(scene, inputs, state.q.dtype).astype(state.q.dtype)
+    f = as_input_vector(as_scene(scene), inputs)
+    state = as_state(scene, state, what="state", inputs=f)
+    f = f.astype(state.q.dtype)
     coordinates = None if coordinates is None else as_names(coordinates)
     y = privileged_speeds(scene, privileged)
     dependent_s = dependent_coordinates(scene, state, coordinates or (), None if dependent is None else as_names(dependent))

@@ -128,7 +128,7 @@ def check_starts(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns)
         moved, moved_runs = unknowns.put_into(scene, runs, unknowns.values(vector))
         for index, run in enumerate(moved_runs):
             try:
-                consistent_start(moved, t0=run.t0, **run.start)
+                consistent_start(moved, t0=run.t0, inputs=run.inputs, **run.start)
             except ValueError as error:
                 why = "no longer meets the constraints when the unknowns change: the values in `start` depend on each other" if changed else "is not admissible"
                 raise ValueError(f"the start of run {index} {why}. {error}") from None

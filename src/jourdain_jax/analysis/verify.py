@@ -59,9 +59,9 @@ def verify(scene: Scene, state: State | dict | None = None, inputs: Numbers | di
 
     **Returns** a `Verification`. Nothing is raised for a failed check; not under jit or vmap.
     """
-    state = as_state(as_scene(scene), state, what="state")
+    inputs = as_input_vector(as_scene(scene), inputs)
+    state = as_state(scene, state, what="state", inputs=inputs)
     t, q, u = state.t, state.q, state.u
-    inputs = as_input_vector(scene, inputs)
     found = jax.tree.map(np.asarray, _evaluate(scene, t, q, u, inputs))
     applicable = [name for name, ok in found["applicable"].items() if ok]
     Z = jnp.asarray(found["directions"])

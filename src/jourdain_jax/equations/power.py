@@ -6,9 +6,15 @@
                 + dV/dt at fixed poses          potentials that depend on time
                 + sum mdot v.v/2 + omega.(dI/dt omega)/2   masses and inertias that change: matter that joins a body at the body's own velocity
 
-A term that is zero at every state by the scene's structure is left out, not computed.
+A term that is zero at every state by the scene's structure is left out, not computed. Inputs count as constant here. Where the potential V_i of a
+load depends on inputs, these do the work dV_i/df . df/dt besides. It is found without a derivative of the inputs, which may jump:
+
+    W = integral of (power - dV_i/dt at fixed poses + F_i.v + L_i.omega + Q_i u) dt + V_i(t) - V_i(t0)        (`rate_of_work`, `stored_by_inputs`)
+
 Source: Wang and Pao (2003), eqs. (71)-(73).
 """
+
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -43,7 +49,7 @@ class Power(eqx.Module):
 def needs_work(scene: Scene, structure: Structure) -> bool:
     """Whether anything changes T + V, so that the work done must be integrated beside the motion: any term above that is not zero by structure."""
     by_structure = structure.driven or structure.varying_inertia or _rows_work(structure) or "potential" in structure.timed
-    return by_structure or _some_load_has_no_potential(scene)
+    return by_structure or bool(structure.potentials_of_inputs) or _some_load_has_no_potential(scene)
 
 
 def _rows_work(structure: Structure) -> bool:
@@ -63,7 +69,7 @@ def _some_load_has_no_potential(scene: Scene) -> bool:
 
 
 def power_of_nonconservative(scene: Scene, t, q, u, inputs, accelerations: Accelerations | Reduced) -> Float[Array, ""]:
-    """`d(T + V)/dt` in W along the motion with the given accelerations: zero where the energy T + V is conserved."""
+    """`d(T + V)/dt` in W along the motion with the given accelerations, at constant inputs: zero where the energy T + V is conserved."""
     return power(scene, motion_at(scene, t, q, u, inputs), accelerations).total
 
 
@@ -76,19 +82,41 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
         # lambda . (A u), which is lambda . phi = 0 for rows homogeneous and linear in u
         rows=accelerations.constraint_force @ motion.u.array if _rows_work(structure) else zero,
         driven=_power_of_drives(scene, motion, accelerations.udot) if structure.driven else zero,
-        potential=_explicit_rate_of_potential(scene, motion) if structure.driven or "potential" in structure.timed else zero,
+        potential=_explicit_rate(scene, motion, potential_energy) if structure.driven or "potential" in structure.timed else zero,
         inertia=_power_of_changing_inertia(scene, motion) if structure.varying_inertia else zero,
     )
 
 
-def explicit_power(scene: Scene, motion: Motion) -> Float[Array, ""]:
-    """The part that needs no accelerations: of loads without a potential, and of potentials that depend on time; W."""
-    return power_of_loads(scene, motion, conservative=False) + _explicit_rate_of_potential(scene, motion)
+def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
+    """What is integrated for the work done, in W: the power, with the forces of the loads `of_inputs` in place of their potentials.
+
+    `of_inputs`: numbers of the loads whose potential depends on inputs; what they store (`stored_by_inputs`) is added to the integral.
+    """
+    return power(scene, motion, accelerations).total + _forces_for_potentials(scene, motion, of_inputs)
 
 
-def power_of_loads(scene: Scene, motion: Motion, *, conservative: bool | None = None) -> Float[Array, ""]:
-    """`sum F.v + L.omega + Q_k u_k` in W; only loads with (`conservative=True`) or without a potential (`False`) if asked."""
-    loads = resultants(scene, motion, conservative=conservative)
+def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
+    """Potential energy in J of the loads with the numbers `of_inputs`."""
+    loads = tuple(loads_of(scene, motion))
+    return sum((loads[k].potential for k in of_inputs), start=jnp.zeros_like(motion.t))
+
+
+def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
+    """The part of `rate_of_work` that needs no accelerations: of loads without a potential, of potentials that depend on time or on inputs; W."""
+    by_time = power_of_loads(scene, motion, conservative=False) + _explicit_rate(scene, motion, potential_energy)
+    return by_time + _forces_for_potentials(scene, motion, of_inputs)
+
+
+def _forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
+    if not of_inputs:
+        return jnp.zeros_like(motion.t)
+    stored = _explicit_rate(scene, motion, lambda scene, motion: stored_by_inputs(scene, motion, of_inputs))
+    return power_of_loads(scene, motion, among=of_inputs) - stored
+
+
+def power_of_loads(scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None) -> Float[Array, ""]:
+    """`sum F.v + L.omega + Q_k u_k` in W; only loads with (`conservative=True`) or without a potential (`False`), or with the numbers `among`."""
+    loads = resultants(scene, motion, conservative=conservative, among=among)
     v = jnp.stack([body.velocity for body in motion.bodies.values()])
     omega = jnp.stack([body.angular_velocity for body in motion.bodies.values()])
     return jnp.sum(loads.force * v) + jnp.sum(loads.torque * omega) + loads.direct @ motion.u.array
@@ -103,14 +131,14 @@ def _power_of_drives(scene: Scene, motion: Motion, udot) -> Float[Array, ""]:
     return jnp.sum(total.linear * v) + jnp.sum(total.angular * omega)
 
 
-def _explicit_rate_of_potential(scene: Scene, motion: Motion) -> Float[Array, ""]:
-    """`dV/dt` with all poses held, and with coordinates moving only as they do at `u = 0`."""
+def _explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Float[Array, ""]:
+    """`dV/dt` of a `potential` with all poses held, and with coordinates moving only as they do at `u = 0`."""
     q = motion.q.array
     nu = coordinate_rates(scene, motion.t, q, jnp.zeros_like(motion.u.array))
 
     def V(t, q):
         held = eqx.tree_at(lambda m: (m.t, m.q.array), motion, (t, q))
-        return potential_energy(scene, held)
+        return potential(scene, held)
 
     return jax.jvp(V, (motion.t, q), (jnp.ones_like(motion.t), nu))[1]
 

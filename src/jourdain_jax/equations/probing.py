@@ -7,6 +7,7 @@ anything is compiled, and it is found by evaluating the scene at a few states.
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import fields
 from functools import lru_cache, wraps
 
 import equinox as eqx
@@ -14,7 +15,6 @@ import jax
 import numpy as np
 
 from jourdain_jax.program.uncompiled import uncompiled
-from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 
@@ -76,33 +76,51 @@ def standing_in(scene: Scene) -> Iterator[None]:
 def concretised(scene: Scene) -> Scene:
     """The scene with numbers in place of traced parameters: generic ones near those that stand in, the class's defaults, or one.
 
-    Generic, because a default of zero (a tilt, a rate) must not pass for a term that is absent.
+    Generic, because a default of zero (a tilt, a rate) must not pass for a term that is absent, nor two equal defaults for one length.
     """
-    if not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(scene)):
+    leaves, treedef = jax.tree.flatten(scene)
+    if not any(_is_traced(x) for x in leaves):
         return scene
+    near = _defaults(scene)
     known = _STAND_IN.get()
-    if known is not None and jax.tree.structure(known) == jax.tree.structure(scene):
-        near = lambda x, y: _generic(np.asarray(y, x.dtype)) if _is_traced(x) and not _is_traced(y) and np.shape(x) == np.shape(y) else x  # noqa: E731
-        scene = jax.tree.map(near, scene, known)
-    for name, value, _ in parameters_of(scene):
-        if isinstance(value, jax.core.Tracer):
-            default = scene.__dataclass_fields__[name].default
-            usable = isinstance(default, int | float) or hasattr(default, "shape")
-            number = _generic(np.broadcast_to(np.asarray(default, value.dtype), value.shape)) if usable else _near_one(value)
-            scene = eqx.tree_at(lambda s, name=name: getattr(s, name), scene, number)
-    return jax.tree.map(lambda x: _near_one(x) if isinstance(x, jax.core.Tracer) else x, scene)
+    if known is not None and jax.tree.structure(known) == treedef:
+        near = [y if _is_number(y) and np.shape(y) == np.shape(x) else d for x, y, d in zip(leaves, jax.tree.leaves(known), near, strict=True)]
+    numbers = [_generic(x, y, place) if _is_traced(x) else x for place, (x, y) in enumerate(zip(leaves, near, strict=True))]
+    return jax.tree.unflatten(treedef, numbers)
+
+
+def _defaults(scene: Scene) -> list:
+    """The class's default for every leaf of a scene, or None."""
+    found: list = []
+    for field in fields(scene):
+        if field.metadata.get("static", False):
+            continue
+        leaves = jax.tree.leaves(getattr(scene, field.name))
+        default = jax.tree.leaves(field.default)
+        if len(default) != len(leaves):
+            default = [field.default if len(leaves) == 1 else None] * len(leaves)
+        found += default
+    return found
 
 
 def _is_traced(x) -> bool:
     return isinstance(x, jax.core.Tracer)
 
 
-def _generic(x: np.ndarray) -> np.ndarray:
-    return np.asarray(np.where(x == 0, 0.1, x) * (1.0 + 0.01 * np.random.default_rng(0).uniform(size=x.shape)), x.dtype)
+def _is_number(x) -> bool:
+    return x is not None and not _is_traced(x)
 
 
-def _near_one(x) -> np.ndarray:
-    return np.asarray(1.0 + 0.1 * np.random.default_rng(0).uniform(size=x.shape), x.dtype)
+def _generic(x, near, place: int) -> np.ndarray:
+    """Numbers of the shape of x, near what is given (or one), unlike those at any other `place`."""
+    draws = np.random.default_rng(place).uniform(size=np.shape(x))
+    try:
+        near = np.broadcast_to(np.asarray(near, x.dtype), np.shape(x))
+    except (TypeError, ValueError):  # no numbers, or as many of them as do not fit
+        near = np.full(np.shape(x), np.nan)
+    if not np.all(np.isfinite(near)):
+        return np.asarray(1.0 + 0.1 * draws, x.dtype)
+    return np.asarray(np.where(near == 0, 0.1, near) * (1.0 + 0.01 * draws), x.dtype)
 
 
 def on_numbers(f: Callable) -> Callable:

@@ -2,7 +2,7 @@
 
 States are drawn from the scene's domain, together with the symmetric configurations (zero and right angles), where partitions that look
 well at random states are singular; all are projected onto the geometric rows. Probing runs on concrete numbers also while a scene's
-parameters are traced (the class's default values stand in), so that the choice is static.
+parameters are traced (numbers near the class's defaults stand in), so that the choice is static.
 """
 
 import itertools
@@ -22,6 +22,7 @@ from jourdain_jax.equations.projection import closure_residual, project_position
 from jourdain_jax.equations.rows import names_of_rows, position_residual, velocity_residual
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import mass_matrix_at, potential_energy, resultants
+from jourdain_jax.scene.answers import loads_of
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.numbers import is_traced
@@ -55,6 +56,7 @@ class Structure:
     timed: tuple[str, ...]  # what depends on time by itself, out of `TIMED`
     driven: bool  # bodies or coordinates move, or bodies turn, while all speeds are zero
     varying_inertia: bool  # masses or central inertias change along the motion
+    potentials_of_inputs: tuple[int, ...]  # numbers of the loads whose potential depends on inputs
     chosen_by_user: bool
     faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, as sentences
 
@@ -118,8 +120,8 @@ def _assembled(scene: Scene, miss: np.ndarray, generic: np.ndarray) -> np.ndarra
     if not good[generic].any():
         raise ValueError(
             f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by {np.min(miss[generic]):.1e} or "
-            "more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, the "
-            "class's default values stood in for them)"
+            "more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, "
+            "numbers near their defaults stood in for them, or near one where they have none: give defaults near the values in use)"
         )
     return good
 
@@ -172,6 +174,7 @@ class _Probed(eqx.Module):
     timed: dict[str, Bool[Array, ""]]
     driven: Bool[Array, ""]
     varying_inertia: Bool[Array, ""]
+    potentials_of_inputs: Bool[Array, "loads"]
     miss: Float[Array, ""]  # of the geometric rows
     numbers: PyTree  # of bodies and planes, for their plausibility
 
@@ -197,6 +200,7 @@ def _probe(scene, t, q, u, u_other):
             timed=_timed(scene, t, q, u, inputs),
             driven=_moves((velocities(scene, t, q, at_rest), nu)),
             varying_inertia=_moves(jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), qdot))[1]),
+            potentials_of_inputs=_potentials_of_inputs(scene, t, q, u, inputs),
             miss=_miss(scene, t, q),
             numbers=pose_numbers(scene, t, q),
         )
@@ -221,6 +225,16 @@ def _timed(scene: Scene, t, q, u, inputs) -> dict[str, Bool[Array, ""]]:
 
     rates = jax.jvp(pieces, (t,), (jnp.ones_like(t),))[1]
     return {name: _moves(rates[name]) for name in TIMED}
+
+
+def _potentials_of_inputs(scene: Scene, t, q, u, inputs) -> Bool[Array, "loads"]:
+    """Whether the potential of each load changes with the inputs."""
+
+    def potentials(inputs):
+        return [0.0 * t if load.potential is None else load.potential for load in loads_of(scene, motion_at(scene, t, q, u, inputs))]
+
+    rates = jax.jvp(potentials, (inputs,), (inputs**2,))[1]  # in a generic direction
+    return jnp.stack([_moves(rate) for rate in rates]) if rates else jnp.zeros(0, bool)
 
 
 def _moves(rates) -> Bool[Array, ""]:
@@ -278,6 +292,7 @@ def _probed_structure(scene: Scene) -> Structure:
         timed=tuple(name for name in TIMED if found.timed[name].any()),
         driven=bool(found.driven.any()),
         varying_inertia=bool(found.varying_inertia.any()),
+        potentials_of_inputs=tuple(np.flatnonzero(found.potentials_of_inputs.any(axis=0)).tolist()),
         chosen_by_user=by_user,
         faults=faults,
     )

@@ -42,13 +42,15 @@ class Resultants(eqx.Module):
     direct: Float[Array, "speeds"]
 
 
-def resultants(scene: Scene, motion: Motion, *, conservative: bool | None = None) -> Resultants:
-    """Sum of the loads per body and per speed; only those with (`conservative=True`) or without a potential (`False`) if asked."""
+def resultants(scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None) -> Resultants:
+    """Sum of the loads per body and per speed; only those with (`conservative=True`) or without a potential (`False`), or with the numbers `among`."""
     force = {name: jnp.zeros_like(body.position) for name, body in motion.bodies.items()}
     torque = dict(force)
     direct = {name: jnp.zeros_like(motion.t) for name in scene.speed_names.entries}
-    for load in loads_of(scene, motion):
+    for number, load in enumerate(loads_of(scene, motion)):
         if conservative is not None and conservative != (load.potential is not None):
+            continue
+        if among is not None and number not in among:
             continue
         for total, part, kind in ((force, load.forces, "body"), (torque, load.torques, "body"), (direct, load.generalized, "speed")):
             for name, value in part.items():

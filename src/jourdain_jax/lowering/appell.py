@@ -52,7 +52,7 @@ class Equations:
     f: list[int]
     pivots: list[int]  # must not vanish
     guards: list[int] = field(default_factory=list)  # must stay positive
-    power: int = 0  # d(T + V)/dt; for scenes that no prescribed pose drives
+    power: int = 0  # `rate_of_work`; for scenes that no prescribed pose drives
     events: list[int] = field(default_factory=list)  # values of the stop events
 
 

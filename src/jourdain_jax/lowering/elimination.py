@@ -16,7 +16,7 @@ GOOD = 0.02  # of a pivot, relative to its row, at the worst probe
 
 @dataclass(frozen=True)
 class Eliminated:
-    """`solution[column][k]` of `A x_k = b_k`, and the pivots that may vanish."""
+    """`solution[column][k]` of `A x_k = b_k`, and the pivots that may vanish: along the motion, or for some parameters."""
 
     solution: list[list[int]]
     pivots: list[int]
@@ -46,7 +46,7 @@ def eliminate(graph: Graph, A: list[list[int]], right: list[list[int]], probes: 
         known = [(A[r][k], solution[k]) for k in solution if A[r][k] != graph.zero]
         rest = [graph.sub(b, graph.total(graph.mul(a, x[j]) for a, x in known)) for j, b in enumerate(right[r])]
         solution[c] = [quotient(graph, b, A[r][c]) for b in rest]
-    return Eliminated([solution[c] for c in range(count)], [A[r][c] for r, c in order if graph.varies[A[r][c]]])
+    return Eliminated([solution[c] for c in range(count)], [A[r][c] for r, c in order if graph.op[A[r][c]] != "const"])
 
 
 def quotient(graph: Graph, a: int, b: int) -> int:

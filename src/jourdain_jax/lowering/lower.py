@@ -58,6 +58,7 @@ class _Key:
         self.scene, self.structure = scene, structure
         leaves, treedef = jax.tree.flatten(scene)
         kept = (structure.independent, structure.redundant_rows, structure.affine, structure.well_conditioned, structure.driven)
+        kept += (structure.homogeneous, structure.potentials_of_inputs)
         self.key = (treedef, tuple(np.shape(x) for x in leaves), kept, jnp.result_type(float))
 
     def __hash__(self):
@@ -83,7 +84,7 @@ def _built(key: _Key) -> Lowered:
     if not structure.well_conditioned:
         raise NotLowered("no privileged speeds serve everywhere in its domain")
     try:
-        traced = traced_scene(scene)
+        traced = traced_scene(scene, structure.potentials_of_inputs)
         probes = _probes(scene, traced.graph)
         builder = AppellOnGraph(traced, structure, probes, scene.coordinates.reference(), tuple(first for first, _ in scene.coordinates.quaternions))
         return _best(scene, structure, builder, begin)

@@ -46,7 +46,7 @@ class Lowered:
     pivots: tuple[int, ...]  # must not vanish
     typical: tuple[float, ...]  # their magnitude at the probes
     guards: tuple[int, ...]  # must stay positive
-    power: int | None  # d(T + V)/dt where it is not zero by structure; None where poses are driven
+    power: int | None  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated); None where poses are driven
     events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
     held: tuple[str, ...]  # ignorable coordinates, set to the reference in the accelerations
     stages: tuple[Stage, ...]
@@ -145,7 +145,10 @@ class Lowered:
         return u, pivot
 
     def event_values(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "events *lanes"]:
-        """Values of the stop events, sorted by name; arguments as in `rates`."""
+        """Values of the stop events, sorted by name.
+
+        `fixed`, `q`, `y`, `inputs`: as in `rates`.
+        """
         out = run(self.graph, self.events, self._known(fixed, t, q, y, inputs))
         return jnp.stack([jnp.broadcast_to(jnp.asarray(c, jnp.result_type(*q)), jnp.shape(q[0])) for c in out])
 

@@ -43,12 +43,12 @@ class VelocityQuantities(eqx.Module):
     force: Num[Entries, "bodies 3"]
     torque: Num[Entries, "bodies 3"]  # body axes
     direct: Num[Entries, "speeds"]
-    power: Num[Entries, ""]  # of loads without a potential, and of potentials that depend on time
+    power: Num[Entries, ""]  # of loads without a potential, and of potentials that depend on time or on inputs
     events: Num[Entries, "events"]  # sorted by name
 
 
-def velocity_quantities(scene: Scene, t, q, u, inputs, with_events: bool = True) -> VelocityQuantities:
-    """The same on numbers."""
+def velocity_quantities(scene: Scene, t, q, u, inputs, of_inputs: tuple[int, ...] = (), with_events: bool = True) -> VelocityQuantities:
+    """The same on numbers; `of_inputs`: numbers of the loads whose potential depends on inputs."""
     motion = motion_at(scene, t, q, u, inputs)
     velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion)
     return VelocityQuantities(
@@ -64,7 +64,7 @@ def velocity_quantities(scene: Scene, t, q, u, inputs, with_events: bool = True)
         loads.force,
         loads.torque,
         loads.direct,
-        explicit_power(scene, motion),
+        explicit_power(scene, motion, of_inputs),
         event_values(scene, motion) if with_events else jnp.zeros(0),
     )
 
@@ -88,22 +88,25 @@ class TracedScene:
     at: VelocityQuantities
 
 
-def traced_scene(scene: Scene) -> TracedScene:
-    """The scene as a graph, without its stop events where these alone cannot be; `Unsupported` where it cannot be."""
+def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
+    """The scene as a graph, without its stop events where these alone cannot be; `Unsupported` where it cannot be.
+
+    `of_inputs`: numbers of the loads whose potential depends on inputs.
+    """
     try:
-        return _traced(scene, True)
+        return _traced(scene, of_inputs, True)
     except Unsupported:
-        return _traced(scene, False)
+        return _traced(scene, of_inputs, False)
 
 
-def _traced(scene: Scene, with_events: bool) -> TracedScene:
+def _traced(scene: Scene, of_inputs: tuple[int, ...], with_events: bool) -> TracedScene:
     leaves, treedef = jax.tree.flatten(scene)
     real = jnp.result_type(float)
     state = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),), (len(scene.inputs),))]
     numbers = [jax.ShapeDtypeStruct(np.shape(x), real) for x in leaves]
 
     def quantities(leaves, t, q, u, inputs):
-        return velocity_quantities(jax.tree.unflatten(treedef, leaves), t, q, u, inputs, with_events)
+        return velocity_quantities(jax.tree.unflatten(treedef, leaves), t, q, u, inputs, of_inputs, with_events)
 
     closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
     graph = Graph()

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 import diffrax
 import numpy as np
 
-from jourdain_jax.motion.start import State, start
+from jourdain_jax.motion.start import State, named_start
+from jourdain_jax.scene.arguments import as_input_vector
 from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.scene import Scene
 
@@ -18,8 +19,11 @@ _KINDS = {
 }
 
 
-def as_state(scene: Scene, given, *, what: str = "start", t0=0.0) -> State:
-    """A state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example."""
+def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None) -> State:
+    """A state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
+
+    `inputs`: the scene's inputs at that instant, a vector or by name (default: zero); they count where velocity rows depend on them.
+    """
     if isinstance(given, State):
         return given
     if given is not None and not isinstance(given, Mapping):
@@ -27,7 +31,7 @@ def as_state(scene: Scene, given, *, what: str = "start", t0=0.0) -> State:
             f"`{what}` is {described(given)}, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None for the "
             "scene's example"
         )
-    return start(scene, t0=t0, **(scene.example if given is None else given))
+    return named_start(scene, scene.example if given is None else given, t0, as_input_vector(scene, inputs))
 
 
 def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, **objects) -> None:

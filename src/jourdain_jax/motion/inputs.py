@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -48,6 +49,16 @@ class Constant(eqx.Module):
         return self.value
 
 
+class FunctionOfTime(eqx.Module):
+    """An input as a given function of time: no numbers of its own, so that motions with it can be batched."""
+
+    function: Callable = eqx.field(static=True)
+
+    def __call__(self, t):
+        """Value at time t."""
+        return self.function(t)
+
+
 class Inputs(eqx.Module):
     """All inputs of a scene, in order; `inputs(t)` is their vector."""
 
@@ -74,5 +85,10 @@ def as_inputs(scene: Scene, given) -> Inputs:
     for name in scene.inputs.entries:
         value = given.get(name, 0.0)
         advice = "give a number, a function of time, or `jj.Sampled(ts, values)`"
-        channels.append(value if callable(value) else Constant(checked_real(value, f"input `{name}` of `{type(scene).__name__}`", (), advice=advice)))
+        if callable(value):
+            leaves = jax.tree.leaves(value)
+            plain = len(leaves) == 1 and leaves[0] is value  # a module may hold arrays to be differentiated, and is kept as it is
+            channels.append(FunctionOfTime(value) if plain else value)
+            continue
+        channels.append(Constant(checked_real(value, f"input `{name}` of `{type(scene).__name__}`", (), advice=advice)))
     return Inputs(tuple(channels))

@@ -121,6 +121,7 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
     solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, _mark_outputs(adjoint, (solved.ys, solved.y_end)))
     end = _located_end(solved, args, t0, options.event_names)
     moving = form.projects_positions or form.projects_speeds
+    stored_first = form.stored(scene, t0, start.q, inputs(t0))
     before_end = (solved.ts - t0) * jnp.sign(t1 - t0) <= (end.t - t0) * jnp.sign(t1 - t0)
     valid = solved.reached & before_end
 
@@ -129,7 +130,8 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
         t, y = jnp.where(valid, t, end.t), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, end.y)
         y = _project(t, y, args) if moving and not options.lean else y
         q, u = form.unpack(scene, fixed, t, y, inputs(t))
-        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (q, u, y.work)), form.pivot(scene, fixed, t, y, inputs(t))
+        work = None if y.work is None else y.work + form.stored(scene, t, q, inputs(t)) - stored_first
+        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (q, u, work)), form.pivot(scene, fixed, t, y, inputs(t))
 
     # the end state as one more saved one, so that all this is compiled once
     with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), (end.t, end.y, jnp.array(True)))

@@ -182,7 +182,8 @@ def _together(scene, fixed, options, varied, parameters) -> Trajectory:
 
     def lane(varied, parameters):
         own = scene.replace(**parameters) if parameters else scene
-        start = varied if isinstance(varied, State) else consistent_start(own, t0=_first_time(options), **fixed, **varied)
+        at_start = {"t0": _first_time(options), "inputs": options.get("inputs")}
+        start = varied if isinstance(varied, State) else consistent_start(own, **at_start, **fixed, **varied)
         return set_up(own, start, **options)
 
     return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))

@@ -112,7 +112,8 @@ def _set_up(
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, solver=solver, adjoint=adjoint, stepsize_controller=stepsize_controller, saveat=saveat)
     _check_adjoint(adjoint)
     made_here = not isinstance(start, State)
-    start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts)
+    inputs = as_inputs(scene, inputs)
+    start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs)
     form = state_form(scene, structure_of(scene), state, reduction, stabilisation, projection, work, lowering)
     _warn_float32(start.q.dtype, rtol)
     options = Options(
@@ -126,7 +127,6 @@ def _set_up(
         saveat=None if saveat is None else _checked_saveat(saveat),
         event_names=names_of_events(scene) if events else (),
     )
-    inputs = as_inputs(scene, inputs)
     start = _on_constraints(scene, t0, start, inputs(t0), made_here) if projection else start
     return Setup(scene, start, inputs, t0, t1, ts, form, options)
 
@@ -182,6 +182,7 @@ def state_form(scene: Scene, structure: Structure, state="auto", reduction=None,
         projects_positions=projection and _is_closed(scene),
         projects_speeds=projection and not minimal and bool(structure.row_names),
         lowered=program if isinstance(program, Lowered) else None,
+        of_inputs=structure.potentials_of_inputs,
     )
 
 

@@ -6,21 +6,22 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.motion.arguments import as_state
+from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.scene import Scene
 
 DEFAULT_SAMPLES = 201
 
 
-def span_and_start(scene: Scene, start, t0, t1, ts):
-    """The start as a state, t0, the times to save at, t1; a ValueError where they do not go together."""
+def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs):
+    """The start as a state (with the inputs at t0), t0, the times to save at, t1; a ValueError where they do not go together."""
     real = jnp.result_type(float)
     ts = None if ts is None else saved_times(ts)
     if t0 is None:
         t0 = start.t if isinstance(start, State) else 0.0
     if t1 is None:
         t1 = t0 + scene.example_span if ts is None else ts[-1]
-    start = as_state(scene, start, t0=t0)
+    start = as_state(scene, start, t0=t0, inputs=None if isinstance(start, State) else inputs(jnp.asarray(t0, real)))
     if start.q.ndim != 1:
         raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
     t0, t1 = jnp.asarray(t0, real), jnp.asarray(t1, real)

@@ -3,6 +3,8 @@
 g(t, q) = 0,  phi(t, q, u) = 0
 """
 
+from collections.abc import Mapping
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,7 @@ from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.printing import Printed
@@ -87,17 +90,23 @@ _compiled_projection = eqx.filter_jit(_put_onto_constraints)  # one program for 
 _uncompiled_projection = on_numbers(_put_onto_constraints)
 
 
-def start(scene: Scene, *, t0: Number = 0.0, **values) -> State:
+def start(scene: Scene, *, t0: Number = 0.0, inputs=None, **values) -> State:
     """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`.
 
     `values` that are given are kept, at time `t0` (s). Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;
     where dependent speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
+    `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; what they are at `t0` counts where velocity rows depend on them.
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
     """
+    return named_start(scene, values, t0, as_inputs(as_scene(scene), inputs)(jnp.asarray(t0, jnp.result_type(float))))
+
+
+def named_start(scene: Scene, values: Mapping, t0, inputs: Float[Array, "inputs"]) -> State:
+    """The same from a dictionary of `values`, and the `inputs` at time `t0` as a vector."""
     q, u, given = as_scene(scene).named(**values)
     _check_finite(values)
-    state = consistent(scene, t0, q, u, held=(*given, *_resting(scene, given)))
-    _check_residual(scene, state, given)
+    state = consistent(scene, t0, q, u, inputs, held=(*given, *_resting(scene, given)))
+    _check_residual(scene, state, inputs, given)
     return state
 
 
@@ -110,17 +119,17 @@ def _resting(scene: Scene, given: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name for name in privileged if name not in given)
 
 
-def _check_finite(values: dict) -> None:
+def _check_finite(values: Mapping) -> None:
     for name, value in values.items():
         if not isinstance(value, jax.core.Tracer) and not np.all(np.isfinite(np.asarray(value, float))):
             raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
 
 
-def _check_residual(scene: Scene, state: State, given: tuple[str, ...]) -> None:
+def _check_residual(scene: Scene, state: State, inputs, given: tuple[str, ...]) -> None:
     if isinstance(state.residual, jax.core.Tracer) or float(state.residual) < 1e3 * np.sqrt(np.finfo(state.q.dtype).eps):
         return
     g = np.abs(np.asarray(closure_residual(scene, state.t, state.q)))
-    phi = np.abs(np.asarray(velocity_residual(scene, state.t, state.q, state.u)))
+    phi = np.abs(np.asarray(velocity_residual(scene, state.t, state.q, state.u, inputs)))
     names = list(names_of_position_rows(scene))
     names += [f"norm of quaternion {k + 1}" for k in range(len(g) - len(names))] + list(names_of_rows(scene))
     worst = int(np.argmax(np.concatenate([g, phi])))

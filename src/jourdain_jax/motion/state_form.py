@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.equations.accelerations import Baumgarte, bare_accelerations
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations, speeds_and_pivot, speeds_from_privileged
-from jourdain_jax.equations.power import power
+from jourdain_jax.equations.power import rate_of_work, stored_by_inputs
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Privileged
 from jourdain_jax.lowering.lowered import Lowered
@@ -40,6 +40,7 @@ class StateForm(eqx.Module):
     projects_positions: bool = eqx.field(static=True)
     projects_speeds: bool = eqx.field(static=True)
     lowered: Lowered | None = eqx.field(static=True, default=None)  # the scalar program of the rates; None: dense matrices
+    of_inputs: tuple[int, ...] = eqx.field(static=True, default=())  # numbers of the loads whose potential depends on inputs
 
     @property
     def name(self) -> str:
@@ -71,6 +72,12 @@ class StateForm(eqx.Module):
             return y.q, self.lowered.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
         return y.q, y.v if self.independent is None else speeds_from_privileged(scene, self.independent, t, y.q, y.v, inputs)
 
+    def stored(self, scene: Scene, t, q, inputs) -> Float[Array, ""]:
+        """What loads whose potential depends on inputs store, J: with its change, the integrated work is the work done."""
+        if not (self.with_work and self.of_inputs):
+            return jnp.zeros((), q.dtype)
+        return stored_by_inputs(scene, motion_at(scene, t, q, jnp.zeros(len(scene.speed_names), q.dtype), inputs), self.of_inputs)
+
     def pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, ""]:
         """How well the privileged speeds determine the others, with a sign that changes where they do not (1 for the full state)."""
         if self.lowered is not None:
@@ -100,7 +107,7 @@ class StateForm(eqx.Module):
             motion = motion_at(scene, t, y.q, u, inputs)
             found = bare_accelerations(scene, t, y.q, u, inputs, reduction=self.reduction, stabilisation=self.stabilisation)
         v = found.udot if self.independent is None else found.udot[jnp.array(self.independent, jnp.int32)]
-        return Integrated(motion.qdot.array, v, power(scene, motion, found).total if self.with_work else None)
+        return Integrated(motion.qdot.array, v, rate_of_work(scene, motion, found, self.of_inputs) if self.with_work else None)
 
     def project(self, scene: Scene, t, y: Integrated, inputs, iterations: int = 2) -> Integrated:
         """The state put back onto geometric rows, quaternion norms and (full state) velocity rows."""

@@ -1,14 +1,18 @@
-"""Saving and loading trajectories: NumPy's `.npz`, readable by anything that reads `.npz`.
+"""Saving and loading motions: NumPy's `.npz`, readable by anything that reads `.npz`.
 
 Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent where not tracked), `t_end`, `q_end`, `u_end`,
 `result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `inputs` (times, inputs; sampled at `ts`), and `parameter:NAME` for every
-parameter. `header` is JSON text: `format`, `scene` (class name), `coordinates`, `speeds`, `input_names`, `units` of the parameters,
-`static` (fields that are no parameters), `state_form`, `reduction`, `solver`, `projected`, `event_names`, `versions`.
+field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`, `speeds`, `input_names`, `units` of the parameters,
+`static` (fields that are plain numbers or texts), `state_form`, `reduction`, `solver`, `projected`, `event_names`, `versions`.
+`kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `continued` holds
+the numbers of the lanes that were run again with the full state.
 """
 
 import json
 import os
 import zipfile
+import zlib
+from collections.abc import Iterator
 from dataclasses import fields
 
 import jax
@@ -16,6 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.motion.inputs import Inputs, Sampled
+from jourdain_jax.motion.results import BAD_PARAMETER
+from jourdain_jax.motion.rollout import Rollout
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.motion.versions import version_of
 from jourdain_jax.scene.names import nearest
@@ -25,25 +31,36 @@ from jourdain_jax.scene.scene import Scene
 
 _ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", "result", "event", "accepted", "rejected", "moved_q", "moved_u", "smallest_pivot")
 _TEXTS = ("state_form", "reduction", "solver", "projected")
+_HEADER = ("scene", "coordinates", "speeds", "input_names", "static", "event_names", *_TEXTS)
+_READERS = {"trajectory": "jj.load(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
 
 
-def save(trajectory: Trajectory, path: str | os.PathLike) -> None:
-    """Write a `trajectory` to `path` (`.npz`, format 1 above). Inputs are stored as samples at the saved times."""
-    _check_saved(trajectory, path)
+def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
+    """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of `motion/storage.py`).
+
+    Inputs are stored as samples at the saved times. ValueError where the path is a folder, or the scene has a field that is no array, number or text.
+    Read it with `load` or `load_rollout`.
+    """
+    _check_saved(motion, path)
+    many = isinstance(motion, Rollout)
+    trajectory = motion.lanes if isinstance(motion, Rollout) else motion
     scene = trajectory.scene
     arrays = {name: np.asarray(getattr(trajectory, name)) for name in _ARRAYS}
     if trajectory.work is not None:
         arrays["work"] = np.asarray(trajectory.work)
-    arrays["inputs"] = np.asarray(jax.vmap(trajectory.inputs)(trajectory.ts)).reshape(len(trajectory.ts), len(scene.inputs))
-    arrays |= {f"parameter:{name}": np.asarray(value) for name, value, _ in parameters_of(scene)}
+    arrays["inputs"] = np.asarray((jax.vmap(_sampled) if many else _sampled)(trajectory.inputs, trajectory.ts))
+    arrays |= {f"parameter:{name}": np.asarray(getattr(scene, name)) for name in _array_fields(scene)}
+    if isinstance(motion, Rollout):
+        arrays["continued"] = np.array(motion.continued, int)
     header = {name: getattr(trajectory, name) for name in _TEXTS} | {
         "format": 1,
+        "kind": "rollout" if many else "trajectory",
         "scene": type(scene).__name__,
         "coordinates": scene.coordinate_names.entries,
         "speeds": scene.speed_names.entries,
         "input_names": scene.inputs.entries,
         "units": {name: metadata["unit"] for name, _, metadata in parameters_of(scene)},
-        "static": {name: getattr(scene, name) for name in _static_fields(scene)},
+        "static": dict(_static_fields(scene)),
         "event_names": trajectory.event_names,
         "versions": {name: version_of(name) for name in ("jourdain-jax", "jax", "diffrax", "numpy")},
     }
@@ -51,14 +68,26 @@ def save(trajectory: Trajectory, path: str | os.PathLike) -> None:
         np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
 
 
-def _check_saved(trajectory, path) -> None:
-    """One motion, and a path that can be written."""
-    if hasattr(trajectory, "lane"):
-        raise ValueError("`save` takes one motion and was given a rollout; save its lanes one by one: jj.save(rollout.lane(0), 'lane-0.npz')")
-    if not isinstance(trajectory, Trajectory):
-        raise ValueError(f"`save` was given {described(trajectory)}, expected a `Trajectory` from `jj.simulate`")
-    if trajectory.q.ndim != 2:
-        raise ValueError(f"`save` takes one motion and was given a batch of shape {trajectory.q.shape[:-2]}; save them one by one")
+def _sampled(inputs: Inputs, ts):
+    return jax.vmap(inputs)(ts).reshape(ts.shape[0], len(inputs.channels))
+
+
+def _check_saved(motion, path) -> None:
+    """One motion or a rollout, of a scene that can be stored, and a path that can be written."""
+    if not isinstance(motion, Trajectory | Rollout):
+        raise ValueError(f"`save` was given {described(motion)}, expected a `Trajectory` from `jj.simulate` or a `Rollout` from `jj.rollout`")
+    if isinstance(motion, Trajectory) and motion.q.ndim != 2:
+        raise ValueError(
+            f"`save` takes one motion and was given a batch of shape {motion.q.shape[:-2]}; save a `Rollout`, `jj.Rollout(batch)` for one axis of lanes"
+        )
+    scene = motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
+    stored = {*_array_fields(scene), *(name for name, _ in _static_fields(scene))}
+    for field in fields(scene):
+        if field.init and field.name not in stored and getattr(scene, field.name) is not field.default:
+            raise ValueError(
+                f"field `{field.name}` of `{type(scene).__name__}` is {described(getattr(scene, field.name))}, which `save` cannot store; "
+                "expected arrays, numbers or texts, or the class's default"
+            )
     if os.path.isdir(path):
         raise ValueError(f"cannot write `{os.fspath(path)}`: it is a folder; give the name of a file in it, such as motion.npz")
 
@@ -66,48 +95,109 @@ def _check_saved(trajectory, path) -> None:
 def load(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
     """Read a trajectory written by `save` from `path`. `scene`: the scene's class, or any scene of that class; parameters come from the file.
 
-    ValueError where the file cannot be read, is of another format, or belongs to another scene.
+    ValueError where the file cannot be read, is of another format, holds a rollout, or belongs to another scene.
     """
-    header, arrays = _read(path)
-    kind = scene if isinstance(scene, type) else type(scene)
-    if header["scene"] != kind.__name__:
-        raise ValueError(f"`{path}` holds a trajectory of `{header['scene']}`, expected `{kind.__name__}`; pass the class it was made with")
+    header, arrays = _read(path, "trajectory")
+    kind = _checked_class(path, scene, header, arrays)
+    arrays["input_ts"], arrays["inputs"] = _samples(arrays["ts"], arrays["inputs"])
+    if int(arrays["result"]) == BAD_PARAMETER:  # what cannot be built by itself: as a lane, where parameters are not looked at
+        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), _lanes(kind, header, {name: x[None] for name, x in arrays.items()}))
+    return _trajectory(kind, header, arrays)
+
+
+def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout:
+    """Read a rollout written by `save` from `path`: all its lanes, failed ones too, each with its result code.
+
+    `scene`: the scene's class, or any scene of that class; parameters come from the file. ValueError where the file cannot be read, is of another
+    format, holds one trajectory, or belongs to another scene.
+    """
+    header, arrays = _read(path, "rollout")
+    kind = _checked_class(path, scene, header, arrays)
+    continued = tuple(arrays.pop("continued").tolist())
+    lanes = [_samples(ts, inputs) for ts, inputs in zip(arrays["ts"], arrays["inputs"], strict=True)]
+    longest = max(len(times) for times, _ in lanes)  # lanes with fewer are filled up with their last sample
+    arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in lanes])
+    arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in lanes])
+    return Rollout(_lanes(kind, header, arrays), continued)
+
+
+def _lanes(kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
+    """Trajectories from arrays with a leading axis of lanes, which may be failed ones: built under `vmap`, where no value is refused."""
+    return jax.vmap(lambda arrays: _trajectory(kind, header, arrays))(arrays)
+
+
+def _trajectory(kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
     values = {name.removeprefix("parameter:"): value for name, value in arrays.items() if name.startswith("parameter:")}
-    known = [field.name for field in fields(kind)]
-    unknown = [name for name in (*values, *header["static"]) if name not in known]
-    if unknown:
-        raise ValueError(f"`{path}` has a parameter `{unknown[0]}` that `{kind.__name__}` has not; {nearest(unknown[0], known)}")
-    rebuilt = kind(**values, **header["static"])
-    forward = np.argsort(arrays["ts"])  # of a motion in reversed time
-    inputs = Inputs(tuple(Sampled(arrays["ts"][forward], column[forward]) for column in arrays["inputs"].T))
+    scene = kind(**values, **header["static"])
+    for name, now in (("coordinates", scene.coordinate_names), ("speeds", scene.speed_names), ("input_names", scene.inputs)):
+        if tuple(header[name]) != now.entries:
+            raise ValueError(
+                f"the file holds the {name.replace('_', ' ')} {', '.join(header[name])}, but `{kind.__name__}` has {', '.join(now.entries) or 'none'}; "
+                "pass the class as it was when the file was written"
+            )
     return Trajectory(
-        scene=rebuilt,
+        scene=scene,
         work=jnp.asarray(arrays["work"]) if "work" in arrays else None,
-        inputs=inputs,
+        inputs=Inputs(tuple(Sampled(arrays["input_ts"], column) for column in arrays["inputs"].T)),
         event_names=tuple(header["event_names"]),
         **{name: jnp.asarray(arrays[name]) for name in _ARRAYS},
         **{name: header[name] for name in _TEXTS},
     )
 
 
-def _read(path) -> tuple[dict, dict]:
+def _samples(ts: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Samples of the inputs in increasing time, also of a motion in reversed time, without times that were not reached."""
+    reached = np.flatnonzero(np.isfinite(ts))
+    times, first = np.unique(ts[reached], return_index=True)
+    return (times, inputs[reached][first]) if times.size else (np.zeros(1), np.zeros((1, inputs.shape[1])))
+
+
+def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict) -> type[Scene]:
+    """The class of the scene; a ValueError where it is not the one in the file, or has other parameters or names than at that time."""
+    kind = scene if isinstance(scene, type) else type(scene)
+    if header["scene"] != kind.__name__:
+        raise ValueError(f"`{path}` holds a {header['kind']} of `{header['scene']}`, expected `{kind.__name__}`; pass the class it was made with")
+    known = [field.name for field in fields(kind)]
+    for name in (*(name.removeprefix("parameter:") for name in arrays if name.startswith("parameter:")), *header["static"]):
+        if name not in known:
+            raise ValueError(f"`{path}` has a parameter `{name}` that `{kind.__name__}` has not; {nearest(name, known)}")
+    counts = {"coordinates": arrays["q"].shape[-1], "speeds": arrays["u"].shape[-1], "input_names": arrays["inputs"].shape[-1]}
+    for name, count in counts.items():
+        if len(header[name]) != count:
+            raise ValueError(f"`{path}` has {count} columns for {len(header[name])} {name.replace('_', ' ')}; it is damaged or was not written by `save`")
+    return kind
+
+
+def _read(path, kind: str) -> tuple[dict, dict]:
+    """Header and arrays of a file of this kind."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        header = json.loads(str(arrays.pop("header")))
+        header = dict(json.loads(str(arrays.pop("header"))))
     except FileNotFoundError:
         raise ValueError(f"there is no file `{path}`; check the path") from None
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"`{path}` is no trajectory file, or is damaged ({error}); expected an .npz written by `save`") from None
+    except (OSError, ValueError, TypeError, AttributeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"`{path}` is no {kind} file, or is damaged ({error}); expected an .npz written by `save`") from None
     if header.get("format") != 1:
         raise ValueError(f"`{path}` has format {header.get('format')}, expected 1; read it with the version of jourdain-jax that wrote it")
-    missing = [name for name in (*_ARRAYS, "inputs") if name not in arrays]
+    found = header.setdefault("kind", "trajectory")
+    if found != kind:
+        raise ValueError(f"`{path}` holds a {found}, expected a {kind}; read it with `{_READERS.get(found, 'the version of jourdain-jax that wrote it')}`")
+    missing = [name for name in (*_ARRAYS, "inputs", *(["continued"] if kind == "rollout" else [])) if name not in arrays]
+    missing += [name for name in _HEADER if name not in header]
     if missing:
-        raise ValueError(f"`{path}` lacks the array `{missing[0]}`; it is damaged or was not written by `save`")
+        raise ValueError(f"`{path}` lacks `{missing[0]}`; it is damaged or was not written by `save`")
     return header, arrays
 
 
-def _static_fields(scene: Scene) -> list[str]:
+def _array_fields(scene: Scene) -> list[str]:
+    """Parameters, and other fields that are arrays."""
+    kept = [field for field in fields(scene) if field.init and not field.metadata.get("static")]
+    return [field.name for field in kept if isinstance(getattr(scene, field.name), jax.Array | np.ndarray)]
+
+
+def _static_fields(scene: Scene) -> Iterator[tuple[str, object]]:
     """Fields that are plain numbers or texts, such as a number of bodies."""
-    parameters = {name for name, _, _ in parameters_of(scene)}
-    return [field.name for field in fields(scene) if field.name not in parameters and isinstance(getattr(scene, field.name), int | float | str | bool)]
+    for field in fields(scene):
+        if field.init and isinstance(getattr(scene, field.name), int | float | str | bool):
+            yield field.name, getattr(scene, field.name)

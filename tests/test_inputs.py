@@ -1,0 +1,182 @@
+"""Inputs: what they are at the start counts in the start, and their rates in the balance of energy."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import jourdain_jax as jj
+from jourdain_jax.models import ChaplyginSleigh
+
+
+class OnBelt(jj.Scene):
+    """A bead that slides across a belt; the belt, at the speed of an input, carries it along faster the farther out it is."""
+
+    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
+    coordinates = jj.coordinates("x y")
+    inputs = jj.inputs("speed push")
+    domain = {"y": (-0.4, 0.4)}
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, y_rate=motion.inputs.push),)
+
+    def velocity_constraints(self, motion):
+        return {"belt": motion.u.x_rate - (1.0 + motion.q.y) * motion.inputs.speed}
+
+
+SPEEDS = {
+    "number": 3.0,
+    "function": lambda t: 1.0 + t**2 / 2.0,
+    "samples": jj.Sampled([0.0, 4.0], [1.0, 5.0]),
+}
+
+
+@pytest.mark.parametrize("speed", SPEEDS.values(), ids=SPEEDS)
+def test_a_start_meets_rows_that_depend_on_inputs_at_its_time(speed):
+    start = jj.start(OnBelt(), t0=2.0, y=0.5, inputs={"speed": speed})
+    np.testing.assert_allclose(start["x_rate"], 1.5 * 3.0, rtol=1e-14)
+    assert start.residual < 1e-14
+    assert jj.start(OnBelt(), t0=2.0, y=0.5)["x_rate"] == 0.0
+
+
+def test_given_values_are_compared_with_the_rows_at_the_inputs():
+    kept = jj.start(OnBelt(), y=0.5, x_rate=4.5, inputs={"speed": 3.0})
+    assert (kept["x_rate"], kept["y"]) == (4.5, 0.5)
+    with pytest.raises(ValueError, match=r"contradicts row `belt`: residual 1.5 is left"):
+        jj.start(OnBelt(), y=0.5, x_rate=4.5, inputs={"speed": 2.0})
+    with pytest.raises(ValueError, match=r"contradicts row `belt`: residual 4.5 is left"):
+        jj.start(OnBelt(), y=0.5, x_rate=4.5)
+
+
+def test_a_start_follows_its_inputs_smoothly_and_in_batches():
+    def carried(speed):
+        return jj.start(OnBelt(), y=0.5, inputs={"speed": speed})["x_rate"]
+
+    np.testing.assert_allclose(jax.jit(jax.vmap(jax.grad(carried)))(jnp.array([1.0, 3.0])), 1.5, rtol=1e-14)
+
+
+def test_named_starts_of_simulate_rollout_and_linearize_meet_rows_that_depend_on_inputs():
+    scene, values, inputs = OnBelt(), {"y": 0.5, "x_rate": 4.5}, {"speed": 3.0}
+    alone = jj.simulate(scene, values, ts=[0.0, 0.5], inputs=inputs).raise_if_failed()
+    assert alone.moved_u == 0.0
+    np.testing.assert_allclose(alone.q_end, [4.5 * 0.5, 0.5], rtol=1e-12)
+    starts = {"y": np.array([0.5, 0.2]), "x_rate": np.array([4.5, 3.6])}
+    lanes = jj.rollout(scene, starts, ts=[0.0, 0.5], inputs=inputs, progress=False)
+    assert lanes.failed.size == 0
+    np.testing.assert_allclose(lanes["x"][:, -1], [4.5 * 0.5, 3.6 * 0.5], rtol=1e-12)
+    assert jj.linearize(scene, values, (), inputs=inputs).A.shape[0] > 0
+    assert jj.verify(scene, values, inputs=inputs).passed
+
+
+@pytest.mark.parametrize("inputs", [{"spede": 1.0}, {"speed": "fast"}, {"speed": [1.0, 2.0]}, [1.0, 2.0], 3.0], ids=str)
+def test_a_start_refuses_inputs_in_the_words_of_simulate(inputs):
+    said = []
+    for f in (lambda: jj.start(OnBelt(), inputs=inputs), lambda: jj.simulate(OnBelt(), {}, t1=1.0, inputs=inputs)):
+        with pytest.raises(ValueError) as error:
+            f()
+        said.append(str(error.value))
+    assert said[0] == said[1]
+
+
+def test_a_scene_without_inputs_takes_none_in_a_start():
+    with pytest.raises(ValueError, match="`ChaplyginSleigh` has no input `force`"):
+        jj.start(ChaplyginSleigh(), inputs={"force": 1.0})
+
+
+# Potentials that depend on inputs. ------------------------------------------------------------------------------------
+
+
+class PulledBead(jj.Scene):
+    """A bead between a spring to the origin and one, stiffening in time, to a hand at the place of an input; a damper besides."""
+
+    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
+    stiffness: jnp.ndarray = jj.parameter(18.0, unit="N/m")
+    stiffening: jnp.ndarray = jj.parameter(5.0, unit="N/m/s")
+    damping: jnp.ndarray = jj.parameter(0.5, unit="N s/m")
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("push hand")
+    example = {"x": 0.2}
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        bead, hand = motion["bead"].point(), jnp.stack([motion.inputs.hand, 0.0 * motion.t, 0.0 * motion.t])
+        return (
+            jj.spring(bead, jj.fixed_point((0.0, 0.0, 0.0)), self.stiffness),
+            jj.spring(bead, jj.fixed_point(hand), self.stiffness + self.stiffening * motion.t),
+            jj.generalized_force(motion, x_rate=motion.inputs.push - self.damping * motion.u.x_rate),
+        )
+
+
+KNOTS, PLACES = np.array([0.0, 0.3, 0.7, 1.5]), np.array([0.0, 0.4, -0.1, 0.2])
+SPAN = np.linspace(0.0, 1.5, 6)
+
+
+def work_by_quadrature():
+    """The work on the bead by integrating the power of hand, clock, damper and push, from one knot of the hand's path to the next."""
+    m, k, s, c = 2.0, 18.0, 5.0, 0.5
+    y, works = np.array([0.2, 0.0, 0.0]), {}
+    for start, end, first, last in zip(KNOTS[:-1], KNOTS[1:], PLACES[:-1], PLACES[1:], strict=True):
+        slope = (last - first) / (end - start)
+
+        def rates(t, y, start=start, first=first, slope=slope):
+            x, v, _ = y
+            stretch = x - (first + slope * (t - start))
+            force = 0.7 - c * v
+            return [v, (force - k * x - (k + s * t) * stretch) / m, force * v + 0.5 * s * stretch**2 - (k + s * t) * stretch * slope]
+
+        times = [t for t in SPAN if start <= t <= end]
+        found = solve_ivp(rates, (start, end), y, method="DOP853", rtol=1e-13, atol=1e-14, t_eval=[*times, end] if end not in times else times)
+        works |= dict(zip(times, found.y[2], strict=False))
+        y = found.y[:, -1]
+    return np.array([works[t] for t in SPAN])
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"lowering": False}, {"solver": diffrax.Kvaerno5()}, {"state": "full"}], ids=["lowered", "dense", "diffrax", "full state"]
+)
+def test_the_work_of_a_sampled_input_in_a_potential_is_that_of_a_quadrature(options):
+    inputs = {"hand": jj.Sampled(KNOTS, PLACES), "push": 0.7}
+    motion = jj.simulate(PulledBead(), ts=SPAN, rtol=1e-11, atol=1e-11, inputs=inputs, **options).raise_if_failed()
+    work = work_by_quadrature()
+    # the solver's steps cross the kinks of the hand's path, where its order is lost
+    np.testing.assert_allclose(motion.work, work, atol=1e-8 * np.max(np.abs(work)))
+    balance = np.asarray(motion.energies().balance)
+    np.testing.assert_allclose(balance, balance[0], atol=1e-8 * np.max(np.abs(work)))
+
+
+def test_an_input_that_jumps_does_the_work_of_moving_the_spring_at_once():
+    jumps = {"hand": lambda t: jnp.where(t < 0.5, 0.1, 0.3)}
+    scene = PulledBead(damping=0.0, stiffening=0.0, stiffness=18.0)
+    motion = jj.simulate(scene, ts=jnp.array([0.0, 0.5 - 1e-9, 0.5, 1.0]), rtol=1e-10, atol=1e-10, inputs=jumps).raise_if_failed()
+    before, after = (0.5 * 18.0 * (motion["x"][2] - hand) ** 2 for hand in (0.1, 0.3))
+    np.testing.assert_allclose(motion.work, [0.0, 0.0, after - before, after - before], atol=1e-7)
+    balance = np.asarray(motion.energies().balance)
+    np.testing.assert_allclose(balance, balance[0], atol=1e-7)
+
+
+def test_lanes_and_gradients_carry_the_work_of_inputs():
+    inputs = {"hand": jj.Sampled(KNOTS, PLACES), "push": 0.7}
+    options = {"ts": SPAN, "rtol": 1e-11, "atol": 1e-11, "inputs": inputs}
+    lanes = jj.rollout(PulledBead(), parameters={"mass": np.array([2.0, 3.0])}, progress=False, **options)
+    work = work_by_quadrature()
+    np.testing.assert_allclose(lanes.lane(0).work, work, atol=1e-8 * np.max(np.abs(work)))
+
+    def last(last_place):
+        moved = jj.Sampled(KNOTS, jnp.asarray(PLACES).at[3].set(last_place))
+        return jj.simulate(PulledBead(), **options | {"inputs": {"hand": moved, "push": 0.7}}).work[-1]
+
+    slope = (last(0.2 + 1e-4) - last(0.2 - 1e-4)) / 2e-4
+    np.testing.assert_allclose(jax.grad(last)(0.2), slope, rtol=1e-6)
+
+
+def test_potentials_that_depend_on_inputs_are_found_and_named():
+    assert jj.structure_of(PulledBead()).potentials_of_inputs == (1,)
+    assert "potentials that depend on inputs" in jj.energy_balance(PulledBead()).changed_by
+    assert jj.structure_of(OnBelt()).potentials_of_inputs == ()

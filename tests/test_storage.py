@@ -1,0 +1,146 @@
+"""Rollouts in files: every lane comes back as it was, failed ones with their codes; wrong files are refused with the reason."""
+
+import json
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_inputs import OnBelt
+
+import jourdain_jax as jj
+from jourdain_jax.models import ChaplyginSleigh, PendulumChain, TiltingDisc
+from jourdain_jax.motion import results
+
+TS = jnp.linspace(0.0, 0.5, 3)
+
+
+@pytest.fixture(scope="module")
+def discs():
+    """Three discs: one rolls, one has a wrong radius, one falls."""
+    starts = {"lean": np.array([0.3, 0.3, 1.4]), "spin_rate": np.array([-6.0, -6.0, -0.1])}
+    return jj.rollout(TiltingDisc(), starts, parameters={"radius": np.array([0.5, -0.5, 0.4])}, ts=TS, progress=False)
+
+
+@pytest.fixture(scope="module")
+def files(discs, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    jj.save(discs, folder / "rollout.npz")
+    jj.save(discs.lane(0), folder / "trajectory.npz")
+    return folder
+
+
+def assert_equal_to_the_bit(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert (x.dtype, x.shape) == (y.dtype, y.shape)
+        assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
+
+
+def test_a_saved_rollout_comes_back_to_the_bit_with_one_code_per_lane(discs, files):
+    loaded = jj.load_rollout(files / "rollout.npz", TiltingDisc)
+    assert discs.result.tolist() == [results.SUCCESS, results.BAD_PARAMETER, results.EVENT]
+    assert_equal_to_the_bit(loaded, discs)
+    assert str(loaded) == str(discs)
+    assert str(loaded.lane(2)) == str(discs.lane(2))
+    with np.load(files / "rollout.npz") as file:
+        header = json.loads(str(file["header"]))
+        assert (header["format"], header["kind"], file["result"].tolist()) == (1, "rollout", [0, 7, 1])
+
+
+def test_a_lane_with_wrong_parameters_comes_back_from_a_file_of_its_own(discs, tmp_path):
+    jj.save(discs.lane(1), tmp_path / "lane.npz")
+    loaded = jj.load(tmp_path / "lane.npz", TiltingDisc)
+    assert_equal_to_the_bit(loaded, discs.lane(1))
+    assert loaded.message.endswith("(`radius`); check where it was computed")
+
+
+def test_lanes_that_were_continued_and_fields_that_are_counts_are_kept(tmp_path):
+    lanes = jj.rollout(PendulumChain(links=1), parameters={"mass": np.array([[0.2], [0.3]])}, ts=TS, progress=False)
+    lanes = jj.Rollout(lanes.lanes, continued=(1,))
+    jj.save(lanes, tmp_path / "chains.npz")
+    assert_equal_to_the_bit(jj.load_rollout(tmp_path / "chains.npz", PendulumChain), lanes)
+
+
+def test_inputs_come_back_as_samples_at_the_saved_times(tmp_path):
+    inputs = {"speed": lambda t: 1.0 + t, "push": jj.Sampled([0.0, 1.0], [0.0, 2.0])}
+    lanes = jj.rollout(OnBelt(), {"y": np.array([0.1, 0.2])}, ts=TS[::-1], t0=0.5, inputs=inputs, progress=False)  # in reversed time
+    jj.save(lanes, tmp_path / "belt.npz")
+    loaded = jj.load_rollout(tmp_path / "belt.npz", OnBelt)
+    np.testing.assert_array_equal(loaded["x"], lanes["x"])
+    for i in range(2):
+        np.testing.assert_allclose(jax.vmap(loaded.lane(i).inputs)(TS), jax.vmap(lanes.lane(i).inputs)(TS), rtol=1e-15)
+    np.testing.assert_allclose(loaded.lane(0).inputs(0.125), [1.125, 0.25], rtol=1e-15)
+
+
+def test_a_motion_saved_at_its_steps_comes_back_with_its_inputs(tmp_path):
+    steps = jj.simulate(OnBelt(), {"y": 0.1}, t1=0.5, saveat=diffrax.SaveAt(t0=True, ts=[0.0, 0.2], steps=True), inputs={"speed": 1.0}, max_steps=400)
+    assert not np.all(np.isfinite(steps.ts))  # room for more steps than were taken
+    jj.save(steps, tmp_path / "steps.npz")
+    loaded = jj.load(tmp_path / "steps.npz", OnBelt)
+    np.testing.assert_array_equal(loaded.q, steps.q)
+    np.testing.assert_array_equal(loaded.inputs(0.3), [1.0, 0.0])
+
+
+def test_files_of_the_wrong_kind_are_refused_with_what_reads_them(files):
+    with pytest.raises(ValueError, match=r"holds a rollout, expected a trajectory; read it with `jj.load_rollout\(path, scene\)`"):
+        jj.load(files / "rollout.npz", TiltingDisc)
+    with pytest.raises(ValueError, match=r"holds a trajectory, expected a rollout; read it with `jj.load\(path, scene\)`"):
+        jj.load_rollout(files / "trajectory.npz", TiltingDisc)
+    with pytest.raises(ValueError, match="holds a rollout of `TiltingDisc`, expected `ChaplyginSleigh`"):
+        jj.load_rollout(files / "rollout.npz", ChaplyginSleigh)
+
+
+def rewritten(path, new, change=lambda header: header, drop=(), **arrays):
+    with np.load(path) as file:
+        kept = {name: file[name] for name in file.files if name not in drop}
+    header = change(json.loads(str(kept.pop("header"))))
+    np.savez(new, header=np.array(json.dumps(header)), **(kept | arrays))
+
+
+def test_damaged_and_foreign_files_are_refused_with_the_reason(files, tmp_path):
+    path, new = files / "rollout.npz", tmp_path / "new.npz"
+    whole = path.read_bytes()
+    for cut in (whole[:100], whole[: len(whole) // 2], whole[:-30], b"", b"no numbers here", bytes(len(whole))):
+        new.write_bytes(cut)
+        with pytest.raises(ValueError, match="is no rollout file, or is damaged"):
+            jj.load_rollout(new, TiltingDisc)
+    spoilt = bytearray(whole)
+    middle = len(whole) // 2
+    spoilt[middle : middle + 40] = b"\xff" * 40
+    new.write_bytes(spoilt)
+    with pytest.raises(ValueError, match="is no rollout file, or is damaged"):
+        jj.load_rollout(new, TiltingDisc)
+    for change, sentence in (
+        (lambda h: h | {"format": 2}, "has format 2, expected 1; read it with the version of jourdain-jax that wrote it"),
+        (lambda h: h | {"kind": "film"}, "holds a film, expected a rollout"),
+        (lambda h: {"format": 1, "kind": "rollout"}, "lacks `scene`; it is damaged"),
+        (lambda h: [1, 2], "is no rollout file, or is damaged"),
+        (lambda h: h | {"coordinates": ["x", "y"]}, "has 5 columns for 2 coordinates; it is damaged"),
+        (lambda h: h | {"coordinates": ["x", "y", "z", "lean", "spin"]}, "holds the coordinates x, y, z, lean, spin, but `TiltingDisc` has x, y, yaw"),
+        (lambda h: h | {"static": {"sides": 3}}, "has a parameter `sides` that `TiltingDisc` has not"),
+    ):
+        rewritten(path, new, change)
+        with pytest.raises(ValueError, match=sentence):
+            jj.load_rollout(new, TiltingDisc)
+    rewritten(path, new, drop=("continued",))
+    with pytest.raises(ValueError, match="lacks `continued`"):
+        jj.load_rollout(new, TiltingDisc)
+    with pytest.raises(ValueError, match="there is no file"):
+        jj.load_rollout(tmp_path / "none.npz", TiltingDisc)
+
+
+def test_a_field_that_cannot_be_stored_is_named(tmp_path):
+    class Labelled(ChaplyginSleigh):
+        labels: tuple = ("a",)
+
+    labelled = jj.simulate(ChaplyginSleigh(), ts=TS)
+    for labels, stored in ((Labelled().labels, True), (("b",), False)):
+        motion = jj.Trajectory(**{name: getattr(labelled, name) for name in labelled.__dataclass_fields__} | {"scene": Labelled(labels=labels)})
+        if stored:
+            jj.save(motion, tmp_path / "labels.npz")
+            assert jj.load(tmp_path / "labels.npz", Labelled).scene.labels == ("a",)
+        else:
+            with pytest.raises(ValueError, match=r"field `labels` of `Labelled` is .*, which `save` cannot store"):
+                jj.save(motion, tmp_path / "labels.npz")

@@ -1,0 +1,210 @@
+"""Scenes whose parameters are traced by a user's own `jit`, `vmap` or `grad`: the right motion or a code that says why not, never another structure.
+
+What holds of a scene is found before anything is compiled, at numbers that stand in for traced parameters. These scenes sit at special values by
+default, where rows are dependent, a coordinate does not matter, or nothing does work, and are given generic ones; or the other way round.
+"""
+
+from dataclasses import fields
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.equations.probing import concretised
+from jourdain_jax.models import ChaplyginSleigh
+from jourdain_jax.motion import results
+
+
+class TwoBlades(jj.Scene):
+    """A plate on two parallel blades, turned by a torque: at one place they are one blade, at two places the plate can only slide along."""
+
+    mass: jnp.ndarray = jj.parameter(1.3, unit="kg", positive=True)
+    inertia: jnp.ndarray = jj.parameter(0.4, unit="kg m^2", positive=True)
+    front: jnp.ndarray = jj.parameter(0.3, unit="m")
+    rear: jnp.ndarray = jj.parameter(0.3, unit="m")
+    torque: jnp.ndarray = jj.parameter(0.6, unit="N m")
+    coordinates = jj.coordinates("x y heading")
+
+    def bodies(self, t, q):
+        position = jnp.stack([q.x, q.y, 0.0 * q.x])
+        return {"plate": jj.RigidBody(self.mass, self.inertia * jnp.ones(3), position, jj.rot_z(q.heading))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, heading_rate=self.torque),)
+
+    def velocity_constraints(self, motion):
+        plate = motion["plate"]
+        places = {"front": self.front, "rear": self.rear}
+        return {name: jj.knife_edge(plate, plate.place(jnp.stack([a, 0.0 * a, 0.0 * a])), plate.orientation[:, 1]) for name, a in places.items()}
+
+
+class Slope(jj.Scene):
+    """A bead on a slope: level by default, where its place does not matter; a wind across, none by default."""
+
+    mass: jnp.ndarray = jj.parameter(2.0, unit="kg", positive=True)
+    slope: jnp.ndarray = jj.parameter(0.0, unit="1/m")
+    wind: jnp.ndarray = jj.parameter(0.0, unit="m/s")
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def potential(self, pose):
+        return 0.5 * self.mass * 9.81 * self.slope * pose.q.x**2
+
+    def velocity_constraints(self, motion):
+        return {"carried": motion.u.y_rate - self.wind * (1.0 + motion.q.x)}
+
+
+class Hanging(jj.Scene):
+    """A pendulum of two rods in a row; none of its parameters has a default."""
+
+    mass: jnp.ndarray = jj.parameter(unit="kg", positive=True)
+    upper: jnp.ndarray = jj.parameter(unit="m", positive=True)
+    lower: jnp.ndarray = jj.parameter(unit="m", positive=True)
+    coordinates = jj.coordinates("angle")
+
+    def bodies(self, t, q):
+        rod = (self.upper + self.lower) * jnp.stack([jnp.sin(q.angle), 0.0 * q.angle, -jnp.cos(q.angle)])
+        return {"bob": jj.Particle(self.mass, rod)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81),)
+
+
+class SmallLoop(jj.Scene):
+    """A bead on a small ring, in a domain of the ring's size; its radius has no default."""
+
+    radius: jnp.ndarray = jj.parameter(unit="m", positive=True)
+    coordinates = jj.coordinates("x z")
+    domain = {"x": (-0.03, 0.03), "z": (-0.03, 0.03)}
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(0.1, jnp.stack([q.x, 0.0 * q.x, q.z]))}
+
+    def geometric_constraints(self, pose):
+        return {"ring": jnp.sqrt(jnp.maximum(0.0025 - pose.q.x**2 - pose.q.z**2, 0.0)) - jnp.sqrt(0.0025 - self.radius**2)}
+
+
+OPTIONS = {"ts": jnp.array([0.0, 0.4, 0.8]), "rtol": 1e-10, "atol": 1e-10}
+
+
+def sliding(**parameters):
+    """The end of a motion from speeds that the constraints may change, and its result code."""
+    scene = TwoBlades(**parameters)
+    start = jj.consistent(scene, 0.0, jnp.array([0.0, 0.0, 0.3]), jnp.array([0.7, 0.4, 0.5]))
+    motion = jj.simulate(scene, start, **OPTIONS)
+    return motion.q_end, motion.result
+
+
+def test_parameters_with_defaults_may_be_traced():
+    def end(mass, offset):
+        scene = ChaplyginSleigh(mass=mass, offset=offset)
+        return jj.simulate(scene, {"x_rate": 0.6, "heading_rate": 0.9}, **OPTIONS).q_end
+
+    numbers = (jnp.array([0.7, 2.0]), jnp.array([0.1, 0.9]))
+    alone = np.stack([end(m, a) for m, a in zip(*numbers, strict=True)])
+    np.testing.assert_allclose(jax.jit(jax.vmap(end))(*numbers), alone, atol=1e-9)
+    gradient = jax.jit(jax.grad(lambda m: end(m, 0.1)[2]))(0.7)
+    difference = (end(0.7 + 1e-5, 0.1)[2] - end(0.7 - 1e-5, 0.1)[2]) / 2e-5
+    np.testing.assert_allclose(gradient, difference, rtol=1e-5)
+
+
+def test_parameters_without_defaults_may_be_traced():
+    def end(mass, upper, lower):
+        scene = Hanging(mass=mass, upper=upper, lower=lower)
+        return jj.simulate(scene, {"angle": 0.4}, **OPTIONS).q_end[0]
+
+    alone = end(0.3, 2.0, 0.5)
+    np.testing.assert_allclose(jax.jit(end)(0.3, 2.0, 0.5), alone, rtol=1e-9)
+    np.testing.assert_allclose(jax.vmap(end)(*(jnp.array([x, 1.0]) for x in (0.3, 2.0, 0.5)))[0], alone, rtol=1e-9)
+    along = jax.jit(jax.grad(end, (0, 1, 2)))(0.3, 2.0, 0.5)
+    np.testing.assert_allclose(along[1], along[2], rtol=1e-9)  # only their sum counts
+    np.testing.assert_allclose(along[0], 0.0, atol=1e-9)
+    np.testing.assert_allclose(along[1], (end(0.3, 2.0 + 1e-4, 0.5) - end(0.3, 2.0 - 1e-4, 0.5)) / 2e-4, rtol=1e-6)
+
+
+def test_a_traced_parameter_without_default_that_fits_no_state_of_the_domain_is_refused():
+    assert jj.structure_of(SmallLoop(radius=0.02)).rank == 1
+    with pytest.raises(ValueError, match="numbers near their defaults stood in for them, or near one where they have none: give defaults near"):
+        jax.jit(lambda radius: jj.structure_of(SmallLoop(radius=radius)).rank)(0.02)
+
+
+def test_defaults_at_which_rows_are_dependent_do_not_decide_for_traced_parameters():
+    q, code = jax.jit(lambda front, rear: sliding(front=front, rear=rear))(0.3, 0.5)
+    assert int(code) == results.SUCCESS
+    forward = 0.7 * np.cos(0.3) + 0.4 * np.sin(0.3)  # the one speed that two blades at two places let the plate keep
+    np.testing.assert_allclose(q, [0.8 * forward * np.cos(0.3), 0.8 * forward * np.sin(0.3), 0.3], atol=1e-9)
+    many, codes = jax.vmap(lambda front, rear: sliding(front=front, rear=rear))(jnp.array([0.3, 0.1]), jnp.array([0.5, 0.9]))
+    np.testing.assert_allclose(many, np.stack([q, q]), atol=1e-9)
+    assert codes.tolist() == [results.SUCCESS] * 2
+    np.testing.assert_allclose(jax.jacrev(lambda front, rear: sliding(front=front, rear=rear)[0], (0, 1))(0.3, 0.5), np.zeros((2, 3)), atol=1e-9)
+
+
+def test_traced_parameters_at_which_rows_become_dependent_are_flagged_or_right():
+    _, code = sliding(front=0.3, rear=0.3)
+    assert int(code) == results.SUCCESS
+    for same in (0.3, -0.2):
+        q, code = jax.jit(lambda front, rear: sliding(front=front, rear=rear))(same, same)
+        if int(code) == results.SUCCESS:
+            np.testing.assert_allclose(q, sliding(front=same, rear=same)[0], atol=1e-8)
+        else:
+            assert int(code) == results.SINGULAR_PARTITION
+    lanes, codes = jax.vmap(lambda rear: sliding(front=0.3, rear=rear))(jnp.array([0.3, 0.5]))
+    assert int(codes[1]) == results.SUCCESS
+    np.testing.assert_allclose(lanes[1], sliding(front=0.3, rear=0.5)[0], atol=1e-9)
+
+
+def test_defaults_at_which_a_coordinate_does_not_matter_do_not_decide_for_traced_parameters():
+    def end(slope, wind):
+        motion = jj.simulate(Slope(slope=slope, wind=wind), {"x": 0.5}, **OPTIONS)
+        return jnp.append(motion.q_end, motion.work[-1])
+
+    rate = np.sqrt(9.81 * 0.7)
+    x, y = 0.5 * np.cos(rate * 0.8), 1.3 * (0.8 + 0.5 * np.sin(rate * 0.8) / rate)
+    # the wind alone moves the bead across: its work is all of the kinetic energy there
+    work = 0.5 * 2.0 * 1.3**2 * ((1 + x) ** 2 - 1.5**2)
+    expected = [x, y, work]
+    np.testing.assert_allclose(jax.jit(end)(0.7, 1.3), expected, atol=1e-8)
+    np.testing.assert_allclose(jax.vmap(end)(jnp.array([0.7, 0.0]), jnp.array([1.3, 0.0])), [expected, [0.5, 0.0, 0.0]], atol=1e-8)
+    slopes = jax.jit(jax.jacrev(end, (0, 1)))(0.7, 1.3)
+    h = 1e-5
+    np.testing.assert_allclose(slopes[0], (end(0.7 + h, 1.3) - end(0.7 - h, 1.3)) / (2 * h), atol=1e-5)
+    np.testing.assert_allclose(slopes[1], (end(0.7, 1.3 + h) - end(0.7, 1.3 - h)) / (2 * h), atol=1e-5)
+
+
+def test_a_blade_under_the_mass_centre_is_flagged_where_another_offset_was_expected():
+    def turned(offset):
+        motion = jj.simulate(ChaplyginSleigh(offset=offset), {"x_rate": 0.6, "heading_rate": 0.9}, **OPTIONS)
+        return motion.q_end, motion.result
+
+    eager, code = turned(0.0)
+    assert int(code) == results.SUCCESS
+    q, code = jax.jit(turned)(0.0)
+    if int(code) == results.SUCCESS:
+        np.testing.assert_allclose(q, eager, atol=1e-8)
+    else:
+        assert int(code) == results.SINGULAR_PARTITION
+
+
+@pytest.mark.parametrize("kind", [TwoBlades, Hanging])
+def test_stand_ins_of_parameters_with_equal_defaults_differ(kind):
+    names = [field.name for field in fields(kind)]
+    seen = {}
+
+    def look(*values):
+        seen["scene"] = concretised(kind(**dict(zip(names, values, strict=True))))
+        return 0.0
+
+    jax.eval_shape(look, *np.ones(len(names)))
+    numbers = [float(x) for x in jax.tree.leaves(seen["scene"])]
+    assert len(set(numbers)) == len(names)
+
+
+def test_a_program_made_where_rows_do_no_work_is_not_taken_where_they_do():
+    still, blown = (jj.simulate(Slope(slope=0.7, wind=wind), {"x": 0.5}, **OPTIONS) for wind in (0.0, 1.3))
+    assert still.work is None
+    assert blown.reduction.endswith("lowered")
+    np.testing.assert_allclose(blown.work[-1], 0.5 * 2.0 * 1.3**2 * ((1 + blown["x"][-1]) ** 2 - 1.5**2), rtol=1e-8)
