@@ -253,7 +253,7 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
     happened = jnp.stack([solution.event_mask[name] for name in names]) if names else jnp.zeros(1, bool)
     code = jnp.where(solution.result == diffrax.RESULTS.max_steps_reached, results.MAX_STEPS, results.STEP_TOO_SMALL)
     code = jnp.where(solution.result == diffrax.RESULTS.successful, results.SUCCESS, code)
-    unsolved = solution.result == diffrax.RESULTS.nonlinear_divergence
+    unsolved = (solution.result == diffrax.RESULTS.nonlinear_divergence) | (solution.result == diffrax.RESULTS.nonlinear_max_steps_reached)
     t_end = solution.ts[1][0]
     return Solved(
         ts=solution.ts[0],

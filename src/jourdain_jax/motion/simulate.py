@@ -74,7 +74,8 @@ def simulate(
       `example_span` after t0); `ts`: times to save at (default: 201 even ones). `saveat`: a `diffrax.SaveAt` instead.
     - `rtol`, `atol`, `solver`, `stepsize_controller`, `dt0` (default: 1e-4 of the span), `adjoint`, `max_steps`: as in
       `diffrax.diffeqsolve`. Default solver: Tsit5 for
-      rtol >= 1e-6, Dopri8 below. Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`
+      rtol >= 1e-6, Dopri8 below; structure-preserving ones (`ImplicitMidpoint`, `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps
+      of at most `dt0` between saved times. Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`
       for forward mode of any order; `diffrax.DirectAdjoint()` for all.
     - `state`: "minimal" (q and privileged speeds), "full" (q and u) or "auto"; `reduction`: as in `accelerations`.
     - `projection`: put the state back onto the constraints after each step, where the state form does not keep them by itself.
