@@ -53,11 +53,14 @@ class FixedStepSolver(diffrax.AbstractSolver):
         return 2
 
     def init(self, terms, t0, t1, y0, args):
-        """Nothing is carried from step to step. Arguments as in diffrax."""
+        """Nothing is carried from step to step. `terms`, `t0`, `t1`, `y0`, `args`: as in diffrax."""
         return None
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step; where its equations were not solved, the state stays and the result says so. Arguments as in diffrax."""
+        """One step; where its equations were not solved, the state stays and the result says so.
+
+        `terms`, `t0`, `t1`, `y0`, `args`, `solver_state`, `made_jump`: as in diffrax.
+        """
         h = terms.contr(t0, t1)  # signed; diffrax itself counts time along the direction of the motion
         direction = jnp.sign(h)
         found = self.stepped(Step(t0 * direction, h, lambda t, y: terms.vf(t * direction, y, args), args), y0)
@@ -66,5 +69,5 @@ class FixedStepSolver(diffrax.AbstractSolver):
         return y1, None, {"y0": y0, "y1": y1}, None, result
 
     def func(self, terms, t0, y0, args):
-        """The rates at a state. Arguments as in diffrax."""
+        """The rates at a state. `terms`, `t0`, `y0`, `args`: as in diffrax."""
         return terms.vf(t0, y0, args)

@@ -81,11 +81,14 @@ class MuntheKaas(diffrax.AbstractWrappedSolver):
         return replace(form, projects_positions=form.projects_positions and bool(names_of_position_rows(scene)))
 
     def init(self, terms, t0, t1, y0, args):
-        """Nothing is carried from step to step: slopes belong to the rotation vectors of one step. Arguments as in diffrax."""
+        """Nothing is carried from step to step: slopes belong to the rotation vectors of one step. `terms`, `t0`, `t1`, `y0`, `args`: as in diffrax."""
         return None
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step of the wrapped solver in rotation vectors, then the exponential. Arguments as in diffrax."""
+        """One step of the wrapped solver in rotation vectors, then the exponential.
+
+        `terms`, `t0`, `t1`, `y0`, `args`, `solver_state`, `made_jump`: as in diffrax.
+        """
         chart = _Chart(y0.q, tuple(first for first, _ in args[1].coordinates.quaternions))
         direction = jnp.sign(terms.contr(t0, t1))
 
@@ -102,7 +105,7 @@ class MuntheKaas(diffrax.AbstractWrappedSolver):
         return y1, error, {"y0": y0, "y1": y1}, None, result
 
     def func(self, terms, t0, y0, args):
-        """The rates at a state. Arguments as in diffrax."""
+        """The rates at a state. `terms`, `t0`, `y0`, `args`: as in diffrax."""
         return terms.vf(t0, y0, args)
 
 
