@@ -56,7 +56,11 @@ from jourdain_jax.equations.virtual_power import (
 from jourdain_jax.lowering.lower import NotLowered, lower
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.diagnostics import diagnose
+from jourdain_jax.motion.discrete_gradient import DiscreteGradient
+from jourdain_jax.motion.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
+from jourdain_jax.motion.implicit_midpoint import ImplicitMidpoint
 from jourdain_jax.motion.inputs import Sampled
+from jourdain_jax.motion.munthe_kaas import MuntheKaas
 from jourdain_jax.motion.results import SimulationError
 from jourdain_jax.motion.rollout import Rollout, rollout
 from jourdain_jax.motion.simulate import simulate

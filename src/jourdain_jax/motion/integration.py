@@ -19,6 +19,7 @@ from jourdain_jax.motion.event_location import Located, locate
 from jourdain_jax.motion.land_on import land_on
 from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
+from jourdain_jax.motion.solver_choice import controller_of
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
 from jourdain_jax.motion.trajectory import Trajectory
@@ -230,21 +231,24 @@ def _inputs_of_lanes(inputs, t) -> Float[Array, "inputs lanes"]:
 def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
     t0, t1, ts, form, options, args, y0 = setup.t0, setup.t1, setup.ts, setup.form, setup.options, begun.args, begun.y0
     names, (rtol, atol) = options.event_names, options.tolerances
-    controller = options.controller
+    controller = controller_of(options.solver, options.controller, ts, t1)
+    land = options.land and controller is None
+    controller = options.controller if controller is None else controller
     if controller is None:
         controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=_StateNorm(), dtmin=_shortest(t0, t1), force_dtmin=False)
     saveat = diffrax.SaveAt(ts=ts) if options.saveat is None else options.saveat
     moving = form.projects_positions or form.projects_speeds
+    solver = for_adjoint(options.solver, options.adjoint)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(_rates),
-        ProjectedSolver(for_adjoint(options.solver, options.adjoint), _project) if moving else options.solver,
+        ProjectedSolver(solver, _project) if moving else solver,
         t0,
         t1,
         options.dt0,
         y0,
         args,
         saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)]),
-        stepsize_controller=land_on(ts, controller) if options.land else controller,
+        stepsize_controller=land_on(ts, controller) if land else controller,
         adjoint=options.adjoint,
         event=diffrax.Event({name: _EventValue(i) for i, name in enumerate(names)}, direction=False) if names else None,
         max_steps=options.max_steps,
@@ -253,13 +257,16 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
     happened = jnp.stack([solution.event_mask[name] for name in names]) if names else jnp.zeros(1, bool)
     code = jnp.where(solution.result == diffrax.RESULTS.max_steps_reached, results.MAX_STEPS, results.STEP_TOO_SMALL)
     code = jnp.where(solution.result == diffrax.RESULTS.successful, results.SUCCESS, code)
+    unsolved = (solution.result == diffrax.RESULTS.nonlinear_divergence) | (solution.result == diffrax.RESULTS.nonlinear_max_steps_reached)
+    t_end = solution.ts[1][0]
     return Solved(
         ts=solution.ts[0],
         ys=solution.ys[0],
-        reached=jnp.isfinite(solution.ts[0]),
-        t_end=solution.ts[1][0],
+        # a step that was not solved is no step: the times at its end were not reached
+        reached=jnp.isfinite(solution.ts[0]) & ~(unsolved & ((solution.ts[0] - t_end) * jnp.sign(t1 - t0) >= 0)),
+        t_end=t_end,
         y_end=jax.tree.map(lambda x: x[0], solution.ys[1]),
-        code=jnp.where(jnp.any(happened), results.EVENT, code),
+        code=jnp.where(jnp.any(happened), results.EVENT, jnp.where(unsolved, results.UNSOLVED_STEP, code)),
         event=jnp.where(jnp.any(happened), jnp.argmax(happened), -1).astype(jnp.int32),
         accepted=solution.stats["num_accepted_steps"],
         rejected=solution.stats["num_rejected_steps"],
@@ -336,8 +343,9 @@ class _EventValue(eqx.Module):
 
     index: int = eqx.field(static=True)
 
-    def __call__(self, t, y, args, **kwargs):
-        return _events(t, y, args)[self.index]
+    def __call__(self, t, y, args, *, terms, **kwargs):
+        direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
+        return _events(t * direction, y, args)[self.index]
 
 
 def _mark_inputs(adjoint, tree):

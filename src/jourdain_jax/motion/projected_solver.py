@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import diffrax
 import equinox as eqx
+import jax.numpy as jnp
 
 
 class ProjectedSolver(diffrax.AbstractWrappedSolver):
@@ -65,7 +66,8 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """One step of the wrapped solver, then the projection."""
         y1, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, True)
-        return self.project(t1, y1, args), error, dense, solver_state, result
+        t = t1 * jnp.sign(terms.contr(t0, t1))  # diffrax counts time along the direction of the motion
+        return self.project(t, y1, args), error, dense, solver_state, result
 
     def func(self, terms, t0, y0, args):
         """As the wrapped solver."""
@@ -74,6 +76,8 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
 
 def for_adjoint(solver: diffrax.AbstractSolver, adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractSolver:
     """The solver with the loop over its stages that the adjoint can differentiate."""
+    if isinstance(vars(solver).get("solver"), diffrax.AbstractSolver):
+        return eqx.tree_at(lambda s: s.solver, solver, for_adjoint(solver.solver, adjoint))
     kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
     if type(adjoint) in kinds and getattr(solver, "scan_kind", "none of its own") is None:
         return eqx.tree_at(lambda s: s.scan_kind, solver, kinds[type(adjoint)], is_leaf=lambda x: x is None)

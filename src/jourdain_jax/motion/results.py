@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START = range(9)
+SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START, UNSOLVED_STEP = range(10)
 
 MESSAGES = {
     SUCCESS: "reached the end of its span",
@@ -16,6 +16,7 @@ MESSAGES = {
     SINGULAR_PARTITION: "the privileged speeds came near a configuration where they do not determine the others; use state='full'",
     BAD_PARAMETER: "a parameter is not finite or has the wrong sign",
     BAD_START: "the start is not finite; check where its values were computed",
+    UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step (`dt0`), or look for a singularity there",
 }
 
 

@@ -17,6 +17,7 @@ from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.motion import results
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.simulate import lost_codes, set_up, state_form
+from jourdain_jax.motion.solver_choice import may_be_full
 from jourdain_jax.motion.span import saved_times
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.start import start as consistent_start
@@ -155,7 +156,7 @@ def _sound_lane(scene: Scene, parameters: dict) -> Scene:
 
 def _lost(scene: Scene, lanes: Trajectory, options: dict) -> np.ndarray:
     """Lanes that another form of the state may bring to their end."""
-    if options.get("state", "auto") != "auto":
+    if options.get("state", "auto") != "auto" or not may_be_full(options.get("solver")):
         return np.zeros(0, int)
     how = {name: options[name] for name in ("reduction", "stabilisation", "projection", "work", "lowering") if name in options}
     form = state_form(scene, structure_of(scene), **how)

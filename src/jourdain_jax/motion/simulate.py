@@ -24,8 +24,10 @@ from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion import results
 from jourdain_jax.motion.arguments import check_options
+from jourdain_jax.motion.fixed_step import FixedStepSolver
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import Options, Setup, integrate
+from jourdain_jax.motion.solver_choice import check_solver, fitted, may_be_full
 from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.state_form import StateForm, default_reduction
@@ -72,7 +74,8 @@ def simulate(
       `example_span` after t0); `ts`: times to save at (default: 201 even ones). `saveat`: a `diffrax.SaveAt` instead.
     - `rtol`, `atol`, `solver`, `stepsize_controller`, `dt0` (default: 1e-4 of the span), `adjoint`, `max_steps`: as in
       `diffrax.diffeqsolve`. Default solver: Tsit5 for
-      rtol >= 1e-6, Dopri8 below. Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`
+      rtol >= 1e-6, Dopri8 below; structure-preserving ones (`ImplicitMidpoint`, `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps
+      of at most `dt0` between saved times. Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`
       for forward mode of any order; `diffrax.DirectAdjoint()` for all.
     - `state`: "minimal" (q and privileged speeds), "full" (q and u) or "auto"; `reduction`: as in `accelerations`.
     - `projection`: put the state back onto the constraints after each step, where the state form does not keep them by itself.
@@ -90,10 +93,11 @@ def simulate(
     """
     setup = _set_up(**locals())
     motion = integrate(setup)
-    if state == "auto" and not isinstance(motion.result, jax.core.Tracer) and int(motion.result) in lost_codes(setup.form):
+    known = not isinstance(motion.result, jax.core.Tracer)
+    if state == "auto" and may_be_full(solver) and known and int(motion.result) in lost_codes(setup.form):
         # the motion left the domain in which the partition was found to serve
         form = state_form(setup.scene, structure_of(setup.scene), "full", reduction, stabilisation, projection, work, lowering=False)
-        motion = integrate(dataclasses.replace(setup, form=form))
+        motion = integrate(dataclasses.replace(setup, form=fitted(solver, setup.scene, form, "full")))
     return motion
 
 
@@ -111,16 +115,17 @@ def _set_up(
     scene = as_scene(scene)
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, solver=solver, adjoint=adjoint, stepsize_controller=stepsize_controller, saveat=saveat)
     _check_adjoint(adjoint)
+    check_solver(solver, stepsize_controller, dt0, land_on_ts, saveat)
     made_here = not isinstance(start, State)
     inputs = as_inputs(scene, inputs)
     start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs)
-    form = state_form(scene, structure_of(scene), state, reduction, stabilisation, projection, work, lowering)
+    form = fitted(solver, scene, state_form(scene, structure_of(scene), state, reduction, stabilisation, projection, work, lowering), state)
     _warn_float32(start.q.dtype, rtol)
     options = Options(
         solver=(diffrax.Tsit5() if rtol >= 1e-6 else diffrax.Dopri8()) if solver is None else solver,
         controller=stepsize_controller,
         tolerances=(rtol, atol),
-        dt0=1e-4 * (t1 - t0) if dt0 is None else dt0,  # diffrax's own guess costs two more copies of the vector field to compile
+        dt0=_first_step(solver, dt0, t0, t1),  # diffrax's own guess costs two more copies of the vector field to compile
         adjoint=diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         max_steps=max_steps,
         land=land_on_ts,
@@ -129,6 +134,12 @@ def _set_up(
     )
     start = _on_constraints(scene, t0, start, inputs(t0), made_here) if projection else start
     return Setup(scene, start, inputs, t0, t1, ts, form, options)
+
+
+def _first_step(solver, dt0, t0, t1):
+    if isinstance(solver, FixedStepSolver) and dt0 is not None:
+        return jnp.abs(dt0) * jnp.sign(t1 - t0)
+    return 1e-4 * (t1 - t0) if dt0 is None else dt0
 
 
 def _checked_saveat(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
@@ -189,7 +200,7 @@ def state_form(scene: Scene, structure: Structure, state="auto", reduction=None,
 def lost_codes(form: StateForm) -> tuple[int, ...]:
     """Result codes after which another form of the state may do better."""
     guarded = form.lowered is not None and (form.lowered.guards or form.lowered.pivots)
-    return (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL, results.NOT_FINITE) if guarded else (results.SINGULAR_PARTITION,)
+    return (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL, results.NOT_FINITE, results.UNSOLVED_STEP) if guarded else (results.SINGULAR_PARTITION,)
 
 
 @described_once

@@ -66,6 +66,12 @@ def potential_of(scene: Scene, pose: Pose) -> Float[Array, ""] | None:
     return None if V is None else checked_real(V, f"what `potential` of `{_name(scene)}` returned", (), advice="return the energy in J, or None")
 
 
+def gauge_of(scene: Scene, pose: Pose) -> Float[Array, ""] | None:
+    """The scene's gauge function, J s; None where it has none."""
+    S = scene.gauge(pose)
+    return None if S is None else checked_real(S, f"what `gauge` of `{_name(scene)}` returned", (), advice="return a number in J s, or None")
+
+
 def prescribed_of(scene: Scene, t) -> dict[str, Float[Array, ""]]:
     """Prescribed coordinates and their values."""
     given = _dictionary(scene, "prescribed", scene.prescribed(t), '{"x": 0.1 * jnp.sin(t)}')

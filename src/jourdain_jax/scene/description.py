@@ -20,6 +20,7 @@ METHODS = (
     "coordinate_rates",
     "loads",
     "potential",
+    "gauge",
     "prescribed",
     "geometric_constraints",
     "velocity_constraints",

@@ -73,6 +73,13 @@ class Scene(eqx.Module):
         """Potential energy (J) at a `pose` besides that of the loads, a function of time and coordinates; None where there is none."""
         return None
 
+    def gauge(self, pose: Pose) -> Float[Array, ""] | None:
+        """A function S (J s) of a `pose` whose rate is taken off the Lagrangian, L = T - V - dS/dt; None where there is none.
+
+        The motion does not depend on it. Integrators built on a discrete Lagrangian do: it shows what they owe to a lucky choice of L.
+        """
+        return None
+
     def prescribed(self, t: Float[Array, ""]) -> dict[str, Float[Array, ""]]:
         """Coordinates driven as given functions of time: name -> value. The multiplier of the row is the actuator's force."""
         return {}

@@ -1,0 +1,49 @@
+"""What a solver asks for besides its rates: a form of the state, constant steps, states saved at ends of steps only."""
+
+import diffrax
+import jax.numpy as jnp
+
+from jourdain_jax.motion.discrete_gradient import DiscreteGradient
+from jourdain_jax.motion.even_steps import EvenSteps
+from jourdain_jax.motion.fixed_step import FixedStepSolver
+from jourdain_jax.motion.munthe_kaas import MuntheKaas
+from jourdain_jax.motion.state_form import StateForm
+from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.scene import Scene
+
+
+def fitted(solver, scene: Scene, form: StateForm, asked: str) -> StateForm:
+    """The form of the state that the solver integrates; a ValueError where it does not apply to the scene. `asked`: the `state` of `simulate`."""
+    return solver.fitted(scene, form, asked) if isinstance(solver, FixedStepSolver | MuntheKaas) else form
+
+
+def may_be_full(solver) -> bool:
+    """Whether a motion that lost its privileged speeds may go on with the full state."""
+    return not isinstance(solver, DiscreteGradient)
+
+
+def check_solver(solver, controller, dt0, land: bool, saveat) -> None:
+    """ValueError for options that do not go with a structure-preserving solver; others pass."""
+    if not isinstance(solver, FixedStepSolver | MuntheKaas):
+        return
+    name = type(solver).__name__
+    if not land or (saveat is not None and saveat.subs.ts is not None):
+        raise ValueError(f"`{name}` has states at ends of steps only: leave `land_on_ts` at True, and give times to save at as `ts`, not in `saveat`")
+    if not isinstance(solver, FixedStepSolver):
+        return
+    if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        raise ValueError(
+            f"`{name}` takes steps of one length and has no error estimate, which `stepsize_controller` = {type(controller).__name__} needs; leave it away "
+            "and give `dt0`, the step in s"
+        )
+    if dt0 is None and not isinstance(controller, diffrax.StepTo):
+        raise ValueError(f"`{name}` takes steps of one length; give `dt0`, the step in s")
+    if dt0 is not None and not is_traced(dt0) and not 0 < abs(float(dt0)) < float("inf"):
+        raise ValueError(f"`dt0` is {float(dt0):g}, expected the step in s; give a number above zero")
+
+
+def controller_of(solver, controller, ts, t1):
+    """Even steps between the saved times for a structure-preserving solver, unless the steps are given otherwise; None: no such choice."""
+    if isinstance(solver, FixedStepSolver) and (controller is None or type(controller) is diffrax.ConstantStepSize):
+        return EvenSteps(jnp.append(ts, t1))
+    return None

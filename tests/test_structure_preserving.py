@@ -1,0 +1,294 @@
+"""Structure-preserving solvers: what each keeps, their order, their derivatives, and what is said where one does not apply."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from long_runs_scenes import ContactOscillator, GaugeTwin
+from oracles import chaplygin_sleigh, skate
+from small_scenes import DrivenPendulum
+from tolerances import tolerance
+
+import jourdain_jax as jj
+from jourdain_jax.calculus.newton import newton_root
+from jourdain_jax.models import MODELS
+from jourdain_jax.motion import results
+
+MIDPOINT, DLA, TRAPEZOIDAL, GRADIENT = (
+    jj.ImplicitMidpoint(),
+    jj.DiscreteLagrangeDAlembert(),
+    jj.DiscreteLagrangeDAlembert("trapezoidal"),
+    jj.DiscreteGradient(),
+)
+LIE = jj.MuntheKaas(jj.ImplicitMidpoint())
+
+
+def named(solver) -> str:
+    return f"{type(solver).__name__} {getattr(solver, 'rule', '')}".strip()
+
+
+def run(scene, start, solver, *, t1, dt0, t0=0.0, **options):
+    """The end of a motion; always the same shapes, so that a solver and a scene are compiled once."""
+    motion = jj.simulate(scene, start, t0=t0, t1=t1, ts=jnp.array([t1]), dt0=dt0, solver=solver, **options)
+    return motion.raise_if_failed() if not isinstance(motion.result, jax.core.Tracer) else motion
+
+
+def order(errors) -> float:
+    """Measured from the last halving of the step."""
+    return float(np.log2(errors[-2] / errors[-1]))
+
+
+# Order. ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", [MIDPOINT, DLA, GRADIENT], ids=named)
+def test_the_chaplygin_sleigh_is_followed_to_second_order(solver):
+    data = chaplygin_sleigh.RUN | {"t_end": 4.0}
+    v0, w0, a = data["v0"], data["w0"], data["a"]
+    exact = {name: values[-1] for name, values in chaplygin_sleigh.motion(np.linspace(0.0, 4.0, 5), x0=0.0, y0=0.0, **data).items()}
+    sleigh = MODELS["chaplygin-sleigh"](mass=data["mass"], inertia=data["inertia"], offset=a)
+    start = jj.start(sleigh, x_rate=v0, heading_rate=w0)
+    errors = []
+    for dt0 in (0.05, 0.025):
+        end = run(sleigh, start, solver, t1=4.0, dt0=dt0)
+        errors.append(np.max(np.abs(np.asarray(end.q_end) - [exact["x"], exact["y"], exact["th"]])))
+    assert errors[-1] < 1e-3
+    assert 1.9 < order(errors) < 2.1
+
+
+def test_discrete_forces_and_prescribed_coordinates_are_of_second_order_too():
+    pendulum = DrivenPendulum()  # damped, sprung to a moving point, its pivot driven
+    start = jj.start(pendulum, angle=0.3)
+    exact = jj.simulate(pendulum, start, ts=jnp.array([1.0]), rtol=1e-11, atol=1e-11)
+    ends = [run(pendulum, start, TRAPEZOIDAL, t1=1.0, dt0=dt0) for dt0 in (0.02, 0.01)]
+    for part in ("q_end", "u_end", "work"):
+        errors = [np.max(np.abs(getattr(end, part) - getattr(exact, part))) for end in ends]
+        assert 1.9 < order(errors) < 2.1, part
+    np.testing.assert_allclose(ends[-1].q_end[0], 0.3 * np.sin(2.0), atol=tolerance("round_off"))  # the prescribed pivot
+
+
+def test_rows_that_depend_on_each_other_are_left_out():
+    class TwoEdges(MODELS["skate"]):
+        """A skate with its row stated twice."""
+
+        def velocity_constraints(self, motion):
+            (row,) = super().velocity_constraints(motion).values()
+            return {"blade": row, "blade again": 2.0 * row}
+
+    data = skate.RUN | {"t_end": 1.0}
+    edges = TwoEdges(slope=data["slope"], mass=data["mass"], inertia=data["inertia"])
+    exact = skate.motion(np.array([0.0, 1.0]), **data)
+    errors = [np.abs(run(edges, jj.start(edges, heading_rate=data["th_rate"]), DLA, t1=1.0, dt0=dt0).q_end[0] - exact["x"][-1]) for dt0 in (0.05, 0.025)]
+    assert errors[-1] < 1e-3
+    assert 1.9 < order(errors) < 2.1
+
+
+def test_turning_by_the_exponential_has_the_order_of_the_method_within():
+    body = MODELS["free-rigid-body"]()
+    start = jj.start(body, **body.example)
+    exact = jj.simulate(body, start, ts=jnp.array([2.0]), rtol=1e-12, atol=1e-12)
+    options = {"stepsize_controller": diffrax.ConstantStepSize(), "t1": 2.0}
+    tsit5 = jj.MuntheKaas(diffrax.Tsit5())
+    errors = [np.max(np.abs(run(body, start, tsit5, dt0=jnp.array(dt0), **options).q_end - exact.q_end)) for dt0 in (0.1, 0.05)]
+    assert 4.7 < order(errors) < 5.3
+    errors = [np.max(np.abs(run(body, start, LIE, t1=2.0, dt0=dt0).q_end - exact.q_end)) for dt0 in (0.05, 0.025)]
+    assert 1.9 < order(errors) < 2.1
+
+
+# What is kept. ---------------------------------------------------------------------------------------------------------
+
+
+def change(scene, solver, quantity, dt0, **options) -> float:
+    """Largest relative change of `quantity(q, u)` after 300, 700 and 1000 steps."""
+    start = jj.start(scene, **scene.example)
+    ends = [run(scene, start, solver, t1=steps * dt0, dt0=jnp.array(dt0), **options) for steps in (300, 700, 1000)]
+    assert int(ends[-1].accepted) == 1000
+    first = quantity(start.q, start.u)
+    return max(float(jnp.abs(quantity(end.q_end, end.u_end) / first - 1)) for end in ends)
+
+
+def energy_of(scene):
+    return lambda q, u: jj.energy(scene, 0.0, q, u).total
+
+
+def driver(q, u):
+    return (q[1] ** 2 + u[1] ** 2) / 2  # of the contact oscillator
+
+
+@pytest.mark.parametrize("solver", [DLA, TRAPEZOIDAL], ids=named)
+def test_steps_back_undo_the_steps_forth(solver):
+    twin = GaugeTwin()
+    start = jj.start(twin, **twin.example)
+    there = run(twin, start, solver, t1=4.0, dt0=0.2)
+    end = jj.State(there.t_end, there.q_end, there.u_end, start.moved_q, start.moved_u, start.residual, start.names)
+    back = run(twin, end, solver, t0=4.0, t1=0.0, dt0=0.2)
+    assert np.max(np.abs(there.q_end - start.q)) > 0.1
+    np.testing.assert_allclose(back.q_end, start.q, rtol=0, atol=tolerance("round_off"))
+    np.testing.assert_allclose(back.u_end, start.u, rtol=0, atol=tolerance("round_off"))
+
+
+def test_the_discrete_gradient_keeps_the_energy():
+    oscillator = ContactOscillator()
+    assert change(oscillator, GRADIENT, energy_of(oscillator), 0.2) < tolerance("round_off")
+    assert 1e-6 < change(oscillator, GRADIENT, driver, 0.2) < 0.1  # which it does not keep
+
+
+@pytest.mark.parametrize("solver", [MIDPOINT, DLA], ids=named)
+def test_midpoint_rules_keep_a_quadratic_integral(solver):
+    oscillator = ContactOscillator()
+    assert change(oscillator, solver, driver, 0.2) < tolerance("round_off")
+    assert 1e-6 < change(oscillator, solver, energy_of(oscillator), 0.2) < 0.1  # which they do not keep
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "dt0"), [("free-rigid-body", 0.02), ("chaplygin-sleigh", 0.02), ("tilting-disc", 0.01)])
+def test_the_discrete_gradient_keeps_the_energy_of_models(name, dt0):
+    scene = MODELS[name]()
+    assert change(scene, GRADIENT, energy_of(scene), dt0) < tolerance("round_off")
+
+
+def test_a_gauge_changes_no_motion_but_that_of_the_discrete_lagrangian():
+    oscillator, twin = ContactOscillator(), GaugeTwin()
+    start = jj.start(oscillator, **oscillator.example)
+    found, of_twin = (jj.accelerations(scene, 0.0, start.q, start.u) for scene in (oscillator, twin))
+    np.testing.assert_array_equal(found.udot, of_twin.udot)
+    for solver, told_apart in ((MIDPOINT, False), (DLA, True)):
+        ends = [run(scene, start, solver, t1=4.0, dt0=0.2).q_end for scene in (oscillator, twin)]
+        assert (float(jnp.max(jnp.abs(ends[0] - ends[1]))) > 1e-4) == told_apart, named(solver)
+
+
+@pytest.mark.parametrize("solver", [jj.MuntheKaas(diffrax.Tsit5()), LIE], ids=lambda solver: type(solver.solver).__name__)
+def test_norms_of_quaternions_stay_one_without_renormalisation(solver):
+    body = MODELS["free-rigid-body"]()
+    options = {} if solver is LIE else {"stepsize_controller": diffrax.ConstantStepSize()}
+    assert change(body, solver, lambda q, u: jnp.linalg.norm(q[3:]), 0.1, **options) < 1e-13
+    if solver is LIE:  # both integrals of Euler's equations are quadratic in the speeds
+        moments = jnp.array([body.i1, body.i2, body.i3])
+        assert change(body, solver, lambda q, u: moments @ u[3:] ** 2, 0.1) < tolerance("round_off")
+        assert change(body, solver, lambda q, u: moments**2 @ u[3:] ** 2, 0.1) < tolerance("round_off")
+
+
+def test_a_turn_about_a_fixed_axis_is_exact_for_long_steps():
+    body = MODELS["free-rigid-body"](i1=1.0, i2=1.0, i3=1.0)
+    axis = np.array([2.0, -1.0, 2.0]) / 3
+    start = jj.start(body, attitude_omega=3.0 * axis)
+    end = run(body, start, LIE, t1=8.0, dt0=1.0)
+    np.testing.assert_allclose(end.q_end[3:], jj.quaternion_from_axis_angle(axis, 24.0), rtol=0, atol=tolerance("round_off"))
+
+
+@pytest.mark.slow
+def test_a_projected_scene_is_turned_by_the_exponential_too():
+    disc = MODELS["tilting-disc-quaternion"]()
+    motion = jj.simulate(disc, ts=jnp.linspace(0.0, 1.0, 5), rtol=1e-9, atol=1e-9, solver=jj.MuntheKaas(diffrax.Dopri8()))
+    usual = jj.simulate(disc, ts=jnp.linspace(0.0, 1.0, 5), rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(motion.raise_if_failed().q_end, usual.q_end, rtol=0, atol=1e-7)
+    assert float(jnp.max(jnp.abs(motion.residuals()[0]))) < tolerance("residual")
+
+
+def test_geometric_rows_hold_at_every_node():
+    rods = MODELS["double-pendulum-rods"]()
+    motion = run(rods, jj.start(rods, **rods.example), DLA, t1=1.0, dt0=0.02)
+    assert float(jnp.max(jnp.abs(motion.residuals()[0]))) < tolerance("round_off")
+    assert float(jnp.max(jnp.abs(motion.residuals()[1]))) < tolerance("round_off")
+
+
+# Derivatives and batches. ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", [MIDPOINT, DLA, pytest.param(GRADIENT, marks=pytest.mark.slow), pytest.param(LIE, marks=pytest.mark.slow)], ids=named)
+def test_derivatives_through_fifty_steps_are_right_in_both_modes(solver):
+    if solver is LIE:
+        scene, parameter, at = MODELS["free-rigid-body"](), "i2", 2.0
+    else:
+        scene, parameter, at = ContactOscillator(), "strength", 0.3
+    start = jj.start(scene, **scene.example)
+
+    def end(value, **options):
+        motion = run(scene.replace(**{parameter: value}), start, solver, t1=5.0, dt0=0.1, **options)
+        return jnp.sum(jnp.sin(jnp.arange(1.0, scene.coordinates.reference().size + 1) * motion.q_end)) + motion.u_end[-1]
+
+    step = 1e-4
+    values = [float(end(jnp.asarray(at + k * step))) for k in (-2, -1, 1, 2)]
+    difference = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step)
+    assert abs(difference) > 1e-2
+    at = jnp.asarray(at)
+    forward = jax.jvp(lambda x: end(x, adjoint=diffrax.ForwardMode()), (at,), (jnp.ones_like(at),))[1]
+    backward = jax.grad(end)(at)
+    np.testing.assert_allclose(forward, difference, rtol=tolerance("gradient_fd"))
+    np.testing.assert_allclose(backward, forward, rtol=1e-9)
+
+
+def test_a_rollout_solves_every_lane_and_names_those_whose_step_was_not_solved():
+    oscillator = ContactOscillator()
+    strengths = jnp.array([0.0, 0.3, 0.6, 1e8])  # at the last, a step of 0.2 s is thousands of periods
+    starts = {"x": jnp.ones(4), "y": 1.0, "z": 0.5, "y_rate": 0.3}
+    rolled = jj.rollout(oscillator, starts, parameters={"strength": strengths}, ts=[0.0, 2.0, 4.0], dt0=0.2, solver=DLA)
+    assert rolled.result.tolist() == [results.SUCCESS] * 3 + [results.UNSOLVED_STEP]
+    assert "equations of an implicit step were not solved" in str(rolled)
+    assert not np.isfinite(np.asarray(rolled.lanes.q[3, -1])).any()
+    assert np.isfinite(np.asarray(rolled.lanes.q_end)).all()
+    alone = run(oscillator.replace(strength=0.6), jj.start(oscillator, x=1.0, y=1.0, z=0.5, y_rate=0.3), DLA, t1=4.0, dt0=0.2)
+    np.testing.assert_allclose(rolled.lanes.q_end[2], alone.q_end, rtol=0, atol=tolerance("round_off"))
+
+
+def test_a_root_is_differentiated_twice_and_a_missing_one_is_flagged():
+    def root(a):
+        return newton_root(lambda x: x**2 - a, jnp.array([1.0]), jnp.ones(1)).x[0]
+
+    np.testing.assert_allclose([root(2.0), jax.grad(root)(2.0), jax.grad(jax.grad(root))(2.0)], [2**0.5, 0.5 * 2**-0.5, -0.25 * 2**-1.5], rtol=1e-14)
+    assert not newton_root(lambda x: x**2 + 1, jnp.array([1.0]), jnp.ones(1)).converged
+
+
+# Steps, time and errors. -----------------------------------------------------------------------------------------------
+
+
+def test_steps_between_saved_times_are_equal_and_no_longer_than_asked():
+    oscillator = ContactOscillator()
+    motion = jj.simulate(oscillator, ts=jnp.array([0.0, 1.0, 1.5, 4.0]), dt0=0.3, solver=MIDPOINT)
+    assert int(motion.raise_if_failed().accepted) == 4 + 2 + 9
+    whole = jj.simulate(oscillator, ts=jnp.array([0.0, 1.0, 1.5, 3.0]), t1=3.0, dt0=0.1, solver=MIDPOINT)
+    assert int(whole.raise_if_failed().accepted) == 30
+
+
+def test_reversed_time_is_what_projections_and_events_are_given():
+    class Watched(DrivenPendulum):
+        """Stops where the clock falls through 0.5 s."""
+
+        def events(self, motion):
+            return {"clock": motion.t - 0.5}
+
+    pendulum = Watched()
+    start = jj.start(pendulum, t0=1.0, angle=0.3)
+    back = jj.simulate(pendulum, start, t1=0.0, ts=[1.0, 0.0], rtol=1e-8, atol=1e-8, solver=diffrax.Bosh3())
+    assert int(back.result) == results.EVENT
+    np.testing.assert_allclose(back.t_end, 0.5, rtol=1e-12)
+    np.testing.assert_allclose(back.q_end[0], 0.3 * np.sin(1.0), rtol=0, atol=1e-9)  # the prescribed pivot
+
+
+WRONG = {
+    "jj.simulate(oscillator, solver=jj.ImplicitMidpoint())": r"`ImplicitMidpoint` takes steps of one length; give `dt0`, the step in s",
+    "jj.simulate(oscillator, dt0=0.1, solver=jj.DiscreteGradient(), stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))": (
+        r"`DiscreteGradient` takes steps of one length and has no error estimate, which `stepsize_controller` = PIDController needs; leave it away"
+    ),
+    "jj.simulate(oscillator, dt0=0.0, solver=jj.ImplicitMidpoint())": r"`dt0` is 0, expected the step in s; give a number above zero",
+    "jj.simulate(oscillator, dt0=0.1, solver=jj.ImplicitMidpoint(), land_on_ts=False)": r"states at ends of steps only: leave `land_on_ts` at True",
+    "jj.simulate(oscillator, solver=jj.MuntheKaas())": r"`ContactOscillator` has no quaternion among its coordinates; use solver=Tsit5\(\) by itself",
+    "jj.MuntheKaas(jj.DiscreteGradient())": r"`solver` of `MuntheKaas` is DiscreteGradient, expected a Runge-Kutta method",
+    "jj.DiscreteLagrangeDAlembert('midpiont')": r"unknown rule `midpiont` of `DiscreteLagrangeDAlembert`; did you mean `midpoint`",
+    "jj.simulate(oscillator, dt0=0.1, solver=jj.DiscreteLagrangeDAlembert(), state='minimal')": r"integrates all speeds; leave `state` at 'auto'",
+    "jj.simulate(model('free-rigid-body'), dt0=0.1, solver=jj.DiscreteLagrangeDAlembert())": (
+        r"does not apply to `FreeRigidBody`: its speeds are quasi-velocities or angular velocities.*; use solver=jj.ImplicitMidpoint\(\)"
+    ),
+    "jj.simulate(model('isokinetic-particle'), dt0=0.1, solver=jj.DiscreteLagrangeDAlembert())": r"its rows are nonlinear in the speeds",
+    "jj.simulate(DrivenPendulum(), dt0=0.1, solver=jj.DiscreteGradient())": r"does not apply to `DrivenPendulum`: its T \+ V is not constant",
+    "jj.simulate(model('double-pendulum-rods'), dt0=0.1, solver=jj.DiscreteGradient())": r"its geometric rows would have to be projected",
+    "jj.simulate(model('skate'), dt0=0.1, solver=jj.DiscreteGradient())": r"needs the minimal state \(state='minimal' keeps to the privileged speeds",
+}
+
+
+@pytest.mark.parametrize("call", WRONG)
+def test_a_method_that_does_not_apply_says_so_and_what_to_do(call):
+    names = {"jj": jj, "diffrax": diffrax, "oscillator": ContactOscillator(), "model": lambda name: MODELS[name](), "DrivenPendulum": DrivenPendulum}
+    with pytest.raises(ValueError, match=WRONG[call]):
+        eval(call, names)
