@@ -21,7 +21,7 @@ from jourdain_jax.equations.probing import standing_in
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.reactions import row_reactions
 from jourdain_jax.equations.reductions import Partition, _by_null_space, diagnosed, reduce
-from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.equations.rows import ConstraintRows, velocity_residual
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.program.uncompiled import uncompiled
@@ -82,7 +82,7 @@ def evaluated(recipe: Recipe, *, parameters: int, states: int, seed: int = 0, co
 @eqx.filter_jit
 def _solved(ways: dict, equations, rows) -> dict:
     """Accelerations by every reduction of equations and rows; traced once for each shape."""
-    return {name: diagnosed(reduce(way, equations, rows), equations, rows) for name, way in ways.items()}
+    return {name: reduce(way, equations, rows) for name, way in ways.items()}
 
 
 @eqx.filter_jit
@@ -111,9 +111,9 @@ def _accelerations(scene, ways, t, q, u, inputs):
     """By every reduction, and the equations and rows they came from."""
     equations, rows = equations_module.equations_and_rows(scene, t, q, u, inputs)
     gibbs = {name: way for name, way in ways.items() if isinstance(way, GibbsAppell)}
+    rows = ConstraintRows(rows.phi, rows.A, rows.drift, ())  # without names, so that one trace serves all rows of one shape
     found = _solved({name: way for name, way in ways.items() if name not in gibbs}, equations, rows)
-    found |= {name: _diagnosed(way.accelerations(scene, t, q, u, equations, rows), equations, rows) for name, way in gibbs.items()}
-    return found, equations, rows
+    return found | {name: way.accelerations(scene, t, q, u, equations, rows) for name, way in gibbs.items()}, equations, rows
 
 
 def _seen(recipe: Recipe, scene, view, t, q, u, rate) -> dict:
@@ -131,7 +131,7 @@ def _seen(recipe: Recipe, scene, view, t, q, u, rate) -> dict:
         "applicable": {name: way.applicable for name, way in by.items()},
         "expected": expected * view.time / c,
         "force": c * (equations.Q - equations.h),
-        "rank": by["svd"].rank,
+        "rank": _diagnosed(by["svd"], equations, rows).rank,
     }
 
 
@@ -143,7 +143,7 @@ def _plain(scene, t, q, u, sign) -> dict:
     left = jnp.concatenate([closure_residual(scene, t, q), velocity_residual(scene, t, q, u, inputs)])
     ways = jj.reductions(scene)
     by, equations, rows = _accelerations(scene, ways, t, q, u, inputs)
-    best = by["svd"]
+    best = _diagnosed(by["svd"], equations, rows)
     bases = _bases(structure_of(scene).independent, equations, rows)
     c = scaled(equations, rows).c
     motion = jj.motion_at(scene, t, q, u, inputs)

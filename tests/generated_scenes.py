@@ -15,7 +15,7 @@ from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.scene.scene import Scene
 
 GROUND = -1
-MOST_SPEEDS = 10
+MOST_SPEEDS = 7
 
 
 @dataclass(frozen=True)
