@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.answers import contacts_of, geometric_constraints_of, prescribed_of, velocity_constraints_of
-from jourdain_jax.scene.arguments import as_coordinates, as_speeds
+from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.scene import Scene
@@ -91,7 +91,7 @@ def flatten_rows(rows: dict[str, Array], dtype) -> Float[Array, "rows"]:
 
 def position_residual(scene: Scene, t, q) -> Float[Array, "geometric_rows"]:
     """`g(t, q)` of all geometric rows, shape (geometric rows,), in their own units; zero on the constraints. Eq. (5)."""
-    return _position_residual(scene, jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q))
+    return _position_residual(scene, as_time(t), as_coordinates(scene, q))
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
@@ -104,7 +104,7 @@ def velocity_residual(scene: Scene, t, q, u, inputs=None) -> Float[Array, "rows"
 
     `inputs`: values of the scene's inputs (default: zero).
     """
-    return _velocity_residual(scene, jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u), inputs)
+    return _velocity_residual(scene, as_time(t), as_coordinates(scene, q), as_speeds(scene, u), inputs)
 
 
 @eqx.filter_jit

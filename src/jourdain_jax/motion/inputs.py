@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -58,6 +59,19 @@ class Inputs(eqx.Module):
         return jnp.stack([jnp.asarray(channel(t), jnp.result_type(float)) for channel in self.channels]) if self.channels else jnp.zeros(0)
 
 
+def _check_function(f: Callable, where: str) -> None:
+    """ValueError unless `f` of one time is one number; nothing is computed."""
+    advice = "give a function of one time that returns one number, such as `lambda t: jnp.sin(t)`"
+    try:
+        found = jax.eval_shape(f, jax.ShapeDtypeStruct((), jnp.result_type(float)))
+    except TypeError as error:
+        raise ValueError(f"{where} cannot be called with a time ({str(error).splitlines()[0]}); {advice}") from None
+    if not hasattr(found, "shape"):
+        raise ValueError(f"{where} returned {described(found)}, expected one number; {advice}")
+    if found.shape != ():
+        raise ValueError(f"{where} returned an array of shape {found.shape}, expected one number; {advice}")
+
+
 def as_inputs(scene: Scene, given) -> Inputs:
     """Inputs from a dictionary of name -> number, function of time or `Sampled`; what is not named is zero."""
     if isinstance(given, Inputs):
@@ -74,5 +88,8 @@ def as_inputs(scene: Scene, given) -> Inputs:
     for name in scene.inputs.entries:
         value = given.get(name, 0.0)
         advice = "give a number, a function of time, or `jj.Sampled(ts, values)`"
-        channels.append(value if callable(value) else Constant(checked_real(value, f"input `{name}` of `{type(scene).__name__}`", (), advice=advice)))
+        where = f"input `{name}` of `{type(scene).__name__}`"
+        if callable(value):
+            _check_function(value, where)
+        channels.append(value if callable(value) else Constant(checked_real(value, where, (), advice=advice)))
     return Inputs(tuple(channels))

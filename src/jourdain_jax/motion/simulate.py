@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from jourdain_jax.calculus.reals import Number
-from jourdain_jax.equations.accelerations import Baumgarte, as_reduction
+from jourdain_jax.equations.accelerations import Baumgarte, as_reduction, as_stabilisation
 from jourdain_jax.equations.event_names import names_of_events
 from jourdain_jax.equations.power import needs_work
 from jourdain_jax.equations.probing import described_once
@@ -88,7 +88,10 @@ def simulate(
     support the mode of differentiation.
     """
     scene = as_scene(scene)
-    check_options(rtol=rtol, atol=atol, max_steps=max_steps, solver=solver, adjoint=adjoint, stepsize_controller=stepsize_controller, saveat=saveat)
+    switches = {"projection": projection, "events": events, "work": work, "land_on_ts": land_on_ts, "lowering": lowering, "batch": batch}
+    objects = {"solver": solver, "adjoint": adjoint, "stepsize_controller": stepsize_controller, "saveat": saveat}
+    check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, switches=switches, **objects)
+    as_stabilisation(stabilisation)
     _check_adjoint(adjoint)
     made_here = not isinstance(start, State)
     start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts)
@@ -153,7 +156,7 @@ def state_form(
 ) -> StateForm:
     """How the scene's state is integrated, given what was asked."""
     if state not in _STATE_FORMS:
-        raise ValueError(f"unknown state form `{state}`; {nearest(state, _STATE_FORMS)}")
+        raise ValueError(f"unknown state form `{state}`; {nearest(str(state), _STATE_FORMS)}")
     if state == "minimal" and not structure.affine:
         raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use state='full'")
     minimal = state == "minimal" or (state == "auto" and structure.affine and structure.well_conditioned)

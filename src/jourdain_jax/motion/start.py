@@ -14,8 +14,9 @@ from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.structure import structure_of
-from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_scene, as_speeds
+from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.coordinates import Names
+from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -54,8 +55,12 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
 
     Differentiable in any mode. What cannot be met stays in `residual` (no error: this also runs inside jit and vmap). ValueError for wrong shapes.
     """
-    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u)
+    t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     inputs = as_input_vector(scene, inputs, q.dtype)
+    known = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    for name in held:
+        if name not in known:
+            raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, known)}")
     free_q, free_u = (np.array([name not in held for name in names.entries], bool) for names in (scene.coordinate_names, scene.speed_names))
     project = _uncompiled_projection if _seldom(scene, t, q, u, inputs) else _compiled_projection
     near_q, near_u, moved_q, moved_u, residual = (jnp.asarray(x) for x in project(scene, t, q, u, inputs, free_q, free_u))
@@ -95,7 +100,7 @@ def start(scene: Scene, *, t0: Number = 0.0, **values) -> State:
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
     """
     q, u, given = as_scene(scene).named(**values)
-    _check_finite(values)
+    _check_finite(values | {"t0": as_time(t0)})
     state = consistent(scene, t0, q, u, held=(*given, *_resting(scene, given)))
     _check_residual(scene, state, given)
     return state

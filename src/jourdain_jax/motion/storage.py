@@ -24,6 +24,7 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 _ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", "result", "event", "accepted", "rejected", "moved_q", "moved_u", "smallest_pivot")
+_ENTRIES = ("scene", "coordinates", "speeds", "static", "event_names")
 _TEXTS = ("state_form", "reduction", "solver", "projected")
 
 
@@ -59,6 +60,11 @@ def _check_saved(trajectory, path) -> None:
         raise ValueError(f"`save` was given {described(trajectory)}, expected a `Trajectory` from `jj.simulate`")
     if trajectory.q.ndim != 2:
         raise ValueError(f"`save` takes one motion and was given a batch of shape {trajectory.q.shape[:-2]}; save them one by one")
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"`path` is {described(path)}, expected the name of a file")
+    folder = os.path.dirname(path) or "."
+    if not os.path.isdir(folder):
+        raise ValueError(f"cannot write `{os.fspath(path)}`: there is no folder `{folder}`; make it first")
     if os.path.isdir(path):
         raise ValueError(f"cannot write `{os.fspath(path)}`: it is a folder; give the name of a file in it, such as motion.npz")
 
@@ -68,8 +74,10 @@ def load(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
 
     ValueError where the file cannot be read, is of another format, or belongs to another scene.
     """
-    header, arrays = _read(path)
     kind = scene if isinstance(scene, type) else type(scene)
+    if not issubclass(kind, Scene):
+        raise ValueError(f"`scene` is {described(scene)}, expected the class of the scene that moved, or any scene of that class")
+    header, arrays = _read(path)
     if header["scene"] != kind.__name__:
         raise ValueError(f"`{path}` holds a trajectory of `{header['scene']}`, expected `{kind.__name__}`; pass the class it was made with")
     values = {name.removeprefix("parameter:"): value for name, value in arrays.items() if name.startswith("parameter:")}
@@ -78,6 +86,7 @@ def load(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
     if unknown:
         raise ValueError(f"`{path}` has a parameter `{unknown[0]}` that `{kind.__name__}` has not; {nearest(unknown[0], known)}")
     rebuilt = kind(**values, **header["static"])
+    _check_shapes(path, rebuilt, header, arrays)
     forward = np.argsort(arrays["ts"])  # of a motion in reversed time
     inputs = Inputs(tuple(Sampled(arrays["ts"][forward], column[forward]) for column in arrays["inputs"].T))
     return Trajectory(
@@ -90,7 +99,20 @@ def load(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
     )
 
 
+def _check_shapes(path, scene: Scene, header: dict, arrays: dict) -> None:
+    """The file's coordinates, speeds and shapes are those of the scene."""
+    for what, names, stored in (("coordinates", scene.coordinate_names.entries, "q"), ("speeds", scene.speed_names.entries, "u")):
+        if tuple(header[what]) != names:
+            listed = ", ".join(map(str, header[what]))
+            raise ValueError(f"`{path}` has the {what} {listed}, but `{type(scene).__name__}` has {', '.join(names)}; pass the class it was made with")
+        for name, shape in ((stored, (*arrays["ts"].shape, len(names))), (f"{stored}_end", (len(names),))):
+            if arrays[name].shape != shape:
+                raise ValueError(f"the array `{name}` of `{path}` has shape {arrays[name].shape}, expected {shape}; the file is damaged")
+
+
 def _read(path) -> tuple[dict, dict]:
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"`path` is {described(path)}, expected the name of a file")
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -99,11 +121,16 @@ def _read(path) -> tuple[dict, dict]:
         raise ValueError(f"there is no file `{path}`; check the path") from None
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"`{path}` is no trajectory file, or is damaged ({error}); expected an .npz written by `save`") from None
+    if not isinstance(header, dict):
+        raise ValueError(f"`{path}` is no trajectory file, or is damaged (its header is no dictionary); expected an .npz written by `save`")
     if header.get("format") != 1:
         raise ValueError(f"`{path}` has format {header.get('format')}, expected 1; read it with the version of jourdain-jax that wrote it")
     missing = [name for name in (*_ARRAYS, "inputs") if name not in arrays]
     if missing:
         raise ValueError(f"`{path}` lacks the array `{missing[0]}`; it is damaged or was not written by `save`")
+    absent = [name for name in (*_TEXTS, *_ENTRIES) if name not in header]
+    if absent:
+        raise ValueError(f"the header of `{path}` lacks `{absent[0]}`; it is damaged or was not written by `save`")
     return header, arrays
 
 
