@@ -15,7 +15,6 @@ import jourdain_jax as jj
 from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, present
 from jourdain_jax.equations import virtual_power as equations_module
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
-from jourdain_jax.equations.lagrange import speeds_are_rates
 from jourdain_jax.equations.power import power, power_of_loads
 from jourdain_jax.equations.probing import standing_in
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
@@ -149,20 +148,16 @@ def _plain(scene, t, q, u, sign) -> dict:
     motion = jj.motion_at(scene, t, q, u, inputs)
     along = jnp.cos(1.0 + jnp.arange(u.shape[0])) / c  # any direction, for Hessians
     h, M_along = jax.jvp(jax.grad(lambda a: jj.gibbs_function(scene, t, q, u, a)), (jnp.zeros_like(u),), (along,))
-    forms = {"the Gibbs function": (c * M_along, c * h)}
-    if speeds_are_rates(scene):
-        lagrange = jj.lagrange_equations(scene, t, q, u, inputs)
-        forms["Lagrange's equations"] = (c * (lagrange.M @ along), c * lagrange.h)
 
-    def T(u):
+    def T(u, t=t, q=q):
         return jj.kinetic_energy(scene, t, q, u)
 
-    def energy(t, q, u):
-        return jj.kinetic_energy(scene, t, q, u) + jj.potential_energy(scene, jj.motion_at(scene, t, q, u, inputs))
+    def energies(t, q, u):
+        return T(u, t, q), jj.potential_energy(scene, jj.motion_at(scene, t, q, u, inputs)), velocity_residual(scene, t, q, u, inputs)
 
     rates = (jnp.ones_like(t), jj.coordinate_rates(scene, t, q, u), best.udot)
-    (E, _), (E_rate, phi_rate) = jax.jvp(lambda t, q, u: (energy(t, q, u), velocity_residual(scene, t, q, u, inputs)), (t, q, u), rates)
-    slope, T_along = jax.jvp(jax.grad(T), (jnp.zeros_like(u),), (along,))
+    (kinetic, V, _), (T_rate, V_rate, phi_rate) = jax.jvp(energies, (t, q, u), rates)
+    (at_rest, slope), (_, T_along) = jax.jvp(jax.value_and_grad(T), (jnp.zeros_like(u),), (along,))
     reactions = row_reactions(scene, t, q, u, best, inputs)
     partial = jj.partial_velocities(scene, t, q, u)
     turned = jnp.einsum("bji,sbj->sbi", jnp.stack([body.orientation for body in motion.bodies.values()]), reactions.torque)
@@ -173,9 +168,10 @@ def _plain(scene, t, q, u, sign) -> dict:
         "Q": c * equations.Q,
         "M along": c * (equations.M @ along),
         "T along": c * T_along,
-        "forms": forms,
-        "T": T(u),
-        "T by M": T(jnp.zeros_like(u)) + slope @ u + 0.5 * u @ equations.M @ u,
+        "G along": c * M_along,
+        "h of G": c * h,
+        "T": kinetic,
+        "T by M": at_rest + slope @ u + 0.5 * u @ equations.M @ u,
         "A": bases["A"],
         "Z": bases["Z"],
         "C": bases["C"],
@@ -189,8 +185,8 @@ def _plain(scene, t, q, u, sign) -> dict:
         "sigma": best.smallest_singular_value,
         "row rates": scaled(equations, rows).d * phi_rate,
         "row forces": c * by_row,
-        "E": E,
-        "E rate": E_rate,
+        "E": kinetic + V,
+        "E rate": T_rate + V_rate,
         "power": power(scene, motion, best).total,
         "power of loads": power_of_loads(scene, motion, conservative=False),
         "speed": jnp.linalg.norm(u / c),
@@ -220,13 +216,12 @@ def residuals(recipe: Recipe, found: dict) -> dict[str, np.ndarray]:
         "M is positive definite": np.where(np.linalg.eigvalsh(M)[:, 0] > 0, 0.0, 1.0),
         "u'Mu/2 is the quadratic part of T": np.abs(found["T"] - found["T by M"]) / (found["T"] + 1e-3),
         "M is the Hessian of T": largest(found["M along"] - found["T along"]),
+        "M is the Hessian of the Gibbs function": largest(found["M along"] - found["G along"]),
+        "h is the gradient of the Gibbs function": largest(found["h"] - found["h of G"]) / force,
         "rows hold along the motion": largest(found["row rates"]) / size,
         "reactions add up": largest(np.sum(found["row forces"], axis=1) - found["force"]["svd"]) / force,
         "dE/dt is the power of all that works": np.abs(found["E rate"] - found["power"]) / (np.abs(found["E"]) + found["speed"] * size),
     }
-    for name, (M_along, h) in found["forms"].items():
-        out[f"M is that of {name}"] = largest(found["M along"] - M_along)
-        out[f"h is that of {name}"] = largest(found["h"] - h) / force
     for name, Z in found["Z"].items():
         out[f"A Z = 0, {name}"] = largest(found["A"] @ Z)
         out[f"Z' reaction of each row = 0, {name}"] = largest(found["row forces"] @ Z) / force

@@ -15,7 +15,7 @@ from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.scene.scene import Scene
 
 GROUND = -1
-MOST_SPEEDS = 7
+MOST_SPEEDS = 6
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,8 @@ class Recipe:
     def __str__(self) -> str:
         rows = ", ".join(f"{p.kind}{list(p.on)}" for p in self.rows)
         loads = ", ".join(f"{p.kind}{list(p.on)}" for p in self.loads)
-        return f"structure {self.seed}: bodies {', '.join(self.bodies)}; rows {rows or 'none'}; loads {loads or 'none'}; own speeds: {self.own_speeds or 'none'}"
+        own = self.own_speeds or "none"
+        return f"structure {self.seed}: bodies {', '.join(self.bodies)}; rows {rows or 'none'}; loads {loads or 'none'}; own speeds: {own}"
 
     def kinds(self) -> set[str]:
         """Everything that occurs in it."""
@@ -330,10 +331,11 @@ def recipe(seed: int) -> Recipe:
 
 def _drawn_rows(made: Recipe, draw) -> tuple[Part, ...]:
     bodies, free = made.bodies, plain_coordinates(made)
-    left = sum(speed_count(kind) for kind in bodies) - sum({"disc": 2, "wheel": 3, "ball on a lift": 3}.get(kind, 2 * kind.startswith("ball")) for kind in bodies)
+    held = {"disc": 2, "wheel": 3, "ball on a lift": 3}
+    left = sum(speed_count(kind) - held.get(kind, 2 * kind.startswith("ball")) for kind in bodies)
     held_down = [kind in ("disc", "wheel") or kind.startswith("ball") for kind in bodies]
     kinds = ["edge", "rod", "flat pin", "pin", "steered row", "curve", "affine row", "timed row", "driven", "constant speed", "rod", "edge"]
-    wanted = [kinds[(3 * made.seed + k) % len(kinds)] for k in range(len(kinds))][: 1 + int(draw.integers(0, 3))]
+    wanted = [kinds[(7 * made.seed + 4 + k) % len(kinds)] for k in range(len(kinds))][: 1 + int(draw.integers(0, 3))]
     rows: list[Part] = []
     for kind in wanted:
         part, count = None, 1

@@ -37,13 +37,14 @@ def views(coordinates: int, speeds: int) -> tuple[tuple[str, ...], View]:
     """Names of the ways of looking, and all of them as one batch."""
     q, u = np.zeros(coordinates), np.zeros(speeds)
     plain = View(np.eye(3), np.zeros(3), np.zeros(3), np.array(1.0), np.array(1.0), np.array(1.0), q, u)
-    turned = np.asarray(jj.rot_x(0.7) @ jj.rot_z(-1.1) @ jj.rot_y(0.4))
+    moved = (np.asarray(jj.rot_x(0.7) @ jj.rot_z(-1.1) @ jj.rot_y(0.4)), np.array([0.7, -1.3, 0.4]), np.array([0.5, 0.2, -0.8]))
+    units = (np.array(1e-3), np.array(0.45), np.array(60.0))
     made = {
         "reordering of bodies, rows and coordinates": plain,
-        "a rigid motion of the frame": eqx.tree_at(lambda v: (v.rotation, v.shift, v.velocity), plain, (turned, np.array([0.7, -1.3, 0.4]), np.array([0.5, 0.2, -0.8]))),
+        "a rigid motion of the frame": eqx.tree_at(lambda v: (v.rotation, v.shift, v.velocity), plain, moved),
         "a change of coordinates": eqx.tree_at(lambda v: v.bend, plain, 0.4 * np.cos(1.0 + np.arange(coordinates))),
         "a change of speeds": eqx.tree_at(lambda v: v.mix, plain, 0.5 * np.cos(2.0 + np.arange(speeds))),
-        "a change of units": eqx.tree_at(lambda v: (v.length, v.mass, v.time), plain, (np.array(1e-3), np.array(0.45), np.array(60.0))),
+        "a change of units": eqx.tree_at(lambda v: (v.length, v.mass, v.time), plain, units),
     }
     return tuple(made), jax.tree.map(lambda *x: np.stack(x), *made.values())
 
