@@ -8,8 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from generated_scenes import LENGTHS, Recipe, coordinate_list, generated
-from seen_differently import Seen, views
+from generated_scenes import LENGTHS, Recipe, body_name, coordinate_list, generated
+from seen_differently import Seen, other_names, views
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, present
@@ -51,8 +51,8 @@ def dimensions(recipe: Recipe) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
     return tuple(q), tuple(u)
 
 
-def evaluated(recipe: Recipe, *, parameters: int, states: int, seed: int = 0, compiled: bool = False) -> dict:
-    """Everything at all instances, as NumPy arrays with a leading axis of instances."""
+def evaluated(recipe: Recipe, *, parameters: int, states: int, seed: int = 0, compiled: bool = False, looks: bool = True) -> dict:
+    """Everything at all instances, as NumPy arrays with a leading axis of instances; `looks`: also seen differently."""
     stacked, scene, t, q, u = instances(recipe, parameters, states, seed)
     run = jax.jit if compiled else uncompiled
     leaves, treedef = jax.tree.flatten(stacked)
@@ -61,21 +61,24 @@ def evaluated(recipe: Recipe, *, parameters: int, states: int, seed: int = 0, co
     def plain(leaves, t, q, u, sign):
         return jax.vmap(lambda leaves, *state: _plain(jax.tree.unflatten(treedef, leaves), *state))(leaves, t, q, u, sign)
 
-    names, looks = views(len(scene.coordinate_names), len(scene.speed_names))
+    names, ways = views(len(scene.coordinate_names), len(scene.speed_names))
 
-    def seen(leaves, looks, *state):
-        return jax.vmap(lambda leaves, *view_and_state: _seen(recipe, jax.tree.unflatten(treedef, leaves), *view_and_state))(leaves, looks, *state)
+    def seen(leaves, ways, *state):
+        return jax.vmap(lambda leaves, *view_and_state: _seen(recipe, jax.tree.unflatten(treedef, leaves), *view_and_state))(leaves, ways, *state)
 
     with standing_in(scene):
         both = [np.concatenate([x, x]) for x in (*leaves, t, q, u)]
         found = jax.tree.map(np.asarray, run(plain)(both[:-3], *both[-3:], np.repeat([1.0, -1.0], len(t))))
         forwards, backwards = (jax.tree.map(lambda x, half=half: x[half], found) for half in (slice(len(t)), slice(len(t), None)))
+        forwards["reversed"] = backwards["udot"]
+        if not looks:
+            return forwards
         known = (forwards[name] for name in ("t", "q", "u", "rate"))
         every = [np.repeat(x, len(names), axis=0) for x in (*leaves, *known)]
-        looks = jax.tree.map(lambda x: np.tile(x, (len(t), *[1] * (x.ndim - 1))), looks)
-        viewed = jax.tree.map(np.asarray, run(seen)(every[:-4], looks, *every[-4:]))
+        ways = jax.tree.map(lambda x: np.tile(x, (len(t), *[1] * (x.ndim - 1))), ways)
+        viewed = jax.tree.map(np.asarray, run(seen)(every[:-4], ways, *every[-4:]))
     viewed = jax.tree.map(lambda x: x.reshape(len(t), len(names), *x.shape[1:]), viewed)
-    return forwards | {"reversed": backwards["udot"], "seen": viewed}
+    return forwards | {"seen": viewed}
 
 
 @eqx.filter_jit
@@ -119,7 +122,7 @@ def _seen(recipe: Recipe, scene, view, t, q, u, rate) -> dict:
     """Accelerations of the same motion, seen differently."""
     inputs = PUSH * jnp.ones(len(scene.inputs))
     lengths, paces = dimensions(recipe)
-    seen = Seen(scene, view, lengths, paces)
+    seen = Seen(scene, view, other_names(body_name(i) for i in range(len(recipe.bodies))), lengths, paces)
     new_q = seen.new_coordinates(q)
     new_u, expected = jax.jvp(seen.new_speeds, (q, u), (jj.coordinate_rates(scene, t, q, u), rate))
     ways = {name: way for name, way in jj.reductions(scene).items() if name != "gibbs-appell"}
@@ -190,6 +193,7 @@ def _plain(scene, t, q, u, sign) -> dict:
         "power": power(scene, motion, best).total,
         "power of loads": power_of_loads(scene, motion, conservative=False),
         "speed": jnp.linalg.norm(u / c),
+        "well conditioned": jnp.array(structure_of(scene).well_conditioned),
         "miss": jnp.max(jnp.abs(left), initial=0.0),
         "t": t,
         "q": q,
@@ -239,7 +243,7 @@ def residuals(recipe: Recipe, found: dict) -> dict[str, np.ndarray]:
     if recipe.reversible:
         for name, udot in found["reversed"].items():
             out[f"time reversal, {name}"] = np.where(found["applicable"][name], largest(udot - found["udot"][name]) / size, 0.0)
-    return out | _of_views(found)
+    return out | (_of_views(found) if "seen" in found else {})
 
 
 def _of_views(found: dict) -> dict[str, np.ndarray]:

@@ -80,6 +80,7 @@ RIGID = {"plate", "block", "top", "disc", "wheel", "arm"}
 TIMED = {"ball on a lift", "swing", "timed row", "driven", "gust", "tide"}
 MOVING = {"ball on a turntable", "ball on a belt", "affine row", "affine quasi-velocities", "constant speed", "input"}
 ODD = {"damper", "drag", "magnet", "steering"}
+GEOMETRIC = {"rod", "pin", "flat pin", "curve"}
 LENGTHS = {"x", "y", "z"}
 
 
@@ -343,8 +344,9 @@ def _drawn_rows(made: Recipe, draw) -> tuple[Part, ...]:
         if kind == "edge":
             on = [i for i in loose if bodies[i] in RIGID]
             part = Part(kind, (on[0],)) if on else None
-        elif kind in ("rod", "pin", "flat pin", "curve"):
-            on = [i for i in loose if kind != "pin" or bodies[i] in ("particle", "block", "top")]
+        elif kind in GEOMETRIC:
+            tied = {part.on[0] for part in rows if part.kind in GEOMETRIC}  # a second such row on one body may contradict the first
+            on = [i for i in loose if i not in tied and (kind != "pin" or bodies[i] in ("particle", "block", "top"))]
             if on:
                 other = [j for j in range(len(bodies)) if j < on[-1]]
                 part = Part(kind, (on[-1], int(draw.choice([GROUND, *other])))) if kind != "curve" else Part(kind, (on[-1],))
@@ -360,7 +362,7 @@ def _drawn_rows(made: Recipe, draw) -> tuple[Part, ...]:
         if part is not None and left - count >= 1:
             rows.append(part)
             left -= count
-    geometric = [s for s, part in enumerate(rows) if part.kind in ("rod", "pin", "flat pin", "curve")]
+    geometric = [s for s, part in enumerate(rows) if part.kind in GEOMETRIC]
     alike = [group for group in (geometric, [s for s, p in enumerate(rows) if s not in geometric and p.kind != "driven"]) if group]
     if alike and made.seed % 3 != 1:
         group = alike[int(draw.integers(len(alike)))]
@@ -422,7 +424,7 @@ def _anchors(scene, q):
     pose = jj.pose_at(scene, 0.0, q)
     found = []
     for part in scene.recipe.rows:
-        on = part.on[0] if part.kind in ("rod", "pin", "flat pin", "curve") else 0
+        on = part.on[0] if part.kind in GEOMETRIC else 0
         own = pose[body_name(on)].place(jnp.stack([0.3, 0.1, -0.2]) * scene.sizes[on])
         held = jnp.ones(3)
         if part.kind == "rod":

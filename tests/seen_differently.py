@@ -49,11 +49,17 @@ def views(coordinates: int, speeds: int) -> tuple[tuple[str, ...], View]:
     return tuple(made), jax.tree.map(lambda *x: np.stack(x), *made.values())
 
 
+def other_names(names) -> tuple[tuple[str, str], ...]:
+    """New names of the bodies, in the opposite order."""
+    return tuple((name, f"body {chr(ord('z') - i)}") for i, name in enumerate(sorted(names)))
+
+
 class Seen(jj.Scene):
     """`scene` as `view` shows it."""
 
     scene: Scene
     view: View
+    names: tuple[tuple[str, str], ...] = eqx.field(static=True)  # old and new names of the bodies
     lengths: tuple[bool, ...] = eqx.field(static=True)  # whether each coordinate is a length
     paces: tuple[bool, ...] = eqx.field(static=True)  # whether each speed is the rate of one
 
@@ -104,17 +110,11 @@ class Seen(jj.Scene):
         """The unit of power."""
         return self.view.mass * self.view.length**2 / self.view.time**3
 
-    def _names(self) -> dict[str, str]:
-        """New names of the bodies, in the opposite order."""
-        q, _, _ = self.scene.named()
-        names = sorted(jax.eval_shape(lambda s: jj.pose_at(s, 0.0, q).bodies, self.scene))
-        return {name: f"body {chr(ord('z') - i)}" for i, name in enumerate(names)}
-
     # The scene in the primed quantities. --------------------------------------------------------------------------
 
     def bodies(self, t, q):
         t = t * self.view.time
-        q, names = self.scene.coordinate_names.view(self.old_coordinates(q.array)), self._names()
+        q, names = self.scene.coordinate_names.view(self.old_coordinates(q.array)), dict(self.names)
         return {names[name]: self._body(body, t) for name, body in self.scene.bodies(t, q).items()}
 
     def _body(self, body, t):
@@ -132,7 +132,7 @@ class Seen(jj.Scene):
     def _pose(self, pose) -> Pose:
         """What the scene's author is shown of a pose."""
         t, old = pose.t * self.view.time, self.scene.coordinate_names.view(self.old_coordinates(pose.q.array))
-        return Pose(t, old, {name: BodyPose(name, self._old_body(pose[new], t)) for name, new in self._names().items()})
+        return Pose(t, old, {name: BodyPose(name, self._old_body(pose[new], t)) for name, new in self.names})
 
     def _old_body(self, seen, t):
         view = self.view
@@ -146,7 +146,7 @@ class Seen(jj.Scene):
         view, pose, t = self.view, self._pose(motion.pose()), motion.t * self.view.time
         u = self.old_speeds(pose.q.array, motion.u.array)
         moving = {}
-        for name, new in self._names().items():
+        for name, new in self.names:
             v = view.rotation.T @ (motion[new].velocity * view.length / view.time - view.velocity)
             omega = view.rotation.T @ motion[new].angular_velocity / view.time
             moving[name] = BodyMotion(name, pose[name].body, v, omega)
@@ -154,7 +154,7 @@ class Seen(jj.Scene):
         return Motion(t, pose.q, self.scene.speed_names.view(u), self.scene.coordinate_names.view(rates), motion.inputs, moving)
 
     def loads(self, motion):
-        names, seen, force = self._names(), self._motion(motion), self._power() * self.view.time / self.view.length
+        names, seen, force = dict(self.names), self._motion(motion), self._power() * self.view.time / self.view.length
         made = []
         for load in self.scene.loads(seen):
             made.append(
