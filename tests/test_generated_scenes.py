@@ -23,7 +23,7 @@ from jourdain_jax.program.evaluate import Probes
 STRUCTURES = range(25)
 PARAMETERS, STATES, LEAST = 2, 5, 8  # per structure: 25 times at least 8 instances make 200
 MANY_PARAMETERS, MANY_STATES, MANY = 12, 20, 200  # 5,000 in all
-QUICKLY_LOWERED = (1, 3, 12, 13, 16, 22)
+QUICKLY_LOWERED = (13, 16, 22)
 
 
 def broken(made: Recipe, found: dict) -> dict[str, float]:
@@ -71,7 +71,7 @@ def test_the_structures_contain_everything_that_can_be_generated():
     occurring = set().union(*(r.kinds() for r in made))
     assert {*KINDS, *rows, *loads, "homogeneous quasi-velocities", "affine quasi-velocities"} <= occurring
     assert sum(r.reversible for r in made) >= 5
-    assert sum(r.scleronomic for r in made) >= 10
+    assert sum(r.scleronomic for r in made) >= 8
 
 
 def check_lowered(number: int) -> bool:
@@ -140,7 +140,7 @@ def _wrong_sign_of_bias(equations_of):
 def _row_forgotten(rows_of):
     def wrong(scene, at):
         right = rows_of(scene, at)
-        kept = jnp.ones(right.phi.shape[0]).at[0].set(0.0)
+        kept = jnp.ones(right.phi.shape[0]).at[-1].set(0.0)  # one that no other row repeats
         return ConstraintRows(right.phi * kept, right.A * kept[:, None], right.drift * kept, right.names)
 
     return wrong
