@@ -61,34 +61,6 @@ def test_simulate_writes_what_it_was_asked_for(capsys, tmp_path):
     assert all((tmp_path / name).stat().st_size > 1000 for name in ("run.png", "run.gif"))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["modles"], "unknown verb `modles`; did you mean `models`"),
-        (["report", "chaplygin-slay"], "unknown model `chaplygin-slay`; did you mean `chaplygin-sleigh`"),
-        (["simulate", "skate", "--set", "mas=2"], "has no parameter `mas`; did you mean `mass`"),
-        (["simulate", "skate", "--set", "mass"], "`mass` is not NAME=VALUE"),
-        (["simulate", "skate", "--start", "x=fast"], "`x=fast` is not NAME=VALUE with a number"),
-        (["simulate", "skate", "--start", "xx=1"], "has no coordinate or speed `xx`"),
-        (["simulate", "skate", "--samples", "1"], "--samples is 1, expected at least 2"),
-        (["simulate", "skate", "--out", "nowhere/run.npz"], "there is no folder `nowhere`"),
-        (["bicycle", "Rigid", "--samples", "0"], "--samples is 0"),
-        (["simulate", "skate", "--out", "."], "cannot write `.`: it is a folder; give the name of a file in it"),
-        (["simulate", "skate", "--animate", "run.mp4"], "cannot write `run.mp4`: an animation is a .gif file"),
-        (["simulate", "skate", "--plot", "run.xyz"], "cannot write `run.xyz`: a plot is a .png, .svg or .pdf file, and matplotlib knows no `xyz`"),
-        (["simulate", "skate", "--rtol", "-1"], "`rtol` is -1, expected a positive finite number"),
-        (["simulate", "skate", "--atol", "nan"], "`atol` is nan, expected a positive finite number"),
-        (["report", "pendulum-chain", "--set", "links=1.5"], "--set links=1.5: `links` of `pendulum-chain` is a count, expected a whole number"),
-        (["report", "pendulum-chain", "--set", "links=0"], "`links` of `PendulumChain` is 0, expected a whole number of particles >= 1"),
-        (["report", "pendulum-chain", "--set", "link=2"], "model `pendulum-chain` has no parameter `link`; did you mean `links`"),
-    ],
-)
-def test_wrong_commands_exit_with_2_and_say_what_to_do(arguments, sentence, capsys):
-    code, out = run(capsys, *arguments)
-    assert code == 2
-    assert sentence in out.err
-
-
 def test_a_file_that_cannot_be_written_is_answered_without_a_traceback(capsys, tmp_path, monkeypatch):
     def refuse(*_):
         raise PermissionError(13, "Permission denied", str(tmp_path / "run.npz"))

@@ -1,7 +1,6 @@
 """A wrong description of a scene is answered at build time, by name, with what to do."""
 
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import jourdain_jax as jj
@@ -22,19 +21,6 @@ def described(**methods):
     return type("Described", (Slider,), methods)()
 
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"mass": -1.0}, "parameter `mass` of `Slider` is -1.0, expected a positive number in kg"),
-        ({"mass": np.nan}, "parameter `mass` of `Slider` is nan, expected finite numbers"),
-        ({"mas": 1.0}, "has no parameter `mas`; did you mean `mass`"),
-    ],
-)
-def test_a_wrong_parameter_is_named(change, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        Slider().replace(**change)
-
-
 def test_a_scene_without_coordinates_says_how_to_state_them():
     class Empty(jj.Scene):
         pass
@@ -49,15 +35,6 @@ def test_a_scene_without_bodies_says_what_to_define():
 
     with pytest.raises(NotImplementedError, match=r"define `bodies\(self, t, q\)`"):
         jj.simulate(Bare(), {}, t1=1.0)
-
-
-@pytest.mark.parametrize(
-    ("names", "sentence"),
-    [(("x x",), "coordinate name `x` is used twice"), (("1x",), "`1x` is not an identifier"), (("array",), "`array` is taken")],
-)
-def test_a_wrong_coordinate_name_is_named(names, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        jj.coordinates(*names)
 
 
 def test_an_unknown_coordinate_in_a_method_lists_the_valid_ones():
@@ -94,21 +71,6 @@ def test_two_rows_of_one_name_are_refused():
         jj.accelerations(wrong, 0.0, jnp.zeros(2), jnp.zeros(2))
 
 
-def test_an_unknown_prescribed_coordinate_is_named():
-    wrong = described(prescribed=lambda self, t: {"w": t})
-    with pytest.raises(ValueError, match=r"prescribed coordinate of `Described`: `w`"):
-        jj.accelerations(wrong, 0.0, jnp.zeros(2), jnp.zeros(2))
-
-
-@pytest.mark.parametrize(
-    ("privileged", "sentence"),
-    [(("z_rate", "x_rate"), "unknown privileged speed of `Described`: `z_rate`"), (("x_rate",), "names 1 speeds, but the scene has 2 degrees of freedom")],
-)
-def test_wrong_privileged_speeds_are_named(privileged, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        jj.structure_of(described(privileged=privileged))
-
-
 @pytest.mark.parametrize(
     ("build", "sentence"),
     [
@@ -122,14 +84,3 @@ def test_wrong_privileged_speeds_are_named(privileged, sentence):
 def test_a_body_or_joint_of_the_wrong_shape_is_refused(build, sentence):
     with pytest.raises(ValueError, match=sentence):
         build()
-
-
-def test_geometric_rows_that_cannot_be_met_are_found_when_probed():
-    apart = described(geometric_constraints=lambda self, pose: {"far": pose.q.x**2 + 1.0})
-    with pytest.raises(ValueError, match="no admissible state of `Described` was found"):
-        jj.structure_of(apart)
-
-
-def test_an_unknown_reduction_is_answered_with_the_nearest_name():
-    with pytest.raises(ValueError, match="unknown reduction `svdd`; did you mean `svd`"):
-        jj.accelerations(Slider(), 0.0, jnp.zeros(2), jnp.zeros(2), reduction="svdd")

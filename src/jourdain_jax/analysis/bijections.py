@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.reals import Number
+from jourdain_jax.calculus.reals import Number, checked_real
 
 
 class Bijection(eqx.Module):
@@ -115,6 +115,8 @@ def bounds(low: Number, high: Number) -> Bounded:
 
     Raises ValueError unless both are finite and low < high.
     """
+    for name, end in (("low end", low), ("high end", high)):
+        checked_real(end, f"{name} of `bounds`", ())
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
         raise ValueError(f"bounds({low}, {high}): expected finite numbers low < high; for one bound at zero use `positive()`, for none `unbounded()`")
     return Bounded(jnp.asarray(low, jnp.result_type(float)), jnp.asarray(high, jnp.result_type(float)))
@@ -125,6 +127,8 @@ def unbounded(scale: Number | None = None) -> Unbounded:
 
     Raises ValueError unless the scale is positive and finite.
     """
+    if scale is not None:
+        checked_real(scale, "`scale` of `unbounded`", ())
     if scale is not None and not (np.isfinite(scale) and scale > 0):
         raise ValueError(f"unbounded({scale}): expected a positive scale, a typical change in the unit of the unknown")
     return Unbounded(None if scale is None else jnp.asarray(scale, jnp.result_type(float)))

@@ -16,6 +16,7 @@ from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.reductions import reduce
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.equations.virtual_power import equations_and_rows
+from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
 
 
@@ -30,6 +31,8 @@ def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) 
 
     Needs numbers: not under jit or vmap.
     """
+    if jax.tree.structure(direction) != jax.tree.structure(scene):
+        raise ValueError(f"`direction` is {described(direction)}, expected a change of every parameter, as a scene like `scene`: a `{type(scene).__name__}`")
     A, dA, size = (np.asarray(x) for x in _row_change(scene, t, as_real(q), as_real(u), direction, as_real(dq), inputs))
     if A.size == 0:
         return True

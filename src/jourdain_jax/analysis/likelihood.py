@@ -3,7 +3,7 @@
 r = (channel(motion) - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi))
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import equinox as eqx
 import jax
@@ -13,12 +13,15 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.measurements import Measurements, checked
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
 
 
 def as_runs(scene: Scene, data: Measurements | Sequence[Measurements], *, repeats: bool = False) -> tuple[Measurements, ...]:
     """One run or several, checked against the scene; ValueError as in `checked`, and where there is no run."""
     as_scene(scene)
+    if not isinstance(data, Measurements | Iterable):
+        raise ValueError(f"`data` is {described(data)}, expected a `Measurements` or a sequence of at least one")
     runs = (data,) if isinstance(data, Measurements) else tuple(data)
     if not runs or not all(isinstance(run, Measurements) for run in runs):
         raise ValueError("`data` must be a `Measurements` or a sequence of at least one")

@@ -16,6 +16,7 @@ from jourdain_jax.calculus.reals import Number
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.numbers import checked_real, described
 from jourdain_jax.scene.scene import Scene
 
 
@@ -63,12 +64,15 @@ class Measurements(eqx.Module):
         t0: Number | None = None,
     ):
         real = jnp.result_type(float)
-        self.ts = jnp.asarray(ts, real)
+        self.ts = checked_real(ts, "`ts`", advice="give times in s").astype(real)
         _check_times(self.ts)
-        self.values = {name: jnp.asarray(value, real) for name, value in values.items()}
+        for what, part in (("values", values), ("start", start)):
+            if not isinstance(part, Mapping):
+                raise ValueError(f'`{what}` of `Measurements` is {described(part)}, expected a dictionary by name, such as {{"x": ...}}')
+        self.values = _reals("values of channel", values)
         given = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.values, sigma)
-        self.sigma = {name: jnp.asarray(value, real) for name, value in given.items()}
-        self.start = {name: jnp.asarray(value, real) for name, value in start.items()}
+        self.sigma = _reals("sigma of channel", given)
+        self.start = _reals("start value", start)
         self.unknown_start = dict(unknown_start) if isinstance(unknown_start, Mapping) else dict.fromkeys(as_names(unknown_start))
         self.inputs = inputs
         self.functions = dict(functions or {})
@@ -113,6 +117,10 @@ class Measurements(eqx.Module):
 def _holds(condition: Callable, x) -> bool:
     """Whether a condition holds throughout; traced values are not looked at."""
     return isinstance(x, jax.core.Tracer) or bool(np.all(condition(np.asarray(x))))
+
+
+def _reals(what: str, given: Mapping) -> dict[str, Array]:
+    return {name: checked_real(value, f"{what} `{name}`").astype(jnp.result_type(float)) for name, value in given.items()}
 
 
 def _check_times(ts) -> None:

@@ -1,6 +1,6 @@
 """What a scene states (bodies, loads, potentials, rows), checked piece by piece, so that a wrong one is named.
 
-inertia        m >= 0,  I = I' >= 0,  R'R = 1                         per body
+inertia        m >= 0,  I = I' >= 0,  I_3 <= I_1 + I_2,  R'R = 1      per body
 potentials     Z' (Q_i + N' dV_i/dq) = 0                              per load i that states a potential V_i
 derivatives    d/ds of every piece along one direction in (parameters, t, q, u): autodiff against central differences; no kink there
 """
@@ -51,6 +51,8 @@ def _inertia(motion: Motion) -> dict[str, Float[Array, ""]]:
         moments = jnp.linalg.eigvalsh((body.inertia + body.inertia.T) / 2)
         values[f"body `{name}`: its inertia is not symmetric"] = jnp.max(jnp.abs(body.inertia - body.inertia.T)) / size
         values[f"body `{name}`: a principal moment of inertia is negative"] = jnp.maximum(-moments[0], 0.0) / size
+        excess = jnp.maximum(moments[2] - moments[0] - moments[1], 0.0)
+        values[f"body `{name}`: a principal moment of inertia exceeds the sum of the other two"] = excess / size
         values[f"body `{name}`: its orientation is no rotation matrix"] = jnp.max(jnp.abs(body.orientation.T @ body.orientation - jnp.eye(3)))
     return values
 

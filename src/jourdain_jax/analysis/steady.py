@@ -77,6 +77,8 @@ def steady(
 
     **Raises** ValueError: an unknown name.
     """
+    if not isinstance(max_steps, int | np.integer) or max_steps < 1:
+        raise ValueError(f"`max_steps` is {max_steps!r}, expected a whole number of at least 1")
     t, q, u = _guessed(as_scene(scene), guess, t0)
     f = as_input_vector(scene, inputs, q.dtype).astype(q.dtype)
     held = as_names(held)

@@ -117,7 +117,14 @@ def privileged_speeds(scene: Scene, names: str | tuple[str, ...] | None = None) 
     names = scene.privileged if names is None else names
     if names is None:
         return structure_of(scene).independent
-    return tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(names))
+    chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(names))
+    freedoms = structure_of(scene).degrees_of_freedom
+    if len(set(chosen)) != freedoms or len(chosen) != freedoms:
+        raise ValueError(
+            f"`privileged` names {len(set(chosen))} speeds of `{type(scene).__name__}` ({', '.join(as_names(names))}), which has {freedoms} degrees of "
+            f"freedom; name {freedoms} independent speeds"
+        )
+    return chosen
 
 
 def dependent_coordinates(scene: Scene, state: State, named: tuple[str, ...], dependent: tuple[str, ...] | None) -> Int[np.ndarray, "dependent"]:
@@ -129,6 +136,8 @@ def dependent_coordinates(scene: Scene, state: State, named: tuple[str, ...], de
     for name in (*named, *(dependent or ())):
         if name not in names:
             raise ValueError(f"`{type(scene).__name__}` has no coordinate `{name}` to perturb; {nearest(name, names)}")
+    if len(set(named)) != len(named):
+        raise ValueError(f"`coordinates` names one twice ({', '.join(named)}); name each once")
     both = set(named) & set(dependent or ())
     if both:
         raise ValueError(f"coordinate `{both.pop()}` is asked for in `coordinates` and said to be dependent; leave it out of one of the two")

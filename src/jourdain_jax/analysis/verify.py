@@ -59,6 +59,8 @@ def verify(scene: Scene, state: State | dict | None = None, inputs: Numbers | di
 
     **Returns** a `Verification`. Nothing is raised for a failed check; not under jit or vmap.
     """
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
     inputs = as_input_vector(as_scene(scene), inputs)
     state = as_state(scene, state, what="state", inputs=inputs)
     t, q, u = state.t, state.q, state.u

@@ -10,12 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
-from jourdain_jax.calculus.reals import Number, Vector, as_real
+from jourdain_jax.calculus.reals import Number, Vector, checked_real
+
+
+def _angle(angle: Number) -> Float[Array, ""]:
+    return checked_real(angle, "angle of a rotation", (), advice="give one angle in rad; use `jax.vmap` for many")
 
 
 def rot_x(angle: Number) -> Float[Array, "3 3"]:
     """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the x axis."""
-    angle = as_real(angle)
+    angle = _angle(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     o, i = jnp.zeros_like(c), jnp.ones_like(c)
     return jnp.stack([jnp.stack([i, o, o]), jnp.stack([o, c, -s]), jnp.stack([o, s, c])])
@@ -23,7 +27,7 @@ def rot_x(angle: Number) -> Float[Array, "3 3"]:
 
 def rot_y(angle: Number) -> Float[Array, "3 3"]:
     """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the y axis."""
-    angle = as_real(angle)
+    angle = _angle(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     o, i = jnp.zeros_like(c), jnp.ones_like(c)
     return jnp.stack([jnp.stack([c, o, s]), jnp.stack([o, i, o]), jnp.stack([-s, o, c])])
@@ -31,7 +35,7 @@ def rot_y(angle: Number) -> Float[Array, "3 3"]:
 
 def rot_z(angle: Number) -> Float[Array, "3 3"]:
     """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the z axis."""
-    angle = as_real(angle)
+    angle = _angle(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     o, i = jnp.zeros_like(c), jnp.ones_like(c)
     return jnp.stack([jnp.stack([c, -s, o]), jnp.stack([s, c, o]), jnp.stack([o, o, i])])
@@ -51,7 +55,7 @@ def vee(S: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 def quaternion_to_matrix(quaternion: Real[Array | np.ndarray, "4"] | Sequence[Number]) -> Float[Array, "3 3"]:
     """Rotation matrix (3, 3), body to space, of a `quaternion` (w, x, y, z) of any norm but zero (the formula divides by the squared norm)."""
-    quaternion = as_real(quaternion)
+    quaternion = checked_real(quaternion, "quaternion", (4,), advice="give (w, x, y, z)")
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     # R = 1 + 2 (w [v]x + [v]x^2) / (w^2 + v.v): unchanged by the norm, so that a drifting norm never scales an inertia.
     two = 2.0 / (w * w + x * x + y * y + z * z)
@@ -85,5 +89,6 @@ def quaternion_product(p: Float[Array, "4"], q: Float[Array, "4"]) -> Float[Arra
 
 def quaternion_from_axis_angle(axis: Vector, angle: Number) -> Float[Array, "4"]:
     """The unit quaternion (w, x, y, z) `(cos(angle/2), sin(angle/2) axis)` of a turn by `angle` (rad) about the unit vector `axis`."""
-    half = as_real(angle) / 2
-    return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * as_real(axis)])
+    half = _angle(angle) / 2
+    axis = checked_real(axis, "axis of a quaternion", (3,), advice="give a unit vector")
+    return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * axis])

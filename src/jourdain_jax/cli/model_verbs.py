@@ -126,6 +126,8 @@ def _simulate(options) -> bool:
     t1 = scene.example_span if options.t1 is None else options.t1
     if options.samples < 2:
         raise ValueError(f"--samples is {options.samples}, expected at least 2")
+    if not np.isfinite(t1) or t1 == 0:
+        raise ValueError(f"--t1 is {t1:g}, expected a finite time in s other than zero")
     _check_files(options)
     trajectory = simulate(scene, _state(scene, options), ts=np.linspace(0.0, t1, options.samples), rtol=options.rtol, atol=options.atol)
     if options.out:

@@ -5,9 +5,9 @@ kinematics -> virtual power (M, h, Q) -> rows (A, drift) -> reduction -> udot, l
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.reductions import (
     Accelerations,
@@ -26,7 +26,7 @@ from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
 from jourdain_jax.scene.arguments import as_coordinates, as_scene, as_speeds
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import described
+from jourdain_jax.scene.numbers import checked_real, described
 from jourdain_jax.scene.scene import Scene
 
 
@@ -37,8 +37,8 @@ class Baumgarte(eqx.Module):
     accurate.
     """
 
-    alpha: Float[Array, ""] = eqx.field(converter=as_real, default=5.0)
-    beta: Float[Array, ""] = eqx.field(converter=as_real, default=5.0)
+    alpha: Float[Array, ""] = eqx.field(converter=lambda x: checked_real(x, "`alpha` of `Baumgarte`", ()), default=5.0)
+    beta: Float[Array, ""] = eqx.field(converter=lambda x: checked_real(x, "`beta` of `Baumgarte`", ()), default=5.0)
 
 
 def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
@@ -68,7 +68,23 @@ def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
         return known[reduction]
     if not isinstance(reduction, Reduction | GibbsAppell):
         raise ValueError(f"`reduction` is {described(reduction)}, expected a name ({', '.join(reductions(scene))}) or an object such as `jj.NullSpaceQR()`")
+    if isinstance(reduction, Privileged | GibbsAppell):
+        _check_independent(scene, reduction.independent)
     return reduction
+
+
+def _check_independent(scene: Scene, chosen) -> None:
+    count = len(scene.speed_names)
+    if any(not isinstance(i, int | np.integer) or not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
+        where = f"speeds of `{type(scene).__name__}`, 0 to {count - 1}"
+        raise ValueError(f"`independent` is {chosen}, expected different indices of {where}; or give the reduction by its name")
+
+
+def as_stabilisation(stabilisation) -> Baumgarte | None:
+    """The Baumgarte terms, or None; a ValueError for anything else."""
+    if stabilisation is not None and not isinstance(stabilisation, Baumgarte):
+        raise ValueError(f"`stabilisation` is {described(stabilisation)}, expected `jj.Baumgarte(alpha, beta)` or None")
+    return stabilisation
 
 
 def accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None) -> Accelerations:
@@ -95,7 +111,7 @@ def _reduced(scene: Scene, t, q, u, inputs, reduction, stabilisation) -> tuple[R
     q, u = as_coordinates(scene, q), as_speeds(scene, u)
     reduction = as_reduction(scene, reduction)
     equations, rows = equations_and_rows(scene, t, q, u, inputs)
-    if stabilisation is not None:
+    if as_stabilisation(stabilisation) is not None:
         rows = _stabilised(scene, t, q, rows, stabilisation)
     if isinstance(reduction, GibbsAppell):
         return reduction.accelerations(scene, t, q, u, equations, rows), equations, rows

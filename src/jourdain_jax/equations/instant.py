@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import as_real
 from jourdain_jax.equations.kinematics import Inertias, Velocities, coordinate_rates, inertias_of, motion_at, velocities_of
 from jourdain_jax.equations.rows import ConstraintRows, flatten_rows, names_of_rows, velocity_rows
-from jourdain_jax.scene.arguments import as_coordinates, as_speeds
+from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
@@ -60,7 +60,7 @@ def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
 
 def derivatives_in_speeds(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
     """`beta`, `gamma` and `A`; the velocities and residuals themselves; and the motion they belong to."""
-    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u)
+    t, q, u = as_time(t), as_real(q), as_real(u)
 
     def level(u):
         value, motion = _velocity_level(scene, t, q, u, inputs)
@@ -72,7 +72,7 @@ def derivatives_in_speeds(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityL
 
 def rates_along_motion(scene: Scene, t, q, u, inputs=None) -> tuple[VelocityLevel, VelocityLevel, Motion]:
     """Velocities and residuals; `a_0`, `alpha_0` and the drift: their derivatives along `(1, qdot, 0)`; and the motion."""
-    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u)
+    t, q, u = as_time(t), as_real(q), as_real(u)
     qdot = coordinate_rates(scene, t, q, u)
     return jax.jvp(lambda t, q: _velocity_level(scene, t, q, u, inputs), (t, q), (jnp.ones_like(t), qdot), has_aux=True)
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import Numbers, as_real
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.scene.answers import bodies_of, coordinate_rates_of
-from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_speeds
+from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_speeds, as_time
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Pose
 from jourdain_jax.scene.scene import Scene
@@ -37,19 +37,19 @@ class Inertias(eqx.Module):
 
 def coordinate_rates(scene: Scene, t, q: Numbers, u: Numbers) -> Float[Array, "coordinates"]:
     """`qdot = N(q,t) u + nu(q,t)`, shape (coordinates,), per s; eq. (53)."""
-    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u)
+    t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     return coordinate_rates_of(scene, t, scene.coordinate_names.view(q), scene.speed_names.view(u))
 
 
 def pose_at(scene: Scene, t, q: Numbers) -> Pose:
     """Poses of all bodies (m, inertial frame), sorted by name: the order in which JAX returns dictionaries, so that it is the same everywhere."""
-    t, named = jnp.asarray(t, jnp.result_type(float)), scene.coordinate_names.view(as_coordinates(scene, q))
+    t, named = as_time(t), scene.coordinate_names.view(as_coordinates(scene, q))
     return Pose(t, named, {name: BodyPose(name, body) for name, body in sorted(bodies_of(scene, t, named).items())})
 
 
 def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
     """Poses and velocities (inertial frame) of all bodies at one instant. `inputs`: values of the scene's inputs (default: zero)."""
-    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u)
+    t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     inputs = as_input_vector(scene, inputs, q.dtype)
     qdot = coordinate_rates(scene, t, q, u)
     poses, rates = jax.jvp(lambda t, q: pose_at(scene, t, q).bodies, (t, q), (jnp.ones_like(t), qdot))
@@ -67,7 +67,7 @@ def _space_angular_velocity(body, rate) -> Float[Array, "3"]:
 
 def velocities(scene: Scene, t, q, u) -> Velocities:
     """Velocities of the mass centres and body angular velocities, affine in u."""
-    return _velocities(scene, jnp.asarray(t, jnp.result_type(float)), as_real(q), as_real(u))
+    return _velocities(scene, as_time(t), as_real(q), as_real(u))
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
@@ -88,7 +88,7 @@ def partial_velocities(scene: Scene, t, q, u) -> Velocities:
 
 def bias_accelerations(scene: Scene, t, q, u) -> tuple[Velocities, Velocities]:
     """Velocities, and accelerations at `udot = 0`: the derivative of the velocities along `(1, qdot, 0)`."""
-    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u)
+    t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     qdot = coordinate_rates(scene, t, q, u)
     return jax.jvp(lambda t, q: velocities(scene, t, q, u), (t, q), (jnp.ones_like(t), qdot))
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces, kinetic_energy
-from jourdain_jax.scene.arguments import as_coordinates, as_speeds
+from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.scene import Scene
 
 
@@ -23,7 +23,7 @@ def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquat
         raise ValueError(
             f"Lagrange's equations hold for coordinate rates, and the speeds of `{type(scene).__name__}` are quasi-velocities; use Appell's equations"
         )
-    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u)
+    t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
 
     def momentum(t, q, u):
         return jax.grad(kinetic_energy, argnums=3)(scene, t, q, u)

@@ -23,6 +23,7 @@ class PoseNumbers(eqx.Module):
     """Numbers of all bodies and contacts at one state (or, with a leading axis, at many), by name."""
 
     mass: dict[str, Float[Array, "*states"]]
+    position: dict[str, Float[Array, "*states 3"]]
     inertia: dict[str, Float[Array, "*states 3 3"]]  # of rigid bodies only
     orientation: dict[str, Float[Array, "*states 3 3"]]
     planes: dict[str, Float[Array, "*states 3"]]  # normal velocity by origin and tilt, by velocity and angular velocity; size of both, m/s
@@ -34,6 +35,7 @@ def pose_numbers(scene: Scene, t, q) -> PoseNumbers:
     rigid = {name: body.body for name, body in pose.bodies.items() if isinstance(body.body, RigidBody)}
     return PoseNumbers(
         mass={name: body.mass for name, body in pose.bodies.items()},
+        position={name: body.position for name, body in pose.bodies.items()},
         inertia={name: body.inertia for name, body in rigid.items()},
         orientation={name: body.orientation for name, body in rigid.items()},
         planes=_normal_velocities(scene, pose),
@@ -61,11 +63,19 @@ def _normal_velocities(scene: Scene, pose: Pose) -> dict[str, Float[Array, "3"]]
 def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
     """What cannot be, one sentence each; `numbers` at many states, those that are not finite are passed over."""
     who = type(scene).__name__
-    sentences = [_of_mass(f"body `{name}` of `{who}`", mass) for name, mass in numbers.mass.items()]
+    pieces = {"mass": numbers.mass, "inertia": numbers.inertia, "position": numbers.position, "orientation": numbers.orientation}
+    sentences = [_of_nothing(f"body `{name}` of `{who}`", what, x) for what, part in pieces.items() for name, x in part.items()]
+    sentences += [_of_mass(f"body `{name}` of `{who}`", mass) for name, mass in numbers.mass.items()]
     sentences += [_of_inertia(f"body `{name}` of `{who}`", I) for name, I in numbers.inertia.items()]
     sentences += [_of_orientation(f"body `{name}` of `{who}`", R) for name, R in numbers.orientation.items()]
     sentences += [_of_plane(f"the plane of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.planes.items()]
     return tuple(sentence for sentence in sentences if sentence)
+
+
+def _of_nothing(what: str, piece: str, values: np.ndarray) -> str:
+    if not len(values) or len(_finite(values)):
+        return ""
+    return f"{what} has no finite {piece} at any probed state, expected finite numbers; check what its {piece} is computed from"
 
 
 def _of_mass(what: str, mass: np.ndarray) -> str:

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.equations.kinematics import motion_at, pose_at
+from jourdain_jax.equations.probing import described_once
 from jourdain_jax.scene.answers import contacts_of, geometric_constraints_of, prescribed_of, velocity_constraints_of
-from jourdain_jax.scene.arguments import as_coordinates, as_speeds
+from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.scene import Scene
@@ -91,7 +92,7 @@ def flatten_rows(rows: dict[str, Array], dtype) -> Float[Array, "rows"]:
 
 def position_residual(scene: Scene, t, q) -> Float[Array, "geometric_rows"]:
     """`g(t, q)` of all geometric rows, shape (geometric rows,), in their own units; zero on the constraints. Eq. (5)."""
-    return _position_residual(scene, jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q))
+    return _position_residual(scene, as_time(t), as_coordinates(scene, q))
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
@@ -104,7 +105,7 @@ def velocity_residual(scene: Scene, t, q, u, inputs=None) -> Float[Array, "rows"
 
     `inputs`: values of the scene's inputs (default: zero).
     """
-    return _velocity_residual(scene, jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u), inputs)
+    return _velocity_residual(scene, as_time(t), as_coordinates(scene, q), as_speeds(scene, u), inputs)
 
 
 @eqx.filter_jit
@@ -112,12 +113,14 @@ def _velocity_residual(scene: Scene, t: Float[Array, ""], q, u, inputs):
     return flatten_rows(velocity_rows(scene, motion_at(scene, t, q, u, inputs)), q.dtype)
 
 
+@described_once
 def names_of_rows(scene: Scene) -> tuple[str, ...]:
     """Names of all rows, in order, without evaluating them."""
     q, u, _ = scene.named()
     return _names(lambda s: velocity_rows(s, motion_at(s, 0.0, q, u)), scene)
 
 
+@described_once
 def names_of_position_rows(scene: Scene) -> tuple[str, ...]:
     """Names of the geometric rows, in order; they come first among all rows."""
     q, _, _ = scene.named()

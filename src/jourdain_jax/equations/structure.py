@@ -6,6 +6,7 @@ parameters are traced (numbers near the class's defaults stand in), so that the 
 """
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -25,7 +26,7 @@ from jourdain_jax.equations.virtual_power import mass_matrix_at, potential_energ
 from jourdain_jax.scene.answers import loads_of
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import as_names
-from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.numbers import described, is_traced
 from jourdain_jax.scene.scene import Scene
 
 RANDOM_PROBES = 24
@@ -86,6 +87,10 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
 
     `seed`: of the generator. Scene parameters must be concrete. ValueError where no state meets the geometric rows.
     """
+    if not isinstance(count, int | np.integer) or count < 1:
+        raise ValueError(f"`count` is {count!r}, expected a whole number of states, at least 1")
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
     t, q, u = _random_states(scene, drawn, np.random.default_rng(seed))
     q, u, miss = _projected(scene, t, q, u)
@@ -267,6 +272,10 @@ def _probed_structure(scene: Scene) -> Structure:
     on_rows = _assembled(scene, found.miss, generic)
     faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
     usable = np.all(np.isfinite(found.A), axis=(1, 2)) & on_rows
+    if not faults and not usable.any():
+        finite = np.isfinite(found.A).all(axis=2)[on_rows].any(axis=0)
+        named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "the rows together"
+        faults = (f"rows {named} of `{type(scene).__name__}` are not finite at any probed state, expected numbers; check how they are computed",)
     q, generic, found = jax.tree.map(lambda x: x[usable], (q, generic, found))
     ranks = [_rank(A) for A in found.A]
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
@@ -343,7 +352,11 @@ def _describe(scene: Scene, q: np.ndarray) -> str:
 def _user_choice(scene: Scene, freedoms: int) -> tuple[int, ...] | None:
     if scene.privileged is None:
         return None
+    if not isinstance(scene.privileged, str | Iterable):
+        raise ValueError(f"`privileged` of `{type(scene).__name__}` is {described(scene.privileged)}, expected names of speeds")
     chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(scene.privileged))
+    if len(set(chosen)) != len(chosen):
+        raise ValueError(f"`privileged` of `{type(scene).__name__}` names a speed twice ({', '.join(as_names(scene.privileged))}); name independent ones")
     if len(chosen) != freedoms:
         raise ValueError(
             f"`privileged` of `{type(scene).__name__}` names {len(chosen)} speeds, but the scene has {freedoms} degrees of freedom; "

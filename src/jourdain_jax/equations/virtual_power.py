@@ -23,6 +23,7 @@ from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
 
 
@@ -66,6 +67,8 @@ def _rows(vectors: dict) -> Float[Array, "bodies 3"]:
 
 def potential_energy(scene: Scene, motion: Motion) -> Float[Array, ""]:
     """V in J at a `motion`: the potentials of the loads and of the scene."""
+    if not isinstance(motion, Motion):
+        raise ValueError(f"`motion` is {described(motion)}, expected a motion, such as `jj.motion_at(scene, t, q, u)`")
     V = jnp.zeros_like(motion.t)
     for load in loads_of(scene, motion):
         if load.potential is not None:

@@ -158,7 +158,8 @@ def _check_against_dense(scene: Scene, structure: Structure, probes: Probes, fou
     """The scalar program against JAX's own derivatives and a dense solution, at the probes; the reason, with a name, where they differ."""
     leaves, treedef = jax.tree.flatten(scene)
     columns = [[probes.inputs[f"p{k}_{i}"] for i in range(np.size(leaf))] for k, leaf in enumerate(leaves)]
-    parameters = jax.tree.unflatten(treedef, [np.stack(c, -1).reshape(-1, *np.shape(leaf)) for c, leaf in zip(columns, leaves, strict=True)])
+    values_of = [np.stack(c, -1) if c else np.zeros((probes.count, 0)) for c in columns]  # a parameter may have no entries
+    parameters = jax.tree.unflatten(treedef, [x.reshape(-1 if x.size else probes.count, *np.shape(leaf)) for x, leaf in zip(values_of, leaves, strict=True)])
     t = np.broadcast_to(probes.inputs["t_0"], probes.count)
     sizes = (len(scene.coordinate_names), len(scene.speed_names), len(scene.inputs))
     q, u, inputs = (np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0)) for p, n in zip("qui", sizes, strict=True))

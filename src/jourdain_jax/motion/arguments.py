@@ -34,13 +34,20 @@ def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None) -
     return named_start(scene, scene.example if given is None else given, t0, as_input_vector(scene, inputs))
 
 
-def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, **objects) -> None:
+def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, switches: dict | None = None, **objects) -> None:
     """ValueError for tolerances that are no positive numbers, and for `solver`, `adjoint`, ... that are no objects of their kind (None is let pass)."""
     for name, value in (("rtol", rtol), ("atol", atol)):
         number = checked_real(value, f"`{name}`", (), advice="give one number, such as 1e-8")
         if not is_traced(number) and not 0 < float(number) < np.inf:
             raise ValueError(f"`{name}` is {float(number):g}, expected a positive finite number; give a tolerance such as 1e-8")
-    if max_steps is not None and (not isinstance(max_steps, int | np.integer) or max_steps < 1):
+    for name, value in (switches or {}).items():
+        if not isinstance(value, bool | np.bool_):
+            raise ValueError(f"`{name}` is {described(value)}, expected True or False")
+    if dt0 is not None:
+        first = checked_real(dt0, "`dt0`", (), advice="give the first step in s, or None for 1e-4 of the span")
+        if not is_traced(first) and not 0 < abs(float(first)) < np.inf:
+            raise ValueError(f"`dt0` is {float(first):g}, expected a finite first step in s that is not zero; or None for 1e-4 of the span")
+    if max_steps is not None and (not isinstance(max_steps, int | np.integer) or isinstance(max_steps, bool) or max_steps < 1):
         raise ValueError(f"`max_steps` is {max_steps!r}, expected a whole number of at least 1; give the number of steps after which to stop")
     for name, value in objects.items():
         kind, example = _KINDS[name]

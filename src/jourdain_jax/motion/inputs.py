@@ -69,6 +69,19 @@ class Inputs(eqx.Module):
         return jnp.stack([jnp.asarray(channel(t), jnp.result_type(float)) for channel in self.channels]) if self.channels else jnp.zeros(0)
 
 
+def _check_function(f: Callable, where: str) -> None:
+    """ValueError unless `f` of one time is one number; nothing is computed."""
+    advice = "give a function of one time that returns one number, such as `lambda t: jnp.sin(t)`"
+    try:
+        found = jax.eval_shape(f, jax.ShapeDtypeStruct((), jnp.result_type(float)))
+    except TypeError as error:
+        raise ValueError(f"{where} cannot be called with a time ({str(error).splitlines()[0]}); {advice}") from None
+    if not hasattr(found, "shape"):
+        raise ValueError(f"{where} returned {described(found)}, expected one number; {advice}")
+    if found.shape != ():
+        raise ValueError(f"{where} returned an array of shape {found.shape}, expected one number; {advice}")
+
+
 def as_inputs(scene: Scene, given) -> Inputs:
     """Inputs from a dictionary of name -> number, function of time or `Sampled`; what is not named is zero."""
     if isinstance(given, Inputs):
@@ -85,10 +98,12 @@ def as_inputs(scene: Scene, given) -> Inputs:
     for name in scene.inputs.entries:
         value = given.get(name, 0.0)
         advice = "give a number, a function of time, or `jj.Sampled(ts, values)`"
+        where = f"input `{name}` of `{type(scene).__name__}`"
         if callable(value):
+            _check_function(value, where)
             leaves = jax.tree.leaves(value)
             plain = len(leaves) == 1 and leaves[0] is value  # a module may hold arrays to be differentiated, and is kept as it is
             channels.append(FunctionOfTime(value) if plain else value)
             continue
-        channels.append(Constant(checked_real(value, f"input `{name}` of `{type(scene).__name__}`", (), advice=advice)))
+        channels.append(Constant(checked_real(value, where, (), advice=advice)))
     return Inputs(tuple(channels))

@@ -3,7 +3,7 @@
 Lanes of one chunk run in lockstep as one vmapped integration; chunks run one after another through the same compiled program.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -18,12 +18,13 @@ from jourdain_jax.motion import results
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.simulate import lost_codes, set_up, state_form
 from jourdain_jax.motion.solver_choice import may_be_full
-from jourdain_jax.motion.span import saved_times
+from jourdain_jax.motion.span import check_span, saved_times
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.parameters import parameter_faults, parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
@@ -66,7 +67,9 @@ class Rollout(Printed, eqx.Module):
 
         Lanes that ended are left out from then on; NaN where none is left.
         """
-        values = np.asarray(self[name])
+        values, quantiles = np.asarray(self[name]), np.asarray(checked_real(levels, "`levels`", advice="give numbers from 0 to 1"))
+        if quantiles.ndim != 1 or not np.all((quantiles >= 0) & (quantiles <= 1)):
+            raise ValueError(f"`levels` are {levels}, expected a list of numbers from 0 to 1")
         out = np.full((len(levels), *values.shape[1:]), np.nan)
         reached = np.isfinite(values).any(axis=0)
         out[:, reached] = np.nanquantile(values[:, reached], levels, axis=0)
@@ -116,11 +119,15 @@ def rollout(
     Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`.
     """
     starts = dict(as_scene(scene).example) if starts is None else starts
-    parameters = {} if parameters is None else {name: jnp.asarray(value) for name, value in parameters.items()}
+    for what, given in (("starts", starts), ("parameters", parameters)):
+        if given is not None and not isinstance(given, Mapping) and not (what == "starts" and isinstance(given, State)):
+            raise ValueError(f'`{what}` is {described(given)}, expected a dictionary by name, such as {{"x": jnp.linspace(0.0, 1.0, 8)}}')
+    parameters = {} if parameters is None else {name: checked_real(value, f"parameter `{name}`") for name, value in parameters.items()}
     fixed, varied, count = _lanes(scene, starts, parameters)
     chunk = _chunk(scene, count, chunk, options)
     if options.get("ts") is not None:
         options["ts"] = saved_times(options["ts"])
+    _check_span_of_lanes(starts, options)
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, fixed, varied, parameters))):
         return Rollout(_together(scene, fixed, options, varied, parameters))  # being differentiated or batched: one piece, no host loop
     pieces = []
@@ -143,6 +150,16 @@ def rollout(
             again = _together(scene, fixed, options | {"state": "full", "lowering": False}, *lanes_again)
         lanes = _replaced(lanes, again, index)
     return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(lost.tolist()))
+
+
+def _check_span_of_lanes(starts, options: dict) -> None:
+    """Where both ends are given and known: inside the lanes they are traced, and nothing is refused."""
+    t1, t0 = options.get("t1"), options.get("t0")
+    if t1 is None or (t0 is None and isinstance(starts, State)):
+        return
+    t0, t1 = (checked_real(x, f"`{name}`", (), advice="give one time in s") for name, x in (("t0", 0.0 if t0 is None else t0), ("t1", t1)))
+    if not is_traced(t0, t1):
+        check_span(t0, t1)
 
 
 def _sound_lane(scene: Scene, parameters: dict) -> Scene:
@@ -205,7 +222,7 @@ def _lanes(scene: Scene, starts, parameters: dict):
         fixed, varied = {}, starts
         lengths["`starts`"] = starts.q.shape[0] if starts.q.ndim == 2 else None
     else:
-        arrays = {name: jnp.asarray(value, jnp.result_type(float)) for name, value in starts.items()}
+        arrays = {name: checked_real(value, f"start `{name}`").astype(jnp.result_type(float)) for name, value in starts.items()}
         groups = {group for names in (scene.coordinate_names, scene.speed_names) for group, _, _ in names.groups}  # quaternions and their rates
         fixed = {name: value for name, value in arrays.items() if value.ndim == (1 if name in groups else 0)}
         varied = {name: value for name, value in arrays.items() if name not in fixed}
@@ -226,8 +243,8 @@ def _common_length(lengths: dict) -> int:
 
 
 def _chunk(scene: Scene, count: int, chunk: int | None, options: dict) -> int:
-    if chunk is not None and chunk < 1:
-        raise ValueError(f"`chunk` is {chunk}, expected at least one lane")
+    if chunk is not None and (not isinstance(chunk, int | np.integer) or chunk < 1):
+        raise ValueError(f"`chunk` is {chunk!r}, expected a whole number, at least one lane")
     times = 201 if options.get("ts") is None else np.shape(options["ts"])[0]
     per_lane = 8 * times * (len(scene.coordinate_names) + len(scene.speed_names) + 2)
     return max(1, min(count, CHUNK if chunk is None else chunk, max(1, MEMORY // per_lane)))

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from jourdain_jax.calculus.reals import Number
-from jourdain_jax.equations.accelerations import Baumgarte, as_reduction
+from jourdain_jax.equations.accelerations import Baumgarte, as_reduction, as_stabilisation
 from jourdain_jax.equations.event_names import names_of_events
 from jourdain_jax.equations.power import needs_work
 from jourdain_jax.equations.probing import described_once
@@ -113,7 +113,10 @@ def _set_up(
     projection, inputs, events, work, land_on_ts, lowering,
 ) -> Setup:  # fmt: skip
     scene = as_scene(scene)
-    check_options(rtol=rtol, atol=atol, max_steps=max_steps, solver=solver, adjoint=adjoint, stepsize_controller=stepsize_controller, saveat=saveat)
+    switches = {"projection": projection, "events": events, "work": work, "land_on_ts": land_on_ts, "lowering": lowering}
+    objects = {"solver": solver, "adjoint": adjoint, "stepsize_controller": stepsize_controller, "saveat": saveat}
+    check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, switches=switches, **objects)
+    as_stabilisation(stabilisation)
     _check_adjoint(adjoint)
     check_solver(solver, stepsize_controller, dt0, land_on_ts, saveat)
     made_here = not isinstance(start, State)
@@ -176,7 +179,7 @@ def _warn_float32(dtype, rtol) -> None:
 def state_form(scene: Scene, structure: Structure, state="auto", reduction=None, stabilisation=None, projection=True, work=True, lowering=True) -> StateForm:
     """How the scene's state is integrated, given what was asked."""
     if state not in _STATE_FORMS:
-        raise ValueError(f"unknown state form `{state}`; {nearest(state, _STATE_FORMS)}")
+        raise ValueError(f"unknown state form `{state}`; {nearest(str(state), _STATE_FORMS)}")
     if state == "minimal" and not structure.affine:
         raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use state='full'")
     minimal = state == "minimal" or (state == "auto" and structure.affine and structure.well_conditioned)

@@ -17,8 +17,9 @@ from jourdain_jax.equations.projection import closure_residual, project_position
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.motion.inputs import as_inputs
-from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_scene, as_speeds
+from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.coordinates import Names
+from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -57,8 +58,12 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
 
     Differentiable in any mode. What cannot be met stays in `residual` (no error: this also runs inside jit and vmap). ValueError for wrong shapes.
     """
-    t, q, u = jnp.asarray(t, jnp.result_type(float)), as_coordinates(scene, q), as_speeds(scene, u)
+    t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     inputs = as_input_vector(scene, inputs, q.dtype)
+    known = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    for name in held:
+        if name not in known:
+            raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, known)}")
     free_q, free_u = (np.array([name not in held for name in names.entries], bool) for names in (scene.coordinate_names, scene.speed_names))
     project = _uncompiled_projection if _seldom(scene, t, q, u, inputs) else _compiled_projection
     near_q, near_u, moved_q, moved_u, residual = (jnp.asarray(x) for x in project(scene, t, q, u, inputs, free_q, free_u))
@@ -98,13 +103,13 @@ def start(scene: Scene, *, t0: Number = 0.0, inputs=None, **values) -> State:
     `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; what they are at `t0` counts where velocity rows depend on them.
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
     """
-    return named_start(scene, values, t0, as_inputs(as_scene(scene), inputs)(jnp.asarray(t0, jnp.result_type(float))))
+    return named_start(scene, values, t0, as_inputs(as_scene(scene), inputs)(as_time(t0)))
 
 
 def named_start(scene: Scene, values: Mapping, t0, inputs: Float[Array, "inputs"]) -> State:
     """The same from a dictionary of `values`, and the `inputs` at time `t0` as a vector."""
     q, u, given = as_scene(scene).named(**values)
-    _check_finite(values)
+    _check_finite({**values, "t0": t0})
     state = consistent(scene, t0, q, u, inputs, held=(*given, *_resting(scene, given)))
     _check_residual(scene, state, inputs, given)
     return state

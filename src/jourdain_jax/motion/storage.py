@@ -88,6 +88,11 @@ def _check_saved(motion, path) -> None:
                 f"field `{field.name}` of `{type(scene).__name__}` is {described(getattr(scene, field.name))}, which `save` cannot store; "
                 "expected arrays, numbers or texts, or the class's default"
             )
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"`path` is {described(path)}, expected the name of a file")
+    folder = os.path.dirname(path) or "."
+    if not os.path.isdir(folder):
+        raise ValueError(f"cannot write `{os.fspath(path)}`: there is no folder `{folder}`; make it first")
     if os.path.isdir(path):
         raise ValueError(f"cannot write `{os.fspath(path)}`: it is a folder; give the name of a file in it, such as motion.npz")
 
@@ -155,6 +160,8 @@ def _samples(ts: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict) -> type[Scene]:
     """The class of the scene; a ValueError where it is not the one in the file, or has other parameters or names than at that time."""
     kind = scene if isinstance(scene, type) else type(scene)
+    if not issubclass(kind, Scene):
+        raise ValueError(f"`scene` is {described(scene)}, expected the class of the scene that moved, or any scene of that class")
     if header["scene"] != kind.__name__:
         raise ValueError(f"`{path}` holds a {header['kind']} of `{header['scene']}`, expected `{kind.__name__}`; pass the class it was made with")
     known = [field.name for field in fields(kind)]
@@ -170,10 +177,14 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
 
 def _read(path, kind: str) -> tuple[dict, dict]:
     """Header and arrays of a file of this kind."""
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"`path` is {described(path)}, expected the name of a file")
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-        header = dict(json.loads(str(arrays.pop("header"))))
+        header = json.loads(str(arrays.pop("header")))
+        if not isinstance(header, dict):
+            raise ValueError("its header is no dictionary")
     except FileNotFoundError:
         raise ValueError(f"there is no file `{path}`; check the path") from None
     except (OSError, ValueError, TypeError, AttributeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:

@@ -65,6 +65,8 @@ def animate(
     if not isinstance(trajectory, Trajectory) or trajectory.q.ndim != 2:
         what = described(trajectory)
         raise ValueError(f"`animate` was given {what}, expected one motion; of a rollout take one lane: jj.animate(rollout.lane(0), 'lane-0.gif')")
+    if not isinstance(frames, int | np.integer) or frames < 1:
+        raise ValueError(f"`frames` is {frames!r}, expected a whole number of at least 1")
     check_suffix(path)
     plt = pyplot()
     from matplotlib.animation import FuncAnimation, PillowWriter

@@ -9,6 +9,7 @@ from jourdain_jax.motion.rollout import Rollout
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
 from jourdain_jax.scene.names import UnknownNameError, nearest
+from jourdain_jax.scene.numbers import described
 
 ENERGIES = ("energy", "kinetic energy", "potential energy")
 _BANDS = ((0.025, 0.975, 0.2), (0.25, 0.75, 0.4))  # lower and upper quantile, opacity
@@ -17,6 +18,9 @@ _BANDS = ((0.025, 0.975, 0.2), (0.25, 0.75, 0.4))  # lower and upper quantile, o
 def check_format(path: str | os.PathLike) -> None:
     """ValueError where matplotlib knows no picture with the suffix of this path."""
     known = pyplot().FigureCanvasBase.get_supported_filetypes()
+    folder = os.path.dirname(path) or "."
+    if not os.path.isdir(folder):
+        raise ValueError(f"cannot write `{os.fspath(path)}`: there is no folder `{folder}`; make it first")
     suffix = os.path.splitext(os.fspath(path))[1].removeprefix(".").lower()
     if suffix not in known:
         raise ValueError(f"cannot write `{path}`: a plot is a .png, .svg or .pdf file, and matplotlib knows no `{suffix or 'file without suffix'}`")
@@ -31,6 +35,8 @@ def plot(motion: Trajectory | Rollout, *names: str, path: str | os.PathLike | No
 
     Returns the matplotlib figure. KeyError for an unknown name, with the nearest valid one; ImportError without matplotlib.
     """
+    if not isinstance(motion, Rollout | Trajectory):
+        raise ValueError(f"`plot` was given {described(motion)}, expected a motion from `jj.simulate` or a rollout")
     if path is not None:
         check_format(path)
     scene = motion.lanes.scene if isinstance(motion, Rollout) else motion.scene

@@ -249,6 +249,7 @@ _RULES: dict[str, Callable] = {
     "rev": lambda e, x: np.flip(x, e.params["dimensions"]),
     "concatenate": lambda e, *xs: np.concatenate(xs, axis=e.params["dimension"]),
     "stack": lambda e, *xs: np.stack(xs, axis=e.params["axis"]),
+    "unstack": lambda e, x: list(np.moveaxis(x, e.params["axis"], 0)),
     "split": lambda e, x: np.split(x, np.cumsum(e.params["sizes"])[:-1], axis=e.params["axis"]),
     "slice": _slice,
     "dynamic_slice": _dynamic_slice,

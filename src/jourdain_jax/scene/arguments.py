@@ -23,6 +23,11 @@ def as_scene(scene) -> Scene:
     raise ValueError(f"`scene` is {described(scene)}, expected a scene: an instance of a subclass of `jj.Scene`")
 
 
+def as_time(t) -> Float[Array, ""]:
+    """A time in s, as a number of the default floating-point type."""
+    return checked_real(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many").astype(jnp.result_type(float))
+
+
 def as_coordinates(scene: Scene, q) -> Float[Array, "coordinates"]:
     """q as a vector of the scene's coordinates."""
     return _as_vector(scene, "q", q, as_scene(scene).coordinate_names)

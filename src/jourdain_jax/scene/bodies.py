@@ -60,6 +60,7 @@ class RigidBody(eqx.Module):
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
         ValueError for another axis.
         """
+        mass, radius = checked_real(mass, "mass of a disc", ()), checked_real(radius, "radius of a disc", ())
         axial = mass * radius**2 / 2 if axial is None else axial
         diametral = mass * radius**2 / 4 if diametral is None else diametral
         k = _axis_index(axis)
@@ -73,7 +74,8 @@ class RigidBody(eqx.Module):
 
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
         """
-        moment = factor * mass * radius**2
+        mass, radius = checked_real(mass, "mass of a ball", ()), checked_real(radius, "radius of a ball", ())
+        moment = checked_real(factor, "factor of a ball", (), advice="give 2/5 for a solid ball, 2/3 for a shell") * mass * radius**2
         return RigidBody(mass, _stack([moment] * 3), position, orientation, radius * _ball_outline())
 
     @staticmethod
@@ -83,6 +85,7 @@ class RigidBody(eqx.Module):
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`. ValueError for another axis.
         """
         k = _axis_index(axis)
+        mass, length = checked_real(mass, "mass of a rod", ()), checked_real(length, "length of a rod", ())
         moments = [mass * length**2 / 12] * 3
         moments[k] = jnp.zeros_like(jnp.asarray(moments[k]))
         ends = np.zeros((2, 3))
@@ -95,9 +98,10 @@ class RigidBody(eqx.Module):
 
         `mass` in kg; `position` (m, mass centre) and `orientation` as in `RigidBody`.
         """
+        mass, sides = checked_real(mass, "mass of a box", ()), checked_real(sides, "sides of a box", (3,), advice="give three lengths, m")
         a, b, c = sides[0], sides[1], sides[2]
         moments = _stack([mass * (b**2 + c**2) / 12, mass * (a**2 + c**2) / 12, mass * (a**2 + b**2) / 12])
-        return RigidBody(mass, moments, position, orientation, _box_outline() * jnp.asarray(sides))
+        return RigidBody(mass, moments, position, orientation, _box_outline() * sides)
 
 
 Body = Particle | RigidBody

@@ -8,9 +8,14 @@ Geometric rows are functions of a `Pose` and vanish; the engine differentiates t
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Number, Vector, as_real
+from jourdain_jax.calculus.reals import Number, Vector, checked_real, described
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose
+from jourdain_jax.scene.numbers import is_traced
+
+
+def _point(position: Vector, what: str) -> Float[Array, "3"]:
+    return checked_real(position, what, (3,), advice="give three components in the inertial frame, m")
 
 
 def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector) -> Float[Array, ""]:
@@ -18,7 +23,8 @@ def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector) -> Float[Arra
 
     - `body`: `motion["name"]`; `contact` (m) and the unit vector `lateral`, both in the inertial frame. Eq. (7).
     """
-    return body.velocity_at(contact) @ as_real(lateral)
+    contact = _point(contact, f"contact of the knife edge of `{body.name}`")
+    return body.velocity_at(contact) @ checked_real(lateral, f"lateral direction of the knife edge of `{body.name}`", (3,), advice="give a unit vector")
 
 
 def rod(a: Vector, b: Vector, length: Number) -> Float[Array, ""]:
@@ -26,7 +32,10 @@ def rod(a: Vector, b: Vector, length: Number) -> Float[Array, ""]:
 
     To first order the excess length; its multiplier is the thrust (positive, N) in the rod. Smooth also where the points meet. Eq. (5).
     """
-    apart = as_real(b) - as_real(a)
+    apart = _point(b, "second point of a rod") - _point(a, "first point of a rod")
+    length = checked_real(length, "length of a rod", (), advice="give a positive number, m")
+    if not is_traced(length) and not length > 0:
+        raise ValueError(f"length of a rod is {length}, expected a positive number, m; to keep two points together use `jj.pin`")
     return (apart @ apart - length**2) / (2 * length)
 
 
@@ -35,10 +44,9 @@ def pin(a: Vector, b: Vector, *, axes: str = "xyz") -> Float[Array, "axes"]:
 
     `axes`: letters of the inertial axes along which it holds (`"xy"` in a plane); ValueError for others. Eq. (5).
     """
-    unknown = set(axes) - set("xyz")
-    if unknown or not axes:
+    if not isinstance(axes, str) or set(axes) - set("xyz") or not axes:
         raise ValueError(f"pin along axes `{axes}`, expected letters out of `xyz`, such as `xyz` or `xy`")
-    return (as_real(b) - as_real(a))[jnp.array(["xyz".index(axis) for axis in axes])]
+    return (_point(b, "second point of a pin") - _point(a, "first point of a pin"))[jnp.array(["xyz".index(axis) for axis in axes])]
 
 
 def weld(first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_second=(0.0, 0.0, 0.0), turn=None) -> Float[Array, "6"]:
@@ -47,5 +55,8 @@ def weld(first: BodyPose, second: BodyPose, *, at_first=(0.0, 0.0, 0.0), at_seco
     The points `at_first`, `at_second` (m, body frames, from the mass centres) coincide, and `R_second = R_first turn` (`turn`: (3, 3), the
     identity by default). The rotation rows are `vee` of the antisymmetric part of `turn' R_first' R_second`, the rotation vector to first order.
     """
-    turn = jnp.eye(3, dtype=first.position.dtype) if turn is None else as_real(turn)
+    for body, which in ((first, "first"), (second, "second")):
+        if not isinstance(body, BodyPose):
+            raise ValueError(f'the {which} body of a weld is {described(body)}, expected the pose of a body; write pose["name"]')
+    turn = jnp.eye(3, dtype=first.position.dtype) if turn is None else checked_real(turn, "turn of a weld", (3, 3), advice="give a rotation matrix")
     return jnp.concatenate([second.place(at_second) - first.place(at_first), vee(turn.T @ first.orientation.T @ second.orientation)])

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Vector, as_real
-from jourdain_jax.scene.bodies import _axis_index
+from jourdain_jax.scene.bodies import RigidBody, _axis_index
 from jourdain_jax.scene.motion_state import BodyPose
-from jourdain_jax.scene.numbers import checked_real
+from jourdain_jax.scene.numbers import checked_real, described
 
 _HEIGHTS = ("coordinates", "row")
 
@@ -82,7 +82,7 @@ def disc_contact(
     Two velocity rows (m/s), along the plane's tangents; ValueError for an unknown axis or height.
     """
     _check_height(height)
-    plane = Plane() if plane is None else plane
+    radius, plane = _rolling(body, radius, plane)
     k = body.orientation[:, _axis_index(axis)]
     up = plane.normal - (plane.normal @ k) * k
     point = body.position - radius * up / jnp.sqrt(up @ up)
@@ -99,8 +99,19 @@ def ball_contact(body: BodyPose, radius, *, plane: Plane | None = None, height: 
     Two velocity rows (m/s), along the plane's tangents; ValueError for an unknown height.
     """
     _check_height(height)
-    plane = Plane() if plane is None else plane
+    radius, plane = _rolling(body, radius, plane)
     return Contact(body.name, body.position - radius * plane.normal, plane, height, carried)
+
+
+def _rolling(body, radius, plane) -> tuple[Float[Array, ""], Plane]:
+    """Radius and plane of the contact of a body that can roll; a ValueError otherwise."""
+    if not isinstance(body, BodyPose):
+        raise ValueError(f'the body of a contact is {described(body)}, expected the pose of a body; write pose["name"]')
+    if not isinstance(body.body, RigidBody):
+        raise ValueError(f"body `{body.name}` of a contact is a particle, which cannot roll; make it a `jj.RigidBody`")
+    if plane is not None and not isinstance(plane, Plane):
+        raise ValueError(f"`plane` of the contact of `{body.name}` is {described(plane)}, expected a `jj.Plane(...)`, or None for z = 0 at rest")
+    return checked_real(radius, f"radius of the contact of `{body.name}`", ()), Plane() if plane is None else plane
 
 
 def _check_height(height: str) -> None:

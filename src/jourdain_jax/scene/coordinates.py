@@ -4,6 +4,7 @@ A plain coordinate `x` has the speed `x_rate = xdot`. A quaternion `attitude` ha
 angular velocity, `attitude_omega_x`, `..._y`, `..._z`, with `d attitude/dt = 1/2 attitude (0, omega)`.
 """
 
+import keyword
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import quaternion_rate
 from jourdain_jax.scene.names import Named, nearest
+from jourdain_jax.scene.numbers import described
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,8 @@ def quaternion(name: str) -> Quaternion:
 
     The speeds are the body components of the angular velocity (rad/s), `d name/dt = 1/2 name (0, omega)`.
     """
+    if not isinstance(name, str):
+        raise ValueError(f"the name of a quaternion is {described(name)}, expected a text, such as jj.quaternion('attitude')")
     return Quaternion(name)
 
 
@@ -90,10 +94,12 @@ def coordinates(*parts: str | Quaternion) -> Coordinates:
             names += [f"{part.name}_{c}" for c in "wxyz"]
             speeds += [f"{part.name}_omega_{c}" for c in "xyz"]
             continue
-        for name in part.split():
+        for name in _split(part, "coordinates"):
             plain.append((len(names), len(speeds)))
             names.append(name)
             speeds.append(f"{name}_rate")
+    if not names:
+        raise ValueError("`coordinates` was given no name; give at least one, such as jj.coordinates('x y')")
     _check_names(names, "coordinate")
     return Coordinates(Names(tuple(names), tuple(q_groups)), Names(tuple(speeds), tuple(u_groups)), tuple(quaternions), tuple(plain))
 
@@ -103,20 +109,30 @@ def speeds(names: str) -> Names:
 
     The scene then states `coordinate_rates(t, q, u)`. ValueError as in `coordinates`.
     """
-    _check_names(names.split(), "speed")
-    return Names(tuple(names.split()))
+    entries = _split(names, "speeds")
+    _check_names(entries, "speed")
+    return Names(tuple(entries))
 
 
 def inputs(names: str) -> Names:
     """Names of a scene's inputs (actuator torques, say), parted by blanks in `names`; their unit is the scene's. ValueError as in `coordinates`."""
-    _check_names(names.split(), "input")
-    return Names(tuple(names.split()))
+    entries = _split(names, "inputs")
+    _check_names(entries, "input")
+    return Names(tuple(entries))
+
+
+def _split(names, what: str) -> list[str]:
+    if not isinstance(names, str):
+        raise ValueError(f"`{what}` was given {described(names)}, expected names in one text, parted by blanks: jj.{what}('a b c')")
+    return names.split()
 
 
 def _check_names(names: Sequence[str], kind: str) -> None:
     for name in names:
         if not name.isidentifier():
             raise ValueError(f"{kind} name `{name}` is not an identifier; use letters, digits and underscores")
+        if keyword.iskeyword(name):
+            raise ValueError(f"{kind} name `{name}` is a word of Python's own, so that `q.{name}` cannot be written; choose another")
         if names.count(name) > 1:
             raise ValueError(f"{kind} name `{name}` is used twice; every {kind} needs a name of its own")
         if name in ("array", "slots", "keys"):

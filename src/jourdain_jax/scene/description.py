@@ -104,8 +104,15 @@ def _check_domain(scene) -> None:
     for name, pair in domain.items():
         if is_traced(pair):
             continue
-        if np.shape(pair) != (2,) or not np.all(np.isfinite(np.asarray(pair, float))) or pair[0] > pair[1]:
+        if np.shape(pair) != (2,) or not _is_finite(pair) or pair[0] > pair[1]:
             raise ValueError(f"`domain` of `{kind.__name__}` gives {pair} for `{name}`, expected two finite numbers (low, high) with low <= high")
+
+
+def _is_finite(pair) -> bool:
+    try:
+        return bool(np.all(np.isfinite(np.asarray(pair, float))))
+    except (TypeError, ValueError):
+        return False
 
 
 def _check_keys(kind: type, what: str, given, valid) -> None:

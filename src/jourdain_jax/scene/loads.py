@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.scene.motion_state import Motion, Point
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import checked_real
+from jourdain_jax.scene.numbers import checked_real, described
 
 
 class Load(eqx.Module):
@@ -28,11 +28,16 @@ class Load(eqx.Module):
     potential: Float[Array, ""] | None  # J; None: not conservative, its work is integrated along the motion
 
     def __init__(self, forces=None, torques=None, generalized=None, potential=None):
-        self.forces, self.torques, self.generalized = (_real_parts(part or {}) for part in (forces, torques, generalized))
+        given = {"forces": forces, "torques": torques, "generalized": generalized}
+        self.forces, self.torques, self.generalized = (_real_parts(kind, part) for kind, part in given.items())
         self.potential = None if potential is None else checked_real(potential, "potential of a load")
 
 
-def _real_parts(parts: dict) -> dict[str, Array]:
+def _real_parts(kind: str, parts: dict | None) -> dict[str, Array]:
+    if parts is None:
+        return {}
+    if not isinstance(parts, dict):
+        raise ValueError(f'`{kind}` of a load is {described(parts)}, expected a dictionary by name, such as {{"disc": force}}')
     return {name: checked_real(value, f"load on `{name}`") for name, value in parts.items()}
 
 
@@ -41,6 +46,7 @@ def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
 
     `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame.
     """
+    motion = _motion(motion, "gravity")
     g = checked_real(strength, "strength of gravity", ()) * checked_real(direction, "direction of gravity", (3,))
     forces = {name: body.mass * g for name, body in motion.bodies.items()}
     potential = -sum(body.mass * (g @ body.position) for body in motion.bodies.values())
@@ -49,6 +55,7 @@ def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
 
 def point_force(point: Point, force) -> Load:
     """A `force` (3,) (N, inertial frame) on a `point` of a body, `motion["body"].point(local)`; no potential."""
+    point = _as_point(point, "point of a force")
     return _on_point(point, checked_real(force, f"force on a point of `{point.body}`", (3,), advice="give three components in the inertial frame, N"), None)
 
 
@@ -57,6 +64,7 @@ def torque(motion: Motion, body: str, moment, *, reaction: str | None = None) ->
 
     No potential. ValueError for an unknown body.
     """
+    motion = _motion(motion, "torque")
     moment = checked_real(moment, f"torque on `{body}`", (3,), advice="give three components in the inertial frame, N m")
     names = [body] if reaction is None else [body, reaction]
     for name in names:
@@ -70,7 +78,8 @@ def spring(a: Point, b: Point, stiffness, rest_length=0.0) -> Load:
 
     Points: `motion["body"].point(local)` or `fixed_point(position)`. `stiffness` k in N/m, `rest_length` l0 in m.
     """
-    apart, length, direction = _line(a, b)
+    apart, length, direction = _line(a, b, "spring")
+    stiffness, rest_length = checked_real(stiffness, "stiffness of a spring", ()), checked_real(rest_length, "rest length of a spring", ())
     extension = length - rest_length
     # k (l - l0) e, written so that a spring of no natural length is smooth where its ends meet
     pull = stiffness * (apart - rest_length * direction)
@@ -82,7 +91,8 @@ def damper(a: Point, b: Point, damping) -> Load:
 
     Points: `motion["body"].point(local)` or `fixed_point(position)`. `damping` c in N s/m.
     """
-    _, _, direction = _line(a, b)
+    _, _, direction = _line(a, b, "damper")
+    damping = checked_real(damping, "damping of a damper", ())
     return _between(a, b, damping * ((b.velocity - a.velocity) @ direction) * direction, None)
 
 
@@ -91,13 +101,27 @@ def generalized_force(motion: Motion, **forces) -> Load:
 
     `forces`: speed -> force, in N or N m. ValueError for an unknown speed.
     """
+    motion = _motion(motion, "generalized_force")
     for name in forces:
         if name not in motion.u:
             raise ValueError(f"generalized force on unknown speed `{name}`; {nearest(name, motion.u.keys())}")
     return Load(generalized={name: checked_real(value, f"generalized force on `{name}`", ()) for name, value in forces.items()})
 
 
-def _line(a: Point, b: Point):
+def _motion(motion: Motion, what: str) -> Motion:
+    if not isinstance(motion, Motion):
+        raise ValueError(f"`{what}` was given {described(motion)}, expected a motion: what `loads(self, motion)` is handed")
+    return motion
+
+
+def _as_point(point: Point, what: str) -> Point:
+    if not isinstance(point, Point):
+        raise ValueError(f'{what} is {described(point)}, expected a point: motion["name"].point(local) or jj.fixed_point(position)')
+    return point
+
+
+def _line(a: Point, b: Point, what: str):
+    a, b = _as_point(a, f"first end of a {what}"), _as_point(b, f"second end of a {what}")
     apart = b.position - a.position
     squared = apart @ apart
     apart_is_nonzero = squared > 0

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Vector, as_real
+from jourdain_jax.calculus.reals import Vector
 from jourdain_jax.scene.bodies import Body, RigidBody
 from jourdain_jax.scene.names import Named, UnknownNameError, nearest
 from jourdain_jax.scene.numbers import checked_real
@@ -76,7 +76,8 @@ class BodyMotion(eqx.Module):
 
     def velocity_at(self, position: Vector) -> Float[Array, "3"]:
         """Velocity (m/s, inertial frame) of the material point at `position` (m, inertial frame): `v + omega x (position - r)`."""
-        return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.position)
+        position = checked_real(position, f"point of body `{self.name}`", (3,), advice="give three components in the inertial frame, m")
+        return self.velocity + jnp.cross(self.angular_velocity, position - self.position)
 
     def point(self, local=(0.0, 0.0, 0.0)) -> Point:
         """The material point with body-frame coordinates `local` (m, relative to the mass centre)."""

@@ -24,6 +24,8 @@ def nearest(name: str, valid: Iterable[str]) -> str:
 
 def as_names(names: "str | Iterable[str]") -> tuple[str, ...]:
     """Names as a tuple; a text is one name."""
+    if not isinstance(names, str | Iterable):
+        raise ValueError(f"names were expected, in one text or several, and `{names}` was given")
     return (names,) if isinstance(names, str) else tuple(names)
 
 

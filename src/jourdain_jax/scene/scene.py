@@ -18,6 +18,7 @@ from jourdain_jax.scene.description import check_description, checked_arguments
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
+from jourdain_jax.scene.numbers import checked_real
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
 
 
@@ -145,6 +146,8 @@ class Scene(eqx.Module):
 
 def _put(names: Names, entries: list, name: str, value) -> list[str]:
     """Put a value, or a run of values, where `name` says; the names of the entries that were set."""
+    if name in names.entries or name in (group for group, _, _ in names.groups):
+        checked_real(value, f"`{name}`", advice="give its value")
     shape = np.shape(value)
     if name in names.entries:
         if shape != ():

@@ -1,0 +1,599 @@
+"""Malformed input to every public entry point, as one table: what is written, the kind of answer, and the words it must contain.
+
+The expressions are evaluated in the namespace of `PRELUDE`, in a process without the run-time type checks of the other tests, as a user sees them
+(`test_malformed_inputs.py`). Kinds: the name of an exception; `exit N`, an exit code of the command line with its text; `result N`, a result code of a motion
+with its message; `FAILED`, a check of `verify` with its culprit.
+"""
+
+PRELUDE = '''
+import contextlib, io, json, os
+import diffrax, jax, jax.numpy as jnp, numpy as np
+import jourdain_jax as jj
+from jourdain_jax.bicycle.parameter_files import read_bicycle
+from jourdain_jax.cli import main
+from jourdain_jax.models import ChaplyginSleigh, DoublePendulumRods, FreeRigidBody, PendulumChain, TrailerChain
+from jourdain_jax.models.registry import model
+
+nan, inf = float("nan"), float("inf")
+o, two, eye = jnp.zeros(3), jnp.zeros(2), jnp.eye(3)
+
+
+class Bead(jj.Scene):
+    mass: object = jj.parameter(1.0, unit="kg", positive=True)
+    stiffness: object = jj.parameter(2.0, unit="N/m", non_negative=True)
+    coordinates = jj.coordinates("x y")
+    inputs = jj.inputs("push")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.push),)
+
+
+def described(**members):
+    return type("Described", (Bead,), members)()
+
+
+def shaped(mass, inertia, orientation=eye, position=None):
+    """The bead as a rigid body."""
+    at = lambda q: jnp.stack([q.x, q.y, 0.0 * q.x]) if position is None else position * jnp.ones(3)
+    return described(bodies=lambda self, t, q: {"bead": jj.RigidBody(mass, inertia, at(q), orientation)})
+
+
+def looked_at(**members):
+    return jj.structure_of(described(**members))
+
+
+def held(**rows):
+    """The bead with velocity rows."""
+    return described(velocity_constraints=lambda self, motion: {name: row(motion) for name, row in rows.items()})
+
+
+def shell(line):
+    """A command: its exit code and what it says."""
+    told = io.StringIO()
+    with contextlib.redirect_stderr(told), contextlib.redirect_stdout(told):
+        try:
+            code = main(line.split())
+        except SystemExit as ended:
+            code = ended.code
+    return f"exit {code}", told.getvalue()
+
+
+def ended(scene, start, **options):
+    """A motion: its result code and message."""
+    motion = jj.simulate(scene, start, t1=0.1, ts=[0.0, 0.1], **options)
+    return f"result {int(motion.result)}", motion.message
+
+
+def lanes_ended(starts, **options):
+    """A rollout: the result code of its last lane, and what is printed."""
+    lanes = jj.rollout(b, starts, t1=0.1, ts=[0.0, 0.1], progress=False, **options)
+    return f"result {int(lanes.result[-1])}", str(lanes)
+
+
+def verified(scene, **state):
+    """A verification: whether it passed, and what is printed."""
+    found = jj.verify(scene, state)
+    return "passed" if found.passed else "FAILED", str(found)
+
+
+def rewritten(name, **changes):
+    """A trajectory file with some arrays, or entries of its header, changed or (None) left out."""
+    header = HEADER | {key: value for key, value in changes.items() if key in HEADER}
+    arrays = ARRAYS | {"header": np.array(json.dumps({key: value for key, value in header.items() if value is not None}))}
+    arrays |= {key.replace("parameter_", "parameter:"): value for key, value in changes.items() if key not in HEADER}
+    np.savez(name, **{key: value for key, value in arrays.items() if value is not None})
+    return name
+
+
+def bicycle(line="", **changes):
+    """A measured bicycle's file with a line more, or with values changed."""
+    text = RIGID + line
+    for name, value in changes.items():
+        text = "".join(f"{name} = {value}\\n" if row.startswith(f"{name} =") else row for row in text.splitlines(keepends=True))
+    with open("mine.txt", "w") as file:
+        file.write(text)
+    return "mine.txt"
+
+
+b, sleigh, chain = Bead(), ChaplyginSleigh(), TrailerChain()
+pose, moving = jj.pose_at(b, 0.0, two), jj.motion_at(b, 0.0, two, two)
+bead, rest, fixed = pose["bead"], jj.start(b), jj.fixed_point(o)
+run = jj.simulate(b, {"x_rate": 1.0}, t1=0.1, ts=[0.0, 0.1])
+lanes = jj.rollout(b, {"x_rate": np.array([0.5, 0.6])}, t1=0.1, ts=[0.0, 0.1], progress=False)
+data = jj.Measurements([0.0, 0.1], {"x": [0.0, 0.1]}, 0.01, start={})
+jj.save(run, "run.npz")
+WHOLE = open("run.npz", "rb").read()
+ARRAYS = dict(np.load("run.npz"))
+HEADER = json.loads(str(ARRAYS["header"]))
+open("half.npz", "wb").write(WHOLE[: len(WHOLE) // 2])
+open("empty.npz", "wb").close()
+open("text.npz", "w").write("no trajectory")
+from jourdain_jax.bicycle.parameter_files import shipped_bicycles
+RIGID = shipped_bicycles()["Rigid"].read_text()
+'''
+
+Case = tuple[str, str]  # kind of answer, words in it
+
+BODIES: dict[str, Case] = {
+    "jj.Particle(jnp.ones(2), o)": ("ValueError", "mass of a particle has shape (2,), expected one number"),
+    "jj.Particle(1j, o)": ("ValueError", "mass of a particle is of type complex128, expected real numbers"),
+    "jj.Particle(True, o)": ("ValueError", "mass of a particle is of type bool, expected real numbers"),
+    "jj.Particle(1.0, [1.0, 'a', 2.0])": ("ValueError", "position of a particle is a list, expected real numbers"),
+    "jj.RigidBody(1.0, jnp.ones(4), o, eye)": ("ValueError", "inertia of a rigid body has shape (4,), expected (3, 3); give three principal moments"),
+    "jj.RigidBody(1.0, None, o, eye)": ("ValueError", "inertia of a rigid body is `None`, expected real numbers"),
+    "jj.RigidBody(1.0, jnp.ones(3), o, 'upright')": ("ValueError", "orientation of a rigid body is the text 'upright', expected real numbers"),
+    "jj.RigidBody.thin_disc(1.0, 'wide', axis='y', position=o, orientation=eye)": ("ValueError", "radius of a disc is the text 'wide', expected real"),
+    "jj.RigidBody.thin_disc(1.0, jnp.ones(2), axis='y', position=o, orientation=eye)": ("ValueError", "radius of a disc has shape (2,), expected one"),
+    "jj.RigidBody.thin_disc(1.0, 0.5, axis=1, position=o, orientation=eye)": ("ValueError", "body axis `1` is unknown; expected one of `x`, `y`, `z`"),
+    "jj.RigidBody.ball(1.0, None, position=o, orientation=eye)": ("ValueError", "radius of a ball is `None`, expected real numbers"),
+    "jj.RigidBody.ball(1.0, 0.1, position=o, orientation=eye, factor='solid')": ("ValueError", "factor of a ball is the text 'solid', expected real"),
+    "jj.RigidBody.rod(1.0, 'long', axis='x', position=o, orientation=eye)": ("ValueError", "length of a rod is the text 'long', expected real numbers"),
+    "jj.RigidBody.box(1.0, (1.0, 2.0), position=o, orientation=eye)": ("ValueError", "sides of a box has shape (2,), expected (3,); give three lengths"),
+    "jj.RigidBody.box(1.0, 3.0, position=o, orientation=eye)": ("ValueError", "sides of a box has shape (), expected (3,); give three lengths, m"),
+    "jj.structure_of(shaped(-1.0, jnp.ones(3)))": ("ValueError", "body `bead` of `Described` has a mass of -1 kg, expected a number that is not negative"),
+    "jj.structure_of(shaped(0.0, jnp.ones(3)))": ("ValueError", "nothing in `Described` has inertia along `x_rate`: no mass moves with it"),
+    "jj.structure_of(shaped(nan, jnp.ones(3)))": ("ValueError", "body `bead` of `Described` has no finite mass at any probed state"),
+    "jj.structure_of(shaped(1.0, [nan, 1.0, 1.0]))": ("ValueError", "body `bead` of `Described` has no finite inertia at any probed state"),
+    "jj.structure_of(shaped(1.0, jnp.ones(3), position=nan))": ("ValueError", "body `bead` of `Described` has no finite position at any probed state"),
+    "jj.structure_of(shaped(1.0, jnp.ones(3), nan * eye))": ("ValueError", "body `bead` of `Described` has no finite orientation at any probed state"),
+    "jj.structure_of(shaped(1.0, [1.0, -1.0, 1.0]))": ("ValueError", "body `bead` of `Described` has a principal moment of inertia of -1 kg m^2"),
+    "jj.structure_of(shaped(1.0, jnp.eye(3).at[0, 1].set(0.3)))": ("ValueError", "body `bead` of `Described` has an inertia that is not symmetric"),
+    "jj.structure_of(shaped(1.0, jnp.ones(3), 2 * eye))": ("ValueError", "body `bead` of `Described` has an orientation R that is no rotation"),
+    "jj.structure_of(shaped(1.0, jnp.ones(3), -eye))": ("ValueError", "body `bead` of `Described` has an orientation of determinant -1, a reflection"),
+    "verified(shaped(1.0, [1.0, 1.0, 5.0]))": ("FAILED", "look at body `bead`: a principal moment of inertia exceeds the sum of the other two"),
+}
+
+PARAMETERS: dict[str, Case] = {
+    "Bead(mass=0)": ("ValueError", "parameter `mass` of `Bead` is 0.0, expected a positive number in kg; give a value above zero"),
+    "Bead(mass=inf)": ("ValueError", "parameter `mass` of `Bead` is inf, expected finite numbers; check where it was computed"),
+    "Bead(mass='heavy')": ("ValueError", "parameter `mass` of `Bead` is the text 'heavy', expected a number in kg or an array of numbers"),
+    "Bead(mass=None)": ("ValueError", "parameter `mass` of `Bead` is `None`, expected a number in kg"),
+    "Bead(stiffness=-1.0)": ("ValueError", "parameter `stiffness` of `Bead` is -1.0, expected a number >= 0 in N/m; give a value that is not negative"),
+    "Bead(mas=1.0)": ("ValueError", "scene `Bead` has no parameter `mas`; did you mean `mass`? Valid names: `mass`, `stiffness`."),
+    "b.replace(mass=[1.0, -2.0])": ("ValueError", "parameter `mass` of `Bead` is [ 1. -2.], expected a positive number"),
+    "b.replace(mass=nan)": ("ValueError", "parameter `mass` of `Bead` is nan, expected finite numbers"),
+    "b.replace(stifness=1.0)": ("ValueError", "scene `Bead` has no parameter `stifness`; did you mean `stiffness`?"),
+    "b.replace(coordinates=1.0)": ("ValueError", "scene `Bead` has no parameter `coordinates`; Valid names: `mass`, `stiffness`."),
+    "jj.simulate(b.replace(mass=jnp.ones(2)), {}, t1=0.1)": ("ValueError", "mass of a particle has shape (2,), expected one number"),
+    "PendulumChain(links=2.5)": ("ValueError", "`links` of `PendulumChain` is 2.5, expected a whole number of particles >= 1"),
+    "TrailerChain(trailers='three')": ("ValueError", "`trailers` of `TrailerChain` is 'three', expected a whole number >= 0"),
+    "model('skat')": ("ValueError", "unknown model `skat`; did you mean `skate`?"),
+    "model('skate', mas=1.0)": ("ValueError", "model `skate` has no parameter `mas`; did you mean `mass`?"),
+}
+
+NAMES: dict[str, Case] = {
+    "jj.coordinates()": ("ValueError", "`coordinates` was given no name; give at least one, such as jj.coordinates('x y')"),
+    "jj.coordinates(3)": ("ValueError", "`coordinates` was given an int, expected names in one text, parted by blanks: jj.coordinates('a b c')"),
+    "jj.coordinates(['x', 'y'])": ("ValueError", "`coordinates` was given a list, expected names in one text"),
+    "jj.coordinates('x y', 'x')": ("ValueError", "coordinate name `x` is used twice; every coordinate needs a name of its own"),
+    "jj.coordinates('1x')": ("ValueError", "coordinate name `1x` is not an identifier; use letters, digits and underscores"),
+    "jj.coordinates('for')": ("ValueError", "coordinate name `for` is a word of Python's own, so that `q.for` cannot be written"),
+    "jj.coordinates('array')": ("ValueError", "coordinate name `array` is taken by the container itself"),
+    "jj.coordinates(jj.quaternion('a b'))": ("ValueError", "coordinate name `a b_w` is not an identifier"),
+    "jj.quaternion(3)": ("ValueError", "the name of a quaternion is an int, expected a text, such as jj.quaternion('attitude')"),
+    "jj.speeds(['a', 'b'])": ("ValueError", "`speeds` was given a list, expected names in one text, parted by blanks: jj.speeds('a b c')"),
+    "jj.speeds('a a')": ("ValueError", "speed name `a` is used twice"),
+    "jj.inputs(None)": ("ValueError", "`inputs` was given `None`, expected names in one text"),
+    "type('S', (jj.Scene,), {'coordinates': 'x y'})()": ("ValueError", "scene `S` has no `coordinates`; state them as a class attribute"),
+    "described(inputs='push')": ("ValueError", "`inputs` of `Described` is the text 'push', expected names; write inputs = jj.inputs('a b c')"),
+    "described(speeds=jj.speeds('a b'))": ("ValueError", "`Described` has speeds of its own (a, b) but does not say how they move its coordinates"),
+    "described(domain={'z': (0.0, 1.0)})": ("ValueError", "`domain` of `Described` names `z`, which is no coordinate or speed"),
+    "described(domain={'x': (nan, 0.0)})": ("ValueError", "`domain` of `Described` gives (nan, 0.0) for `x`, expected two finite numbers (low, high)"),
+    "described(domain={'x': (0, 'a')})": ("ValueError", "`domain` of `Described` gives (0, 'a') for `x`, expected two finite numbers"),
+    "described(example={'z': 1.0})": ("ValueError", "`example` of `Described` names `z`, which is no coordinate or speed"),
+    "described(load=lambda self, motion: ())": ("ValueError", "`Described` has a method `load`, which nothing calls; did you mean `loads`?"),
+    "looked_at(privileged=('x_rate',))": ("ValueError", "`privileged` of `Described` names 1 speeds, but the scene has 2 degrees of freedom"),
+    "looked_at(privileged=('x_rate', 'z_rate'))": ("ValueError", "unknown privileged speed of `Described`: `z_rate`; did you mean `y_rate`?"),
+    "looked_at(privileged=('x_rate', 'x_rate'))": ("ValueError", "`privileged` of `Described` names a speed twice (x_rate, x_rate)"),
+    "looked_at(privileged=3)": ("ValueError", "`privileged` of `Described` is an int, expected names of speeds"),
+    "b.named(z=1.0)": ("ValueError", "scene `Bead` has no coordinate or speed `z`; Valid names: `x`, `y`, `x_rate`, `y_rate`."),
+    "b.named(x=[1.0, 2.0])": ("ValueError", "`x` was given an array of shape (2,), expected one number; use `jax.vmap` or `rollout` for many"),
+    "b.named(x='far')": ("ValueError", "`x` is the text 'far', expected real numbers; give its value"),
+    "FreeRigidBody().named(attitude=[1.0, 0.0])": ("ValueError", "`attitude` was given an array of shape (2,), expected (4,)"),
+}
+
+PARTS: dict[str, Case] = {
+    "jj.rot_x('a')": ("ValueError", "angle of a rotation is the text 'a', expected real numbers; give one angle in rad"),
+    "jj.rot_z(jnp.ones(2))": ("ValueError", "angle of a rotation has shape (2,), expected one number"),
+    "jj.quaternion_to_matrix([1.0, 0.0])": ("ValueError", "quaternion has shape (2,), expected (4,); give (w, x, y, z)"),
+    "jj.quaternion_from_axis_angle([1.0, 0.0], 0.3)": ("ValueError", "axis of a quaternion has shape (2,), expected (3,); give a unit vector"),
+    "jj.rod(o, o, 'long')": ("ValueError", "length of a rod is the text 'long', expected real numbers; give a positive number, m"),
+    "jj.rod(o, eye[0], 0.0)": ("ValueError", "length of a rod is 0.0, expected a positive number, m; to keep two points together use `jj.pin`"),
+    "jj.rod(o, eye[0], -1.0)": ("ValueError", "length of a rod is -1.0, expected a positive number"),
+    "jj.rod(o, two, 1.0)": ("ValueError", "second point of a rod has shape (2,), expected (3,); give three components in the inertial frame, m"),
+    "jj.pin(two, o)": ("ValueError", "first point of a pin has shape (2,), expected (3,)"),
+    "jj.pin(o, o, axes=3)": ("ValueError", "pin along axes `3`, expected letters out of `xyz`"),
+    "jj.pin(o, o, axes='')": ("ValueError", "pin along axes ``, expected letters out of `xyz`, such as `xyz` or `xy`"),
+    "jj.knife_edge(moving['bead'], two, o)": ("ValueError", "contact of the knife edge of `bead` has shape (2,), expected (3,)"),
+    "jj.knife_edge(moving['bead'], o, two)": ("ValueError", "lateral direction of the knife edge of `bead` has shape (2,), expected (3,); give a unit vector"),
+    "jj.weld(bead, bead, turn=two)": ("ValueError", "turn of a weld has shape (2,), expected (3, 3); give a rotation matrix"),
+    "jj.weld(bead, o)": ("ValueError", 'the second body of a weld is an array of shape (3,), expected the pose of a body; write pose["name"]'),
+    "jj.Plane(tilt='steep')": ("ValueError", "tilt of a plane is the text 'steep', expected real numbers; give one angle in rad"),
+    "jj.Plane(velocity=1.0)": ("ValueError", "velocity of a plane has shape (), expected (3,)"),
+    "jj.disc_contact(bead, 0.5)": ("ValueError", "body `bead` of a contact is a particle, which cannot roll; make it a `jj.RigidBody`"),
+    "jj.disc_contact(bead, 0.5, height='rows')": ("ValueError", "contact height `rows` is unknown; expected `coordinates`"),
+    "jj.ball_contact(b, 0.5)": ("ValueError", "the body of a contact is a Bead, expected the pose of a body"),
+    "jj.ball_contact(jj.pose_at(shaped(1.0, jnp.ones(3)), 0.0, two)['bead'], 0.5, plane='ground')": (
+        "ValueError",
+        "`plane` of the contact of `bead` is the text 'ground', expected a `jj.Plane(...)`, or None for z = 0 at rest",
+    ),
+    "jj.fixed_point('origin')": ("ValueError", "position of a fixed point is the text 'origin', expected real numbers"),
+    "moving['bead'].velocity_at([1.0, 2.0])": ("ValueError", "point of body `bead` has shape (2,), expected (3,); give three components in the inertial frame"),
+    "moving['bead'].point([1.0])": ("ValueError", "point of body `bead` has shape (1,), expected (3,); give three components in its body frame, m"),
+    "moving['bed']": ("UnknownNameError", "no body `bed` in this scene; did you mean `bead`? Valid names: `bead`."),
+    "pose.q.z": ("AttributeError", "no `z` here; Valid names: `x`, `y`."),
+    "jj.gravity(b, 9.81)": ("ValueError", "`gravity` was given a Bead, expected a motion: what `loads(self, motion)` is handed"),
+    "jj.gravity(moving, [9.81])": ("ValueError", "strength of gravity has shape (1,), expected one number"),
+    "jj.spring(o, fixed, 1.0)": ("ValueError", 'first end of a spring is an array of shape (3,), expected a point: motion["name"].point(local) or'),
+    "jj.spring(fixed, fixed, 'k')": ("ValueError", "stiffness of a spring is the text 'k', expected real numbers"),
+    "jj.spring(fixed, fixed, jnp.ones(3))": ("ValueError", "stiffness of a spring has shape (3,), expected one number"),
+    "jj.damper(fixed, 'wall', 1.0)": ("ValueError", "second end of a damper is the text 'wall', expected a point"),
+    "jj.damper(fixed, fixed, None)": ("ValueError", "damping of a damper is `None`, expected real numbers"),
+    "jj.torque(moving, 'bed', o)": ("ValueError", "torque on unknown body `bed`; did you mean `bead`?"),
+    "jj.torque(moving, 'bead', o, reaction='wall')": ("ValueError", "torque on unknown body `wall`; Valid names: `bead`."),
+    "jj.point_force(o, o)": ("ValueError", "point of a force is an array of shape (3,), expected a point"),
+    "jj.point_force(moving['bead'].point(), [1.0])": ("ValueError", "force on a point of `bead` has shape (1,), expected (3,)"),
+    "jj.generalized_force(moving, x=1.0)": ("ValueError", "generalized force on unknown speed `x`; Valid names: `x_rate`, `y_rate`."),
+    "jj.Load(forces=[o])": ("ValueError", "`forces` of a load is a list, expected a dictionary by name"),
+    "jj.Load(forces={'bead': 'hard'})": ("ValueError", "load on `bead` is the text 'hard', expected real numbers"),
+    "jj.Load(potential='high')": ("ValueError", "potential of a load is the text 'high', expected real numbers"),
+}
+
+ROWS: dict[str, Case] = {
+    "looked_at(geometric_constraints=lambda self, p: {'a': p.q.x - 1.0, 'b': p.q.x - 2.0})": ("ValueError", "no admissible state of `Described` was found"),
+    "looked_at(geometric_constraints=lambda self, p: {'a': 0.0 * p.q.x + 1.0})": ("ValueError", "positions miss the geometric rows by 1.0e+00 or more"),
+    "looked_at(geometric_constraints=lambda self, p: {'a': nan * p.q.x})": ("ValueError", "no admissible state of `Described` was found"),
+    "looked_at(prescribed=lambda self, t: {'z': t})": ("ValueError", "unknown prescribed coordinate of `Described`: `z`; Valid names: `x`, `y`."),
+    "jj.structure_of(held(a=lambda m: nan * m.u.x_rate))": ("ValueError", "rows `a` of `Described` are not finite at any probed state, expected numbers"),
+    "jj.start(held(a=lambda m: m.u.x_rate - 1.0, b=lambda m: m.u.x_rate - 2.0))": ("ValueError", "the start of `Described` contradicts row `a`: residual 0.5"),
+    "jj.accelerations(held(a=lambda m: None), 0.0, two, two)": ("ValueError", "row `a` of `Described` is `None`, expected real numbers"),
+    "jj.accelerations(held(a=lambda m: m.u.x_rate > 0), 0.0, two, two)": ("ValueError", "row `a` of `Described` is of type bool, expected real numbers"),
+    "jj.accelerations(described(contacts=lambda self, p: {'rim': 1.0}), 0.0, two, two)": ("ValueError", "contact `rim` of `Described` is a float, expected a"),
+}
+
+STATES: dict[str, Case] = {
+    "jj.start(Bead)": ("ValueError", "`scene` is the class `Bead`, expected a scene of it; write `Bead()`, with parameters in the parentheses"),
+    "jj.start(b, z=1.0)": ("ValueError", "scene `Bead` has no coordinate or speed `z`"),
+    "jj.start(b, x=nan)": ("ValueError", "start value `x` is nan, expected a finite number; check where it was computed"),
+    "jj.start(b, t0='noon')": ("ValueError", "`t` is the text 'noon', expected real numbers; give one time in s"),
+    "jj.start(b, t0=nan)": ("ValueError", "start value `t0` is nan, expected a finite number"),
+    "jj.start(sleigh, x_rate=0.0, y_rate=1.0, heading=0.0, heading_rate=0.0)": ("ValueError", "the start of `ChaplyginSleigh` contradicts row `blade`"),
+    "jj.start(DoublePendulumRods(), x1=5.0, z1=5.0)": ("ValueError", "the start of `DoublePendulumRods` contradicts row `upper rod`: residual"),
+    "jj.consistent(b, 0.0, [1.0], two)": ("ValueError", "`q` of `Bead` has shape (1,), expected (2,); one number for each of x, y"),
+    "jj.consistent(b, 0.0, two, two, held=('z',))": (
+        "ValueError",
+        "`held` names `z`, which is no coordinate or speed; Valid names: `x`, `y`, `x_rate`, `y_rate`.",
+    ),
+    "jj.accelerations(Bead, 0.0, two, two)": ("ValueError", "`scene` is the class `Bead`, expected a scene of it"),
+    "jj.accelerations(b, 'now', two, two)": ("ValueError", "`t` is the text 'now', expected real numbers; give one time in s"),
+    "jj.accelerations(b, two, two, two)": ("ValueError", "`t` has shape (2,), expected one number; give one time in s; use `jax.vmap` for many"),
+    "jj.accelerations(b, 0.0, two, 'fast')": ("ValueError", "`u` of `Bead` is the text 'fast', expected real numbers; one number for each of x_rate, y_rate"),
+    "jj.accelerations(b, 0.0, two, two, {'pull': 1.0})": ("ValueError", "`Bead` has no input `pull`; did you mean `push`?"),
+    "jj.accelerations(b, 0.0, two, two, [1.0, 2.0])": ("ValueError", "`inputs` of `Bead` has shape (2,), expected (1,); one number for each of push"),
+    "jj.accelerations(b, 0.0, two, two, {'push': lambda t: t})": (
+        "ValueError",
+        "input `push` of `Bead` is a function, expected real numbers; a function of time",
+    ),
+    "jj.accelerations(b, 0.0, two, two, reduction='rq')": ("ValueError", "unknown reduction `rq`; did you mean `qr`?"),
+    "jj.accelerations(b, 0.0, two, two, reduction=jj.NullSpaceQR)": ("ValueError", "`reduction` is the class `NullSpaceQR`, expected a name (privileged, qr,"),
+    "jj.accelerations(b, 0.0, two, two, reduction=jj.Privileged((0, 7)))": (
+        "ValueError",
+        "`independent` is (0, 7), expected different indices of speeds of `Bead`",
+    ),
+    "jj.accelerations(b, 0.0, two, two, reduction=jj.Privileged(('x_rate',)))": ("ValueError", "`independent` is ('x_rate',), expected different indices"),
+    "jj.accelerations(b, 0.0, two, two, stabilisation=5.0)": ("ValueError", "`stabilisation` is a float, expected `jj.Baumgarte(alpha, beta)` or None"),
+    "jj.Baumgarte(alpha='hard')": ("ValueError", "`alpha` of `Baumgarte` is the text 'hard', expected real numbers"),
+    "jj.kinetic_energy(b, 0.0, two, [1.0])": ("ValueError", "`u` of `Bead` has shape (1,), expected (2,)"),
+    "jj.potential_energy(b, None)": ("ValueError", "`motion` is `None`, expected a motion, such as `jj.motion_at(scene, t, q, u)`"),
+    "jj.gibbs_function(b, 0.0, two, two, [1.0])": ("ValueError", "`udot` of `Bead` has shape (1,), expected (2,)"),
+    "jj.lagrange_equations(FreeRigidBody(), 0.0, jnp.zeros(7), jnp.zeros(6))": (
+        "ValueError",
+        "Lagrange's equations hold for coordinate rates, and the speeds of",
+    ),
+    "jj.virtual_power(b, 0.0, two, two, two, [1.0])": ("ValueError", "`virtual_velocity` of `Bead` has shape (1,), expected (2,)"),
+    "jj.newton_residual(b, 0.0, two, two, [1.0])": ("ValueError", "`udot` of `Bead` has shape (1,), expected (2,)"),
+    "jj.constraint_rows(b, 0.0, {'x': 1.0}, two)": (
+        "ValueError",
+        "`q` of `Bead` is a dictionary, expected a vector of x, y; `jj.start(scene, **values)` makes one",
+    ),
+    "jj.velocity_residual(b, 0.0, two, None)": ("ValueError", "`u` of `Bead` is `None`, expected real numbers"),
+    "jj.coordinate_rates(b, 0.0, two, jnp.ones((3, 2)))": (
+        "ValueError",
+        "`u` of `Bead` has shape (3, 2), expected (2,); one number for each of x_rate, y_rate",
+    ),
+    "jj.pose_at(b, 0.0, [[0.0, 0.0]])": ("ValueError", "`q` of `Bead` has shape (1, 2), expected (2,)"),
+    "jj.sample_states(b, 0)": ("ValueError", "`count` is 0, expected a whole number of states, at least 1"),
+    "jj.sample_states(b, 2.5)": ("ValueError", "`count` is 2.5, expected a whole number of states"),
+    "jj.sample_states(b, 4, seed='x')": ("ValueError", "`seed` is 'x', expected a whole number that is not negative"),
+    "jj.derivative_exists(b, 0.0, two, two, 3, two)": ("ValueError", "`direction` is an int, expected a change of every parameter, as a scene like `scene`: a"),
+    "jj.structure_of(Bead)": ("ValueError", "`scene` is the class `Bead`"),
+    "jj.reductions(3)": ("ValueError", "`scene` is an int, expected a scene: an instance of a subclass of `jj.Scene`"),
+    "jj.lower(3)": ("ValueError", "`scene` is an int, expected a scene"),
+}
+
+MOTIONS: dict[str, Case] = {
+    "jj.simulate(Bead, {}, t1=1.0)": ("ValueError", "`scene` is the class `Bead`, expected a scene of it; write `Bead()`"),
+    "jj.simulate(3.0, {}, t1=1.0)": ("ValueError", "`scene` is a float, expected a scene: an instance of a subclass of `jj.Scene`"),
+    "jj.simulate(b, 3.0, t1=1.0)": (
+        "ValueError",
+        "`start` is a float, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None",
+    ),
+    "jj.simulate(b, jj.start(sleigh), t1=0.1)": ("ValueError", "`q` of `Bead` has shape (3,), expected (2,)"),
+    "jj.simulate(b, jax.tree.map(lambda x: jnp.stack([x, x]), rest), t1=0.1)": ("ValueError", "`start` holds a batch of shape (2,); use `jj.rollout`"),
+    "jj.simulate(b, rest, t1=0.0)": ("ValueError", "the span from t0 = 0.0 to t1 = 0.0 s is empty or not finite; give a finite `t1` different from `t0`"),
+    "jj.simulate(b, rest, t0=1.0, t1=1.0)": ("ValueError", "the span from t0 = 1.0 to t1 = 1.0 s is empty"),
+    "jj.simulate(b, rest, t1=inf)": ("ValueError", "the span from t0 = 0.0 to t1 = inf s is empty or not finite"),
+    "jj.simulate(b, rest, t1='later')": ("ValueError", "`t1` is the text 'later', expected real numbers; give one time in s"),
+    "jj.simulate(b, rest, t1=[1.0, 2.0])": ("ValueError", "`t1` has shape (2,), expected one number; give one time in s"),
+    "jj.simulate(described(example_span=nan), {})": ("ValueError", "the span from t0 = 0.0 to t1 = nan s is empty or not finite"),
+    "jj.simulate(b, rest, ts=[])": ("ValueError", "`ts` has shape (0,), expected a vector of at least one time in s"),
+    "jj.simulate(b, rest, ts='all')": ("ValueError", "`ts` is the text 'all', expected real numbers; give a vector of times in s"),
+    "jj.simulate(b, rest, ts=[0.0, 0.5, 0.2])": ("ValueError", "`ts` must be finite and strictly increasing (or decreasing, for reversed time)"),
+    "jj.simulate(b, rest, ts=[0.0, nan])": ("ValueError", "`ts` must be finite and strictly increasing"),
+    "jj.simulate(b, rest, ts=[0.0, 2.0], t1=1.0)": ("ValueError", "`ts` runs from 0.0 to 2.0 s, outside of the span from t0 = 0.0 to t1 = 1.0 s"),
+    "jj.simulate(b, rest, ts=[1.0, 0.5], t1=2.0)": ("ValueError", "`ts` runs from 1.0 to 0.5 s, outside of the span from t0 = 0.0 to t1 = 2.0 s or against it"),
+    "jj.simulate(b, {}, t1=1.0, rtol=nan)": ("ValueError", "`rtol` is nan, expected a positive finite number; give a tolerance such as 1e-8"),
+    "jj.simulate(b, {}, t1=1.0, rtol='tight')": ("ValueError", "`rtol` is the text 'tight', expected real numbers; give one number, such as 1e-8"),
+    "jj.simulate(b, {}, t1=1.0, atol=-1)": ("ValueError", "`atol` is -1, expected a positive finite number"),
+    "jj.simulate(b, {}, t1=1.0, atol=[1e-8, 1e-8])": ("ValueError", "`atol` has shape (2,), expected one number"),
+    "jj.simulate(b, {}, t1=1.0, max_steps=0)": ("ValueError", "`max_steps` is 0, expected a whole number of at least 1"),
+    "jj.simulate(b, {}, t1=1.0, max_steps=True)": ("ValueError", "`max_steps` is True, expected a whole number of at least 1"),
+    "jj.simulate(b, {}, t1=1.0, dt0='small')": ("ValueError", "`dt0` is the text 'small', expected real numbers; give the first step in s"),
+    "jj.simulate(b, {}, t1=1.0, dt0=0.0)": ("ValueError", "`dt0` is 0, expected a finite first step in s that is not zero"),
+    "jj.simulate(b, {}, t1=1.0, dt0=nan)": ("ValueError", "`dt0` is nan, expected a finite first step in s"),
+    "jj.simulate(b, {}, t1=1.0, solver='dopri5')": ("ValueError", "`solver` is the text 'dopri5', expected an object of diffrax; write `diffrax.Dopri5()`"),
+    "jj.simulate(b, {}, t1=1.0, solver=diffrax.Tsit5)": ("ValueError", "`solver` is the class `Tsit5`, expected an object of diffrax; write `diffrax.Tsit5()`"),
+    "jj.simulate(b, {}, t1=1.0, solver=diffrax.ForwardMode())": ("ValueError", "`solver` is a ForwardMode, expected an object of diffrax"),
+    "jj.simulate(b, {}, t1=1.0, adjoint='forward')": (
+        "ValueError",
+        "`adjoint` is the text 'forward', expected an object of diffrax; write `diffrax.ForwardMode()`",
+    ),
+    "jj.simulate(b, {}, t1=1.0, adjoint=diffrax.BacksolveAdjoint())": ("ValueError", "diffrax.BacksolveAdjoint, which solves the motion backwards"),
+    "jj.simulate(b, {}, t1=1.0, stepsize_controller=0.1)": (
+        "ValueError",
+        "`stepsize_controller` is a float, expected an object of diffrax; write `diffrax.PID",
+    ),
+    "jj.simulate(b, {}, t1=1.0, saveat=[0.0])": ("ValueError", "`saveat` is a list, expected an object of diffrax; write `diffrax.SaveAt(ts=...)`"),
+    "jj.simulate(b, {}, t1=1.0, saveat=diffrax.SaveAt(dense=True))": ("ValueError", "`saveat` must be a plain `diffrax.SaveAt(t0=, t1=, ts=, steps=)`"),
+    "jj.simulate(b, {}, t1=1.0, state='minimum')": ("ValueError", "unknown state form `minimum`; did you mean `minimal`?"),
+    "jj.simulate(b, {}, t1=1.0, state=None)": ("ValueError", "unknown state form `None`; Valid names: `auto`, `minimal`, `full`."),
+    "jj.simulate(held(a=lambda m: m.u.x_rate**2 + m.u.y_rate**2 - 1.0), {'x_rate': 1.0}, t1=1.0, state='minimal')": (
+        "ValueError",
+        "the rows of `Described` are nonlinear in the speeds and have no minimal state; use state='full'",
+    ),
+    "jj.simulate(b, {}, t1=1.0, reduction='QR')": ("ValueError", "unknown reduction `QR`; Valid names: `privileged`, `qr`"),
+    "jj.simulate(b, {}, t1=1.0, stabilisation=3.0)": ("ValueError", "`stabilisation` is a float, expected `jj.Baumgarte(alpha, beta)` or None"),
+    "jj.simulate(b, {}, t1=1.0, projection='yes')": ("ValueError", "`projection` is the text 'yes', expected True or False"),
+    "jj.simulate(b, {}, t1=1.0, events='none')": ("ValueError", "`events` is the text 'none', expected True or False"),
+    "jj.simulate(b, {}, t2=1.0)": ("TypeError", "unexpected keyword argument 't2'"),
+    "jj.simulate(b, {}, t1=1.0, inputs=[1.0])": ("ValueError", "`inputs` is a list, expected a dictionary: name -> number, function of time, or `jj.Sampled`"),
+    "jj.simulate(b, {}, t1=1.0, inputs={'pull': 1.0})": ("ValueError", "`Bead` has no input `pull`; did you mean `push`?"),
+    "jj.simulate(b, {}, t1=1.0, inputs={'push': 'hard'})": ("ValueError", "input `push` of `Bead` is the text 'hard', expected real numbers; give a number, a"),
+    "jj.simulate(b, {}, t1=1.0, inputs={'push': lambda t: jnp.stack([t, t])})": (
+        "ValueError",
+        "input `push` of `Bead` returned an array of shape (2,), expected",
+    ),
+    "jj.simulate(b, {}, t1=1.0, inputs={'push': lambda t: None})": (
+        "ValueError",
+        "input `push` of `Bead` returned `None`, expected one number; give a function of one",
+    ),
+    "jj.simulate(b, {}, t1=1.0, inputs={'push': lambda: 1.0})": ("ValueError", "input `push` of `Bead` cannot be called with a time"),
+    "ended(b, {}, inputs={'push': nan})": ("result 4", "the accelerations are not finite or not determined"),
+    "jj.simulate(described(events=lambda self, m: {'out': m.q.x < 1.0}), {}, t1=0.1)": (
+        "ValueError",
+        "event `out` of `Described` is of type bool, expected real",
+    ),
+    "jj.simulate(described(events=lambda self, m: 1.0 - m.q.x), {}, t1=0.1)": (
+        "ValueError",
+        "`events` of `Described` returned an array of shape (), expected a dictionary",
+    ),
+    "jj.Sampled([0, 2, 1], [0, 1, 2])": ("ValueError", "the times of `Sampled` must be finite and increase from one to the next; sort the samples by time"),
+    "jj.Sampled([0, 1], [0, 1, 2])": ("ValueError", "`Sampled` was given times of shape (2,) and values of shape (3,), expected two vectors of one length"),
+    "jj.Sampled(0.0, 1.0)": ("ValueError", "`Sampled` was given times of shape () and values of shape ()"),
+    "jj.Sampled([0, 1], [0, nan])": ("ValueError", "value 1 of `Sampled` is nan, expected finite numbers; leave samples out that were not measured"),
+    "jj.Sampled(['a'], [0])": ("ValueError", "`ts` of `Sampled` is a list, expected real numbers; give times in s"),
+    "run['z']": ("UnknownNameError", "a trajectory of `Bead` has no `z`; Valid names: `x`, `y`, `x_rate`, `y_rate`, `t`."),
+    "run.point('bed')": ("UnknownNameError", "no body `bed` in this scene; did you mean `bead`?"),
+}
+
+BATCHES: dict[str, Case] = {
+    "jj.rollout(Bead)": ("ValueError", "`scene` is the class `Bead`"),
+    "jj.rollout(b, 3.0, t1=0.1)": ("ValueError", "`starts` is a float, expected a dictionary by name"),
+    "jj.rollout(b, {'x': 1.0}, t1=0.1)": ("ValueError", "no lanes: give at least one start value or parameter as an array with one entry per lane"),
+    "jj.rollout(b, {'x': []}, t1=0.1)": ("ValueError", "no lanes: give at least one start value or parameter"),
+    "jj.rollout(b, {'x': ['a', 'b']}, t1=0.1)": ("ValueError", "start `x` is a list, expected real numbers"),
+    "jj.rollout(b, {'x': [1.0, 2.0], 'y': [1.0]}, t1=0.1)": (
+        "ValueError",
+        "lanes differ in number: start `x` has 2, start `y` has 1; give arrays of one length",
+    ),
+    "jj.rollout(b, {'z': [1.0, 2.0]}, t1=0.1)": ("ValueError", "scene `Bead` has no coordinate or speed `z`"),
+    "jj.rollout(b, rest, t1=0.1)": ("ValueError", "`starts` has no axis of lanes; give an array with one entry per lane"),
+    "jj.rollout(b, {'x': [1.0, 2.0]}, parameters=[1.0], t1=0.1)": ("ValueError", "`parameters` is a list, expected a dictionary by name"),
+    "jj.rollout(b, {'x': [1.0, 2.0]}, parameters={'mas': [1.0, 2.0]}, t1=0.1)": ("ValueError", "scene `Bead` has no parameter `mas`; did you mean `mass`?"),
+    "jj.rollout(b, {'x': [1.0, 2.0]}, parameters={'mass': 1.0}, t1=0.1)": ("ValueError", "parameter `mass` has no axis of lanes"),
+    "jj.rollout(b, {'x': [1.0, 2.0]}, parameters={'mass': 'heavy'}, t1=0.1)": ("ValueError", "parameter `mass` is the text 'heavy', expected real numbers"),
+    "jj.rollout(b, {'x': [1.0, 2.0]}, chunk=0, t1=0.1)": ("ValueError", "`chunk` is 0, expected a whole number, at least one lane"),
+    "jj.rollout(b, {'x': [1.0, 2.0]}, chunk=1.5, t1=0.1)": ("ValueError", "`chunk` is 1.5, expected a whole number"),
+    "jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.0)": ("ValueError", "the span from t0 = 0.0 to t1 = 0.0 s is empty or not finite"),
+    "jj.rollout(b, {'x': [1.0, 2.0]}, ts=[0.2, 0.1, 0.3])": ("ValueError", "`ts` must be finite and strictly increasing"),
+    "jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.1, solver='tsit5')": (
+        "ValueError",
+        "`solver` is the text 'tsit5', expected an object of diffrax; write `diffrax.Tsit5()`",
+    ),
+    "lanes_ended({'x_rate': [1.0, nan]})": ("result 8", "the start is not finite; check where its values were computed: lanes 1"),
+    "lanes_ended({'x_rate': [1.0, 2.0]}, parameters={'mass': [1.0, -1.0]})": ("result 7", "a parameter is not finite or has the wrong sign (`mass`): lanes 1"),
+    "lanes.lane(2)": ("IndexError", "lane 2 does not exist; this rollout has 2 lanes, 0 to 1"),
+    "lanes['z']": ("UnknownNameError", "a trajectory of `Bead` has no `z`"),
+    "lanes.quantiles('x', [2.0])": ("ValueError", "`levels` are [2.0], expected a list of numbers from 0 to 1"),
+}
+
+FILES: dict[str, Case] = {
+    "jj.load('nowhere.npz', Bead)": ("ValueError", "there is no file `nowhere.npz`; check the path"),
+    "jj.load('half.npz', Bead)": ("ValueError", "`half.npz` is no trajectory file, or is damaged (File is not a zip file); expected an .npz written by `save`"),
+    "jj.load('empty.npz', Bead)": ("ValueError", "`empty.npz` is no trajectory file, or is damaged (No data left in file)"),
+    "jj.load('text.npz', Bead)": ("ValueError", "`text.npz` is no trajectory file, or is damaged"),
+    "jj.load('.', Bead)": ("ValueError", "`.` is no trajectory file, or is damaged ([Errno 21] Is a directory: '.')"),
+    "jj.load(3.5, Bead)": ("ValueError", "`path` is a float, expected the name of a file"),
+    "jj.load('run.npz', 3)": ("ValueError", "`scene` is an int, expected the class of the scene that moved, or any scene of that class"),
+    "jj.load('run.npz', ChaplyginSleigh)": (
+        "ValueError",
+        "`run.npz` holds a trajectory of `Bead`, expected `ChaplyginSleigh`; pass the class it was made with",
+    ),
+    "jj.load(rewritten('noq.npz', q=None), Bead)": ("ValueError", "`noq.npz` lacks `q`; it is damaged or was not written by `save`"),
+    "jj.load(rewritten('shape.npz', q=ARRAYS['q'][:, :1]), Bead)": (
+        "ValueError",
+        "`shape.npz` has 1 columns for 2 coordinates; it is damaged or was not written by `save`",
+    ),
+    "jj.load(rewritten('later.npz', format=9), Bead)": (
+        "ValueError",
+        "`later.npz` has format 9, expected 1; read it with the version of jourdain-jax that wrote it",
+    ),
+    "jj.load(rewritten('bare.npz', solver=None), Bead)": ("ValueError", "`bare.npz` lacks `solver`; it is damaged or was not written by `save`"),
+    "jj.load(rewritten('headless.npz', header=None), Bead)": ("ValueError", "`headless.npz` is no trajectory file, or is damaged ('header')"),
+    "jj.load(rewritten('broken.npz', header=np.array('{')), Bead)": (
+        "ValueError",
+        "`broken.npz` is no trajectory file, or is damaged (Expecting property name",
+    ),
+    "jj.load(rewritten('listed.npz', header=np.array('[1]')), Bead)": (
+        "ValueError",
+        "`listed.npz` is no trajectory file, or is damaged (its header is no dictionary)",
+    ),
+    "jj.load(rewritten('other.npz', coordinates=['r', 'phi']), Bead)": ("ValueError", "the file holds the coordinates r, phi, but `Bead` has x, y"),
+    "jj.load(rewritten('minus.npz', parameter_mass=np.array(-1.0)), Bead)": (
+        "ValueError",
+        "parameter `mass` of `Bead` is -1.0, expected a positive number in kg",
+    ),
+    "jj.load(rewritten('more.npz', parameter_load=np.array(1.0)), Bead)": ("ValueError", "`more.npz` has a parameter `load` that `Bead` has not"),
+    "jj.save(run, 'nowhere/run.npz')": ("ValueError", "cannot write `nowhere/run.npz`: there is no folder `nowhere`; make it first"),
+    "jj.save(run, '.')": ("ValueError", "cannot write `.`: it is a folder; give the name of a file in it, such as motion.npz"),
+    "jj.save(run, 3.5)": ("ValueError", "`path` is a float, expected the name of a file"),
+    "jj.save(b, 'b.npz')": ("ValueError", "`save` was given a Bead, expected a `Trajectory` from `jj.simulate`"),
+    "jj.save(lanes.lanes, 'lanes.npz')": (
+        "ValueError",
+        "`save` takes one motion and was given a batch of shape (2,); save a `Rollout`, `jj.Rollout(batch)` for one axis of lanes",
+    ),
+    "jj.animate(lanes, 'run.gif')": (
+        "ValueError",
+        "`animate` was given a Rollout, expected one motion; of a rollout take one lane: jj.animate(rollout.lane(0), 'lane-0.gif')",
+    ),
+    "jj.animate(run, 'run.mp4')": ("ValueError", "cannot write `run.mp4`: an animation is a .gif file"),
+    "jj.animate(run, 'run.gif', frames=0)": ("ValueError", "`frames` is 0, expected a whole number of at least 1"),
+    "jj.plot(run, 'x', path='run.xyz')": ("ValueError", "cannot write `run.xyz`: a plot is a .png, .svg or .pdf file, and matplotlib knows no `xyz`"),
+    "jj.plot(run, 'x', path='nowhere/x.png')": ("ValueError", "cannot write `nowhere/x.png`: there is no folder `nowhere`; make it first"),
+    "jj.plot(run, 'z')": ("UnknownNameError", "nothing named `z` to plot; Valid names: `x`, `y`, `x_rate`, `y_rate`, `energy`"),
+    "jj.plot(b, 'x')": ("ValueError", "`plot` was given a Bead, expected a motion from `jj.simulate` or a rollout"),
+    "read_bicycle('nowhere.txt')": ("ValueError", "nowhere.txt: no such file. Give the path of a bicycle parameter file."),
+    "read_bicycle('.')": ("ValueError", ".: cannot be read"),
+    "read_bicycle('empty.npz')": ("ValueError", "empty.npz: the file is empty. Expected lines `name = value`"),
+    "read_bicycle('run.npz')": ("ValueError", "run.npz: not UTF-8 text"),
+    "read_bicycle(bicycle('wheel = 1\\n'))": ("ValueError", "unknown parameter `wheel`; the nearest valid name is"),
+    "read_bicycle(bicycle(w='long'))": ("ValueError", "value of `w` is `long`, expected a number"),
+    "read_bicycle(bicycle(w='1.0+/-nan'))": ("ValueError", "sigma of `w` is nan, expected a finite number"),
+    "read_bicycle(bicycle(rF='-0.3'))": ("ValueError", "degenerate bicycle: `rF`"),
+}
+
+ANALYSIS: dict[str, Case] = {
+    "jj.report(Bead)": ("ValueError", "`scene` is the class `Bead`"),
+    "jj.verify(Bead, {})": ("ValueError", "`scene` is the class `Bead`"),
+    "jj.verify(b, 3.0)": ("ValueError", "`state` is a float, expected a State"),
+    "jj.verify(b, {'z': 1.0})": ("ValueError", "scene `Bead` has no coordinate or speed `z`"),
+    "jj.verify(b, {}, inputs={'force': 1.0})": ("ValueError", "`Bead` has no input `force`; Valid names: `push`."),
+    "jj.verify(b, {}, seed='x')": ("ValueError", "`seed` is 'x', expected a whole number that is not negative"),
+    "jj.linearize(Bead, {})": ("ValueError", "`scene` is the class `Bead`"),
+    "jj.linearize(b, o)": ("ValueError", "`state` is an array of shape (3,), expected a State"),
+    "jj.linearize(sleigh, {}, 'headin')": ("ValueError", "`ChaplyginSleigh` has no coordinate `headin` to perturb; did you mean `heading`?"),
+    "jj.linearize(b, {}, 3)": ("ValueError", "names were expected, in one text or several, and `3` was given"),
+    "jj.linearize(b, {}, ('x', 'x'))": ("ValueError", "`coordinates` names one twice (x, x); name each once"),
+    "jj.linearize(sleigh, {}, dependent=('hedding',))": ("ValueError", "`ChaplyginSleigh` has no coordinate `hedding` to perturb; did you mean `heading`?"),
+    "jj.linearize(sleigh, {}, ('x',), privileged=('heading_rate',))": (
+        "ValueError",
+        "`privileged` names 1 speeds of `ChaplyginSleigh` (heading_rate), which has 2",
+    ),
+    "jj.linearize(sleigh, {}, privileged=('heading_rat', 'x_rate'))": (
+        "ValueError",
+        "unknown privileged speed of `ChaplyginSleigh`: `heading_rat`; did you mean",
+    ),
+    "jj.linearize(chain, None, inputs={'trun': 1.0})": ("ValueError", "`TrailerChain` has no input `trun`; did you mean `turn`?"),
+    "jj.steady(Bead, {})": ("ValueError", "`scene` is the class `Bead`"),
+    "jj.steady(b, None)": ("ValueError", "`guess` is `None`, expected a State or a dictionary of named values"),
+    "jj.steady(sleigh, {}, held='headin')": ("ValueError", "`ChaplyginSleigh` has no `headin` to hold or to move; did you mean `heading`?"),
+    "jj.steady(b, {}, moving=('z',))": ("ValueError", "`Bead` has no `z` to hold or to move; Valid names: `x`, `y`."),
+    "jj.steady(b, {}, max_steps=0)": ("ValueError", "`max_steps` is 0, expected a whole number of at least 1"),
+}
+
+MEASURED: dict[str, Case] = {
+    "jj.Measurements([0.0, 0.0], {'x': [0.0, 0.0]}, 0.01, start={})": ("ValueError", "`ts` must be finite and strictly increasing; sort the samples by time"),
+    "jj.Measurements('ts', {'x': [0.0]}, 0.01, start={})": ("ValueError", "`ts` is the text 'ts', expected real numbers; give times in s"),
+    "jj.Measurements([0.0, 0.1], [0.0, 0.0], 0.01, start={})": ("ValueError", "`values` of `Measurements` is a list, expected a dictionary by name"),
+    "jj.Measurements([0.0, 0.1], {}, 0.01, start={})": ("ValueError", "`values` is empty; give at least one channel: name -> measured values"),
+    "jj.Measurements([0.0, 0.1], {'x': [0.0, nan]}, 0.01, start={})": ("ValueError", "channel `x` holds values that are not finite, the first at sample 1"),
+    "jj.Measurements([0.0, 0.1], {'x': ['a', 'b']}, 0.01, start={})": ("ValueError", "values of channel `x` is a list, expected real numbers"),
+    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, -1.0, start={})": ("ValueError", "sigma of channel `x` must be above zero (and not NaN)"),
+    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 'small', start={})": ("ValueError", "sigma of channel `x` is the text 'small', expected real numbers"),
+    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, {'y': 0.1}, start={})": ("ValueError", "`sigma` names channel `y`, which has no values; Valid names: `x`."),
+    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start=None)": ("ValueError", "`start` of `Measurements` is `None`, expected a dictionary by name"),
+    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, t0=0.5)": ("ValueError", "the start at t0 = 0.5 s comes after the first sample (0.0 s)"),
+    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, unknown_start=('x',))": ("ValueError", "unknown start value `x` has no first guess"),
+    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, functions={'nose': len})": ("ValueError", "function `nose` has no measured values"),
+    "jj.bounds(1.0, 0.0)": ("ValueError", "expected finite numbers low < high; for one bound at zero use `positive()`, for none `unbounded()`"),
+    "jj.bounds('a', 1.0)": ("ValueError", "low end of `bounds` is the text 'a', expected real numbers"),
+    "jj.unbounded(-1.0)": ("ValueError", "expected a positive scale, a typical change in the unit of the unknown"),
+    "jj.unbounded('a')": ("ValueError", "`scale` of `unbounded` is the text 'a', expected real numbers"),
+    "jj.fit(Bead, data, 'mass')": ("ValueError", "`scene` is the class `Bead`"),
+    "jj.fit(b, 3, 'mass')": ("ValueError", "`data` is an int, expected a `Measurements` or a sequence of at least one"),
+    "jj.fit(b, [data, 3], 'mass')": ("ValueError", "`data` must be a `Measurements` or a sequence of at least one"),
+    "jj.fit(b, data, ())": ("ValueError", "nothing is free; name parameters in `free` (`mass`, `stiffness`), or `unknown_start` values of a run"),
+    "jj.fit(b, data, 'mas')": ("ValueError", "`free` names `mas`, which is no parameter of `Bead`; did you mean `mass`?"),
+    "jj.fit(b, data, {'mass': 3})": ("ValueError", "`mass` was given 3; expected `bounds(low, high)`, `positive()`, `unbounded()`, or None"),
+    "jj.fit(b, data, {'mass': jj.bounds(2.0, 3.0)})": ("ValueError", "first guess of `mass` is 1.0; expected a first guess between its bounds 2.0 and 3.0"),
+    "jj.fit(b, jj.Measurements([0.0, 0.1], {'z': [0.0, 0.1]}, 0.01, start={}), 'mass')": (
+        "ValueError",
+        "run 0 of `Bead` has unknown channel `z`; Valid names:",
+    ),
+    "jj.fit(b, jj.Measurements([0.0, 0.1], {'x': [[0.0, 0.1]]}, 0.01, start={}), 'mass')": (
+        "ValueError",
+        "channel `x` of run 0 of `Bead` has shape (1, 2), expected (2,)",
+    ),
+    "jj.fit_batch(b, data, 'mass')": ("ValueError", "channel `x` of run 0 of `Bead` has shape (2,), expected (repeats, 2) for 2 times"),
+    "jj.log_likelihood(b, 3)": ("ValueError", "`data` is an int, expected a `Measurements` or a sequence of at least one"),
+    "jj.log_likelihood(b, data, rtol=-1.0)": ("ValueError", "`rtol` is -1, expected a positive finite number"),
+}
+
+COMMANDS: dict[str, Case] = {
+    "shell('')": ("exit 2", "the following arguments are required: VERB"),
+    "shell('modles')": ("exit 2", "unknown verb `modles`; did you mean `models`"),
+    "shell('models extra')": ("exit 2", "unrecognized arguments: extra"),
+    "shell('report')": ("exit 2", "the following arguments are required: model"),
+    "shell('report chaplygin-slay')": ("exit 2", "unknown model `chaplygin-slay`; did you mean `chaplygin-sleigh`"),
+    "shell('report pendulum-chain --set links=1.5')": ("exit 2", "--set links=1.5: `links` of `pendulum-chain` is a count, expected a whole number"),
+    "shell('report pendulum-chain --set links=0')": ("exit 2", "`links` of `PendulumChain` is 0, expected a whole number of particles >= 1"),
+    "shell('report pendulum-chain --set link=2')": ("exit 2", "model `pendulum-chain` has no parameter `link`; did you mean `links`"),
+    "shell('verify skate --start z=1')": ("exit 2", "scene `Skate` has no coordinate or speed `z`"),
+    "shell('simulate skate --set mas=2')": ("exit 2", "has no parameter `mas`; did you mean `mass`"),
+    "shell('simulate skate --set mass')": ("exit 2", "`mass` is not NAME=VALUE"),
+    "shell('simulate skate --set mass=-1')": ("exit 2", "parameter `mass` of `Skate` is -1.0, expected a positive number"),
+    "shell('simulate skate --set mass=nan')": ("exit 2", "parameter `mass` of `Skate` is nan, expected finite numbers"),
+    "shell('simulate skate --start x=fast')": ("exit 2", "`x=fast` is not NAME=VALUE with a number"),
+    "shell('simulate skate --start xx=1')": ("exit 2", "has no coordinate or speed `xx`"),
+    "shell('simulate skate --t1 later')": ("exit 2", "argument --t1: invalid float value: 'later'"),
+    "shell('simulate skate --t1 0')": ("exit 2", "--t1 is 0, expected a finite time in s other than zero"),
+    "shell('simulate skate --t1 nan')": ("exit 2", "--t1 is nan, expected a finite time in s other than zero"),
+    "shell('simulate skate --samples 1')": ("exit 2", "--samples is 1, expected at least 2"),
+    "shell('simulate skate --samples two')": ("exit 2", "argument --samples: invalid int value: 'two'"),
+    "shell('simulate skate --rtol -1')": ("exit 2", "`rtol` is -1, expected a positive finite number"),
+    "shell('simulate skate --atol nan')": ("exit 2", "`atol` is nan, expected a positive finite number"),
+    "shell('simulate skate --out nowhere/run.npz')": ("exit 2", "there is no folder `nowhere`"),
+    "shell('simulate skate --out .')": ("exit 2", "cannot write `.`: it is a folder; give the name of a file in it"),
+    "shell('simulate skate --animate run.mp4')": ("exit 2", "cannot write `run.mp4`: an animation is a .gif file"),
+    "shell('simulate skate --plot run.xyz')": ("exit 2", "cannot write `run.xyz`: a plot is a .png, .svg or .pdf file, and matplotlib knows no `xyz`"),
+    "shell('bicycle')": ("exit 2", "the following arguments are required: FILE"),
+    "shell('bicycle Rigid --samples 0')": ("exit 2", "--samples is 0, expected at least 1"),
+    "shell('bicycle Rigid --seed x')": ("exit 2", "argument --seed: invalid int value: 'x'"),
+    "shell('bicycle Rigid --out text.npz')": ("exit 2", "cannot make the folder `text.npz`: File exists; choose another with --out"),
+    "shell('bicycle text.npz --no-figures --samples 1 --out refused')": ("exit 1", "refused: text.npz, line 1: got `no trajectory`, expected `name = value`"),
+}
+
+TABLE: dict[str, Case] = BODIES | PARAMETERS | NAMES | PARTS | ROWS | STATES | MOTIONS | BATCHES | FILES | ANALYSIS | MEASURED | COMMANDS
