@@ -1,6 +1,8 @@
 """Generated scenes hold every invariant of mechanics under every reduction: 200 instances in 25 structures, 5,000 behind `-m slow`.
 
-The normal set runs every structure's equations on NumPy, the long one compiles them. A failure names structure, invariant, reduction and seed.
+The normal set runs every structure's equations on NumPy, the long one compiles them. Seen from moved frames, in other coordinates, speeds, units and
+orders, which takes most of the time, are every fourth structure in the normal set and all in the long one. A failure names structure, invariant,
+reduction and seed.
 """
 
 import diffrax
@@ -35,10 +37,10 @@ def broken(made: Recipe, found: dict) -> dict[str, float]:
 _EVALUATED: dict[int, dict] = {}  # what the first tests have worked out, for those of the scalar programs
 
 
-def check(number: int, *, parameters: int, states: int, least: int, seed: int, compiled: bool) -> None:
+def check(number: int, *, parameters: int, states: int, least: int, seed: int, compiled: bool, looks: bool = True) -> None:
     """All invariants of one structure."""
     made = recipe(number)
-    found = evaluated(made, parameters=parameters, states=states, seed=seed, compiled=compiled)
+    found = evaluated(made, parameters=parameters, states=states, seed=seed, compiled=compiled, looks=looks)
     _EVALUATED[number] = found if not compiled else {}
     where = f"{made}; seed {seed}"
     good = admitted(found)
@@ -55,7 +57,7 @@ def check(number: int, *, parameters: int, states: int, least: int, seed: int, c
 
 @pytest.mark.parametrize("number", STRUCTURES)
 def test_a_generated_scene_holds_every_invariant(number):
-    check(number, parameters=PARAMETERS, states=STATES, least=LEAST, seed=0, compiled=False)
+    check(number, parameters=PARAMETERS, states=STATES, least=LEAST, seed=0, compiled=False, looks=number % 4 == 0)
 
 
 @pytest.mark.slow
