@@ -12,10 +12,13 @@ import os
 import subprocess
 import sys
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # thousands of small programs: compiling them is most of the time
+# Hundreds of small programs: compiling them is most of the time. The first flag belongs to jaxlib 0.10.
+FLAGS = "--xla_backend_optimization_level=0" + (" --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else "")
+os.environ.setdefault("XLA_FLAGS", FLAGS)
 sys.path[:0] = [str(HERE), str(HERE.parent / "tests")]  # `tests/oracles` holds the closed forms
 
 

@@ -6,11 +6,13 @@ classical method with fixed steps. They report nothing: what comes out is right,
 
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
+from jourdain_jax.equations.virtual_power import equations_and_rows
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ SPEEDS_IN_BASIS = ("speeds in SVD basis", "speeds in QR basis")
 
 def accelerations(name: str, scene, static: Static, t, q, u):
     """udot by the naive method `name`."""
-    equations, rows = jj.unconstrained_equations(scene, t, q, u), jj.constraint_rows(scene, t, q, u)
+    equations, rows = equations_and_rows(scene, t, q, u)
     if rows.A.shape[0] == 0:
         return jnp.linalg.solve(equations.M, equations.Q - equations.h)
     return ACCELERATIONS[name](equations.M, equations.Q - equations.h, rows.A, -rows.drift, static)
@@ -118,6 +120,13 @@ def motion(name: str, scene, static: Static, q, u, ts: np.ndarray, steps: int):
     return _all_in_one(scene, static, names, jnp.asarray(names.index(name)), q, u, jnp.asarray(ts), steps)
 
 
+_STAGES = ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6))  # how far each stage reaches along the slope before it, and its weight
+
+
+def _plus(y, factor, slope):
+    return jax.tree.map(lambda a, b: a + factor * b, y, slope)
+
+
 def _runge_kutta(rates, y, ts, steps: int):
     """Classical fourth order, states at all `ts`."""
 
@@ -126,12 +135,14 @@ def _runge_kutta(rates, y, ts, steps: int):
 
         def step(i, y):
             t = ends[0] + i * h
-            add = lambda k, c: jax.tree.map(lambda a, b: a + c * h * b, y, k)  # noqa: E731
-            k1 = rates(t, y)
-            k2 = rates(t + h / 2, add(k1, 0.5))
-            k3 = rates(t + h / 2, add(k2, 0.5))
-            k4 = rates(t + h, add(k3, 1.0))
-            return jax.tree.map(lambda a, b, c, d, e: a + h / 6 * (b + 2 * c + 2 * d + e), y, k1, k2, k3, k4)
+
+            def stage(carry, weights):
+                slope, total = carry
+                reach, share = weights
+                slope = rates(t + reach * h, _plus(y, reach * h, slope))
+                return (slope, _plus(total, share * h, slope)), None
+
+            return jax.lax.scan(stage, (jax.tree.map(jnp.zeros_like, y), y), jnp.asarray(_STAGES, h.dtype))[0][1]
 
         y = jax.lax.fori_loop(0, steps, step, y)
         return y, y
@@ -147,7 +158,7 @@ def _all_in_one(scene, static, names, index, q, u, ts, steps):
         def run(scene, index, q, u, ts):
             def rates(t, y):
                 q, u = y
-                equations, rows = jj.unconstrained_equations(scene, t, q, u), jj.constraint_rows(scene, t, q, u)
+                equations, rows = equations_and_rows(scene, t, q, u)
                 problem = (equations.M, equations.Q - equations.h, rows.A, -rows.drift)
                 if rows.A.shape[0] == 0:
                     return jj.coordinate_rates(scene, t, q, u), jnp.linalg.solve(problem[0], problem[1])
@@ -177,6 +188,7 @@ def _in_basis(name, scene, static, q, u, ts, steps):
                 rows = jj.constraint_rows(scene, t, q, u)
                 return rows.A, rows.phi - rows.A @ u
 
+            @eqx.filter_jit  # one copy of it
             def basis(t, q):
                 """Z and c of `u = Z s + c`."""
                 return jax.lax.switch(index, [lambda A, b, f=f: f(A, b, static) for f in REDUCED_STATE.values()], *rows_at(t, q, jnp.zeros(u.shape)))
@@ -186,7 +198,7 @@ def _in_basis(name, scene, static, q, u, ts, steps):
                 Z, c = basis(t, q)
                 u = Z @ s + c
                 qdot = jj.coordinate_rates(scene, t, q, u)
-                udot = accelerations("raw QR basis" if static.rank == len(static.rows) else "pinv, 1e-10", scene, static, t, q, u)
+                udot = accelerations("pinv, 1e-10", scene, static, t, q, u)
                 Z1, c1 = basis(t + small, q + small * qdot)
                 jump = ((Z1 - Z) @ s + c1 - c) / small
                 by_basis = Z.T @ (udot - jump)  # Z'Z = 1 for orthonormal bases

@@ -26,7 +26,7 @@ from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import Options, integrate
 from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
-from jourdain_jax.motion.state_form import StateForm, default_reduction
+from jourdain_jax.motion.state_form import StateForm, cutoff_of, default_reduction
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
@@ -161,7 +161,8 @@ def state_form(
     with_work = work and needs_work(scene, structure)
     plain = minimal and lowering and reduction is None and stabilisation is None and not (with_work and (structure.driven or structure.varying_inertia))
     program = lowered(scene) if plain else None
-    reduction = as_reduction(scene, default_reduction(independent) if reduction is None else reduction)
+    cutoff = cutoff_of(structure) if reduction is None and not minimal else None
+    reduction = as_reduction(scene, default_reduction(structure, independent) if reduction is None else reduction)
     return StateForm(
         independent=independent,
         reduction=reduction,
@@ -171,6 +172,7 @@ def state_form(
         projects_speeds=projection and not minimal and bool(structure.row_names),
         lowered=program if isinstance(program, Lowered) else None,
         as_scalars=batch and isinstance(program, Lowered),
+        cutoff=cutoff,
     )
 
 

@@ -11,12 +11,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.equations.accelerations import Baumgarte, bare_accelerations
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations, speeds_and_pivot, speeds_from_privileged
 from jourdain_jax.equations.power import power
 from jourdain_jax.equations.projection import project_positions, project_speeds
-from jourdain_jax.equations.reductions import Privileged
+from jourdain_jax.equations.reductions import NullSpaceQR, Privileged, Reduction
+from jourdain_jax.equations.structure import WELL_CONDITIONED, Structure
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.scene.scene import Scene
 
@@ -40,6 +42,7 @@ class StateForm(eqx.Module):
     projects_speeds: bool = eqx.field(static=True)
     lowered: Lowered | None = eqx.field(static=True, default=None)  # the scalar program of the rates; None: dense matrices
     as_scalars: bool = eqx.field(static=True, default=False)  # the state of a lowered scene as a tuple of scalars: best for batches
+    cutoff: float | None = eqx.field(static=True, default=None)  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     @property
     def name(self) -> str:
@@ -104,10 +107,15 @@ class StateForm(eqx.Module):
         """The state put back onto geometric rows, quaternion norms and (full state) velocity rows."""
         y = self.vectors(y)
         q = project_positions(scene, t, y.q, iterations=iterations) if self.projects_positions else y.q
-        v = project_speeds(scene, t, q, y.v, inputs, iterations=iterations) if self.projects_speeds else y.v
+        v = project_speeds(scene, t, q, y.v, inputs, iterations=iterations, cutoff=self.cutoff) if self.projects_speeds else y.v
         return self._like_state(Integrated(q, v, y.work))
 
 
-def default_reduction(independent: tuple[int, ...] | None):
+def cutoff_of(structure: Structure) -> float | None:
+    """Where rows that are well conditioned at most states lose rank, motions pass more safely with a wider cut-off; None: round-off."""
+    return passing_cutoff(jnp.result_type(float)) if structure.typical_pivot >= WELL_CONDITIONED else None
+
+
+def default_reduction(structure: Structure, independent: tuple[int, ...] | None) -> Reduction:
     """Privileged velocities for the minimal state, the null space by QR for the full one."""
-    return "qr" if independent is None else Privileged(independent)
+    return NullSpaceQR(cutoff_of(structure)) if independent is None else Privileged(independent)
