@@ -2,6 +2,6 @@
 
 import re
 
-from atlas_cases import cases_rows
+from atlas_cases import cases_derivatives, cases_motion, cases_rows
 
-CASES = tuple(sorted((*cases_rows.CASES,), key=lambda case: int(re.match(r"E(\d+)", case.name).group(1))))
+CASES = tuple(sorted((*cases_rows.CASES, *cases_motion.CASES, *cases_derivatives.CASES), key=lambda case: int(re.match(r"E(\d+)", case.name).group(1))))

@@ -63,7 +63,7 @@ class DerivativeOfMotion:
         return judged(worst(float(slope), self.known, self.scale), tolerance)
 
     def _by_naive(self, method: Method, x, tolerance: float) -> Outcome:
-        if self.naive_value is None or method.naive in naive.SPEEDS_IN_BASIS:
+        if self.naive_value is None or method.naive in naive.REDUCED_STATE:
             return not_applicable("fixed steps find no event" if self.naive_value is None else "asked of motions")
         scene, start = self.begin(x)
         state = jj.start(scene, **start)
@@ -72,7 +72,7 @@ class DerivativeOfMotion:
         def value(x):
             scene, start = self.begin(x)
             state = jj.start(scene, **start)
-            qs, us = naive.motion(method.naive, scene, static, state.q, state.u, self.ts, self.steps)
+            qs, us = naive.motion(method.naive, scene, static, state.q, state.u, self.ts, self.steps, alone=True)
             return self.naive_value(qs[-1], us[-1])
 
         try:

@@ -112,11 +112,14 @@ def accelerations(name: str, scene, static: Static, t, q, u):
     return ACCELERATIONS[name](equations.M, equations.Q - equations.h, rows.A, -rows.drift, static)
 
 
-def motion(name: str, scene, static: Static, q, u, ts: np.ndarray, steps: int):
-    """q and u at `ts` (the first is the start) with `steps` equal steps from each time to the next."""
+def motion(name: str, scene, static: Static, q, u, ts: np.ndarray, steps: int, *, alone: bool = False):
+    """q and u at `ts` (the first is the start) with `steps` equal steps from each time to the next.
+
+    `alone`: a program of its own, for derivatives: where methods share one, a method without a derivative would take it from all.
+    """
     if name in REDUCED_STATE:
         return _in_basis(name, scene, static, q, u, ts, steps)
-    names = tuple(ACCELERATIONS)
+    names = (name,) if alone else tuple(ACCELERATIONS)
     return _all_in_one(scene, static, names, jnp.asarray(names.index(name)), q, u, jnp.asarray(ts), steps)
 
 
@@ -152,7 +155,7 @@ def _runge_kutta(rates, y, ts, steps: int):
 
 
 def _all_in_one(scene, static, names, index, q, u, ts, steps):
-    key = (type(scene), static, steps, len(ts), q.dtype)
+    key = (jax.tree.structure(scene), static, steps, len(ts), q.dtype, names)
     if key not in _compiled:
 
         def run(scene, index, q, u, ts):
@@ -180,7 +183,7 @@ def _in_basis(name, scene, static, q, u, ts, steps):
     Z is whatever basis the library returns, or C of the fixed partition, for which Z+ just picks the independent speeds.
     """
     small, names = float(np.sqrt(jnp.finfo(q.dtype).eps)), tuple(REDUCED_STATE)
-    key = (type(scene), static, steps, len(ts), q.dtype, "reduced state")
+    key = (jax.tree.structure(scene), static, steps, len(ts), q.dtype, "reduced state")
     if key not in _compiled:
 
         def run(scene, index, q, u, ts):
