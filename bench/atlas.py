@@ -51,7 +51,7 @@ def in_process(dtype: str, arguments) -> list[dict]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="a third of the cases, under two minutes")
+    parser.add_argument("--quick", action="store_true", help="seven cases")
     parser.add_argument("--json", type=Path, help="file for the list of cells")
     parser.add_argument("--out", type=Path, help="folder for the picture and the table")
     parser.add_argument("--case", nargs="*", help="only these cases")
