@@ -73,6 +73,7 @@ class DerivativeOfAccelerations:
     weights: np.ndarray
     known: float
     scale: float | None = None
+    compiled: dict = field(default_factory=dict)  # one program serves all reductions
 
     def cell(self, method: Method, tolerance: float) -> Outcome:
         """Outcome of one method."""
@@ -82,14 +83,17 @@ class DerivativeOfAccelerations:
         scene, q, u = self.state(jnp.asarray(self.x))
         static = naive.settled(scene, q, u) if method.naive else None
 
-        def value(x):
+        def value(x, way):
             scene, q, u = self.state(x)
             if method.naive is not None:
                 return weights @ naive.accelerations(method.naive, scene, static, 0.0, q, u)
-            return weights @ jj.accelerations(scene, 0.0, q, u, reduction=method.reduction).udot
+            return weights @ jj.accelerations(scene, 0.0, q, u, reduction=way).udot
 
+        key = method.naive or ("default" if method.reduction is None else "reductions")
+        if key not in self.compiled:
+            self.compiled[key] = eqx.filter_jit(jax.grad(value))
         try:
-            slope = float(jax.jit(jax.grad(value))(jnp.asarray(self.x, jnp.result_type(float))))
+            slope = float(self.compiled[key](jnp.asarray(self.x, jnp.result_type(float)), reduction(scene, method.reduction)))
         except NotImplementedError as refusal:
             return judged(np.nan, tolerance, f"NotImplementedError: {str(refusal).splitlines()[0][:90]}")
         return judged(worst(slope, self.known, self.scale), tolerance)

@@ -90,6 +90,10 @@ class DragDisc(jj.Scene):
     def contacts(self, pose):
         return {"rim": jj.disc_contact(pose["disc"], 0.3, height="row")}
 
+    def events(self, motion):
+        axle = motion["disc"].orientation[:, 1]
+        return {"flat": axle[0] ** 2 + axle[1] ** 2 - 45 * jnp.finfo(axle.dtype).eps}  # as the model `tilting_disc_quaternion`
+
 
 class ContactOscillator(jj.Scene):
     """McLachlan and Perlmutter's contact oscillator, `xdot + y zdot = 0`, V = (x^2 + y^2 + z^2)/2 + strength x^2 z^2/2, masses 1 kg.
