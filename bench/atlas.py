@@ -32,10 +32,19 @@ def chosen(arguments):
 
 
 def measure(arguments) -> list[dict]:
-    """All cells in the floating-point type of this process."""
+    """All cells in the floating-point type of this process; what there is so far is written after every case."""
     from atlas_cases.run import cells
 
-    return list(cells(*chosen(arguments), progress=lambda text: print(text, file=sys.stderr, flush=True)))
+    found: list[dict] = []
+
+    def report(text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+        if arguments.json:
+            arguments.json.write_text(json.dumps(found))
+
+    for cell in cells(*chosen(arguments), progress=report):
+        found.append(cell)
+    return found
 
 
 def in_process(dtype: str, arguments) -> list[dict]:

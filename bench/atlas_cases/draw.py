@@ -8,6 +8,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.patches import Rectangle
 
+from atlas_cases.case import Case
 from atlas_cases.cases import CASES
 from atlas_cases.methods import METHODS
 from atlas_cases.outcomes import FLAGGED, NAN, NOT_APPLICABLE, RIGHT, STALLED, WRONG
@@ -50,7 +51,7 @@ def draw(cells: list[dict], out: Path) -> None:
                 _cell(ax, columns[cell["method"]], row, cell["outcome"])
         ax.set(xlim=(-0.1, width + 0.1), ylim=(height, -0.1), title=dtype)
         ax.set_xticks([c + 0.5 for c in columns.values()], list(columns), rotation=90, fontsize=8)
-        ax.set_yticks([r + 0.5 for r in range(height)], [f"{case.title}   {case.name}" for case in cases], fontsize=8)
+        ax.set_yticks([r + 0.5 for r in range(height)], [_label(case) for case in cases], fontsize=8)
         ax.tick_params(length=0)
         for spine in ax.spines.values():
             spine.set_visible(False)
@@ -67,6 +68,10 @@ def draw(cells: list[dict], out: Path) -> None:
     for suffix in ("png", "svg"):
         figure.savefig(out / f"atlas.{suffix}", dpi=130)
     plt.close(figure)
+
+
+def _label(case: Case) -> str:
+    return f"{case.title}{' (no answer: f is right)' if case.flag_is_right else ''}   {case.name}"
 
 
 def _cell(ax, x: float, y: float, outcome: str) -> None:

@@ -47,8 +47,10 @@ def fall_time_slope(lean: float, end: float = 1.5, radius: float = 0.5) -> float
     """dt*/dlean of a disc at rest that falls from `lean` to `end`: t* = sqrt(5a/(8g)) int dx / sqrt(cos(lean) - cos(x))."""
 
     def fall_time(start):
-        # x = start + s^2 takes the root at the start away
-        part = lambda s: 2 * s / mpmath.sqrt(mpmath.cos(start) - mpmath.cos(start + s * s)) if s else 2 / mpmath.sqrt(mpmath.sin(start))  # noqa: E731
+        # x = start + s^2 takes the root at the start away; cos(start) - cos(x) as a product, so that nothing cancels
+        def part(s):
+            return 2 * s / mpmath.sqrt(2 * mpmath.sin(start + s * s / 2) * mpmath.sin(s * s / 2))
+
         return mpmath.sqrt(5 * mpmath.mpf(radius) / (8 * mpmath.mpf(9.81))) * mpmath.quad(part, [0, mpmath.sqrt(end - start)])
 
     with mpmath.workdps(30):

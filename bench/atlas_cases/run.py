@@ -9,7 +9,8 @@ import numpy as np
 from atlas_cases.case import Case, single
 from atlas_cases.mechanisms import mechanism
 from atlas_cases.methods import Method
-from atlas_cases.outcomes import NOT_APPLICABLE, WRONG, Outcome
+from atlas_cases.outcomes import FLAGGED, NOT_APPLICABLE, WRONG, Outcome
+from jourdain_jax import DifferentiationModeError, SimulationError
 
 
 def cells(cases: tuple[Case, ...], methods: tuple[Method, ...], progress=print) -> Iterator[dict]:
@@ -35,8 +36,9 @@ def cells(cases: tuple[Case, ...], methods: tuple[Method, ...], progress=print) 
 
 
 def _asked(probe, method: Method, tolerance: float) -> Outcome:
-    """The method's outcome; whatever it raises unexpectedly is a wrong answer that says why."""
+    """The method's outcome. An error of the engine's own kind is a flag; whatever else is raised is a wrong answer that says why."""
     try:
         return probe.cell(method, tolerance)
     except Exception as error:
-        return Outcome(WRONG, None, f"raised {type(error).__name__}: {str(error).splitlines()[0][:120] if str(error) else ''}")
+        own = isinstance(error, ValueError | SimulationError | DifferentiationModeError) and method.naive is None
+        return Outcome(FLAGGED if own else WRONG, None, f"raised {type(error).__name__}: {str(error).splitlines()[0][:120] if str(error) else ''}")

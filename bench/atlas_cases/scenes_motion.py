@@ -14,9 +14,13 @@ class CeltInQuaternion(jj.Scene):
     """The rattleback (B15) with a quaternion and a height row: no attitude is singular. z up; body axis 3 down at identity of the table's angles."""
 
     gravity: Float[Array, ""] = jj.parameter(9.81, unit="m/s^2")
-    scale: Float[Array, ""] = jj.parameter(1.0)  # units of length per metre
+    scale: float = eqx.field(static=True, default=1.0)  # units of length per metre
     coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
-    domain = {"z": (0.01, 0.2), **_DOMAIN}
+
+    @property
+    def domain(self):
+        """Heights in the unit of length."""
+        return {"z": (0.01 * self.scale, 0.2 * self.scale), **_DOMAIN}
 
     def bodies(self, t, q):
         k = self.scale**2
