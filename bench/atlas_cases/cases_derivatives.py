@@ -10,7 +10,7 @@ from atlas_cases.cases_rows import SNAKE_START, heavy_axle
 from atlas_cases.gradients import DerivativeOfMotion
 from atlas_cases.instants import DerivativeOfAccelerations, Instant
 from atlas_cases.references import fall_time_slope, slope
-from atlas_cases.scenes import Edges, HeavyAxle, OrthonormalRows
+from atlas_cases.scenes import Edges, HeavyAxle, LeadingRow, OrthonormalRows
 
 
 def rosenberg() -> DerivativeOfAccelerations:
@@ -34,13 +34,13 @@ def orthonormal() -> DerivativeOfAccelerations:
 
 
 def along_an_axis() -> DerivativeOfAccelerations:
-    """The skate at heading 0, its row along y: xddot = g' cos^2 h - v w sin h."""
-    scene, v, w = jj.models.Skate(), 0.7, 1.3
+    """yddot = -z zdot ydot/(1 + z^2) at z = 0, where the row lies along x, the first coordinate."""
+    scene, b, v = LeadingRow(), 0.8, 1.1
 
-    def state(h):
-        return scene, jnp.stack([0 * h, 0 * h, h]), jnp.stack([v * jnp.cos(h), v * jnp.sin(h), w + 0 * h])
+    def state(z):
+        return scene, jnp.stack([0 * z, 0 * z, z]), jnp.stack([v * z, v + 0 * z, b + 0 * z])
 
-    return DerivativeOfAccelerations(state, 0.0, np.array([1.0, 0.0, 0.0]), -v * w)
+    return DerivativeOfAccelerations(state, 0.0, np.array([0.0, 1.0, 0.0]), -b * v)
 
 
 def dependent() -> DerivativeOfAccelerations:

@@ -87,6 +87,18 @@ class OrthonormalRows(jj.Scene):
         return {"first": velocity @ frame[:, 1], "second": velocity @ frame[:, 2]}
 
 
+class LeadingRow(jj.Scene):
+    """Rosenberg's particle in another order, `xdot = z ydot`: at z = 0 the row lies along the first coordinate."""
+
+    coordinates = jj.coordinates("x y z")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, q.array)}
+
+    def velocity_constraints(self, motion):
+        return {"sheet": motion.u.x_rate - motion.q.z * motion.u.y_rate}
+
+
 class AppellHamel(jj.Scene):
     """Appell and Hamel's example, a row quadratic in the speeds: `xdot^2 + ydot^2 = k^2 zdot^2`. It vanishes, with its slope, at rest."""
 
