@@ -62,13 +62,13 @@ def test_outcomes_are_decided_by_the_error_and_by_what_a_method_says():
 def test_the_script_writes_cells_of_both_precisions_a_table_and_a_picture(tmp_path):
     source = Path(jj.__file__).parents[1]
     script = Path(__file__).parents[1] / "bench" / "atlas.py"
-    asked = ["--case", "E8 1e-06", "E23", "--method", "default", "qr", "Schur, Cholesky"]
+    asked = ["--case", "E23", "--method", "default", "Schur, Cholesky"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(source), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, str(script), "--quick", *asked, "--json", str(tmp_path / "atlas.json"), "--out", str(tmp_path)]
     run = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     cells = json.loads((tmp_path / "atlas.json").read_text())
-    assert len(cells) == 2 * 2 * 3
+    assert len(cells) == 2 * 2
     for cell in cells:
         assert list(cell) == KEYS
         assert cell["outcome"] in OUTCOMES
@@ -79,7 +79,7 @@ def test_the_script_writes_cells_of_both_precisions_a_table_and_a_picture(tmp_pa
         if cell["outcome"] == RIGHT:
             assert cell["error"] <= cell["tolerance"]
     assert all(cell["outcome"] in (RIGHT, FLAGGED) for cell in cells if cell["method"] == "default")
-    failed = [cell for cell in cells if cell["method"] == "Schur, Cholesky" and cell["case"] == "E23"]
+    failed = [cell for cell in cells if cell["method"] == "Schur, Cholesky"]
     assert all(cell["outcome"] in (NAN, WRONG) for cell in failed)  # a singular A M^-1 A'
     with (tmp_path / "atlas.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(cells)

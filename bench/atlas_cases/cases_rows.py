@@ -49,7 +49,7 @@ def snakeboard_through_loss_of_rank() -> Motion:
     scene, known = jj.models.Snakeboard(), snakeboard.motion(ts, **snakeboard.RUN)
     travelled = ts[-1] * np.mean(np.abs(snakeboard.velocities(np.linspace(0.0, ts[-1], 101), **snakeboard.RUN)["u"]))  # m, on curls
     names = {"x": "x", "y": "y", "heading": "th", "rotor": "psi", "heading_rate": "th_rate"}
-    return Motion(scene, SNAKE_START, ts, against(scene, {a: known[b] for a, b in names.items()}, {"x": travelled, "y": travelled}))
+    return Motion(scene, SNAKE_START, ts, against(scene, {a: known[b] for a, b in names.items()}, {"x": travelled, "y": travelled}), asked=("rollout",))
 
 
 def snakeboard_at_loss_of_rank() -> Instant:

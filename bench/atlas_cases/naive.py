@@ -27,7 +27,8 @@ class Static:
 def settled(scene, q, u, t=0.0, independent: tuple[str, ...] | None = None) -> Static:
     """Rank at the start, and the partition that is best there (or the one asked for)."""
     A = np.asarray(jj.constraint_rows(scene, t, q, u).A, float)
-    rank = int(np.linalg.matrix_rank(A, tol=1e-6)) if A.size else 0
+    cut = 4096 * float(jnp.finfo(q.dtype).eps) * np.linalg.norm(A) if A.size else 0.0
+    rank = int(np.linalg.matrix_rank(A, tol=cut)) if A.size else 0
     rows = _pivots(A.T, rank)
     names = scene.speed_names.entries
     dependent = _pivots(A[list(rows)], rank) if independent is None else tuple(i for i, name in enumerate(names) if name not in independent)

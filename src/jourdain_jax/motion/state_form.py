@@ -52,7 +52,8 @@ class StateForm(eqx.Module):
     @property
     def reduction_name(self) -> str:
         """Name of the reduction, as it stands in a trajectory."""
-        return getattr(self.reduction, "name", "") + ("" if self.lowered is None else ", lowered")
+        detail = "" if self.lowered is None else ", lowered"
+        return getattr(self.reduction, "name", "") + (detail if self.cutoff is None else f", cut-off {self.cutoff:.0e}")
 
     @property
     def _by_appell(self) -> bool:
