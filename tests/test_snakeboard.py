@@ -51,6 +51,17 @@ def test_a_step_that_ends_where_the_rows_are_parallel_is_right_or_says_so(reduct
     assert relative_error(motion["heading"][valid], heading[valid]) <= tolerance("closed_form")
 
 
+def test_the_default_passes_wherever_a_step_ends_near_the_loss_of_rank():
+    # a step that ends within round-off of parallel rows once met a jump of v/(1 - steer) in the accelerations and shrank to nothing
+    times = np.linspace(0.0, oracle.RUN["t_end"], 9)
+    for beyond in (0.0, 1e-15, 3e-15, 1e-14, 1e-13, 1e-12, 1e-11, 1e-10, -1e-13, -1e-11):
+        shifted = times + beyond * (np.arange(9) == 4)
+        motion = jj.simulate(BOARD, START, ts=jnp.asarray(shifted), rtol=1e-12, atol=1e-12)
+        assert int(motion.result) == results.SUCCESS, beyond
+        assert "cut-off 1e-08" in str(motion.reduction)
+        assert relative_error(motion["heading"], oracle.motion(shifted, **oracle.RUN)["th"]) <= tolerance("closed_form"), beyond
+
+
 def test_the_loss_of_rank_is_reported_not_hidden():
     q, u, _ = BOARD.named(steer=jnp.pi / 2, heading_rate=1.0)
     for name, reduction in jj.reductions(BOARD).items():

@@ -21,9 +21,12 @@ def null_space_svd(A: Float[Array, "rows columns"]) -> Float[Array, "columns col
     return _null_space(A, "svd")
 
 
-def null_space_qr(A: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
-    """Null-space basis from the column-pivoted QR decomposition of `A'`; columns of the row space are zero."""
-    return _null_space(A, "qr")
+def null_space_qr(A: Float[Array, "rows columns"], cutoff: float | None = None) -> Float[Array, "columns columns"]:
+    """Null-space basis from the column-pivoted QR decomposition of `A'`; columns of the row space are zero.
+
+    Pivots below `cutoff` times the largest count as zero (default: `rank_cutoff`).
+    """
+    return _null_space(A, "qr", cutoff)
 
 
 def present(Z: Float[Array, "columns columns"]) -> Bool[Array, "columns"]:
@@ -31,35 +34,35 @@ def present(Z: Float[Array, "columns columns"]) -> Bool[Array, "columns"]:
     return jnp.any(jax.lax.stop_gradient(Z) != 0, axis=0)
 
 
-def _null_space(A, method):
+def _null_space(A, method, cutoff=None):
     if A.shape[0] == 0:
         return jnp.eye(A.shape[1], dtype=A.dtype)
-    return _basis(A, method)
+    return _basis(A, method, cutoff)
 
 
-def _svd_basis(A):
+def _svd_basis(A, cutoff):
     _, sigma, right = jnp.linalg.svd(A, full_matrices=True)
-    return right.T, numerical_rank(sigma)
+    return right.T, numerical_rank(sigma, cutoff)
 
 
-def _qr_basis(A):
+def _qr_basis(A, cutoff):
     Q, R, _ = jax.lax.linalg.qr(A.T, full_matrices=True, pivoting=True)
-    return Q, numerical_rank(jnp.abs(jnp.diagonal(R)))
+    return Q, numerical_rank(jnp.abs(jnp.diagonal(R)), cutoff)
 
 
 _BASES = {"svd": _svd_basis, "qr": _qr_basis}
 
 
-def _masked(A, method):
-    basis, rank = _BASES[method](A)
+def _masked(A, method, cutoff):
+    basis, rank = _BASES[method](A, cutoff)
     return jnp.where(jnp.arange(A.shape[1]) >= rank, basis, 0)
 
 
-_basis = jax.custom_jvp(_masked, nondiff_argnums=(1,))
+_basis = jax.custom_jvp(_masked, nondiff_argnums=(1, 2))
 
 
 @_basis.defjvp
-def _basis_jvp(method, primals, tangents):
+def _basis_jvp(method, cutoff, primals, tangents):
     (A,), (dA,) = primals, tangents
-    Z = _basis(A, method)
-    return Z, -pseudo_inverse(A) @ (dA @ Z)
+    Z = _basis(A, method, cutoff)
+    return Z, -pseudo_inverse(A, cutoff) @ (dA @ Z)

@@ -18,6 +18,14 @@ def rank_cutoff(dtype: jnp.dtype) -> float:
     return 4096 * float(jnp.finfo(dtype).eps)
 
 
+def passing_cutoff(dtype: jnp.dtype) -> float:
+    """The cut-off for motions *through* a loss of rank of rows that are well conditioned elsewhere: the root of the round-off of `dtype`.
+
+    Round-off e of a row of size sigma is a velocity e/sigma and an acceleration e/sigma^2; the step size resolves them down to about sqrt(e).
+    """
+    return max(rank_cutoff(dtype), float(jnp.finfo(dtype).eps) ** 0.5)
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def pseudo_inverse(A: Float[Array, "rows columns"], cutoff: float | None = None) -> Float[Array, "columns rows"]:
     """Moore-Penrose inverse of `A`; singular values below `cutoff` times the largest are dropped.
@@ -49,8 +57,9 @@ def singular_values(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
     return jnp.linalg.svd(jax.lax.stop_gradient(A), compute_uv=False)
 
 
-def numerical_rank(sigma: Float[Array, "values"]) -> Int[Array, ""]:
-    """How many singular values exceed the cut-off of their dtype."""
+def numerical_rank(sigma: Float[Array, "values"], cutoff: float | None = None) -> Int[Array, ""]:
+    """How many singular values exceed `cutoff` times the largest (default: the cut-off of their dtype)."""
     if sigma.shape[0] == 0:
         return jnp.zeros((), jnp.int32)
-    return jnp.sum(sigma > rank_cutoff(sigma.dtype) * sigma[0]).astype(jnp.int32)
+    cutoff = rank_cutoff(sigma.dtype) if cutoff is None else cutoff
+    return jnp.sum(sigma > cutoff * sigma[0]).astype(jnp.int32)

@@ -49,8 +49,13 @@ def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "c
     return q
 
 
-def project_speeds(scene: Scene, t, q, u: Float[Array, "speeds"], inputs=None, *, free: Bool[Array, "speeds"] | None = None, iterations: int = 8):
-    """Speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are `free` move."""
+def project_speeds(
+    scene: Scene, t, q, u: Float[Array, "speeds"], inputs=None, *, free: Bool[Array, "speeds"] | None = None, iterations: int = 8, cutoff: float | None = None
+):
+    """Speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are `free` move.
+
+    Rows count as dependent below `cutoff` (default: `rank_cutoff`).
+    """
     if jax.eval_shape(lambda s, q, u: velocity_residual(s, 0.0, q, u), scene, q, u).shape[0] == 0:
         return u
     free = jnp.ones(u.shape, bool) if free is None else free
@@ -63,7 +68,7 @@ def project_speeds(scene: Scene, t, q, u: Float[Array, "speeds"], inputs=None, *
         phi, A = velocity_residual(scene, t, q, u, inputs), jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
         weighted = jax.scipy.linalg.solve_triangular(L, jnp.where(free, A * c, 0.0).T, lower=True).T  # A L'^-1
         d = row_scale(weighted)
-        x = pseudo_inverse(d[:, None] * weighted) @ (d * phi)
+        x = pseudo_inverse(d[:, None] * weighted, cutoff) @ (d * phi)
         return u - jnp.where(free, c * jax.scipy.linalg.solve_triangular(L.T, x, lower=False), 0.0), None
 
     return jax.lax.scan(step, u, length=iterations)[0]

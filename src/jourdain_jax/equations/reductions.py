@@ -191,9 +191,9 @@ class Partition(eqx.Module):
         return jnp.linalg.solve(A_z, right) if A_z.shape[0] == A_z.shape[1] else pseudo_inverse(A_z) @ right
 
 
-def _by_null_space(problem: ScaledProblem, Z):
+def _by_null_space(problem: ScaledProblem, Z, cutoff: float | None = None):
     # A udot_p = -drift;  (Z' M Z) zeta = Z' (Q - h - M udot_p);  absent columns of Z get a unit diagonal and a zero right-hand side
-    particular = pseudo_inverse(problem.A) @ problem.b
+    particular = pseudo_inverse(problem.A, cutoff) @ problem.b
     S = Z.T @ problem.M @ Z + jnp.diag(jnp.where(present(Z), 0.0, 1.0).astype(Z.dtype))
     zeta, definite = solve_definite(S, Z.T @ (problem.f - problem.M @ particular))
     return particular + Z @ zeta, jnp.ones((), Z.dtype), definite
@@ -203,12 +203,14 @@ class NullSpaceQR(Reduction):
     """Null space of the rows from a column-pivoted QR decomposition: `udot = udot_p + Z zeta`, `(Z'MZ) zeta = Z'(Q - h - M udot_p)`.
 
     Applies wherever `Z'MZ` is positive definite. Independent of the choice of Z: geometrically, `F - m a` is orthogonal to it, (71)-(73).
+    `cutoff`: scaled rows count as dependent below this fraction (default: round-off, `rank_cutoff`).
     """
 
+    cutoff: float | None = eqx.field(static=True, default=None)
     name = "null space (QR)"
 
     def solve(self, problem):
-        return _by_null_space(problem, null_space_qr(problem.A))
+        return _by_null_space(problem, null_space_qr(problem.A, self.cutoff), self.cutoff)
 
 
 class NullSpaceSVD(Reduction):

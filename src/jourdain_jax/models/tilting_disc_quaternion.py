@@ -19,7 +19,7 @@ from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 
 _LEAN, _YAW_RATE, _LEAN_RATE, _SPIN_RATE = 0.3, 0.5, 0.2, -3.0  # the example of `tilting_disc`
-_FLAT = 1e-7  # rad; nearer to the ground the contact point is undefined in double precision
+_FLAT = 45.0  # units of round-off of the squared angle to the ground (1e-7 rad in double precision): nearer the contact point is undefined
 
 
 class TiltingDiscQuaternion(Scene):
@@ -54,4 +54,4 @@ class TiltingDiscQuaternion(Scene):
 
     def events(self, motion):
         axle = motion["disc"].orientation[:, 1]
-        return {"flat": axle[0] ** 2 + axle[1] ** 2 - _FLAT**2}
+        return {"flat": axle[0] ** 2 + axle[1] ** 2 - _FLAT * jnp.finfo(axle.dtype).eps}

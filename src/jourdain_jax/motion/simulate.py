@@ -30,7 +30,7 @@ from jourdain_jax.motion.integration import Options, Setup, integrate
 from jourdain_jax.motion.solver_choice import check_solver, fitted, may_be_full
 from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
-from jourdain_jax.motion.state_form import StateForm, default_reduction
+from jourdain_jax.motion.state_form import StateForm, cutoff_of, default_reduction
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
@@ -187,7 +187,8 @@ def state_form(scene: Scene, structure: Structure, state="auto", reduction=None,
     with_work = work and needs_work(scene, structure)
     plain = minimal and lowering and reduction is None and stabilisation is None and not (with_work and (structure.driven or structure.varying_inertia))
     program = lowered(scene) if plain else None
-    reduction = as_reduction(scene, default_reduction(independent) if reduction is None else reduction)
+    cutoff = cutoff_of(structure) if reduction is None and not minimal else None
+    reduction = as_reduction(scene, default_reduction(structure, independent) if reduction is None else reduction)
     return StateForm(
         independent=independent,
         reduction=reduction,
@@ -197,6 +198,7 @@ def state_form(scene: Scene, structure: Structure, state="auto", reduction=None,
         projects_speeds=projection and not minimal and bool(structure.row_names),
         lowered=program if isinstance(program, Lowered) else None,
         of_inputs=structure.potentials_of_inputs,
+        cutoff=cutoff,
     )
 
 

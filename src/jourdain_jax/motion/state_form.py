@@ -11,12 +11,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.equations.accelerations import Baumgarte, bare_accelerations
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations, speeds_and_pivot, speeds_from_privileged
 from jourdain_jax.equations.power import rate_of_work, stored_by_inputs
 from jourdain_jax.equations.projection import project_positions, project_speeds
-from jourdain_jax.equations.reductions import Privileged
+from jourdain_jax.equations.reductions import NullSpaceQR, Privileged, Reduction
+from jourdain_jax.equations.structure import WELL_CONDITIONED, Structure
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.lowering.trace import event_values
 from jourdain_jax.scene.scene import Scene
@@ -41,6 +43,7 @@ class StateForm(eqx.Module):
     projects_speeds: bool = eqx.field(static=True)
     lowered: Lowered | None = eqx.field(static=True, default=None)  # the scalar program of the rates; None: dense matrices
     of_inputs: tuple[int, ...] = eqx.field(static=True, default=())  # numbers of the loads whose potential depends on inputs
+    cutoff: float | None = eqx.field(static=True, default=None)  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     @property
     def name(self) -> str:
@@ -50,7 +53,8 @@ class StateForm(eqx.Module):
     @property
     def reduction_name(self) -> str:
         """Name of the reduction, as it stands in a trajectory."""
-        return getattr(self.reduction, "name", "") + ("" if self.lowered is None else ", lowered")
+        detail = "" if self.lowered is None else ", lowered"
+        return getattr(self.reduction, "name", "") + (detail if self.cutoff is None else f", cut-off {self.cutoff:.0e}")
 
     @property
     def _by_appell(self) -> bool:
@@ -112,10 +116,15 @@ class StateForm(eqx.Module):
     def project(self, scene: Scene, t, y: Integrated, inputs, iterations: int = 2) -> Integrated:
         """The state put back onto geometric rows, quaternion norms and (full state) velocity rows."""
         q = project_positions(scene, t, y.q, iterations=iterations) if self.projects_positions else y.q
-        v = project_speeds(scene, t, q, y.v, inputs, iterations=iterations) if self.projects_speeds else y.v
+        v = project_speeds(scene, t, q, y.v, inputs, iterations=iterations, cutoff=self.cutoff) if self.projects_speeds else y.v
         return Integrated(q, v, y.work)
 
 
-def default_reduction(independent: tuple[int, ...] | None):
+def cutoff_of(structure: Structure) -> float | None:
+    """Where rows that are well conditioned at most states lose rank, motions pass more safely with a wider cut-off; None: round-off."""
+    return passing_cutoff(jnp.result_type(float)) if structure.typical_pivot >= WELL_CONDITIONED else None
+
+
+def default_reduction(structure: Structure, independent: tuple[int, ...] | None) -> Reduction:
     """Privileged velocities for the minimal state, the null space by QR for the full one."""
-    return "qr" if independent is None else Privileged(independent)
+    return NullSpaceQR(cutoff_of(structure)) if independent is None else Privileged(independent)

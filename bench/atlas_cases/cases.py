@@ -1,0 +1,7 @@
+"""All cases of the atlas, in the order of the table of hard cases."""
+
+import re
+
+from atlas_cases import cases_derivatives, cases_motion, cases_rows
+
+CASES = tuple(sorted((*cases_rows.CASES, *cases_motion.CASES, *cases_derivatives.CASES), key=lambda case: int(re.match(r"E(\d+)", case.name).group(1))))

@@ -1,0 +1,264 @@
+"""Cases about long, stiff and singular motions: E9 to E17 of the table of hard cases."""
+
+import numpy as np
+from oracles import chaplygin_sleigh, rolling_disc, vertical_disc
+
+import jourdain_jax as jj
+from atlas_cases.case import Case
+from atlas_cases.motions import Motion, against, drift, max_error
+from atlas_cases.outcomes import worst
+from atlas_cases.references import ball_on_switched_turntable, celt_without_angles, linkage_angle
+from atlas_cases.scenes import FourBars
+from atlas_cases.scenes_motion import CeltInQuaternion, ContactOscillator, DragDisc, EccentricBall, PendulumDrivenGear, SoftWheel, SwitchedTurntable
+
+NO_ROWS = {"naive": "no rows", "constraints": "no rows"}
+LONG_RUN = {"naive": "the same in the shorter case", "reductions": "the same in the shorter case", "constraints": "the same in the shorter case"}
+
+
+def matrices(quaternions) -> np.ndarray:
+    """Rotation matrices (times, 3, 3) of quaternions (times, 4) of any norm."""
+    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (1, 2))
+
+
+def leaning_disc(lean: float, yaw_rate: float, lean_rate: float, spin_rate: float, radius: float) -> dict:
+    """A start of the disc in quaternions, yaw and spin zero."""
+    c, s = np.cos(lean), np.sin(lean)
+    return {
+        "y": -radius * s,
+        "z": radius * c,
+        "attitude_w": np.cos(lean / 2),
+        "attitude_x": np.sin(lean / 2),
+        "attitude_omega_x": lean_rate,
+        "attitude_omega_y": spin_rate + yaw_rate * s,
+        "attitude_omega_z": yaw_rate * c,
+    }
+
+
+def disc_off_its_rows(radius: float):
+    """Error: by how much a disc leaves the plane (m), slips (m/s), or its quaternion's norm leaves 1."""
+
+    def error(q, u):
+        turned = matrices(q[:, 3:])
+        axle = turned[:, :, 1]
+        flat = np.sqrt(1 - axle[:, 2] ** 2)
+        arm = -radius * (np.array([0, 0, 1.0]) - axle[:, 2:] * axle) / flat[:, None]
+        slip = u[:, :3] + np.cross(np.einsum("tij,tj->ti", turned, u[:, 3:]), arm)
+        off = (q[:, 2] - radius * flat, slip, np.linalg.norm(q[:, 3:], axis=1) - 1)
+        return max_error(worst(part, 0.0, 1.0) for part in off)
+
+    return error
+
+
+def disc_for_long(t_end: float) -> Motion:
+    """The disc in quaternions: what is left of its rows."""
+    run, scene = rolling_disc.RUN, jj.models.TiltingDiscQuaternion()
+    start = leaning_disc(run["lean"], run["yaw_rate"], run["lean_rate"], run["spin_rate"], 0.5)
+    skip = {} if t_end <= 100 else LONG_RUN
+    options = {"rtol": 1e-8, "atol": 1e-8, "steps": 400, "asked": ("rollout", "Baumgarte 1e4/s") if t_end <= 20 else ("rollout",)}
+    return Motion(scene, start, np.linspace(0.0, t_end, 21), disc_off_its_rows(0.5), skip=skip, **options)
+
+
+def disc_to_its_reference() -> Motion:
+    """The disc in quaternions for 2 s at the default tolerance: where it ends."""
+    run, scene = rolling_disc.RUN, jj.models.TiltingDiscQuaternion()
+    ts = np.linspace(0.0, 2.0, 6)
+    known = rolling_disc.motion_yaw_lean_spin(ts, **run)
+    start = leaning_disc(run["lean"], run["yaw_rate"], run["lean_rate"], run["spin_rate"], 0.5)
+    error = against(scene, {"x": known["cx"], "y": known["cy"], "z": known["cz"]})
+    return Motion(scene, start, ts, error, rtol=1e-8, atol=1e-8, asked=("Baumgarte 1e4/s", "Kvaerno5"))
+
+
+def linkage() -> Motion:
+    """Two windows swing through the horizontal, where one freedom becomes three."""
+    scene, ts = FourBars(), np.linspace(0.0, 2.0, 9)
+    angle = linkage_angle(ts)
+    known = {f"{axis}{i}": value for i in range(3) for axis, value in (("x", i + np.sin(angle)), ("z", np.cos(angle)))}
+    start = {f"x{i}": float(i) for i in range(3)} | {f"z{i}": 1.0 for i in range(3)} | {f"x{i}_rate": 1.0 for i in range(3)}
+    return Motion(scene, start, ts, against(scene, known, dict.fromkeys(known, 1.0)))
+
+
+def _celt_error(ts, w0):
+    known = celt_without_angles(ts, [0.0, 1.0, 0.0], w0)
+    return lambda mu, w: max_error([worst(mu, known[:, :3], 1.0), worst(w, known[:, 3:])])
+
+
+def celt_on_edge(scale: float = 1.0, w0=(2.0, 1.0, -3.0)) -> Motion:
+    """The rattleback set on its long edge, where the usual angles are singular; quaternion coordinates. `scale`: units of length per metre."""
+    scene, ts = CeltInQuaternion(scale=scale), np.linspace(0.0, 0.5, 6)
+    compare = _celt_error(ts, w0)
+    start = {"z": 0.03 * scale, "attitude_w": np.cos(0.75 * np.pi), "attitude_x": np.sin(0.75 * np.pi)}
+    start |= {f"attitude_omega_{axis}": value for axis, value in zip("xyz", w0, strict=True)}
+    return Motion(scene, start, ts, lambda q, u: compare(-matrices(q[:, 3:])[:, 2], u[:, 3:]), rtol32=1e-6, atol32=1e-6)
+
+
+def celt_on_edge_in_angles() -> Motion:
+    """The same in the usual angles."""
+    scene, ts = jj.models.Rattleback(), np.linspace(0.0, 0.5, 6)
+    compare = _celt_error(ts, (2.0, 1.0, -3.0))
+
+    def error(q, u):
+        al, be = q[:, 2], q[:, 3]
+        return compare(np.stack([-np.cos(al) * np.sin(be), np.sin(al), np.cos(al) * np.cos(be)], axis=1), u[:, 2:])
+
+    start = {"alpha": np.pi / 2, "beta": 0.0, "w1": 2.0, "w2": 1.0, "w3": -3.0}
+    return Motion(scene, start, ts, error)
+
+
+def free_top(t_end: float) -> Motion:
+    """A free top: energy, angular momentum in space, norm of the quaternion."""
+    scene, moments = jj.models.FreeRigidBody(), np.array([1.0, 2.0, 2.5])
+
+    def energy(q, u):
+        return np.sum(moments * u[:, 3:] ** 2, axis=1) / 2
+
+    def error(q, u):
+        spin = np.einsum("tij,tj->ti", matrices(q[:, 3:]), moments * u[:, 3:])
+        off = [worst(spin, spin[:1]), worst(np.linalg.norm(q[:, 3:], axis=1), 1.0)]
+        return max_error([*off, drift(energy)(q, u)])
+
+    skip = NO_ROWS if t_end <= 100 else NO_ROWS | LONG_RUN
+    return Motion(scene, scene.example, np.linspace(0.0, t_end, 21), error, rtol=1e-11, atol=1e-11, skip=skip, asked=("rollout",))
+
+
+def eccentric_ball() -> Motion:
+    """An eccentric ball that rolls: energy, and Jellett's integral, angular momentum times contact vector."""
+    scene = EccentricBall()
+    moments = np.array([0.4, 0.4, 0.5])
+
+    def energy(q, u):
+        return (np.sum(u[:, :3] ** 2, axis=1) + np.sum(moments * u[:, 3:] ** 2, axis=1)) / 2 + 9.81 * q[:, 2]
+
+    def jellett(q, u):
+        turned = matrices(q[:, 3:])
+        arm = -0.3 * turned[:, :, 2] - np.array([0.0, 0.0, 1.0])
+        return np.sum(np.einsum("tij,tj->ti", turned, moments * u[:, 3:]) * arm, axis=1)
+
+    start = {"z": 1.0 + 0.3 * np.cos(0.4), "attitude_w": np.cos(0.2), "attitude_x": np.sin(0.2), "attitude_omega_z": 4.0, "attitude_omega_x": 0.5}
+    return Motion(scene, start, np.linspace(0.0, 50.0, 26), drift(energy, jellett), asked=("rollout",))
+
+
+def near_fall(turn: float) -> Motion:
+    """The disc nearly falls flat and rises again (B6): the contact races half round the rim."""
+    run, theta = rolling_disc.NEAR_FALL, rolling_disc.NEAR_FALL["theta0"]
+    scene, ts = jj.models.TiltingDiscQuaternion(run["mass"], run["radius"], run["gravity"]), np.array([0.0, 0.25])
+    yaw_rate = turn / np.sin(theta)
+    start = leaning_disc(theta - np.pi / 2, yaw_rate, 0.0, yaw_rate * np.cos(theta), run["radius"])
+    if turn >= 1e-5:
+        values = {name: run[name] for name in ("mass", "radius", "gravity")}
+        known = rolling_disc.motion(ts, **values, theta=theta, w1=0.0, w2=turn, w3=0.0)
+        error = against(scene, {name: known[f"c{name}"] for name in "xyz"}, dict.fromkeys("xyz", 0.3))
+    else:
+        error = lambda q, u: np.inf  # noqa: E731
+    return Motion(scene, start, ts, error, rtol=1e-9, atol=1e-9, steps=20_000)
+
+
+def eulers_disc() -> Motion:
+    """Euler's disc: theta^2 falls to zero within the span."""
+    theta = 0.1
+    yaw_rate = np.sqrt(4 * 9.81 / (0.3 * np.sin(theta)))  # the centre at rest
+    start = leaning_disc(theta - np.pi / 2, yaw_rate, 0.0, yaw_rate * np.cos(theta), 0.3)
+    return Motion(DragDisc(), start, np.linspace(0.0, 2.0, 5), lambda q, u: np.inf, rtol=1e-8, atol=1e-8, steps=2000, asked=("rollout",))
+
+
+def contact_oscillator(pairs: int, strength: float, t_end: float) -> Motion:
+    """Energy, what is left of the row and, of one pair, the driver's own energy."""
+    scene = ContactOscillator(strength=strength, pairs=pairs)
+    y, z = slice(1, None, 2), slice(2, None, 2)
+
+    def energy(q, u):
+        return (np.sum(u**2, axis=1) + np.sum(q**2, axis=1) + strength * q[:, 0] ** 2 * np.sum(q[:, z] ** 2, axis=1)) / 2
+
+    def row(q, u):
+        return 1 + u[:, 0] + np.sum(q[:, y] * u[:, z], axis=1)
+
+    def driver(q, u):
+        return (q[:, 1] ** 2 + u[:, 1] ** 2) / 2
+
+    start = {"x": 1.0, **{f"y{i}": 0.6 + 0.3 * i for i in range(pairs)}, **{f"z{i}_rate": 0.8 - 0.5 * i for i in range(pairs)}}
+    integrals = (energy, row, driver) if pairs == 1 else (energy, row)
+    return Motion(scene, start, np.linspace(0.0, t_end, 21), drift(*integrals), asked=("rollout", "Kvaerno5"), rtol=1e-11, atol=1e-11, steps=2000)
+
+
+def gear(t_end: float) -> Motion:
+    """Energy of all and of the driver, which nothing acts back on."""
+    scene = PendulumDrivenGear()
+
+    def driver(q, u):
+        return u[:, 1] ** 2 / 2 + 1 - np.cos(q[:, 1]) + 0.2 * q[:, 1]
+
+    def energy(q, u):
+        return driver(q, u) + (u[:, 0] ** 2 + u[:, 2] ** 2 + q[:, 0] ** 2 + q[:, 2] ** 2) / 2
+
+    start = {"x": 0.5, "y": 0.9, "z": 0.3, "z_rate": 0.4}
+    return Motion(scene, start, np.linspace(0.0, t_end, 21), drift(energy, driver), rtol=1e-11, atol=1e-11, steps=2000)
+
+
+def soft_wheel(stiffness: float) -> Motion:
+    """A wheel on a stiff contact of springs, near the motion on rows."""
+    scene, ts = SoftWheel(stiffness=stiffness), np.linspace(0.0, 1.0, 6)
+    known = vertical_disc.motion(ts, **vertical_disc.RUN)
+    start = {"z": 1.0, "x_rate": 1.0, "heading_rate": 2.0, "roll_rate": 1.0}
+    error = against(scene, {"x": known["x"], "y": known["y"], "heading": known["phi"], "roll": known["th"]})
+    return Motion(scene, start, ts, error, rtol=1e-8, atol=1e-8, skip=NO_ROWS | {"reductions": "no rows"}, asked=("Kvaerno5", "rollout"))
+
+
+def switched_turntable() -> Motion:
+    """Rows that move in time: the table reverses its turning."""
+    scene, ts = SwitchedTurntable(), np.linspace(0.0, 4.0, 9)
+    known = ball_on_switched_turntable(ts, (0.2, 0.0), (0.1, 0.3))
+    start = {"x": 0.2, "x_rate": 0.1, "y_rate": 0.3, "attitude_omega_z": 1.0}
+    return Motion(scene, start, ts, against(scene, dict(zip(("x", "y", "x_rate", "y_rate"), known.T, strict=True))))
+
+
+def sleigh_backwards() -> Motion:
+    """The sleigh from its end back to its start: the forward motion contracts, so that errors grow 700 times."""
+    run, scene, ts = chaplygin_sleigh.RUN, jj.models.ChaplyginSleigh(), np.linspace(12.0, 0.0, 7)
+    known = {name: values[::-1] for name, values in chaplygin_sleigh.motion(ts[::-1], **run).items()}
+    first = {name: values[0] for name, values in known.items()}
+    start = {"x": first["x"], "y": first["y"], "heading": first["th"], "heading_rate": first["w"]}
+    start["x_rate"] = first["v"] * np.cos(first["th"]) - run["a"] * first["w"] * np.sin(first["th"])
+    state = jj.start(scene, t0=12.0, **start)
+    return Motion(scene, state, ts, against(scene, {"x": known["x"], "y": known["y"], "heading": known["th"]}))
+
+
+LONG_DRIFT = "rtol of every step adds up over the run (1e-11 in float64, 1e-5 in float32)"
+NEAR_FLAT = "round-off of the attitude counts 1/theta^2 in the contact's motion"
+CASES = (
+    Case("E9", "drift off the rows in 100 s of a disc", lambda: disc_for_long(100.0), 1e-10, 1e-4, "residuals", must_be_right=True),
+    Case("E9 short", "drift off the rows in 10 s of a disc", lambda: disc_for_long(10.0), 1e-10, 1e-4, "residuals"),
+    Case("E9 long", "drift off the rows in 1000 s of a disc", lambda: disc_for_long(1000.0), 1e-10, 1e-4, "residuals", must_be_right=True),
+    Case("E10", "stabilisation against projection: 2 s of a disc", disc_to_its_reference, 1e-7, 1e-3, "a run at rtol = atol = 1e-8 (float32: 1e-5, 1e-6)"),
+    Case("E11", "a linkage through its singular configuration", linkage, 1e-6, 1e-2, "rtol 1e-12; errors grow as the inverse square of the distance to it"),
+    Case("E12", "gimbal lock: a rattleback on its edge, quaternion", celt_on_edge, 1e-9, 1e-2, "a fall from an edge amplifies errors", must_be_right=True),
+    Case("E12 angles", "the same in angles, which are singular there", celt_on_edge_in_angles, 1e-9, 1e-2, "as E12", flag_is_right=True),
+    Case("E13", "norm of the quaternion: a free top for 100 s", lambda: free_top(100.0), 1e-9, 2e-2, LONG_DRIFT, must_be_right=True),
+    Case("E13 long", "norm of the quaternion: a free top for 10,000 s", lambda: free_top(1e4), 1e-7, 1.0, LONG_DRIFT, must_be_right=True),
+    Case("E13 ball", "an eccentric ball rolls for 50 s", eccentric_ball, 1e-9, 2e-2, LONG_DRIFT, must_be_right=True),
+    Case("E14 1e-2", "near fall of a disc, 3e-4 rad from flat", lambda: near_fall(1e-2), 1e-8, 1e-2, NEAR_FLAT),
+    Case("E14 1e-4", "near fall of a disc, 3e-6 rad from flat", lambda: near_fall(1e-4), 1e-3, 1e-2, NEAR_FLAT),
+    Case("E14 1e-6", "near fall of a disc, 3e-8 rad from flat", lambda: near_fall(1e-6), 0.0, 0.0, "beyond double precision", flag_is_right=True),
+    Case("E14 Euler", "Euler's disc: flat in finite time", eulers_disc, 0.0, 0.0, "there is no motion beyond", flag_is_right=True),
+    Case("E15", "contact oscillator, 100 s", lambda: contact_oscillator(1, 0.3, 100.0), 1e-8, 2e-2, LONG_DRIFT),
+    Case("E15 chaotic", "chaotic contact oscillator, 100 s", lambda: contact_oscillator(3, 0.3, 100.0), 1e-8, 2e-2, LONG_DRIFT),
+    Case("E16", "pendulum-driven transmission, 100 s", lambda: gear(100.0), 1e-8, 2e-2, LONG_DRIFT),
+    *(
+        Case(
+            f"E17 {k:g}",
+            f"a contact of springs, {k:g} N/m, for rolling",
+            lambda k=k: soft_wheel(k),
+            10 / k,
+            10 / k + 1e-3,
+            "a soft row yields by its force over k",
+        )
+        for k in (1e3, 1e6, 1e8)
+    ),
+    Case("E19", "a contracting motion run backwards", sleigh_backwards, 1e-8, 2e-1, "errors grow 700 times"),
+    Case("E21 units", "a rattleback in centimetres", lambda: celt_on_edge(100.0), 1e-9, 1e-2, "as E12", must_be_right=True),
+    Case("E22 switched", "rows that move: a turntable reverses", switched_turntable, 1e-10, 1e-3, "as E22", must_be_right=True),
+)

@@ -1,0 +1,192 @@
+"""Cases about rows and bases: E1, E2, E5 to E8, E18, E21 to E24 of the table of hard cases."""
+
+import jax.numpy as jnp
+import numpy as np
+from oracles import ball_on_turntable, rolling_disc, skate, snakeboard, two_wheel_axle, vertical_disc
+
+import jourdain_jax as jj
+from atlas_cases.case import Case
+from atlas_cases.instants import Instant
+from atlas_cases.motions import Motion, against
+from atlas_cases.scenes import AppellHamel, Edges, HeavyAxle
+
+CLOSED = "a run at rtol = atol = 1e-12 (float32: 1e-5, 1e-6) against an exact solution, relative to the largest value"
+
+
+def turning_skate() -> Motion:
+    """The skate turns through 90 degrees twice a turn (B2)."""
+    ts = np.linspace(0.0, 10.0, 11)
+    scene, known = jj.models.Skate(), skate.motion(ts, **skate.RUN)
+    return Motion(scene, {"heading_rate": 1.3}, ts, against(scene, {"x": known["x"], "y": known["y"], "heading": known["th"]}))
+
+
+def vertical_disc_by_heading_and_x() -> Motion:
+    """The vertical disc (B4); the fixed partition keeps heading and x, which turning makes singular."""
+    ts = np.linspace(0.0, 5.0, 11)
+    scene, run = jj.models.VerticalDisc(), dict(vertical_disc.RUN)
+    known = vertical_disc.motion(ts, **run)
+    expected = {"x": known["x"], "y": known["y"], "heading": known["phi"], "roll": known["th"]}
+    start = {"heading_rate": 2.0, "roll_rate": 1.0}
+    return Motion(scene, start, ts, against(scene, expected), independent=("x_rate", "heading_rate"))
+
+
+def tilting_disc() -> Motion:
+    """The wobbling disc (B6) for 10 s: three null-space columns of one singular value."""
+    run = rolling_disc.RUN
+    ts = np.linspace(0.0, 10.0, 11)
+    known, scene = rolling_disc.motion_yaw_lean_spin(ts, **run), jj.models.TiltingDisc()
+    expected = {name: known[name] for name in ("x", "y", "yaw", "lean", "spin")}
+    start = {name: run[name] for name in ("lean", "yaw_rate", "lean_rate", "spin_rate")}
+    return Motion(scene, start, ts, against(scene, expected))
+
+
+SNAKE_START = {"steer": 0.3, "steer_rate": 0.5, "x_rate": 1.0, "rotor_rate": 0.4}
+
+
+def snakeboard_through_loss_of_rank() -> Motion:
+    """Across parallel rows (B14), with a step that ends exactly there."""
+    ts = np.linspace(0.0, snakeboard.RUN["t_end"], 9)  # steer is 90 degrees at the fifth
+    scene, known = jj.models.Snakeboard(), snakeboard.motion(ts, **snakeboard.RUN)
+    travelled = ts[-1] * np.mean(np.abs(snakeboard.velocities(np.linspace(0.0, ts[-1], 101), **snakeboard.RUN)["u"]))  # m, on curls
+    names = {"x": "x", "y": "y", "heading": "th", "rotor": "psi", "heading_rate": "th_rate"}
+    return Motion(scene, SNAKE_START, ts, against(scene, {a: known[b] for a, b in names.items()}, {"x": travelled, "y": travelled}), asked=("rollout",))
+
+
+def snakeboard_at_loss_of_rank() -> Instant:
+    """Accelerations exactly at parallel rows, turning freely about the middle: none, for the free rows bear nothing there."""
+    scene = jj.models.Snakeboard()
+    q, u, _ = scene.named(steer=np.pi / 2, heading_rate=1.0)
+    return Instant(scene, q, u, np.zeros(5), scale=1.0)
+
+
+def snakeboard_without_continuation() -> Motion:
+    """At parallel rows with a sideways velocity, while steering on: no motion continues it."""
+    scene = jj.models.Snakeboard()
+    start = {"steer": np.pi / 2, "steer_rate": 0.5, "y_rate": 0.5, "heading_rate": 0.3}
+    return Motion(scene, start, np.linspace(0.0, 1.0, 3), lambda q, u: np.inf)
+
+
+def heavy_axle(wheel_mass: float = 1.2, axle_mass: float = 0.5) -> Motion:
+    """The axle with two equal lateral rows (B1)."""
+    run = two_wheel_axle.RUN_HEAVY_AXLE | {"wheel_mass": wheel_mass, "axle_mass": axle_mass}
+    ts = np.linspace(0.0, run["t_end"], 11)
+    scene = HeavyAxle(wheel_mass=wheel_mass, axle_mass=axle_mass)
+    known = two_wheel_axle.motion_heavy_axle(ts, **run)
+    start = {"x_rate": run["u0"], "th_rate": run["th_rate"]}
+    return Motion(scene, start, ts, against(scene, {name: known[name] for name in ("x", "y", "th", "p1", "p2")}))
+
+
+def three_edges() -> Motion:
+    """The skate with its row three times, once seven times as long."""
+    ts = np.linspace(0.0, 10.0, 11)
+    scene, known = Edges(), skate.motion(ts, **skate.RUN)
+    return Motion(scene, {"heading_rate": 1.3}, ts, against(scene, {"x": known["x"], "y": known["y"], "heading": known["th"]}))
+
+
+def two_edges(angle: float) -> Instant:
+    """Two edges on one spot, turned by an angle: the body can only turn, however small the angle; the edges bear g sin(slope)."""
+    scene = Edges(angle=angle, copies=False)
+    q, u, _ = scene.named(heading=0.4)
+    pull = 9.81 * np.sin(0.3)
+    return Instant(scene, q, u, np.zeros(3), scale=pull, force=np.array([-pull, 0.0, 0.0]))
+
+
+def off_the_rows() -> Motion:
+    """A start 1e-3 m/s off the row: the skate moves as from its M-orthogonal projection, and the trajectory says by how much it was moved."""
+    scene = jj.models.Skate()
+    q, u, _ = scene.named(heading=0.4, heading_rate=1.3)
+    along, across = np.array([np.cos(0.4), np.sin(0.4)]), np.array([-np.sin(0.4), np.cos(0.4)])
+    given = np.array(u) + np.append(0.7 * along + 1e-3 * across, 0.0)
+    state = jj.State(t=jnp.zeros(()), q=q, u=jnp.asarray(given, q.dtype), **_unmoved(q), names=(scene.coordinate_names, scene.speed_names))
+    ts = np.linspace(0.0, 5.0, 6)
+    known = skate.motion(ts, **(skate.RUN | {"u0": 0.7, "th0": 0.4}))
+    expected = {"x": known["x"], "y": known["y"], "heading": known["th"]}
+    return Motion(scene, state, ts, against(scene, expected), naive_start=(q, jnp.asarray(given, q.dtype)))
+
+
+def _unmoved(q) -> dict:
+    zero = jnp.zeros((), q.dtype)
+    return {"moved_q": zero, "moved_u": zero, "residual": zero}
+
+
+def ball_on_tilted_turntable() -> Motion:
+    """Rows that depend on place and time through the table's turning (B8)."""
+    run = ball_on_turntable.RUN
+    ts = np.linspace(0.0, 10.0, 11)
+    scene, known = jj.models.BallOnTurntable(tilt=run["tilt"]), ball_on_turntable.motion(ts, **run)
+    start = {"x": run["x0"], "x_rate": run["vx0"], "y_rate": run["vy0"], "spin": run["wz"]}
+    return Motion(scene, start, ts, against(scene, {"x": known["x"], "y": known["y"], "roll_x": known["wx"], "roll_y": known["wy"]}))
+
+
+def cone_from_rest() -> Motion:
+    """Appell and Hamel's row at rest, where it has no slope: many motions meet it."""
+    return Motion(AppellHamel(), {}, np.linspace(0.0, 1.0, 3), lambda q, u: np.inf)
+
+
+def cone_in_motion() -> Motion:
+    """The same falling: a straight line with `sdotdot = g k/(1 + k^2)` (from Chetaev's rule, which gives the row the force 2 lambda (v, -k^2 zdot))."""
+    scene, k, s0 = AppellHamel(), 0.8, 0.5
+    ts = np.linspace(0.0, 2.0, 6)
+    path = s0 * ts + 9.81 * k / (1 + k**2) * ts**2 / 2
+    c, s = np.cos(0.6), np.sin(0.6)
+    start = {"x_rate": s0 * c, "y_rate": s0 * s, "z_rate": -s0 / k}
+    return Motion(scene, start, ts, against(scene, {"x": c * path, "y": s * path, "z": -path / k}))
+
+
+CASES = (
+    Case(
+        "E1",
+        "coordinate partitioning: a skate turns through 90 degrees",
+        turning_skate,
+        1e-10,
+        1e-3,
+        CLOSED,
+        {"fixed partition": "ydot = xdot tan(heading): division by cos(heading), which passes zero"},
+        must_be_right=True,
+        quick=True,
+    ),
+    Case(
+        "E1 disc",
+        "coordinate partitioning: a vertical disc by heading and x",
+        vertical_disc_by_heading_and_x,
+        1e-10,
+        1e-3,
+        CLOSED,
+        {"fixed partition": "rolldot = xdot / (R cos(heading)): division by zero at 90 degrees"},
+        must_be_right=True,
+    ),
+    Case(
+        "E2", "bases that jump: a disc through several turns", tilting_disc, 1e-9, 3e-3, CLOSED + "; the motion amplifies errors 66 times", must_be_right=True
+    ),
+    Case(
+        "E5", "loss of rank: a snakeboard, a step ends on parallel rows", snakeboard_through_loss_of_rank, 1e-10, 1e-3, CLOSED, must_be_right=True, quick=True
+    ),
+    Case("E5 point", "accelerations exactly at the loss of rank", snakeboard_at_loss_of_rank, 1e-12, 1e-5, "round-off", quick=True),
+    Case(
+        "E6",
+        "no motion continues the start at the loss of rank",
+        snakeboard_without_continuation,
+        0.0,
+        0.0,
+        "there is no right number",
+        flag_is_right=True,
+    ),
+    Case("E7", "dependent rows: an axle with four rows of rank three", heavy_axle, 1e-10, 1e-3, CLOSED, must_be_right=True),
+    Case("E7 copies", "dependent rows: one edge three times", three_edges, 1e-10, 1e-3, CLOSED, must_be_right=True),
+    *(
+        Case(
+            f"E8 {angle:g}",
+            f"nearly dependent rows: a second edge turned by {angle:g} rad",
+            lambda angle=angle: two_edges(angle),
+            1e-12 + 1e-15 / angle,
+            1e-6 + 3e-7 / angle,
+            "round-off over the angle: the rows themselves are no better known",
+            quick=angle == 1e-6,
+        )
+        for angle in (1e-2, 1e-6, 1e-10, 1e-13)
+    ),
+    Case("E18", "an initial velocity 1e-3 m/s off the row", off_the_rows, 1e-10, 1e-3, CLOSED, must_be_right=True),
+    Case("E22", "rows that move: a ball on a tilted turntable", ball_on_tilted_turntable, 1e-10, 1e-3, CLOSED, must_be_right=True),
+    Case("E24", "a row without slope at rest", cone_from_rest, 0.0, 0.0, "there is no right number", flag_is_right=True),
+    Case("E24 moving", "the same row in motion", cone_in_motion, 1e-10, 1e-3, CLOSED),
+)

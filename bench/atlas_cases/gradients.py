@@ -1,0 +1,82 @@
+"""The probe of a derivative through a whole motion, against a known derivative."""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jourdain_jax as jj
+from atlas_cases import naive
+from atlas_cases.case import by_type
+from atlas_cases.methods import Method
+from atlas_cases.outcomes import Outcome, judged, not_applicable, worst
+
+
+@dataclass
+class DerivativeOfMotion:
+    """`d value/d x`, `value` being a function of the trajectory that starts from `begin(x)`: a scene and a start."""
+
+    begin: Callable
+    x: float
+    ts: np.ndarray
+    value: Callable[[jj.Trajectory], jax.Array]
+    known: float
+    scale: float | None = None
+    rtol: float = 1e-10
+    atol: float = 1e-10
+    rtol32: float = 1e-5
+    atol32: float = 1e-6
+    steps: int = 400
+    options: dict = field(default_factory=dict)
+    skip: dict = field(default_factory=dict)
+    naive_value: Callable | None = None  # (q_end, u_end) -> value; None: naive methods are not asked
+
+    def cell(self, method: Method, tolerance: float) -> Outcome:
+        """Outcome of one method."""
+        why = self.skip.get(method.name, self.skip.get(method.group))
+        if why is not None or method.group == "constraints":
+            return not_applicable(why or "asked of motions")
+        x = jnp.asarray(self.x, jnp.result_type(float))
+        if method.naive is not None:
+            return self._by_naive(method, x, tolerance)
+        options = {**self.options, **method.options(self.begin(x)[0])}
+        options |= {"rtol": by_type(self.rtol, self.rtol32), "atol": by_type(self.atol, self.atol32), "ts": self.ts}
+
+        def value(x):
+            scene, start = self.begin(x)
+            if method.batch:
+                lanes = {name: jnp.stack([jnp.asarray(v, x.dtype)] * 2) for name, v in start.items()}
+                return self.value(jj.rollout(scene, lanes, **options).lane(1))
+            return self.value(jj.simulate(scene, start, **options))
+
+        forward = isinstance(options.get("adjoint"), diffrax.ForwardMode)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                slope = jax.jvp(value, (x,), (jnp.ones_like(x),))[1] if forward else jax.grad(value)(x)
+        except (ValueError, jj.DifferentiationModeError) as refusal:
+            return judged(np.nan, tolerance, f"{type(refusal).__name__}: {str(refusal)[:90]}")
+        return judged(worst(float(slope), self.known, self.scale), tolerance)
+
+    def _by_naive(self, method: Method, x, tolerance: float) -> Outcome:
+        if self.naive_value is None or method.naive in naive.REDUCED_STATE:
+            return not_applicable("fixed steps find no event" if self.naive_value is None else "asked of motions")
+        scene, start = self.begin(x)
+        state = jj.start(scene, **start)
+        static = naive.settled(scene, state.q, state.u)
+
+        def value(x):
+            scene, start = self.begin(x)
+            state = jj.start(scene, **start)
+            qs, us = naive.motion(method.naive, scene, static, state.q, state.u, self.ts, self.steps, alone=True)
+            return self.naive_value(qs[-1], us[-1])
+
+        try:
+            slope = jax.jvp(value, (x,), (jnp.ones_like(x),))[1]
+        except NotImplementedError as refusal:
+            return judged(np.nan, tolerance, f"NotImplementedError: {str(refusal).splitlines()[0][:90]}")
+        return judged(worst(float(slope), self.known, self.scale), tolerance)

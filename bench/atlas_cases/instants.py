@@ -1,0 +1,99 @@
+"""The probes of one state: accelerations, and their derivatives."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jourdain_jax as jj
+from atlas_cases import naive
+from atlas_cases.methods import Method, reduction
+from atlas_cases.outcomes import Outcome, judged, not_applicable, worst
+
+ONLY_MOTION = "no motion is asked"
+
+
+@eqx.filter_jit
+def _solved(scene, q, u, way):
+    return jj.accelerations(scene, 0.0, q, u, reduction=way)
+
+
+@dataclass
+class Instant:
+    """Accelerations at one state against known ones."""
+
+    scene: jj.Scene
+    q: np.ndarray
+    u: np.ndarray
+    udot: np.ndarray  # known
+    scale: float | None = None
+    force: np.ndarray | None = None  # known constraint force on the speeds
+    skip: dict = field(default_factory=dict)
+
+    def cell(self, method: Method, tolerance: float) -> Outcome:
+        """Outcome of one method."""
+        if method.group in ("constraints", "integrators", "adjoints") or method.batch or method.naive in naive.SPEEDS_IN_BASIS or method.name in self.skip:
+            return not_applicable(self.skip.get(method.name, ONLY_MOTION))
+        q, u = jnp.asarray(self.q, jnp.result_type(float)), jnp.asarray(self.u, jnp.result_type(float))
+        if method.naive is not None:
+            udot = naive.accelerations(method.naive, self.scene, naive.settled(self.scene, q, u), 0.0, q, u)
+            return judged(worst(udot, self.udot, self.scale), tolerance)
+        found = _solved(self.scene, q, u, reduction(self.scene, method.reduction))
+        error = worst(found.udot, self.udot, self.scale)
+        if self.force is not None:
+            error = float(np.maximum(error, worst(found.constraint_force, self.force)))
+        plain = judged(error, tolerance)
+        if plain.outcome == "right" and bool(found.applicable):
+            return plain
+        flag = flags_of(found)
+        return judged(error, tolerance, flag) if flag else plain
+
+
+def flags_of(found: jj.Accelerations) -> str:
+    """What accelerations say against themselves: not applicable, fewer independent rows than rows, a small singular value, a residual."""
+    rows, eps = found.multipliers.shape[0], float(jnp.finfo(found.udot.dtype).eps)
+    if not bool(found.applicable):
+        return "`applicable` is False"
+    if int(found.rank) < rows:
+        return f"rank {int(found.rank)} of {rows} rows"
+    if float(found.smallest_singular_value) < np.sqrt(eps):
+        return f"smallest singular value {float(found.smallest_singular_value):.1e}"
+    return f"residual {float(found.residual):.1e}" if float(found.residual) > np.sqrt(eps) else ""
+
+
+@dataclass
+class DerivativeOfAccelerations:
+    """`d w.udot/d x` at one state, in reverse mode, against a known derivative; `state(x)` gives scene, q, u."""
+
+    state: Callable
+    x: float
+    weights: np.ndarray
+    known: float
+    scale: float | None = None
+    compiled: dict = field(default_factory=dict)  # one program serves all reductions
+
+    def cell(self, method: Method, tolerance: float) -> Outcome:
+        """Outcome of one method."""
+        if method.group in ("constraints", "integrators", "adjoints") or method.batch or method.naive in naive.SPEEDS_IN_BASIS:
+            return not_applicable(ONLY_MOTION)
+        weights = jnp.asarray(self.weights, jnp.result_type(float))
+        scene, q, u = self.state(jnp.asarray(self.x))
+        static = naive.settled(scene, q, u) if method.naive else None
+
+        def value(x, way):
+            scene, q, u = self.state(x)
+            if method.naive is not None:
+                return weights @ naive.accelerations(method.naive, scene, static, 0.0, q, u)
+            return weights @ jj.accelerations(scene, 0.0, q, u, reduction=way).udot
+
+        key = method.naive or ("default" if method.reduction is None else "reductions")
+        if key not in self.compiled:
+            self.compiled[key] = eqx.filter_jit(jax.grad(value))
+        try:
+            slope = float(self.compiled[key](jnp.asarray(self.x, jnp.result_type(float)), reduction(scene, method.reduction)))
+        except NotImplementedError as refusal:
+            return judged(np.nan, tolerance, f"NotImplementedError: {str(refusal).splitlines()[0][:90]}")
+        return judged(worst(slope, self.known, self.scale), tolerance)

@@ -1,0 +1,145 @@
+"""The probe of a motion: integrate to some end, compare with a closed form, a reference or integrals of the motion."""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import numpy as np
+
+import jourdain_jax as jj
+from atlas_cases import naive
+from atlas_cases.case import by_type
+from atlas_cases.methods import Method
+from atlas_cases.outcomes import NAN, Outcome, judged, not_applicable, worst
+from jourdain_jax.motion import results
+
+# Methods that take long and show something in some cases only.
+SELDOM = {
+    "rollout": "a batch is one more program; asked in a dozen cases",
+    "Kvaerno5": "implicit; asked where a motion is stiff or long",
+    "Baumgarte 1e4/s": "its steps are bound to 1e-4 s; asked in E9 and E10",
+}
+
+
+@dataclass
+class Motion:
+    """A start, times, and the error of states at these times (the first is the start)."""
+
+    scene: jj.Scene
+    start: object  # dict or State
+    ts: np.ndarray
+    error: Callable[[np.ndarray, np.ndarray], float]  # q (times, n), u (times, m) -> error
+    rtol: float = 1e-12
+    atol: float = 1e-12
+    rtol32: float = 1e-5
+    atol32: float = 1e-6
+    steps: int = 400  # of the naive methods, between two times
+    independent: tuple[str, ...] | None = None  # speeds that the fixed partition keeps; None: the best at the start
+    options: dict = field(default_factory=dict)  # of `simulate`, part of the set-up
+    flags: Callable | None = None  # trajectory -> further flag in words
+    ends_at_event: bool = False  # whether an event is a right end
+    skip: dict = field(default_factory=dict)  # method or group -> why it is not asked
+    asked: tuple[str, ...] = ()  # costly methods, `SELDOM`, that are asked here
+    naive_start: tuple | None = None  # (q, u) for methods that do not project a start
+
+    def cell(self, method: Method, tolerance: float) -> Outcome:
+        """Outcome of one method."""
+        why = self.skip.get(method.name, self.skip.get(method.group))
+        if method.name in SELDOM and method.name not in self.asked:
+            why = SELDOM[method.name]
+        if why is not None or method.group == "adjoints":
+            return not_applicable(why or "no derivative is asked")
+        if method.naive is not None:
+            return self._by_naive(method, tolerance)
+        motion = self._rollout() if method.batch else self._simulate(method)
+        return self.of_trajectory(motion, tolerance)
+
+    @property
+    def tolerances(self) -> dict:
+        """rtol and atol of this process's floats."""
+        return {"rtol": by_type(self.rtol, self.rtol32), "atol": by_type(self.atol, self.atol32)}
+
+    def _simulate(self, method: Method):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return jj.simulate(self.scene, self.start, ts=self.ts, **self.tolerances, **{**self.options, **method.options(self.scene)})
+
+    def _rollout(self):
+        """The same twice, as a batch."""
+        state = self.start if isinstance(self.start, jj.State) else jj.start(self.scene, **self.start)
+        leaves = {name: jnp.stack([getattr(state, name)] * 2) for name in ("t", "q", "u", "moved_q", "moved_u", "residual")}
+        lanes = jj.State(**leaves, names=state.names)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return jj.rollout(self.scene, lanes, ts=self.ts, **self.tolerances, **self.options).lane(1)
+
+    def of_trajectory(self, motion: jj.Trajectory, tolerance: float) -> Outcome:
+        """Outcome of a trajectory: its result code, its numbers, and what its summary warns of."""
+        code = int(motion.result)
+        if code == results.MAX_STEPS:
+            return judged(np.nan, tolerance, f"{motion.message} (t = {float(motion.t_end):.3g} s)", stalled=True)
+        if code not in (results.SUCCESS, results.EVENT) or (code == results.EVENT and not self.ends_at_event):
+            return judged(np.nan, tolerance, f"{motion.message} (t = {float(motion.t_end):.3g} s)")
+        error = self.error(np.asarray(motion.q, float), np.asarray(motion.u, float))
+        found = judged(error, tolerance)
+        if found.outcome == "right":
+            return found
+        flag = warned(motion) or (self.flags(motion) if self.flags else "")
+        return judged(error, tolerance, flag) if flag else found
+
+    def _by_naive(self, method: Method, tolerance: float) -> Outcome:
+        if self.naive_start is None:
+            state = self.start if isinstance(self.start, jj.State) else jj.start(self.scene, **self.start)
+            q, u = state.q, state.u
+        else:
+            q, u = (jnp.asarray(x) for x in self.naive_start)
+        rows = jj.constraint_rows(self.scene, 0.0, q, u)
+        if method.naive in naive.REDUCED_STATE and (not jj.structure_of(self.scene).affine or rows.A.shape[0] == 0):
+            return not_applicable("no rows that are linear in the speeds")
+        static = naive.settled(self.scene, q, u, independent=self.independent)
+        steps = by_type(self.steps, max(20, self.steps // 10))  # in float32 more of them would only add round-off
+        qs, us = naive.motion(method.naive, self.scene, static, q, u, self.ts, steps)
+        qs, us = np.asarray(qs, float), np.asarray(us, float)
+        if not (np.all(np.isfinite(qs)) and np.all(np.isfinite(us))):
+            return Outcome(NAN)
+        return judged(self.error(qs, us), tolerance)
+
+
+def warned(motion: jj.Trajectory) -> str:
+    """What the printed summary of a motion that claims success warns of: a change of rank, rows near a loss of rank, an energy that drifts."""
+    found = jj.diagnose(motion)
+    low, high = (int(r) for r in found.rank)
+    smallest = float(found.smallest_singular_value)
+    eps = float(jnp.finfo(motion.q.dtype).eps)
+    if low != high:
+        return f"summary: rank {low} to {high}"
+    return f"summary: smallest singular value {smallest:.1e}" if smallest < np.sqrt(eps) else ""
+
+
+def against(scene: jj.Scene, expected: dict, scales: dict | None = None) -> Callable[[np.ndarray, np.ndarray], float]:
+    """Error against named coordinates and speeds at all times, each relative to its own size (or its entry in `scales`)."""
+    names = (scene.coordinate_names.entries, scene.speed_names.entries)
+
+    def error(q, u):
+        columns = [q[:, names[0].index(name)] if name in names[0] else u[:, names[1].index(name)] for name in expected]
+        pairs = zip(expected, columns, strict=True)
+        return max_error(worst(column, expected[name], (scales or {}).get(name)) for name, column in pairs)
+
+    return error
+
+
+def drift(*integrals: Callable[[np.ndarray, np.ndarray], np.ndarray], size: float | None = None) -> Callable[[np.ndarray, np.ndarray], float]:
+    """Error as the largest change of integrals of the motion, relative to their start or to `size`."""
+
+    def error(q, u):
+        values = [integral(q, u) for integral in integrals]
+        return max_error(worst(value - value[0], 0.0, size or max(abs(value[0]), 1e-300)) for value in values)
+
+    return error
+
+
+def max_error(errors) -> float:
+    """The largest; NaN where one is."""
+    errors = list(errors)
+    return float("nan") if any(np.isnan(e) for e in errors) else max(errors)

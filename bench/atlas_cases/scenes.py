@@ -1,0 +1,213 @@
+"""Scenes of the atlas that are no textbook models: redundant and nearly redundant rows, linkages, rows nonlinear in the speeds."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+import jourdain_jax as jj
+
+_TURN = (-3.2, 3.2)
+
+
+class HeavyAxle(jj.Scene):
+    """Two disc wheels on an axle with mass, on an incline (B1): four rows, of which the two lateral ones are the same."""
+
+    radius: Float[Array, ""] = jj.parameter(0.3, unit="m", positive=True)
+    half_track: Float[Array, ""] = jj.parameter(0.4, unit="m", positive=True)
+    wheel_mass: Float[Array, ""] = jj.parameter(1.2, unit="kg", positive=True)
+    axle_mass: Float[Array, ""] = jj.parameter(0.5, unit="kg", positive=True)
+    slope: Float[Array, ""] = jj.parameter(0.2, unit="rad")
+    gravity: Float[Array, ""] = jj.parameter(9.81, unit="m/s^2")
+    coordinates = jj.coordinates("x y th p1 p2")
+    domain = {"th": _TURN, "p1": _TURN, "p2": _TURN}
+
+    def bodies(self, t, q):
+        turned = jj.rot_z(q.th)
+        middle = jnp.stack([q.x, q.y, self.radius])
+        axle = self.half_track * turned[:, 1]
+        slender = self.axle_mass * (2 * self.half_track) ** 2 / 12
+        bodies = {"axle": jj.RigidBody(self.axle_mass, slender * jnp.ones(3), middle, turned)}
+        for name, place, spin in (("wheel 1", middle + axle, q.p1), ("wheel 2", middle - axle, q.p2)):
+            bodies[name] = jj.RigidBody.thin_disc(self.wheel_mass, self.radius, axis="y", position=place, orientation=turned @ jj.rot_y(spin))
+        return bodies
+
+    def loads(self, motion):
+        down = jnp.stack([jnp.sin(self.slope), jnp.zeros_like(self.slope), -jnp.cos(self.slope)])
+        return (jj.gravity(motion, self.gravity, down),)
+
+    def velocity_constraints(self, motion):
+        q, u = motion.q, motion.u
+        s, c = jnp.sin(q.th), jnp.cos(q.th)
+        sideways, forward = -s * u.x_rate + c * u.y_rate, c * u.x_rate + s * u.y_rate
+        return {
+            "lateral 1": sideways,
+            "lateral 2": sideways,
+            "rolling 1": forward - self.half_track * u.th_rate - self.radius * u.p1_rate,
+            "rolling 2": forward + self.half_track * u.th_rate - self.radius * u.p2_rate,
+        }
+
+
+class Edges(jj.Scene):
+    """The skate with three copies of its row (one of them seven times as long), or with a second edge turned by `angle` against the first."""
+
+    angle: Float[Array, ""] = jj.parameter(0.0, unit="rad")
+    slope: Float[Array, ""] = jj.parameter(0.3, unit="rad")
+    copies: bool = eqx.field(static=True, default=True)
+    coordinates = jj.coordinates("x y heading")
+    domain = {"heading": _TURN}
+
+    def bodies(self, t, q):
+        return {"skate": jj.RigidBody(1.0, 0.2 * jnp.ones(3), jnp.stack([q.x, q.y, 0.0 * q.x]), jj.rot_z(q.heading))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81, jnp.stack([jnp.sin(self.slope), jnp.zeros_like(self.slope), -jnp.cos(self.slope)])),)
+
+    def velocity_constraints(self, motion):
+        skate = motion["skate"]
+        rows = {"edge": jj.knife_edge(skate, skate.position, skate.orientation[:, 1])}
+        if self.copies:
+            return rows | {"copy": rows["edge"], "longer copy": 7.0 * rows["edge"]}
+        return rows | {"second": jj.knife_edge(skate, skate.position, skate.orientation @ jnp.stack([-jnp.sin(self.angle), jnp.cos(self.angle), 0.0]))}
+
+
+class OrthonormalRows(jj.Scene):
+    """A particle in space whose velocity has two orthonormal rows, turned with its coordinate x: equal singular values everywhere."""
+
+    coordinates = jj.coordinates("x y z")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, q.array)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81),)
+
+    def velocity_constraints(self, motion):
+        frame = jj.rot_z(motion.q.x) @ jj.rot_x(0.7 + motion.q.x)
+        velocity = motion["particle"].velocity
+        return {"first": velocity @ frame[:, 1], "second": velocity @ frame[:, 2]}
+
+
+class LeadingRow(jj.Scene):
+    """Rosenberg's particle in another order, `xdot = z ydot`: at z = 0 the row lies along the first coordinate."""
+
+    coordinates = jj.coordinates("x y z")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, q.array)}
+
+    def velocity_constraints(self, motion):
+        return {"sheet": motion.u.x_rate - motion.q.z * motion.u.y_rate}
+
+
+class AppellHamel(jj.Scene):
+    """Appell and Hamel's example, a row quadratic in the speeds: `xdot^2 + ydot^2 = k^2 zdot^2`. It vanishes, with its slope, at rest."""
+
+    k: Float[Array, ""] = jj.parameter(0.8)
+    coordinates = jj.coordinates("x y z")
+    domain = {"x_rate": (0.2, 1.0), "y_rate": (0.2, 1.0), "z_rate": (-2.0, -0.2)}
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, q.array)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81),)
+
+    def velocity_constraints(self, motion):
+        v = motion["particle"].velocity
+        return {"cone": v[0] ** 2 + v[1] ** 2 - (self.k * v[2]) ** 2}
+
+
+class FourBars(jj.Scene):
+    """The n-four-bar linkage: n windows of rods of 1 m and 1 kg, in a vertical plane. Points P0 to Pn hang from pivots 1 m apart.
+
+    A uniform rod is as good as a sixth of its mass at either end and the rest in the middle.
+    """
+
+    windows: int = eqx.field(static=True, default=2)
+    gravity: Float[Array, ""] = jj.parameter(9.81, unit="m/s^2")
+
+    @property
+    def coordinates(self):
+        """x and z of every moving point."""
+        return jj.coordinates(*(f"x{i} z{i}" for i in range(self.windows + 1)))
+
+    @property
+    def domain(self):
+        """Near the half circle above the pivots."""
+        return {f"x{i}": (i - 1.0, i + 1.0) for i in range(self.windows + 1)} | {f"z{i}": (0.2, 1.0) for i in range(self.windows + 1)}
+
+    def _points(self, q):
+        points = [jnp.stack([q[f"x{i}"], 0.0 * q.x0, q[f"z{i}"]]) for i in range(self.windows + 1)]
+        return points, [jnp.array([float(i), 0.0, 0.0]) for i in range(self.windows + 1)]
+
+    def bodies(self, t, q):
+        points, pivots = self._points(q)
+        bodies = {f"end {i}": jj.Particle((1 + (0 < i < self.windows) + 1.0) / 6, point) for i, point in enumerate(points)}
+        bodies |= {f"crank {i}": jj.Particle(2 / 3, (a + b) / 2) for i, (a, b) in enumerate(zip(points, pivots, strict=True))}
+        return bodies | {f"coupler {i}": jj.Particle(2 / 3, (points[i] + points[i + 1]) / 2) for i in range(self.windows)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, self.gravity),)
+
+    def geometric_constraints(self, pose):
+        points, pivots = self._points(pose.q)
+        rows = {f"crank {i}": jj.rod(a, b, 1.0) for i, (a, b) in enumerate(zip(pivots, points, strict=True))}
+        return rows | {f"coupler {i}": jj.rod(points[i], points[i + 1], 1.0) for i in range(self.windows)}
+
+
+class Bricard(jj.Scene):
+    """Bricard's line-symmetric octahedron: six particles, twelve rods of rank eleven, and yet it bends. Axis of symmetry: z.
+
+    With `whole=False` the same by symmetry: three particles of double mass whose images are turned by half a turn, six rods of full rank.
+    """
+
+    lengths: Float[Array, "6"] = jj.parameter((1.0,) * 6, unit="m", positive=True)
+    whole: bool = eqx.field(static=True, default=True)
+    domain_near: tuple[float, ...] = eqx.field(static=True, default=())
+
+    @property
+    def coordinates(self):
+        """Cartesian coordinates of A, B, C and, of the whole, their images."""
+        return jj.coordinates(*(f"{name}{axis}" for name in _VERTICES[: 6 if self.whole else 3] for axis in "xyz"))
+
+    @property
+    def domain(self):
+        """Near a given shape."""
+        near = dict(zip(self.coordinates.names, self.domain_near, strict=False)) if self.domain_near else {}
+        return {name: (value - 0.05, value + 0.05) for name, value in near.items()}
+
+    def _points(self, q):
+        points = {name: jnp.stack([q[f"{name}{axis}"] for axis in "xyz"]) for name in _VERTICES[: 6 if self.whole else 3]}
+        if not self.whole:
+            points |= {name + "i": points[name] * jnp.array([-1.0, -1.0, 1.0]) for name in "abc"}
+        return points
+
+    def bodies(self, t, q):
+        points = self._points(q)
+        return {name: jj.Particle(mass * (1.0 if self.whole else 2.0), points[name]) for name, mass in _MASSES.items() if name in q_names(self)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81),)
+
+    def geometric_constraints(self, pose):
+        points = self._points(pose.q)
+        rows = {}
+        for k, (first, second) in enumerate(_EDGES):
+            rows[f"{first}{second}"] = jj.rod(points[first], points[second], self.lengths[k])
+            if self.whole:
+                rows[f"{first}{second} image"] = jj.rod(points[_image(first)], points[_image(second)], self.lengths[k])
+        return rows
+
+
+_VERTICES = ("a", "b", "c", "ai", "bi", "ci")
+_MASSES = {"a": 1.0, "b": 1.5, "c": 0.7, "ai": 1.0, "bi": 1.5, "ci": 0.7}
+_EDGES = (("a", "b"), ("b", "c"), ("a", "c"), ("a", "bi"), ("b", "ci"), ("a", "ci"))
+
+
+def _image(name: str) -> str:
+    return name[0] if name.endswith("i") else name + "i"
+
+
+def q_names(scene: Bricard) -> tuple[str, ...]:
+    """Vertices that have coordinates of their own."""
+    return _VERTICES[: 6 if scene.whole else 3]

@@ -1,0 +1,188 @@
+"""Scenes of the atlas about long, stiff and singular motions: balls, discs, rattlebacks in quaternions, contact oscillators, a soft contact."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+import jourdain_jax as jj
+
+_OMEGA = (-3.0, 3.0)
+_DOMAIN = {f"attitude_omega_{axis}": _OMEGA for axis in "xyz"}
+
+
+class CeltInQuaternion(jj.Scene):
+    """The rattleback (B15) with a quaternion and a height row: no attitude is singular. z up; body axis 3 down at identity of the table's angles."""
+
+    gravity: Float[Array, ""] = jj.parameter(9.81, unit="m/s^2")
+    scale: float = eqx.field(static=True, default=1.0)  # units of length per metre
+    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+
+    @property
+    def domain(self):
+        """Heights in the unit of length."""
+        return {"z": (0.01 * self.scale, 0.2 * self.scale), **_DOMAIN}
+
+    def bodies(self, t, q):
+        k = self.scale**2
+        inertia = k * jnp.array([[2e-4, -0.2e-4, 0.0], [-0.2e-4, 16e-4, 0.0], [0.0, 0.0, 17e-4]])
+        return {"stone": jj.RigidBody(1.0, inertia, jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, self.gravity * self.scale),)
+
+    def _arm(self, down):
+        weighted = self.scale**2 * jnp.array([0.2**2, 0.03**2, 0.02**2]) * down
+        return weighted / jnp.sqrt(down @ weighted) - self.scale * jnp.array([0.0, 0.0, 0.01])
+
+    def geometric_constraints(self, pose):
+        stone = pose["stone"]
+        down = -stone.orientation[2]
+        return {"height": stone.position[2] - self._arm(down) @ down}
+
+    def velocity_constraints(self, motion):
+        stone = motion["stone"]
+        return {"no slip": stone.velocity_at(stone.place(self._arm(-stone.orientation[2])))[:2]}
+
+
+class EccentricBall(jj.Scene):
+    """A ball of radius 1 m that rolls on a plane, its mass centre off its middle along the body axis z, about which its inertia is symmetric."""
+
+    offset: Float[Array, ""] = jj.parameter(0.3, unit="m")
+    axial: Float[Array, ""] = jj.parameter(0.5, unit="kg m^2", positive=True)
+    transverse: Float[Array, ""] = jj.parameter(0.4, unit="kg m^2", positive=True)
+    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+    domain = {"z": (0.7, 1.3), **_DOMAIN}
+
+    def bodies(self, t, q):
+        inertia = jnp.stack([self.transverse, self.transverse, self.axial])
+        return {"ball": jj.RigidBody(1.0, inertia, jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81),)
+
+    def _contact(self, body):
+        middle = body.position - self.offset * body.orientation[:, 2]
+        return middle - jnp.array([0.0, 0.0, 1.0])
+
+    def geometric_constraints(self, pose):
+        return {"height": self._contact(pose["ball"])[2]}
+
+    def velocity_constraints(self, motion):
+        ball = motion["ball"]
+        return {"no slip": ball.velocity_at(self._contact(ball))[:2]}
+
+
+class DragDisc(jj.Scene):
+    """Euler's disc (B7): a rolling disc in quaternions that loses the power `drag psidot^2`; theta^2 then falls linearly, to zero in finite time."""
+
+    drag: Float[Array, ""] = jj.parameter(1.7e-4, unit="N m s", non_negative=True)
+    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+    domain = {"z": (0.05, 0.3), **_DOMAIN}
+
+    def bodies(self, t, q):
+        centre, turned = jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude)
+        return {"disc": jj.RigidBody.thin_disc(1.0, 0.3, axis="y", position=centre, orientation=turned)}
+
+    def loads(self, motion):
+        disc = motion["disc"]
+        axle = disc.orientation[:, 1]
+        up = jnp.array([0.0, 0.0, 1.0]) - axle[2] * axle  # of length sin(theta), along the line from the contact to the centre
+        squared = up @ up
+        # psidot = w . up / sin^2, and M . w = -drag psidot^2
+        return (jj.gravity(motion, 9.81), jj.torque(motion, "disc", -self.drag * (disc.angular_velocity @ up) / squared**2 * up))
+
+    def contacts(self, pose):
+        return {"rim": jj.disc_contact(pose["disc"], 0.3, height="row")}
+
+    def events(self, motion):
+        axle = motion["disc"].orientation[:, 1]
+        return {"flat": axle[0] ** 2 + axle[1] ** 2 - 45 * jnp.finfo(axle.dtype).eps}  # as the model `tilting_disc_quaternion`
+
+
+class ContactOscillator(jj.Scene):
+    """McLachlan and Perlmutter's contact oscillator, `xdot + y zdot = 0`, V = (x^2 + y^2 + z^2)/2 + strength x^2 z^2/2, masses 1 kg.
+
+    With `pairs` = 3 the chaotic one: `xdot + sum y_i zdot_i = 0` and a coupling of x^2 with all z_i^2.
+    """
+
+    strength: Float[Array, ""] = jj.parameter(0.3)
+    pairs: int = eqx.field(static=True, default=1)
+
+    @property
+    def coordinates(self):
+        """x, y_i and z_i."""
+        return jj.coordinates("x", *(f"y{i} z{i}" for i in range(self.pairs)))
+
+    @property
+    def privileged(self):
+        """All but x."""
+        return tuple(f"{name}{i}_rate" for i in range(self.pairs) for name in "yz")
+
+    def bodies(self, t, q):
+        zero = 0.0 * q.x
+        bodies = {"x": jj.Particle(1.0, jnp.stack([q.x, zero, zero]))}
+        return bodies | {f"pair {i}": jj.Particle(1.0, jnp.stack([zero, q[f"y{i}"], q[f"z{i}"]])) for i in range(self.pairs)}
+
+    def potential(self, pose):
+        q = pose.q
+        squares = sum(q[f"z{i}"] ** 2 for i in range(self.pairs))
+        return (q.array @ q.array + self.strength * q.x**2 * squares) / 2
+
+    def velocity_constraints(self, motion):
+        q, u = motion.q, motion.u
+        return {"contact": u.x_rate + sum(q[f"y{i}"] * u[f"z{i}_rate"] for i in range(self.pairs))}
+
+
+class PendulumDrivenGear(jj.Scene):
+    """A continuously variable transmission: a driver y, on its own, sets the ratio between two oscillators, `xdot + f(y) zdot = 0`.
+
+    f(y) = 1 + sin(y), which is neither even nor odd; V = 1 - cos(y) + y/5 + (x^2 + z^2)/2; masses 1 kg.
+    """
+
+    coordinates = jj.coordinates("x y z")
+    privileged = ("y_rate", "z_rate")
+
+    def bodies(self, t, q):
+        return {"point": jj.Particle(1.0, q.array)}
+
+    def potential(self, pose):
+        q = pose.q
+        return 1 - jnp.cos(q.y) + 0.2 * q.y + (q.x**2 + q.z**2) / 2
+
+    def velocity_constraints(self, motion):
+        return {"gear": motion.u.x_rate + (1 + jnp.sin(motion.q.y)) * motion.u.z_rate}
+
+
+class SoftWheel(jj.Scene):
+    """The vertical disc (B4) with a contact of springs instead of rows: normal stiffness k and damping, slip resisted by `stiffness` times 1 s.
+
+    What penalty methods do. Its limit is rolling.
+    """
+
+    stiffness: Float[Array, ""] = jj.parameter(1e5, unit="N/m", positive=True)
+    coordinates = jj.coordinates("x y z heading roll")
+    domain = {"z": (0.9, 1.1), "heading": (-3.2, 3.2), "roll": (-3.2, 3.2)}
+
+    def bodies(self, t, q):
+        turned = jj.rot_z(q.heading) @ jj.rot_y(q.roll)
+        return {"disc": jj.RigidBody(1.0, jnp.ones(3), jnp.stack([q.x, q.y, q.z]), turned)}
+
+    def loads(self, motion):
+        disc, q, u, k = motion["disc"], motion.q, motion.u, self.stiffness
+        contact = jnp.array([0.0, 0.0, -1.0])
+        slip = disc.velocity + jnp.cross(disc.angular_velocity, contact)
+        normal = k * (1.0 - q.z) + 9.81 - 0.1 * jnp.sqrt(k) * u.z_rate
+        return (jj.gravity(motion, 9.81), jj.point_force(disc.point(disc.orientation.T @ contact), jnp.stack([-k * slip[0], -k * slip[1], normal])))
+
+
+class SwitchedTurntable(jj.Scene):
+    """A ball (radius 0.05 m, solid) on a flat turntable whose turning is reversed smoothly: Om(t) = -2 tanh(3 (t - 1)) rad/s."""
+
+    coordinates = jj.coordinates("x y", jj.quaternion("attitude"))
+
+    def bodies(self, t, q):
+        return {"ball": jj.RigidBody.ball(1.0, 0.05, position=jnp.stack([q.x, q.y, 0.05 + 0.0 * q.x]), orientation=jj.quaternion_to_matrix(q.attitude))}
+
+    def contacts(self, pose):
+        turning = -2.0 * jnp.tanh(3.0 * (pose.t - 1.0))
+        return {"table": jj.ball_contact(pose["ball"], 0.05, plane=jj.Plane(angular_velocity=turning * jnp.array([0.0, 0.0, 1.0])))}
