@@ -181,7 +181,7 @@ def draw(found: dict, path: Path) -> None:
     for axis in axes[-1]:
         axis.set_xlabel("t (s)")
     handles = [plt.Line2D([], [], color=colour, ls="--" if name in EXPLICIT else "-", lw=1.6) for name, colour in colours.items()]
-    labels = [name if name in METHODS else f"{name}, at the cost of midpoint" for name in colours]
+    labels = [name if name in METHODS else f"{name}, at most the cost of midpoint" for name in colours]
     figure.legend(handles, labels, loc="upper center", ncol=3, frameon=False)
     figure.tight_layout(rect=(0, 0, 1, 1 - 0.75 / figure.get_figheight()))
     figure.savefig(path, dpi=130)
