@@ -271,7 +271,7 @@ WRONG = {
     "jj.simulate(oscillator, dt0=0.1, solver=jj.DiscreteGradient(), stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6))": (
         r"`DiscreteGradient` takes steps of one length and has no error estimate, which `stepsize_controller` = PIDController needs; leave it away"
     ),
-    "jj.simulate(oscillator, dt0=0.0, solver=jj.ImplicitMidpoint())": r"`dt0` is 0, expected the step in s; give a number above zero",
+    "jj.simulate(oscillator, dt0=0.0, solver=jj.ImplicitMidpoint())": r"`dt0` is 0, expected a finite first step in s that is not zero",
     "jj.simulate(oscillator, dt0=0.1, solver=jj.ImplicitMidpoint(), land_on_ts=False)": r"states at ends of steps only: leave `land_on_ts` at True",
     "jj.simulate(oscillator, solver=jj.MuntheKaas())": r"`ContactOscillator` has no quaternion among its coordinates; use solver=Tsit5\(\) by itself",
     "jj.MuntheKaas(jj.DiscreteGradient())": r"`solver` of `MuntheKaas` is DiscreteGradient, expected a Runge-Kutta method",

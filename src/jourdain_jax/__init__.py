@@ -44,7 +44,8 @@ from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, parti
 from jourdain_jax.equations.lagrange import lagrange_equations
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, NullSpaceSVD, Privileged, UdwadiaKalaba
 from jourdain_jax.equations.rows import position_residual, velocity_residual
-from jourdain_jax.equations.structure import sample_states, structure_of
+from jourdain_jax.equations.sampling import sample_states
+from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.equations.virtual_power import (
     generalized_forces,
     kinetic_energy,

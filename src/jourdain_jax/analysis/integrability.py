@@ -24,8 +24,9 @@ from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.reductions import Partition
 from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.equations.sampling import sample_states
 from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.equations.structure import sample_states, structure_of
+from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.scene.scene import Scene
 
 INTEGRABLE = 1e-9  # size of dw on the velocities that w admits, relative to the derivatives of w

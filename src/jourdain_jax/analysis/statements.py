@@ -51,7 +51,7 @@ def _inertia(motion: Motion) -> dict[str, Float[Array, ""]]:
         moments = jnp.linalg.eigvalsh((body.inertia + body.inertia.T) / 2)
         values[f"body `{name}`: its inertia is not symmetric"] = jnp.max(jnp.abs(body.inertia - body.inertia.T)) / size
         values[f"body `{name}`: a principal moment of inertia is negative"] = jnp.maximum(-moments[0], 0.0) / size
-        excess = jnp.maximum(moments[2] - moments[0] - moments[1], 0.0)
+        excess = jnp.where(moments[0] >= 0, jnp.maximum(moments[2] - moments[0] - moments[1], 0.0), 0.0)
         values[f"body `{name}`: a principal moment of inertia exceeds the sum of the other two"] = excess / size
         values[f"body `{name}`: its orientation is no rotation matrix"] = jnp.max(jnp.abs(body.orientation.T @ body.orientation - jnp.eye(3)))
     return values

@@ -18,8 +18,9 @@ from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.probing import concretised, on_numbers
 from jourdain_jax.equations.reductions import Privileged
 from jourdain_jax.equations.rows import names_of_position_rows, position_residual
+from jourdain_jax.equations.sampling import sample_states
 from jourdain_jax.equations.scaling import row_scale, scaled
-from jourdain_jax.equations.structure import sample_states, structure_of
+from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.names import as_names, nearest

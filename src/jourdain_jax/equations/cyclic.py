@@ -19,8 +19,9 @@ from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion
 from jourdain_jax.equations.probing import on_numbers, probed_once
 from jourdain_jax.equations.reductions import Partition, Privileged, reduce
 from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.equations.sampling import sample_states
 from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.equations.structure import sample_states, structure_of
+from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.equations.virtual_power import equations_and_rows, potential_resultants, resultants
 from jourdain_jax.scene.scene import Scene
 

@@ -19,8 +19,9 @@ from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, pose_at, velocities
 from jourdain_jax.equations.plausibility import implausible, pose_numbers
 from jourdain_jax.equations.probing import on_numbers, probed_once
-from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
+from jourdain_jax.equations.projection import project_positions
 from jourdain_jax.equations.rows import names_of_rows, position_residual, velocity_residual
+from jourdain_jax.equations.sampling import assembled, miss_of_rows, random_states, symmetric_configurations
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import mass_matrix_at, potential_energy, resultants
 from jourdain_jax.scene.answers import loads_of
@@ -30,10 +31,6 @@ from jourdain_jax.scene.numbers import described, is_traced
 from jourdain_jax.scene.scene import Scene
 
 RANDOM_PROBES = 24
-SYMMETRIC_PROBES = 200
-# Where a scene states no domain: wide enough that an angle meets every direction, so that no partition passes by luck.
-COORDINATE_DOMAIN = (-3.2, 3.2)
-SPEED_DOMAIN = (-1.0, 1.0)
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
 TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")
 _EXHAUSTIVE = 3000
@@ -82,92 +79,6 @@ class Structure:
         return self.worst_pivot >= WELL_CONDITIONED
 
 
-def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """At most `count` random admissible states (t, q, u) from the scene's domain, on the rows, each with a leading axis of states.
-
-    `seed`: of the generator. Scene parameters must be concrete. ValueError where no state meets the geometric rows.
-    """
-    if not isinstance(count, int | np.integer) or count < 1:
-        raise ValueError(f"`count` is {count!r}, expected a whole number of states, at least 1")
-    if not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
-    drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
-    t, q, u = _random_states(scene, drawn, np.random.default_rng(seed))
-    q, u, miss = _projected(scene, t, q, u)
-    good = np.flatnonzero(_assembled(scene, miss, np.ones(drawn, bool)))[:count]
-    return t[good], q[good], u[good]
-
-
-def symmetric_states(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States (t, q, u) at the symmetric configurations (zero and right angles), on the rows where those can be met."""
-    configurations = _symmetric_configurations(scene)[:32]
-    t, _, u = _random_states(scene, 32, np.random.default_rng(2))
-    q, u, miss = _projected(scene, 0.0 * t, np.resize(configurations, (32, configurations.shape[1])), u)
-    good = np.flatnonzero(miss < np.sqrt(np.finfo(miss.dtype).eps))
-    good = good[good < len(configurations)]
-    return t[good], q[good], u[good]
-
-
-def _random_states(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States from the domain, not yet on the rows."""
-    q_low, q_high = _bounds(scene, scene.coordinate_names.entries, COORDINATE_DOMAIN)
-    u_low, u_high = _bounds(scene, scene.speed_names.entries, SPEED_DOMAIN)
-    q = generator.uniform(q_low, q_high, (count, len(q_low)))
-    for first, _ in scene.coordinates.quaternions:
-        wxyz = generator.normal(size=(count, 4))
-        q[:, first : first + 4] = wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
-    return generator.uniform(0, 1, count), q, generator.uniform(u_low, u_high, (count, len(u_low)))
-
-
-def _assembled(scene: Scene, miss: np.ndarray, generic: np.ndarray) -> np.ndarray:
-    """Which states lie on the geometric rows; a ValueError where no random one does."""
-    good = miss < np.sqrt(np.finfo(miss.dtype).eps)
-    if not good[generic].any():
-        raise ValueError(
-            f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by {np.min(miss[generic]):.1e} or "
-            "more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, "
-            "numbers near their defaults stood in for them, or near one where they have none: give defaults near the values in use)"
-        )
-    return good
-
-
-def _bounds(scene: Scene, names, default) -> tuple[np.ndarray, np.ndarray]:
-    pairs = [scene.domain.get(name, default) for name in names]
-    return np.array([p[0] for p in pairs], float), np.array([p[1] for p in pairs], float)
-
-
-@on_numbers
-def _projected(scene, t, q, u):
-    def one(t, q, u):
-        q = project_positions(scene, t, q)
-        return q, project_speeds(scene, t, q, u), _miss(scene, t, q)
-
-    return jax.vmap(one)(t, q, u)
-
-
-def _miss(scene, t, q):
-    """Largest residual of the geometric rows; infinite where it is not a number."""
-    miss = jnp.max(jnp.abs(closure_residual(scene, t, q)), initial=0.0)
-    return jnp.where(jnp.isfinite(miss), miss, jnp.inf)
-
-
-def _symmetric_configurations(scene: Scene) -> np.ndarray:
-    """Zero, and right angles (within the domain) in one or two coordinates."""
-    low, high = _bounds(scene, scene.coordinate_names.entries, COORDINATE_DOMAIN)
-    reference = scene.coordinates.reference()
-    attitude = {i + k for i, _ in scene.coordinates.quaternions for k in range(4)}
-    turns = [(i, a) for i in range(len(low)) if i not in attitude for a in (np.pi / 2, -np.pi / 2) if low[i] <= a <= high[i]]
-    pairs = sorted(itertools.combinations(turns, 2), key=lambda pair: pair[0][1] != pair[1][1])  # equal angles first: headings of one axle
-    chosen = [(), *((turn,) for turn in turns), *pairs]
-    configurations = []
-    for turned in chosen[:SYMMETRIC_PROBES]:
-        q = np.where([i in attitude for i in range(len(low))], reference, np.clip(reference, low, high))
-        for i, angle in turned:
-            q[i] = angle
-        configurations.append(q)
-    return np.array(configurations).reshape(-1, len(low))
-
-
 class _Probed(eqx.Module):
     """What is looked at, at one state."""
 
@@ -206,7 +117,7 @@ def _probe(scene, t, q, u, u_other):
             driven=_moves((velocities(scene, t, q, at_rest), nu)),
             varying_inertia=_moves(jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), qdot))[1]),
             potentials_of_inputs=_potentials_of_inputs(scene, t, q, u, inputs),
-            miss=_miss(scene, t, q),
+            miss=miss_of_rows(scene, t, q),
             numbers=pose_numbers(scene, t, q),
         )
 
@@ -264,12 +175,12 @@ def structure_of(scene: Scene) -> Structure:
 def _probed_structure(scene: Scene) -> Structure:
     names = names_of_rows(scene)
     count = len(scene.speed_names)
-    t, q, u = _random_states(scene, RANDOM_PROBES, np.random.default_rng(0))
-    symmetric = _symmetric_configurations(scene)
+    t, q, u = random_states(scene, RANDOM_PROBES, np.random.default_rng(0))
+    symmetric = symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
     found = _probe(scene, t, q, u, -u[::-1])
     generic = np.arange(len(t)) < RANDOM_PROBES
-    on_rows = _assembled(scene, found.miss, generic)
+    on_rows = assembled(scene, found.miss, generic)
     faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
     usable = np.all(np.isfinite(found.A), axis=(1, 2)) & on_rows
     if not faults and not usable.any():

@@ -14,7 +14,8 @@ import numpy as np
 from jourdain_jax.equations.minimal import minimal_accelerations
 from jourdain_jax.equations.probing import concretised, on_numbers
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.equations.structure import Structure, sample_states, structure_of, symmetric_states
+from jourdain_jax.equations.sampling import sample_states, symmetric_states
+from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
 from jourdain_jax.lowering.trace import event_values, named_values, traced_scene

@@ -8,7 +8,6 @@ from jourdain_jax.motion.even_steps import EvenSteps
 from jourdain_jax.motion.fixed_step import FixedStepSolver
 from jourdain_jax.motion.munthe_kaas import MuntheKaas
 from jourdain_jax.motion.state_form import StateForm
-from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 
 
@@ -38,8 +37,6 @@ def check_solver(solver, controller, dt0, land: bool, saveat) -> None:
         )
     if dt0 is None and not isinstance(controller, diffrax.StepTo):
         raise ValueError(f"`{name}` takes steps of one length; give `dt0`, the step in s")
-    if dt0 is not None and not is_traced(dt0) and not 0 < abs(float(dt0)) < float("inf"):
-        raise ValueError(f"`dt0` is {float(dt0):g}, expected the step in s; give a number above zero")
 
 
 def controller_of(solver, controller, ts, t1):

@@ -1,0 +1,104 @@
+"""States of a scene's domain, put on its rows: random ones, and the symmetric configurations (zero and right angles), where partitions that look well
+at random states are singular.
+"""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
+from jourdain_jax.scene.scene import Scene
+
+SYMMETRIC_PROBES = 200
+# Where a scene states no domain: wide enough that an angle meets every direction, so that no partition passes by luck.
+COORDINATE_DOMAIN = (-3.2, 3.2)
+SPEED_DOMAIN = (-1.0, 1.0)
+
+
+def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """At most `count` random admissible states (t, q, u) from the scene's domain, on the rows, each with a leading axis of states.
+
+    `seed`: of the generator. Scene parameters must be concrete. ValueError where no state meets the geometric rows.
+    """
+    if not isinstance(count, int | np.integer) or count < 1:
+        raise ValueError(f"`count` is {count!r}, expected a whole number of states, at least 1")
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
+    drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
+    t, q, u = random_states(scene, drawn, np.random.default_rng(seed))
+    q, u, miss = _projected(scene, t, q, u)
+    good = np.flatnonzero(assembled(scene, miss, np.ones(drawn, bool)))[:count]
+    return t[good], q[good], u[good]
+
+
+def symmetric_states(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States (t, q, u) at the symmetric configurations (zero and right angles), on the rows where those can be met."""
+    configurations = symmetric_configurations(scene)[:32]
+    t, _, u = random_states(scene, 32, np.random.default_rng(2))
+    q, u, miss = _projected(scene, 0.0 * t, np.resize(configurations, (32, configurations.shape[1])), u)
+    good = np.flatnonzero(miss < np.sqrt(np.finfo(miss.dtype).eps))
+    good = good[good < len(configurations)]
+    return t[good], q[good], u[good]
+
+
+def random_states(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States from the domain, not yet on the rows."""
+    q_low, q_high = _bounds(scene, scene.coordinate_names.entries, COORDINATE_DOMAIN)
+    u_low, u_high = _bounds(scene, scene.speed_names.entries, SPEED_DOMAIN)
+    q = generator.uniform(q_low, q_high, (count, len(q_low)))
+    for first, _ in scene.coordinates.quaternions:
+        wxyz = generator.normal(size=(count, 4))
+        q[:, first : first + 4] = wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
+    return generator.uniform(0, 1, count), q, generator.uniform(u_low, u_high, (count, len(u_low)))
+
+
+def assembled(scene: Scene, miss: np.ndarray, generic: np.ndarray) -> np.ndarray:
+    """Which states lie on the geometric rows; a ValueError where no random one does."""
+    good = miss < np.sqrt(np.finfo(miss.dtype).eps)
+    if not good[generic].any():
+        raise ValueError(
+            f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by {np.min(miss[generic]):.1e} or "
+            "more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, "
+            "numbers near their defaults stood in for them, or near one where they have none: give defaults near the values in use)"
+        )
+    return good
+
+
+def _bounds(scene: Scene, names, default) -> tuple[np.ndarray, np.ndarray]:
+    pairs = [scene.domain.get(name, default) for name in names]
+    return np.array([p[0] for p in pairs], float), np.array([p[1] for p in pairs], float)
+
+
+@on_numbers
+def _projected(scene, t, q, u):
+    def one(t, q, u):
+        q = project_positions(scene, t, q)
+        return q, project_speeds(scene, t, q, u), miss_of_rows(scene, t, q)
+
+    return jax.vmap(one)(t, q, u)
+
+
+def miss_of_rows(scene, t, q):
+    """Largest residual of the geometric rows; infinite where it is not a number."""
+    miss = jnp.max(jnp.abs(closure_residual(scene, t, q)), initial=0.0)
+    return jnp.where(jnp.isfinite(miss), miss, jnp.inf)
+
+
+def symmetric_configurations(scene: Scene) -> np.ndarray:
+    """Zero, and right angles (within the domain) in one or two coordinates."""
+    low, high = _bounds(scene, scene.coordinate_names.entries, COORDINATE_DOMAIN)
+    reference = scene.coordinates.reference()
+    attitude = {i + k for i, _ in scene.coordinates.quaternions for k in range(4)}
+    turns = [(i, a) for i in range(len(low)) if i not in attitude for a in (np.pi / 2, -np.pi / 2) if low[i] <= a <= high[i]]
+    pairs = sorted(itertools.combinations(turns, 2), key=lambda pair: pair[0][1] != pair[1][1])  # equal angles first: headings of one axle
+    chosen = [(), *((turn,) for turn in turns), *pairs]
+    configurations = []
+    for turned in chosen[:SYMMETRIC_PROBES]:
+        q = np.where([i in attitude for i in range(len(low))], reference, np.clip(reference, low, high))
+        for i, angle in turned:
+            q[i] = angle
+        configurations.append(q)
+    return np.array(configurations).reshape(-1, len(low))
