@@ -2,8 +2,8 @@
 
     d o_i = sum_j J_ij d x_j          J_ij: nodes that share subexpressions with the program and with one another
 
-The entries are computed once, with the values and in the same loop, however many tangents there are; and reverse mode has to keep no more than
-them. Programs whose Jacobian is large, and those with an operation that has no rule on the graph, are differentiated by JAX.
+The entries are computed once, with the values, however many tangents there are; and reverse mode has to keep no more than them. Programs whose
+Jacobian is large, and those with an operation that has no rule on the graph, are differentiated by JAX.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
     def values_of(nodes, values) -> tuple:
         shape, real = jnp.broadcast_shapes(*map(jnp.shape, values)), jnp.result_type(values[like])
         found = run(graph, nodes, dict(zip(variables, values, strict=True)))
-        return together(tuple(jnp.broadcast_to(jnp.asarray(x, real), shape) for x in found))
+        return tuple(jnp.broadcast_to(jnp.asarray(x, real), shape) for x in found)
 
     def program(*values):
         return values_of(outputs, values)
@@ -47,6 +47,7 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
         used = [(i, j, node) for i, j, node in entries if moving[j]]
         varying = list(dict.fromkeys(node for *_, node in used if not graph.is_const(node)))
         found = values_of([*outputs, *varying], values)
+        found = together(found) if found[0].ndim == 0 else found  # measured: a quarter less time for one motion, a quarter more in batches
         J = dict(zip(varying, found[len(outputs) :], strict=True))
         # d o_i = sum_j J_ij d x_j
         along = [jnp.zeros_like(x) for x in found[: len(outputs)]]
