@@ -59,6 +59,7 @@ def test_outcomes_are_decided_by_the_error_and_by_what_a_method_says():
     assert judged(0.0, 1e-10, "out of steps", stalled=True).outcome == "stalled"
 
 
+@pytest.mark.slow
 def test_the_script_writes_cells_of_both_precisions_a_table_and_a_picture(tmp_path):
     source = Path(jj.__file__).parents[1]
     script = Path(__file__).parents[1] / "bench" / "atlas.py"

@@ -164,6 +164,7 @@ def test_derivatives_of_the_speeds_are_their_central_differences(quantity):
         np.testing.assert_allclose(forward[k], difference, rtol=tolerance("gradient_fd"))
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_a_speed_are_differences_of_the_first():
     parameters = _parameters("Benchmark")
 

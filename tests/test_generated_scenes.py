@@ -1,7 +1,7 @@
 """Generated scenes hold every invariant of mechanics under every reduction: 200 instances in 25 structures, 5,000 behind `-m slow`.
 
 The normal set runs every structure's equations on NumPy, the long one compiles them. Seen from moved frames, in other coordinates, speeds, units and
-orders, which takes most of the time, are every eighth structure in the normal set and all in the long one. A failure names structure, invariant,
+orders, which takes most of the time, are one structure in the normal set and all in the long one. A failure names structure, invariant,
 reduction and seed.
 """
 
@@ -57,7 +57,7 @@ def check(number: int, *, parameters: int, states: int, least: int, seed: int, c
 
 @pytest.mark.parametrize("number", STRUCTURES)
 def test_a_generated_scene_holds_every_invariant(number):
-    check(number, parameters=PARAMETERS, states=STATES, least=LEAST, seed=0, compiled=False, looks=number % 8 == 0)
+    check(number, parameters=PARAMETERS, states=STATES, least=LEAST, seed=0, compiled=False, looks=number == 0)
 
 
 @pytest.mark.slow
@@ -110,7 +110,7 @@ def test_the_scalar_programs_of_all_generated_scenes_are_their_dense_equations()
     assert sum(check_lowered(number) for number in STRUCTURES) >= 12
 
 
-@pytest.mark.parametrize("number", [13, 12])  # a driven swing in its minimal state; beads and rods, projected
+@pytest.mark.parametrize("number", [13, pytest.param(12, marks=pytest.mark.slow)])  # a driven swing in its minimal state; beads and rods, projected
 def test_halving_the_step_divides_the_error_by_two_to_the_order(number):
     scene = generated(recipe(number), 0)
     q, u = scene.reference(), 0.3 * np.cos(np.arange(len(scene.speed_names)))

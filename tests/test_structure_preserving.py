@@ -42,7 +42,7 @@ def order(errors) -> float:
 # Order. ----------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("solver", [MIDPOINT, DLA, GRADIENT], ids=named)
+@pytest.mark.parametrize("solver", [MIDPOINT, DLA, pytest.param(GRADIENT, marks=pytest.mark.slow)], ids=named)
 def test_the_chaplygin_sleigh_is_followed_to_second_order(solver):
     data = chaplygin_sleigh.RUN | {"t_end": 4.0}
     v0, w0, a = data["v0"], data["w0"], data["a"]
@@ -196,7 +196,11 @@ def test_geometric_rows_hold_at_every_node():
 # Derivatives and batches. ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("solver", [MIDPOINT, DLA, pytest.param(GRADIENT, marks=pytest.mark.slow), pytest.param(LIE, marks=pytest.mark.slow)], ids=named)
+@pytest.mark.parametrize(
+    "solver",
+    [MIDPOINT, *(pytest.param(solver, marks=pytest.mark.slow) for solver in (DLA, GRADIENT, LIE))],
+    ids=named,
+)
 def test_derivatives_through_fifty_steps_are_right_in_both_modes(solver):
     if solver is LIE:
         scene, parameter, at = MODELS["free-rigid-body"](), "i2", 2.0
