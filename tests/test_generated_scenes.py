@@ -1,8 +1,8 @@
 """Generated scenes hold every invariant of mechanics under every reduction: 200 instances in 25 structures, 5,000 behind `-m slow`.
 
-The normal set runs every structure's equations on NumPy, the long one compiles them. Seen from moved frames, in other coordinates, speeds, units and
-orders, which takes most of the time, are one structure in the normal set and all in the long one. A failure names structure, invariant,
-reduction and seed.
+The normal set runs every structure's equations on NumPy, the long one compiles them. Views from moved frames and in other
+coordinates, speeds, units and orders take most of the time: the normal set has those of one structure, the long one all. A failure names structure,
+invariant, reduction and seed.
 """
 
 import diffrax
