@@ -6,8 +6,8 @@ coordinate in the tuple `q` and per privileged speed in `v`; all rates of the mi
 
 The engine's privileged speeds are an expert's choice for four of the models. For two they are not:
 
-    skate               x_rate, heading_rate: singular at right angles; `skate_in_all_speeds` (9 operations) and, with the forward
-                        speed as a quasi-velocity, `skate_in_forward_speed` (5) are not
+    skate               none serves at every heading: all three stay (9 operations). `skate_in_x_rate` (8) is singular at right angles;
+                        `skate_in_forward_speed` (5), a quasi-velocity, is not
     chaplygin-sleigh    x_rate, y_rate: needs an offset; with forward speed and turn rate `sleigh_in_blade_speeds` (12) does not
 
 Sources: the docstrings of the models; Wang and Pao (2003), sections V and VI; Neimark and Fufaev (1972), ch. III.
@@ -34,8 +34,8 @@ def two_wheel_axle(parameters, t, q, v, xp=jnp):
     return qdot, (push * c, xp.zeros_like(phi_rate))
 
 
-def skate(parameters, t, q, v, xp=jnp):
-    """The skate in x_rate: `ydot = xdot tan`, `x'' = G cos^2 - headingdot ydot`, G = g sin(slope)."""
+def skate_in_x_rate(parameters, t, q, v, xp=jnp):
+    """The skate in x_rate, singular at right angles: `ydot = xdot tan`, `x'' = G cos^2 - headingdot ydot`, G = g sin(slope)."""
     G = parameters["gravity"] * xp.sin(parameters["slope"])
     x_rate, w = v
     s, c = xp.sin(q[2]), xp.cos(q[2])
@@ -146,7 +146,7 @@ class HandDerived(NamedTuple):
     rates: Callable
     parameters: tuple[str, ...]
     coordinates: tuple[str, ...]
-    speeds: tuple[str, ...]  # the privileged ones
+    speeds: tuple[str, ...]  # the integrated ones
 
 
 def _entry(rates: Callable, parameters: str, coordinates: str, speeds: str) -> HandDerived:
@@ -159,7 +159,7 @@ _BALL = "radius inertia_ratio turn_rate tilt gravity", "x y attitude_w attitude_
 
 HAND_DERIVED = {
     "two-wheel-axle-coordinates": _entry(two_wheel_axle, "radius length mass rim_mass slope gravity", "x1 y1 psi1 x2 y2 psi2 phi", "psi1_rate phi_rate"),
-    "skate": _entry(skate, *_SKATE, "x_rate heading_rate"),
+    "skate": _entry(skate_in_all_speeds, *_SKATE, "x_rate y_rate heading_rate"),
     "chaplygin-sleigh": _entry(chaplygin_sleigh, *_SLEIGH, "x_rate y_rate"),
     "vertical-disc": _entry(vertical_disc, "radius", "x y heading roll", "heading_rate roll_rate"),
     "tilting-disc": _entry(tilting_disc, "radius gravity", "x y yaw lean spin", "yaw_rate lean_rate spin_rate"),
@@ -168,7 +168,7 @@ HAND_DERIVED = {
 
 # The same models in speeds that an expert would rather take.
 ALTERNATIVES = {
-    "skate, all speeds": _entry(skate_in_all_speeds, *_SKATE, "x_rate y_rate heading_rate"),
+    "skate, x_rate": _entry(skate_in_x_rate, *_SKATE, "x_rate heading_rate"),
     "skate, forward speed": _entry(skate_in_forward_speed, *_SKATE, "forward heading_rate"),
     "chaplygin-sleigh, blade speeds": _entry(sleigh_in_blade_speeds, *_SLEIGH, "forward heading_rate"),
 }

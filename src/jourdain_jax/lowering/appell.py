@@ -5,6 +5,7 @@
     M = sum m beta' beta + gamma' I gamma,   f = sum beta' (F - m a_0) + gamma' (L - I alpha_0 - omega x I omega) + Q_direct
     M ydot = f                                                                                             (41), (50), (56)
 
+Rows that are not eliminated are kept by multipliers instead (`multipliers.py`).
 Two ways lead there. *Explicit*: z, as an expression in (q, y), is put into the velocities before they are differentiated; best where z is
 simple. *Implicit*: speeds are differentiated as they stand, and the rates of z come from the rates of the rows; best where z is not.
 """
@@ -15,10 +16,13 @@ import numpy as np
 
 from jourdain_jax.equations.structure import Structure
 from jourdain_jax.lowering.elimination import eliminate, solve_symmetric
+from jourdain_jax.lowering.multipliers import accelerations_by_multipliers, projected_coordinates, projected_speeds
 from jourdain_jax.lowering.trace import TracedScene, VelocityQuantities
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
+
+SMALL_SINE = 0.02  # of the angle between rows: where it is smaller at some probe, the program watches it at every evaluation
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,7 @@ class Strategy:
     @property
     def description(self) -> str:
         """In words."""
-        way = "dependent speeds put in before differentiation" if self.explicit else "rows differentiated through the bodies' velocities"
+        way = "speeds put in before differentiation" if self.explicit else "rows differentiated through the bodies' velocities"
         solved = "accelerations by determinants in normal form" if self.by_determinants else "accelerations by elimination"
         return f"{way}, {solved}"
 
@@ -56,14 +60,25 @@ class Equations:
     events: list[int] = field(default_factory=list)  # values of the stop events
 
 
+@dataclass
+class Projection:
+    """Nodes of the state after it was put back onto the rows."""
+
+    q: list[int]
+    u: list[int]  # none where rows are eliminated
+
+
 class AppellOnGraph:
     """The construction for one scene."""
 
-    def __init__(self, traced: TracedScene, structure: Structure, probes: Probes, reference: np.ndarray, quaternions: tuple[int, ...]):
+    def __init__(
+        self, traced: TracedScene, structure: Structure, by_multipliers: bool, probes: Probes, reference: np.ndarray, quaternions: tuple[int, ...]
+    ):
         self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
-        self.independent = list(structure.independent)
-        self.dependent = [k for k in range(len(traced.u)) if k not in structure.independent]
-        self.rows = [s for s, name in enumerate(structure.row_names) if name not in structure.redundant_rows]
+        every, rows = range(len(traced.u)), [s for s, name in enumerate(structure.row_names) if name not in structure.redundant_rows]
+        self.independent = list(every) if by_multipliers else list(structure.independent)
+        self.dependent = [k for k in every if k not in self.independent]
+        self.rows, self.multiplied = ([], rows) if by_multipliers else (rows, [])
         self.reference, self.quaternions = reference, quaternions
 
     def build(self, strategy: Strategy) -> Equations:
@@ -73,9 +88,14 @@ class AppellOnGraph:
         kinematics = _Kinematics(self, forms, held, strategy.explicit, strategy.free_z)
         forms_of_equations = self._forms(strategy.keep_sines, strategy.most_terms_of_equations)
         M, f = self._equations(kinematics, forms_of_equations)
-        ydot = self._solved(M, f, forms_of_equations if strategy.by_determinants else None)
+        if self.multiplied:
+            A, drift = kinematics.rows_along_motion(self.multiplied)
+            ydot, sines, margins = accelerations_by_multipliers(self.graph, M, f, A, drift, forms)
+        else:
+            ydot, sines, margins = self._solved(M, f, forms_of_equations if strategy.by_determinants else None), [], []
         z, qdot, pivots = self._true_rates(kinematics, forms) if held else (kinematics.z, kinematics.qdot, [])
         guards = {node for made in (forms, forms_of_equations) if made is not None for node in made.guards}
+        guards |= {margin for sine, margin in zip(sines, margins, strict=True) if self._may_vanish(sine)}
         power = self._power(kinematics, ydot)
         if strategy.free_z:
             *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
@@ -87,7 +107,26 @@ class AppellOnGraph:
         elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
             power = power if np.allclose(*self.probes([power, true_power]), rtol=1e-9, atol=1e-9) else true_power
-        return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots])), sorted(guards), power, events)
+        return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots, *sines])), sorted(guards), power, events)
+
+    def projection(self, most_terms: int) -> "Projection":
+        """Nodes of the state put back onto quaternion norms and geometric rows, and (where rows are kept by multipliers) onto velocity rows."""
+        g, at, q = self.graph, self.traced.at, self.traced.q.tolist()
+        redundant = {s for s in range(len(at.closure)) if s not in self.rows and s not in self.multiplied}
+        closure = [int(n) for s, n in enumerate(at.closure) if s not in redundant]
+        norms = [g.total(g.mul(n, n) for n in q[first : first + 4]) for first in self.quaternions]
+        moved = list(q)
+        if closure:
+            moved = projected_coordinates(g, q, [*closure, *(g.mul(g.const(0.5), g.sub(n, g.one)) for n in norms)])
+        else:
+            for first, n in zip(self.quaternions, norms, strict=True):
+                moved[first : first + 4] = [g.div(part, g.call("sqrt", n)) for part in q[first : first + 4]]
+        if not self.multiplied:
+            return Projection(moved, [])
+        forms = self._forms(False, most_terms)
+        M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
+        phi = [int(at.phi[s]) for s in self.multiplied]
+        return Projection(moved, projected_speeds(g, M, self.traced.u.tolist(), phi, forms))
 
     def _not_needed(self, held: dict[int, int]) -> dict[int, int]:
         """The held coordinates on whose value no dependent speed and no rate depends, at any probe."""
@@ -99,6 +138,11 @@ class AppellOnGraph:
             return np.allclose(there, here, rtol=1e-9, atol=1e-9, equal_nan=True)
 
         return {n: value for n, value in held.items() if unchanged(n, value)}
+
+    def _may_vanish(self, pivot: int) -> bool:
+        """Whether a pivot is small or not a number at some probe."""
+        values = self.probes([pivot])[0]
+        return not bool(np.min(values) > SMALL_SINE)
 
     def _power(self, k: "_Kinematics", ydot: list[int]) -> int:
         """Power of loads without a potential and of potentials in time, and `(A' lambda).u` where rows are not homogeneous.
@@ -131,7 +175,7 @@ class AppellOnGraph:
                 return forms.cramer(M, f)
             except TooLarge:
                 pass
-        return solve_symmetric(self.graph, M, f, self.probes)
+        return solve_symmetric(self.graph, M, [f]).solution[0]
 
     def _true_rates(self, kinematics: "_Kinematics", forms) -> tuple[list[int], list[int], list[int]]:
         """Dependent speeds and rates at the true coordinates: those that do not depend on held ones are taken over, the others follow."""
@@ -183,10 +227,11 @@ class AppellOnGraph:
             force = [g.sub(F, g.mul(mass, a)) for F, a in zip(at.force[b].tolist(), k.a0[b], strict=True)]
             turning = [g.dot(row, k.alpha0[b]) for row in inertia[b]]
             torque = [g.sub(L, g.add(i, w)) for L, i, w in zip(at.torque[b].tolist(), turning, gyroscopic, strict=True)]
-            for i in freedoms:
+            moving = [i for i in freedoms if any(n != g.zero for n in (*beta[i], *gamma[i]))]
+            for i in moving:
                 f[i] = g.total([f[i], g.dot(beta[i], force), g.dot(gamma[i], torque)])
                 turned = [g.dot(row, gamma[i]) for row in inertia[b]]
-                for j in range(i + 1):
+                for j in moving[: moving.index(i) + 1]:
                     M[i][j] = g.total([M[i][j], g.mul(mass, g.dot(beta[i], beta[j])), g.dot(gamma[j], turned)])
         for i in freedoms:
             f[i] = simple(f[i])
@@ -273,6 +318,13 @@ class _Kinematics:
         self.B, self.b = [row[:-1] for row in solution], [row[-1] for row in solution]
         self.z = self._simple([g.add(g.dot(B, self.y), b) for B, b in zip(self.B, self.b, strict=True)])
         self.known = dict(zip([self.u[d] for d in build.dependent], self.z, strict=True))
+
+    def rows_along_motion(self, rows: list[int]) -> tuple[list[list[int]], list[int]]:
+        """Jacobian in the speeds and drift of some rows, at the held coordinates."""
+        raw = [int(self.build.traced.at.phi[s]) for s in rows]
+        simple = self._at(raw)
+        columns = [self._simple(column) for column in self._by(simple, self.u)]
+        return [list(row) for row in zip(*columns, strict=True)], self._along(simple, raw, self.qdot)
 
     # helpers
 

@@ -4,6 +4,7 @@ A pivot that is a number or depends on parameters alone cannot vanish on the way
 value they take, relative to their row, at all probes. Among good pivots the one that fills in least is taken.
 """
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 
 GOOD = 0.02  # of a pivot, relative to its row, at the worst probe
+FEW = 12  # equations: with more, the operations that lead to a pivot are not counted when it is chosen
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ def eliminate(graph: Graph, A: list[list[int]], right: list[list[int]], probes: 
             if A[other][c] == graph.zero:
                 continue
             factor = graph.mul(A[other][c], inverse)
-            for k in columns:
+            for k in (k for k in columns if A[r][k] != graph.zero):
                 A[other][k] = graph.sub(A[other][k], graph.mul(factor, A[r][k]))
             right[other] = [graph.sub(a, graph.mul(factor, b)) for a, b in zip(right[other], right[r], strict=True)]
     solution: dict[int, list[int]] = {}
@@ -58,42 +60,56 @@ def _best(graph: Graph, A, rows: set[int], columns: set[int], probes: Probes) ->
     places = [(r, c) for r in sorted(rows) for c in sorted(columns) if A[r][c] != graph.zero]
     if not places:
         raise ZeroDivisionError("the rows are dependent")
-    values = dict(zip(places, np.abs(probes(A[r][c] for r, c in places)), strict=True))
-    largest = {r: np.max([v for (s, _), v in values.items() if s == r], axis=0) for r in {r for r, _ in places}}
+    nodes = [A[r][c] for r, c in places]
+    in_row, in_column = Counter(r for r, _ in places), Counter(c for _, c in places)
+    values = np.abs(probes(nodes))
+    starts = np.flatnonzero([k == 0 or places[k][0] != places[k - 1][0] for k in range(len(places))])  # places come row by row
+    largest = np.repeat(np.maximum.reduceat(values, starts), np.diff([*starts, len(places)]), axis=0)
+    with np.errstate(all="ignore"):
+        ratio = values / np.where(largest > 0, largest, 1.0)
+    worst = np.min(np.where(np.isfinite(ratio), ratio, 0.0), axis=1)
+    fixed = [not graph.varies[n] and w > 0 for n, w in zip(nodes, worst, strict=True)]
+    good = [k for k in range(len(places)) if fixed[k] or worst[k] > GOOD]
+    if not good:
+        return places[int(np.argmax(worst))]
 
-    def cost(place):
-        r, c = place
-        with np.errstate(all="ignore"):
-            ratio = values[place] / np.where(largest[r] > 0, largest[r], 1.0)
-        worst = np.min(np.where(np.isfinite(ratio), ratio, 0.0))
-        fill = (sum(A[r][k] != graph.zero for k in columns) - 1) * (sum(A[k][c] != graph.zero for k in rows) - 1)
-        fixed = not graph.varies[A[r][c]] and worst > 0
-        return (0, fill, not fixed, graph.operations([A[r][c]]), -worst) if fixed or worst > GOOD else (1, -worst)
+    def cost(k):
+        r, c = places[k]
+        fill = (in_row[r] - 1) * (in_column[c] - 1)
+        return fill, not fixed[k], graph.operations([nodes[k]]) if len(rows) <= FEW else 0, -worst[k]
 
-    return min(places, key=cost)
+    return places[min(good, key=cost)]
 
 
-def solve_symmetric(graph: Graph, M: list[list[int]], right: list[int], probes: Probes) -> list[int]:
-    """`M^-1 right` for a symmetric positive definite M, as L D L'."""
-    count = len(right)
-    S, b = [list(row) for row in M], list(right)
+def solve_symmetric(graph: Graph, M: list[list[int]], right: list[list[int]]) -> Eliminated:
+    """`M^-1 right` for a symmetric positive definite M, as L D L'; `right` holds columns, and so does the solution. The pivots are D."""
+    count = len(M)
+    S, columns = [list(row) for row in M], [list(column) for column in right]
     left = set(range(count))
     order: list[int] = []
-    factors: dict[tuple[int, int], int] = {}
+    factors: dict[int, dict[int, int]] = {}  # column of L by pivot
+
+    def cost(k):
+        fill = sum(S[k][j] != graph.zero for j in left)
+        return fill, graph.varies[S[k][k]], graph.operations([S[k][k]]) if count <= FEW else 0
+
     while left:
-        pivot = min(left, key=lambda k: (sum(S[k][j] != graph.zero for j in left), graph.varies[S[k][k]], graph.operations([S[k][k]])))
+        pivot = min(left, key=cost)
         left.remove(pivot)
         order.append(pivot)
-        for i in sorted(left):
-            if S[i][pivot] == graph.zero:
-                continue
-            factor = factors[i, pivot] = quotient(graph, S[i][pivot], S[pivot][pivot])
-            for j in sorted(left):
-                if j <= i and S[j][pivot] != graph.zero:
-                    S[i][j] = S[j][i] = graph.sub(S[i][j], graph.mul(factor, S[j][pivot]))
-            b[i] = graph.sub(b[i], graph.mul(factor, b[pivot]))
-    x: dict[int, int] = {}
-    for pivot in reversed(order):
-        known = graph.total(graph.mul(factors[i, pivot], x[i]) for i in x if (i, pivot) in factors)
-        x[pivot] = graph.sub(quotient(graph, b[pivot], S[pivot][pivot]), known)
-    return [x[k] for k in range(count)]
+        below = [i for i in sorted(left) if S[i][pivot] != graph.zero]
+        factors[pivot] = {i: quotient(graph, S[i][pivot], S[pivot][pivot]) for i in below}
+        for i in below:
+            for j in below:
+                if j <= i:
+                    S[i][j] = S[j][i] = graph.sub(S[i][j], graph.mul(factors[pivot][i], S[j][pivot]))
+            for b in columns:
+                b[i] = graph.sub(b[i], graph.mul(factors[pivot][i], b[pivot]))
+    solution = []
+    for b in columns:
+        x: dict[int, int] = {}
+        for pivot in reversed(order):
+            known = graph.total(graph.mul(factor, x[i]) for i, factor in factors[pivot].items())
+            x[pivot] = graph.sub(quotient(graph, b[pivot], S[pivot][pivot]), known)
+        solution.append([x[k] for k in range(count)])
+    return Eliminated(solution, [S[k][k] for k in range(count)])

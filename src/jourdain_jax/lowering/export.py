@@ -13,14 +13,22 @@ def summary(lowered) -> str:
     lines = [
         f"Lowered equations of {lowered.scene_name}: {lowered.operations} operations for {len(lowered.qdot)} rates and {len(lowered.ydot)} accelerations",
         *(f"  {stage.operations:6d} operations: {stage.name}" for stage in lowered.stages),
-        f"  privileged speeds: {', '.join(lowered.speeds[i] for i in lowered.independent) or 'none'}",
-        f"  dependent speeds, eliminated: {', '.join(lowered.speeds[i] for i in lowered.dependent) or 'none'}",
+        *_speeds(lowered),
         f"  left out of the accelerations, which do not depend on them: {fewer or 'nothing'}",
         f"  computed once per motion, from parameters alone: {len(lowered.fixed)} numbers",
         f"  pivots that are watched: {len(lowered.pivots)}; signs that are relied on: {len(lowered.guards)}",
         f"  way: {lowered.way}; {lowered.seconds:.2f} s",
     ]
     return "\n".join(lines)
+
+
+def _speeds(lowered) -> list[str]:
+    if lowered.projected_u:
+        return [f"  speeds, all integrated, with rows kept by multipliers: {', '.join(lowered.speeds)}"]
+    return [
+        f"  privileged speeds: {', '.join(lowered.speeds[i] for i in lowered.independent) or 'none'}",
+        f"  dependent speeds, eliminated: {', '.join(lowered.speeds[i] for i in lowered.dependent) or 'none'}",
+    ]
 
 
 def identifiers(lowered) -> dict[int, str]:

@@ -11,9 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.equations.accelerations import bare_accelerations
+from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations
 from jourdain_jax.equations.probing import concretised, on_numbers
-from jourdain_jax.equations.reductions import SMALLEST_PIVOT
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT, NullSpaceQR
 from jourdain_jax.equations.sampling import sample_states, symmetric_states
 from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
@@ -35,18 +37,26 @@ class NotLowered(Exception):
     """Why a scene is not lowered."""
 
 
-def lowered(scene: Scene) -> Lowered | NotLowered:
-    """The lowered equations of the scene's class, or the reason why there are none. Built once per class, shapes and privileged speeds."""
-    return _lowered(_Key(concretised(scene), structure_of(scene)))
+def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLowered:
+    """The lowered equations of the scene's class, or the reason why there are none. Built once per class, shapes and privileged speeds.
+
+    `every_speed`: all speeds stay in the state, rows are kept by multipliers; default: where no privileged speeds serve everywhere.
+    """
+    structure = structure_of(scene)
+    every_speed = not (structure.affine and structure.well_conditioned) if every_speed is None else every_speed
+    return _lowered(_Key(concretised(scene), structure, every_speed or not structure.row_names))
 
 
-def lower(scene: Scene) -> Lowered:
+def lower(scene: Scene, every_speed: bool | None = None) -> Lowered:
     """The lowered equations of `scene`'s class: the scalar program that `simulate` and `rollout` integrate. Raises `NotLowered` with the reason.
 
     print(jj.lower(disc))                     operations after each step, what was dropped and why
     print(jj.lower(disc).python_source())     the equations, readable; also c_source(), expressions() and latex() (SymPy)
+
+    `every_speed`: whether all speeds stay in the state and the rows are kept by multipliers (True), or dependent speeds are eliminated (False);
+    default: the latter where privileged speeds serve everywhere in the scene's domain.
     """
-    found = lowered(scene)
+    found = lowered(scene, every_speed)
     if isinstance(found, NotLowered):
         raise NotLowered(f"`{type(scene).__name__}` is not lowered: {found}") from None
     return found
@@ -55,10 +65,10 @@ def lower(scene: Scene) -> Lowered:
 class _Key:
     """What the program depends on: not on the values of parameters."""
 
-    def __init__(self, scene: Scene, structure: Structure):
-        self.scene, self.structure = scene, structure
+    def __init__(self, scene: Scene, structure: Structure, every_speed: bool):
+        self.scene, self.structure, self.every_speed = scene, structure, every_speed
         leaves, treedef = jax.tree.flatten(scene)
-        kept = (structure.independent, structure.redundant_rows, structure.affine, structure.well_conditioned, structure.driven)
+        kept = (every_speed, None if every_speed else structure.independent, structure.redundant_rows, structure.affine, structure.driven)
         kept += (structure.homogeneous, structure.potentials_of_inputs)
         self.key = (treedef, tuple(np.shape(x) for x in leaves), kept, jnp.result_type(float))
 
@@ -80,14 +90,13 @@ def _lowered(key: _Key) -> Lowered | NotLowered:
 def _built(key: _Key) -> Lowered:
     begin = time.perf_counter()
     scene, structure = key.scene, key.structure
-    if not structure.affine:
+    if not (structure.affine or key.every_speed):
         raise NotLowered("its rows are nonlinear in the speeds")
-    if not structure.well_conditioned:
-        raise NotLowered("no privileged speeds serve everywhere in its domain")
     try:
         traced = traced_scene(scene, structure.potentials_of_inputs)
         probes = _probes(scene, traced.graph)
-        builder = AppellOnGraph(traced, structure, probes, scene.coordinates.reference(), tuple(first for first, _ in scene.coordinates.quaternions))
+        quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
+        builder = AppellOnGraph(traced, structure, key.every_speed, probes, scene.coordinates.reference(), quaternions)
         return _best(scene, structure, builder, begin)
     except Unsupported as reason:
         raise NotLowered(f"{reason} has no scalar form") from None
@@ -108,27 +117,29 @@ def _probes(scene: Scene, graph) -> Probes:
 
 def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: float) -> Lowered:
     graph, probes = builder.graph, builder.probes
-    plain = {explicit: builder.build(Strategy(explicit)) for explicit in (False, True)}
+    plain = {explicit: builder.build(Strategy(explicit)) for explicit in ((False, True) if builder.dependent else (True,))}
     counts = {explicit: graph.operations(_rates(found)) for explicit, found in plain.items()}
-    best, fewest, way = plain[False], counts[False], Strategy(False)
+    first = min(plain)
+    best, fewest, way = plain[first], counts[first], Strategy(first)
     if fewest > MOST_OPERATIONS:
         raise NotLowered(f"its scalar program has {fewest} operations, more than {MOST_OPERATIONS}")
     expected = _values(best, probes)
-    _check_against_dense(scene, structure, probes, best, expected)
+    _check_against_dense(scene, builder, best, expected)
     held = _ignorable(scene, builder, best, expected)
     stages = [Stage("scalar program: structural zeros and ones removed, repeated parts shared", fewest)]
-    plainly_held = graph.operations(_rates(builder.build(Strategy(False, held=held))))
+    plainly_held = graph.operations(_rates(builder.build(Strategy(first, held=held)))) if held else fewest
     stages.append(Stage("ignorable coordinates held in the accelerations", plainly_held))
-    for strategy in _strategies(held, plainly_held < SMALL, counts[True] / counts[False]):
+    for strategy in _strategies(held, plainly_held < SMALL, counts[True] / counts[False] if builder.dependent else None):
         candidate = builder.build(strategy)
         count = graph.operations(graph.with_quotients(_rates(candidate)))
         if count < fewest and _agree(_values(candidate, probes), expected):
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
-    groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power], best.events]
+    put_back = builder.projection(MOST_TERMS if fewest < SMALL else 0)
+    groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power], best.events, put_back.q, put_back.u]
     outputs = graph.with_quotients([n for group in groups for n in group])
     ends = np.cumsum([len(group) for group in groups])
-    qdot, ydot, z, pivots, guards, power, events = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
+    qdot, ydot, z, pivots, guards, power, events, put_q, put_u = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
     names = scene.coordinate_names.entries
     return Lowered(
         traced=builder.traced,
@@ -137,7 +148,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         coordinates=names,
         speeds=scene.speed_names.entries,
         inputs=scene.inputs.entries,
-        independent=structure.independent,
+        independent=tuple(builder.independent),
         dependent=tuple(builder.dependent),
         qdot=qdot,
         ydot=ydot,
@@ -147,6 +158,8 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         guards=guards,
         power=None if structure.driven else power[0],
         events=events,
+        projected_q=put_q,
+        projected_u=put_u,
         held=tuple(names[i] for i in held),
         stages=tuple(stages),
         way=way.description,
@@ -155,8 +168,9 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     )
 
 
-def _check_against_dense(scene: Scene, structure: Structure, probes: Probes, found: Equations, values: np.ndarray) -> None:
+def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations, values: np.ndarray) -> None:
     """The scalar program against JAX's own derivatives and a dense solution, at the probes; the reason, with a name, where they differ."""
+    probes, independent = builder.probes, tuple(builder.independent)
     leaves, treedef = jax.tree.flatten(scene)
     columns = [[probes.inputs[f"p{k}_{i}"] for i in range(np.size(leaf))] for k, leaf in enumerate(leaves)]
     values_of = [np.stack(c, -1) if c else np.zeros((probes.count, 0)) for c in columns]  # a parameter may have no entries
@@ -164,9 +178,9 @@ def _check_against_dense(scene: Scene, structure: Structure, probes: Probes, fou
     t = np.broadcast_to(probes.inputs["t_0"], probes.count)
     sizes = (len(scene.coordinate_names), len(scene.speed_names), len(scene.inputs))
     q, u, inputs = (np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0)) for p, n in zip("qui", sizes, strict=True))
-    *dense, dense_events = _dense_rates(structure.independent)(parameters, t, q, u, inputs)
+    *dense, dense_events = _dense_rates(independent, bool(builder.dependent))(parameters, t, q, u, inputs)
     expected = np.concatenate(dense, axis=1).T
-    names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in structure.independent)]
+    names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in independent)]
     usable = np.all(np.isfinite(values), axis=0) & np.all(np.isfinite(expected), axis=0)
     size = 1 + np.max(np.abs(expected[:, usable]), axis=0, initial=0.0)
     error = np.max(np.abs(values - expected)[:, usable] / size, axis=1, initial=0.0)
@@ -180,11 +194,14 @@ def _check_against_dense(scene: Scene, structure: Structure, probes: Probes, fou
 
 
 @lru_cache(maxsize=64)
-def _dense_rates(independent: tuple[int, ...]):
+def _dense_rates(independent: tuple[int, ...], eliminates: bool):
     """`(scene, t, q, u, inputs) -> qdot, ydot, event values` by dense matrices, for many states and parameters, uncompiled."""
 
     def one(scene, t, q, y, inputs):
-        _, motion, found = minimal_accelerations(scene, independent, t, q, y, inputs)
+        if eliminates:
+            _, motion, found = minimal_accelerations(scene, independent, t, q, y, inputs)
+        else:
+            motion, found = motion_at(scene, t, q, y, inputs), bare_accelerations(scene, t, q, y, inputs, reduction=NullSpaceQR())
         return motion.qdot.array, found.udot[np.array(independent, int)], event_values(scene, motion)
 
     return on_numbers(lambda scene, t, q, u, inputs: jax.vmap(one)(scene, t, q, u[:, np.array(independent, int)], inputs))
@@ -194,8 +211,12 @@ def _rates(found: Equations) -> list[int]:
     return [*found.qdot, *found.ydot]
 
 
-def _strategies(held: tuple[int, ...], small: bool, explicit_to_implicit: float) -> Iterator[Strategy]:
-    """Ways worth trying: more of them where the program is small."""
+def _strategies(held: tuple[int, ...], small: bool, explicit_to_implicit: float | None) -> Iterator[Strategy]:
+    """Ways worth trying: more of them where the program is small; there is one way only where no speed is eliminated."""
+    if explicit_to_implicit is None:
+        for keep_sines, terms in itertools.product((False, True) if small else (False,), (MOST_TERMS, 0) if small else (0,)):
+            yield Strategy(True, keep_sines, MOST_TERMS, terms, terms > 0, False, held)
+        return
     if small:
         for keep_sines, by_determinants, free_z in itertools.product((False, True), repeat=3):
             yield Strategy(False, keep_sines, MOST_TERMS, MOST_TERMS, by_determinants, free_z, held)

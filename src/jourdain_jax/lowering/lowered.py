@@ -27,7 +27,7 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class Lowered:
-    """Rates of the minimal state (q, y) of one class of scenes as a scalar program; parameters are inputs of it.
+    """Rates of the minimal state (q, y), or of the full one (y = u), of one class of scenes as a scalar program; parameters are inputs of it.
 
     Compared by identity, so that it can be a static argument of compiled functions.
     """
@@ -48,6 +48,8 @@ class Lowered:
     guards: tuple[int, ...]  # must stay positive
     power: int | None  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated); None where poses are driven
     events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
+    projected_q: tuple[int, ...]  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
+    projected_u: tuple[int, ...]  # all speeds put back onto the rows; none where dependent speeds are eliminated
     held: tuple[str, ...]  # ignorable coordinates, set to the reference in the accelerations
     stages: tuple[Stage, ...]
     way: str  # which way of building it took fewest operations
@@ -143,6 +145,22 @@ class Lowered:
             ratio = jax.lax.stop_gradient(value) / size
             pivot = jnp.sign(pivot) * jnp.sign(ratio) * jnp.minimum(jnp.abs(pivot), jnp.abs(ratio))
         return u, pivot
+
+    def projected(self, fixed, t, q: Sequence, y: Sequence, inputs, affine: bool) -> tuple[tuple, tuple]:
+        """Coordinates and integrated speeds put back onto the rows; `affine`: rows are, so that one step is exact for the speeds.
+
+        `fixed`, `q`, `y`, `inputs`: as in `rates`.
+        """
+        real = jnp.result_type(*q)
+
+        def step(nodes, q, y):
+            return tuple(jnp.broadcast_to(jnp.asarray(x, real), jnp.shape(q[0])) for x in run(self.graph, nodes, self._known(fixed, t, q, y, inputs)))
+
+        # twice: what a step of integration leaves is small, and its square is round-off
+        q = jax.lax.scan(lambda q, _: (step(self.projected_q, q, y), None), tuple(q), length=2)[0]
+        if not self.projected_u:
+            return q, tuple(y)
+        return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), tuple(y), length=1 if affine else 2)[0]
 
     def event_values(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "events *lanes"]:
         """Values of the stop events, sorted by name.

@@ -1,6 +1,7 @@
 """A scene at the level of velocities, traced to a graph of scalars: what Jourdain's principle needs, before any derivative is taken.
 
 v, omega (body axes), phi, qdot      of (t, q, u)
+g                                    geometric rows at the level of positions
 F, L (body axes), Q_direct, power    impressed forces
 m, I                                 inertias
 c                                    stop events
@@ -17,7 +18,7 @@ from jaxtyping import Array, Float, Num
 
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, velocities_of
 from jourdain_jax.equations.power import explicit_power
-from jourdain_jax.equations.rows import flatten_rows, velocity_rows
+from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import impressed
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.interpret import Nodes, Unsupported, as_nodes, interpret
@@ -39,6 +40,7 @@ class VelocityQuantities(eqx.Module):
     mass: Num[Entries, "bodies"]
     inertia: Num[Entries, "bodies 3 3"]
     phi: Num[Entries, "rows"]
+    closure: Num[Entries, "geometric_rows"]
     qdot: Num[Entries, "coordinates"]
     force: Num[Entries, "bodies 3"]
     torque: Num[Entries, "bodies 3"]  # body axes
@@ -60,6 +62,7 @@ def velocity_quantities(scene: Scene, t, q, u, inputs, of_inputs: tuple[int, ...
         weights.mass,
         weights.inertia,
         flatten_rows(velocity_rows(scene, motion), q.dtype),
+        flatten_rows(position_rows(scene, motion.pose()), q.dtype),
         motion.qdot.array,
         loads.force,
         loads.torque,

@@ -98,7 +98,7 @@ def integrate_lanes(setups: Setup) -> Trajectory:
     begun = eqx.filter_vmap(_begin)(setups)
     program = setups.form.lowered
     if setups.options.lean and program is not None:
-        solved = in_blocks(_lanes_by_lean_loop, width(program, setups.form.projects_positions), setups, begun)
+        solved = in_blocks(_lanes_by_lean_loop, width(program), setups, begun)
     else:
         solved = eqx.filter_vmap(_solved)(setups, begun)
     return eqx.filter_vmap(_finish)(setups, begun, solved)
@@ -187,7 +187,7 @@ def _lanes_by_lean_loop(setups: Setup, begun: Begun) -> Solved:
     moving = form.projects_positions or form.projects_speeds
     events = _events_of_lanes if options.event_names else None
     y0, ts = _lanes_last((begun.y0, setups.ts))
-    solved = _lean(setups, y0, begun.args, ts, _rates_of_lanes, _lane_by_lane(_project) if moving else None, events)
+    solved = _lean(setups, y0, begun.args, ts, _rates_of_lanes, _project_of_lanes if moving else None, events)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solved)
 
 
@@ -321,8 +321,13 @@ def _rates(t, y, args):
 
 @eqx.filter_jit  # traced once, not once per stage and derivative
 def _project(t, y, args):
-    form, scene, inputs, _ = args
-    return form.project(scene, t, y, inputs(t))
+    form, scene, inputs, fixed = args
+    return form.project(scene, fixed, t, y, inputs(t))
+
+
+def _project_of_lanes(t, y, args):
+    form, scene, inputs, fixed = args
+    return form.project(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
 
 
 @eqx.filter_jit

@@ -32,9 +32,9 @@ def in_blocks(function: Callable, lanes_at_once: int, *trees: PyTree) -> PyTree:
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
 
 
-def width(program: Lowered, projected: bool) -> int:
+def width(program: Lowered) -> int:
     """How many lanes of a lowered scene run in lockstep."""
-    small = not projected and program.operations <= LARGEST_PROGRAM
+    small = program.operations <= LARGEST_PROGRAM
     return TOGETHER if small and loops_are_single_functions() else 2**30
 
 

@@ -16,7 +16,7 @@ from jourdain_jax.equations.probing import standing_in
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.motion import results
 from jourdain_jax.motion.integration import integrate_lanes
-from jourdain_jax.motion.simulate import lost_codes, set_up, state_form
+from jourdain_jax.motion.simulate import lost_codes, may_be_another_form, set_up, state_form
 from jourdain_jax.motion.solver_choice import may_be_full
 from jourdain_jax.motion.span import check_span, saved_times
 from jourdain_jax.motion.start import State
@@ -173,11 +173,11 @@ def _sound_lane(scene: Scene, parameters: dict) -> Scene:
 
 def _lost(scene: Scene, lanes: Trajectory, options: dict) -> np.ndarray:
     """Lanes that another form of the state may bring to their end."""
-    if options.get("state", "auto") != "auto" or not may_be_full(options.get("solver")):
-        return np.zeros(0, int)
-    how = {name: options[name] for name in ("reduction", "stabilisation", "projection", "work", "lowering") if name in options}
+    how = {name: options[name] for name in ("state", "reduction", "stabilisation", "projection", "work", "lowering") if name in options}
     form = state_form(scene, structure_of(scene), **how)
-    return np.flatnonzero(np.isin(lanes.result, lost_codes(form))) if form.name == "minimal" else np.zeros(0, int)
+    if options.get("state", "auto") not in may_be_another_form(form) or not may_be_full(options.get("solver")):
+        return np.zeros(0, int)
+    return np.flatnonzero(np.isin(lanes.result, lost_codes(form)))
 
 
 def _round_up(count: int) -> int:

@@ -94,8 +94,8 @@ def simulate(
     setup = _set_up(**locals())
     motion = integrate(setup)
     known = not isinstance(motion.result, jax.core.Tracer)
-    if state == "auto" and may_be_full(solver) and known and int(motion.result) in lost_codes(setup.form):
-        # the motion left the domain in which the partition was found to serve
+    if state in may_be_another_form(setup.form) and may_be_full(solver) and known and int(motion.result) in lost_codes(setup.form):
+        # the motion left the domain in which the partition, or the program, was found to serve
         form = state_form(setup.scene, structure_of(setup.scene), "full", reduction, stabilisation, projection, work, lowering=False)
         motion = integrate(dataclasses.replace(setup, form=fitted(solver, setup.scene, form, "full")))
     return motion
@@ -185,10 +185,11 @@ def state_form(scene: Scene, structure: Structure, state="auto", reduction=None,
     minimal = state == "minimal" or (state == "auto" and structure.affine and structure.well_conditioned)
     independent = structure.independent if minimal else None
     with_work = work and needs_work(scene, structure)
-    plain = minimal and lowering and reduction is None and stabilisation is None and not (with_work and (structure.driven or structure.varying_inertia))
-    program = lowered(scene) if plain else None
+    plain = lowering and reduction is None and stabilisation is None and not (with_work and (structure.driven or structure.varying_inertia))
+    program = lowered(scene, every_speed=not minimal) if plain else None
+    program = program if isinstance(program, Lowered) else None
     cutoff = cutoff_of(structure) if reduction is None and not minimal else None
-    reduction = as_reduction(scene, default_reduction(structure, independent) if reduction is None else reduction)
+    reduction = as_reduction(scene, default_reduction(structure, independent, program is not None) if reduction is None else reduction)
     return StateForm(
         independent=independent,
         reduction=reduction,
@@ -196,10 +197,16 @@ def state_form(scene: Scene, structure: Structure, state="auto", reduction=None,
         with_work=with_work,
         projects_positions=projection and _is_closed(scene),
         projects_speeds=projection and not minimal and bool(structure.row_names),
-        lowered=program if isinstance(program, Lowered) else None,
+        lowered=program,
         of_inputs=structure.potentials_of_inputs,
+        affine=structure.affine,
         cutoff=cutoff,
     )
+
+
+def may_be_another_form(form: StateForm) -> tuple[str, ...]:
+    """For which `state` asked for a motion that was lost in this form is run again, with the full state and dense matrices."""
+    return ("auto", "full") if form.name == "full" and form.lowered is not None else ("auto",) if form.name == "minimal" else ()
 
 
 def lost_codes(form: StateForm) -> tuple[int, ...]:

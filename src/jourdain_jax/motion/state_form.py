@@ -17,7 +17,7 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations, speeds_and_pivot, speeds_from_privileged
 from jourdain_jax.equations.power import rate_of_work, stored_by_inputs
 from jourdain_jax.equations.projection import project_positions, project_speeds
-from jourdain_jax.equations.reductions import NullSpaceQR, Privileged, Reduction
+from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
 from jourdain_jax.equations.structure import WELL_CONDITIONED, Structure
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.lowering.trace import event_values
@@ -43,6 +43,7 @@ class StateForm(eqx.Module):
     projects_speeds: bool = eqx.field(static=True)
     lowered: Lowered | None = eqx.field(static=True, default=None)  # the scalar program of the rates; None: dense matrices
     of_inputs: tuple[int, ...] = eqx.field(static=True, default=())  # numbers of the loads whose potential depends on inputs
+    affine: bool = eqx.field(static=True, default=True)  # rows are, in the speeds
     cutoff: float | None = eqx.field(static=True, default=None)  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     @property
@@ -53,8 +54,9 @@ class StateForm(eqx.Module):
     @property
     def reduction_name(self) -> str:
         """Name of the reduction, as it stands in a trajectory."""
-        detail = "" if self.lowered is None else ", lowered"
-        return getattr(self.reduction, "name", "") + (detail if self.cutoff is None else f", cut-off {self.cutoff:.0e}")
+        if self.lowered is not None:
+            return getattr(self.reduction, "name", "") + ", lowered"
+        return getattr(self.reduction, "name", "") + ("" if self.cutoff is None else f", cut-off {self.cutoff:.0e}")
 
     @property
     def _by_appell(self) -> bool:
@@ -113,8 +115,11 @@ class StateForm(eqx.Module):
         v = found.udot if self.independent is None else found.udot[jnp.array(self.independent, jnp.int32)]
         return Integrated(motion.qdot.array, v, rate_of_work(scene, motion, found, self.of_inputs) if self.with_work else None)
 
-    def project(self, scene: Scene, t, y: Integrated, inputs, iterations: int = 2) -> Integrated:
-        """The state put back onto geometric rows, quaternion norms and (full state) velocity rows."""
+    def project(self, scene: Scene, fixed, t, y: Integrated, inputs, iterations: int = 2) -> Integrated:
+        """The state put back onto geometric rows, quaternion norms and (full state) velocity rows; lanes only where it is lowered."""
+        if self.lowered is not None:
+            q, v = self.lowered.projected(fixed, t, tuple(y.q), tuple(y.v), inputs, self.affine)
+            return Integrated(jnp.stack(q), jnp.stack(v) if v else y.v, y.work)
         q = project_positions(scene, t, y.q, iterations=iterations) if self.projects_positions else y.q
         v = project_speeds(scene, t, q, y.v, inputs, iterations=iterations, cutoff=self.cutoff) if self.projects_speeds else y.v
         return Integrated(q, v, y.work)
@@ -125,6 +130,8 @@ def cutoff_of(structure: Structure) -> float | None:
     return passing_cutoff(jnp.result_type(float)) if structure.typical_pivot >= WELL_CONDITIONED else None
 
 
-def default_reduction(structure: Structure, independent: tuple[int, ...] | None) -> Reduction:
-    """Privileged velocities for the minimal state, the null space by QR for the full one."""
-    return NullSpaceQR(cutoff_of(structure)) if independent is None else Privileged(independent)
+def default_reduction(structure: Structure, independent: tuple[int, ...] | None, by_program: bool) -> Reduction:
+    """Privileged velocities for the minimal state; for the full one multipliers in a lowered program, otherwise the null space by QR."""
+    if independent is not None:
+        return Privileged(independent)
+    return Multipliers() if by_program else NullSpaceQR(cutoff_of(structure))

@@ -75,14 +75,21 @@ def _scan(params, inputs) -> list[np.ndarray]:
     constants, carry, xs = inputs[:fixed], inputs[fixed : fixed + carried], inputs[fixed + carried :]
     outs: list[list] = [[] for _ in range(len(params["jaxpr"].jaxpr.outvars) - carried)]
     order = range(params["length"])
-    for i in reversed(order) if params["reverse"] else order:
+    before: list[np.ndarray] = []  # what was carried one turn ago
+    for done, i in enumerate(reversed(order) if params["reverse"] else order, 1):
         result = _closed(params["jaxpr"], [*constants, *carry, *(x[i] for x in xs)])
-        carry = result[:carried]
+        before_last, before, carry = before, carry, result[:carried]
+        if not xs and not outs and (_equal(carry, before) or (_equal(carry, before_last) and (params["length"] - done) % 2 == 0)):
+            return carry  # an iteration that has converged, or goes to and fro: the rest changes nothing
         for out, y in zip(outs, result[carried:], strict=True):
             out.append(y)
     avals = [v.aval for v in params["jaxpr"].jaxpr.outvars[carried:]]
     stacked = [np.stack(out[::-1] if params["reverse"] else out) if out else np.zeros((0, *a.shape), a.dtype) for out, a in zip(outs, avals, strict=True)]
     return [*carry, *stacked]
+
+
+def _equal(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
+    return len(a) == len(b) and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 
 
 def _while(params, inputs) -> list[np.ndarray]:

@@ -1,0 +1,73 @@
+"""Rows kept by multipliers, and states put back onto rows, on the graph; all speeds stay in the state.
+
+    M udot = f + A' lambda,   A udot = -drift          S lambda = -(drift + A M^-1 f),   S = A M^-1 A'
+    q <- q - G' (G G')^-1 g(t, q)                      one step of Gauss-Newton; G = dg/dq
+    u <- u - M^-1 A' S^-1 phi(t, q, u)                 exact where rows are affine in the speeds
+
+S is symmetric and positive definite where the rows are independent, and as sparse as the rows are local: tridiagonal for a chain. What is
+left of a diagonal entry of S after elimination, relative to the entry, is the squared sine of the angle between that row and those before it.
+Accelerations lose as many digits as that square is small.
+"""
+
+from typing import NamedTuple
+
+from jourdain_jax.lowering.elimination import quotient, solve_symmetric
+from jourdain_jax.program.derivative import derivatives
+from jourdain_jax.program.graph import Graph
+
+Columns = list[list[int]]
+
+
+LEAST_SQUARE = 1e-8  # of a sine: below it rows count as dependent, and the program does not serve
+
+
+class Accelerations(NamedTuple):
+    """Nodes of the solution, and of what must not vanish on the way."""
+
+    udot: list[int]
+    sines: list[int]  # one per row, between that row and those before it
+    margins: list[int]  # must stay positive: squared sines above their least, times the diagonal entry
+
+
+def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], forms=None) -> Accelerations:
+    """The accelerations under all rows."""
+    *impulses, free = (list(column) for column in solve_symmetric(graph, M, [*A, f]).solution)  # M^-1 A' column by column, M^-1 f
+    S = _products(graph, A, impulses, forms)
+    for r in range(len(A)):
+        alone = all(S[r][s] == graph.zero for s in range(len(A)) if s != r)
+        if alone and not graph.varies[S[r][r]]:  # the entry is divided out where it costs nothing
+            impulses[r] = [n if forms is None else forms.simplified(n) for n in (quotient(graph, n, S[r][r]) for n in impulses[r])]
+            S[r][r] = graph.one
+    right = [graph.neg(graph.add(d, graph.dot(row, free))) for d, row in zip(drift, A, strict=True)]
+    solved = solve_symmetric(graph, S, [right])
+    multipliers = solved.solution[0]
+    udot = [graph.add(w, graph.total(graph.mul(x[k], m) for x, m in zip(impulses, multipliers, strict=True))) for k, w in enumerate(free)]
+    left = [(pivot, S[r][r]) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
+    sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, diagonal))) for pivot, diagonal in left]
+    return Accelerations(udot, sines, [graph.sub(pivot, graph.mul(graph.const(LEAST_SQUARE), diagonal)) for pivot, diagonal in left])
+
+
+def projected_coordinates(graph: Graph, q: list[int], closure: list[int]) -> list[int]:
+    """One step of Gauss-Newton towards `closure = 0`."""
+    G = [list(row) for row in zip(*(derivatives(graph, closure, {n: graph.one}) for n in q), strict=True)]
+    correction = solve_symmetric(graph, _products(graph, G, G), [closure]).solution[0]
+    return [graph.sub(n, graph.total(graph.mul(row[k], c) for row, c in zip(G, correction, strict=True))) for k, n in enumerate(q)]
+
+
+def projected_speeds(graph: Graph, M: Columns, u: list[int], phi: list[int], forms=None) -> list[int]:
+    """The speeds on `phi = 0`, nearest in the metric of M."""
+    A = [list(row) for row in zip(*(derivatives(graph, phi, {n: graph.one}) for n in u), strict=True)]
+    impulses = solve_symmetric(graph, M, A).solution
+    multipliers = solve_symmetric(graph, _products(graph, A, impulses, forms), [phi]).solution[0]
+    return [graph.sub(n, graph.total(graph.mul(x[k], m) for x, m in zip(impulses, multipliers, strict=True))) for k, n in enumerate(u)]
+
+
+def _products(graph: Graph, A: Columns, X: Columns, forms=None) -> Columns:
+    """`A X'`, which is symmetric; zero where no speed is shared."""
+    simple = (lambda n: n) if forms is None else forms.simplified
+    S = [[graph.zero] * len(A) for _ in A]
+    used = [[k for k, n in enumerate(row) if n != graph.zero] for row in A]
+    for r in range(len(A)):
+        for s in range(r + 1):
+            S[r][s] = S[s][r] = simple(graph.total(graph.mul(A[r][k], X[s][k]) for k in used[r]))
+    return S
