@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.graph import COMPARISONS, Graph
 
 
 def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) -> list:
@@ -43,12 +43,7 @@ FUNCTIONS: dict[str, Callable] = {
     "atan": jnp.arctan,
     "max": jnp.maximum,
     "min": jnp.minimum,
-    "lt": lambda a, b: a < b,
-    "le": lambda a, b: a <= b,
-    "gt": lambda a, b: a > b,
-    "ge": lambda a, b: a >= b,
-    "eq": lambda a, b: a == b,
-    "ne": lambda a, b: a != b,
+    **COMPARISONS,
     "and": jnp.logical_and,
     "or": jnp.logical_or,
     "not": jnp.logical_not,
