@@ -100,7 +100,7 @@ def _check_counts(scene) -> None:
         if isinstance(value, int) and not field.metadata.get("static"):
             raise ValueError(
                 f"field `{field.name}` of `{type(scene).__name__}` is {value} and no parameter; for a count or switch write "
-                f"`{field.name}: {type(value).__name__} = eqx.field(static=True, default={value})`, for a quantity `{field.name} = jj.parameter({float(value)})`"
+                f"`{field.name}: {type(value).__name__} = eqx.field(static=True, default={value})`, for a number `{field.name} = jj.parameter({float(value)})`"
             )
 
 
