@@ -55,8 +55,8 @@ def _mark_range(study: Study, axes) -> None:
     for name, value in (("weave", weave), ("capsize", capsize)):
         if value is None or value > study.grid[-1]:
             continue
-        low, high = (study.speeds[f"{name}_speed"][limit] for limit in ("low", "high"))
-        limits = "" if low is None or low == high else f"\n({low:.2f} to {high:.2f})"
+        low, high = (_value(study, f"{name}_speed", limit) for limit in ("low", "high"))
+        limits = "" if low is None or high is None or low == high else f"\n({low:.2f} to {high:.2f})"
         for axis in axes:
             axis.axvline(value, color="0.4", lw=0.8, ls="--")
             if limits:
@@ -73,9 +73,9 @@ def _mark_range(study: Study, axes) -> None:
         )
 
 
-def _value(study: Study, name: str) -> float | None:
+def _value(study: Study, name: str, part: str = "value") -> float | None:
     speed = study.speeds[name]
-    return None if speed is None else speed["value"]
+    return None if speed is None else speed[part]
 
 
 def draw_rides(study: Study, path: str | os.PathLike) -> None:
