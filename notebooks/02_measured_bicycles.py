@@ -23,10 +23,7 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 
-from jourdain_jax.bicycle.linear import linear_matrices
-from jourdain_jax.bicycle.parameter_files import read_bicycle, shipped_bicycles
-from jourdain_jax.bicycle.stability import stability_speeds
-from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
+from jourdain_jax.bicycle import interval, linear_matrices, read_bicycle, sample_parameters, shipped_bicycles, stability_speeds
 
 # %% [markdown]
 # ## One bicycle

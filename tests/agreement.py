@@ -1,10 +1,10 @@
 """Random admissible states of a scene, and all its reductions against each other there."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 import jourdain_jax as jj
+from jourdain_jax.equations.probing import on_numbers
 
 
 def admissible_states(scene: jj.Scene, count: int, seed: int = 0) -> list[tuple]:
@@ -20,8 +20,9 @@ def disagreement(scene: jj.Scene, count: int = 20, seed: int = 0) -> dict[str, f
     """
     by_name = jj.reductions(scene)
 
-    @eqx.filter_jit
-    def all_of_them(scene, t, q, u):
+    @on_numbers
+    @jax.vmap
+    def all_of_them(t, q, u):
         found = {name: jj.accelerations(scene, t, q, u, reduction=reduction) for name, reduction in by_name.items()}
         equations = jj.unconstrained_equations(scene, t, q, u)
         forces = jnp.stack([equations.h, equations.Q, found["qr"].constraint_force])
@@ -30,7 +31,7 @@ def disagreement(scene: jj.Scene, count: int = 20, seed: int = 0) -> dict[str, f
 
     states = admissible_states(scene, count, seed)
     assert len(states) >= count // 2
-    results, sizes = jax.vmap(lambda t, q, u: all_of_them(scene, t, q, u))(*map(jnp.stack, zip(*states, strict=True)))
+    results, sizes = all_of_them(*map(jnp.stack, zip(*states, strict=True)))
     return {
         name: max(_relative(*compared) for compared in zip(result[:2], results["qr"][:2], sizes, strict=True))
         for name, result in results.items()

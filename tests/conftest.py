@@ -26,6 +26,24 @@ if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":
     install_import_hook([f"jourdain_jax.{layer}" for layer in LAYERS], "beartype.beartype")
 
 
+# What takes longest for its number of tests, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
+LONGEST = ("every_model", "generated_scenes", "float32", "notebooks", "bicycle_job", "bicycle_stability", "atlas", "reactions", "verify", "chains", "readme")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files first."""
+    last = len(LONGEST)
+    order = {f"test_{name}": place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.stem, last))
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Tracing makes millions of objects that live for a moment: what is there for good is not looked through again and again for garbage among it."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _compiled_programs_are_dropped():
     """Compiled programs hold memory maps, of which a process may have 65530 on Linux: without this a long run aborts inside the compiler."""
@@ -37,7 +55,8 @@ def _compiled_programs_are_dropped():
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Keep compiled programs in pytest's cache, so that a second run does not compile again."""
+    """Keep compiled programs in pytest's cache, so that a second run does not compile again; keep the order of files above for pytest-xdist."""
+    config.option.loadscopereorder = False  # it would hand out files by their number of tests
     if not config.pluginmanager.hasplugin("cacheprovider"):
         return
     compiled: Path = config.cache.mkdir("jax_compilation")

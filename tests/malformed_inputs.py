@@ -565,7 +565,8 @@ MEASURED: dict[str, Case] = {
 COMMANDS: dict[str, Case] = {
     "shell('')": ("exit 2", "the following arguments are required: VERB"),
     "shell('modles')": ("exit 2", "unknown verb `modles`; did you mean `models`"),
-    "shell('models extra')": ("exit 2", "unrecognized arguments: extra"),
+    "shell('models extra')": ("exit 2", "unknown model `extra`"),
+    "shell('models skate extra')": ("exit 2", "unrecognized arguments: extra"),
     "shell('report')": ("exit 2", "the following arguments are required: model"),
     "shell('report chaplygin-slay')": ("exit 2", "unknown model `chaplygin-slay`; did you mean `chaplygin-sleigh`"),
     "shell('report pendulum-chain --set links=1.5')": ("exit 2", "--set links=1.5: `links` of `pendulum-chain` is a count, expected a whole number"),

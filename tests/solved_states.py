@@ -1,18 +1,18 @@
-"""Accelerations of a scene at given and at random admissible states, compiled once per class of scene."""
+"""Accelerations of a scene at given and at random admissible states, uncompiled: each is worked out once."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 import jourdain_jax as jj
+from jourdain_jax.equations.probing import on_numbers
 
 
-@eqx.filter_jit
+@on_numbers
 def _solve(scene, t, q, u):
     return jax.vmap(lambda t, q, u: jj.accelerations(scene, t, q, u))(t, q, u)
 
 
-@eqx.filter_jit
+@on_numbers
 def _solve_by_every_reduction(scene, reductions, q, u):
     return {name: jj.accelerations(scene, 0.0, q, u, reduction=reduction) for name, reduction in reductions.items()}
 
@@ -20,10 +20,10 @@ def _solve_by_every_reduction(scene, reductions, q, u):
 def solved_at_random_states(scene: jj.Scene, count: int = 20):
     """Coordinates, speeds and accelerations by name, each an array over the states, and the whole result."""
     t, q, u = (jnp.asarray(x) for x in jj.sample_states(scene, count))
-    solved = _solve(scene, t, q, u)
+    solved = jax.tree.map(jnp.asarray, _solve(scene, t, q, u))
     return scene.coordinate_names.view(q), scene.speed_names.view(u), scene.speed_names.view(solved.udot), solved
 
 
 def solved_by_every_reduction(scene: jj.Scene, q, u) -> dict[str, jj.Accelerations]:
     """The result of each reduction at one state, by the reduction's short name."""
-    return _solve_by_every_reduction(scene, jj.reductions(scene), q, u)
+    return jax.tree.map(jnp.asarray, _solve_by_every_reduction(scene, jj.reductions(scene), q, u))

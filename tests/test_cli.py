@@ -26,6 +26,19 @@ def test_models_lists_every_model_by_name(capsys):
     assert run(capsys, "models")[1].out.count("\n") == len(MODELS)
 
 
+def test_models_tells_what_can_be_set_and_started_from(capsys):
+    code, out = run(capsys, "models", "tilting-disc")
+    assert code == 0
+    assert "mass=1 kg, radius=0.5 m, gravity=9.81 m/s^2" in out.out
+    assert "yaw_rate, lean_rate, spin_rate" in out.out
+    assert "lean=0.3, yaw_rate=0.5, lean_rate=0.2, spin_rate=-3; 10 s" in out.out
+    (row,) = json.loads(run(capsys, "models", "tilting-disc", "--json")[1].out)
+    assert row["example"] == dict(MODELS["tilting-disc"].example)
+    code, out = run(capsys, "models", "tilted-disc")
+    assert code == 2
+    assert "did you mean `tilting-disc`" in out.err
+
+
 def test_report_has_the_documented_keys(capsys):
     code, out = run(capsys, "report", "chaplygin-sleigh", "--json")
     found = json.loads(out.out)

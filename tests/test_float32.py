@@ -26,13 +26,14 @@ SINGLE = 1e-4  # relative: rtol is 1e-5 per step, over some 30 steps
 GRADIENT = 1e-3
 
 PROGRAM = """
-import json, warnings
+import gc, json, warnings
 import jax, jax.numpy as jnp, numpy as np
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion import results
 from jourdain_jax.scene.parameters import parameters_of
 
+gc.disable()  # a process of a minute
 names, with_gradient, ts = json.loads(input())
 
 

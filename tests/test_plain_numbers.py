@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_scenes import BeadOnTurningWire
+from tolerances import tolerance
 
 import jourdain_jax as jj
 
@@ -121,3 +122,25 @@ def test_starts_simulations_and_analyses_take_plain_numbers():
 def test_the_derivative_at_a_state_of_integers_is_right():
     gradient = jax.grad(lambda rate: jj.accelerations(BeadOnTurningWire(rate=rate), 0, [1], [0]).udot[0])(2.0)
     assert np.isclose(gradient, 4.0)  # r (rate)^2
+
+
+EQUATIONS = (jj.accelerations, jj.unconstrained_equations, jj.constraint_rows, jj.partial_velocities, jj.lagrange_equations, jj.gibbs_equations)
+
+
+def test_equations_of_numbers_are_those_of_traced_values_and_hardly_anything_is_compiled():
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: compiled.append(event) if event.endswith("backend_compile_duration") else None)
+
+    class Sleigh(jj.models.ChaplyginSleigh):
+        """One that nothing has been compiled for."""
+
+    sleigh = Sleigh()
+    start = jj.start(sleigh, heading=0.3, x_rate=0.5, heading_rate=0.7)
+    for equations in EQUATIONS:
+        compiled.clear()
+        found = jax.tree.leaves(equations(sleigh, 0.0, start.q, start.u))
+        assert len(compiled) <= 20, equations.__name__  # not one for every operation
+        assert all(isinstance(x, jax.Array) for x in found)
+        traced = jax.jit(lambda q, u, equations=equations: jax.tree.leaves(equations(sleigh, 0.0, q, u)))(start.q, start.u)
+        for value, expected in zip(found, traced, strict=True):
+            np.testing.assert_allclose(value, expected, rtol=tolerance("round_off"), atol=1e-13)

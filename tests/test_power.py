@@ -1,6 +1,5 @@
 """Power: the rate of T + V is the power of what has no potential, by every way energy can enter a scene."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
@@ -11,6 +10,7 @@ from tolerances import relative_error, tolerance
 import jourdain_jax as jj
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.power import power, power_of_nonconservative
+from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.models import BallOnTurntable, ChaplyginSleigh, IsokineticParticle, TiltingDisc, TwoWheelAxleCoordinates
 
 
@@ -43,7 +43,7 @@ SCENES = [
 @pytest.mark.parametrize("scene", SCENES, ids=lambda s: type(s).__name__)
 def test_energy_changes_by_the_power_of_what_has_no_potential(scene):
     states = [jnp.asarray(x) for x in jj.sample_states(scene, 20)]
-    rate, supplied, size = jax.vmap(eqx.filter_jit(lambda t, q, u: energy_rate_and_power(scene, t, q, u)))(*states)
+    rate, supplied, size = on_numbers(jax.vmap(lambda t, q, u: energy_rate_and_power(scene, t, q, u)))(*states)
     assert jnp.all(jnp.abs(rate - supplied) <= tolerance("round_off") * size)
 
 

@@ -1,6 +1,5 @@
 """Constraint forces by row and by body, and contact forces, against statics, closed forms and the principle of virtual power."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +8,7 @@ import small_scenes as small
 from tolerances import tolerance
 
 import jourdain_jax as jj
+from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.reactions import contact_forces, row_reactions
 from jourdain_jax.models import (
     BallOnTurntable,
@@ -33,7 +33,8 @@ SCENES = [
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda s: type(s).__name__)
 def test_forces_by_row_and_body_have_the_virtual_power_of_the_multipliers(scene):
-    @eqx.filter_jit
+    @on_numbers
+    @jax.vmap
     def compare(t, q, u):
         found = jj.accelerations(scene, t, q, u)
         rows = row_reactions(scene, t, q, u, found)
@@ -44,7 +45,7 @@ def test_forces_by_row_and_body_have_the_virtual_power_of_the_multipliers(scene)
         return power + jnp.sum(rows.direct, axis=0), found.constraint_force
 
     states = [jnp.asarray(x) for x in jj.sample_states(scene, 10)]
-    by_body, expected = jax.vmap(compare)(*states)
+    by_body, expected = compare(*states)
     assert jnp.max(jnp.abs(by_body - expected)) <= tolerance("round_off") * jnp.max(jnp.abs(expected))
 
 
@@ -96,7 +97,8 @@ def test_a_vertical_disc_presses_with_its_weight_and_needs_the_friction_of_its_t
 def test_the_normal_force_is_the_same_from_newtons_equation_and_from_a_height_row():
     built_in, as_row = TiltingDisc(), small.DiscWithHeightRow()
 
-    @eqx.filter_jit
+    @on_numbers
+    @jax.vmap
     def both(t, q, u):
         # the tilting disc's x, y are those of the contact point, the other's those of the centre
         motion = jj.motion_at(built_in, t, q, u)["disc"]
@@ -106,7 +108,7 @@ def test_the_normal_force_is_the_same_from_newtons_equation_and_from_a_height_ro
         second = contact_forces(as_row, t, q6, u6, jj.accelerations(as_row, t, q6, u6))["rim"]
         return first, second
 
-    first, second = jax.vmap(both)(*(jnp.asarray(x) for x in jj.sample_states(built_in, 20)))
+    first, second = both(*(jnp.asarray(x) for x in jj.sample_states(built_in, 20)))
     size = jnp.max(jnp.abs(first.normal))
     assert jnp.max(jnp.abs(first.normal - second.normal)) <= tolerance("round_off") * size
     assert jnp.max(jnp.abs(first.tangential - second.tangential)) <= tolerance("round_off") * size

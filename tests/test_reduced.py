@@ -1,6 +1,5 @@
 """The reduced Appell equations and quadrature give the motion that all coordinates together give (row S9)."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.reduced import (
     quadrature_times,
     recover_dropped,
@@ -73,12 +73,13 @@ def test_reduced_accelerations_are_those_of_the_whole_scene():
     scene = TiltingDisc()
     independent = list(jj.structure_of(scene).independent)
 
-    @eqx.filter_jit
+    @on_numbers
+    @jax.vmap
     def both(t, q, u):
         y = u[jnp.array(independent)]
         return reduced_accelerations(scene, t, q[3:4], y), jj.accelerations(scene, t, q, u).udot[jnp.array(independent)]
 
-    reduced, whole = jax.vmap(both)(*(jnp.asarray(x) for x in jj.sample_states(scene, 20)))
+    reduced, whole = both(*(jnp.asarray(x) for x in jj.sample_states(scene, 20)))
     assert jnp.max(jnp.abs(reduced - whole)) <= tolerance("round_off") * jnp.max(jnp.abs(whole))
 
 

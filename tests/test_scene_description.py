@@ -2,6 +2,7 @@
 
 import inspect
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
@@ -127,6 +128,20 @@ def test_a_scene_with_an_init_of_its_own_takes_its_own_arguments():
     assert float(Heavy(weight=9.81).mass) == 1.0
     with pytest.raises(ValueError, match=r"scene `Heavy` has no parameter `wait`; .*Valid names: `weight`"):
         Heavy(wait=9.81)
+
+
+@pytest.mark.parametrize("value", [3, True])
+def test_a_count_or_a_switch_must_be_a_static_field(value):
+    class Chain(Bead):
+        links: object = value
+
+    with pytest.raises(ValueError, match=rf"field `links` of `Chain` is {value} and no parameter; .*static=True, default={value}"):
+        Chain()
+
+    class Static(Bead):
+        links: object = eqx.field(static=True, default=value)
+
+    assert Static().links == value
 
 
 def test_every_model_is_described_rightly_and_no_check_is_in_a_traced_program():

@@ -27,12 +27,13 @@ from jourdain_jax import models
 from jourdain_jax.analysis.bijections import bounds, positive, unbounded
 from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
 from jourdain_jax.analysis.fit import fit, fit_batch
+from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.gradients import derivative_exists
 from jourdain_jax.analysis.likelihood import log_likelihood
 from jourdain_jax.analysis.linearize import Linearization, linearize
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.report import Report, report
-from jourdain_jax.analysis.steady import steady
+from jourdain_jax.analysis.steady import SteadyMotion, steady
 from jourdain_jax.analysis.verification import Verification
 from jourdain_jax.analysis.verify import verify
 from jourdain_jax.calculus.guards import DifferentiationModeError
@@ -68,6 +69,7 @@ from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import State, consistent, start
 from jourdain_jax.motion.storage import load, load_rollout, save
 from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.motion.versions import version_of as _version_of
 from jourdain_jax.plotting.animation import animate
 from jourdain_jax.plotting.quantities import plot
 from jourdain_jax.scene.bodies import Particle, RigidBody
@@ -78,3 +80,109 @@ from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, p
 from jourdain_jax.scene.motion_state import fixed_point
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+
+__version__ = _version_of("jourdain-jax")
+
+__all__ = [
+    "Accelerations",
+    "Baumgarte",
+    "DifferentiationModeError",
+    "DiscreteGradient",
+    "DiscreteLagrangeDAlembert",
+    "Energy",
+    "EnergyBalance",
+    "Fit",
+    "GibbsAppell",
+    "ImplicitMidpoint",
+    "Linearization",
+    "Load",
+    "Lowered",
+    "Measurements",
+    "Multipliers",
+    "MuntheKaas",
+    "NotLowered",
+    "NullSpaceQR",
+    "NullSpaceSVD",
+    "Particle",
+    "Plane",
+    "Privileged",
+    "Report",
+    "RigidBody",
+    "Rollout",
+    "Sampled",
+    "Scene",
+    "SimulationError",
+    "State",
+    "SteadyMotion",
+    "Trajectory",
+    "UdwadiaKalaba",
+    "Verification",
+    "accelerations",
+    "animate",
+    "ball_contact",
+    "bounds",
+    "consistent",
+    "constraint_rows",
+    "coordinate_rates",
+    "coordinates",
+    "damper",
+    "derivative_exists",
+    "diagnose",
+    "disc_contact",
+    "energy",
+    "energy_balance",
+    "fit",
+    "fit_batch",
+    "fixed_point",
+    "generalized_force",
+    "generalized_forces",
+    "gibbs_equations",
+    "gibbs_function",
+    "gravity",
+    "inputs",
+    "kinetic_energy",
+    "knife_edge",
+    "lagrange_equations",
+    "linearize",
+    "load",
+    "load_rollout",
+    "log_likelihood",
+    "lower",
+    "models",
+    "motion_at",
+    "newton_residual",
+    "parameter",
+    "partial_velocities",
+    "pin",
+    "plot",
+    "point_force",
+    "pose_at",
+    "position_residual",
+    "positive",
+    "potential_energy",
+    "quaternion",
+    "quaternion_from_axis_angle",
+    "quaternion_to_matrix",
+    "reductions",
+    "report",
+    "rod",
+    "rollout",
+    "rot_x",
+    "rot_y",
+    "rot_z",
+    "sample_states",
+    "save",
+    "simulate",
+    "speeds",
+    "spring",
+    "start",
+    "steady",
+    "structure_of",
+    "torque",
+    "unbounded",
+    "unconstrained_equations",
+    "velocity_residual",
+    "verify",
+    "virtual_power",
+    "weld",
+]

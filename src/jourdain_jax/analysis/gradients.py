@@ -13,6 +13,7 @@ from jourdain_jax.equations.accelerations import reductions
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.instant import constraint_rows
 from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.reductions import reduce
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.equations.virtual_power import equations_and_rows
@@ -33,7 +34,7 @@ def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) 
     """
     if jax.tree.structure(direction) != jax.tree.structure(scene):
         raise ValueError(f"`direction` is {described(direction)}, expected a change of every parameter, as a scene like `scene`: a `{type(scene).__name__}`")
-    A, dA, size = (np.asarray(x) for x in _row_change(scene, t, as_real(q), as_real(u), direction, as_real(dq), inputs))
+    A, dA, size = _row_change(scene, t, as_real(q), as_real(u), direction, as_real(dq), inputs)
     if A.size == 0:
         return True
     P = np.asarray(pseudo_inverse(jnp.asarray(A)))
@@ -41,7 +42,7 @@ def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) 
     return bool(np.max(np.abs(split)) <= 1e3 * rank_cutoff(A.dtype) * (size + np.max(np.abs(dA))))
 
 
-@eqx.filter_jit
+@on_numbers
 def _row_change(scene, t, q, u, direction, dq, inputs):
     moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
 
@@ -75,9 +76,9 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
     point, direction = (moving, q, u), (relative, dq, du)
     forward, size = _forward(arguments, point, direction)
     reverse = _reverse(arguments, point, direction)
-    # fourth-order central difference, every point through the same compiled function
+    # fourth-order central difference, every point through the same program
     h = DIFFERENCE_STEP[u.dtype.name] / (1 + float(jnp.max(jnp.abs(u), initial=0.0)))
-    along = [_outcome(arguments, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
+    along = [_outcome_of_numbers(arguments, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
     difference = central_difference(along, h)
     by_way = lambda error: {f"reduction `{name}`": float(e) for name, e in zip(ways, np.asarray(error / size), strict=True)}  # noqa: E731
     return [
@@ -86,7 +87,6 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
     ]
 
 
-@eqx.filter_jit
 def _outcome(arguments, point) -> Float[Array, "reductions"]:
     """A random combination of accelerations and constraint forces, by every reduction."""
     ways, weights, t, inputs, fixed = arguments
@@ -97,18 +97,21 @@ def _outcome(arguments, point) -> Float[Array, "reductions"]:
     return jnp.stack([weights @ jnp.concatenate([a.udot, a.constraint_force]) for a in found])
 
 
+_outcome_of_numbers = on_numbers(_outcome)
+
+
 def by_reduction(way, scene, t, q, u, equations, rows):
     """One reduction of equations and rows that all share."""
     return way.accelerations(scene, t, q, u, equations, rows) if isinstance(way, GibbsAppell) else reduce(way, equations, rows)
 
 
-@eqx.filter_jit
+@on_numbers
 def _forward(arguments, point, direction):
     value, change = jax.jvp(lambda point: _outcome(arguments, point), (point,), (direction,))
     return change, jnp.abs(value) + jnp.abs(change) + jnp.sum(jnp.abs(arguments[1])) * 1e-3
 
 
-@eqx.filter_jit
+@on_numbers
 def _reverse(arguments, point, direction):
     value, pull = jax.vjp(lambda point: _outcome(arguments, point), point)
     return jax.vmap(lambda way: _dot(pull(way)[0], direction))(jnp.eye(value.size, dtype=value.dtype))

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.verification import DIFFERENCE_STEP, Check, central_difference, check
 from jourdain_jax.equations.kinematics import Velocities, coordinate_rates, motion_at, partial_velocities, pose_at
+from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.rows import position_rows, velocity_rows
 from jourdain_jax.scene.answers import loads_of, potential_of
 from jourdain_jax.scene.bodies import RigidBody
@@ -26,7 +27,7 @@ _KINK = 1e-3  # a kink is a jump of order one, and its estimate is of lower orde
 
 def statement_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], seed: int) -> list[Check]:
     """The three checks above; `Z` spans the admissible speeds."""
-    inertia, potentials = jax.tree.map(np.asarray, _evaluate(scene, t, q, u, inputs, Z))
+    inertia, potentials = _evaluate(scene, t, q, u, inputs, Z)
     return [
         check("inertia", {name: float(value) for name, value in inertia.items()}, q.dtype),
         check("potentials", {name: float(value) for name, value in potentials.items()}, q.dtype),
@@ -34,7 +35,7 @@ def statement_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colu
     ]
 
 
-@eqx.filter_jit
+@on_numbers
 def _evaluate(scene: Scene, t, q, u, inputs, Z) -> tuple[dict, dict]:
     motion = motion_at(scene, t, q, u, inputs)
     return _inertia(motion), _potentials(scene, motion, Z)
@@ -126,7 +127,7 @@ def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
     point = (moving, t, q, u)
     value, change = _pushed(fixed, inputs, point, direction)
     h = DIFFERENCE_STEP[kind] / (1 + float(jnp.max(jnp.abs(u), initial=0.0)))
-    along = [_at(fixed, inputs, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
+    along = [_at_numbers(fixed, inputs, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
     values = {}
     for name in value:
         f, slope, ends = np.asarray(value[name]), np.asarray(change[name]), [np.asarray(x[name]) for x in along]
@@ -138,12 +139,14 @@ def _derivatives(scene: Scene, t, q, u, inputs, seed: int) -> Check:
     return check("derivatives", values, q.dtype)
 
 
-@eqx.filter_jit
 def _at(fixed, inputs, point) -> dict[str, Array]:
     parameters, t, q, u = point
     return _pieces(eqx.combine(parameters, fixed), t, q, u, inputs)
 
 
-@eqx.filter_jit
+_at_numbers = on_numbers(_at)
+
+
+@on_numbers
 def _pushed(fixed, inputs, point, direction) -> tuple[dict[str, Array], dict[str, Array]]:
     return jax.jvp(lambda point: _at(fixed, inputs, point), (point,), (direction,))

@@ -9,9 +9,10 @@ virtual power      Z' (M udot + h - Q) = 0 over the admissible virtual velocitie
 Newton             sum beta' R + gamma' T = A' lambda, R = m a - F per body (S1); R from the rows alone, where nothing is built in
 energy             d(T + V)/dt along the motion, less the power of what has no potential
 gradients          of udot and A' lambda: forward against reverse mode, and against central differences
+
+Everything is worked out once, uncompiled: compiling it would take several times as long as running it.
 """
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +28,7 @@ from jourdain_jax.equations.gibbs_appell import gibbs_equations
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, partial_velocities, velocities
 from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
 from jourdain_jax.equations.power import power_of_nonconservative
+from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.reactions import row_reactions
 from jourdain_jax.equations.reductions import diagnosed
 from jourdain_jax.equations.rows import names_of_rows
@@ -64,7 +66,7 @@ def verify(scene: Scene, state: State | dict | None = None, inputs: Numbers | di
     inputs = as_input_vector(as_scene(scene), inputs)
     state = as_state(scene, state, what="state", inputs=inputs)
     t, q, u = state.t, state.q, state.u
-    found = jax.tree.map(np.asarray, _evaluate(scene, t, q, u, inputs))
+    found = _evaluate(scene, t, q, u, inputs)
     applicable = [name for name, ok in found["applicable"].items() if ok]
     Z = jnp.asarray(found["directions"])
     checks = statement_checks(scene, t, q, u, inputs, Z, seed)
@@ -73,7 +75,7 @@ def verify(scene: Scene, state: State | dict | None = None, inputs: Numbers | di
     return Verification(type(scene).__name__, tuple(checks), tuple(name for name in found["applicable"] if name not in applicable))
 
 
-@eqx.filter_jit
+@on_numbers
 def _evaluate(scene, t, q, u, inputs) -> dict:
     equations, rows = equations_and_rows(scene, t, q, u, inputs)
     ways = {name: diagnosed(by_reduction(way, scene, t, q, u, equations, rows), equations, rows) for name, way in reductions(scene).items()}

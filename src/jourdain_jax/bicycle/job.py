@@ -94,7 +94,7 @@ def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Re
     values = jnp.concatenate([nominal[None], jnp.where(drawn.physical[:, None], drawn.values, nominal)])
     found, matrices = _speeds(values)
     weave, capsize = float(found.weave_speed[0]), float(found.capsize_speed[0])
-    grid = np.linspace(0.0, _top_speed(weave, capsize), _GRID)
+    grid = _speeds_to_draw(_top_speed(weave, capsize), float(found.double_root_speed[0]))
     labels, ridden = ride_speeds(weave, capsize, bool(found.stable_range_exists[0]))
     return Study(
         path=str(path),
@@ -126,6 +126,13 @@ def _interval(values, physical) -> dict | None:
     limits = interval(values[1:], nominal=values[0], counted=jnp.asarray(physical))
     numbers = {"value": limits.value, "low": limits.low, "high": limits.high, "fraction": limits.fraction}
     return {name: None if np.isnan(x) else float(x) for name, x in numbers.items()}
+
+
+def _speeds_to_draw(top: float, double_root: float) -> np.ndarray:
+    """Even speeds up to `top`, and closer ones about the double root, where two eigenvalues leave each other like a square root."""
+    middle = double_root if np.isfinite(double_root) else 0.0
+    close = middle + 0.1 * top * np.linspace(-1.0, 1.0, _GRID // 4) ** 3
+    return np.sort(np.concatenate([np.linspace(0.0, top, _GRID), np.clip(close, 0.0, top)]))
 
 
 def _top_speed(weave: float, capsize: float) -> float:

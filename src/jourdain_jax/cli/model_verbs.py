@@ -23,8 +23,9 @@ from jourdain_jax.scene.scene import Scene
 
 def add(verbs) -> None:
     """Add the verbs to the parser."""
-    listing = verbs.add_parser("models", help="list the models")
-    listing.add_argument("--json", action="store_true", help="machine-readable")
+    listing = verbs.add_parser("models", help="list the models, or what one has: parameters, coordinates, speeds, a typical start")
+    listing.add_argument("model", nargs="?", help="name of the one to describe (default: list all)")
+    listing.add_argument("--json", action="store_true", help="machine-readable: a list of objects")
     listing.set_defaults(run=_models)
 
     about = verbs.add_parser("report", help="what kind of system a model is: freedoms, rows, integrability, cyclic coordinates")
@@ -51,12 +52,14 @@ def add(verbs) -> None:
 
 def _model_options(parser) -> None:
     parser.add_argument("model", help="name, see `jourdain-jax models`")
-    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="parameters, and counts such as links=7")
+    about = "parameters (see `jourdain-jax models MODEL`), and counts such as links=7"
+    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=about)
     parser.add_argument("--json", action="store_true", help="machine-readable")
 
 
 def _start_options(parser) -> None:
-    parser.add_argument("--start", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help="start values (default: the model's example)")
+    about = "coordinates and speeds at the start; those not named begin at zero and are put onto the constraints (default: the model's example)"
+    parser.add_argument("--start", nargs="+", action="extend", default=[], metavar="NAME=VALUE", help=about)
 
 
 def _pairs(words: list[str], what: str) -> dict[str, float]:
@@ -88,9 +91,13 @@ def _state(scene: Scene, options):
 
 
 def _models(options) -> bool:
-    rows = [_model_row(name) for name in MODELS]
+    if options.model is not None:
+        known_model(options.model)
+    rows = [_model_row(name) for name in MODELS if options.model in (None, name)]
     if options.json:
         print(json.dumps(rows, indent=2))
+    elif options.model is not None:
+        print(_description(rows[0]))
     else:
         width = max(map(len, MODELS))
         print("\n".join(f"{row['name']:<{width}}  {row['about']}" for row in rows))
@@ -104,8 +111,24 @@ def _model_row(name: str) -> dict:
     parameters = {key: {"value": np.asarray(value).tolist(), "unit": meta["unit"]} for key, value, meta in parameters_of(scene)}
     names = {"coordinates": scene.coordinate_names.entries, "speeds": scene.speed_names.entries, "inputs": scene.inputs.entries}
     domain = {key: [float(bound) for bound in bounds] for key, bounds in scene.domain.items()}
-    more = {"events": names_of_events(scene), "domain": domain, "conventions": scene.conventions}
+    example = {key: np.asarray(value).tolist() for key, value in scene.example.items()}
+    more = {"events": names_of_events(scene), "domain": domain, "example": example, "example_span": scene.example_span, "conventions": scene.conventions}
     return {"name": name, "about": about, **names, "parameters": parameters, "counts": counts, **more}
+
+
+def _description(row: dict) -> str:
+    """What a model has, for people."""
+    values = {key: f"{key}={entry['value']:g} {entry['unit'] or ''}".strip() for key, entry in row["parameters"].items()}
+    lines = {
+        "parameters (--set)": ", ".join([*values.values(), *(f"{key}={entry['value']}" for key, entry in row["counts"].items())]),
+        "coordinates (--start)": ", ".join(row["coordinates"]),
+        "speeds (--start)": ", ".join(row["speeds"]),
+        "inputs": ", ".join(row["inputs"]),
+        "stop events": ", ".join(row["events"]),
+        "example": ", ".join(f"{key}={value:g}" for key, value in row["example"].items()) + f"; {row['example_span']:g} s",
+        "conventions": row["conventions"],
+    }
+    return "\n".join([f"{row['name']}: {row['about']}", *(f"  {key:<22} {text}" for key, text in lines.items() if text)])
 
 
 def _report(options) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
+from jourdain_jax.equations.probing import at_once
 from jourdain_jax.equations.reductions import (
     Accelerations,
     Multipliers,
@@ -24,7 +25,7 @@ from jourdain_jax.equations.reductions import (
 from jourdain_jax.equations.rows import ConstraintRows, position_residual
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
-from jourdain_jax.scene.arguments import as_coordinates, as_scene, as_speeds
+from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import checked_real, described
 from jourdain_jax.scene.scene import Scene
@@ -99,6 +100,13 @@ def accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabili
     Pure: works under any nesting of jit, vmap, jvp and vjp, with right derivatives wherever the rank of the rows is constant. Look at `applicable`
     and `residual`: nothing is raised for a state that a reduction cannot serve. ValueError for an unknown reduction. Eqs. (41), (68)-(70).
     """
+    f = None if inputs is None else as_input_vector(scene, inputs)
+    arguments = as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f
+    return _accelerations(scene, *arguments, as_reduction(scene, reduction), as_stabilisation(stabilisation))
+
+
+@at_once
+def _accelerations(scene: Scene, t, q, u, inputs, reduction, stabilisation) -> Accelerations:
     return diagnosed(*_reduced(scene, t, q, u, inputs, reduction, stabilisation))
 
 

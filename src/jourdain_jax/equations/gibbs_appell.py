@@ -13,11 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.equations.kinematics import bias_accelerations, inertias, velocities
+from jourdain_jax.equations.probing import at_once
 from jourdain_jax.equations.reductions import APPLICABLE_PIVOT, Partition, Reduced, reduced, solve_definite
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces
-from jourdain_jax.scene.arguments import as_coordinates, as_speeds
+from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_speeds, as_time
 from jourdain_jax.scene.scene import Scene
 
 
@@ -40,7 +41,12 @@ def gibbs_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquation
 
     `inputs`: values of the scene's inputs (default: zero).
     """
-    q, u = as_coordinates(scene, q), as_speeds(scene, u)
+    f = None if inputs is None else as_input_vector(scene, inputs)
+    return _gibbs_equations(scene, as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f)
+
+
+@at_once
+def _gibbs_equations(scene: Scene, t, q, u, inputs) -> UnconstrainedEquations:
     zero = jnp.zeros_like(u)
     h, M = _gradient_and_hessian(lambda a: gibbs_function(scene, t, q, u, a), zero)
     return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs))

@@ -9,12 +9,15 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import fields
 from functools import lru_cache, wraps
+from inspect import signature
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.program.uncompiled import uncompiled
+from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 
 
@@ -136,6 +139,23 @@ def on_numbers(f: Callable) -> Callable:
         numbers, others = eqx.partition(arguments, eqx.is_array)
         rest, treedef = jax.tree.flatten(others, is_leaf=_is_none)
         return program(treedef, tuple(rest), jax.config.jax_enable_x64)(numbers)
+
+    return run
+
+
+def at_once(f: Callable) -> Callable:
+    """`f` of numbers run uncompiled, so that a first call at a prompt takes a tenth of the time; of traced values, as it stands.
+
+    What `f` finds out by the scene's own numbers (rank, privileged speeds) must be among its arguments: inside, the numbers are traced.
+    """
+    known, parameters = on_numbers(f), signature(f)
+
+    @wraps(f)
+    def run(*given, **named):
+        bound = parameters.bind(*given, **named)
+        bound.apply_defaults()
+        arguments = bound.args
+        return f(*arguments) if is_traced(arguments) else jax.tree.map(jnp.asarray, known(*arguments))
 
     return run
 

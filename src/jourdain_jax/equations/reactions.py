@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
+from jourdain_jax.equations.probing import at_once
 from jourdain_jax.equations.reductions import Accelerations
 from jourdain_jax.equations.rows import flatten_rows, names_of_rows, velocity_residual, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
@@ -61,6 +62,7 @@ class ContactForce(eqx.Module):
     determined: Bool[Array, ""]  # whether the rows at hand determine these numbers
 
 
+@at_once
 def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=None) -> RowReactions:
     """Constraint forces per row and per body at (t, q, u), from the multipliers of known `accelerations`.
 
@@ -100,6 +102,7 @@ def determined_rows(A: Float[Array, "rows speeds"]) -> Bool[Array, "rows"]:
     return alone > 1 - jnp.sqrt(jnp.finfo(A.dtype).eps)
 
 
+@at_once
 def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=None) -> dict[str, ContactForce]:
     """Normal and tangential force of every rolling contact, and the friction coefficient it needs to roll without slip.
 

@@ -22,7 +22,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class BallOnTurntable(Scene):
-    """x, y of the centre along the table, and the attitude; roll_x, roll_y, spin: angular velocity in the table's axes."""
+    """A ball that rolls without slip on a turntable, flat or tilted.
+
+    x, y of the centre along the table, and the attitude; roll_x, roll_y, spin: angular velocity in the table's axes.
+    """
 
     mass: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
     radius: Float[Array, ""] = parameter(0.05, unit="m", positive=True)

@@ -19,7 +19,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class ChaplyginSleigh(Scene):
-    """x, y of the mass centre, heading of the blade; the blade touches the ice at body point (-offset, 0, 0)."""
+    """The Chaplygin sleigh: a body on smooth ice with one blade, its mass centre ahead of the blade.
+
+    x, y of the mass centre, heading of the blade; the blade touches the ice at body point (-offset, 0, 0).
+    """
 
     mass: Float[Array, ""] = parameter(1.3, unit="kg", positive=True)
     inertia: Float[Array, ""] = parameter(0.4, unit="kg m^2", positive=True, about="I, about the mass centre")

@@ -18,7 +18,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class DoublePendulumAngles(Scene):
-    """Angles of the upper and the lower rod from straight down; pivot at the origin."""
+    """A planar double pendulum in the angles of its rods: no rows.
+
+    Angles of the upper and the lower rod from straight down; pivot at the origin.
+    """
 
     mass1: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
     mass2: Float[Array, ""] = parameter(0.7, unit="kg", positive=True)

@@ -17,7 +17,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class DoublePendulumRods(Scene):
-    """Cartesian coordinates of both particles; pivot at the origin."""
+    """A planar double pendulum in Cartesian coordinates: two rods as geometric rows.
+
+    Cartesian coordinates of both particles; pivot at the origin.
+    """
 
     mass1: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
     mass2: Float[Array, ""] = parameter(0.7, unit="kg", positive=True)

@@ -17,7 +17,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class FreeRigidBody(Scene):
-    """Position of the mass centre, attitude as a quaternion, body angular velocity as speeds; body axes are principal."""
+    """A rigid body that nothing acts on.
+
+    Position of the mass centre, attitude as a quaternion, body angular velocity as speeds; body axes are principal.
+    """
 
     mass: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
     i1: Float[Array, ""] = parameter(1.0, unit="kg m^2", positive=True)

@@ -14,7 +14,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class HeisenbergParticle(Scene):
-    """A free particle under one linear row; lengths in units of the length that makes the row `zdot = y xdot - x ydot`."""
+    """The Heisenberg system: a free particle under the row `zdot = y xdot - x ydot`.
+
+    Lengths in units of the length that makes the row `zdot = y xdot - x ydot`.
+    """
 
     mass: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
 

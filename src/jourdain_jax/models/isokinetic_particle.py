@@ -18,7 +18,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class IsokineticParticle(Scene):
-    """Motion in a vertical plane, x horizontal and z up."""
+    """A particle kept at constant speed under gravity: a row that is nonlinear in the velocities.
+
+    Motion in a vertical plane, x horizontal and z up.
+    """
 
     mass: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
     speed: Float[Array, ""] = parameter(1.7, unit="m/s", positive=True, about="c, which the row keeps")

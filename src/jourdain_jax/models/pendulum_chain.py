@@ -19,7 +19,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class PendulumChain(Scene):
-    """Cartesian coordinates of all particles, from the pivot down; masses and lengths are one number, or one per link."""
+    """A hanging chain of particles and massless rods in a vertical plane.
+
+    Cartesian coordinates of all particles, from the pivot down; masses and lengths are one number, or one per link.
+    """
 
     links: int = eqx.field(static=True, default=5)
     mass: Float[Array, "*links"] = parameter(0.2, unit="kg", positive=True)

@@ -29,7 +29,10 @@ _HALF_TURN = np.diag([1.0, -1.0, -1.0])  # from axes with n3 down to the engine'
 
 
 class Rattleback(Scene):
-    """x, y of the mass centre; angles alpha, beta, gamma; body angular velocity w1, w2, w3. Singular at alpha = +-pi/2."""
+    """The rattleback (celt): an ellipsoid, its inertia axes turned, that rolls without slip on a level plane.
+
+    x, y of the mass centre; angles alpha, beta, gamma; body angular velocity w1, w2, w3. Singular at alpha = +-pi/2.
+    """
 
     mass: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
     a: Float[Array, ""] = parameter(0.20, unit="m", positive=True, about="semi-axis along body 1")

@@ -15,7 +15,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class RosenbergParticle(Scene):
-    """A free particle under one linear row; lengths in units of the length that makes the row `zdot = y xdot`."""
+    """Rosenberg's particle: free but for the row `zdot = y xdot`.
+
+    Lengths in units of the length that makes the row `zdot = y xdot`.
+    """
 
     mass: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
 

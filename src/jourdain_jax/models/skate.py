@@ -22,7 +22,10 @@ _BLADE = np.array([[-0.15, 0.0, 0.0], [0.15, 0.0, 0.0]])  # m, for drawing only
 
 
 class Skate(Scene):
-    """A rigid body whose blade lies under its mass centre; x, y of that centre, heading of the blade."""
+    """A skate (knife edge) on an incline, its blade under its mass centre.
+
+    x, y of the mass centre, heading of the blade.
+    """
 
     mass: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
     inertia: Float[Array, ""] = parameter(0.2, unit="kg m^2", positive=True, about="about the normal of the slope")

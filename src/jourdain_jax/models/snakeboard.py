@@ -22,7 +22,9 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Snakeboard(Scene):
-    """x, y of the board's middle, heading; rotor angle relative to the board; steer of the front wheels, the back ones by -steer.
+    """The snakeboard: a board with a rotor, on two wheel pairs that steer by opposite angles.
+
+    x, y of the board's middle, heading; rotor angle relative to the board; steer of the front wheels, the back ones by -steer.
 
     Inputs (N m): `rotor_torque` between rotor and board, `steer_torque` that opens both wheel pairs.
     """

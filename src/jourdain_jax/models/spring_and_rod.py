@@ -18,7 +18,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class SpringAndRod(Scene):
-    """Cartesian coordinates of both particles; origin - spring (and damper) - first - rod - second."""
+    """Two particles in a vertical plane: a spring holds the first to the origin, a rod the second to the first.
+
+    Cartesian coordinates of both particles; origin - spring (and damper) - first - rod - second.
+    """
 
     mass1: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
     mass2: Float[Array, ""] = parameter(0.6, unit="kg", positive=True)

@@ -18,7 +18,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Suslov(Scene):
-    """Attitude as a quaternion, speeds: body angular velocity. Moments of inertia about the fixed point, the mass centre."""
+    """Suslov's problem: a body about a fixed point that cannot turn about its own third axis.
+
+    Attitude as a quaternion, speeds: body angular velocity. Moments of inertia about the fixed point, the mass centre.
+    """
 
     i11: Float[Array, ""] = parameter(1.0, unit="kg m^2", positive=True)
     i22: Float[Array, ""] = parameter(2.0, unit="kg m^2", positive=True)

@@ -18,7 +18,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class TiltingDisc(Scene):
-    """Uniform thin disc: yaw about z, lean about the heading, spin about the axle; x, y of the contact point."""
+    """A thin disc that rolls without slip on a level plane, in angles.
+
+    Uniform thin disc: yaw about z, lean about the heading, spin about the axle; x, y of the contact point.
+    """
 
     mass: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
     radius: Float[Array, ""] = parameter(0.5, unit="m", positive=True)

@@ -23,7 +23,10 @@ _FLAT = 45.0  # units of round-off of the squared angle to the ground (1e-7 rad 
 
 
 class TiltingDiscQuaternion(Scene):
-    """Uniform thin disc: x, y, z of the centre, attitude as a quaternion, body angular velocity; the axle is body y."""
+    """A thin disc that rolls without slip on a level plane, as a free body with the contact as rows.
+
+    Uniform thin disc: x, y, z of the centre, attitude as a quaternion, body angular velocity; the axle is body y.
+    """
 
     mass: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
     radius: Float[Array, ""] = parameter(0.5, unit="m", positive=True)

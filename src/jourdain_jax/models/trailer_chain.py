@@ -25,7 +25,9 @@ from jourdain_jax.scene.scene import Scene
 
 
 class TrailerChain(Scene):
-    """Body 0 is the car, bodies 1 to n the trailers; mass centres on the axles. Trailer parameters: one number or one each.
+    """A car that pulls a chain of trailers, each hitched to the axle ahead.
+
+    Body 0 is the car, bodies 1 to n the trailers; mass centres on the axles. Trailer parameters: one number or one each.
 
     Inputs: `drive` forward on the car (N), `turn` torque on the car (N m).
     """

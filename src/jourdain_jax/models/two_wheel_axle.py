@@ -104,14 +104,17 @@ class _FreeWheels(_TwoWheelAxle):
 
 
 class TwoWheelAxleFree(_FreeWheels):
-    """Method I: Jourdain's equation (50) for two free bodies, ten rows."""
+    """Two wheels on an axle down an incline, Method I: Jourdain's equation (50) for two free bodies, ten rows."""
 
     def velocity_constraints(self, motion):
         return {"rigid axle": self._axle_row(motion.u.psi1_rate, motion.u.psi2_rate, motion.u.phi1_rate)}
 
 
 class TwoWheelAxleRedundant(_FreeWheels):
-    """Method I with both rows (60a) and (60b): either alone loses the axle where its factor, cos phi or sin phi, passes zero."""
+    """Two wheels on an axle down an incline, Method I with both rows (60a) and (60b).
+
+    Either alone loses the axle where its factor, cos phi or sin phi, passes zero.
+    """
 
     def velocity_constraints(self, motion):
         u, phi = motion.u, motion.q.phi1
@@ -136,7 +139,7 @@ class _UprightWheels(_TwoWheelAxle):
 
 
 class TwoWheelAxleCoordinates(_UprightWheels):
-    """Method II: Appell's equations (52) in seven coordinates with the five rows (65)."""
+    """Two wheels on an axle down an incline, Method II: Appell's equations (52) in seven coordinates with the five rows (65)."""
 
     privileged = ("psi1_rate", "phi_rate")
     example = {"y2": 0.8, "psi1_rate": 0.7 / 0.3, "phi_rate": 1.1}
@@ -152,7 +155,10 @@ class TwoWheelAxleCoordinates(_UprightWheels):
 
 
 class TwoWheelAxleQuasi(_UprightWheels):
-    """Method III: of the seven quasi-velocities (67) the five rows are set to zero; rolling of wheel 1 and turning remain."""
+    """Two wheels on an axle down an incline, Method III: quasi-velocities (67).
+
+    Of the seven the five rows are set to zero; rolling of wheel 1 and turning remain.
+    """
 
     speeds = speeds("rolling turning")
     example = {"y2": 0.8, "rolling": 0.7 / 0.3, "turning": 1.1}

@@ -18,7 +18,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class VerticalDisc(Scene):
-    """x, y of the contact point (and of the centre), heading about the vertical, roll about the axle."""
+    """An upright disc that rolls and turns on a level plane.
+
+    x, y of the contact point (and of the centre), heading about the vertical, roll about the axle.
+    """
 
     mass: Float[Array, ""] = parameter(1.0, unit="kg", positive=True)
     radius: Float[Array, ""] = parameter(1.0, unit="m", positive=True)

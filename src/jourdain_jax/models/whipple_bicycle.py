@@ -27,7 +27,9 @@ from jourdain_jax.scene.scene import Scene
 
 
 class WhippleBicycle(Scene):
-    """Coordinates: x, y of the rear contact; yaw, lean, pitch of the rear frame; steer; spins of the wheels in their frames.
+    """The full nonlinear Whipple bicycle: four rigid bodies on two knife-edge wheels that roll without slip.
+
+    x, y of the rear contact; yaw, lean, pitch of the rear frame; steer; spins of the wheels in their frames.
 
     Inputs, both positive to the right (N m): `lean_torque` from outside on the rear frame about the level line through the rear
     contact; `steer_torque` on the front frame about the steer axis, with its reaction on the rear frame.

@@ -9,6 +9,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jourdain_jax.motion.land_on import time_ahead
+
 _WHOLE = 1e-9  # a ratio this little above a whole number counts as that number
 
 
@@ -43,16 +45,12 @@ class EvenSteps(diffrax.AbstractStepSizeController):
         steps = _Steps(index, left, state.longest)
         return jnp.array(True), t1, self._end(steps, t1), jnp.array(False), steps, diffrax.RESULTS.successful
 
-    def _goal(self, index):
-        count = self.ts.shape[0]
-        return jnp.where(index < count, self.ts[jnp.minimum(index, count - 1)], jnp.inf)
-
     def _count(self, index, t, longest) -> Int[Array, ""]:
-        rest = self._goal(index) - t
+        rest = time_ahead(self.ts, index) - t
         rest = jnp.where(jnp.isfinite(rest), rest, longest)
         return jnp.maximum(jnp.ceil(rest / longest - _WHOLE), 1).astype(jnp.int32)
 
     def _end(self, steps: _Steps, t):
-        goal = self._goal(steps.index)
+        goal = time_ahead(self.ts, steps.index)
         rest = jnp.where(jnp.isfinite(goal), goal - t, steps.longest)
         return jnp.where(steps.left <= 1, jnp.where(jnp.isfinite(goal), goal, t + rest), t + rest / steps.left)

@@ -18,6 +18,12 @@ def land_on(ts: Float[Array, "times"], controller: diffrax.AbstractStepSizeContr
     return kind(controller, ts)
 
 
+def time_ahead(ts: Float[Array, "times"], index: Int[Array, ""]) -> Float[Array, ""]:
+    """The time with this `index` among `ts`; infinity beyond the last."""
+    count = ts.shape[0]
+    return jnp.where(index < count, ts[jnp.minimum(index, count - 1)], jnp.inf)
+
+
 class _State(eqx.Module):
     index: Int[Array, ""]  # of the next time
     inner: PyTree
@@ -45,16 +51,12 @@ class _Landing(eqx.Module):
             t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state.inner
         )
         index = controller_state.index
-        arrived = keep & (t1 >= self._goal(index))
+        arrived = keep & (t1 >= time_ahead(self.ts, index))
         index = index + arrived.astype(index.dtype)
         return keep, next_t0, self._aimed(index, next_t0, next_t1), jumped, _State(index, inner), result
 
-    def _goal(self, index):
-        count = self.ts.shape[0]
-        return jnp.where(index < count, self.ts[jnp.minimum(index, count - 1)], jnp.inf)
-
     def _aimed(self, index, t0, t1):
-        goal = self._goal(index)
+        goal = time_ahead(self.ts, index)
         rest, step = goal - t0, t1 - t0
         short = jnp.where(2 * step > rest, t0 + 0.5 * jnp.where(jnp.isfinite(rest), rest, 0.0), t1)
         return jnp.where(step >= NEARLY * rest, goal, short)

@@ -122,7 +122,7 @@ def _frame(axes, centre, radius: float) -> None:
     axes.set_xlim(centre[0] - radius, centre[0] + radius)
     axes.set_ylim(centre[1] - radius, centre[1] + radius)
     axes.set_zlim(centre[2] - radius, centre[2] + radius)
-    axes.set_box_aspect((1, 1, 1), zoom=1.15)
+    axes.set_box_aspect((1, 1, 1), zoom=1.0)  # beyond, the labels of the axes are cut off
 
 
 def _ground(axes, low, high, radius: float) -> bool:
@@ -147,4 +147,6 @@ def _label(axes) -> None:
     axes.set_zlabel("z in m")
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
+        axis.get_major_locator().set_params(nbins=4)
+    axes.tick_params(labelsize=8, pad=0)
     axes.grid(False)

@@ -8,17 +8,19 @@ from jourdain_jax.bicycle.job import Study
 from jourdain_jax.plotting.animation import animate
 from jourdain_jax.plotting.backend import pyplot
 
-_MODES = (("castering", 0, "tab:green"), ("capsize", 1, "tab:orange"), ("weave", 2, "tab:blue"))
+# columns of the eigenvalues; weave is a pair, two real ones below the double root
+_MODES = (("castering", (0,), "tab:green"), ("capsize", (1,), "tab:orange"), ("weave", (2, 3), "tab:blue"))
 _FLOOR, _CEILING = -12.0, 12.0  # 1/s; castering goes far below what matters
 
 
 def draw_eigenvalues(study: Study, path: str | os.PathLike) -> None:
-    """Real and imaginary parts against forward speed; bands are the 2.5 and 97.5 % quantiles of the samples, the stable range is shaded."""
+    """Real and imaginary parts against forward speed; bands are the 2.5 and 97.5 % quantiles of the samples, of the speeds too; the stable range is green."""
     plt = pyplot()
     figure, (real, imaginary) = plt.subplots(2, 1, sharex=True, figsize=(7.5, 6.5), height_ratios=(3, 2), layout="constrained")
     nominal, samples = study.eigenvalues[0], study.eigenvalues[1:][study.physical]
-    for name, column, colour in _MODES:
-        _band(real, study.grid, nominal[:, column].real, samples[:, :, column].real, colour, name)
+    for name, columns, colour in _MODES:
+        for column in columns:
+            _band(real, study.grid, nominal[:, column].real, samples[:, :, column].real, colour, name if column == columns[0] else None)
     weave = nominal[:, 2].imag
     _band(imaginary, study.grid, np.abs(weave), np.abs(samples[:, :, 2].imag), "tab:blue", "weave")
     _mark_range(study, (real, imaginary))
@@ -29,7 +31,7 @@ def draw_eigenvalues(study: Study, path: str | os.PathLike) -> None:
     imaginary.set_ylim(bottom=0.0)
     imaginary.set_xlabel("forward speed in m/s")
     imaginary.set_xlim(study.grid[0], study.grid[-1])
-    real.set_title(f"{study.bicycle.name}: eigenvalues of upright running, bands hold 95 % of {len(samples)} samples", fontsize=11)
+    real.set_title(f"{study.bicycle.name}: eigenvalues of upright running; bands, grey for the speeds, hold 95 % of {len(samples)} samples", fontsize=10)
     real.legend(loc="lower right", fontsize=9)
     for axis in (real, imaginary):
         axis.grid(alpha=0.3)
@@ -53,13 +55,17 @@ def _mark_range(study: Study, axes) -> None:
     for name, value in (("weave", weave), ("capsize", capsize)):
         if value is None or value > study.grid[-1]:
             continue
+        low, high = (_value(study, f"{name}_speed", limit) for limit in ("low", "high"))
+        limits = "" if low is None or high is None or low == high else f"\n({low:.2f} to {high:.2f})"
         for axis in axes:
             axis.axvline(value, color="0.4", lw=0.8, ls="--")
+            if limits:
+                axis.axvspan(low, high, color="0.4", alpha=0.2, lw=0)
         side = "right" if name == "weave" else "left"
         axes[0].annotate(
-            f"{name} speed\n{value:.2f} m/s",
+            f"{name} speed\n{value:.2f} m/s{limits}",
             (value, _CEILING),
-            xytext=(-4 if side == "right" else 4, -6),
+            xytext=(-8 if side == "right" else 8, -6),
             textcoords="offset points",
             ha=side,
             va="top",
@@ -67,9 +73,9 @@ def _mark_range(study: Study, axes) -> None:
         )
 
 
-def _value(study: Study, name: str) -> float | None:
+def _value(study: Study, name: str, part: str = "value") -> float | None:
     speed = study.speeds[name]
-    return None if speed is None else speed["value"]
+    return None if speed is None else speed[part]
 
 
 def draw_rides(study: Study, path: str | os.PathLike) -> None:

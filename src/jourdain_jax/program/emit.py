@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.graph import COMPARISONS, Graph
 from jourdain_jax.program.together import together
 
 DEEP = 120  # operations one after the other; measured: chains of links and trailers gain from 100 to 250 on, the bicycle (102) loses a quarter
@@ -73,12 +73,7 @@ FUNCTIONS: dict[str, Callable] = {
     "atan": jnp.arctan,
     "max": jnp.maximum,
     "min": jnp.minimum,
-    "lt": lambda a, b: a < b,
-    "le": lambda a, b: a <= b,
-    "gt": lambda a, b: a > b,
-    "ge": lambda a, b: a >= b,
-    "eq": lambda a, b: a == b,
-    "ne": lambda a, b: a != b,
+    **COMPARISONS,
     "and": jnp.logical_and,
     "or": jnp.logical_or,
     "not": jnp.logical_not,

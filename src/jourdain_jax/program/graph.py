@@ -5,6 +5,7 @@ Arguments of sums and products are ordered, so that a b and b a are one node.
 """
 
 import math
+import operator
 from collections.abc import Callable, Iterable, Mapping
 
 OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
@@ -207,14 +208,7 @@ class Graph:
 
     def reachable(self, outputs: Iterable[int]) -> list[int]:
         """All nodes that the outputs need, in an order in which they can be computed."""
-        seen: set[int] = set()
-        stack = list(outputs)
-        while stack:
-            node = stack.pop()
-            if node not in seen:
-                seen.add(node)
-                stack.extend(self.args[node])
-        return sorted(seen)  # arguments are older than what uses them
+        return self.needed(outputs, known=())
 
     def needed(self, outputs: Iterable[int], known) -> list[int]:
         """What must be computed for the outputs where the nodes in `known` are known, in order."""
@@ -225,7 +219,7 @@ class Graph:
             if node not in seen:
                 seen.add(node)
                 stack.extend(a for a in self.args[node] if a not in known)
-        return sorted(seen)
+        return sorted(seen)  # arguments are older than what uses them
 
     def with_quotients(self, outputs: Iterable[int]) -> list[int]:
         """The outputs with `a (1/b)` as one division, where `1/b` serves only once."""
@@ -257,6 +251,7 @@ class Graph:
         return sum(self.varies[n] and self.op[n] in OPERATIONS for n in self.reachable(outputs))
 
 
+COMPARISONS: dict[str, Callable] = {name: getattr(operator, name) for name in ("lt", "le", "gt", "ge", "eq", "ne")}
 _ARITHMETIC = {"add", "sub", "mul", "div", "neg"}
 _FOLDED: dict[str, Callable] = {
     "sin": math.sin,
@@ -270,11 +265,6 @@ _FOLDED: dict[str, Callable] = {
     "sign": lambda x: math.copysign(1.0, x) if x else 0.0,
     "max": max,
     "min": min,
-    "lt": lambda a, b: a < b,
-    "le": lambda a, b: a <= b,
-    "gt": lambda a, b: a > b,
-    "ge": lambda a, b: a >= b,
-    "eq": lambda a, b: a == b,
-    "ne": lambda a, b: a != b,
+    **COMPARISONS,
     "select": lambda c, a, b: b if c else a,
 }

@@ -47,6 +47,7 @@ def check_description(scene, base: Any) -> None:
             f"`{kind.__name__}` has speeds of its own ({', '.join(scene.speeds.entries)}) but does not say how they move its coordinates; "
             "define `coordinate_rates(self, t, q, u)`, which returns the rates of all coordinates"
         )
+    _check_counts(scene)
     _check_one_meaning(scene)
     _check_domain(scene)
     example = inspect.getattr_static(kind, "example")
@@ -90,6 +91,17 @@ def _misspelt(kind: type, base: type) -> str:
                     f"Rename it, or begin its name with an underscore (`_{name}`) if it is your own"
                 )
     return ""
+
+
+def _check_counts(scene) -> None:
+    """A count that is no static field would be a number of the equations, and a loop or a branch over it could not be traced."""
+    for field in fields(scene):
+        value = getattr(scene, field.name)
+        if isinstance(value, int) and not field.metadata.get("static"):
+            raise ValueError(
+                f"field `{field.name}` of `{type(scene).__name__}` is {value} and no parameter; for a count or switch write "
+                f"`{field.name}: {type(value).__name__} = eqx.field(static=True, default={value})`, for a number `{field.name} = jj.parameter({float(value)})`"
+            )
 
 
 def _check_one_meaning(scene) -> None:
