@@ -24,6 +24,7 @@ from jourdain_jax.motion import results
 
 RUNNING = -1
 SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
+_SHRANK = 0.01
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,10 @@ def integrate(
         return end, (end.y, end.t == goal)
 
     end, (ys, reached) = jax.lax.scan(to_goal, start, goals)
-    return ys, reached, eqx.tree_at(lambda p: p.code, end, jnp.where(end.code == RUNNING, results.SUCCESS, end.code))
+    # the last steps against the average one
+    shrank = (end.code == results.MAX_STEPS) & (end.h * end.accepted < _SHRANK * jnp.abs(end.t - t0))
+    code = jnp.where(shrank, results.SHRANK, jnp.where(end.code == RUNNING, results.SUCCESS, end.code))
+    return ys, reached, eqx.tree_at(lambda p: p.code, end, code)
 
 
 def _step(problem: Problem, method: Method, p: Progress, goal, last_goal, direction) -> Progress:

@@ -43,6 +43,7 @@ class StateForm(eqx.Module):
     projects_speeds: bool = eqx.field(static=True)
     lowered: Lowered | None = eqx.field(static=True, default=None)  # the scalar program of the rates; None: dense matrices
     of_inputs: tuple[int, ...] = eqx.field(static=True, default=())  # numbers of the loads whose potential depends on inputs
+    own_equations: str = eqx.field(static=True, default="")  # of a solver that takes no accelerations: what it solves instead
     cutoff: float | None = eqx.field(static=True, default=None)  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     @property
@@ -53,6 +54,8 @@ class StateForm(eqx.Module):
     @property
     def reduction_name(self) -> str:
         """Name of the reduction, as it stands in a trajectory."""
+        if self.own_equations:
+            return f"none, {self.own_equations}"
         detail = "" if self.lowered is None else ", lowered"
         return getattr(self.reduction, "name", "") + (detail if self.cutoff is None else f", cut-off {self.cutoff:.0e}")
 
