@@ -65,6 +65,7 @@ from jourdain_jax.motion.munthe_kaas import MuntheKaas
 from jourdain_jax.motion.radau import RadauIIA
 from jourdain_jax.motion.results import SimulationError
 from jourdain_jax.motion.rollout import Rollout, rollout
+from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import State, consistent, start
 from jourdain_jax.motion.storage import load, load_rollout, save

@@ -9,6 +9,7 @@ Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (199
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import ClassVar
 
 import diffrax
@@ -39,7 +40,7 @@ class RadauIIA(diffrax.AbstractSolver):
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
-    interpolation_cls: ClassVar[Callable] = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
+    interpolation_cls: ClassVar[Callable] = partial(diffrax.ThirdOrderHermitePolynomialInterpolation.from_k)
 
     def order(self, terms):
         """Five. `terms` as in diffrax."""

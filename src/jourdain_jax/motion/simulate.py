@@ -27,11 +27,12 @@ from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.fixed_step import FixedStepSolver
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import Options, Setup, integrate
+from jourdain_jax.motion.sensitivity import watched
 from jourdain_jax.motion.solver_choice import check_solver, fitted, may_be_full
 from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
-from jourdain_jax.motion.stiff import OUT_OF_STEPS, by_implicit, is_stiff
 from jourdain_jax.motion.state_form import StateForm, cutoff_of, default_reduction
+from jourdain_jax.motion.stiff import OUT_OF_STEPS, by_implicit, is_stiff
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
@@ -76,8 +77,9 @@ def simulate(
       `example_span` after t0); `ts`: times to save at (default: 201 even ones). `saveat`: a `diffrax.SaveAt` instead.
     - `rtol`, `atol`, `solver`, `stepsize_controller`, `dt0` (default: 1e-4 of the span), `adjoint`, `max_steps`: as in
       `diffrax.diffeqsolve`. Default solver: Tsit5 for
-      rtol >= 1e-6, Dopri8 below, and where these run out of steps on a stiff motion, `RadauIIA`; structure-preserving ones (`ImplicitMidpoint`, `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps
-      of at most `dt0` between saved times. Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`
+      rtol >= 1e-6, Dopri8 below, and where these run out of steps on a stiff motion, `RadauIIA`; structure-preserving ones (`ImplicitMidpoint`,
+      `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps of at most `dt0` between saved times.
+      Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`
       for forward mode of any order; `diffrax.DirectAdjoint()` for all.
     - `state`: "minimal" (q and privileged speeds), "full" (q and u) or "auto"; `reduction`: as in `accelerations`.
     - `projection`: put the state back onto the constraints after each step, where the state form does not keep them by itself.
@@ -97,16 +99,16 @@ def simulate(
     support the mode of differentiation.
     """
     setup = _set_up(**locals())
-    motion = integrate(setup)
+    motion = watched(setup, integrate)
     if isinstance(motion.result, jax.core.Tracer):
         return motion
     if state == "auto" and may_be_full(solver) and int(motion.result) in lost_codes(setup.form):
         # the motion left the domain in which the partition was found to serve
         form = state_form(setup.scene, structure_of(setup.scene), "full", reduction, stabilisation, projection, work, lowering=False)
         setup = dataclasses.replace(setup, form=fitted(solver, setup.scene, form, "full"))
-        motion = fallen_back(integrate(setup), results.FULL_STATE)
+        motion = fallen_back(watched(setup, integrate), results.FULL_STATE)
     if solver is None and stepsize_controller is None and is_stiff(setup.form, motion, setup.t0):
-        motion = fallen_back(integrate(by_implicit(setup)), results.IMPLICIT)
+        motion = fallen_back(watched(by_implicit(setup), integrate), results.IMPLICIT)
     return motion
 
 

@@ -56,8 +56,8 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
 
     `inputs`: values of the scene's inputs (default: zero). `held`: names of coordinates and speeds that do not move.
 
-    Differentiable in any mode. What cannot be met stays in `residual`, which is infinite where numbers are not finite (no error: this also runs inside jit and vmap); the quaternion
-    (0, 0, 0, 0) has no direction and stays as it is, with a residual of 1/2. ValueError for wrong shapes.
+    Differentiable in any mode. What cannot be met stays in `residual`, which is infinite where numbers are not finite (no error: this also runs
+    inside jit and vmap); the quaternion (0, 0, 0, 0) has no direction and stays as it is, with a residual of 1/2. ValueError for wrong shapes.
     """
     t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     inputs = as_input_vector(scene, inputs, q.dtype)

@@ -18,14 +18,18 @@ from jourdain_jax.motion.integration import Options, Setup
 from jourdain_jax.motion.radau import RadauIIA
 from jourdain_jax.motion.state_form import StateForm
 from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.scene.numbers import is_traced
 
 OUT_OF_STEPS = (results.MAX_STEPS, results.SHRANK)
 _SHARE = 10  # a step of the implicit solver costs tens of explicit ones: it gets a tenth of the number
 
 
 def is_stiff(form: StateForm, motion: Trajectory, t0) -> bool:
-    """Whether stability kept the steps of a `motion` from `t0` short that ran out of them."""
+    """Whether stability kept the steps of a `motion` from `t0` short that ran out of them; False where its numbers are not known."""
     if int(motion.result) not in OUT_OF_STEPS or int(motion.accepted) == 0:
+        return False
+    form, motion, t0 = (jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, x) for x in (form, motion, t0))
+    if is_traced((form, motion, t0)):
         return False
     step = float(motion.last_step)
     step = abs(float(motion.t_end) - float(t0)) / int(motion.accepted) if np.isnan(step) else step

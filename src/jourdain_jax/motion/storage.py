@@ -2,8 +2,9 @@
 
 Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent where not tracked), `t_end`, `q_end`, `u_end`,
 `result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `fallback`, `inputs` (times, inputs; sampled at `ts`), and
-`parameter:NAME` for every field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`, `speeds`, `input_names`, `units` of the parameters,
-`static` (fields that are plain numbers or texts), `state_form`, `reduction`, `solver`, `projected`, `event_names`, `versions`.
+`parameter:NAME` for every field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`, `speeds`,
+`input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
+`state_form`, `reduction`, `solver`, `projected`, `event_names`, `versions`.
 `kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `continued` holds
 the numbers of the lanes that were run again with the full state; `ways` in its header says how lanes with a `fallback` were run.
 """
@@ -29,7 +30,8 @@ from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
-_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", "result", "event", "accepted", "rejected", "moved_q", "moved_u", "smallest_pivot", "last_step", "fallback")
+_COUNTS = ("result", "event", "accepted", "rejected", "fallback")
+_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", *_COUNTS, "last_step", "moved_q", "moved_u", "smallest_pivot")
 _TEXTS = ("state_form", "reduction", "solver", "projected")
 _HEADER = ("scene", "coordinates", "speeds", "input_names", "static", "event_names", *_TEXTS)
 _READERS = {"trajectory": "jj.load(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
