@@ -101,7 +101,7 @@ def bricard() -> Instant:
     def whole(half):
         return np.concatenate([half, half @ turned]).ravel()
 
-    scene = Bricard(lengths=np.linalg.norm(rods, axis=1), domain_near=tuple(whole(points)))
+    scene = Bricard(lengths=np.linalg.norm(rods, axis=1), domain_near=tuple(whole(points).tolist()))
     return Instant(scene, whole(points), whole(velocities), whole(known))
 
 
