@@ -8,8 +8,6 @@ component decays at once.
 Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (1996), section IV.5 and equations (IV.8.17) to (IV.8.19).
 """
 
-from collections.abc import Callable
-from functools import partial
 from typing import ClassVar
 
 import diffrax
@@ -40,7 +38,11 @@ class RadauIIA(diffrax.AbstractSolver):
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
-    interpolation_cls: ClassVar[Callable] = partial(diffrax.ThirdOrderHermitePolynomialInterpolation.from_k)
+
+    @property
+    def interpolation_cls(self):
+        """A cubic between the ends of a step, by the states and rates there."""
+        return diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
     def order(self, terms):
         """Five. `terms` as in diffrax."""
@@ -55,7 +57,10 @@ class RadauIIA(diffrax.AbstractSolver):
         return None
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """One step; an infinite error where its equations were not solved. `terms`, `t0`, ...: as in diffrax."""
+        """One step; an infinite error where its equations were not solved.
+
+        `terms`, `t0`, `t1`, `y0`, `args`, `solver_state`, `made_jump`: as in diffrax.
+        """
         x0, unravel = ravel_pytree(y0)
         h = jnp.asarray(terms.contr(t0, t1), x0.dtype)  # signed, as the times that the rates are given
         n, A, estimate = x0.shape[0], jnp.asarray(_A, x0.dtype), jnp.asarray(_ESTIMATE, x0.dtype)
