@@ -1,6 +1,6 @@
 """The atlas of where methods fail: hard cases E1 to E24, every method, float64 and float32.
 
-    python bench/atlas.py [--quick] [--json FILE] [--out DIR] [--case NAME ...] [--method NAME ...]
+    python bench/atlas.py [--quick] [--json FILE] [--out DIR] [--case NAME ...] [--method NAME ...] [--cache DIR]
 
 Writes a list of {"case", "method", "dtype", "outcome", "error", "tolerance", "mechanism"}, a table (CSV and Markdown) and a picture (PNG and SVG).
 The engine as it comes is the method `default`. Each floating-point type runs in a process of its own: JAX chooses it once.
@@ -52,6 +52,7 @@ def in_process(dtype: str, arguments) -> list[dict]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cells.json"
         command = [sys.executable, __file__, "--only-dtype", dtype, "--json", str(path), *(["--quick"] if arguments.quick else [])]
+        command += ["--cache", str(arguments.cache)] if arguments.cache else []
         for option in ("case", "method"):
             command += [f"--{option}", *getattr(arguments, option)] if getattr(arguments, option) else []
         subprocess.run(command, env=os.environ | {"JAX_ENABLE_X64": "1" if dtype == "float64" else "0"}, check=True)
@@ -64,9 +65,15 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the list of cells")
     parser.add_argument("--out", type=Path, help="folder for the picture and the table")
     parser.add_argument("--case", nargs="*", help="only these cases")
+    parser.add_argument("--cache", type=Path, help="folder for compiled programs, which makes a second run much shorter")
     parser.add_argument("--method", nargs="*", help="only these methods")
     parser.add_argument("--only-dtype", choices=("float64", "float32"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
+    if arguments.cache:
+        import jax
+
+        jax.config.update("jax_compilation_cache_dir", str(arguments.cache))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
     if arguments.only_dtype:
         found = measure(arguments)
     else:

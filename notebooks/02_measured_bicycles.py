@@ -60,9 +60,7 @@ for name in names:
     samples = sample_parameters(bicycle, jax.random.key(1), 500)
     speeds = batch(samples.by_name())
     nominal = speeds_of({key: jnp.asarray(value) for key, value in bicycle.values.items()})
-    limits = [
-        interval(getattr(speeds, speed), nominal=getattr(nominal, speed), counted=samples.physical) for speed in ("weave_speed", "capsize_speed")
-    ]
+    limits = [interval(getattr(speeds, speed), nominal=getattr(nominal, speed), counted=samples.physical) for speed in ("weave_speed", "capsize_speed")]
     rows.append(limits)
     weave, capsize = limits
     print(f"{name:<10} weave {weave.value:.3f} [{weave.low:.3f}, {weave.high:.3f}]   capsize {capsize.value:.3f} [{capsize.low:.3f}, {capsize.high:.3f}] m/s")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from atlas_cases.cases import CASES
+from atlas_cases.mechanisms import USUAL
 from atlas_cases.methods import METHODS
 from atlas_cases.outcomes import FLAGGED, NAN, OUTCOMES, RIGHT, WRONG, judged
 
@@ -49,6 +50,28 @@ def test_every_row_of_the_table_of_hard_cases_is_there_once():
     assert rows == set(range(1, 25))
     assert len(BY_NAME) == len(CASES)
     assert len({method.name for method in METHODS}) == len(METHODS)
+
+
+def test_every_method_has_a_reason_to_fail_in_one_line():
+    for method in METHODS:
+        assert USUAL[method.name], method.name
+        assert "\n" not in USUAL[method.name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["E17 1000", "E17 1e+06", "E17 1e+08"])
+def test_stiff_contacts_are_right_for_the_engine_as_it_comes(name):
+    case = BY_NAME[name]
+    found = case.probe().cell(DEFAULT, case.tolerance)
+    assert found.outcome == RIGHT, found
+
+
+@pytest.mark.slow
+def test_a_derivative_takes_the_steps_of_its_motion():
+    """Integrated again between checkpoints, the rattleback took other steps: off by 6e-4 at rtol 1e-11, in float64."""
+    case = BY_NAME["E19 gradient 2 s"]
+    found = case.probe().cell(DEFAULT, case.tolerance)
+    assert found.outcome == RIGHT, found
 
 
 def test_outcomes_are_decided_by_the_error_and_by_what_a_method_says():

@@ -90,6 +90,18 @@ def through_projected_start() -> DerivativeOfMotion:
     return DerivativeOfMotion(begin, 0.5, ts, lambda m: m.q_end[0], slope(known, 0.5), skip=skip)
 
 
+def along_the_norm() -> DerivativeOfMotion:
+    """A free top for 2 s: how it ends does not depend on the norm of the quaternion that it is given."""
+    scene = jj.models.FreeRigidBody()
+    q, u, _ = scene.named(**scene.example)
+
+    def begin(size):
+        return scene, jj.consistent(scene, 0.0, jnp.concatenate([q[:3], size * q[3:]]), u)
+
+    skip = {"rollout": "asked in E4 gradient", "direct adjoint": "asked in E4 gradient", "reductions": "no rows", "naive": "no rows"}
+    return DerivativeOfMotion(begin, 1.0, np.array([0.0, 2.0]), lambda m: m.q_end[4], 0.0, scale=1.0, skip=skip)
+
+
 def through_a_long_motion(t_end: float) -> DerivativeOfMotion:
     """The rattleback: d w3(T) / d w3(0), of the order 1e3 to 1e4."""
     scene, ts = jj.models.Rattleback(), np.array([0.0, t_end])
@@ -129,6 +141,7 @@ CASES = (
     Case("E4 gradient", "derivative through a motion that starts there", through_a_motion, 1e-6, 5e-2, OTHERS),
     Case("E5 gradient", "derivative through the loss of rank", through_loss_of_rank, 1e-6, 5e-2, OTHERS, must_be_right=True),
     Case("E7 gradient", "derivative of accelerations: dependent rows", dependent, 1e-10, 1e-4, ROUND_OFF, must_be_right=True),
+    Case("E13 gradient", "derivative along the norm of a quaternion", along_the_norm, 1e-10, 1e-4, "zero, to round-off", must_be_right=True),
     Case("E18 gradient", "derivative through the projected start", through_projected_start, 1e-6, 5e-2, OTHERS, must_be_right=True),
     *(
         Case(f"E19 gradient {t:g} s", f"derivative through {t:g} s of a rattleback", lambda t=t: through_a_long_motion(t), 1e-6, 5e-2, OTHERS)

@@ -8,7 +8,8 @@ import jourdain_jax as jj
 from atlas_cases.case import Case
 from atlas_cases.instants import Instant
 from atlas_cases.motions import Motion, against
-from atlas_cases.scenes import AppellHamel, Edges, HeavyAxle
+from atlas_cases.references import bricard_accelerations
+from atlas_cases.scenes import AppellHamel, Bricard, Edges, HeavyAxle
 
 CLOSED = "a run at rtol = atol = 1e-12 (float32: 1e-5, 1e-6) against an exact solution, relative to the largest value"
 
@@ -17,7 +18,7 @@ def turning_skate() -> Motion:
     """The skate turns through 90 degrees twice a turn (B2)."""
     ts = np.linspace(0.0, 10.0, 11)
     scene, known = jj.models.Skate(), skate.motion(ts, **skate.RUN)
-    return Motion(scene, {"heading_rate": 1.3}, ts, against(scene, {"x": known["x"], "y": known["y"], "heading": known["th"]}))
+    return Motion(scene, {"heading_rate": 1.3}, ts, against(scene, {"x": known["x"], "y": known["y"], "heading": known["th"]}), step=0.005)
 
 
 def vertical_disc_by_heading_and_x() -> Motion:
@@ -81,6 +82,27 @@ def three_edges() -> Motion:
     ts = np.linspace(0.0, 10.0, 11)
     scene, known = Edges(), skate.motion(ts, **skate.RUN)
     return Motion(scene, {"heading_rate": 1.3}, ts, against(scene, {"x": known["x"], "y": known["y"], "heading": known["th"]}))
+
+
+def bricard() -> Instant:
+    """Bricard's octahedron of twelve rods, rank eleven, while it bends: accelerations against those of its half, six rods of full rank."""
+    points = np.array([[1.0, 0.2, 0.3], [-0.3, 0.9, -0.4], [0.4, -0.5, 1.1]])
+    edges = ((0, 1, False), (1, 2, False), (0, 2, False), (0, 1, True), (1, 2, True), (0, 2, True))
+    turned = np.diag([-1.0, -1.0, 1.0])
+    rods = [points[i] - (turned @ points[j] if image else points[j]) for i, j, image in edges]
+    rows = np.zeros((6, 9))
+    for k, (i, j, image) in enumerate(edges):
+        rows[k, 3 * i : 3 * i + 3] += rods[k]
+        rows[k, 3 * j : 3 * j + 3] -= turned @ rods[k] if image else rods[k]
+    free = np.linalg.svd(rows)[2][6:]  # two rigid motions that keep the axis, and the bending
+    velocities = ((0.4, -0.7, 0.9) @ free).reshape(3, 3)
+    known = np.asarray(bricard_accelerations(points, velocities, (1.0, 1.5, 0.7), edges), float)
+
+    def whole(half):
+        return np.concatenate([half, half @ turned]).ravel()
+
+    scene = Bricard(lengths=np.linalg.norm(rods, axis=1), domain_near=tuple(whole(points).tolist()))
+    return Instant(scene, whole(points), whole(velocities), whole(known))
 
 
 def two_edges(angle: float) -> Instant:
@@ -173,6 +195,7 @@ CASES = (
     ),
     Case("E7", "dependent rows: an axle with four rows of rank three", heavy_axle, 1e-10, 1e-3, CLOSED, must_be_right=True),
     Case("E7 copies", "dependent rows: one edge three times", three_edges, 1e-10, 1e-3, CLOSED, must_be_right=True),
+    Case("E7 Bricard", "dependent rows: an octahedron of twelve rods, rank eleven, that bends", bricard, 1e-11, 1e-3, "round-off, over angles of rods"),
     *(
         Case(
             f"E8 {angle:g}",

@@ -38,7 +38,8 @@ class DerivativeOfMotion:
     def cell(self, method: Method, tolerance: float) -> Outcome:
         """Outcome of one method."""
         why = self.skip.get(method.name, self.skip.get(method.group))
-        if why is not None or method.group == "constraints":
+        others = ("Radau IIA", "Munthe-Kaas")
+        if why is not None or method.group == "constraints" or method.even_steps or method.name in others:
             return not_applicable(why or "asked of motions")
         x = jnp.asarray(self.x, jnp.result_type(float))
         if method.naive is not None:
@@ -55,12 +56,14 @@ class DerivativeOfMotion:
 
         forward = isinstance(options.get("adjoint"), diffrax.ForwardMode)
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
+            with warnings.catch_warnings(record=True) as given:
+                warnings.simplefilter("always")
                 slope = jax.jvp(value, (x,), (jnp.ones_like(x),))[1] if forward else jax.grad(value)(x)
         except (ValueError, jj.DifferentiationModeError) as refusal:
             return judged(np.nan, tolerance, f"{type(refusal).__name__}: {str(refusal)[:90]}")
-        return judged(worst(float(slope), self.known, self.scale), tolerance)
+        found = judged(worst(float(slope), self.known, self.scale), tolerance)
+        said = [str(warning.message) for warning in given if issubclass(warning.category, jj.SensitivityWarning)]
+        return found if found.outcome == "right" or not said else judged(worst(float(slope), self.known, self.scale), tolerance, f"warning: {said[0]}")
 
     def _by_naive(self, method: Method, x, tolerance: float) -> Outcome:
         if self.naive_value is None or method.naive in naive.REDUCED_STATE:

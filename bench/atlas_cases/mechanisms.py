@@ -2,7 +2,7 @@
 
 from atlas_cases.case import Case
 from atlas_cases.methods import Method
-from atlas_cases.outcomes import FLAGGED, NAN, NOT_APPLICABLE, RIGHT, STALLED, Outcome
+from atlas_cases.outcomes import FLAGGED, NOT_APPLICABLE, RIGHT, Outcome
 
 USUAL = {
     "fixed partition": "division by the determinant of a partition that was chosen once, at the start",
@@ -19,6 +19,23 @@ USUAL = {
     "Baumgarte 1e4/s": "a pole at -1e4/s that the motion does not have: the step is bound to it",
     "privileged": "the privileged speeds stop determining the others: division by their pivot",
     "gibbs-appell": "the privileged speeds stop determining the others: division by their pivot",
+    "qr": "all speeds are integrated: errors off the rows and round-off are amplified by the motion before the projection takes them back",
+    "svd": "all speeds are integrated: errors off the rows and round-off are amplified by the motion before the projection takes them back",
+    "kkt": "all speeds are integrated: errors off the rows and round-off are amplified by the motion before the projection takes them back",
+    "udwadia-kalaba": "all speeds are integrated: errors off the rows and round-off are amplified by the motion before the projection takes them back",
+    "Tsit5": "order 5: the tolerance is met per step, and errors add up over the run; explicit: a stiff force bounds its steps",
+    "Dopri8": "the tolerance is met per step, and errors add up over the run or are amplified by the motion; explicit: a stiff force bounds its steps",
+    "Kvaerno5": "order 5, by iterations that stop at the tolerance: errors of the order of it add up; where these iterations fail, steps shrink",
+    "Radau IIA": "order 5 with an estimate of order 3: many short steps at a tight tolerance, whose errors add up over the run",
+    "Munthe-Kaas": "turns are advanced exactly, everything else as by the method within: errors are amplified by the motion all the same",
+    "implicit midpoint": "order 2: its energy error stays bounded, but is of the size of the step squared; a fast transient is not damped, only its sign flips",
+    "DLA": "order 2: the discrete Lagrangian is conserved, not the energy; a gauge term, which changes no motion, changes its errors",
+    "discrete gradient": "order 2: the energy is kept to round-off, every other integral and the path itself only to the size of the step squared",
+    "forward mode": "the derivative is exact for steps that are off by the tolerance: a motion that amplifies errors spoils it, too",
+    "direct adjoint": "the derivative is exact for steps that are off by the tolerance: a motion that amplifies errors spoils it, too",
+    "backsolve adjoint": "it would solve the motion backwards, off the constraints and against its contraction: refused",
+    "default": "the tolerance is met per step, and errors are amplified by the motion",
+    "rollout": "the tolerance is met per step, and errors are amplified by the motion",
 }
 
 
@@ -28,8 +45,7 @@ def mechanism(case: Case, method: Method, outcome: Outcome) -> str:
         return ""
     if outcome.outcome == NOT_APPLICABLE:
         return outcome.flag
+    if case.flag_is_right and outcome.outcome == FLAGGED:
+        return f"{case.reason} [{outcome.flag}]"
     own = case.mechanisms.get(method.name, USUAL.get(method.name, ""))
-    said = f"[{outcome.flag}]" if outcome.flag else ""
-    if outcome.outcome in (FLAGGED, STALLED, NAN):
-        return " ".join(part for part in (own, said) if part)
-    return " ".join(part for part in (own, said) if part)
+    return " ".join(part for part in (own, f"[{outcome.flag}]" if outcome.flag else "") if part)

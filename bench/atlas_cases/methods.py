@@ -19,8 +19,13 @@ INTEGRATORS: dict[str, Callable[[], diffrax.AbstractSolver]] = {
     "Tsit5": diffrax.Tsit5,
     "Dopri8": diffrax.Dopri8,
     "Kvaerno5": diffrax.Kvaerno5,
-    # "implicit midpoint": ..., "discrete Lagrange-d'Alembert": ..., "energy-preserving": ...
+    "Radau IIA": jj.RadauIIA,
+    "Munthe-Kaas": lambda: jj.MuntheKaas(diffrax.Dopri8()),
+    "implicit midpoint": jj.ImplicitMidpoint,
+    "DLA": jj.DiscreteLagrangeDAlembert,
+    "discrete gradient": jj.DiscreteGradient,
 }
+EVEN_STEPS = ("implicit midpoint", "DLA", "discrete gradient")  # they take steps of one length, `step` of a case
 ADJOINTS: dict[str, Callable[[], diffrax.AbstractAdjoint]] = {
     "forward mode": diffrax.ForwardMode,
     "direct adjoint": diffrax.DirectAdjoint,
@@ -71,6 +76,11 @@ class Method:
     reduction: str | None = None  # of `accelerations` and of `simulate`
     naive: str | None = None
     batch: bool = False  # by `rollout`
+
+    @property
+    def even_steps(self) -> bool:
+        """Whether it takes steps of one length."""
+        return self.name in EVEN_STEPS
 
 
 def _by_reduction(name: str) -> Method:

@@ -31,6 +31,26 @@ def linkage_angle(ts) -> np.ndarray:
     return integrate(lambda _, y: [y[1], LONG(35) / 30 * LONG(9.81) * np.sin(y[0])], [0.0, 1.0], ts)[:, 0]
 
 
+def bricard_accelerations(points, velocities, masses, edges) -> np.ndarray:
+    """Accelerations (3, 3) of the three vertices of a line-symmetric octahedron under gravity, images turned by half a turn about z.
+
+    Six rods `|P - Q| = l` of full rank, `(P - Q).(P'' - Q'') = -|P' - Q'|^2`; vertices count twice, once for their image. `edges`: (i, j, image):
+    whether the rod ends at the image of j.
+    """
+    points, velocities = np.asarray(points, LONG), np.asarray(velocities, LONG)
+    turned = np.diag(np.array([-1, -1, 1], LONG))
+    rows, known = np.zeros((len(edges), 9), LONG), np.zeros(len(edges), LONG)
+    for k, (i, j, image) in enumerate(edges):
+        S = turned if image else np.eye(3, dtype=LONG)
+        rod, rate = points[i] - S @ points[j], velocities[i] - S @ velocities[j]
+        rows[k, 3 * i : 3 * i + 3] += rod
+        rows[k, 3 * j : 3 * j + 3] -= S.T @ rod
+        known[k] = -(rate @ rate)
+    force = np.tile(np.array([0, 0, -1], LONG) * LONG("9.81"), 3)  # per mass
+    W = rows.T / np.repeat(np.asarray(masses, LONG), 3)[:, None]
+    return (force + W @ solve(rows @ W, known - rows @ force)).reshape(3, 3)
+
+
 def ball_on_switched_turntable(ts, x0, v0) -> np.ndarray:
     """x, y, vx, vy: `R'' = (2/7) (Om' z x R + Om z x R')` with Om = -2 tanh(3 (t - 1))."""
 

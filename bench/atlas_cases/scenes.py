@@ -173,7 +173,7 @@ class Bricard(jj.Scene):
     @property
     def domain(self):
         """Near a given shape."""
-        near = dict(zip(self.coordinates.names, self.domain_near, strict=False)) if self.domain_near else {}
+        near = dict(zip(self.coordinates.names.entries, self.domain_near, strict=False)) if self.domain_near else {}
         return {name: (value - 0.05, value + 0.05) for name, value in near.items()}
 
     def _points(self, q):

@@ -18,7 +18,7 @@ def write_tables(cells: list[dict], out: Path) -> None:
         writer = csv.DictWriter(file, KEYS)
         writer.writeheader()
         writer.writerows(cells)
-    (out / "atlas.md").write_text("\n".join([*_outcomes(cells), "", *_failures(cells), ""]))
+    (out / "atlas.md").write_text("\n".join([by_method(cells), "", *_outcomes(cells), "", *_failures(cells), ""]))
 
 
 def _outcomes(cells):
@@ -46,6 +46,16 @@ def _failures(cells):
     for cell in cells:
         if cell["outcome"] not in (RIGHT, NOT_APPLICABLE):
             yield f"| {cell['case']} | {cell['method']} | {cell['dtype']} | {cell['outcome']} | {cell['mechanism']} |"
+
+
+def by_method(cells: list[dict]) -> str:
+    """A Markdown table: how often each method was right, flagged, ..., in both types together."""
+    shown = [outcome for outcome in OUTCOMES if outcome != NOT_APPLICABLE]
+    lines = ["| method | " + " | ".join(shown) + " |", "|---|" + "---|" * len(shown)]
+    for method in dict.fromkeys(cell["method"] for cell in cells):
+        counts = Counter(cell["outcome"] for cell in cells if cell["method"] == method)
+        lines.append(f"| {method} | " + " | ".join(str(counts[outcome] or "") for outcome in shown) + " |")
+    return "\n".join(lines)
 
 
 def summary(cells: list[dict]) -> str:

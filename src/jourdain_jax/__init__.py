@@ -63,8 +63,10 @@ from jourdain_jax.motion.discrete_lagrange_dalembert import DiscreteLagrangeDAle
 from jourdain_jax.motion.implicit_midpoint import ImplicitMidpoint
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.munthe_kaas import MuntheKaas
+from jourdain_jax.motion.radau import RadauIIA
 from jourdain_jax.motion.results import SimulationError
 from jourdain_jax.motion.rollout import Rollout, rollout
+from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import State, consistent, start
 from jourdain_jax.motion.storage import load, load_rollout, save

@@ -6,6 +6,7 @@ A rotation matrix `R` takes body components to space components, `r_space = R r_
 
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
@@ -54,8 +55,13 @@ def vee(S: Float[Array, "3 3"]) -> Float[Array, "3"]:
 
 
 def quaternion_to_matrix(quaternion: Real[Array | np.ndarray, "4"] | Sequence[Number]) -> Float[Array, "3 3"]:
-    """Rotation matrix (3, 3), body to space, of a `quaternion` (w, x, y, z) of any norm but zero (the formula divides by the squared norm)."""
+    """Rotation matrix (3, 3), body to space, of a `quaternion` (w, x, y, z) of any norm but zero (the formula divides by the squared norm).
+
+    ValueError where it is known to be zero; NaN where a traced one is.
+    """
     quaternion = checked_real(quaternion, "quaternion", (4,), advice="give (w, x, y, z)")
+    if not isinstance(quaternion, jax.core.Tracer) and not np.any(np.asarray(quaternion)):
+        raise ValueError("quaternion is (0, 0, 0, 0), which is no attitude; give (w, x, y, z) of any other length, such as (1, 0, 0, 0) for none turned")
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     # R = 1 + 2 (w [v]x + [v]x^2) / (w^2 + v.v): unchanged by the norm, so that a drifting norm never scales an inertia.
     two = 2.0 / (w * w + x * x + y * y + z * z)

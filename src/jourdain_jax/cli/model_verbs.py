@@ -10,7 +10,7 @@ from jourdain_jax.analysis.verify import verify
 from jourdain_jax.equations.event_names import names_of_events
 from jourdain_jax.models.registry import MODELS, counts_of, known_model, model
 from jourdain_jax.motion.diagnostics import ContactExtremes, diagnose
-from jourdain_jax.motion.results import EVENT, SUCCESS
+from jourdain_jax.motion.results import EVENT, FALLBACKS, SUCCESS
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import start
 from jourdain_jax.motion.storage import save
@@ -200,6 +200,8 @@ def _motion_row(name: str, trajectory: Trajectory) -> dict:
         "result": int(trajectory.result),
         "message": trajectory.message,
         "t_end": float(trajectory.t_end),
+        "warnings": list(trajectory.warnings),
+        "fallback": FALLBACKS[int(trajectory.fallback)],
         "state": trajectory.state_form,
         "steps_accepted": int(trajectory.accepted),
         "steps_rejected": int(trajectory.rejected),

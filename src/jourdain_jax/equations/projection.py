@@ -45,7 +45,8 @@ def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "c
     """Where there are unit norms only, what the iteration converges to: `q / |q|` of every quaternion."""
     for first, _ in scene.coordinates.quaternions:
         wxyz = q[first : first + 4]
-        q = q.at[first : first + 4].set(wxyz / jnp.sqrt(wxyz @ wxyz))
+        squared = wxyz @ wxyz
+        q = q.at[first : first + 4].set(wxyz / jnp.sqrt(jnp.where(squared == 0, 1.0, squared)))  # zero has no direction and stays
     return q
 
 

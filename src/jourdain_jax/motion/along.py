@@ -35,6 +35,8 @@ class Record(Protocol):
     work: Float[Array, "times"] | None
     accepted: Int[Array, ""]
     rejected: Int[Array, ""]
+    last_step: Float[Array, ""]
+    fallback: Int[Array, ""]
     moved_q: Float[Array, ""]
     moved_u: Float[Array, ""]
     smallest_pivot: Float[Array, ""]

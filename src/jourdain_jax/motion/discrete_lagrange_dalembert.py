@@ -60,7 +60,8 @@ class DiscreteLagrangeDAlembert(FixedStepSolver):
             raise ValueError(f"`DiscreteLagrangeDAlembert` does not apply to `{name}`: {fault}; use solver=jj.ImplicitMidpoint()")
         if asked == "minimal":
             raise ValueError("`DiscreteLagrangeDAlembert` integrates all speeds; leave `state` at 'auto'")
-        return replace(form, independent=None, lowered=None, projects_positions=False, projects_speeds=False)
+        equations = f"discrete Lagrange-d'Alembert equations, {self.rule} rule"
+        return replace(form, independent=None, lowered=None, projects_positions=False, projects_speeds=False, own_equations=equations)
 
     def stepped(self, step: Step, y: Integrated) -> Stepped:
         """The state `y` after one `step`."""

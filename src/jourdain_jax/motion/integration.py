@@ -61,6 +61,7 @@ class Solved(eqx.Module):
     event: Int[Array, "*lanes"]  # index of the event that ended the motion, -1: none
     accepted: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
+    last_step: Float[Array, "*lanes"]  # s, that the step-size control would take next; NaN where it keeps that to itself
 
 
 class Setup(eqx.Module):
@@ -157,6 +158,8 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
         event=solved.event,
         accepted=solved.accepted,
         rejected=solved.rejected,
+        last_step=solved.last_step,
+        fallback=jnp.zeros((), jnp.int32) + results.AS_ASKED,
         moved_q=start.moved_q,
         moved_u=start.moved_u,
         smallest_pivot=pivot,
@@ -207,7 +210,7 @@ def _lean(setup: Setup, y0, args, ts, rates, project, events) -> Solved:
     kind: Literal["lax", "checkpointed"] = "lax" if isinstance(options.adjoint, diffrax.ForwardMode) else "checkpointed"
     goals = jnp.concatenate([ts, setup.t1[None]])
     ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, setup.t0, goals, options.dt0, kind)
-    return Solved(ts, jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected)
+    return Solved(ts, jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h)
 
 
 def _lanes_last(tree):
@@ -270,6 +273,7 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
         event=jnp.where(jnp.any(happened), jnp.argmax(happened), -1).astype(jnp.int32),
         accepted=solution.stats["num_accepted_steps"],
         rejected=solution.stats["num_rejected_steps"],
+        last_step=jnp.full_like(t_end, jnp.nan),
     )
 
 

@@ -4,11 +4,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START, UNSOLVED_STEP = range(10)
+SHRANK, STIFF = 10, 11
 
 MESSAGES = {
     SUCCESS: "reached the end of its span",
     EVENT: "stopped at an event",
-    MAX_STEPS: "ran out of steps; raise `max_steps`, loosen the tolerances, or look for a singularity near the last time",
+    MAX_STEPS: "ran out of steps; raise `max_steps`, loosen the tolerances, give solver=jj.RadauIIA() where forces are stiff, or look for a singularity "
+    "near the last time",
     STEP_TOO_SMALL: "the step size shrank to nothing: a singularity, a discontinuity, or rows that cannot be met near the last time",
     NOT_FINITE: "the accelerations are not finite or not determined (no inertia along a free direction); look at the last state with "
     "`accelerations` and `verify`",
@@ -16,7 +18,18 @@ MESSAGES = {
     SINGULAR_PARTITION: "the privileged speeds came near a configuration where they do not determine the others; use state='full'",
     BAD_PARAMETER: "a parameter is not finite or has the wrong sign",
     BAD_START: "the start is not finite; check where its values were computed",
+    SHRANK: "ran out of steps, which had shrunk to less than a hundredth of their average: a singularity, a discontinuity or a stiff force near the last time",
+    STIFF: "stiff: ran out of steps that stability, not accuracy, keeps short, and an implicit solver did not reach the end either; "
+    "put a row in the place of a stiff spring or damper, or loosen the tolerances",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step (`dt0`), or look for a singularity there",
+}
+
+# In what other way a motion was run again after the first way had failed: `Trajectory.fallback`.
+AS_ASKED, FULL_STATE, IMPLICIT = range(3)
+FALLBACKS = {
+    AS_ASKED: "",
+    FULL_STATE: "run again with the full state: the privileged speeds came near where they do not determine the others",
+    IMPLICIT: "run again with an implicit solver: the motion is stiff",
 }
 
 

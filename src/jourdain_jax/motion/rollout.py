@@ -3,6 +3,7 @@
 Lanes of one chunk run in lockstep as one vmapped integration; chunks run one after another through the same compiled program.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
@@ -16,11 +17,14 @@ from jourdain_jax.equations.probing import standing_in
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.motion import results
 from jourdain_jax.motion.integration import integrate_lanes
-from jourdain_jax.motion.simulate import lost_codes, may_be_another_form, set_up, state_form
+from jourdain_jax.motion.radau import RadauIIA
+from jourdain_jax.motion.simulate import MOST_STEPS, fallen_back, lost_codes, may_be_another_form, set_up, state_form
 from jourdain_jax.motion.solver_choice import may_be_full
 from jourdain_jax.motion.span import check_span, saved_times
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.start import start as consistent_start
+from jourdain_jax.motion.state_form import StateForm
+from jourdain_jax.motion.stiff import OUT_OF_STEPS, implicit_steps, is_stiff
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
@@ -30,6 +34,7 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 CHUNK = 512  # lanes whose stages fit the cache of a core
+WAYS = ("state_form", "reduction", "solver", "projected")  # static, of a trajectory
 MEMORY = 2**30  # bytes of saved states per chunk, at most
 
 
@@ -38,6 +43,7 @@ class Rollout(Printed, eqx.Module):
 
     lanes: Trajectory
     continued: tuple[int, ...] = eqx.field(static=True, default=())  # lanes that lost their privileged speeds and were run again with the full state
+    ways: tuple[tuple[int, tuple], ...] = eqx.field(static=True, default=())  # fallback -> how such lanes were run: `WAYS`
 
     def __len__(self) -> int:
         return self.lanes.q.shape[0]
@@ -50,7 +56,9 @@ class Rollout(Printed, eqx.Module):
         """The motion of the lane with number `index`, as a `Trajectory`; IndexError where there is none."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"lane {index} does not exist; this rollout has {len(self)} lanes, 0 to {len(self) - 1}")
-        return jax.tree.map(lambda x: x[index], self.lanes)
+        lane = jax.tree.map(lambda x: x[index], self.lanes)
+        ways = {} if is_traced(lane.fallback) else dict(self.ways)
+        return dataclasses.replace(lane, **dict(zip(WAYS, ways.get(int(lane.fallback), ()), strict=False))) if ways else lane
 
     @property
     def result(self) -> np.ndarray:
@@ -91,6 +99,9 @@ class Rollout(Printed, eqx.Module):
             lines.append(f"  {lanes.size} {message}{named}")
         if self.continued:
             lines.append(f"  {len(self.continued)} left the domain of their privileged speeds and were run with the full state")
+        stiff = int(np.sum(np.asarray(self.lanes.fallback) == results.IMPLICIT))
+        if stiff:
+            lines.append(f"  {stiff} are stiff and were run with an implicit solver")
         steps = np.asarray(self.lanes.accepted)
         lines.append(f"  steps accepted: {steps.min()} to {steps.max()}, median {int(np.median(steps))}")
         return "\n".join(lines)
@@ -142,14 +153,22 @@ def rollout(
         bar.update(kept)
     bar.close()
     lanes = jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
+
+    def again(lanes, chosen, way: int, **other):
+        """`lanes` with the chosen ones run again with other options; how they were run."""
+        for first in range(0, len(chosen), chunk):
+            index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
+            with standing_in(sound):
+                new = _together(scene, fixed, options | other, *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+            lanes, ways[way] = _replaced(lanes, fallen_back(new, way), index), tuple(getattr(new, name) for name in WAYS)
+        return lanes
+
+    ways: dict[int, tuple] = {}
     lost = _lost(scene, lanes, options)
-    for first in range(0, len(lost), chunk):
-        index = lost[np.minimum(np.arange(first, first + min(chunk, _round_up(len(lost)))), len(lost) - 1)]
-        with standing_in(sound):
-            lanes_again = jax.tree.map(lambda x, index=index: x[index], (varied, parameters))
-            again = _together(scene, fixed, options | {"state": "full", "lowering": False}, *lanes_again)
-        lanes = _replaced(lanes, again, index)
-    return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(lost.tolist()))
+    lanes = again(lanes, lost, results.FULL_STATE, state="full", lowering=False)
+    steps = implicit_steps(options.get("max_steps", MOST_STEPS))
+    lanes = again(lanes, _stiff(scene, lanes, varied, options), results.IMPLICIT, solver=RadauIIA(), max_steps=steps)
+    return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(lost.tolist()), tuple(sorted(ways.items())))
 
 
 def _check_span_of_lanes(starts, options: dict) -> None:
@@ -173,11 +192,27 @@ def _sound_lane(scene: Scene, parameters: dict) -> Scene:
 
 def _lost(scene: Scene, lanes: Trajectory, options: dict) -> np.ndarray:
     """Lanes that another form of the state may bring to their end."""
-    how = {name: options[name] for name in ("state", "reduction", "stabilisation", "projection", "work", "lowering") if name in options}
-    form = state_form(scene, structure_of(scene), **how)
+    form = _form(scene, options)
     if options.get("state", "auto") not in may_be_another_form(form) or not may_be_full(options.get("solver")):
         return np.zeros(0, int)
     return np.flatnonzero(np.isin(lanes.result, lost_codes(form)))
+
+
+def _stiff(scene: Scene, lanes: Trajectory, starts, options: dict) -> np.ndarray:
+    """Lanes, run as asked by the default solver, that ran out of steps on a stiff motion."""
+    out = np.flatnonzero(np.isin(lanes.result, OUT_OF_STEPS) & (np.asarray(lanes.fallback) == results.AS_ASKED))
+    if not out.size or any(options.get(name) is not None for name in ("solver", "stepsize_controller")):
+        return np.zeros(0, int)
+    own_times = isinstance(starts, State) and options.get("t0") is None
+    begun = np.broadcast_to(np.asarray(starts.t if own_times else _first_time(options)), lanes.result.shape)
+    form = _form(scene, options)
+    return np.array([i for i in out if is_stiff(form, jax.tree.map(lambda x, i=i: x[i], lanes), begun[i])], int)
+
+
+def _form(scene: Scene, options: dict) -> StateForm:
+    """How the lanes' state is integrated."""
+    how = {name: options[name] for name in ("state", "reduction", "stabilisation", "projection", "work", "lowering") if name in options}
+    return state_form(scene, structure_of(scene), **how)
 
 
 def _round_up(count: int) -> int:

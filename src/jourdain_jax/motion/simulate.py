@@ -27,16 +27,19 @@ from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.fixed_step import FixedStepSolver
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import Options, Setup, integrate
+from jourdain_jax.motion.sensitivity import watched
 from jourdain_jax.motion.solver_choice import check_solver, fitted, may_be_full
 from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.state_form import StateForm, cutoff_of, default_reduction
+from jourdain_jax.motion.stiff import OUT_OF_STEPS, by_implicit, is_stiff
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
 _STATE_FORMS = ("auto", "minimal", "full")
+MOST_STEPS = 100_000
 
 
 def simulate(
@@ -53,7 +56,7 @@ def simulate(
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     dt0: Number | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
-    max_steps: int = 100_000,
+    max_steps: int = MOST_STEPS,
     state: str = "auto",
     reduction=None,
     stabilisation: Baumgarte | None = None,
@@ -74,8 +77,9 @@ def simulate(
       `example_span` after t0); `ts`: times to save at (default: 201 even ones). `saveat`: a `diffrax.SaveAt` instead.
     - `rtol`, `atol`, `solver`, `stepsize_controller`, `dt0` (default: 1e-4 of the span), `adjoint`, `max_steps`: as in
       `diffrax.diffeqsolve`. Default solver: Tsit5 for
-      rtol >= 1e-6, Dopri8 below; structure-preserving ones (`ImplicitMidpoint`, `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps
-      of at most `dt0` between saved times. Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`
+      rtol >= 1e-6, Dopri8 below, and where these run out of steps on a stiff motion, `RadauIIA`; structure-preserving ones (`ImplicitMidpoint`,
+      `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps of at most `dt0` between saved times.
+      Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`
       for forward mode of any order; `diffrax.DirectAdjoint()` for all.
     - `state`: "minimal" (q and privileged speeds), "full" (q and u) or "auto"; `reduction`: as in `accelerations`.
     - `projection`: put the state back onto the constraints after each step, where the state form does not keep them by itself.
@@ -86,19 +90,34 @@ def simulate(
       the dense matrices.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
 
+    Where nothing is traced, a motion that leaves the domain of its privileged speeds is run again with the full state, and a stiff one by an implicit
+    solver (unless `state` or `solver` is chosen); `trajectory.fallback` and its summary say so. Inside your own `jit` or `grad` the result code stays.
+
     **Returns** a `Trajectory`, with a result code instead of an exception; `trajectory.raise_if_failed()` raises `SimulationError`.
 
     **Raises** ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` where the adjoint does not
     support the mode of differentiation.
     """
     setup = _set_up(**locals())
-    motion = integrate(setup)
-    known = not isinstance(motion.result, jax.core.Tracer)
-    if state in may_be_another_form(setup.form) and may_be_full(solver) and known and int(motion.result) in lost_codes(setup.form):
+    motion = watched(setup, integrate)
+    if isinstance(motion.result, jax.core.Tracer):
+        return motion
+    if state in may_be_another_form(setup.form) and may_be_full(solver) and int(motion.result) in lost_codes(setup.form):
         # the motion left the domain in which the partition, or the program, was found to serve
         form = state_form(setup.scene, structure_of(setup.scene), "full", reduction, stabilisation, projection, work, lowering=False)
-        motion = integrate(dataclasses.replace(setup, form=fitted(solver, setup.scene, form, "full")))
+        setup = dataclasses.replace(setup, form=fitted(solver, setup.scene, form, "full"))
+        motion = fallen_back(watched(setup, integrate), results.FULL_STATE)
+    if solver is None and stepsize_controller is None and is_stiff(setup.form, motion, setup.t0):
+        motion = fallen_back(watched(by_implicit(setup), integrate), results.IMPLICIT)
     return motion
+
+
+def fallen_back(motion: Trajectory, way: int) -> Trajectory:
+    """A motion, or several, marked as run again in that way; out of steps once more, it is called stiff."""
+    code = motion.result
+    if way == results.IMPLICIT:
+        code = jnp.where(jnp.isin(code, jnp.array(OUT_OF_STEPS)), results.STIFF, code).astype(code.dtype)
+    return eqx.tree_at(lambda m: (m.result, m.fallback), motion, (code, jnp.full_like(motion.fallback, way)))
 
 
 def set_up(scene: Scene, start=None, **options) -> Setup:

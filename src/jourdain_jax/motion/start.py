@@ -56,7 +56,8 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
 
     `inputs`: values of the scene's inputs (default: zero). `held`: names of coordinates and speeds that do not move.
 
-    Differentiable in any mode. What cannot be met stays in `residual` (no error: this also runs inside jit and vmap). ValueError for wrong shapes.
+    Differentiable in any mode. What cannot be met stays in `residual`, which is infinite where numbers are not finite (no error: this also runs
+    inside jit and vmap); the quaternion (0, 0, 0, 0) has no direction and stays as it is, with a residual of 1/2. ValueError for wrong shapes.
     """
     t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     inputs = as_input_vector(scene, inputs, q.dtype)
@@ -84,11 +85,13 @@ _calls: dict = {}
 
 
 def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u):
-    """q and u on the constraints; the largest changes of both and the largest residual."""
+    """q and u on the constraints; the largest changes of both and the largest residual, infinite where a number is not finite."""
     near_q = project_positions(scene, t, q, free=jnp.asarray(free_q))
     near_u = project_speeds(scene, t, near_q, u, inputs, free=jnp.asarray(free_u))
     left = jnp.concatenate([closure_residual(scene, t, near_q), velocity_residual(scene, t, near_q, near_u, inputs)])
-    return near_q, near_u, *(jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
+    finite = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left])))
+    moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
+    return near_q, near_u, moved_q, moved_u, jnp.where(finite, residual, jnp.inf)
 
 
 _compiled_projection = eqx.filter_jit(_put_onto_constraints)  # one program for every choice of what is held

@@ -44,6 +44,7 @@ class StateForm(eqx.Module):
     lowered: Lowered | None = eqx.field(static=True, default=None)  # the scalar program of the rates; None: dense matrices
     of_inputs: tuple[int, ...] = eqx.field(static=True, default=())  # numbers of the loads whose potential depends on inputs
     affine: bool = eqx.field(static=True, default=True)  # rows are, in the speeds
+    own_equations: str = eqx.field(static=True, default="")  # of a solver that takes no accelerations: what it solves instead
     cutoff: float | None = eqx.field(static=True, default=None)  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     @property
@@ -54,9 +55,10 @@ class StateForm(eqx.Module):
     @property
     def reduction_name(self) -> str:
         """Name of the reduction, as it stands in a trajectory."""
-        if self.lowered is not None:
-            return getattr(self.reduction, "name", "") + ", lowered"
-        return getattr(self.reduction, "name", "") + ("" if self.cutoff is None else f", cut-off {self.cutoff:.0e}")
+        if self.own_equations:
+            return f"none, {self.own_equations}"
+        name = getattr(self.reduction, "name", "")
+        return f"{name}, lowered" if self.lowered is not None else name if self.cutoff is None else f"{name}, cut-off {self.cutoff:.0e}"
 
     @property
     def _by_appell(self) -> bool:

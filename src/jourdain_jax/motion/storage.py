@@ -1,11 +1,12 @@
 """Saving and loading motions: NumPy's `.npz`, readable by anything that reads `.npz`.
 
 Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent where not tracked), `t_end`, `q_end`, `u_end`,
-`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `inputs` (times, inputs; sampled at `ts`), and `parameter:NAME` for every
-field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`, `speeds`, `input_names`, `units` of the parameters,
-`static` (fields that are plain numbers or texts), `state_form`, `reduction`, `solver`, `projected`, `event_names`, `versions`.
+`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `fallback`, `inputs` (times, inputs; sampled at `ts`), and
+`parameter:NAME` for every field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`, `speeds`,
+`input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
+`state_form`, `reduction`, `solver`, `projected`, `event_names`, `versions`.
 `kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `continued` holds
-the numbers of the lanes that were run again with the full state.
+the numbers of the lanes that were run again with the full state; `ways` in its header says how lanes with a `fallback` were run.
 """
 
 import json
@@ -29,7 +30,8 @@ from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
-_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", "result", "event", "accepted", "rejected", "moved_q", "moved_u", "smallest_pivot")
+_COUNTS = ("result", "event", "accepted", "rejected", "fallback")
+_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", *_COUNTS, "last_step", "moved_q", "moved_u", "smallest_pivot")
 _TEXTS = ("state_form", "reduction", "solver", "projected")
 _HEADER = ("scene", "coordinates", "speeds", "input_names", "static", "event_names", *_TEXTS)
 _READERS = {"trajectory": "jj.load(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
@@ -55,6 +57,7 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
     header = {name: getattr(trajectory, name) for name in _TEXTS} | {
         "format": 1,
         "kind": "rollout" if many else "trajectory",
+        "ways": motion.ways if isinstance(motion, Rollout) else (),
         "scene": type(scene).__name__,
         "coordinates": scene.coordinate_names.entries,
         "speeds": scene.speed_names.entries,
@@ -123,7 +126,8 @@ def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout
     longest = max(len(times) for times, _ in lanes)  # lanes with fewer are filled up with their last sample
     arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in lanes])
     arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in lanes])
-    return Rollout(_lanes(kind, header, arrays), continued)
+    ways = tuple((int(way), tuple(how)) for way, how in header.get("ways", ()))
+    return Rollout(_lanes(kind, header, arrays), continued, ways)
 
 
 def _lanes(kind: type[Scene], header: dict, arrays: dict) -> Trajectory:

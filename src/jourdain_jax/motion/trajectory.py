@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jourdain_jax.equations.accelerations import Accelerations
 from jourdain_jax.equations.reactions import ContactForce, RowReactions
 from jourdain_jax.motion import along, results
-from jourdain_jax.motion.diagnostics import Energies, energies_of, summary, summary_html
+from jourdain_jax.motion.diagnostics import Energies, diagnose, energies_of, summary, summary_html, warnings_of
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import UnknownNameError, nearest
@@ -32,6 +32,8 @@ class Trajectory(eqx.Module):
     event: Int[Array, ""]  # index into `event_names`, -1: none
     accepted: Int[Array, ""]  # steps
     rejected: Int[Array, ""]
+    last_step: Float[Array, ""]  # s, that the step-size control would take next; NaN where it keeps that to itself
+    fallback: Int[Array, ""]  # in what other way the motion was run again, see `results.FALLBACKS`; 0: as asked
     moved_q: Float[Array, ""]  # how far the start was moved onto the constraints
     moved_u: Float[Array, ""]
     # of the privileged speeds, over the saved times (lowered: of the elimination, relative to its usual size); negative if it changed sign; 1: full state
@@ -119,6 +121,16 @@ class Trajectory(eqx.Module):
         if code == results.BAD_PARAMETER:
             return f"{text} ({', '.join(f'`{name}`' for name in self.wrong_parameters)}); check where it was computed"
         return f"{text} `{self.event_names[int(self.event)]}`" if code == results.EVENT else text
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What speaks against a motion, in words, most serious first; empty where nothing does. The printed summary shows them.
+
+        A failure; rows that gain or lose rank, or come near it, so that constraint forces and what follows may not be unique; contacts that would have
+        to pull. Computed where it is asked for; needs numbers: not under jit or vmap.
+        """
+        failure = () if int(self.result) in (results.SUCCESS, results.EVENT) else (self.message,)
+        return (*failure, *warnings_of(diagnose(self), self.q.dtype))
 
     @property
     def wrong_parameters(self) -> tuple[str, ...]:

@@ -1,0 +1,162 @@
+"""Stiff motions, motions that end in a singularity, and derivatives through motions that amplify errors: what the engine does, and what it says."""
+
+import warnings
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tolerances import tolerance
+
+import jourdain_jax as jj
+from jourdain_jax.motion import results
+
+TS = np.linspace(0.0, 2.0, 5)
+
+
+class Damped(jj.Scene):
+    """A particle of 1 kg that a damper drags behind a carriage moving as sin(t): `xddot = -rate (xdot - cos t) - sin t`, so that x = sin t."""
+
+    rate: object = jj.parameter(1e7, unit="1/s", positive=True)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-self.rate * (motion.u.x_rate - jnp.cos(motion.t)) - jnp.sin(motion.t)),)
+
+
+class OnALine(jj.Scene):
+    """A particle of 1 kg on a line, V(x) given by its kind: falls towards an attracting centre, or off a ridge."""
+
+    strength: object = jj.parameter(1.0)
+    coordinates = jj.coordinates("x")
+    domain = {"x": (0.5, 1.5)}
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+
+class Centre(OnALine):
+    """`xddot = -strength / x^2`: from rest at 1 m it arrives after pi / (2 sqrt(2 strength)) s, infinitely fast."""
+
+    def potential(self, pose):
+        return -self.strength / pose.q.x
+
+
+class Ridge(OnALine):
+    """`xddot = strength x`: errors grow as exp(sqrt(strength) t)."""
+
+    def potential(self, pose):
+        return -self.strength * pose.q.x**2 / 2
+
+
+@pytest.fixture(scope="module")
+def damped():
+    return jj.simulate(Damped(), {"x_rate": 1.0}, ts=TS)
+
+
+def test_a_stiff_motion_is_run_again_by_an_implicit_solver_and_says_so(damped):
+    assert int(damped.raise_if_failed().fallback) == results.IMPLICIT
+    assert damped.solver == "RadauIIA"
+    assert "with an implicit solver: the motion is stiff" in str(damped)
+    np.testing.assert_allclose(damped["x"], np.sin(TS), rtol=0, atol=1e-8)  # as asked
+    assert int(damped.accepted) < 1000  # an explicit method needs some 3e6 for stability
+
+
+def test_a_solver_that_was_chosen_is_kept_and_a_motion_that_is_not_stiff_has_no_other_solver():
+    chosen = jj.simulate(Damped(), {"x_rate": 1.0}, ts=TS, solver=diffrax.Dopri8(), max_steps=2000)
+    assert int(chosen.result) == results.MAX_STEPS
+    assert int(chosen.fallback) == results.AS_ASKED
+    slow = jj.simulate(Ridge(strength=0.0), {"x": 1.0, "x_rate": 1.0}, ts=TS, max_steps=2)
+    assert int(slow.result) in (results.MAX_STEPS, results.SHRANK)
+    assert int(slow.fallback) == results.AS_ASKED
+
+
+def test_a_motion_too_stiff_for_its_number_of_steps_is_called_stiff():
+    motion = jj.simulate(Damped(), {"x_rate": 0.0}, ts=TS, max_steps=30)  # 3 for the implicit solver
+    assert int(motion.result) == results.STIFF
+    assert motion.message.startswith("stiff: ran out of steps")
+    assert motion.warnings[0] == motion.message
+
+
+def test_the_method_of_radau_is_of_order_five():
+    errors = []
+    for dt0 in (0.4, 0.2):
+        steps = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": dt0}
+        motion = jj.simulate(Ridge(strength=-4.0), {"x": 1.0}, ts=TS[[0, -1]], t1=2.0, solver=jj.RadauIIA(), land_on_ts=False, **steps)
+        errors.append(abs(float(motion.q_end[0]) - np.cos(4.0)))
+    assert 4.7 < np.log2(errors[0] / errors[1]) < 5.4
+
+
+@pytest.mark.slow
+def test_a_derivative_through_a_stiff_motion_is_that_of_what_it_follows():
+    def end(pace):  # x_rate of the start is forgotten at once, x is not
+        return jj.simulate(Damped(), {"x": pace, "x_rate": pace}, ts=TS[[0, -1]]).q_end[0]
+
+    np.testing.assert_allclose(jax.grad(end)(1.0), 1.0, rtol=0, atol=tolerance("gradient_simulation"))
+
+
+@pytest.mark.slow
+def test_stiff_lanes_of_a_rollout_are_run_again_and_the_others_are_kept():
+    batch = jj.rollout(Damped(), {"x_rate": jnp.ones(3)}, parameters={"rate": jnp.array([10.0, 1e7, 1e9])}, ts=TS)
+    assert batch.lanes.fallback.tolist() == [results.AS_ASKED, results.IMPLICIT, results.IMPLICIT]
+    assert [batch.lane(i).solver for i in range(3)] == ["Dopri8", "RadauIIA", "RadauIIA"]
+    assert "2 are stiff and were run with an implicit solver" in str(batch)
+    for i in range(3):
+        np.testing.assert_allclose(batch.lane(i)["x"], np.sin(TS), rtol=0, atol=1e-7)
+
+
+def test_steps_that_shrink_towards_a_singularity_are_named():
+    motion = jj.simulate(Centre(), {"x": 1.0}, ts=TS, max_steps=70)
+    assert int(motion.result) == results.SHRANK
+    assert "shrunk" in motion.message
+    assert 0 < float(motion.last_step) < 1e-3
+    np.testing.assert_allclose(motion.t_end, np.pi / np.sqrt(8), rtol=1e-3)
+
+
+def said(derivative, x) -> list[str]:
+    """What a derivative warns of."""
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        derivative(x)
+    return [str(warning.message) for warning in given if warning.category is jj.SensitivityWarning]
+
+
+def test_a_derivative_through_a_motion_that_amplifies_errors_warns_outside_of_jit():
+    scene = Ridge(strength=16.0)
+
+    def end(x, rtol):  # exp(-8) m, on the way to rest on the ridge; the derivative is cosh(8) = 1490
+        return jj.simulate(scene, {"x": x, "x_rate": -4.0}, ts=TS[[0, -1]], rtol=rtol, atol=rtol).q_end[0]
+
+    (text,) = said(jax.grad(lambda x: end(x, 1e-6)), 1.0)
+    assert "amplifies errors" in text
+    assert "with rtol = 1e-06 in each of" in text
+    assert said(jax.grad(lambda x: end(x, 1e-10)), 1.0) == []
+    assert said(jax.jit(jax.grad(lambda x: end(x, 1e-6))), 1.0) == []  # no call back to Python in a program
+
+
+def test_zero_is_no_attitude():
+    with pytest.raises(ValueError, match=r"quaternion is \(0, 0, 0, 0\), which is no attitude"):
+        jj.quaternion_to_matrix([0.0, 0.0, 0.0, 0.0])
+    top = jj.models.FreeRigidBody()
+    with pytest.raises(ValueError, match="contradicts row `norm of quaternion 1`"):
+        jj.start(top, attitude_w=0.0)
+    none = jj.consistent(top, 0.0, jnp.zeros(7), jnp.zeros(6))
+    assert float(none.residual) == 0.5
+    assert int(jj.simulate(top, none, t1=1.0).result) == results.INCONSISTENT_START
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_start_that_is_not_finite_is_not_called_consistent(value):
+    skate = jj.models.Skate()
+    state = jj.consistent(skate, 0.0, jnp.array([0.0, value, 0.0]), jnp.zeros(3))
+    assert float(state.residual) == np.inf
+    assert int(jj.simulate(skate, state, t1=1.0).result) == results.BAD_START
+
+
+def test_the_discrete_lagrange_dalembert_equations_are_named_as_such():
+    motion = jj.simulate(jj.models.Skate(), t1=0.1, dt0=0.05, solver=jj.DiscreteLagrangeDAlembert())
+    assert motion.reduction == "none, discrete Lagrange-d'Alembert equations, midpoint rule"
