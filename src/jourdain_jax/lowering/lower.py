@@ -244,7 +244,7 @@ def _agree(values: np.ndarray, expected: np.ndarray) -> bool:
 
 def _enough(usable: np.ndarray) -> bool:
     """Whether a program serves at enough of the probed states; of long chains only some are assembled."""
-    return np.count_nonzero(usable) >= max(4, min(PROBES, len(usable)) // 2)
+    return int(np.count_nonzero(usable)) >= max(4, min(PROBES, len(usable)) // 2)
 
 
 def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:
