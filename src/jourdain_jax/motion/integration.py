@@ -19,6 +19,7 @@ from jourdain_jax.motion.event_location import Located, locate
 from jourdain_jax.motion.land_on import land_on
 from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
+from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.solver_choice import controller_of
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
@@ -85,11 +86,17 @@ class Begun(eqx.Module):
     y0: Integrated
 
 
-@eqx.filter_jit
 def integrate(setup: Setup) -> Trajectory:
     """The motion of one setup."""
+    return (_integrate_dense if setup.form.lowered is None else _integrate_lowered)(setup)
+
+
+def _one_motion(setup: Setup) -> Trajectory:
     begun = _begin(setup)
     return _finish(setup, begun, _solved(setup, begun))
+
+
+_integrate_dense, _integrate_lowered = eqx.filter_jit(_one_motion), quickly_compiled(_one_motion)
 
 
 @eqx.filter_jit
