@@ -14,7 +14,7 @@ import numpy as np
 from jourdain_jax.equations.minimal import minimal_accelerations
 from jourdain_jax.equations.probing import concretised, on_numbers
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.equations.sampling import sample_states, symmetric_states
+from jourdain_jax.equations.sampling import random_states
 from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
@@ -23,7 +23,8 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.interpret import Unsupported
 from jourdain_jax.scene.scene import Scene
 
-PROBES = 32
+PROBES = 56  # at most
+LEAST_PROBES = 12  # at which programs can be compared
 MOST_OPERATIONS = 20_000  # of the program before simplification: beyond, the dense path is taken
 MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
@@ -86,7 +87,7 @@ def _built(key: _Key) -> Lowered:
         raise NotLowered("no privileged speeds serve everywhere in its domain")
     try:
         traced = traced_scene(scene, structure.potentials_of_inputs)
-        probes = _probes(scene, traced.graph)
+        probes = _probes(scene, structure, traced.graph)
         builder = AppellOnGraph(traced, structure, probes, scene.coordinates.reference(), tuple(first for first, _ in scene.coordinates.quaternions))
         return _best(scene, structure, builder, begin)
     except Unsupported as reason:
@@ -95,10 +96,13 @@ def _built(key: _Key) -> Lowered:
         raise NotLowered("its rows are dependent in a way that no elimination order avoids") from None
 
 
-def _probes(scene: Scene, graph) -> Probes:
-    """Admissible states, random and symmetric ones, and parameters off their values, so that what is zero or equal by chance does not count."""
-    t, q, u = (np.concatenate(parts) for parts in zip(sample_states(scene, PROBES), symmetric_states(scene), strict=True))
+def _probes(scene: Scene, structure: Structure, graph) -> Probes:
+    """Configurations on the geometric rows, random and symmetric ones, as the structure was found at, with any speeds, and parameters off their values,
+    so that what is zero or equal by chance does not count.
+    """
     generator = np.random.default_rng(1)
+    t, q = structure.times[:PROBES], structure.coordinates[:PROBES]
+    u = random_states(scene, len(t), generator)[2]
     varied = jax.tree.map(lambda x: np.where(np.asarray(x) == 0, 0.05, np.asarray(x)) * (1 + 0.1 * generator.uniform(size=(len(t), *np.shape(x)))), scene)
     inputs = generator.normal(size=(len(t), len(scene.inputs)))
     values = named_values(scene, t, q, u, inputs)
@@ -170,7 +174,7 @@ def _check_against_dense(scene: Scene, structure: Structure, probes: Probes, fou
     usable = np.all(np.isfinite(values), axis=0) & np.all(np.isfinite(expected), axis=0)
     size = 1 + np.max(np.abs(expected[:, usable]), axis=0, initial=0.0)
     error = np.max(np.abs(values - expected)[:, usable] / size, axis=1, initial=0.0)
-    if usable.sum() < PROBES // 2:
+    if usable.sum() < LEAST_PROBES:
         raise NotLowered("its scalar program serves at too few of the probed states")
     if np.max(error) > TO_DENSE:
         worst = names[int(np.argmax(error))]
@@ -218,7 +222,7 @@ def _agree(values: np.ndarray, expected: np.ndarray) -> bool:
     """Whether two programs agree wherever the second serves."""
     usable = np.all(np.isfinite(expected), axis=0)
     size = 1 + np.max(np.abs(expected[:, usable]), axis=0, initial=0.0)
-    return bool(np.count_nonzero(usable) >= PROBES // 2 and np.all(np.abs(values - expected)[:, usable] <= AGREEMENT * size))
+    return bool(np.count_nonzero(usable) >= LEAST_PROBES and np.all(np.abs(values - expected)[:, usable] <= AGREEMENT * size))
 
 
 def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:

@@ -24,23 +24,23 @@ class Search(eqx.Module):
     before: Float[Array, "*lanes"]  # a time with c > 0
     after: Float[Array, "*lanes"]  # a time with c <= 0
     left: Int[Array, "*lanes"]  # steps; 0: found
+    shift: Float[Array, "*lanes"]  # the next step, with its sign
 
 
 def none(t: Float[Array, "*lanes"]) -> Search:
     """Nothing to search for."""
-    return Search(jax.lax.stop_gradient(t), jax.lax.stop_gradient(t), jnp.zeros(jnp.shape(t), jnp.int32))
+    t = jax.lax.stop_gradient(t)
+    return Search(t, t, jnp.zeros(jnp.shape(t), jnp.int32), jnp.zeros_like(t))
 
 
 def begun(t_0: Float[Array, "*lanes"], t_1: Float[Array, "*lanes"]) -> Search:
     """The search after a step from `t_0`, before the event, to `t_1`, beyond it."""
-    return Search(jax.lax.stop_gradient(t_0), jax.lax.stop_gradient(t_1), jnp.full(jnp.shape(t_0), MOST_STEPS + 1, jnp.int32))
+    t_0, t_1 = jax.lax.stop_gradient((t_0, t_1))
+    return Search(t_0, t_1, jnp.full(jnp.shape(t_0), MOST_STEPS + 1, jnp.int32), jnp.zeros_like(t_0))
 
 
-def advanced(search: Search, t_0, h, c_0, c_dot_0, t_1, c_1) -> tuple[Search, Float[Array, "*lanes"]]:
-    """The search after a step from `t_0` by `h` to `t_1`, and the next shift.
-
-    `c_0`, `c_1`: values of the event at both ends (any unit); `c_dot_0`: the rate of the first.
-    """
+def advanced(search: Search, h, c_0, c_dot_0, t_1, c_1) -> Search:
+    """The search after a step by `h` to the time `t_1`; `c_0`, `c_1`: values of the event at its ends (any unit), `c_dot_0`: the rate of the first."""
     left = jnp.maximum(search.left - 1, 0)
     fixed_t, fixed_c = jax.lax.stop_gradient((t_1, c_1))
     before, after = jnp.where(fixed_c > 0, fixed_t, search.before), jnp.where(fixed_c > 0, search.after, fixed_t)
@@ -51,7 +51,7 @@ def advanced(search: Search, t_0, h, c_0, c_dot_0, t_1, c_1) -> tuple[Search, Fl
     left = jnp.where((left > _DIFFERENTIABLE) & (jnp.abs(value) <= small), _DIFFERENTIABLE + 1, left)
     usable = (search.left > 0) & (c_dot_0 != 0) & jnp.isfinite(c_dot_0) & jnp.isfinite(c_1)
     newton = jnp.where(usable, -c_1 / jnp.where(usable, c_dot_0, 1.0), 0.0)
-    return Search(before, after, left), jnp.where(left > _DIFFERENTIABLE, value, newton)
+    return Search(before, after, left, jnp.where(left > _DIFFERENTIABLE, value, newton))
 
 
 def _value_shift(start, c_1, small):

@@ -60,7 +60,7 @@ class Progress(eqx.Module):
 
     t: Float[Array, "*lanes"]
     y: PyTree
-    h: Float[Array, "*lanes"]  # the next step, positive; while an event is located with its sign
+    h: Float[Array, "*lanes"]  # the next step, positive
     code: Int[Array, "*lanes"]  # RUNNING, LOCATING, or the result
     accepted: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
@@ -121,7 +121,7 @@ def _step(problem: Problem, method: Method, p: Progress, goal, last_goal, direct
     lands = ~locating & (p.h >= 0.999 * rest)
     size = jnp.where(lands, rest, jnp.where(2 * p.h > rest, 0.5 * rest, p.h))
     shortened = size < p.h
-    h = jnp.where(locating, p.h, direction * size)
+    h = direction * size if p.search is None else jnp.where(locating, p.search.shift, direction * size)
     t1 = jnp.where(lands, goal, p.t + h)
     y1, error, first_slope = _stages(problem, method, p, h)
     if problem.project is not None:
@@ -182,7 +182,7 @@ def _stopped_at_once(problem: Problem, start: Progress) -> Progress:
 
 
 def _watched(problem: Problem, p: Progress, moved: Progress, h, first_slope, accept) -> Progress:
-    """The step from `p` by `h` to `moved`, where an event may have happened or is being located."""
+    """The step from `p` by `h` to `moved`, in which an event may have happened or is being located."""
 
     def events(t, y):
         return problem.events(t, y, problem.args)
@@ -194,13 +194,13 @@ def _watched(problem: Problem, p: Progress, moved: Progress, h, first_slope, acc
     first_values, first_rates = jax.jvp(events, (p.t, p.y), (jnp.ones_like(p.t), first_slope))
     c_0, c_dot_0, c_1 = (_chosen(event, x) for x in (first_values, first_rates, values))
     search = jax.tree.map(lambda new, old: jnp.where(happened, new, old), event_search.begun(p.t, moved.t), p.search)
-    search, shift = event_search.advanced(search, p.t, h, c_0, c_dot_0, moved.t, c_1)
+    search = event_search.advanced(search, h, c_0, c_dot_0, moved.t, c_1)
     # the last, vanishing, shift is along the slope
     found = locating & (search.left == 0)
-    t = jnp.where(found, moved.t + shift, moved.t)
-    y = jax.tree.map(lambda y, f: jnp.where(found, y + _as(shift, y) * f, y), moved.y, first_slope)
+    t = jnp.where(found, moved.t + search.shift, moved.t)
+    y = jax.tree.map(lambda y, f: jnp.where(found, y + _as(search.shift, y) * f, y), moved.y, first_slope)
     code = jnp.where(happened, LOCATING, jnp.where(found, results.EVENT, jnp.where(locating, LOCATING, moved.code))).astype(jnp.int32)
-    return Progress(t, y, jnp.where(happened | locating, shift, moved.h), code, moved.accepted, moved.rejected, event, search)
+    return Progress(t, y, jnp.where(locating, p.h, moved.h), code, moved.accepted, moved.rejected, event, search)
 
 
 def _chosen(index, values: Float[Array, "events *lanes"]) -> Float[Array, "*lanes"]:
