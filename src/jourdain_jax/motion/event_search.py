@@ -4,9 +4,9 @@ Every step of the search starts at (t_0, y_0), where its first slope gives the r
 
     -c_1/s,   s = 2 (c_1 - c_0)/h - cdot_0     slope at t_1 of the parabola through c_0, cdot_0, c_1; cdot_0 itself where h is tiny
 
-and stays between times at which c is known to be positive and not to be. Shifts are numbers to differentiation, but for the last ones, which are
-zero in value and carry the derivatives of the event time and of the state at the event (the saltation term): each is an honest step, and Newton's
-method doubles the order at which it is right, so that they give derivatives up to the third.
+between times at which c is known to be positive and not to be; to their middle where that does not help. Shifts are numbers to differentiation,
+but for the last ones, which are zero in value and carry the derivatives of the event time and of the state at the event (the saltation term): each is
+an honest step, and Newton's method doubles the order at which it is right, so that they give derivatives up to the third.
 """
 
 import equinox as eqx
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-MOST_STEPS = 16
+MOST_STEPS = 30
 _DIFFERENTIABLE = 2
 
 
@@ -42,28 +42,22 @@ def begun(t_0: Float[Array, "*lanes"], t_1: Float[Array, "*lanes"]) -> Search:
 def advanced(search: Search, h, c_0, c_dot_0, t_1, c_1) -> Search:
     """The search after a step by `h` to the time `t_1`; `c_0`, `c_1`: values of the event at its ends (any unit), `c_dot_0`: the rate of the first."""
     left = jnp.maximum(search.left - 1, 0)
-    fixed_t, fixed_c = jax.lax.stop_gradient((t_1, c_1))
-    before, after = jnp.where(fixed_c > 0, fixed_t, search.before), jnp.where(fixed_c > 0, search.after, fixed_t)
-    small = jnp.sqrt(jnp.finfo(fixed_t.dtype).eps) * (jnp.abs(fixed_t) + jnp.abs(after - before))
-    value = _value_shift(jax.lax.stop_gradient((h, c_0, c_dot_0)), fixed_c, small)
-    value = _kept_between(value, fixed_t, before, after)
-    # near enough: one more step to the event, then the differentiable ones
-    left = jnp.where((left > _DIFFERENTIABLE) & (jnp.abs(value) <= small), _DIFFERENTIABLE + 1, left)
-    usable = (search.left > 0) & (c_dot_0 != 0) & jnp.isfinite(c_dot_0) & jnp.isfinite(c_1)
-    newton = jnp.where(usable, -c_1 / jnp.where(usable, c_dot_0, 1.0), 0.0)
-    return Search(before, after, left, jnp.where(left > _DIFFERENTIABLE, value, newton))
-
-
-def _value_shift(start, c_1, small):
-    h, c_0, c_dot_0 = start
+    now, c, h, c_0, rate = jax.lax.stop_gradient((t_1, c_1, h, c_0, c_dot_0))  # numbers to differentiation
+    before, after = jnp.where(c > 0, now, search.before), jnp.where(c > 0, search.after, now)
+    width = jnp.abs(after - before)
+    small = jnp.sqrt(jnp.finfo(now.dtype).eps) * (jnp.abs(now) + width)
     large = jnp.abs(h) > small
-    slope = jnp.where(large, 2 * (c_1 - c_0) / jnp.where(large, h, 1.0) - c_dot_0, c_dot_0)
-    return jnp.where(slope != 0, -c_1 / jnp.where(slope != 0, slope, 1.0), jnp.nan)
-
-
-def _kept_between(shift, t, before, after):
-    """The shift, no further than the times between which the event lies; to their middle where it would lead far beyond or nowhere."""
-    low, high = jnp.minimum(before, after) - t, jnp.maximum(before, after) - t
-    margin = 0.1 * (high - low)
-    sensible = (shift >= low - margin) & (shift <= high + margin)  # false for NaN
-    return jnp.where(sensible, jnp.clip(shift, low, high), 0.5 * (low + high))
+    chord = jnp.where(large, (c - c_0) / jnp.where(large, h, 1.0), rate)
+    slope = jnp.where(large, 2 * chord - rate, rate)
+    # to the middle where the parabola bends back, leads far beyond, or the last step did little
+    steep = slope * chord > 0
+    shift = jnp.where(c == 0, 0.0, -c / jnp.where(steep, slope, 1.0))
+    low, high = jnp.minimum(before, after) - now, jnp.maximum(before, after) - now
+    sensible = (steep | (c == 0)) & (shift >= low - 0.1 * width) & (shift <= high + 0.1 * width)
+    helped = ~large | (jnp.abs(c) <= 0.5 * jnp.abs(c_0)) | (left == MOST_STEPS)
+    shift = jnp.where(sensible & helped, jnp.clip(shift, low, high), 0.5 * (low + high))
+    # near enough: one more step to the event, then the differentiable ones
+    left = jnp.where((left > _DIFFERENTIABLE) & (jnp.abs(c) <= small * jnp.abs(chord)), _DIFFERENTIABLE + 1, left)
+    usable = (search.left > 0) & (jnp.abs(c) < (width + small) * jnp.abs(rate)) & jnp.isfinite(rate)
+    newton = jnp.where(usable, -c_1 / jnp.where(usable, c_dot_0, 1.0), 0.0)
+    return Search(before, after, left, jnp.where(left > _DIFFERENTIABLE, shift, newton))
