@@ -241,8 +241,8 @@ def test_indexing_and_linear_systems_run_uncompiled_give_what_jax_gives():
         expected = transform(f)(*map(jnp.asarray, given))
         for x, y in zip(jax.tree.leaves(uncompiled(transform(f))(*given)), jax.tree.leaves(expected), strict=True):
             assert x.dtype == y.dtype
-            good = np.isfinite(np.asarray(y))
-            np.testing.assert_allclose(x[good], y[good], rtol=1e-11, atol=1e-12)
+            good = np.isfinite(y)
+            np.testing.assert_allclose(x[good], np.asarray(y)[good], rtol=1e-11, atol=1e-12)
 
 
 def test_a_singular_matrix_run_uncompiled_gives_nan_as_jax_does():
