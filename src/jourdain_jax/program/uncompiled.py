@@ -228,6 +228,8 @@ def _triangular_solve(equation, A, b):
     p = equation.params
     A = np.tril(A) if p["lower"] else np.triu(A)
     A = np.swapaxes(A, -1, -2) if p["transpose_a"] else A
+    if p["unit_diagonal"]:
+        A = np.where(np.eye(A.shape[-1], dtype=bool), np.ones((), A.dtype), A)
     singular = np.any(np.diagonal(A, axis1=-2, axis2=-1) == 0, axis=-1)[..., None, None]
     safe = np.where(singular, np.eye(A.shape[-1]), A)
     x = np.linalg.solve(safe, b) if p["left_side"] else np.swapaxes(np.linalg.solve(np.swapaxes(safe, -1, -2), np.swapaxes(b, -1, -2)), -1, -2)
@@ -269,7 +271,7 @@ def _reduced(function: Callable, of_nothing=None) -> Callable:
     return reduced
 
 
-_WITHOUT_RULE = ("conjugate_a", "unit_diagonal")  # variants of `triangular_solve` that are left to JAX
+_WITHOUT_RULE = ("conjugate_a",)  # variants of `triangular_solve` that are left to JAX
 _RULES: dict[str, Callable] = {
     "dot_general": _dot_general,
     "broadcast_in_dim": _broadcast_in_dim,
