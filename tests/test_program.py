@@ -232,7 +232,8 @@ def test_indexing_and_linear_systems_run_uncompiled_give_what_jax_gives():
         LU, swaps, order = jax.lax.linalg.lu(A)
         clipped = A[jnp.array([0, 7])]  # out of bounds: left to JAX
         window = jax.lax.dynamic_slice(A, (1, 0), (2, 2))
-        return A[entries], A[:, k], A[entries[:2], k], jnp.diag(A), put, LU, swaps, order, jnp.linalg.solve(A, b), jnp.linalg.det(A), clipped, window, A[order, 1], A.at[order].set(2 * A)
+        taken = A[entries], A[:, k], A[entries[:2], k], jnp.diag(A), clipped, window, A[order, 1], A.at[order].set(2 * A)
+        return taken, put, LU, swaps, order, jnp.linalg.solve(A, b), jnp.linalg.det(A)
 
     rng = np.random.default_rng(1)
     A, b = rng.normal(size=(5, 3, 3)), rng.normal(size=(5, 3))

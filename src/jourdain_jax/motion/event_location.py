@@ -1,6 +1,7 @@
 """Where in time a stop event lies, to the accuracy of the steps and with the right derivative.
 
-For motions by diffrax, which stops at the end of the step in which an event value c changed sign (`event_search` serves the lean loop). From there the motion is integrated back to c = 0:
+For motions by diffrax, which stops at the end of the step in which an event value c changed sign (`event_search` serves the lean loop). From there
+the motion is integrated back to c = 0:
 
     tau* by Newton on c(y(t_f + tau)) = 0 (held constant in differentiation),   then   t_e = t* - c / cdot,   y_e = y* - f c / cdot   twice
 

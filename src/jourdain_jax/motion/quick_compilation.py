@@ -5,6 +5,7 @@ XLA's newer fusion emitters on the CPU take up to twice as long to compile a sca
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,14 +13,14 @@ import jax.numpy as jnp
 
 from jourdain_jax.scene.numbers import is_traced
 
-_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+_OPTIONS: dict[str, Any] = {"compiler_options": {"xla_cpu_use_fusion_emitters": False}}
 
 
 def quickly_compiled(f: Callable) -> Callable:
     """`f`, compiled as by `equinox.filter_jit`; on a CPU with the quick options, but for calls inside another transformation: JAX takes options of whole
     programs only.
     """
-    plain, quick = eqx.filter_jit(f), eqx.filter_jit(f, compiler_options=_OPTIONS)
+    plain, quick = eqx.filter_jit(f), eqx.filter_jit(f, **_OPTIONS)
 
     def run(*arguments):
         return (quick if jax.default_backend() == "cpu" and _outermost(arguments) else plain)(*arguments)
