@@ -86,7 +86,7 @@ def _seldom(trajectory: Record) -> bool:
     return _calls[key] <= OFTEN
 
 
-FEW_TIMES, OFTEN = 1000, 16
+FEW_TIMES, OFTEN = 1000, 100
 _calls: dict = {}
 
 

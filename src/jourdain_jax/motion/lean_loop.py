@@ -116,7 +116,7 @@ def integrate(
 
 
 def _step(problem: Problem, method: Method, p: Progress, goal, last_goal, direction) -> Progress:
-    locating = p.code == LOCATING
+    locating = jnp.array(False) if p.search is None else p.code == LOCATING
     rest = jnp.abs(goal - p.t)
     lands = ~locating & (p.h >= 0.999 * rest)
     size = jnp.where(lands, rest, jnp.where(2 * p.h > rest, 0.5 * rest, p.h))
