@@ -93,6 +93,14 @@ def test_an_event_is_located_with_derivatives_up_to_the_third(derivative):
         fall_time = derivative(fall_time)
 
 
+@pytest.mark.parametrize("adjoint", [None, diffrax.DirectAdjoint()], ids=["default", "direct"])
+def test_an_event_time_does_not_depend_on_the_times_saved(adjoint):
+    def landing(longer):
+        return jj.simulate(Falling(), ts=longer * jnp.linspace(0.0, 2.0, 5), adjoint=adjoint).t_end
+
+    np.testing.assert_allclose(jax.grad(landing)(1.0), 0.0, atol=1e-10)
+
+
 def test_a_motion_that_starts_beyond_an_event_does_not_start():
     motion = jj.simulate(Falling(), {"z": -1.0}, t1=1.0)
     assert int(motion.result) == results.EVENT

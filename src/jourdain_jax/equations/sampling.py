@@ -34,16 +34,6 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
     return t[good], q[good], u[good]
 
 
-def symmetric_states(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States (t, q, u) at the symmetric configurations (zero and right angles), on the rows where those can be met."""
-    configurations = symmetric_configurations(scene)[:32]
-    t, _, u = random_states(scene, 32, np.random.default_rng(2))
-    q, u, miss = _projected(scene, 0.0 * t, np.resize(configurations, (32, configurations.shape[1])), u)
-    good = np.flatnonzero(miss < np.sqrt(np.finfo(miss.dtype).eps))
-    good = good[good < len(configurations)]
-    return t[good], q[good], u[good]
-
-
 def random_states(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States from the domain, not yet on the rows."""
     q_low, q_high = _bounds(scene, scene.coordinate_names.entries, COORDINATE_DOMAIN)

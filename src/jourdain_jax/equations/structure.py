@@ -7,7 +7,7 @@ parameters are traced (numbers near the class's defaults stand in), so that the 
 
 import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import equinox as eqx
 import jax
@@ -58,6 +58,8 @@ class Structure:
     potentials_of_inputs: tuple[int, ...]  # numbers of the loads whose potential depends on inputs
     chosen_by_user: bool
     faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, as sentences
+    times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric rows
+    coordinates: np.ndarray = field(compare=False, repr=False)  # of the same; random ones first
 
     @property
     def rheonomic(self) -> bool:
@@ -92,6 +94,7 @@ class _Probed(eqx.Module):
     driven: Bool[Array, ""]
     varying_inertia: Bool[Array, ""]
     potentials_of_inputs: Bool[Array, "loads"]
+    q: Float[Array, "coordinates"]  # on the geometric rows
     miss: Float[Array, ""]  # of the geometric rows
     numbers: PyTree  # of bodies and planes, for their plausibility
 
@@ -118,6 +121,7 @@ def _probe(scene, t, q, u, u_other):
             driven=_moves((velocities(scene, t, q, at_rest), nu)),
             varying_inertia=_moves(jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), qdot))[1]),
             potentials_of_inputs=_potentials_of_inputs(scene, t, q, u, inputs),
+            q=q,
             miss=miss_of_rows(scene, t, q),
             numbers=pose_numbers(scene, t, q),
         )
@@ -188,7 +192,7 @@ def _probed_structure(scene: Scene) -> Structure:
         finite = np.isfinite(found.A).all(axis=2)[on_rows].any(axis=0)
         named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "the rows together"
         faults = (f"rows {named} of `{type(scene).__name__}` are not finite at any probed state, expected numbers; check how they are computed",)
-    q, generic, found = jax.tree.map(lambda x: x[usable], (q, generic, found))
+    t, q, generic, found = jax.tree.map(lambda x: x[usable], (t, q, generic, found))
     ranks = [_rank(A) for A in found.A]
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     if not faults:  # a negative mass is named as such
@@ -216,6 +220,8 @@ def _probed_structure(scene: Scene) -> Structure:
         potentials_of_inputs=tuple(np.flatnonzero(found.potentials_of_inputs.any(axis=0)).tolist()),
         chosen_by_user=by_user,
         faults=faults,
+        times=t,
+        coordinates=found.q,
     )
 
 
@@ -250,6 +256,8 @@ def _redundant_rows(scaled: np.ndarray, ranks: list[int], names: tuple[str, ...]
     """Rows that may be left out, later ones first, so that the rest keeps its rank at every probed state."""
     kept = list(range(len(names)))
     for s in reversed(range(len(names))):
+        if len(kept) in ranks:
+            break  # somewhere those that are left are independent
         rest = [i for i in kept if i != s]
         if all(_rank(A[rest]) == r for A, r in zip(scaled, ranks, strict=True)):
             kept = rest

@@ -16,7 +16,7 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations
 from jourdain_jax.equations.probing import concretised, on_numbers
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT, NullSpaceQR
-from jourdain_jax.equations.sampling import sample_states, symmetric_states
+from jourdain_jax.equations.sampling import random_states
 from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
@@ -25,7 +25,8 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.interpret import Unsupported
 from jourdain_jax.scene.scene import Scene
 
-PROBES = 32
+PROBES = 56  # at most
+LEAST_PROBES = 12  # at which programs can be compared, where so many were found
 MOST_OPERATIONS = 20_000  # of the program before simplification: beyond, the dense path is taken
 MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
@@ -94,7 +95,7 @@ def _built(key: _Key) -> Lowered:
         raise NotLowered("its rows are nonlinear in the speeds")
     try:
         traced = traced_scene(scene, structure.potentials_of_inputs)
-        probes = _probes(scene, traced.graph)
+        probes = _probes(scene, structure, traced.graph)
         quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
         builder = AppellOnGraph(traced, structure, key.every_speed, probes, scene.coordinates.reference(), quaternions)
         return _best(scene, structure, builder, begin)
@@ -104,10 +105,13 @@ def _built(key: _Key) -> Lowered:
         raise NotLowered("its rows are dependent in a way that no elimination order avoids") from None
 
 
-def _probes(scene: Scene, graph) -> Probes:
-    """Admissible states, random and symmetric ones, and parameters off their values, so that what is zero or equal by chance does not count."""
-    t, q, u = (np.concatenate(parts) for parts in zip(sample_states(scene, PROBES), symmetric_states(scene), strict=True))
+def _probes(scene: Scene, structure: Structure, graph) -> Probes:
+    """Configurations on the geometric rows, random and symmetric ones, as the structure was found at, with any speeds, and parameters off their values,
+    so that what is zero or equal by chance does not count.
+    """
     generator = np.random.default_rng(1)
+    t, q = structure.times[:PROBES], structure.coordinates[:PROBES]
+    u = random_states(scene, len(t), generator)[2]
     varied = jax.tree.map(lambda x: np.where(np.asarray(x) == 0, 0.05, np.asarray(x)) * (1 + 0.1 * generator.uniform(size=(len(t), *np.shape(x)))), scene)
     inputs = generator.normal(size=(len(t), len(scene.inputs)))
     values = named_values(scene, t, q, u, inputs)
@@ -244,7 +248,7 @@ def _agree(values: np.ndarray, expected: np.ndarray) -> bool:
 
 def _enough(usable: np.ndarray) -> bool:
     """Whether a program serves at enough of the probed states; of long chains only some are assembled."""
-    return int(np.count_nonzero(usable)) >= max(4, min(PROBES, len(usable)) // 2)
+    return int(np.count_nonzero(usable)) >= min(LEAST_PROBES, max(4, len(usable) // 2))
 
 
 def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:

@@ -3,13 +3,16 @@
 import html
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.reactions import ContactForce
 from jourdain_jax.motion.along import Record, accelerations_along, contact_forces_along, energies, invariants, residuals
 from jourdain_jax.motion.results import FALLBACKS
+from jourdain_jax.scene.numbers import is_traced
 
 
 class Energies(eqx.Module):
@@ -69,6 +72,26 @@ def diagnose(trajectory: Record) -> Diagnostics:
 
     Times that were not reached do not count.
     """
+    if _seldom(trajectory):
+        return jax.tree.map(jnp.asarray, _uncompiled(trajectory))
+    return _diagnosed(trajectory)
+
+
+def _seldom(trajectory: Record) -> bool:
+    """Whether all numbers are known and motions like this one have not been looked at often: then compiling does not pay."""
+    leaves, treedef = jax.tree.flatten(trajectory)
+    if is_traced(leaves) or trajectory.ts.shape[0] > FEW_TIMES:
+        return False
+    key = (treedef, trajectory.ts.shape)
+    _calls[key] = _calls.get(key, 0) + 1
+    return _calls[key] <= OFTEN
+
+
+FEW_TIMES, OFTEN = 1000, 100
+_calls: dict = {}
+
+
+def _diagnosed(trajectory: Record) -> Diagnostics:
     energy = energies_of(trajectory, trajectory.work)
     geometric, rows = residuals(trajectory)
     motion = accelerations_along(trajectory)
@@ -83,6 +106,9 @@ def diagnose(trajectory: Record) -> Diagnostics:
         invariant_drifts={name: _span(values) for name, values in invariants(trajectory).items()},
         contacts={name: _extremes(force) for name, force in contact_forces_along(trajectory).items()},
     )
+
+
+_uncompiled = on_numbers(_diagnosed)
 
 
 def _extremes(force: ContactForce) -> ContactExtremes:

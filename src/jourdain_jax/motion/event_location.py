@@ -1,6 +1,7 @@
 """Where in time a stop event lies, to the accuracy of the steps and with the right derivative.
 
-diffrax stops at the end of the step in which an event value c changed sign. From there the motion is integrated back to c = 0:
+For motions by diffrax, which stops at the end of the step in which an event value c changed sign (`event_search` serves the lean loop). From there
+the motion is integrated back to c = 0:
 
     tau* by Newton on c(y(t_f + tau)) = 0 (held constant in differentiation),   then   t_e = t* - c / cdot,   y_e = y* - f c / cdot   twice
 
@@ -33,7 +34,6 @@ def locate(rates: Callable, value: Callable, t_f, y_f: PyTree, args: PyTree, hap
 
     `rates(t, y, args)` is the vector field; `longest` bounds how far back the event can lie (s, signed like the motion).
     """
-    t_f = jax.lax.stop_gradient(t_f)
     earliest, latest = jnp.minimum(-longest, 0.0), jnp.maximum(-longest, 0.0)
 
     def corrected(tau, y_f, args):

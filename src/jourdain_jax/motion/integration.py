@@ -1,7 +1,7 @@
 """One motion from start to end as one compiled program: the lean loop for the default options, diffrax for all others.
 
-Both give states at the saved times, which of those were reached, and where and why the motion ended; events are then located, speeds worked
-out, and all is put into a `Trajectory`.
+Both give states at the saved times, which of those were reached, and where and why the motion ended; events that diffrax stepped over are then
+located (the lean loop does so itself), speeds worked out, and all is put into a `Trajectory`.
 """
 
 from typing import Literal
@@ -19,6 +19,7 @@ from jourdain_jax.motion.event_location import Located, locate
 from jourdain_jax.motion.land_on import land_on
 from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
+from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.solver_choice import controller_of
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
@@ -86,11 +87,17 @@ class Begun(eqx.Module):
     y0: Integrated
 
 
-@eqx.filter_jit
 def integrate(setup: Setup) -> Trajectory:
     """The motion of one setup."""
+    return (_integrate_dense if setup.form.lowered is None else _integrate_lowered)(setup)
+
+
+def _one_motion(setup: Setup) -> Trajectory:
     begun = _begin(setup)
     return _finish(setup, begun, _solved(setup, begun))
+
+
+_integrate_dense, _integrate_lowered = eqx.filter_jit(_one_motion), quickly_compiled(_one_motion)
 
 
 @eqx.filter_jit
@@ -121,7 +128,7 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
     start, args = begun.start, begun.args
     _, scene, inputs, fixed = args
     solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, _mark_outputs(adjoint, (solved.ys, solved.y_end)))
-    end = _located_end(solved, args, t0, options.event_names)
+    end = Located(solved.t_end, solved.y_end) if options.lean else _located_end(solved, args, t0, options.event_names)
     moving = form.projects_positions or form.projects_speeds
     stored_first = form.stored(scene, t0, start.q, inputs(t0))
     before_end = (solved.ts - t0) * jnp.sign(t1 - t0) <= (end.t - t0) * jnp.sign(t1 - t0)

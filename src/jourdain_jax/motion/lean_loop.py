@@ -5,7 +5,9 @@
 
 The state is any tree of arrays. A batch of lanes runs in lockstep: all arrays, times and step sizes among them, then have a last axis of lanes,
 which keeps neighbours in memory neighbours. A step ends at every time asked for; the step size found before such a shortened step is remembered.
-Every lane carries its own result code, and a lane that has ended stands still. `diffrax` serves all other solvers, controllers and ways of saving.
+Every lane carries its own result code, and a lane that has ended stands still. A lane whose step ended beyond a stop event goes back to it in further
+steps of the same loop, so that there is one copy of the rates to compile (`event_search`). `diffrax` serves all other solvers, controllers and ways
+of saving.
 """
 
 from collections.abc import Callable
@@ -20,9 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jourdain_jax.motion import results
+from jourdain_jax.motion import event_search, results
+from jourdain_jax.motion.event_search import Search
 
-RUNNING = -1
+RUNNING, LOCATING = -1, -2
 SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 _SHRANK = 0.01  # of the average step: a singularity is near
 _CHECKPOINTS = 4096  # states kept for reverse mode, of all lanes together
@@ -60,10 +63,11 @@ class Progress(eqx.Module):
     t: Float[Array, "*lanes"]
     y: PyTree
     h: Float[Array, "*lanes"]  # the next step, positive
-    code: Int[Array, "*lanes"]  # RUNNING, or the result
+    code: Int[Array, "*lanes"]  # RUNNING, LOCATING, or the result
     accepted: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
     event: Int[Array, "*lanes"]  # index of the event that ended the motion, or -1
+    search: Search | None  # for that event
 
 
 class Problem(eqx.Module):
@@ -89,13 +93,15 @@ def integrate(
     """
     direction = jnp.sign(goals[-1] - t0)
     zero = jnp.zeros(jnp.shape(t0), jnp.int32)
-    start = Progress(t0, y0, jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0)), zero + RUNNING, zero, zero, zero - 1)
+    start = Progress(t0, y0, jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0)), zero + RUNNING, zero, zero, zero - 1, None)
+    most_steps = problem.max_steps
     if problem.events is not None:
-        start = _stopped_by_event(problem, start, jnp.array(True))
+        start = _stopped_at_once(problem, start)
+        most_steps += event_search.MOST_STEPS
 
     def to_goal(progress: Progress, goal):
         def running(p):
-            return (p.code == RUNNING) & (p.t != goal)
+            return (p.code == LOCATING) | ((p.code == RUNNING) & (p.t != goal))
 
         def step(p):
             return jax.tree.map(lambda new, old: jnp.where(running(p), new, old), _step(problem, method, p, goal, goals[-1], direction), p)
@@ -107,7 +113,7 @@ def integrate(
         # other steps are then taken than forwards, and the derivative is wrong (a rattleback for 2 s at rtol 1e-13 with 512 checkpoints: by 26 %)
         lanes = max(1, goals[0].size)
         checkpoints = None if kind == "lax" else max(8, -(-(_CHECKPOINTS // lanes) // goals.shape[0]))
-        end = eqxi.while_loop(any_running, step, progress, max_steps=None if kind == "lax" else problem.max_steps, kind=kind, checkpoints=checkpoints)
+        end = eqxi.while_loop(any_running, step, progress, max_steps=None if kind == "lax" else most_steps, kind=kind, checkpoints=checkpoints)
         return end, (end.y, end.t == goal)
 
     end, (ys, reached) = jax.lax.scan(to_goal, start, goals)
@@ -118,32 +124,33 @@ def integrate(
 
 
 def _step(problem: Problem, method: Method, p: Progress, goal, last_goal, direction) -> Progress:
+    locating = jnp.array(False) if p.search is None else p.code == LOCATING
     rest = jnp.abs(goal - p.t)
-    lands = p.h >= 0.999 * rest
+    lands = ~locating & (p.h >= 0.999 * rest)
     size = jnp.where(lands, rest, jnp.where(2 * p.h > rest, 0.5 * rest, p.h))
     shortened = size < p.h
-    h = direction * size
+    h = direction * size if p.search is None else jnp.where(locating, p.search.shift, direction * size)
     t1 = jnp.where(lands, goal, p.t + h)
-    y1, error = _stages(problem, method, p, h)
+    y1, error, first_slope = _stages(problem, method, p, h)
     if problem.project is not None:
         y1 = problem.project(t1, y1, problem.args)
     scale = jax.tree.map(lambda a, b: problem.atol + problem.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), p.y, y1)
     size_of_error = jax.lax.stop_gradient(problem.norm(jax.tree.map(lambda e, s: e / s, error, scale)))
-    accept = size_of_error <= 1
+    accept = locating | (size_of_error <= 1)
     factor = SAFETY * jnp.where(size_of_error > 0, size_of_error, 1e-30) ** (-1 / method.order)
     factor = jnp.clip(jnp.where(jnp.isfinite(size_of_error), factor, 0.0), LEAST_FACTOR, jnp.where(accept, LARGEST_FACTOR, 1.0))
     proposed = size * factor
     next_h = jnp.where(accept & shortened, jnp.maximum(proposed, p.h), proposed)
-    accepted, rejected = p.accepted + accept.astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
+    accepted, rejected = p.accepted + (accept & ~locating).astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
     code = jnp.where(next_h < problem.shortest, results.STEP_TOO_SMALL, RUNNING)
     code = jnp.where((code == RUNNING) & (accepted + rejected >= problem.max_steps) & ~(accept & (t1 == last_goal)), results.MAX_STEPS, code).astype(jnp.int32)
     y = jax.tree.map(lambda new, old: jnp.where(accept, _as(new, old), old), y1, p.y)
-    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, accepted, rejected, p.event)
-    return moved if problem.events is None else _stopped_by_event(problem, moved, accept)
+    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, accepted, rejected, p.event, p.search)
+    return moved if problem.events is None else _watched(problem, p, moved, h, first_slope, accept)
 
 
-def _stages(problem: Problem, method: Method, p: Progress, h) -> tuple[PyTree, PyTree]:
-    """y_1 and the error estimate."""
+def _stages(problem: Problem, method: Method, p: Progress, h) -> tuple[PyTree, PyTree, PyTree]:
+    """y_1, the error estimate, and the rates at the start."""
     leaves, treedef = jax.tree.flatten(p.y)
 
     def stage(carried, row):
@@ -159,7 +166,7 @@ def _stages(problem: Problem, method: Method, p: Progress, h) -> tuple[PyTree, P
     slopes = [jnp.zeros((len(method.c), *y.shape), y.dtype) for y in leaves]
     (y1, slopes), _ = jax.lax.scan(stage, (leaves, slopes), rows)
     error = [_as(h, k) * _weighted(method.b_error, k) for k in slopes]
-    return treedef.unflatten(y1), treedef.unflatten(error)
+    return treedef.unflatten(y1), treedef.unflatten(error), treedef.unflatten([k[0] for k in slopes])
 
 
 def _weighted(weights, slopes: Float[Array, "stages *shape"]) -> Float[Array, "*shape"]:
@@ -173,8 +180,40 @@ def _as(x, like) -> Array:
     return jnp.asarray(x, like.dtype)
 
 
-def _stopped_by_event(problem: Problem, p: Progress, accepted) -> Progress:
-    values = problem.events(p.t, p.y, problem.args)
-    happened = accepted & (p.code == RUNNING) & jnp.any(values <= 0, axis=0)
-    code = jnp.where(happened, results.EVENT, p.code).astype(jnp.int32)
-    return eqx.tree_at(lambda p: (p.code, p.event), p, (code, jnp.where(happened, jnp.argmax(values <= 0, axis=0), p.event).astype(jnp.int32)))
+def _stopped_at_once(problem: Problem, start: Progress) -> Progress:
+    """A motion that starts beyond an event has no motion at all."""
+    beyond = problem.events(start.t, start.y, problem.args) <= 0
+    happened = jnp.any(beyond, axis=0)
+    code = jnp.where(happened, results.EVENT, start.code).astype(jnp.int32)
+    event = jnp.where(happened, jnp.argmax(beyond, axis=0), start.event).astype(jnp.int32)
+    return Progress(start.t, start.y, start.h, code, start.accepted, start.rejected, event, event_search.none(start.t))
+
+
+def _watched(problem: Problem, p: Progress, moved: Progress, h, first_slope, accept) -> Progress:
+    """The step from `p` by `h` to `moved`, in which an event may have happened or is being located."""
+
+    def events(t, y):
+        return problem.events(t, y, problem.args)
+
+    locating = p.code == LOCATING
+    values = events(moved.t, moved.y)
+    happened = accept & ~locating & (moved.code == RUNNING) & jnp.any(values <= 0, axis=0)
+    event = jnp.where(happened, jnp.argmax(values <= 0, axis=0), p.event).astype(jnp.int32)
+    first_values, first_rates = jax.jvp(events, (p.t, p.y), (jnp.ones_like(p.t), first_slope))
+    c_0, c_dot_0, c_1 = (_chosen(event, x) for x in (first_values, first_rates, values))
+    search = jax.tree.map(lambda new, old: jnp.where(happened, new, old), event_search.begun(p.t, moved.t), p.search)
+    search = event_search.advanced(search, h, c_0, c_dot_0, moved.t, c_1)
+    # the last, vanishing, shift is along the slope
+    found = locating & (search.left == 0)
+    t = jnp.where(found, moved.t + search.shift, moved.t)
+    y = jax.tree.map(lambda y, f: jnp.where(found, y + _as(search.shift, y) * f, y), moved.y, first_slope)
+    code = jnp.where(happened, LOCATING, jnp.where(found, results.EVENT, jnp.where(locating, LOCATING, moved.code))).astype(jnp.int32)
+    return Progress(t, y, jnp.where(locating, p.h, moved.h), code, moved.accepted, moved.rejected, event, search)
+
+
+def _chosen(index, values: Float[Array, "events *lanes"]) -> Float[Array, "*lanes"]:
+    """The value with this index, of the first one where there is none."""
+    chosen = values[0]
+    for i in range(1, len(values)):
+        chosen = jnp.where(index == i, values[i], chosen)
+    return chosen

@@ -33,7 +33,8 @@ def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs):
     if known:
         check_span(t0, t1)
     if ts is None:
-        return start, t0, t0 + (t1 - t0) * jnp.linspace(0.0, 1.0, DEFAULT_SAMPLES), t1
+        first, last = (np.asarray(t0), np.asarray(t1)) if known else (t0, t1)  # known numbers: nothing to compile
+        return start, t0, jnp.asarray(first + (last - first) * np.linspace(0.0, 1.0, DEFAULT_SAMPLES), real), t1
     _check_inside(ts, t0, t1)
     return start, t0, ts, t1
 

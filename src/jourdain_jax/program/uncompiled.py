@@ -1,6 +1,6 @@
 """A traced function run on NumPy arrays, one primitive after another: for what is looked at once, where compiling takes longer than running.
 
-Primitives without a rule here run one by one in JAX.
+Primitives without a rule here run one by one in JAX, which compiles each: tens of milliseconds.
 """
 
 from collections.abc import Callable
@@ -12,6 +12,7 @@ import numpy as np
 from jax.extend.core import Literal
 
 from jourdain_jax.program.evaluate import FUNCTIONS
+from jourdain_jax.program.indexing import gathered, scattered
 
 
 def uncompiled(f: Callable) -> Callable:
@@ -61,7 +62,8 @@ def _apply(equation, inputs) -> list[np.ndarray]:
         return [np.asarray(with_type, equation.outvars[0].aval.dtype)]
     if name in _RULES and not any(params.get(flag) for flag in _WITHOUT_RULE):
         result = _RULES[name](equation, *inputs)
-        return result if isinstance(result, list) else [result]
+        if result is not None:
+            return result if isinstance(result, list) else [result]
     with jax.ensure_compile_time_eval():
         result = equation.primitive.bind(*(jnp.asarray(x) for x in inputs), **params)
     return [np.asarray(x) for x in (result if equation.primitive.multiple_results else [result])]
@@ -107,6 +109,13 @@ def _cond(params, inputs) -> list[np.ndarray]:
     return _closed(params["branches"][int(inputs[0])], inputs[1:])
 
 
+def _linear_solve(params, inputs) -> list[np.ndarray]:
+    lengths = params["const_lengths"]
+    constants, right = np.split(np.arange(len(inputs)), [sum(lengths)])
+    of_solve = constants[lengths.matvec + lengths.vecmat :][: lengths.solve]
+    return _closed(params["jaxprs"].solve, [inputs[i] for i in (*of_solve, *right)])
+
+
 def _call(key: str) -> Callable:
     return lambda params, inputs: _closed(params[key], inputs)
 
@@ -121,6 +130,7 @@ _CONTROL: dict[str, Callable] = {
     "custom_jvp_call": _call("call_jaxpr"),
     "custom_vjp_call": _call("call_jaxpr"),
     "custom_lin": lambda params, inputs: inputs,
+    "custom_linear_solve": _linear_solve,
 }
 
 # Primitives.
@@ -225,10 +235,33 @@ def _triangular_solve(equation, A, b):
     p = equation.params
     A = np.tril(A) if p["lower"] else np.triu(A)
     A = np.swapaxes(A, -1, -2) if p["transpose_a"] else A
+    if p["unit_diagonal"]:
+        A = np.where(np.eye(A.shape[-1], dtype=bool), np.ones((), A.dtype), A)
     singular = np.any(np.diagonal(A, axis1=-2, axis2=-1) == 0, axis=-1)[..., None, None]
     safe = np.where(singular, np.eye(A.shape[-1]), A)
     x = np.linalg.solve(safe, b) if p["left_side"] else np.swapaxes(np.linalg.solve(np.swapaxes(safe, -1, -2), np.swapaxes(b, -1, -2)), -1, -2)
     return np.where(singular, np.nan, x)
+
+
+def _lu(equation, A):
+    """LU decomposition with partial pivoting, as LAPACK's getrf: factors, row exchanges and their permutation, for all matrices together."""
+    *lanes, rows, columns = A.shape
+    LU = np.array(A).reshape(-1, rows, columns)
+    every, swaps = np.arange(len(LU)), np.zeros((len(LU), min(rows, columns)), np.int32)
+    order = np.broadcast_to(np.arange(rows, dtype=np.int32), (len(LU), rows)).copy()
+    for k in range(swaps.shape[1]):
+        swaps[:, k] = best = k + np.argmax(np.abs(LU[:, k:, k]), axis=1)
+        for exchanged in (LU, order):
+            exchanged[every, k], exchanged[every, best] = exchanged[every, best].copy(), exchanged[every, k].copy()
+        pivot = LU[:, k, k, None]
+        LU[:, k + 1 :, k] /= np.where(pivot == 0, 1, pivot)
+        LU[:, k + 1 :, k + 1 :] -= LU[:, k + 1 :, k, None] * LU[:, k, None, k + 1 :]
+    return [LU.reshape(A.shape), swaps.reshape(*lanes, -1), order.reshape(*lanes, rows)]
+
+
+def _platform(equation):
+    """Which of several implementations: the one for CPUs, or the one for all platforms."""
+    return np.asarray(next(i for i, names in enumerate(equation.params["platforms"]) if names is None or "cpu" in names), np.int32)
 
 
 def _iota(equation, *dynamic):
@@ -245,7 +278,7 @@ def _reduced(function: Callable, of_nothing=None) -> Callable:
     return reduced
 
 
-_WITHOUT_RULE = ("conjugate_a", "unit_diagonal")  # variants of `triangular_solve` that are left to JAX
+_WITHOUT_RULE = ("conjugate_a",)  # variants of `triangular_solve` that are left to JAX
 _RULES: dict[str, Callable] = {
     "dot_general": _dot_general,
     "broadcast_in_dim": _broadcast_in_dim,
@@ -265,7 +298,11 @@ _RULES: dict[str, Callable] = {
     "integer_pow": lambda e, x: np.asarray(x ** e.params["y"] if e.params["y"] >= 0 else 1 / x ** -e.params["y"]),
     "iota": _iota,
     "pad": _pad,
+    "gather": gathered,
+    "scatter": scattered,
+    "platform_index": _platform,
     "svd": _svd,
+    "lu": _lu,
     "cholesky": _cholesky,
     "triangular_solve": _triangular_solve,
     "reduce_sum": _reduced(np.sum),

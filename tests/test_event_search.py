@@ -1,0 +1,86 @@
+"""Stop events located inside the loop over steps: to round-off, with derivatives up to the third, and never outside of the step they lie in."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jourdain_jax.motion import lean_loop, results
+
+GRAVITY = 9.81
+
+
+def stopped(y0, value, *, rates, longest=2.0, solver=None, kind="lax", lanes=(), max_steps=500):
+    """Where a motion from `y0` at t = 0 stopped; `value(t, y)` of the one event."""
+    real = lambda x: jnp.full(lanes, x)  # noqa: E731
+    problem = lean_loop.Problem(
+        rates=lambda t, y, args: rates(t, y),
+        args=None,
+        project=None,
+        events=lambda t, y, args: value(t, y)[None],
+        norm=lambda y: jnp.sqrt(jnp.mean(y**2, axis=0)),
+        rtol=real(1e-9),
+        atol=real(1e-9),
+        shortest=real(1e-14),
+        max_steps=max_steps,
+    )
+    goals = jnp.stack([real(0.5 * longest), real(longest)])
+    method = lean_loop.method_of(diffrax.Dopri8() if solver is None else solver)
+    return lean_loop.integrate(problem, method, y0, real(0.0), goals, 1e-2, kind)[2]
+
+
+def falling(t, y):
+    return jnp.stack([y[1], -GRAVITY * jnp.ones_like(y[1])])
+
+
+@pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Tsit5()], ids=["Dopri8", "Tsit5"])
+def test_a_fall_is_located_with_derivatives_up_to_the_third(solver):
+    def fall_time(height):
+        return stopped(jnp.stack([height, 0.0 * height]), lambda t, y: y[0], rates=falling, solver=solver).t
+
+    height = 2.0
+    exact = np.sqrt(2 * height / GRAVITY)
+    for expected in (exact, exact / (2 * height), -exact / (4 * height**2), 3 * exact / (8 * height**3)):
+        np.testing.assert_allclose(fall_time(height), expected, rtol=1e-9)
+        fall_time = jax.jacfwd(fall_time)
+
+
+def test_the_state_at_an_event_has_the_same_derivative_in_reverse_mode():
+    def landing(height):
+        return stopped(jnp.stack([height, 0.0 * height]), lambda t, y: y[0], rates=falling, kind="checkpointed").y
+
+    speed = np.sqrt(2 * GRAVITY * 2.0)
+    np.testing.assert_allclose(landing(2.0), [0.0, -speed], atol=1e-13)
+    np.testing.assert_allclose(jax.jacrev(landing)(2.0), [0.0, -GRAVITY / speed], atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("value", "digits"),
+    [
+        (lambda t, y: 0.7 - y[0], 1e-14),
+        (lambda t, y: jnp.tanh(40 * (0.7 - y[0])), 1e-14),
+        (lambda t, y: jnp.expm1(30 * (0.7 - y[0])), 1e-14),
+        (lambda t, y: jnp.where(y[0] < 0.7, 1e3, 1.0) * (0.7 - y[0]), 1e-14),
+        (lambda t, y: (0.7 - y[0]) ** 3, 1e-2),  # its slope vanishes there
+        (lambda t, y: jnp.where(y[0] < 0.7, 1.0, -1.0), 1e-2),  # a jump has no slope at all
+    ],
+    ids=["straight", "saturated", "steep", "kinked", "flat", "jump"],
+)
+def test_an_event_is_found_in_its_step_whatever_its_shape(value, digits):
+    end = stopped(jnp.array([0.0]), value, rates=lambda t, y: jnp.ones_like(y))
+    assert int(end.code) == results.EVENT
+    np.testing.assert_allclose(end.t, 0.7, atol=digits)
+    np.testing.assert_allclose(end.y[0], end.t, rtol=1e-13)
+
+
+def test_lanes_stop_each_at_its_own_event_and_the_steps_to_it_do_not_count():
+    heights = jnp.array([0.5, 1.0, 2.0, 50.0])
+    y0 = jnp.stack([heights, jnp.zeros(4)])
+    lanes = stopped(y0, lambda t, y: y[0], rates=falling, lanes=(4,))
+    alone = [stopped(y0[:, k], lambda t, y: y[0], rates=falling) for k in range(4)]
+    np.testing.assert_array_equal(lanes.code, [results.EVENT] * 3 + [results.SUCCESS])
+    np.testing.assert_allclose(lanes.t[:3], np.sqrt(2 * heights[:3] / GRAVITY), rtol=1e-13)
+    np.testing.assert_array_equal(lanes.accepted, [int(end.accepted) for end in alone])
+    few = stopped(y0[:, 1], lambda t, y: y[0], rates=falling, kind="checkpointed", max_steps=int(alone[1].accepted) + 1)
+    np.testing.assert_allclose(few.t, np.sqrt(2 / GRAVITY), rtol=1e-13)
