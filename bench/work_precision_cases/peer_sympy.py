@@ -75,7 +75,7 @@ def _equations(problem: Problem) -> tuple:
     return _made[problem.name]
 
 
-def _callback(function, size: int):
+def callback(function, size: int):
     """The rates as SciPy calls them; every integrator of SciPy copies what it is given, so that one output array serves."""
     out = np.empty(size)
     to = out.__array_interface__["data"][0]
@@ -93,7 +93,7 @@ def _by_ode(name: str):
     def prepare(problem: Problem) -> Prepared:
         equations, function = _equations(problem)
         start = equations.from_minimal(problem.minimal_start)
-        rates, count = _callback(function, len(start))
+        rates, count = callback(function, len(start))
 
         def run(tolerance: float):
             count[0] = 0
@@ -110,7 +110,7 @@ def _by_ode(name: str):
 def _by_solve_ivp(problem: Problem) -> Prepared:
     equations, function = _equations(problem)
     start = equations.from_minimal(problem.minimal_start)
-    rates, _ = _callback(function, len(start))
+    rates, _ = callback(function, len(start))
 
     def copied(t, y):
         return rates(t, np.ascontiguousarray(y)).copy()

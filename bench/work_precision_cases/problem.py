@@ -35,7 +35,8 @@ class Problem:
     compared: tuple[str, ...]  # names of coordinates and speeds
     conserves_energy: bool = True
     steps: tuple[float, ...] = field(default=(0.1, 0.03, 0.01, 0.003, 0.001))  # s, of methods with a constant step
-    dense: bool = True  # whether every reduction and form of the state is run
+    dense: bool = True  # whether every reduction is run
+    structure_preserving: bool = False  # whether the costly solvers of that kind are run
 
     @functools.cached_property
     def scene(self) -> jj.Scene:

@@ -26,6 +26,7 @@ PROBLEMS = {
             rolling_disc.RUN["t_end"],
             references.disc,
             ("x", "y", "yaw", "lean", "spin", "yaw_rate", "lean_rate", "spin_rate"),
+            structure_preserving=True,
         ),
         Problem(
             "chaplygin-sleigh",
@@ -35,6 +36,7 @@ PROBLEMS = {
             _SLEIGH["t_end"],
             references.sleigh,
             ("x", "y", "heading", "x_rate", "y_rate", "heading_rate"),
+            structure_preserving=True,
         ),
         Problem(
             "rattleback",
@@ -65,6 +67,7 @@ PROBLEMS = {
             _AXLE["t_end"],
             references.axle,
             ("x1", "y1", "psi1", "x2", "y2", "psi2", "phi", "psi1_rate", "phi_rate"),
+            structure_preserving=True,
         ),
         Problem(
             "ball-on-turntable",
@@ -84,6 +87,7 @@ PROBLEMS = {
             _BOARD["t_end"],
             references.board,
             ("x", "y", "heading", "rotor", "steer", "heading_rate", "rotor_rate", "steer_rate"),
+            structure_preserving=True,
         ),
         Problem(
             "trailer-chain",
