@@ -70,8 +70,8 @@ def measured(arguments) -> Iterator[dict]:
             yield from gradients.measured(PROBLEMS[name], say, quick)
     if "memory" in arguments.part:
         yield from fresh_process.memory(quick, say)
-    if "cold" in arguments.part:
-        yield from fresh_process.cold(quick, say)
+    if "cold" in arguments.part and not quick:
+        yield from fresh_process.cold(say)
     if ready:
         yield from figures(so_far, ready)
 
@@ -79,7 +79,7 @@ def measured(arguments) -> Iterator[dict]:
 def main() -> None:
     """Measure, or read what was measured; draw, tabulate, print the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="disc and sleigh, fewer methods, under two minutes")
+    parser.add_argument("--quick", action="store_true", help="disc and sleigh, fewer methods, no cold starts: under two minutes")
     parser.add_argument("--json", type=Path, metavar="FILE", help="file for the list of records")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for pictures and the table")
     parser.add_argument("--problem", nargs="*", metavar="NAME", help="only these problems")

@@ -60,6 +60,7 @@ OWN_LOOKS = {
     "implicit midpoint": Look("implicit midpoint", BLACK, "d"),
     "discrete Lagrange-d'Alembert": Look("discrete Lagrange-d'Alembert", BLACK, "P", "--"),
     "discrete gradient": Look("discrete gradient", BLACK, "X", ":"),
+    "start not projected, Dopri8": Look("lowered, start taken as it is", SKY, "o", ":"),
     "full state, projected, Dopri8": Look("full state, projected", ORANGE, "s"),
     "full state, not projected, Dopri8": Look("full state, not projected", ORANGE, "x", ":"),
     "privileged reduction, Dopri8": Look("privileged reduction, dense", RED, "o"),
@@ -93,20 +94,18 @@ def draw(entries: list[dict], out: Path) -> None:
     problems = [name for name in TITLES if any(e["problem"] == name for e in single)]
     main = [name for name in MAIN if name in problems]
     if main:
-        title = "Error against time, one trajectory at a time on one core, warm"
+        title = "Error against time, one trajectory at a time on one core, warm (lower left is better)"
         _chart(single, main, MAIN_LOOKS, _time, _TIME, title, out / "work_precision", columns=2)
         _chart(single, problems, MAIN_LOOKS, _time, _TIME, title, out / "work_precision_all")
-        evaluations = "Error against evaluations of the right-hand side (implicit methods and heyoka do not count them)"
+        evaluations = "Error against evaluations of the right-hand side (lower left is better; implicit methods and heyoka do not count them)"
         _chart(single, problems, MAIN_LOOKS, lambda e: e["rhs_evaluations"], _EVALUATIONS, evaluations, out / "work_precision_evaluations")
-        own = "Methods of this engine: solvers, forms of the state, reductions (dense unless lowered; Dopri8 unless said)"
+        own = "Methods of this engine: solvers, forms of the state, reductions (dense unless lowered; Dopri8 unless said; lower left is better)"
         _chart(single, problems, OWN_LOOKS, _time, _TIME, own, out / "work_precision_methods")
     gradients = [e for e in entries if e.get("kind") == "gradient"]
     named = [name for name in TITLES if any(e["problem"] == name for e in gradients)]
     if named:
-        error = "relative error of the gradient"
-        _chart(
-            gradients, named, GRADIENT_LOOKS, _time, "time (ms)", "Gradient by eight numbers through the whole motion", out / "work_precision_gradients", error
-        )
+        title, error = "Gradient by eight numbers through the whole motion (lower left is better)", "relative error of the gradient"
+        _chart(gradients, named, GRADIENT_LOOKS, _time, "time (ms)", title, out / "work_precision_gradients", error)
     batched = [e for e in entries if "batch" in e and e["note"].startswith("starts")]
     if batched:
         _batches(batched, out / "work_precision_batches")
@@ -156,9 +155,6 @@ def _finish(ax, title: str, xlabel: str, ylabel: str) -> None:
         axis.set_minor_locator(matplotlib.ticker.NullLocator())
     for side in ("top", "right"):
         ax.spines[side].set_visible(False)
-    ax.annotate(
-        "better", (0.015, 0.015), (0.09, 0.09), xycoords="axes fraction", fontsize=7.5, color="#555555", arrowprops={"arrowstyle": "->", "color": "#555555"}
-    )
 
 
 def _legend(figure, looks: list[Look], title: str, path: Path, rows: int, columns: int) -> None:
@@ -182,13 +178,13 @@ def _batches(entries: list[dict], path: Path) -> None:
         len(problems), len(sizes), figsize=(0.7 + 3.7 * len(sizes), 1.4 + 3.0 * len(problems)), squeeze=False, sharex="row", sharey="row"
     )
     drawn: dict[str, Look] = {}
-    for row, name in zip(axes, problems, strict=True):
-        for ax, size in zip(row, sizes, strict=True):
+    for k, name in enumerate(problems):
+        for column, size in enumerate(sizes):
+            ax = axes[k, column]
             for method, look in BATCH_LOOKS.items():
                 if _curve(ax, [e for e in entries if e["problem"] == name and e["batch"] == size and e["method"] == method], look, _time):
                     drawn[method] = look
-            last, first = row is axes[-1], ax is row[0]
             many = "alone" if size == 1 else f"batch of {size:,}"
-            _finish(ax, f"{TITLES[name]}, {many}", "largest error over the lanes" if last else "", _TIME if first else "")
+            _finish(ax, f"{TITLES[name]}, {many}", "largest error over the lanes" if k + 1 == len(problems) else "", "" if column else _TIME)
     looks = [look for method, look in BATCH_LOOKS.items() if method in drawn]
-    _legend(figure, looks, "Batches with scattered starts: time per trajectory", path, len(problems), len(sizes))
+    _legend(figure, looks, "Batches with scattered starts: time per trajectory (lower left is better)", path, len(problems), len(sizes))

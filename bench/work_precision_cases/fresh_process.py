@@ -35,8 +35,16 @@ _MEMORY = {
     "import mujoco": "import mujoco",
     "import exudyn": "import exudyn",
 }
-_QUICK = ("import jax", "simulate the disc")
-_REPORT = "; import resource; print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+_QUICK = ("import jax",)
+# What getrusage says on Linux includes the parent from which the process was forked.
+_REPORT = """
+import pathlib, resource, sys
+status = pathlib.Path("/proc/self/status")
+if status.exists():
+    print(next(line.split()[1] for line in status.read_text().splitlines() if line.startswith("VmHWM")))
+else:
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // (1024 if sys.platform == "darwin" else 1))
+"""
 
 
 def memory(quick: bool, say: Callable[[str], None]) -> Iterator[dict]:
@@ -47,16 +55,16 @@ def memory(quick: bool, say: Callable[[str], None]) -> Iterator[dict]:
         if done.returncode:
             say(f"  memory, {what}: not measured: {done.stderr.strip().splitlines()[-1]}")
             continue
-        kilobytes = int(done.stdout.split()[-1]) / (1024 if sys.platform == "darwin" else 1)  # bytes there
-        say(f"  {what:42s} {kilobytes / 1024:7.0f} MB")
-        yield {"memory": what, "peak_rss_mb": kilobytes / 1024}
+        megabytes = int(done.stdout.split()[-1]) / 1024
+        say(f"  {what:42s} {megabytes:7.0f} MB")
+        yield {"memory": what, "peak_rss_mb": megabytes}
 
 
-def cold(quick: bool, say: Callable[[str], None]) -> Iterator[dict]:
+def cold(say: Callable[[str], None]) -> Iterator[dict]:
     """Seconds of every stage up to a first trajectory, without and with a warm compile cache; see `compile_time.py`."""
-    for model in ("tilting-disc",) if quick else ("tilting-disc", "chaplygin-sleigh", "whipple-bicycle"):
+    for model in ("tilting-disc", "chaplygin-sleigh", "whipple-bicycle"):
         with tempfile.TemporaryDirectory() as cache:
-            for state in ("cold",) if quick else ("cold", "warm cache"):
+            for state in ("cold", "warm cache"):
                 laps = compile_time.measured(model, cache)["laps"]
                 say(f"  {model}, {state}: " + ", ".join(f"{name} {seconds:.3g} s" for name, seconds in laps.items()))
                 yield {"cold": model, "cache": state, "seconds": laps}

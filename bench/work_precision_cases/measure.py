@@ -14,7 +14,7 @@ MOST_REPEATS, LONGEST = 25, 8.0  # s: after a run as long as that, smaller setti
 def fastest(run: Callable[[], object], seconds: float = SECONDS_PER_POINT) -> float:
     """Wall time of the fastest of some warm runs, s: as many as fit in `seconds`, at least two, at most 25; one where a run takes longer than that."""
     laps: list[float] = []
-    while len(laps) < MOST_REPEATS and sum(laps) < seconds or (len(laps) < 2 and laps[0] < seconds):
+    while (len(laps) < MOST_REPEATS and sum(laps) < seconds) or (len(laps) < 2 and laps[0] < seconds):
         begin = time.perf_counter()
         run()
         laps.append(time.perf_counter() - begin)
