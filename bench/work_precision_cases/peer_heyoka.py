@@ -22,6 +22,8 @@ except ImportError:
 
 MISSING = "heyoka cannot be imported, so it is not measured; `pip install heyoka` (wheels for Linux only)"
 TOLERANCES = tuple(10.0**-k for k in range(4, 16, 2))
+FEWER = TOLERANCES[::2]  # every tolerance is compiled anew
+LARGE, HUGE = 100, 1000  # operations: from LARGE on fewer tolerances, from HUGE on in compact mode, without which compiling takes minutes
 
 
 @functools.cache
@@ -48,24 +50,26 @@ def system(problem: Problem) -> list:
     return list(zip(y, [heyoka.expression(rate) if isinstance(rate, float) else rate for rate in rates], strict=True))
 
 
-def _integrator(problem: Problem, equations: list, tolerance: float):
-    return heyoka.taylor_adaptive(equations, problem.minimal_start.tolist(), tol=tolerance, fast_math=True)
+def operations(problem: Problem) -> int:
+    """Of the engine's program."""
+    return jj.lower(problem.scene).operations
 
 
 def extended(problem: Problem) -> dict[str, float]:
     """Coordinates and privileged speeds at the end, in long double with a tolerance of 1e-18."""
     start = problem.minimal_start.astype(np.longdouble)
-    solver = heyoka.taylor_adaptive(system(problem), start, tol=np.longdouble("1e-18"), fp_type=np.longdouble)
+    solver = heyoka.taylor_adaptive(system(problem), start, tol=np.longdouble("1e-18"), fp_type=np.longdouble, compact_mode=True)
     solver.propagate_until(np.longdouble(problem.end))
     return dict(zip(problem.minimal_names, solver.state.astype(float), strict=True))
 
 
-def _prepared(problem: Problem, equations: list) -> Prepared:
+def _prepared(problem: Problem, equations: list, compact: bool) -> Prepared:
     solvers: dict = {}
+    start = problem.minimal_start.tolist()
 
     def run(tolerance: float):
         if tolerance not in solvers:
-            solvers[tolerance] = _integrator(problem, equations, tolerance)
+            solvers[tolerance] = heyoka.taylor_adaptive(equations, start, tol=tolerance, fast_math=True, compact_mode=compact)
         solver = solvers[tolerance]
         solver.time = 0.0
         solver.state[:] = problem.minimal_start
@@ -77,21 +81,28 @@ def _prepared(problem: Problem, equations: list) -> Prepared:
 
 def on_engines_equations(problem: Problem) -> Prepared:
     """One integrator per tolerance."""
-    return _prepared(problem, system(problem))
+    return _prepared(problem, system(problem), compact=operations(problem) >= HUGE)
 
 
 def on_disc_by_hand(problem: Problem) -> Prepared:
     """The disc's equations as an expert writes them."""
     y = heyoka.make_vars(*problem.minimal_names)
     qdot, vdot = tilting_disc(dense.DISC_PARAMETERS, heyoka.time, tuple(y[:5]), tuple(y[5:]), xp=heyoka)
-    return _prepared(problem, list(zip(y, (*qdot, *vdot), strict=True)))
+    return _prepared(problem, list(zip(y, (*qdot, *vdot), strict=True)), compact=False)
+
+
+def _missing(problem: Problem) -> Prepared:
+    raise ImportError(MISSING)
 
 
 def curves(problem: Problem) -> list[Curve]:
     """Those of the problem."""
+    if heyoka is None:
+        return [Curve("heyoka", "peer", TOLERANCES, "tolerance", _missing)]
     found = []
     if problem.name == "tilting-disc":
         found.append(Curve("heyoka, equations by hand", "peer", TOLERANCES, "tolerance", on_disc_by_hand, ("heyoka",)))
     if applies(problem):
-        found.append(Curve("heyoka, the engine's equations", "peer", TOLERANCES, "tolerance", on_engines_equations, ("heyoka",)))
+        tolerances = TOLERANCES if operations(problem) < LARGE else FEWER
+        found.append(Curve("heyoka, the engine's equations", "peer", tolerances, "tolerance", on_engines_equations, ("heyoka",)))
     return found
