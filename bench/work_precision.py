@@ -29,7 +29,7 @@ def say(text: str) -> None:
     print(f"[{time.perf_counter() - BEGIN:6.0f} s] {text}", flush=True)
 
 
-def curves(names, quick: bool, ready: dict) -> Iterator[dict]:
+def curves(names, quick: bool, ready: dict, methods=None) -> Iterator[dict]:
     """References and single trajectories; the disc's methods are kept ready for the figures."""
     from work_precision_cases import measure, ours, peer_diffrax, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy
     from work_precision_cases.figures import DISC
@@ -42,6 +42,8 @@ def curves(names, quick: bool, ready: dict) -> Iterator[dict]:
         yield {"reference": name, "how": reference.how, "against": reference.against, "uncertainty": reference.uncertainty}
         peers = [*peer_sympy.curves(problem, quick), *peer_heyoka.curves(problem), *peer_diffrax.curves(problem, quick)]
         for curve in [*ours.curves(problem, quick), *peers, *peer_exudyn.curves(problem, quick), *peer_mujoco.curves(problem, quick)]:
+            if methods and curve.method not in methods:
+                continue
             found, prepared = measure.points(problem, curve, say)
             yield from found
             if name == DISC and prepared is not None:
@@ -58,7 +60,7 @@ def measured(arguments) -> Iterator[dict]:
     ready: dict = {}
     so_far: list[dict] = []
     if "curves" in arguments.part:
-        for entry in curves(names, quick, ready):
+        for entry in curves(names, quick, ready, arguments.method):
             so_far.append(entry)
             yield entry
     for name in names:
@@ -83,6 +85,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="file for the list of records")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for pictures and the table")
     parser.add_argument("--problem", nargs="*", metavar="NAME", help="only these problems")
+    parser.add_argument("--method", nargs="*", metavar="NAME", help="only these single-trajectory methods, by their names in the records")
     parser.add_argument("--part", nargs="*", choices=PARTS, default=list(PARTS), help="only these parts")
     parser.add_argument("--redraw", type=Path, metavar="FILE", help="measure nothing: draw what is in this file")
     arguments = parser.parse_args()

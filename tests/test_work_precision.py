@@ -11,8 +11,8 @@ from oracles import chaplygin_sleigh
 from tolerances import tolerance
 
 pytest.importorskip("work_precision_cases", reason="the scripts of `bench/` are not here")
-from work_precision_cases import curve, disc_body, figures, measure, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy, record, tables  # noqa: E402
-from work_precision_cases.problems import PROBLEMS  # noqa: E402
+from work_precision_cases import curve, disc_body, figures, measure, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy, record, tables
+from work_precision_cases.problems import PROBLEMS
 
 SLEIGH, DISC = PROBLEMS["chaplygin-sleigh"], PROBLEMS["tilting-disc"]
 EIGHT = (
@@ -134,10 +134,10 @@ def test_sympys_equations_of_the_sleigh_compiled_from_c_are_chaplygins():
     minimal = SLEIGH.minimal_start
     assert np.max(np.abs(equations.to_minimal(equations.from_minimal(minimal)) - minimal)) <= tolerance("round_off")
     try:
-        function = peer_sympy.compiled(peer_sympy.c_source(equations))
+        library = peer_sympy.compiled(peer_sympy.c_source(equations))
     except curve.NotApplicable as reason:
         pytest.skip(str(reason))
-    rates, _ = peer_sympy.callback(function, 5)
+    rates, _ = peer_sympy.callback(library, 5)
     y = equations.from_minimal(minimal)
     scene, (_, _, heading, v, w), a = SLEIGH.scene, y, float(SLEIGH.scene.offset)
     # v' = a w^2, w' = -(a/k^2) v w

@@ -3,7 +3,9 @@
 import time
 from collections.abc import Callable, Iterator
 
+from work_precision_cases import peer_sympy
 from work_precision_cases.curve import Prepared
+from work_precision_cases.problems import PROBLEMS
 
 DISC = "tilting-disc"
 OURS = ("Tsit5", "Dopri8")
@@ -44,6 +46,15 @@ def _ratio(name: str, required: float, theirs: dict | None, ours: dict | None, r
     return {"figure": name, "value": value, "required": required, "met": value >= required, "how": how}
 
 
+def _without_python(theirs: dict, ours: dict, ready: dict[str, Prepared]) -> dict:
+    """A bound from below on what SymPy's C could do in a compiled loop."""
+    alone = peer_sympy.evaluations_alone(PROBLEMS[DISC], theirs["rhs_evaluations"])
+    their_time, our_time = in_turns([alone, lambda: ready[ours["method"]].run(ours["setting"])])
+    name = "disc at error 1e-6: evaluations of SymPy's C alone, in one loop of C, time / ours"
+    how = f"{theirs['rhs_evaluations']:.0f} evaluations {1e3 * their_time:.4g} ms, without any integrator; ours {1e3 * our_time:.4g} ms"
+    return {"figure": name, "value": their_time / our_time, "required": None, "met": None, "how": how}
+
+
 def figures(entries: list[dict], ready: dict[str, Prepared]) -> Iterator[dict]:
     """Records {"figure", "value", "required", "met", "how"}. `ready`: prepared methods of the disc by name."""
 
@@ -57,6 +68,8 @@ def figures(entries: list[dict], ready: dict[str, Prepared]) -> Iterator[dict]:
     yield _ratio("disc at error 1e-6: Exudyn's time / ours", 100, exudyn, ours(ACCURATE), ready, "Exudyn is not installed or did not reach it")
     sympy = cheapest(entries, lambda name: name.startswith("SymPy") and "DOP853" in name, ACCURATE)
     yield _ratio("disc at error 1e-6: SymPy to C with DOP853, time / ours", 1, sympy, ours(ACCURATE), ready, "SymPy, SciPy or a C compiler is missing")
+    if sympy is not None:
+        yield _without_python(sympy, ours(ACCURATE), ready)
     reached = [e for e in entries if e.get("problem") == DISC and e["method"].startswith("MuJoCo") and e["error"] is not None and e["setting"] >= 1.99e-5]
     best = min(reached, key=lambda e: e["error"], default=None)
     name = "disc at the best error of MuJoCo at h >= 2e-5 s: its time / ours"

@@ -94,19 +94,21 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
         Curve(DEFAULT, "ours", COARSE, "tolerance", as_it_comes, group="solver"),
         _tolerance("Tsit5", "solver", diffrax.Tsit5()),
         _tolerance("Dopri8", "solver", diffrax.Dopri8()),
-        _step("implicit midpoint", problem, jj.ImplicitMidpoint()),
     ]
+    if not problem.large:
+        found.append(_step("implicit midpoint", problem, jj.ImplicitMidpoint()))
     given = _tolerance("start not projected, Dopri8", "state", diffrax.Dopri8(), projection=False)
     full = _tolerance("full state, projected, Dopri8", "state", diffrax.Dopri8(), COARSE, state="full")
     if quick:
         return [*found, given, full]
-    found.append(_tolerance("Kvaerno5", "solver", diffrax.Kvaerno5(), IMPLICIT_TOLERANCES))
+    if not problem.large:
+        found.append(_tolerance("Kvaerno5", "solver", diffrax.Kvaerno5(), IMPLICIT_TOLERANCES))
     if problem.structure_preserving:
         found += [_step("discrete Lagrange-d'Alembert", problem, jj.DiscreteLagrangeDAlembert()), _step("discrete gradient", problem, jj.DiscreteGradient())]
     if problem.scene.coordinates.quaternions:
         found.append(_tolerance("Munthe-Kaas Dopri8", "solver", jj.MuntheKaas(diffrax.Dopri8()), COARSE))
     loose = _tolerance("full state, not projected, Dopri8", "state", diffrax.Dopri8(), COARSE, state="full", projection=False)
     # the privileged reduction is the default one, here with dense matrices
-    reductions = REDUCTIONS if problem.dense else ("privileged", "kkt")
+    reductions = ("privileged", "kkt") if problem.large else REDUCTIONS
     reduced = [_tolerance(f"{name} reduction, Dopri8", "reduction", diffrax.Dopri8(), COARSE, reduction=name) for name in reductions]
     return [*found, given, full, loose, *reduced]

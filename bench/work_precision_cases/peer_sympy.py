@@ -8,6 +8,7 @@ import ctypes
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,15 @@ MISSING = "SymPy or SciPy cannot be imported, so this peer is not measured; `pip
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-shared", "-fPIC")
 TOLERANCES = tuple(10.0**-k for k in range(4, 14))
 MOST_STEPS = 1_000_000
+# Evaluations one after another without Python between: each starts from what the last one gave, so that none is left out.
+_REPEAT = """
+void repeat(long count, int states, double *y, double *dy) {
+    for (long k = 0; k < count; ++k) {
+        rates(0.0, y, dy);
+        for (int i = 0; i < states; ++i) y[i] += 1e-9 * dy[i];
+    }
+}
+"""
 
 
 def c_source(equations: kane.KaneEquations) -> str:
@@ -46,21 +56,22 @@ def c_source(equations: kane.KaneEquations) -> str:
     lines += [f"{'' if target.startswith('dy') else 'const double '}{target} = {code(value)};" for target, value in zip(targets, found, strict=True)]
     lines += [f"const double {name} = {code(value)};" for name, value in solving]
     lines += [f"dy[{n + i}] = {code(value)};" for i, value in enumerate(solved)]
-    return "#include <math.h>\nvoid rates(double t, const double *y, double *dy) {\n    " + "\n    ".join(lines) + "\n}\n"
+    return "#include <math.h>\nvoid rates(double t, const double *y, double *dy) {\n    " + "\n    ".join(lines) + "\n}\n" + _REPEAT
 
 
 def compiled(source: str):
-    """The function in a shared library; NotApplicable without a C compiler."""
+    """The shared library; NotApplicable without a C compiler."""
     compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
     if compiler is None:
         raise NotApplicable("there is no C compiler (cc, gcc, clang)")
     folder = Path(tempfile.mkdtemp())
     (folder / "rates.c").write_text(source)
     subprocess.run([compiler, *FLAGS, "-o", str(folder / "rates.so"), str(folder / "rates.c"), "-lm"], check=True)
-    function = ctypes.CDLL(str(folder / "rates.so")).rates
+    library = ctypes.CDLL(str(folder / "rates.so"))
     shutil.rmtree(folder)  # loaded already
-    function.argtypes, function.restype = [ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p], None
-    return function
+    library.rates.argtypes, library.rates.restype = [ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p], None
+    library.repeat.argtypes, library.repeat.restype = [ctypes.c_long, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p], None
+    return library
 
 
 _made: dict[str, tuple] = {}
@@ -75,10 +86,17 @@ def _equations(problem: Problem) -> tuple:
     return _made[problem.name]
 
 
-def callback(function, size: int):
+def evaluations_alone(problem: Problem, count: float) -> Callable[[], None]:
+    """So many evaluations in one call: what a compiled loop over steps could not do without."""
+    equations, library = _equations(problem)
+    y, dy = equations.from_minimal(problem.minimal_start), np.empty(len(problem.minimal_start))
+    return lambda: library.repeat(int(count), len(y), y.ctypes.data, dy.ctypes.data)
+
+
+def callback(library, size: int):
     """The rates as SciPy calls them; every integrator of SciPy copies what it is given, so that one output array serves."""
     out = np.empty(size)
-    to = out.__array_interface__["data"][0]
+    function, to = library.rates, out.__array_interface__["data"][0]
     count = [0]
 
     def rates(t, y):
@@ -91,9 +109,9 @@ def callback(function, size: int):
 
 def _by_ode(name: str):
     def prepare(problem: Problem) -> Prepared:
-        equations, function = _equations(problem)
+        equations, library = _equations(problem)
         start = equations.from_minimal(problem.minimal_start)
-        rates, count = callback(function, len(start))
+        rates, count = callback(library, len(start))
 
         def run(tolerance: float):
             count[0] = 0
@@ -108,9 +126,9 @@ def _by_ode(name: str):
 
 
 def _by_solve_ivp(problem: Problem) -> Prepared:
-    equations, function = _equations(problem)
+    equations, library = _equations(problem)
     start = equations.from_minimal(problem.minimal_start)
-    rates, _ = callback(function, len(start))
+    rates, _ = callback(library, len(start))
 
     def copied(t, y):
         return rates(t, np.ascontiguousarray(y)).copy()

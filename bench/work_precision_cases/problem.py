@@ -35,7 +35,7 @@ class Problem:
     compared: tuple[str, ...]  # names of coordinates and speeds
     conserves_energy: bool = True
     steps: tuple[float, ...] = field(default=(0.1, 0.03, 0.01, 0.003, 0.001))  # s, of methods with a constant step
-    dense: bool = True  # whether every reduction is run
+    large: bool = False  # implicit solvers, whose inner solves take minutes to compile, and most reductions are left out
     structure_preserving: bool = False  # whether the costly solvers of that kind are run
 
     @functools.cached_property

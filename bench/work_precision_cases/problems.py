@@ -57,7 +57,7 @@ PROBLEMS = {
             references.bicycle,
             ("x", "y", "yaw", "lean", "pitch", "steer", "rear_spin", "front_spin", "lean_rate", "steer_rate", "rear_spin_rate"),
             steps=(0.03, 0.01, 0.003, 0.001),
-            dense=False,
+            large=True,
         ),
         Problem(
             "two-wheel-axle",
@@ -97,7 +97,7 @@ PROBLEMS = {
             5.0,
             references.trailers,
             tuple(f"{name}{i}" for i in range(_CHAIN + 1) for name in ("x", "y", "heading", "forward", "turn")),
-            dense=False,
+            large=True,
         ),
     )
 }
