@@ -35,10 +35,14 @@ def points(problem: Problem, curve: Curve, say: Callable[[str], None]) -> tuple[
     except (NotApplicable, ImportError) as reason:
         say(f"  {curve.method}: not measured: {reason}")
         return [], None
-    found = []
+    found: list[dict] = []
     for setting in curve.settings:
         begin = time.perf_counter()
-        raw = ready.run(setting)
+        try:
+            raw = ready.run(setting)
+        except Exception as failure:  # a peer that breaks down is told, and the others go on
+            say(f"  {curve.method}, {setting:.1e}: {type(failure).__name__}: {str(failure).splitlines()[0] if str(failure) else ''}")
+            return found, None
         first = time.perf_counter() - begin
         solved = ready.read(raw)
         verdict = judged(problem, solved)

@@ -20,12 +20,10 @@ from work_precision_cases.problem import Problem, Reference, largest_error
 TIGHT = 1e-14
 
 
-def by_engine(problem: Problem, solver=None) -> dict[str, float]:
+def by_engine(problem: Problem) -> dict[str, float]:
     """The engine's own end, at a tolerance of 1e-14."""
-    run = jax.jit(
-        lambda: jj.simulate(problem.scene, problem.state, ts=jnp.array([problem.end]), rtol=TIGHT, atol=TIGHT, solver=solver or diffrax.Dopri8(), events=False)
-    )
-    motion = run()
+    state, options = problem.state, {"ts": jnp.array([problem.end]), "rtol": TIGHT, "atol": TIGHT, "events": False}
+    motion = jax.jit(lambda state: jj.simulate(problem.scene, state, solver=diffrax.Dopri8(), **options))(state)
     return dict(zip((*problem.scene.coordinate_names.entries, *problem.scene.speed_names.entries), (*motion.q_end, *motion.u_end), strict=True))
 
 
