@@ -23,6 +23,8 @@ DEFAULT = "simulate, as it comes"
 
 def stages(solver) -> int | None:
     """Evaluations per step of an explicit method in the engine's own loop; None for implicit ones, whose inner iterations are not counted."""
+    if isinstance(solver, jj.MuntheKaas):
+        solver = solver.solver
     if not isinstance(solver, diffrax.AbstractERK):
         return None
     method = method_of(solver)

@@ -76,7 +76,7 @@ PROBLEMS = {
             {"x": _BALL["x0"], "y": _BALL["y0"], "x_rate": _BALL["vx0"], "y_rate": _BALL["vy0"], "spin": _BALL["wz"]},
             _BALL["t_end"],
             references.ball,
-            ("x", "y", "x_rate", "y_rate", "roll_x", "roll_y", "spin"),
+            ("x", "y", "attitude_w", "attitude_x", "attitude_y", "attitude_z", "x_rate", "y_rate", "roll_x", "roll_y", "spin"),
             conserves_energy=False,
         ),
         Problem(

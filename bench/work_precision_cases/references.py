@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from baselines import dense
 from oracles import ball_on_turntable, chaplygin_sleigh, rattleback, rolling_disc, snakeboard, two_wheel_axle
-from oracles.reference import integrate
+from oracles.reference import LONG, integrate
 
 import jourdain_jax as jj
 from work_precision_cases import peer_heyoka
@@ -73,10 +73,26 @@ def axle(problem: Problem) -> Reference:
 
 
 def ball(problem: Problem) -> Reference:
-    """Closed form."""
-    found = {name: values[-1] for name, values in ball_on_turntable.motion([0.0, problem.end], **ball_on_turntable.RUN).items()}
+    """Closed form of the centre and the angular velocity; the attitude e by `e' = (0, omega/2) e`, omega in space axes."""
+    run = ball_on_turntable.RUN
+    found = {name: values[-1] for name, values in ball_on_turntable.motion([0.0, problem.end], **run).items()}
     values = {"x": found["x"], "y": found["y"], "x_rate": found["vx"], "y_rate": found["vy"], "roll_x": found["wx"], "roll_y": found["wy"], "spin": found["wz"]}
-    return checked(problem, values, "closed form")
+    r, turn, kappa, wz = (LONG(run[name]) for name in ("radius", "turn_rate", "inertia_ratio", "wz"))
+    c, s = np.cos(LONG(run["tilt"])), np.sin(LONG(run["tilt"]))
+    n, push = turn * kappa / (1 + kappa), LONG(run["gravity"]) * s / (1 + kappa)
+
+    def rates(_, state):
+        x, y, vx, vy, *e = state
+        wx, wy = (turn * x - vy) / r, (vx + turn * y) / r
+        p, q, w = (wx * c + wz * s) / 2, wy / 2, (wz * c - wx * s) / 2
+        turning = [-p * e[1] - q * e[2] - w * e[3], p * e[0] + q * e[3] - w * e[2], q * e[0] + w * e[1] - p * e[3], w * e[0] + p * e[2] - q * e[1]]
+        return [vx, vy, push - n * vy, n * vx, *turning]
+
+    attitude = ("attitude_w", "attitude_x", "attitude_y", "attitude_z")
+    names = problem.scene.coordinate_names.entries
+    at_start = [float(problem.state.q[names.index(name)]) for name in attitude]
+    ends = integrate(rates, [run["x0"], run["y0"], run["vx0"], run["vy0"], *at_start], [0.0, problem.end])[-1]
+    return checked(problem, values | dict(zip(attitude, ends[4:], strict=True)), "closed form; attitude by extrapolation of order 18 in extended precision")
 
 
 def board(problem: Problem) -> Reference:
@@ -108,7 +124,7 @@ def trailers(problem: Problem) -> Reference:
         inertia = float(scene.trailer_inertia)
         return speeds, turns, sum(m * v**2 for m, v in zip(masses, speeds, strict=True)) + inertia * sum(w**2 for w in turns[1:])
 
-    headings0 = np.array([named[f"heading{i}"] for i in range(n + 1)], np.longdouble)
+    headings0 = np.array([named[f"heading{i}"] for i in range(n + 1)], LONG)
     at_start = per_speed(headings0)[2]
 
     def car_speed(headings):
@@ -120,7 +136,7 @@ def trailers(problem: Problem) -> Reference:
         return [v * np.cos(y[2]), v * np.sin(y[2]), turn0, *(v * w for w in turns[1:])]
 
     x, y, *headings = integrate(rates, [named["x0"], named["y0"], *headings0], [0.0, problem.end])[-1]
-    v, speeds, turns = car_speed(np.array(headings, np.longdouble))
+    v, speeds, turns = car_speed(np.array(headings, LONG))
     values = {"x0": x, "y0": y, "heading0": headings[0], "forward0": float(v), "turn0": turn0}
     for i in range(1, n + 1):
         x, y = x - L * np.cos(headings[i]), y - L * np.sin(headings[i])
