@@ -99,7 +99,7 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
     ]
     if not problem.large:
         found.append(_step("implicit midpoint", problem, jj.ImplicitMidpoint()))
-    given = _tolerance("start not projected, Dopri8", "state", diffrax.Dopri8(), projection=False)
+    given = _tolerance("minimal state, not projected, Dopri8", "state", diffrax.Dopri8(), projection=False)
     full = _tolerance("full state, projected, Dopri8", "state", diffrax.Dopri8(), COARSE, state="full")
     if quick:
         return [*found, given, full]
