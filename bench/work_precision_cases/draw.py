@@ -150,8 +150,8 @@ def _finish(ax, title: str, xlabel: str, ylabel: str) -> None:
     ax.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
     ax.set_title(title, fontsize=10.5)
     ax.grid(which="major", alpha=0.3, lw=0.6)
-    ax.xaxis.set_major_locator(matplotlib.ticker.LogLocator(numticks=9))
-    ax.yaxis.set_major_locator(matplotlib.ticker.LogLocator(numticks=9))
+    ax.xaxis.set_major_locator(matplotlib.ticker.LogLocator(numticks=7))
+    ax.yaxis.set_major_locator(matplotlib.ticker.LogLocator(numticks=7))
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_minor_locator(matplotlib.ticker.NullLocator())
     for side in ("top", "right"):
@@ -160,7 +160,7 @@ def _finish(ax, title: str, xlabel: str, ylabel: str) -> None:
 
 def _legend(figure, looks: list[Look], title: str, path: Path, rows: int, columns: int) -> None:
     handles = [plt.Line2D([], [], color=x.colour, marker=x.mark, ls=x.line, lw=x.width, ms=5.5) for x in looks]
-    each = min(len(looks), 2 if columns == 1 else 4 if columns == 2 else 6)
+    each = min(len(looks), 2 if columns == 1 else 3 if columns == 2 else 6)
     lines = math.ceil(len(looks) / each)
     height = figure.get_figheight()
     figure.suptitle(title, fontsize=12)
