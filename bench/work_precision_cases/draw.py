@@ -119,7 +119,7 @@ def _time(entry: dict) -> float:
 def _grid(count: int, columns: int | None):
     columns = min(count, columns or (2 if count <= 4 else 4))
     rows = math.ceil(count / columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(0.7 + 4.1 * columns, 1.6 + 3.1 * rows), squeeze=False)
+    figure, axes = plt.subplots(rows, columns, figsize=(0.7 + max(4.1 * columns, 6.8), 1.6 + 3.1 * rows), squeeze=False)
     for ax in axes.flat[count:]:
         ax.set_axis_off()
     return figure, axes, rows, columns
@@ -149,6 +149,8 @@ def _chart(entries, problems, looks: dict[str, Look], cost, ylabel: str, title: 
 def _finish(ax, title: str, xlabel: str, ylabel: str) -> None:
     ax.set(xscale="log", yscale="log", xlabel=xlabel, ylabel=ylabel)
     ax.set_title(title, fontsize=10.5)
+    low, high = ax.get_ylim()
+    ax.set_ylim(10.0 ** math.floor(math.log10(low) + 0.1), 10.0 ** math.ceil(math.log10(high) - 0.1))  # whole decades
     ax.grid(which="major", alpha=0.3, lw=0.6)
     ax.xaxis.set_major_locator(matplotlib.ticker.LogLocator(numticks=7))
     ax.yaxis.set_major_locator(matplotlib.ticker.LogLocator(numticks=7))
