@@ -1,0 +1,113 @@
+"""Work-precision charts: error against time for eight problems, this engine's methods and its peers, each at its best settings.
+
+    taskset -c 0 python bench/work_precision.py [--quick] [--json FILE] [--out DIR] [--problem NAME ...] [--part NAME ...]
+    python bench/work_precision.py --redraw FILE --out DIR
+
+Writes a list of records (see `work_precision_cases/record.py`), among them how every reference was obtained ({"reference", ...}), peak memory
+({"memory", ...}), cold starts ({"cold", ...}) and the figures ({"figure", "value", "required", "met", "how"}); pictures (PNG and SVG); a table. The main chart
+is `work_precision.png`. Times are wall time of the fastest of some warm runs. Peers that are not installed are skipped with a message.
+"""
+
+import argparse
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
+sys.path[:0] = [str(HERE), str(HERE.parent / "tests")]  # `tests/oracles` holds the closed forms
+PARTS = ("curves", "batches", "gradients", "memory", "cold")
+BEGIN = time.perf_counter()
+
+
+def say(text: str) -> None:
+    """A line with the time since the start."""
+    print(f"[{time.perf_counter() - BEGIN:6.0f} s] {text}", flush=True)
+
+
+def curves(names, quick: bool, ready: dict, methods=None) -> Iterator[dict]:
+    """References and single trajectories; the disc's methods are kept ready for the figures."""
+    from work_precision_cases import measure, ours, peer_diffrax, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy
+    from work_precision_cases.figures import DISC
+    from work_precision_cases.problems import PROBLEMS
+
+    for name in names:
+        problem = PROBLEMS[name]
+        reference = problem.judge.reference
+        say(f"{name}: {reference.how}; {reference.uncertainty:.1e} from {reference.against}")
+        yield {"reference": name, "how": reference.how, "against": reference.against, "uncertainty": reference.uncertainty}
+        peers = [*peer_sympy.curves(problem, quick), *peer_heyoka.curves(problem), *peer_diffrax.curves(problem, quick)]
+        for curve in [*ours.curves(problem, quick), *peers, *peer_exudyn.curves(problem, quick), *peer_mujoco.curves(problem, quick)]:
+            if methods and curve.method not in methods:
+                continue
+            found, prepared = measure.points(problem, curve, say)
+            yield from found
+            if name == DISC and prepared is not None:
+                ready[curve.method] = prepared
+
+
+def measured(arguments) -> Iterator[dict]:
+    """All records."""
+    from work_precision_cases import batches, fresh_process, gradients
+    from work_precision_cases.figures import figures
+    from work_precision_cases.problems import PROBLEMS, QUICK
+
+    names, quick = arguments.problem or (QUICK if arguments.quick else tuple(PROBLEMS)), arguments.quick
+    ready: dict = {}
+    so_far: list[dict] = []
+    if "curves" in arguments.part:
+        for entry in curves(names, quick, ready, arguments.method):
+            so_far.append(entry)
+            yield entry
+    for name in names:
+        if "batches" in arguments.part and name in batches.PROBLEMS:
+            say(f"batches: {name}")
+            yield from batches.measured(PROBLEMS[name], quick, say)
+        if "gradients" in arguments.part and name in gradients.BY:
+            say(f"gradients: {name}")
+            yield from gradients.measured(PROBLEMS[name], say, quick)
+    if "memory" in arguments.part:
+        yield from fresh_process.memory(quick, say)
+    if "cold" in arguments.part and not quick:
+        yield from fresh_process.cold(say)
+    if ready:
+        yield from figures(so_far, ready)
+
+
+def main() -> None:
+    """Measure, or read what was measured; draw, tabulate, print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="disc and sleigh, fewer methods, no cold starts: under two minutes")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="file for the list of records")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for pictures and the table")
+    parser.add_argument("--problem", nargs="*", metavar="NAME", help="only these problems")
+    parser.add_argument("--method", nargs="*", metavar="NAME", help="only these single-trajectory methods, by their names in the records")
+    parser.add_argument("--part", nargs="*", choices=PARTS, default=list(PARTS), help="only these parts")
+    parser.add_argument("--redraw", type=Path, metavar="FILE", help="measure nothing: draw what is in this file")
+    arguments = parser.parse_args()
+    if arguments.redraw:
+        found = json.loads(arguments.redraw.read_text(encoding="utf-8"))
+    else:
+        say(f"Python {platform.python_version()}, {platform.machine()}, float64")
+        found = []
+        for entry in measured(arguments):
+            found.append(entry)
+            if arguments.json:
+                arguments.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    from work_precision_cases.tables import summary, write_table
+
+    if arguments.out:
+        from work_precision_cases.draw import draw
+
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        draw(found, arguments.out)
+        write_table(found, arguments.out)
+    print(summary(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,122 @@
+"""Batches of 1, 100 and 10,000 trajectories with starts that differ by 5 %: time per trajectory against the largest error over the first 100 lanes."""
+
+from collections.abc import Callable, Iterator
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from baselines import heyoka_disc
+
+import jourdain_jax as jj
+from jourdain_jax.equations.minimal import speeds_from_privileged
+from work_precision_cases import peer_diffrax
+from work_precision_cases import record as records
+from work_precision_cases.measure import fastest
+from work_precision_cases.ours import MAX_STEPS
+from work_precision_cases.problem import Problem
+
+SIZES = (1, 100, 10_000)
+TOLERANCES = (1e-6, 1e-8, 1e-10, 1e-12)
+PROBLEMS = ("tilting-disc", "chaplygin-sleigh")
+JUDGED = 100  # lanes
+SCATTER, SEED = 0.05, 0
+SIMD = 8
+LONGEST = 60.0  # s: a method that would take longer than that for a batch is left out
+
+
+def starts(problem: Problem, lanes: int) -> np.ndarray:
+    """Minimal states (lanes, states), every number of the start changed by 5 % (standard deviation)."""
+    return problem.minimal_start * (1 + SCATTER * np.random.default_rng(SEED).normal(size=(max(lanes, JUDGED), len(problem.minimal_start))))[:lanes]
+
+
+def by_rollout(problem: Problem) -> Callable:
+    """`rollout` under `jit`; the consistent starts are given."""
+    scene, independent, n = problem.scene, problem.independent, len(problem.scene.coordinate_names.entries)
+    known = problem.state
+
+    @jax.jit
+    def states(y):
+        u = jax.vmap(lambda y: speeds_from_privileged(scene, independent, jnp.zeros(()), y[:n], y[n:]))(y)
+        same = jax.tree.map(lambda x: jnp.broadcast_to(0.0 * x, (len(y), *jnp.shape(x))), known)
+        return jj.State(same.t, y[:, :n], u, same.moved_q, same.moved_u, same.residual, known.names)
+
+    @jax.jit
+    def compiled(tolerance, state):
+        options = {"ts": jnp.array([problem.end]), "rtol": tolerance, "atol": tolerance, "solver": diffrax.Dopri8(), "events": False, "max_steps": MAX_STEPS}
+        lanes = jj.rollout(scene, state, **options).lanes
+        return jnp.concatenate([lanes.q_end, lanes.u_end[:, jnp.array(independent)]], axis=1)
+
+    def prepared(y):
+        state = jax.block_until_ready(states(jnp.asarray(y)))
+        return lambda tolerance: np.asarray(compiled(jnp.asarray(tolerance), state))
+
+    return prepared
+
+
+def by_vmap(problem: Problem) -> Callable:
+    """diffrax under `vmap` on the equations by hand."""
+    rates = peer_diffrax.rates_by_hand(problem)
+    one = lambda tolerance, y: peer_diffrax.final(rates, problem.end, diffrax.Dopri8(), tolerance, y)[0]  # noqa: E731
+    compiled = jax.jit(jax.vmap(one, in_axes=(None, 0)))
+    return lambda y: lambda tolerance: np.asarray(compiled(jnp.asarray(tolerance), jnp.asarray(y)))
+
+
+def by_dense_vmap(problem: Problem) -> Callable:
+    """diffrax under `vmap` on dense matrices; the disc."""
+    from baselines import disc_run
+
+    run = disc_run.final_states("dense", "Dopri8")
+    return lambda y: lambda tolerance: run(tolerance, y)
+
+
+def by_heyoka(problem: Problem) -> Callable:
+    """heyoka, eight trajectories in the lanes of SIMD registers, one at a time alone; the disc."""
+    made: dict = {}
+
+    def prepared(y):
+        width = SIMD if len(y) >= SIMD else 1
+        padded = np.concatenate([y, y[: -len(y) % width]]) if len(y) % width else y
+
+        def run(tolerance):
+            if (tolerance, width) not in made:
+                made[tolerance, width] = heyoka_disc.final_states(tolerance, width)
+            return made[tolerance, width](padded)[: len(y)]
+
+        return run
+
+    return prepared
+
+
+def methods(problem: Problem, quick: bool) -> list[tuple[str, str, Callable, tuple[str, ...]]]:
+    """Name, kind, preparation, packages."""
+    jax_packages = ("jax", "jaxlib", "diffrax")
+    found = [("rollout, Dopri8", records.OURS, by_rollout, jax_packages), ("JAX by hand, diffrax Dopri8", records.PEER, by_vmap, jax_packages)]
+    if problem.name == "tilting-disc":
+        if not quick:
+            found.append(("dense autodiff, diffrax Dopri8", records.PEER, by_dense_vmap, jax_packages))
+        if heyoka_disc.heyoka is not None:
+            found.append(("heyoka, equations by hand", records.PEER, by_heyoka, ("heyoka",)))
+    return found
+
+
+def measured(problem: Problem, quick: bool, say: Callable[[str], None]) -> Iterator[dict]:
+    """Records of a problem."""
+    sizes = SIZES[:2] if quick else SIZES
+    expected = by_vmap(problem)(starts(problem, JUDGED))(1e-14)
+    for method, kind, make, packages in methods(problem, quick):
+        prepare, each = make(problem), 0.0
+        for size in sizes:
+            if each * size > LONGEST:
+                say(f"  {method}: a batch of {size} is left out, it would take {each * size:.0f} s")
+                continue
+            run = prepare(starts(problem, size))
+            for tolerance in TOLERANCES[1:3] if quick else TOLERANCES:
+                found = run(tolerance)
+                error = float(np.max(np.abs(found[:JUDGED] - expected[: len(found)])))
+                each = fastest(lambda run=run, tolerance=tolerance: run(tolerance)) / size
+                say(f"  batch {size:6d}  {method:32s} {tolerance:8.1e}  error {error:9.1e}  {1e3 * each:9.4f} ms per trajectory")
+                yield records.record(
+                    problem=problem.name, method=method, kind=kind, setting=tolerance, setting_unit="tolerance", batch=size, error=error, seconds=each,
+                    note=f"starts scattered by 5 %; largest error over {min(size, JUDGED)} lanes", versions=records.versions(*packages),
+                )  # fmt: skip

@@ -1,0 +1,125 @@
+"""Three scenes in SymPy's `KanesMethod`, in speeds that leave no row over, as an expert of it would choose them.
+
+The equations come as `M(q) udot = f(q, u)` with `qdot(q, u)`. Source of the method: T. R. Kane and D. A. Levinson, Dynamics (1985).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+try:
+    import sympy as sp
+    from sympy.physics import mechanics as me
+except ImportError:
+    sp = me = None
+
+
+@dataclass(frozen=True)
+class KaneEquations:
+    """Expressions of SymPy, numbers of the parameters, and the change of speeds from and to the engine's minimal state."""
+
+    q: list
+    u: list
+    qdot: list
+    mass_matrix: object
+    forcing: object
+    parameters: dict  # symbol -> number
+    from_minimal: Callable[[np.ndarray], np.ndarray]
+    to_minimal: Callable[[np.ndarray], np.ndarray]
+
+
+def _formed(frame, angles, speeds, kinematic, bodies, loads):
+    """The method, with its equations formed, and the rates of the angles."""
+    kane = me.KanesMethod(frame, q_ind=angles, u_ind=speeds, kd_eqs=kinematic)
+    kane.kanes_equations(bodies, loads)
+    return kane, kane.kindiffdict()
+
+
+def tilting_disc(scene) -> KaneEquations:
+    """Speeds: components of the disc's angular velocity along the heading, the axle and the radius to the contact."""
+    x, y, yaw, lean, spin, w1, w2, w3 = me.dynamicsymbols("x y yaw lean spin w1 w2 w3")
+    m, a, g = sp.symbols("m a g", positive=True)
+    space = me.ReferenceFrame("S")
+    heading = space.orientnew("H", "Axis", [yaw, space.z])
+    tilted = heading.orientnew("T", "Axis", [lean, heading.x])
+    wheel = tilted.orientnew("W", "Axis", [spin, tilted.y])
+    by_rates = wheel.ang_vel_in(space)
+    wheel.set_ang_vel(space, w1 * tilted.x + w2 * tilted.y + w3 * tilted.z)
+    contact = me.Point("P")
+    contact.set_vel(space, 0)
+    centre = contact.locatenew("C", a * tilted.z)
+    centre.v2pt_theory(contact, space, wheel)
+    body = me.RigidBody("disc", centre, wheel, m, (me.inertia(tilted, m * a**2 / 4, m * a**2 / 2, m * a**2 / 4), centre))
+    kinematic = [me.dot(wheel.ang_vel_in(space) - by_rates, axis) for axis in tilted]
+    kane, rates = _formed(space, [yaw, lean, spin], [w1, w2, w3], kinematic, [body], [(centre, -m * g * space.z)])
+    forward = a * rates[spin.diff()]
+    qdot = [forward * sp.cos(yaw), forward * sp.sin(yaw), *(rates[angle.diff()] for angle in (yaw, lean, spin))]
+    numbers = {m: float(scene.mass), a: float(scene.radius), g: float(scene.gravity)}
+
+    def from_minimal(s):
+        yaw_rate, lean_rate, spin_rate = s[5:]
+        return np.concatenate([s[:5], [lean_rate, spin_rate + yaw_rate * np.sin(s[3]), yaw_rate * np.cos(s[3])]])
+
+    def to_minimal(s):
+        yaw_rate = s[7] / np.cos(s[3])
+        return np.concatenate([s[:5], [yaw_rate, s[5], s[6] - yaw_rate * np.sin(s[3])]])
+
+    return KaneEquations([x, y, yaw, lean, spin], [w1, w2, w3], qdot, kane.mass_matrix, kane.forcing, numbers, from_minimal, to_minimal)
+
+
+def chaplygin_sleigh(scene) -> KaneEquations:
+    """Speeds: of the blade along itself, and the turn rate."""
+    x, y, turn, v, w = me.dynamicsymbols("x y turn v w")
+    m, inertia, a = sp.symbols("m I a", positive=True)
+    space = me.ReferenceFrame("S")
+    body_frame = space.orientnew("B", "Axis", [turn, space.z])
+    body_frame.set_ang_vel(space, w * space.z)
+    blade = me.Point("P")
+    blade.set_vel(space, v * body_frame.x)
+    centre = blade.locatenew("C", a * body_frame.x)
+    centre.v2pt_theory(blade, space, body_frame)
+    body = me.RigidBody("sleigh", centre, body_frame, m, (me.inertia(body_frame, 0, 0, inertia), centre))
+    kane, _ = _formed(space, [turn], [v, w], [turn.diff() - w], [body], [])
+    c, s = sp.cos(turn), sp.sin(turn)
+    qdot = [v * c - a * w * s, v * s + a * w * c, w]
+    offset = float(scene.offset)
+    numbers = {m: float(scene.mass), inertia: float(scene.inertia), a: offset}
+
+    def from_minimal(z):  # x, y, heading, x_rate, y_rate
+        c, s = np.cos(z[2]), np.sin(z[2])
+        return np.array([*z[:3], c * z[3] + s * z[4], (c * z[4] - s * z[3]) / offset])
+
+    def to_minimal(z):
+        c, s = np.cos(z[2]), np.sin(z[2])
+        return np.array([*z[:3], z[3] * c - offset * z[4] * s, z[3] * s + offset * z[4] * c])
+
+    return KaneEquations([x, y, turn], [v, w], qdot, kane.mass_matrix, kane.forcing, numbers, from_minimal, to_minimal)
+
+
+def two_wheel_axle(scene) -> KaneEquations:
+    """Speeds: the first wheel's roll rate and the turn rate."""
+    x1, y1, psi1, x2, y2, psi2, phi, roll, turn = me.dynamicsymbols("x1 y1 psi1 x2 y2 psi2 phi roll turn")
+    M, rim, a, l, g, slope = sp.symbols("M rim a l g slope", positive=True)
+    space = me.ReferenceFrame("S")
+    axle = space.orientnew("A", "Axis", [phi, space.z])
+    axle.set_ang_vel(space, turn * space.z)
+    second_roll = roll - l / a * turn
+    bodies, loads = [], []
+    for name, rate, angle in (("1", roll, psi1), ("2", second_roll, psi2)):
+        wheel = axle.orientnew(f"W{name}", "Axis", [angle, axle.y])
+        wheel.set_ang_vel(space, rate * axle.y + turn * axle.z)
+        hub = me.Point(f"C{name}")
+        hub.set_vel(space, a * rate * axle.x)
+        bodies.append(me.RigidBody(f"wheel{name}", hub, wheel, M, (me.inertia(axle, rim * a**2 / 2, rim * a**2, rim * a**2 / 2), hub)))
+        loads.append((hub, M * g * (sp.sin(slope) * space.x - sp.cos(slope) * space.z)))
+    kinematic = [phi.diff() - turn, psi1.diff() - roll, psi2.diff() - second_roll]
+    kane, _ = _formed(space, [phi, psi1, psi2], [roll, turn], kinematic, bodies, loads)
+    c, s = sp.cos(phi), sp.sin(phi)
+    qdot = [a * roll * c, a * roll * s, roll, a * second_roll * c, a * second_roll * s, second_roll, turn]
+    names = {M: "mass", rim: "rim_mass", a: "radius", l: "length", g: "gravity", slope: "slope"}
+    numbers = {symbol: float(getattr(scene, name)) for symbol, name in names.items()}
+    return KaneEquations([x1, y1, psi1, x2, y2, psi2, phi], [roll, turn], qdot, kane.mass_matrix, kane.forcing, numbers, np.array, np.array)
+
+
+SCENES = {"tilting-disc": tilting_disc, "chaplygin-sleigh": chaplygin_sleigh, "two-wheel-axle": two_wheel_axle}

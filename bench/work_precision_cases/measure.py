@@ -1,0 +1,81 @@
+"""Running a curve: error, energy drift, slip and warm time at every setting."""
+
+import time
+from collections.abc import Callable
+
+from work_precision_cases import record as records
+from work_precision_cases.curve import Curve, NotApplicable, Prepared, Solved
+from work_precision_cases.problem import Judged, Problem
+
+SECONDS_PER_POINT = 0.25
+MOST_REPEATS, LONGEST = 25, 8.0  # s: after a run as long as that, smaller settings are left out
+
+
+def fastest(run: Callable[[], object], seconds: float = SECONDS_PER_POINT) -> float:
+    """Wall time of the fastest of some warm runs, s: as many as fit in `seconds`, at least two, at most 25; one where a run takes longer than that."""
+    laps: list[float] = []
+    while (len(laps) < MOST_REPEATS and sum(laps) < seconds) or (len(laps) < 2 and laps[0] < seconds):
+        begin = time.perf_counter()
+        run()
+        laps.append(time.perf_counter() - begin)
+    return min(laps)
+
+
+def judged(problem: Problem, solved: Solved) -> Judged | None:
+    """None where the run failed."""
+    if solved.failed:
+        return None
+    return problem.judge.minimal(solved.y) if solved.y is not None else problem.judge.full(solved.q, solved.u)
+
+
+def points(problem: Problem, curve: Curve, say: Callable[[str], None]) -> tuple[list[dict], Prepared | None]:
+    """Records of a curve, and the method ready to run again; none where it cannot be run, with the reason said."""
+    try:
+        ready = curve.prepare(problem)
+    except (NotApplicable, ImportError) as reason:
+        say(f"  {curve.method}: not measured: {reason}")
+        return [], None
+    found: list[dict] = []
+    for setting in curve.settings:
+        begin = time.perf_counter()
+        try:
+            raw = ready.run(setting)
+        except Exception as failure:  # a peer that breaks down is told, and the others go on
+            say(f"  {curve.method}, {setting:.1e}: {type(failure).__name__}: {str(failure).splitlines()[0] if str(failure) else ''}")
+            return found, None
+        first = time.perf_counter() - begin
+        solved = ready.read(raw)
+        verdict = judged(problem, solved)
+        seconds = fastest(lambda setting=setting: ready.run(setting))
+        entry = records.record(
+            problem=problem.name,
+            method=curve.method,
+            kind=curve.kind,
+            setting=setting,
+            setting_unit=curve.setting_unit,
+            batch=1,
+            error=None if verdict is None else verdict.error,
+            seconds=seconds,
+            rhs_evaluations=solved.rhs_evaluations,
+            steps=solved.steps,
+            energy_drift=None if verdict is None else verdict.energy_drift,
+            slip=None if verdict is None else verdict.slip,
+            note=solved.failed or curve.note,
+            versions=records.versions(*curve.packages),
+        )
+        found.append(entry)
+        say(f"  {curve.method:42s} {setting:8.1e}  {line(entry)}   (first call {first:.2f} s)")
+        if seconds > LONGEST:
+            break
+    return found, ready
+
+
+def line(entry: dict) -> str:
+    """The figures of a record, for reading."""
+
+    def shown(key, form):
+        return "-".rjust(9) if entry[key] is None else format(entry[key], form).rjust(9)
+
+    return f"error {shown('error', '.1e')}  {1e3 * entry['seconds']:10.4f} ms  rhs {shown('rhs_evaluations', '.0f')}" + (
+        f"  energy {shown('energy_drift', '.0e')}  slip {shown('slip', '.0e')}" + (f"  {entry['note']}" if entry["error"] is None else "")
+    )

@@ -1,0 +1,128 @@
+"""Exudyn's rolling disc: as a joint (no slip, implicit integrators of index-3 systems) and as a penalty connector.
+
+The version without range checks is asked for. Source: J. Gerstmayr, Multibody Syst. Dyn. 60 (2024) 553 (Exudyn).
+"""
+
+import sys
+import warnings
+
+import numpy as np
+
+from work_precision_cases import disc_body
+from work_precision_cases.curve import Curve, Prepared, Solved
+from work_precision_cases.problem import Problem
+
+sys.exudynFast = True  # read when it is imported
+try:
+    import exudyn
+    from exudyn.itemInterface import (
+        MarkerBodyRigid,
+        NodeGenericData,
+        ObjectConnectorRollingDiscPenalty,
+        ObjectGround,
+        ObjectJointRollingDisc,
+    )
+    from exudyn.rigidBodyUtilities import RigidBodyInertia
+except ImportError:
+    exudyn = None
+
+MISSING = "exudyn cannot be imported, so it is not measured; `pip install exudyn`"
+STEPS = (1e-2, 2.5e-3, 1e-3, 2.5e-4, 1e-4, 5e-5)  # s
+PENALTY_STEPS = (2.5e-3, 1e-3, 5e-4)
+# Stiffness (N/m), damping (N s/m), friction coefficient, and the speed up to which friction is viscous (m/s): of those tried, the smallest error.
+PENALTY = {"contactStiffness": 5e5, "contactDamping": 50.0, "dryFriction": [1e3, 1e3], "dryFrictionProportionalZone": 1e-3}
+
+
+def _system(problem: Problem, penalty: bool):
+    container = exudyn.SystemContainer()
+    system = container.AddSystem()
+    scene, at_start = problem.scene, disc_body.start(problem)
+    m, a = float(scene.mass), float(scene.radius)
+    on_ground = system.AddMarker(MarkerBodyRigid(bodyNumber=system.AddObject(ObjectGround()), localPosition=[0, 0, 0]))
+    body = system.CreateRigidBody(
+        inertia=RigidBodyInertia(mass=m, inertiaTensor=m * a**2 * np.diag([0.25, 0.5, 0.25]), com=[0, 0, 0]),
+        referencePosition=at_start.centre.tolist(),
+        referenceRotationMatrix=at_start.rotation,
+        initialVelocity=at_start.velocity.tolist(),
+        initialAngularVelocity=at_start.angular_velocity.tolist(),
+        gravity=[0, 0, -float(scene.gravity)],
+    )
+    on_disc = system.AddMarker(MarkerBodyRigid(bodyNumber=body, localPosition=[0, 0, 0]))
+    rolling = {"markerNumbers": [on_ground, on_disc], "discRadius": a, "discAxis": [0, 1, 0]}
+    if penalty:
+        node = system.AddNode(NodeGenericData(initialCoordinates=[0, 0, 0], numberOfDataCoordinates=3))
+        system.AddObject(ObjectConnectorRollingDiscPenalty(**rolling, nodeNumber=node, useLinearProportionalZone=True, **PENALTY))
+    else:
+        system.AddObject(ObjectJointRollingDisc(**rolling))
+    system.Assemble()
+    return container, system, body
+
+
+def _settings(problem: Problem, step: float):
+    settings = exudyn.SimulationSettings()
+    settings.timeIntegration.numberOfSteps = round(problem.end / step)
+    settings.timeIntegration.endTime = problem.end
+    settings.timeIntegration.verboseMode = 0
+    settings.timeIntegration.newton.useModifiedNewton = True
+    settings.timeIntegration.newton.relativeTolerance = 1e-10
+    settings.timeIntegration.newton.absoluteTolerance = 1e-12
+    settings.timeIntegration.generalizedAlpha.spectralRadius = 0.9
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the name changed between versions; the old one serves in both
+        settings.solutionSettings.writeSolutionToFile = False
+        settings.solutionSettings.sensorsWritePeriod = problem.end
+    return settings
+
+
+def _by_exudyn(solver: str, penalty: bool = False):
+    def prepare(problem: Problem) -> Prepared:
+        if exudyn is None:
+            raise ImportError(MISSING)
+        container, system, body = _system(problem, penalty)
+        kind = getattr(exudyn.DynamicSolverType, solver)
+        kinds = exudyn.OutputVariableType
+
+        def run(step: float):
+            settings = _settings(problem, step)
+            try:
+                done = system.SolveDynamic(settings, solverType=kind)  # always from the initial values
+            except Exception as failure:
+                return step, str(failure).splitlines()[0]
+            return step, "" if done else "the solver says that it failed"
+
+        def read(raw):
+            step, failed = raw
+            if failed:
+                return Solved(failed=failed)
+            position, rotation, velocity, omega = (
+                np.array(system.GetObjectOutputBody(body, kind, [0, 0, 0]))
+                for kind in (kinds.Position, kinds.RotationMatrix, kinds.Velocity, kinds.AngularVelocity)
+            )
+            q, u = disc_body.state(problem, disc_body.Body(position, rotation.reshape(3, 3), velocity, omega))
+            return Solved(q=q, u=u, steps=float(round(problem.end / step)), failed="" if np.all(np.isfinite(q)) else "not finite")
+
+        prepared = Prepared(run, read)
+        prepared.run.__dict__["keeps"] = container  # the system dies with its container
+        return prepared
+
+    return prepare
+
+
+def curves(problem: Problem, quick: bool) -> list[Curve]:
+    """Of the disc only; `quick`: one integrator."""
+    if problem.name != "tilting-disc":
+        return []
+    found = [
+        Curve("Exudyn, joint, trapezoidal index 2", "peer", STEPS, "step (s)", _by_exudyn("TrapezoidalIndex2"), ("exudyn",), "ObjectJointRollingDisc"),
+        Curve("Exudyn, joint, generalized-alpha", "peer", STEPS, "step (s)", _by_exudyn("GeneralizedAlpha"), ("exudyn",), "ObjectJointRollingDisc"),
+        Curve(
+            "Exudyn, penalty, generalized-alpha",
+            "peer",
+            PENALTY_STEPS,
+            "step (s)",
+            _by_exudyn("GeneralizedAlpha", penalty=True),
+            ("exudyn",),
+            "ObjectConnectorRollingDiscPenalty",
+        ),
+    ]
+    return found[1:2] if quick else found

@@ -1,0 +1,108 @@
+"""heyoka: Taylor series, compiled to machine code, on equations that the engine prints (`jj.lower(scene).python_source()`); on the disc, by hand too.
+
+Also the second computation behind most references, in extended precision. Source: F. Biscani and D. Izzo, Mon. Not. R. Astron. Soc. 504 (2021) 2614.
+"""
+
+import functools
+import inspect
+import math
+
+import numpy as np
+from baselines import dense
+from baselines.hand_derived import tilting_disc
+
+import jourdain_jax as jj
+from work_precision_cases.curve import Curve, Prepared, Solved
+from work_precision_cases.problem import Problem
+
+try:
+    import heyoka
+except ImportError:
+    heyoka = None
+
+MISSING = "heyoka cannot be imported, so it is not measured; `pip install heyoka` (wheels for Linux only)"
+TOLERANCES = tuple(10.0**-k for k in range(4, 16, 2))
+FEWER = TOLERANCES[::2]  # every tolerance is compiled anew
+LARGE, HUGE = 100, 1000  # operations: from LARGE on fewer tolerances, from HUGE on in compact mode, without which compiling takes minutes
+
+
+@functools.cache
+def applies(problem: Problem) -> bool:
+    """Whether the scene has a scalar program to take the equations from."""
+    try:
+        return jj.lower(problem.scene) is not None
+    except jj.NotLowered:
+        return False
+
+
+def system(problem: Problem) -> list:
+    """The engine's scalar program as equations of heyoka."""
+    scene = problem.scene
+    source = jj.lower(scene).python_source().replace("import math", "")
+    in_numbers, in_symbols = {"math": math}, {"math": heyoka}
+    exec(source, in_numbers)
+    exec(source, in_symbols)
+    parameters = [float(getattr(scene, name)) for name in inspect.signature(in_numbers["fixed"]).parameters]
+    taken = list(inspect.signature(in_symbols["rates"]).parameters)[2:]  # after `fixed` and t
+    y = heyoka.make_vars(*problem.minimal_names)
+    inputs = [0.0] * (len(taken) - len(y))
+    rates = in_symbols["rates"](in_numbers["fixed"](*parameters), heyoka.time, *y, *inputs)
+    return list(zip(y, [heyoka.expression(rate) if isinstance(rate, float) else rate for rate in rates], strict=True))
+
+
+def operations(problem: Problem) -> int:
+    """Of the engine's program."""
+    return jj.lower(problem.scene).operations
+
+
+def extended(problem: Problem) -> dict[str, float]:
+    """Coordinates and privileged speeds at the end, in long double with a tolerance of 1e-18."""
+    start = problem.minimal_start.astype(np.longdouble)
+    solver = heyoka.taylor_adaptive(system(problem), start, tol=np.longdouble("1e-18"), fp_type=np.longdouble, compact_mode=True)
+    solver.propagate_until(np.longdouble(problem.end))
+    return dict(zip(problem.minimal_names, solver.state.astype(float), strict=True))
+
+
+def _prepared(problem: Problem, equations: list, compact: bool) -> Prepared:
+    solvers: dict = {}
+    start = problem.minimal_start.tolist()
+
+    def run(tolerance: float):
+        if tolerance not in solvers:
+            solvers[tolerance] = heyoka.taylor_adaptive(equations, start, tol=tolerance, fast_math=True, compact_mode=compact)
+        solver = solvers[tolerance]
+        solver.time = 0.0
+        solver.state[:] = problem.minimal_start
+        found = solver.propagate_until(problem.end)
+        return solver.state.copy(), found[3]
+
+    return Prepared(run, lambda raw: Solved(y=raw[0], steps=float(raw[1])))
+
+
+def on_engines_equations(problem: Problem) -> Prepared:
+    """One integrator per tolerance."""
+    return _prepared(problem, system(problem), compact=operations(problem) >= HUGE)
+
+
+def on_disc_by_hand(problem: Problem) -> Prepared:
+    """The disc's equations as an expert writes them."""
+    y = heyoka.make_vars(*problem.minimal_names)
+    qdot, vdot = tilting_disc(dense.DISC_PARAMETERS, heyoka.time, tuple(y[:5]), tuple(y[5:]), xp=heyoka)
+    return _prepared(problem, list(zip(y, (*qdot, *vdot), strict=True)), compact=False)
+
+
+def _missing(problem: Problem) -> Prepared:
+    raise ImportError(MISSING)
+
+
+def curves(problem: Problem) -> list[Curve]:
+    """Those of the problem."""
+    if heyoka is None:
+        return [Curve("heyoka", "peer", TOLERANCES, "tolerance", _missing)]
+    found = []
+    if problem.name == "tilting-disc":
+        found.append(Curve("heyoka, equations by hand", "peer", TOLERANCES, "tolerance", on_disc_by_hand, ("heyoka",)))
+    if applies(problem):
+        tolerances = TOLERANCES if operations(problem) < LARGE else FEWER
+        found.append(Curve("heyoka, the engine's equations", "peer", tolerances, "tolerance", on_engines_equations, ("heyoka",)))
+    return found

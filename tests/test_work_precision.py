@@ -1,0 +1,164 @@
+"""The work-precision charts: what a record holds, how an error is judged, and what is said of peers that are not installed."""
+
+import importlib
+import json
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from oracles import chaplygin_sleigh
+from tolerances import tolerance
+
+pytest.importorskip("work_precision_cases", reason="the scripts of `bench/` are not here")
+from work_precision_cases import curve, disc_body, figures, measure, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy, record, tables
+from work_precision_cases.problems import PROBLEMS
+
+SLEIGH, DISC = PROBLEMS["chaplygin-sleigh"], PROBLEMS["tilting-disc"]
+EIGHT = (
+    "tilting-disc", "chaplygin-sleigh", "rattleback", "whipple-bicycle", "two-wheel-axle", "ball-on-turntable", "snakeboard", "trailer-chain",
+)  # fmt: skip
+
+
+def _exact_sleigh():
+    found = {name: values[-1] for name, values in chaplygin_sleigh.motion([0.0, SLEIGH.end], **_without_end(chaplygin_sleigh.RUN)).items()}
+    c, s, a = np.cos(found["th"]), np.sin(found["th"]), chaplygin_sleigh.RUN["a"]
+    speeds = [found["v"] * c - a * found["w"] * s, found["v"] * s + a * found["w"] * c, found["w"]]
+    return np.array([found["x"], found["y"], found["th"]]), np.array(speeds)
+
+
+def _without_end(run):
+    return {name: value for name, value in run.items() if name != "t_end"}
+
+
+def _constant(y):
+    return lambda problem: curve.Prepared(lambda setting: y, lambda raw: curve.Solved(y=raw, steps=1.0))
+
+
+def test_the_eight_problems_are_there():
+    assert tuple(PROBLEMS) == EIGHT
+
+
+def test_the_error_of_the_sleigh_is_its_distance_from_the_closed_form():
+    q, u = _exact_sleigh()
+    exact = SLEIGH.judge.full(q, u)
+    assert exact.error <= tolerance("closed_form")
+    assert exact.energy_drift <= tolerance("closed_form")
+    assert exact.slip <= tolerance("closed_form")
+    moved = SLEIGH.judge.full(q + np.array([0.0, 0.0, 3e-4]), u)
+    assert abs(moved.error - 3e-4) <= tolerance("closed_form")
+    assert moved.slip > 1e-6  # the blade points elsewhere, the velocity does not
+    assert np.isnan(SLEIGH.judge.full(q * np.nan, u).error)
+
+
+def test_the_reference_says_how_far_a_second_computation_is():
+    reference = SLEIGH.judge.reference
+    assert 0 < reference.uncertainty <= 1e-12
+    assert reference.how
+    assert reference.against
+
+
+def test_a_curve_gives_records_of_one_format():
+    q, u = _exact_sleigh()
+    found, ready = measure.points(SLEIGH, curve.Curve("exact", record.PEER, (1e-3,), "step (s)", _constant(np.concatenate([q, u[:2]]))), lambda text: None)
+    (entry,) = found
+    assert tuple(entry) == record.KEYS
+    assert entry == json.loads(json.dumps(entry))
+    assert entry["error"] <= tolerance("closed_form")
+    assert entry["seconds"] > 0
+    assert entry["versions"]["python"]
+    assert ready is not None
+
+
+def test_a_run_that_is_not_finite_or_says_that_it_failed_has_no_error():
+    y = np.full(5, np.nan)
+    (entry,), _ = measure.points(SLEIGH, curve.Curve("lost", record.PEER, (1.0,), "step (s)", _constant(y)), lambda text: None)
+    assert entry["error"] is None
+    failed = lambda problem: curve.Prepared(lambda setting: None, lambda raw: curve.Solved(failed="out of steps"))  # noqa: E731
+    (entry,), _ = measure.points(SLEIGH, curve.Curve("failed", record.PEER, (1.0,), "step (s)", failed), lambda text: None)
+    assert entry["error"] is None
+    assert entry["note"] == "out of steps"
+
+
+def test_a_record_of_an_unknown_kind_is_refused():
+    with pytest.raises(ValueError, match="`kind` is 'theirs'"):
+        record.record(problem="", method="", kind="theirs", setting=0.0, setting_unit="", batch=1, error=None, seconds=None, versions={})
+
+
+@pytest.mark.parametrize(
+    ("module", "missing", "word"),
+    [
+        (peer_mujoco, "mujoco", "pip install mujoco"),
+        (peer_exudyn, "exudyn", "pip install exudyn"),
+        (peer_sympy, "scipy", "pip install sympy scipy"),
+        (peer_heyoka, "heyoka", "pip install heyoka"),
+    ],
+)
+def test_peers_that_are_not_installed_are_skipped_with_a_message(monkeypatch, module, missing, word):
+    monkeypatch.setattr(module, missing, None)
+    said = []
+    for asked in module.curves(DISC) if module is peer_heyoka else module.curves(DISC, True):
+        found, ready = measure.points(DISC, asked, said.append)
+        assert found == []
+        assert ready is None
+    assert said
+    assert all("not measured" in text and word in text for text in said)
+
+
+def test_importing_a_peer_that_is_not_there_leaves_its_module_usable(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)  # `import mujoco` raises ImportError
+    monkeypatch.delitem(sys.modules, "work_precision_cases.peer_mujoco")
+    fresh = importlib.import_module("work_precision_cases.peer_mujoco")
+    assert fresh.mujoco is None
+    assert fresh.curves(DISC, True)
+
+
+def test_a_free_body_is_read_as_the_disc_that_it_is():
+    # as contact engines hold it: centre, rotation, velocities in space; back to the contact point, yaw, lean and spin
+    q, u = disc_body.state(_AtStart, disc_body.start(DISC))
+    assert np.max(np.abs(q - np.asarray(DISC.state.q))) <= tolerance("round_off")
+    assert np.max(np.abs(u - np.asarray(DISC.state.u))) <= tolerance("round_off")
+
+
+class _AtStart:
+    """The disc, with its start in place of the reference, from which whole turns are taken."""
+
+    scene = DISC.scene
+    judge = SimpleNamespace(reference=SimpleNamespace(values={"yaw": 0.0, "spin": 0.0}))
+
+
+def test_sympys_equations_of_the_sleigh_compiled_from_c_are_chaplygins():
+    if peer_sympy.kane.sp is None:
+        pytest.skip(peer_sympy.MISSING)
+    equations = peer_sympy.kane.SCENES["chaplygin-sleigh"](SLEIGH.scene)
+    minimal = SLEIGH.minimal_start
+    assert np.max(np.abs(equations.to_minimal(equations.from_minimal(minimal)) - minimal)) <= tolerance("round_off")
+    try:
+        library = peer_sympy.compiled(peer_sympy.c_source(equations))
+    except curve.NotApplicable as reason:
+        pytest.skip(str(reason))
+    rates, _ = peer_sympy.callback(library, 5)
+    y = equations.from_minimal(minimal)
+    scene, (_, _, heading, v, w), a = SLEIGH.scene, y, float(SLEIGH.scene.offset)
+    # v' = a w^2, w' = -(a/k^2) v w
+    k_squared = float(scene.inertia / scene.mass) + a**2
+    expected = [v * np.cos(heading) - a * w * np.sin(heading), v * np.sin(heading) + a * w * np.cos(heading), w, a * w**2, -a / k_squared * v * w]
+    assert np.max(np.abs(rates(0.0, y) - expected)) <= tolerance("round_off")
+
+
+def test_figures_take_the_cheapest_run_that_is_accurate_enough():
+    common = {"problem": "tilting-disc", "batch": 1, "method": "Dopri8"}
+    entries = [common | {"error": 1e-5, "seconds": 1.0}, common | {"error": 1e-7, "seconds": 3.0}, common | {"error": 5e-7, "seconds": 2.0}]
+    entries.append(common | {"error": None, "seconds": 0.1})
+    assert figures.cheapest(entries, lambda name: name == "Dopri8", 1e-6)["seconds"] == 2.0
+    assert figures.cheapest(entries, lambda name: name == "Tsit5", 1e-6) is None
+    (missing, *_) = figures.figures(entries, {})
+    assert (missing["value"], missing["met"]) == (None, False)
+    assert "not measured" in tables.summary([missing])
+
+
+def test_times_are_those_of_warm_runs():
+    calls = []
+    seconds = measure.fastest(lambda: calls.append(0), seconds=0.01)
+    assert 2 <= len(calls) <= measure.MOST_REPEATS
+    assert 0 < seconds < 0.01
