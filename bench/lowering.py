@@ -26,6 +26,7 @@ from baselines.hand_derived import HAND_DERIVED, operations
 from baselines.timing import fastest, seconds_per_evaluation
 
 import jourdain_jax as jj
+from jourdain_jax.models import PendulumChain, TrailerChain
 
 Figure = dict
 BY_HAND_LANES, DENSE_LANES = 4096, 1024
@@ -195,28 +196,27 @@ def cold_starts(quick: bool) -> Iterator[Figure]:
 
 
 def growth(quick: bool) -> Iterator[Figure]:
-    """Time per evaluation over n of a chain of trailers, and its compile time."""
-    from jourdain_jax.models.trailer_chain import TrailerChain
-
-    laps = {}
-    for n in (2, 4) if quick else (8, 64):
-        scene = TrailerChain(trailers=n)
-        begin = time.perf_counter()
-        try:
-            program = jj.lower(scene)
-        except jj.NotLowered as reason:
-            print(f"  trailer-chain, n = {n}: {reason}")
-            break
-        q, u, _ = scene.named()
-        state = tuple(jnp.asarray(x) for x in q), tuple(jnp.asarray(u[k]) for k in program.independent)
-        rates = lambda s, p=program, scene=scene: p.rates(p.fixed_values(scene), 0.0, *s, jnp.zeros(len(scene.inputs)))[:2]  # noqa: E731
-        laps[n] = seconds_per_evaluation(rates, state, 1, repeats=10) / n
-        compile_time = time.perf_counter() - begin
-        print(f"  trailer-chain, n = {n}: {program.operations} operations, {1e9 * laps[n]:.0f} ns per evaluation and trailer, built in {compile_time:.1f} s")
-    complete = len(laps) == 2
+    """Time per evaluation over n of chains of trailers and of pendulums, and their compile time."""
     few, many = (2, 4) if quick else (8, 64)
-    yield figure(f"time per evaluation / n, n = {many} against n = {few}", "trailer-chain", laps[many] / laps[few] if complete else None, 3, 1.5)
-    yield figure(f"compile time at n = {many}, s", "trailer-chain", compile_time if complete else None, 60, 15)
+    for name, make in (("trailer-chain", lambda n: TrailerChain(trailers=n)), ("pendulum-chain", lambda n: PendulumChain(links=n))):
+        laps, compile_time = {}, None
+        for n in (few, many):
+            scene = make(n)
+            begin = time.perf_counter()
+            try:
+                program = jj.lower(scene)
+            except jj.NotLowered as reason:
+                print(f"  {name}, n = {n}: {reason}")
+                break
+            _, q, u = jj.sample_states(scene, 1)
+            state = tuple(jnp.asarray(x) for x in q[0]), tuple(jnp.asarray(u[0, k]) for k in program.independent)
+            rates = lambda s, p=program, scene=scene: p.rates(p.fixed_values(scene), 0.0, *s, jnp.zeros(len(scene.inputs)))[:2]  # noqa: E731
+            laps[n] = seconds_per_evaluation(rates, state, 1, repeats=10) / n
+            compile_time = time.perf_counter() - begin
+            print(f"  {name}, n = {n}: {program.operations} operations, {1e9 * laps[n]:.0f} ns per evaluation and link, built in {compile_time:.1f} s")
+        complete = len(laps) == 2
+        yield figure(f"time per evaluation / n, n = {many} against n = {few}", name, laps[many] / laps[few] if complete else None, 3, 1.5)
+        yield figure(f"compile time at n = {many}, s", name, compile_time if complete else None, 60, 15)
 
 
 FIGURES = {f.__name__: f for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, cold_starts, growth)}

@@ -11,7 +11,7 @@ from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
 from jourdain_jax.models.double_pendulum_rods import DoublePendulumRods
 from jourdain_jax.models.skate import Skate
-from jourdain_jax.motion import results
+from jourdain_jax.motion import integration, results
 from jourdain_jax.motion.event_location import locate
 
 
@@ -266,3 +266,13 @@ def test_a_motion_that_leaves_the_domain_of_its_partition_is_continued_with_the_
     forced = jj.simulate(UndeclaredSkate(), start, state="minimal", **options)
     assert int(forced.result) != results.SUCCESS
     assert float(forced.smallest_pivot) < 0.02
+
+
+def test_another_tolerance_or_first_step_is_no_other_program(monkeypatch):
+    traced = []
+    begin = integration._begin
+    monkeypatch.setattr(integration, "_begin", lambda setup: traced.append(0) or begin(setup))
+    ts = jnp.linspace(0.0, 0.37, 4)  # a shape of its own: nothing is compiled yet
+    for options in ({"rtol": 1e-7, "atol": 1e-7}, {"rtol": 1e-8, "atol": 1e-9}, {"rtol": 3e-9, "atol": 1e-9, "dt0": 1e-3}):
+        jj.simulate(jj.models.ChaplyginSleigh(), ts=ts, **options)
+    assert len(traced) == 1

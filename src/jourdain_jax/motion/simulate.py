@@ -146,7 +146,7 @@ def _set_up(
     options = Options(
         solver=(diffrax.Tsit5() if rtol >= 1e-6 else diffrax.Dopri8()) if solver is None else solver,
         controller=stepsize_controller,
-        tolerances=(rtol, atol),
+        tolerances=(jnp.asarray(rtol, start.q.dtype), jnp.asarray(atol, start.q.dtype)),  # arrays: another tolerance is no other program
         dt0=_first_step(solver, dt0, t0, t1),  # diffrax's own guess costs two more copies of the vector field to compile
         adjoint=diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         max_steps=max_steps,
@@ -161,7 +161,7 @@ def _set_up(
 def _first_step(solver, dt0, t0, t1):
     if isinstance(solver, FixedStepSolver) and dt0 is not None:
         return jnp.abs(dt0) * jnp.sign(t1 - t0)
-    return 1e-4 * (t1 - t0) if dt0 is None else dt0
+    return 1e-4 * (t1 - t0) if dt0 is None else jnp.asarray(dt0, jnp.result_type(t0))
 
 
 def _checked_saveat(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
