@@ -4,6 +4,7 @@ What holds of a scene at every state (the rank of its rows, which speeds are ind
 anything is compiled, and it is found by evaluating the scene at a few states.
 """
 
+import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -19,6 +20,18 @@ import numpy as np
 from jourdain_jax.program.uncompiled import uncompiled
 from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
+
+
+@contextmanager
+def without_collecting() -> Iterator[None]:
+    """Garbage collection off: what is built meanwhile is many small objects, nearly all of which stay, and looking through them takes a tenth of the time."""
+    on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if on:
+            gc.enable()
 
 
 def probed_once(probe):

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, pose_at, velocities
 from jourdain_jax.equations.plausibility import implausible, pose_numbers
-from jourdain_jax.equations.probing import on_numbers, probed_once
+from jourdain_jax.equations.probing import on_numbers, probed_once, without_collecting
 from jourdain_jax.equations.projection import project_positions
 from jourdain_jax.equations.rows import names_of_rows, position_residual, velocity_residual
 from jourdain_jax.equations.sampling import assembled, miss_of_rows, random_states, symmetric_configurations
@@ -170,7 +170,8 @@ def structure_of(scene: Scene) -> Structure:
     ValueError where no admissible state is found, where a motion that the rows leave free has no inertia, or `privileged` names unknown or too few
     speeds; for known parameters also where numbers of its bodies or planes cannot be.
     """
-    structure = _probed_structure(as_scene(scene))
+    with without_collecting():
+        structure = _probed_structure(as_scene(scene))
     if structure.faults and not is_traced(scene):  # numbers that stand in for traced parameters prove nothing
         raise ValueError(structure.faults[0])
     return structure

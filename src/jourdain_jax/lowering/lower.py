@@ -14,7 +14,7 @@ import numpy as np
 from jourdain_jax.equations.accelerations import bare_accelerations
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations
-from jourdain_jax.equations.probing import concretised, on_numbers
+from jourdain_jax.equations.probing import concretised, on_numbers, without_collecting
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT, NullSpaceQR
 from jourdain_jax.equations.sampling import random_states
 from jourdain_jax.equations.structure import Structure, structure_of
@@ -83,7 +83,8 @@ class _Key:
 @lru_cache(maxsize=256)
 def _lowered(key: _Key) -> Lowered | NotLowered:
     try:
-        return _built(key)
+        with without_collecting():
+            return _built(key)
     except NotLowered as reason:
         return NotLowered(str(reason))  # kept without its traceback
 
