@@ -1,5 +1,8 @@
 """Scenes whose speeds all stay in the state: rows kept by multipliers on the graph, states put back onto rows by the program."""
 
+import dataclasses
+import gc
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -8,8 +11,9 @@ import pytest
 from tolerances import tolerance
 
 import jourdain_jax as jj
+from jourdain_jax.equations.probing import without_collecting
 from jourdain_jax.equations.projection import project_positions, project_speeds
-from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.structure import LONG, structure_of
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion import results
 from jourdain_jax.motion.simulate import state_form
@@ -88,3 +92,18 @@ def test_which_scenes_keep_all_speeds():
     full = jj.simulate(MODELS["chaplygin-sleigh"](), state="full", t1=1.0, rtol=1e-11, atol=1e-11)
     assert full.reduction == "multipliers (KKT), lowered"
     np.testing.assert_allclose(full.u_end, jj.simulate(MODELS["chaplygin-sleigh"](), t1=1.0, rtol=1e-11, atol=1e-11).u_end, atol=1e-9)
+
+
+def test_a_long_chain_counts_as_well_conditioned_where_a_short_one_with_the_same_number_does_not():
+    structure = dataclasses.replace(structure_of(MODELS["skate"]()), worst_pivot=0.01)
+    assert dataclasses.replace(structure, rank=2 * LONG).well_conditioned
+    assert not dataclasses.replace(structure, rank=LONG).well_conditioned
+
+
+def test_garbage_is_collected_again_after_a_scene_was_looked_at_or_refused():
+    structure_of(MODELS["skate"]())
+    assert gc.isenabled()
+    with pytest.raises(ZeroDivisionError), without_collecting():
+        assert not gc.isenabled()
+        1 / 0  # noqa: B018
+    assert gc.isenabled()
