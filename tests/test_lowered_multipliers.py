@@ -101,9 +101,11 @@ def test_a_long_chain_counts_as_well_conditioned_where_a_short_one_with_the_same
 
 
 def test_garbage_is_collected_again_after_a_scene_was_looked_at_or_refused():
-    structure_of(MODELS["skate"]())
-    assert gc.isenabled()
-    with pytest.raises(ZeroDivisionError), without_collecting():
-        assert not gc.isenabled()
-        1 / 0  # noqa: B018
+    def refused():
+        with without_collecting():
+            assert not gc.isenabled()
+            raise ValueError("refused")
+
+    with pytest.raises(ValueError, match="refused"):
+        refused()
     assert gc.isenabled()
