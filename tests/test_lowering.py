@@ -30,6 +30,14 @@ def test_the_bicycle_takes_no_more_than_2500_operations():
     assert jj.lower(MODELS["whipple-bicycle"]()).operations <= 2500
 
 
+def test_scenes_without_rows_and_with_multipliers_are_shortened_too():
+    assert jj.lower(MODELS["double-pendulum-angles"]()).operations <= 33
+    assert "multipliers" not in str(jj.lower(MODELS["double-pendulum-angles"]()))
+    skate = jj.lower(MODELS["skate"]())
+    assert skate.operations <= 11
+    assert "rows kept by multipliers, by elimination" in str(skate)
+
+
 def test_the_summary_says_what_was_dropped_and_chosen():
     text = str(jj.lower(MODELS["tilting-disc"]()))
     for part in ("privileged speeds: yaw_rate, lean_rate, spin_rate", "eliminated: x_rate, y_rate", "x, y, yaw, spin", "operations"):

@@ -5,7 +5,8 @@ anything is compiled, and it is found by evaluating the scene at a few states.
 """
 
 import gc
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import fields
@@ -137,6 +138,21 @@ def _generic(x, near, place: int) -> np.ndarray:
     if not np.all(np.isfinite(near)):
         return np.asarray(1.0 + 0.1 * draws, x.dtype)
     return np.asarray(np.where(near == 0, 0.1, near) * (1.0 + 0.01 * draws), x.dtype)
+
+
+class Seldom:
+    """Counts calls: true for the first `often` ones of a kind, if their numbers are known. So long compiling does not pay (`on_numbers` instead)."""
+
+    def __init__(self, often: int):
+        self.often = often
+        self._calls: Counter[Hashable] = Counter()
+
+    def __call__(self, kind: Hashable, numbers) -> bool:
+        """Whether this call of that kind is one of the first; `numbers`: anything with leaves."""
+        if is_traced(numbers):
+            return False
+        self._calls[kind] += 1
+        return self._calls[kind] <= self.often
 
 
 def on_numbers(f: Callable) -> Callable:

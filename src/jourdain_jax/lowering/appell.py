@@ -40,7 +40,7 @@ class Strategy:
     @property
     def description(self) -> str:
         """In words."""
-        way = "speeds put in before differentiation" if self.explicit else "rows differentiated through the bodies' velocities"
+        way = "dependent speeds put in before differentiation" if self.explicit else "rows differentiated through the bodies' velocities"
         solved = "accelerations by determinants in normal form" if self.by_determinants else "accelerations by elimination"
         return f"{way}, {solved}"
 

@@ -122,7 +122,7 @@ def _probes(scene: Scene, structure: Structure, graph) -> Probes:
 
 def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: float) -> Lowered:
     graph, probes = builder.graph, builder.probes
-    plain = {explicit: builder.build(Strategy(explicit)) for explicit in ((False, True) if builder.dependent else (True,))}
+    plain = {explicit: builder.build(Strategy(explicit)) for explicit in ((True,) if builder.multiplied else (False, True))}
     counts = {explicit: graph.operations(_rates(found)) for explicit, found in plain.items()}
     first = min(plain)
     best, fewest, way = plain[first], counts[first], Strategy(first)
@@ -134,7 +134,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     stages = [Stage("scalar program: structural zeros and ones removed, repeated parts shared", fewest)]
     plainly_held = graph.operations(_rates(builder.build(Strategy(first, held=held)))) if held else fewest
     stages.append(Stage("ignorable coordinates held in the accelerations", plainly_held))
-    for strategy in _strategies(held, plainly_held < SMALL, counts[True] / counts[False] if builder.dependent else None):
+    for strategy in _strategies(held, plainly_held < SMALL, None if builder.multiplied else counts[True] / counts[False]):
         candidate = builder.build(strategy)
         count = graph.operations(graph.with_quotients(_rates(candidate)))
         if count < fewest and _agree(_values(candidate, probes), expected):
@@ -167,7 +167,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         projected_u=put_u,
         held=tuple(names[i] for i in held),
         stages=tuple(stages),
-        way=way.description,
+        way="rows kept by multipliers, by elimination" if builder.multiplied else way.description,
         seconds=time.perf_counter() - begin,
         fixed=fixed_nodes(graph, outputs),
     )
@@ -217,10 +217,10 @@ def _rates(found: Equations) -> list[int]:
 
 
 def _strategies(held: tuple[int, ...], small: bool, explicit_to_implicit: float | None) -> Iterator[Strategy]:
-    """Ways worth trying: more of them where the program is small; there is one way only where no speed is eliminated."""
+    """Ways worth trying: more of them where the program is small; `explicit_to_implicit` is None where rows are kept by multipliers."""
     if explicit_to_implicit is None:
         for keep_sines, terms in itertools.product((False, True) if small else (False,), (MOST_TERMS, 0) if small else (0,)):
-            yield Strategy(True, keep_sines, MOST_TERMS, terms, terms > 0, False, held)
+            yield Strategy(True, keep_sines, MOST_TERMS, terms, False, False, held)
         return
     if small:
         for keep_sines, by_determinants, free_z in itertools.product((False, True), repeat=3):

@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.equations.probing import Seldom, on_numbers
 from jourdain_jax.equations.reactions import ContactForce
 from jourdain_jax.motion.along import Record, accelerations_along, contact_forces_along, energies, invariants, residuals
 from jourdain_jax.motion.results import FALLBACKS
-from jourdain_jax.scene.numbers import is_traced
 
 
 class Energies(eqx.Module):
@@ -72,23 +71,13 @@ def diagnose(trajectory: Record) -> Diagnostics:
 
     Times that were not reached do not count.
     """
-    if _seldom(trajectory):
+    if trajectory.ts.shape[0] <= FEW_TIMES and _seldom((jax.tree.structure(trajectory), trajectory.ts.shape), trajectory):
         return jax.tree.map(jnp.asarray, _uncompiled(trajectory))
     return _diagnosed(trajectory)
 
 
-def _seldom(trajectory: Record) -> bool:
-    """Whether all numbers are known and motions like this one have not been looked at often: then compiling does not pay."""
-    leaves, treedef = jax.tree.flatten(trajectory)
-    if is_traced(leaves) or trajectory.ts.shape[0] > FEW_TIMES:
-        return False
-    key = (treedef, trajectory.ts.shape)
-    _calls[key] = _calls.get(key, 0) + 1
-    return _calls[key] <= OFTEN
-
-
-FEW_TIMES, OFTEN = 1000, 100
-_calls: dict = {}
+FEW_TIMES = 1000
+_seldom = Seldom(often=100)
 
 
 def _diagnosed(trajectory: Record) -> Diagnostics:

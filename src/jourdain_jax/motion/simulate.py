@@ -91,7 +91,7 @@ def simulate(
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
 
     Where nothing is traced, a motion that leaves the domain of its privileged speeds is run again with the full state, and a stiff one by an implicit
-    solver (unless `state` or `solver` is chosen); `trajectory.fallback` and its summary say so. Inside your own `jit` or `grad` the result code stays.
+    solver (unless `state` or `solver` is chosen); `trajectory.fallback` and its summary say so. Inside your own `jit` or `vmap` the result code stays.
 
     **Returns** a `Trajectory`, with a result code instead of an exception; `trajectory.raise_if_failed()` raises `SimulationError`.
 

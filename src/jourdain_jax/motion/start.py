@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Number, Numbers
-from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.equations.probing import Seldom, on_numbers
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.structure import structure_of
@@ -66,22 +66,12 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
         if name not in known:
             raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, known)}")
     free_q, free_u = (np.array([name not in held for name in names.entries], bool) for names in (scene.coordinate_names, scene.speed_names))
-    project = _uncompiled_projection if _seldom(scene, t, q, u, inputs) else _compiled_projection
+    project = _uncompiled_projection if _seldom(jax.tree.structure(scene), (scene, t, q, u, inputs)) else _compiled_projection
     near_q, near_u, moved_q, moved_u, residual = (jnp.asarray(x) for x in project(scene, t, q, u, inputs, free_q, free_u))
     return State(t, near_q, near_u, moved_q, moved_u, residual, (scene.coordinate_names, scene.speed_names))
 
 
-def _seldom(scene: Scene, *numbers) -> bool:
-    """Whether all numbers are known and this class of scene has not been put onto its constraints often: then compiling does not pay."""
-    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, numbers))):
-        return False
-    key = jax.tree.structure(scene)
-    _calls[key] = _calls.get(key, 0) + 1
-    return _calls[key] <= OFTEN
-
-
-OFTEN = 8
-_calls: dict = {}
+_seldom = Seldom(often=8)
 
 
 def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u):
