@@ -12,9 +12,9 @@ from baselines.hand_derived import HAND_DERIVED, operations
 
 import jourdain_jax as jj
 from jourdain_jax.equations.minimal import speeds_from_privileged
+from jourdain_jax.equations.trace import event_values
 from jourdain_jax.lowering import lower as module
 from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.lowering.trace import event_values
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion import lockstep, results
 from jourdain_jax.program.emit import run
