@@ -8,8 +8,8 @@ from jaxtyping import Array, Float
 
 import jourdain_jax as jj
 from jourdain_jax.equations.probed import TIMED, probed
-from jourdain_jax.equations.probed_on_graph import probed_on_graph
-from jourdain_jax.equations.sampling import random_states, symmetric_configurations
+from jourdain_jax.equations.probed_on_graph import probed_on_graph, sampled_on_graph
+from jourdain_jax.equations.sampling import _projected_by_jax, random_states, symmetric_configurations
 from jourdain_jax.equations.structure import structure_of
 
 MODELS = ["skate", "tilting-disc-quaternion", "ball-on-turntable", "snakeboard", "rattleback", "double-pendulum-rods", "isokinetic-particle", "trailer-chain"]
@@ -44,6 +44,14 @@ def test_probing_on_the_graph_agrees_with_jax(scene):
     assert _moves(expected.motion_at_rest) == _moves(found.motion_at_rest)
     assert _moves(expected.inertia_rates) == _moves(found.inertia_rates)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11), expected.numbers, found.numbers)
+
+
+@pytest.mark.parametrize("name", ["snakeboard", "ball-on-turntable", "double-pendulum-rods", "isokinetic-particle", "two-wheel-axle-redundant"])
+def test_states_put_on_the_rows_on_the_graph_are_those_of_jax(name):
+    scene = jj.models.MODELS[name]()
+    t, q, u = random_states(scene, 32, np.random.default_rng(1))
+    for expected, found in zip(_projected_by_jax(scene, t, q, u), sampled_on_graph(scene, t, q, u), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-11)
 
 
 def test_the_structure_of_a_scene_without_a_scalar_form_is_found_by_jax():

@@ -9,9 +9,8 @@ from jaxtyping import Float, PyTree
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, pose_at, velocities
 from jourdain_jax.equations.plausibility import PoseNumbers, pose_numbers
 from jourdain_jax.equations.probing import on_numbers
-from jourdain_jax.equations.projection import project_positions
+from jourdain_jax.equations.projection import miss_of_rows, project_positions
 from jourdain_jax.equations.rows import position_residual, velocity_residual
-from jourdain_jax.equations.sampling import miss_of_rows
 from jourdain_jax.equations.trace import Entries, explicit_rates, potentials_of
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene

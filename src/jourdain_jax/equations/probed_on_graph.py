@@ -1,6 +1,7 @@
 """What is looked at of a scene at each probed state, on its scalar graph: derivatives are taken on the graph, everything is evaluated on NumPy.
 
-    A = d phi/du,   beta = dv/du,   gamma = d omega/du,   M = sum m beta' beta + gamma' I gamma,   q <- q - G+ g(q),   G = dg/dq
+    A = d phi/du,   beta = dv/du,   gamma = d omega/du,   M = sum m beta' beta + gamma' I gamma
+    q <- q - G+ g(q),   G = dg/dq,           u <- u - M^-1 A' (A M^-1 A')+ phi(u)
 
 A scene is traced once for it, where JAX (`probed`) traces it a dozen times through nested transformations, which takes most of the time for large scenes.
 """
@@ -23,33 +24,35 @@ _NEARLY_DEPENDENT = 1e-6  # of the triangular factor's diagonal: below, singular
 
 def probed_on_graph(scene: Scene, t, q, u, u_other) -> Probed:
     """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`. `Unsupported` where the scene has no scalar form."""
-    traced = traced_scene(scene)
-    return _AtStates(traced, scene, t, q, u).probed(u_other)
+    return _AtStates(traced_scene(scene), scene, t, q, u, generic_inputs(scene)).probed(u_other)
+
+
+def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States put on the rows, as by `project_positions` and `project_speeds`, and how far they miss the geometric rows; `Unsupported` as above."""
+    at = _AtStates(traced_scene(scene), scene, t, q, u, np.zeros(len(scene.inputs)))
+    return at.real(at.q), at.real(at.speeds_on_rows()), at.real(at.miss)
 
 
 class _AtStates:
     """Values on the graph at the probed states."""
 
-    def __init__(self, traced: TracedScene, scene: Scene, t, q, u):
+    def __init__(self, traced: TracedScene, scene: Scene, t, q, u, inputs):
         self.traced, self.graph, self.scene = traced, traced.graph, scene
-        self.real = jnp.result_type(float)
-        self.inputs = np.tile(generic_inputs(scene), (len(t), 1))
+        self.inputs = np.tile(inputs, (len(t), 1))
         self.t, self.u = t, u
         self.q, self.miss = self._on_rows(q)
         self.values = self._probes(self.q, u)
 
     def _probes(self, q, u, which=slice(None)) -> Probes:
-        named = named_values(self.scene, self.t[which], q, u[which], self.inputs[which])
+        named = named_values(self.scene, self.t[which], q[which], u[which], self.inputs[which])
         return Probes(self.graph, {name: np.asarray(value, float) for name, value in named.items()})
 
     def probed(self, u_other) -> Probed:
         """All that is looked at."""
         g, at, traced = self.graph, self.traced.at, self.traced
-        u, count = traced.u.tolist(), len(self.t)
+        u = traced.u.tolist()
         flat = [*at.phi.tolist(), *at.v.ravel().tolist(), *at.omega.ravel().tolist()]
-        by_speed = jacobian(g, flat, u)
-        rows, parts = len(at.phi), 3 * len(at.mass)
-        partial = self._matrices(self.values, by_speed[rows:], u)
+        by_speed, rows = jacobian(g, flat, u), len(at.phi)
         still = dict.fromkeys(u, g.zero)
         at_rest = np.split(g.substituted([*flat, *at.qdot.tolist()], still), [rows])
         weights = [*at.mass.tolist(), *at.inertia.ravel().tolist()]
@@ -58,26 +61,27 @@ class _AtStates:
         along = {traced.t: g.one} | dict(zip(traced.q.tolist(), at.qdot.tolist(), strict=True))
         changed = {n: g.mul(n, n) for n in traced.inputs.tolist()}
         return Probed(
-            q=self._real(self.q),
-            miss=self._real(self.miss),
-            A=self._real(self._matrices(self.values, by_speed[:rows], u)),
-            A_other=self._real(self._matrices(self._probes(self.q, u_other), by_speed[:rows], u)),
-            M=self._real(_mass_matrix(self._at(at.mass), self._at(at.inertia), partial[:, :parts], partial[:, parts:], count)),
-            phi_at_rest=self._real(self._at(at_rest[0])),
-            motion_at_rest=self._real(self._at(at_rest[1])),
+            q=self.real(self.q),
+            miss=self.real(self.miss),
+            A=self.real(self._matrices(self.values, by_speed[:rows], u)),
+            A_other=self.real(self._matrices(self._probes(self.q, u_other), by_speed[:rows], u)),
+            M=self.real(self._mass_matrix(by_speed[rows:])),
+            phi_at_rest=self.real(self._at(at_rest[0])),
+            motion_at_rest=self.real(self._at(at_rest[1])),
             timed={name: self._at(derivatives(g, nodes, {traced.t: g.one})) for name, nodes in by_time.items()}
             | jax.tree.map(self._at, traced.particulars.explicit),
             inertia_rates=self._at(derivatives(g, weights, along)),
             potential_rates=self._at(derivatives(g, traced.particulars.potentials.tolist(), changed)),
-            numbers=jax.tree.map(lambda nodes: self._real(self._at(nodes)), traced.particulars.numbers),
+            numbers=jax.tree.map(lambda nodes: self.real(self._at(nodes)), traced.particulars.numbers),
         )
 
     def _at(self, nodes) -> np.ndarray:
         """Values of nodes, with a leading axis of states."""
         return _values(self.values, nodes)
 
-    def _real(self, x: np.ndarray) -> np.ndarray:
-        return np.asarray(x, self.real)
+    def real(self, x: np.ndarray) -> np.ndarray:
+        """In the precision that is in use; what is looked at is computed in double precision."""
+        return np.asarray(x, jnp.result_type(float))
 
     def _matrices(self, probes: Probes, entries: list[dict[int, int]], columns: list[int]) -> np.ndarray:
         """Matrices with these entries by row, with a leading axis of states."""
@@ -88,6 +92,35 @@ class _AtStates:
             i, j, nodes = zip(*places, strict=True)
             found[:, i, j] = _values(probes, nodes)
         return found
+
+    def _mass_matrix(self, by_speed: list[dict[int, int]]) -> np.ndarray:
+        """`M = sum m beta' beta + gamma' I gamma`, from the entries of beta and gamma."""
+        partial = self._matrices(self.values, by_speed, self.traced.u.tolist())
+        beta, gamma = np.split(partial, 2, axis=1)
+        mass, inertia = self._at(self.traced.at.mass), self._at(self.traced.at.inertia)
+        turned = np.einsum("sbij,sbjk->sbik", inertia, gamma.reshape(*inertia.shape[:-1], -1)).reshape(gamma.shape)
+        return np.swapaxes(beta, 1, 2) @ (np.repeat(mass, 3, axis=1)[..., None] * beta) + np.swapaxes(gamma, 1, 2) @ turned
+
+    def speeds_on_rows(self) -> np.ndarray:
+        """`u <- u - M^-1 A' (A M^-1 A')+ phi`, in scaled speeds."""
+        at, columns, u = self.traced.at, self.traced.u.tolist(), np.array(self.u, float)
+        if not at.phi.size:
+            return u
+        M = self._mass_matrix(jacobian(self.graph, [*at.v.ravel().tolist(), *at.omega.ravel().tolist()], columns))
+        diagonal = np.diagonal(M, axis1=1, axis2=2)
+        c = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1)), 1)
+        metric = np.stack([_inverse_root(m) for m in c[:, :, None] * M * c[:, None]])  # L'^-1
+        entries, moving = jacobian(self.graph, at.phi.tolist(), columns), np.arange(len(u))
+        for _ in range(ITERATIONS):
+            probes = self._probes(self.q, u, moving)
+            A = self._matrices(probes, entries, columns) * c[moving, None]
+            x = _shortest(A @ metric[moving], _values(probes, at.phi))
+            shift = c[moving] * np.einsum("sij,sj->si", metric[moving], x)
+            u[moving] -= shift
+            moving = moving[_still_moves(shift, u[moving])]
+            if not moving.size:
+                break
+        return u
 
     def _on_rows(self, q) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates on geometric rows and unit norms, and how far they miss them; as `project_positions`."""
@@ -104,11 +137,11 @@ class _AtStates:
             entries = jacobian(g, rows, columns)
             moving = np.arange(len(q))
             for _ in range(ITERATIONS):
-                probes = self._probes(q[moving], self.u, moving)
+                probes = self._probes(q, self.u, moving)
                 G, residual = self._matrices(probes, entries, columns), _values(probes, rows)
                 shift = _shortest(G, residual)
                 q[moving] -= shift
-                moving = moving[np.max(np.abs(shift), axis=1) > 4 * np.finfo(float).eps * (1 + np.max(np.abs(q[moving]), axis=1))]
+                moving = moving[_still_moves(shift, q[moving])]
                 if not moving.size:
                     break
         missed = np.max(np.abs(_values(self._probes(q, self.u), rows)), axis=1, initial=0.0)
@@ -120,11 +153,19 @@ def _values(probes: Probes, nodes: np.ndarray | Iterable[int]) -> np.ndarray:
     return np.moveaxis(probes(nodes.ravel().tolist()), -1, 0).reshape(probes.count, *nodes.shape)
 
 
-def _mass_matrix(mass, inertia, beta, gamma, count: int) -> np.ndarray:
-    """`M = sum m beta' beta + gamma' I gamma`, with a leading axis of states."""
-    turned = np.einsum("sbij,sbjk->sbik", inertia, gamma.reshape(count, -1, 3, gamma.shape[-1])).reshape(gamma.shape)
-    weighted = np.repeat(mass, 3, axis=1)[..., None] * beta
-    return np.swapaxes(beta, 1, 2) @ weighted + np.swapaxes(gamma, 1, 2) @ turned
+def _still_moves(shift: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """At which states an iteration has not come to rest; where it is not a number it stays so."""
+    return np.max(np.abs(shift), axis=1) > 4 * np.finfo(float).eps * (1 + np.max(np.abs(x), axis=1))
+
+
+def _inverse_root(M: np.ndarray) -> np.ndarray:
+    """`L'^-1` with `M = L L'`; the identity where M is singular: then nearest in the scaled speeds."""
+    try:
+        root = np.linalg.cholesky(M)
+    except np.linalg.LinAlgError:
+        return np.eye(len(M))
+    definite = np.min(np.diagonal(root), initial=1.0) ** 2 > 16 * len(M) * np.finfo(float).eps
+    return np.linalg.inv(root).T if definite else np.eye(len(M))
 
 
 def _shortest(G: np.ndarray, residual: np.ndarray) -> np.ndarray:

@@ -41,6 +41,12 @@ def project_positions(scene: Scene, t, q: Float[Array, "coordinates"], *, free: 
     return jax.lax.scan(step, q, length=iterations)[0]
 
 
+def miss_of_rows(scene: Scene, t, q) -> Float[Array, ""]:
+    """Largest residual of the geometric rows; infinite where it is not a number."""
+    miss = jnp.max(jnp.abs(closure_residual(scene, t, q)), initial=0.0)
+    return jnp.where(jnp.isfinite(miss), miss, jnp.inf)
+
+
 def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "coordinates"]:
     """Where there are unit norms only, what the iteration converges to: `q / |q|` of every quaternion."""
     for first, _ in scene.coordinates.quaternions:

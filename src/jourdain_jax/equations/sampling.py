@@ -5,11 +5,12 @@ at random states are singular.
 import itertools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.equations.probed_on_graph import sampled_on_graph
 from jourdain_jax.equations.probing import on_numbers
-from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
+from jourdain_jax.equations.projection import miss_of_rows, project_positions, project_speeds
+from jourdain_jax.program.interpret import Unsupported
 from jourdain_jax.scene.scene import Scene
 
 SYMMETRIC_PROBES = 200
@@ -62,19 +63,20 @@ def _bounds(scene: Scene, names, default) -> tuple[np.ndarray, np.ndarray]:
     return np.array([p[0] for p in pairs], float), np.array([p[1] for p in pairs], float)
 
 
+def _projected(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    try:
+        return sampled_on_graph(scene, t, q, u)
+    except Unsupported:
+        return _projected_by_jax(scene, t, q, u)
+
+
 @on_numbers
-def _projected(scene, t, q, u):
+def _projected_by_jax(scene, t, q, u):
     def one(t, q, u):
         q = project_positions(scene, t, q)
         return q, project_speeds(scene, t, q, u), miss_of_rows(scene, t, q)
 
     return jax.vmap(one)(t, q, u)
-
-
-def miss_of_rows(scene, t, q):
-    """Largest residual of the geometric rows; infinite where it is not a number."""
-    miss = jnp.max(jnp.abs(closure_residual(scene, t, q)), initial=0.0)
-    return jnp.where(jnp.isfinite(miss), miss, jnp.inf)
 
 
 def symmetric_configurations(scene: Scene) -> np.ndarray:
