@@ -15,6 +15,7 @@ def summary(lowered) -> str:
         *(f"  {stage.operations:6d} operations: {stage.name}" for stage in lowered.stages),
         *_speeds(lowered),
         f"  left out of the accelerations, which do not depend on them: {fewer or 'nothing'}",
+        f"  recoverable by quadrature, as nothing else depends on them: {', '.join(lowered.coordinates[i] for i in lowered.recoverable()) or 'none'}",
         f"  computed once per motion, from parameters alone: {len(lowered.fixed)} numbers",
         f"  pivots that are watched: {len(lowered.pivots)}; signs that are relied on: {len(lowered.guards)}",
         f"  way: {lowered.way}; {lowered.seconds:.2f} s",

@@ -15,10 +15,11 @@ from jourdain_jax.equations.accelerations import bare_accelerations
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations
 from jourdain_jax.equations.probing import concretised, on_numbers, without_collecting
-from jourdain_jax.equations.reductions import SMALLEST_PIVOT, NullSpaceQR
+from jourdain_jax.equations.reductions import NullSpaceQR
 from jourdain_jax.equations.sampling import random_states
 from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
+from jourdain_jax.lowering.elimination import serves
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
 from jourdain_jax.lowering.trace import event_values, named_values, traced_scene
 from jourdain_jax.program.evaluate import Probes
@@ -140,7 +141,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         if count < fewest and _agree(_values(candidate, probes), expected):
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
-    put_back = builder.projection(MOST_TERMS if fewest < SMALL else 0)
+    put_back = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
     groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power], best.events, put_back.q, put_back.u]
     outputs = graph.with_quotients([n for group in groups for n in group])
     ends = np.cumsum([len(group) for group in groups])
@@ -235,9 +236,7 @@ def _strategies(held: tuple[int, ...], small: bool, explicit_to_implicit: float 
 
 def _values(found: Equations, probes: Probes) -> np.ndarray:
     """Rates at all probes, NaN where a pivot is small: there the program does not serve."""
-    pivots = np.abs(probes(found.pivots))
-    good = np.all(pivots > SMALLEST_PIVOT * np.nanmedian(pivots, axis=1, keepdims=True), axis=0)
-    return np.where(good, probes(_rates(found)), np.nan)
+    return np.where(serves(found.pivots, probes), probes(_rates(found)), np.nan)
 
 
 def _agree(values: np.ndarray, expected: np.ndarray) -> bool:
