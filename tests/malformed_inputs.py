@@ -432,7 +432,10 @@ BATCHES: dict[str, Case] = {
 
 FILES: dict[str, Case] = {
     "jj.load_trajectory('nowhere.npz', Bead)": ("ValueError", "there is no file `nowhere.npz`; check the path"),
-    "jj.load_trajectory('half.npz', Bead)": ("ValueError", "`half.npz` is no trajectory file, or is damaged (File is not a zip file); expected an .npz written by `save`"),
+    "jj.load_trajectory('half.npz', Bead)": (
+        "ValueError",
+        "`half.npz` is no trajectory file, or is damaged (File is not a zip file); expected an .npz written by `save`",
+    ),
     "jj.load_trajectory('empty.npz', Bead)": ("ValueError", "`empty.npz` is no trajectory file, or is damaged (No data left in file)"),
     "jj.load_trajectory('text.npz', Bead)": ("ValueError", "`text.npz` is no trajectory file, or is damaged"),
     "jj.load_trajectory('.', Bead)": ("ValueError", "`.` is no trajectory file, or is damaged ([Errno 21] Is a directory: '.')"),

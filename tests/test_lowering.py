@@ -3,6 +3,10 @@
 That its numbers are those of the dense path, for every model, is tested in `test_every_model`.
 """
 
+import ctypes
+import shutil
+import subprocess
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -44,17 +48,82 @@ def test_the_summary_says_what_was_dropped_and_chosen():
         assert part in text
 
 
-def test_the_readable_source_computes_the_rates():
-    scene = MODELS["tilting-disc"]()
-    program = jj.lower(scene)
+class Rough(jj.Scene):
+    """A bead on a rough wire, pushed while it is slow or far: signs, sizes, choices, and names that a program might use itself."""
+
+    mass: jnp.ndarray = jj.parameter(1.3, unit="kg", positive=True)
+    k1: jnp.ndarray = jj.parameter(2.0, unit="N/m")
+    double: jnp.ndarray = jj.parameter(0.7, unit="N")
+    coordinates = jj.coordinates("s0 t")  # a length, and an angle
+
+    def bodies(self, t, q):
+        return {"bead": jj.RigidBody(self.mass, jnp.ones(3), jnp.stack([q.s0, 0.0 * q.s0, 0.0 * q.s0]), jj.rot_x(q.t))}
+
+    def loads(self, motion):
+        x, v = motion.q.s0, motion.u.s0_rate
+        push = jnp.where((jnp.abs(v) < 0.5) | ~(x < 1.0), jnp.maximum(x, 0.1), 0.0)
+        return (jj.generalized_force(motion, s0_rate=push - self.k1 * x - self.double * jnp.sign(v), t_rate=-self.double * jnp.sin(motion.t)),)
+
+
+PRINTED = {name: MODELS[name]() for name in ("skate", "tilting-disc", "two-wheel-axle-coordinates", "whipple-bicycle")} | {"rough": Rough()}
+
+
+def printed_states(scene, program, count=3):
+    """Times, states and inputs at which printed sources are evaluated, and the rates of the program there."""
+    t, q, u = jj.sample_states(scene, count)
+    y, inputs = u[:, np.array(program.independent, int)], np.linspace(0.3, 0.7, len(scene.inputs))
+    fixed = program.fixed_values(scene)
+    for state in zip(np.asarray(t), np.asarray(q), np.asarray(y), strict=True):
+        qdot, ydot, _ = program.rates(fixed, state[0], tuple(state[1]), tuple(state[2]), jnp.asarray(inputs))
+        yield (*state, inputs), np.array([*qdot, *ydot], float)
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_the_readable_source_computes_the_rates(name):
+    program = jj.lower(PRINTED[name])
     scope: dict = {}
     exec(program.python_source(), scope)
-    t, q, u = (x[0] for x in jj.sample_states(scene, 1))
-    y = u[list(program.independent)]
-    found = scope["rates"](scope["fixed"](*(float(x) for x in jax.tree.leaves(scene))), t, *q, *y)
-    udot = jj.accelerations(scene, t, q, u).udot
-    np.testing.assert_allclose(found, [*u, *udot[jnp.array(program.independent)]], rtol=1e-12, atol=1e-12)
-    assert "void rates(" in program.c_source()
+    fixed = scope["fixed"](*(float(x) for leaf in jax.tree.leaves(PRINTED[name]) for x in np.ravel(leaf)))
+    for (t, q, y, inputs), expected in printed_states(PRINTED[name], program):
+        np.testing.assert_allclose(scope["rates"](fixed, t, *q, *y, *inputs), expected, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_the_source_in_c_compiles_without_warnings_and_computes_the_rates(name, tmp_path):
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("there is no C compiler `cc` on this machine")
+    program = jj.lower(PRINTED[name])
+    (tmp_path / "rates.c").write_text(program.c_source())
+    command = [compiler, "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "rates.c", "-o", "rates.so", "-lm"]
+    made = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert made.returncode == 0, made.stderr
+    rates = ctypes.CDLL(str(tmp_path / "rates.so")).rates
+    vector = lambda values: (ctypes.c_double * max(1, len(values)))(*map(float, values))  # noqa: E731
+    parameters = vector([x for leaf in jax.tree.leaves(PRINTED[name]) for x in np.ravel(leaf)])
+    for (t, q, y, inputs), expected in printed_states(PRINTED[name], program):
+        out = vector(np.zeros(len(expected)))
+        rates(parameters, ctypes.c_double(t), vector(q), vector(y), vector(inputs), out)
+        np.testing.assert_allclose(list(out), expected, rtol=1e-11, atol=1e-11)
+
+
+def test_what_is_printed_states_units_symbols_and_what_is_relied_on():
+    disc = jj.lower(MODELS["tilting-disc"]())
+    assert "SI units and radians): mass (kg), radius (m), gravity (m/s^2)" in str(disc)
+    assert "must stay positive, signs that are relied on: cos(lean)" in str(disc)
+    assert '"""What depends on the parameters of TiltingDisc alone: mass (kg), radius (m), gravity (m/s^2)."""' in disc.python_source()
+    assert "positive spin rolls forward" in disc.python_source()
+    assert "const double spin_rate = speeds[2];" in disc.c_source()
+    two = jj.lower(TwoLateralRows())
+    assert "rows left out, as the others imply them: second" in str(two)
+
+
+class TwoLateralRows(jj.models.ChaplyginSleigh):
+    """A sleigh whose one row is stated twice."""
+
+    def velocity_constraints(self, motion):
+        (row,) = super().velocity_constraints(motion).values()
+        return {"first": row, "second": 2.0 * row}
 
 
 def test_expressions_and_latex_are_there_for_small_scenes():
@@ -63,7 +132,10 @@ def test_expressions_and_latex_are_there_for_small_scenes():
     found = program.expressions()
     assert found["d_phi_rate"] == 0
     assert {"phi", "gravity", "slope"} <= {str(s) for s in found["d_psi1_rate"].free_symbols}
-    assert r"\dot{" in program.latex()
+    lines = program.latex().split(" \\\\\n")
+    assert r"\dot{\psi_{2}} &= - \frac{\mathrm{length} \dot{\phi}}{\mathrm{radius}} + \dot{\psi_{1}}" in lines
+    assert r"\ddot{\phi} &= 0" in lines
+    assert not any(line.startswith(r"\dot{\phi}") for line in lines)  # what a dot means needs no equation
 
 
 class Steered(jj.Scene):

@@ -24,6 +24,7 @@ from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
 from jourdain_jax.lowering.trace import event_values, named_values, traced_scene
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.interpret import Unsupported
+from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 PROBES = 56  # at most
@@ -147,10 +148,14 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     ends = np.cumsum([len(group) for group in groups])
     qdot, ydot, z, pivots, guards, power, events, put_q, put_u = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
     names = scene.coordinate_names.entries
+    leaves = tuple(jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(scene)[0])
+    units = {f".{name}": metadata["unit"] for name, _, metadata in parameters_of(scene)}
     return Lowered(
         traced=builder.traced,
         scene_name=type(scene).__name__,
-        parameters=tuple(jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(scene)[0]),
+        parameters=leaves,
+        units=tuple(units.get(name, "") for name in leaves),
+        conventions=scene.conventions,
         coordinates=names,
         speeds=scene.speed_names.entries,
         inputs=scene.inputs.entries,
@@ -166,6 +171,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         events=events,
         projected_q=put_q,
         projected_u=put_u,
+        left_out=structure.redundant_rows,
         held=tuple(names[i] for i in held),
         stages=tuple(stages),
         way="rows kept by multipliers, by elimination" if builder.multiplied else way.description,

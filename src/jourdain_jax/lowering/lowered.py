@@ -36,6 +36,8 @@ class Lowered:
     traced: TracedScene
     scene_name: str
     parameters: tuple[str, ...]  # names of the scene's leaves
+    units: tuple[str, ...]  # of them, empty where none is stated
+    conventions: str  # the scene's own words on its axes
     coordinates: tuple[str, ...]
     speeds: tuple[str, ...]
     inputs: tuple[str, ...]
@@ -51,6 +53,7 @@ class Lowered:
     events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
     projected_q: tuple[int, ...]  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
     projected_u: tuple[int, ...]  # all speeds put back onto the rows; none where dependent speeds are eliminated
+    left_out: tuple[str, ...]  # rows that follow from the others
     held: tuple[str, ...]  # ignorable coordinates, set to the reference in the accelerations
     stages: tuple[Stage, ...]
     way: str  # which way of building it took fewest operations
@@ -90,11 +93,11 @@ class Lowered:
         return self.summary()
 
     def python_source(self) -> str:
-        """The program as readable Python: `fixed(parameters)` and `rates(fixed, t, state)`."""
+        """The program as readable Python, in SI units and radians: `fixed(parameters)` and `rates(fixed, t, state)`."""
         return export.python_source(self)
 
     def c_source(self, name: str = "rates") -> str:
-        """The program as one C function `name`."""
+        """The program as one C function `name`, in SI units and radians; its comment says which number is which."""
         return export.c_source(self, name)
 
     def expressions(self) -> dict:
