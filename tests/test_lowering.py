@@ -4,6 +4,7 @@ That its numbers are those of the dense path, for every model, is tested in `tes
 """
 
 import ctypes
+import re
 import shutil
 import subprocess
 
@@ -16,11 +17,12 @@ from baselines.hand_derived import HAND_DERIVED, operations
 
 import jourdain_jax as jj
 from jourdain_jax.equations.minimal import speeds_from_privileged
+from jourdain_jax.equations.power import needs_work
 from jourdain_jax.lowering import lower as module
-from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.trace import event_values
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion import lockstep, results
+from jourdain_jax.motion.simulate import state_form
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.together import together
 
@@ -192,18 +194,97 @@ def test_a_scene_without_scalar_form_runs_and_the_report_says_why():
     assert int(motion.result) == results.SUCCESS
 
 
-def test_a_scene_whose_program_differs_from_the_dense_path_is_not_lowered_and_the_rate_is_named():
-    with pytest.raises(jj.NotLowered, match=r"the rate of `x_rate` differs from the dense path by .*: a body, load or row has a derivative of its own"):
-        jj.lower(Mistaken())
+class MistakenRow(jj.models.ChaplyginSleigh):
+    """A sleigh whose blade is stated with a derivative rule that is wrong."""
+
+    def velocity_constraints(self, motion):
+        (row,) = super().velocity_constraints(motion).values()
+        return {"blade": row + 0.1 * _wrong_slope(motion.q.heading)}
 
 
-def test_a_program_that_grows_past_the_budget_is_not_lowered(monkeypatch):
+@pytest.mark.parametrize(("scene", "culprit"), [(Mistaken(), "body `point`"), (MistakenRow(), "row `blade`")])
+def test_a_scene_whose_program_differs_from_the_dense_path_is_not_lowered_and_the_body_or_row_is_named(scene, culprit):
+    with pytest.raises(jj.NotLowered, match=rf"the rate of `.*` differs from the dense path by .*: {culprit} has a derivative of its own there"):
+        jj.lower(scene)
+
+
+class AskingPython(Steered):
+    """A load that asks Python."""
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=self.answer(motion.q.x)),)
+
+    def answer(self, x):
+        return jax.pure_callback(lambda x: -x, jax.ShapeDtypeStruct((), x.dtype), x, vmap_method="sequential")
+
+
+class AskingWithRule(AskingPython):
+    """The same with a derivative."""
+
+    def answer(self, x):
+        asked = jax.custom_jvp(super().answer)
+        asked.defjvp(lambda primals, tangents: (asked(*primals), -tangents[0]))
+        return asked(x)
+
+
+class LargeMatrix(Steered):
+    """A load from a table of 250,000 numbers."""
+
+    def loads(self, motion):
+        table = jnp.sin(jnp.arange(250_000.0)).reshape(500, 500)
+        return (jj.generalized_force(motion, x_rate=-1e-6 * jnp.sum(table @ (motion.q.x * jnp.ones(500)))),)
+
+
+@pytest.mark.parametrize(
+    ("scene", "reason"),
+    [
+        (AskingPython(), "a function that JAX cannot differentiate (Pure callbacks do not support JVP) has no scalar form"),
+        (AskingWithRule(), "the operation `pure_callback` has no scalar form"),
+        (LargeMatrix(), "an array of 250000 numbers has no scalar form"),
+    ],
+)
+def test_callbacks_and_large_matrices_have_no_scalar_form_either(scene, reason):
+    with pytest.raises(jj.NotLowered, match=re.escape(reason)):
+        jj.lower(scene)
+    assert reason in jj.report(scene).lowering
+    assert int(jj.simulate(scene, {"x": 1.0}, ts=[0.5]).result) == results.SUCCESS
+
+
+def test_a_program_that_grows_past_the_budget_is_not_lowered_and_the_dense_path_is_taken_with_a_note(monkeypatch):
+    scene = MODELS["rattleback"]()
     monkeypatch.setattr(module, "MOST_OPERATIONS", 50)
     module._lowered.cache_clear()
-    found = lowered(MODELS["rattleback"]())
-    module._lowered.cache_clear()
-    assert isinstance(found, jj.NotLowered)
-    assert "more than 50" in str(found)
+    try:
+        with pytest.raises(jj.NotLowered, match="more than 50"):
+            jj.lower(scene)
+        assert "more than 50" in jj.report(scene).lowering
+        assert state_form(scene, jj.structure_of(scene)).lowered is None
+    finally:
+        module._lowered.cache_clear()
+
+
+def test_what_a_scene_has_not_costs_nothing():
+    free = jj.lower(Falling())
+    assert free.operations == 0  # no row, no rotation, no force that changes, no time
+    assert free.pivots == free.guards == ()
+    assert not {"sin", "cos", "sqrt"} & {free.graph.op[n] for n in free.graph.reachable([*free.qdot, *free.ydot])}
+    assert int(free.traced.t) not in free.graph.reachable([*free.qdot, *free.ydot])
+    assert jj.lower(MODELS["rosenberg-particle"]()).operations <= 6  # particles have no rotation
+    assert not needs_work(MODELS["tilting-disc"](), jj.structure_of(MODELS["tilting-disc"]()))  # nothing integrated but the motion
+
+
+class Falling(jj.Scene):
+    """A stone."""
+
+    mass: jnp.ndarray = jj.parameter(1.3, unit="kg", positive=True)
+    gravity: jnp.ndarray = jj.parameter(9.81, unit="m/s^2")
+    coordinates = jj.coordinates("x z")
+
+    def bodies(self, t, q):
+        return {"stone": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, q.z]))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, self.gravity),)
 
 
 def test_derivatives_through_the_program_agree_with_the_dense_path_in_first_and_second_order():

@@ -19,6 +19,7 @@ from jourdain_jax.equations.reductions import NullSpaceQR
 from jourdain_jax.equations.sampling import random_states
 from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
+from jourdain_jax.lowering.blame import blamed
 from jourdain_jax.lowering.elimination import serves
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
 from jourdain_jax.lowering.trace import event_values, named_values, traced_scene
@@ -136,7 +137,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     stages = [Stage("scalar program: structural zeros and ones removed, repeated parts shared", fewest)]
     plainly_held = graph.operations(_rates(builder.build(Strategy(first, held=held)))) if held else fewest
     stages.append(Stage("ignorable coordinates held in the accelerations", plainly_held))
-    for strategy in _strategies(held, plainly_held < SMALL, None if builder.multiplied else counts[True] / counts[False]):
+    for strategy in _strategies(held, plainly_held < SMALL, None if builder.multiplied else counts[True] / max(1, counts[False])):
         candidate = builder.build(strategy)
         count = graph.operations(graph.with_quotients(_rates(candidate)))
         if count < fewest and _agree(_values(candidate, probes), expected):
@@ -200,7 +201,8 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
         raise NotLowered("its scalar program serves at too few of the probed states")
     if np.max(error) > TO_DENSE:
         worst = names[int(np.argmax(error))]
-        raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: a body, load or row has a derivative of its own there")
+        culprit = blamed(scene, builder.traced, probes, parameters, t, q, u, inputs)
+        raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: {culprit} has a derivative of its own there")
     if found.events and not np.allclose(probes(found.events)[:, usable], dense_events.T[:, usable], rtol=TO_DENSE, atol=TO_DENSE, equal_nan=True):
         raise NotLowered("the value of a stop event differs from the dense path")
 

@@ -111,7 +111,10 @@ def _traced(scene: Scene, of_inputs: tuple[int, ...], with_events: bool) -> Trac
     def quantities(leaves, t, q, u, inputs):
         return velocity_quantities(jax.tree.unflatten(treedef, leaves), t, q, u, inputs, of_inputs, with_events)
 
-    closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
+    try:
+        closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
+    except (ValueError, NotImplementedError) as error:  # the power of potentials takes a derivative of all loads, which nothing else may need
+        raise Unsupported(f"a function that JAX cannot differentiate ({str(error).split('.')[0]})") from None
     graph = Graph()
     parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(leaves)]
     t, q, u, inputs = (_inputs(graph, name, s.shape, True) for name, s in zip("tqui", state, strict=True))
