@@ -20,22 +20,20 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.interpret import Unsupported
 from jourdain_jax.scene.scene import Scene
 
-DIFFERS = 1e-8  # relative to the size of the quantity at the probes
 
-
-def blamed(scene: Scene, traced: TracedScene, probes: Probes, parameters: Scene, t, q, u, inputs) -> str:
+def blamed(scene: Scene, traced: TracedScene, probes: Probes, limit: float, parameters: Scene, t, q, u, inputs) -> str:
     """What has derivatives of its own, by name; in general terms where nothing is found.
 
-    `parameters`, `t`, `q`, `u`, `inputs`: the probes, with a leading axis.
+    `limit`: of the difference, relative to the size of the quantity at the probes; `parameters`, `t`, `q`, `u`, `inputs`: the probes, with a leading axis.
     """
     try:
-        here = list(dict.fromkeys(_differing(scene, traced, probes, parameters, t, q, u, inputs)))
+        here = list(dict.fromkeys(_differing(scene, traced, probes, limit, parameters, t, q, u, inputs)))
     except Unsupported:
         here = []
     return " and ".join(here) if here else "a body, load or row"
 
 
-def _differing(scene: Scene, traced: TracedScene, probes: Probes, parameters, t, q, u, inputs) -> Iterator[str]:
+def _differing(scene: Scene, traced: TracedScene, probes: Probes, limit: float, parameters, t, q, u, inputs) -> Iterator[str]:
     g, along = traced.graph, (1.0, np.cos(1.0 + np.arange(q.shape[1])), np.sin(1.0 + np.arange(u.shape[1])))
     direction = {n: g.const(x) for n, x in zip([traced.t, *traced.q.tolist(), *traced.u.tolist()], np.hstack(along).tolist(), strict=True)}
     values, rates = _by_jax(parameters, t, q, u, inputs, along)
@@ -51,7 +49,7 @@ def _differing(scene: Scene, traced: TracedScene, probes: Probes, parameters, t,
         expected = np.moveaxis(np.stack([getattr(values, field), getattr(rates, field)]), 1, -1)
         size = 1 + np.nanmax(np.abs(expected), initial=0.0)
         for i, owner in enumerate(owners):
-            if np.any(np.abs(found - expected)[:, i] > DIFFERS * size):
+            if np.any(np.abs(found - expected)[:, i] > limit * size):
                 yield owner
 
 

@@ -33,7 +33,7 @@ LEAST_PROBES = 12  # at which programs can be compared, where so many were found
 MOST_OPERATIONS = 20_000  # of the program before simplification: beyond, the dense path is taken
 MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
-TO_DENSE = 1e-8  # between the program and the dense path at the probes, relative to the size of the rates
+TO_DENSE = {"float64": 1e-8, "float32": 1e-3}  # between the program (in double precision) and the dense path at the probes, relative to the size of the rates
 AGREEMENT = 1e-9  # between programs at the probes, relative to the size of the rates
 
 
@@ -114,13 +114,15 @@ def _probes(scene: Scene, structure: Structure, graph) -> Probes:
     so that what is zero or equal by chance does not count.
     """
     generator = np.random.default_rng(1)
-    t, q = structure.times[:PROBES], structure.coordinates[:PROBES]
+    t, q = structure.times[:PROBES], np.array(structure.coordinates[:PROBES], np.float64)
+    for first, _ in scene.coordinates.quaternions:  # in single precision they are unit ones to seven digits
+        q[:, first : first + 4] /= np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
     u = random_states(scene, len(t), generator)[2]
     varied = jax.tree.map(lambda x: np.where(np.asarray(x) == 0, 0.05, np.asarray(x)) * (1 + 0.1 * generator.uniform(size=(len(t), *np.shape(x)))), scene)
     inputs = generator.normal(size=(len(t), len(scene.inputs)))
     values = named_values(scene, t, q, u, inputs)
     values |= {f"p{k}_{i}": column for k, leaf in enumerate(jax.tree.leaves(varied)) for i, column in enumerate(np.reshape(leaf, (len(t), -1)).T)}
-    return Probes(graph, values)
+    return Probes(graph, {name: np.asarray(value, np.float64) for name, value in values.items()})  # whatever precision motions have
 
 
 def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: float) -> Lowered:
@@ -199,11 +201,12 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
     error = np.max(np.abs(values - expected)[:, usable] / size, axis=1, initial=0.0)
     if not _enough(usable):
         raise NotLowered("its scalar program serves at too few of the probed states")
-    if np.max(error) > TO_DENSE:
+    limit = TO_DENSE[jnp.result_type(float).name]
+    if np.max(error) > limit:
         worst = names[int(np.argmax(error))]
-        culprit = blamed(scene, builder.traced, probes, parameters, t, q, u, inputs)
+        culprit = blamed(scene, builder.traced, probes, limit, parameters, t, q, u, inputs)
         raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: {culprit} has a derivative of its own there")
-    if found.events and not np.allclose(probes(found.events)[:, usable], dense_events.T[:, usable], rtol=TO_DENSE, atol=TO_DENSE, equal_nan=True):
+    if found.events and not np.allclose(probes(found.events)[:, usable], dense_events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
         raise NotLowered("the value of a stop event differs from the dense path")
 
 
