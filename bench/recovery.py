@@ -2,9 +2,10 @@
 
     taskset -c 0 python bench/recovery.py [--quick] [--json FILE]
 
-Seen: as many steps as without (the speeds of both scenes decide them anyway), errors alike; where no speed changes, steps grow beyond what the recovered
-coordinates bear, and `quadrature_error` says so. Writes a list of {"model", "recover", "tolerance", "error", "steps", "rejected", "microseconds", "quadrature_error"}: 10 s of the tilting disc and of the
-Chaplygin sleigh, and 10 s of the upright disc on a circle with 1 time saved; one motion inside the user's `jit`, fastest of some warm runs.
+Seen: as many steps as without (the speeds of both scenes decide them anyway), and errors alike; where no speed changes, steps grow beyond what the
+recovered coordinates bear, and `quadrature_error` says so. Writes a list of {"model", "recover", "tolerance", "error", "steps", "rejected",
+"microseconds", "quadrature_error"}: 10 s of the tilting disc, of the Chaplygin sleigh, and of the upright disc on a circle, with one time saved; one
+motion inside the user's `jit`, fastest of some warm runs.
 """
 
 import argparse
