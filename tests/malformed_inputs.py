@@ -431,14 +431,17 @@ BATCHES: dict[str, Case] = {
 }
 
 FILES: dict[str, Case] = {
-    "jj.load('nowhere.npz', Bead)": ("ValueError", "there is no file `nowhere.npz`; check the path"),
-    "jj.load('half.npz', Bead)": ("ValueError", "`half.npz` is no trajectory file, or is damaged (File is not a zip file); expected an .npz written by `save`"),
-    "jj.load('empty.npz', Bead)": ("ValueError", "`empty.npz` is no trajectory file, or is damaged (No data left in file)"),
-    "jj.load('text.npz', Bead)": ("ValueError", "`text.npz` is no trajectory file, or is damaged"),
-    "jj.load('.', Bead)": ("ValueError", "`.` is no trajectory file, or is damaged ([Errno 21] Is a directory: '.')"),
+    "jj.load_trajectory('nowhere.npz', Bead)": ("ValueError", "there is no file `nowhere.npz`; check the path"),
+    "jj.load_trajectory('half.npz', Bead)": (
+        "ValueError",
+        "`half.npz` is no trajectory file, or is damaged (File is not a zip file); expected an .npz written by `save`",
+    ),
+    "jj.load_trajectory('empty.npz', Bead)": ("ValueError", "`empty.npz` is no trajectory file, or is damaged (No data left in file)"),
+    "jj.load_trajectory('text.npz', Bead)": ("ValueError", "`text.npz` is no trajectory file, or is damaged"),
+    "jj.load_trajectory('.', Bead)": ("ValueError", "`.` is no trajectory file, or is damaged ([Errno 21] Is a directory: '.')"),
     "jj.load(3.5, Bead)": ("ValueError", "`path` is a float, expected the name of a file"),
-    "jj.load('run.npz', 3)": ("ValueError", "`scene` is an int, expected the class of the scene that moved, or any scene of that class"),
-    "jj.load('run.npz', ChaplyginSleigh)": (
+    "jj.load_trajectory('run.npz', 3)": ("ValueError", "`scene` is an int, expected the class of the scene that moved, or any scene of that class"),
+    "jj.load_trajectory('run.npz', ChaplyginSleigh)": (
         "ValueError",
         "`run.npz` holds a trajectory of `Bead`, expected `ChaplyginSleigh`; pass the class it was made with",
     ),

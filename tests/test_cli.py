@@ -68,7 +68,7 @@ def test_simulate_writes_what_it_was_asked_for(capsys, tmp_path):
     assert code == 0
     assert found["result"] == 0
     assert found["t_end"] == 1.0
-    loaded = jj.load(files[0], MODELS["chaplygin-sleigh"])
+    loaded = jj.load_trajectory(files[0], MODELS["chaplygin-sleigh"])
     assert float(loaded.scene.mass) == 2.0
     np.testing.assert_allclose(loaded["heading"][-1], found["final"]["heading"])
     assert all((tmp_path / name).stat().st_size > 1000 for name in ("run.png", "run.gif"))

@@ -60,6 +60,8 @@ for name in names:
         "q": motion.q.tolist(),
         "u": motion.u.tolist(),
         "result": int(motion.result) == results.SUCCESS,
+        "reduction": motion.reduction,
+        "operations": jj.lower(scene).operations,
         "types": types((scene, state, motion, motion.energies(), motion.accelerations(), motion.contact_forces(), by_reduction)),
         "warnings": [str(w.message) for w in caught],
         "drift": float(jj.diagnose(motion).energy_drift / motion.energies().kinetic[0]),
@@ -115,6 +117,13 @@ def test_single_precision_gives_nothing_but_single_precision(compared):
     assert found["types"] == ["float32"]
     assert found["result"]
     assert found["warnings"] == []
+
+
+def test_programs_in_single_precision_are_those_of_double_precision(compared):
+    _, found, scene, exact = compared
+    assert found["reduction"].endswith("lowered")
+    assert found["reduction"] == exact.reduction
+    assert found["operations"] == jj.lower(scene).operations
 
 
 def test_motions_in_single_precision_follow_those_in_double_precision(compared):

@@ -3,6 +3,11 @@
 That its numbers are those of the dense path, for every model, is tested in `test_every_model`.
 """
 
+import ctypes
+import re
+import shutil
+import subprocess
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -12,11 +17,12 @@ from baselines.hand_derived import HAND_DERIVED, operations
 
 import jourdain_jax as jj
 from jourdain_jax.equations.minimal import speeds_from_privileged
+from jourdain_jax.equations.power import needs_work
 from jourdain_jax.equations.trace import event_values
 from jourdain_jax.lowering import lower as module
-from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion import lockstep, results
+from jourdain_jax.motion.simulate import state_form
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.together import together
 
@@ -44,17 +50,82 @@ def test_the_summary_says_what_was_dropped_and_chosen():
         assert part in text
 
 
-def test_the_readable_source_computes_the_rates():
-    scene = MODELS["tilting-disc"]()
-    program = jj.lower(scene)
+class Rough(jj.Scene):
+    """A bead on a rough wire, pushed while it is slow or far: signs, sizes, choices, and names that a program might use itself."""
+
+    mass: jnp.ndarray = jj.parameter(1.3, unit="kg", positive=True)
+    k1: jnp.ndarray = jj.parameter(2.0, unit="N/m")
+    double: jnp.ndarray = jj.parameter(0.7, unit="N")
+    coordinates = jj.coordinates("s0 t")  # a length, and an angle
+
+    def bodies(self, t, q):
+        return {"bead": jj.RigidBody(self.mass, jnp.ones(3), jnp.stack([q.s0, 0.0 * q.s0, 0.0 * q.s0]), jj.rot_x(q.t))}
+
+    def loads(self, motion):
+        x, v = motion.q.s0, motion.u.s0_rate
+        push = jnp.where((jnp.abs(v) < 0.5) | ~(x < 1.0), jnp.maximum(x, 0.1), 0.0)
+        return (jj.generalized_force(motion, s0_rate=push - self.k1 * x - self.double * jnp.sign(v), t_rate=-self.double * jnp.sin(motion.t)),)
+
+
+PRINTED = {name: MODELS[name]() for name in ("skate", "tilting-disc", "two-wheel-axle-coordinates", "whipple-bicycle")} | {"rough": Rough()}
+
+
+def printed_states(scene, program, count=3):
+    """Times, states and inputs at which printed sources are evaluated, and the rates of the program there."""
+    t, q, u = jj.sample_states(scene, count)
+    y, inputs = u[:, np.array(program.independent, int)], np.linspace(0.3, 0.7, len(scene.inputs))
+    fixed = program.fixed_values(scene)
+    for state in zip(np.asarray(t), np.asarray(q), np.asarray(y), strict=True):
+        qdot, ydot, _ = program.rates(fixed, state[0], tuple(state[1]), tuple(state[2]), jnp.asarray(inputs))
+        yield (*state, inputs), np.array([*qdot, *ydot], float)
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_the_readable_source_computes_the_rates(name):
+    program = jj.lower(PRINTED[name])
     scope: dict = {}
     exec(program.python_source(), scope)
-    t, q, u = (x[0] for x in jj.sample_states(scene, 1))
-    y = u[list(program.independent)]
-    found = scope["rates"](scope["fixed"](*(float(x) for x in jax.tree.leaves(scene))), t, *q, *y)
-    udot = jj.accelerations(scene, t, q, u).udot
-    np.testing.assert_allclose(found, [*u, *udot[jnp.array(program.independent)]], rtol=1e-12, atol=1e-12)
-    assert "void rates(" in program.c_source()
+    fixed = scope["fixed"](*(float(x) for leaf in jax.tree.leaves(PRINTED[name]) for x in np.ravel(leaf)))
+    for (t, q, y, inputs), expected in printed_states(PRINTED[name], program):
+        np.testing.assert_allclose(scope["rates"](fixed, t, *q, *y, *inputs), expected, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_the_source_in_c_compiles_without_warnings_and_computes_the_rates(name, tmp_path):
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("there is no C compiler `cc` on this machine")
+    program = jj.lower(PRINTED[name])
+    (tmp_path / "rates.c").write_text(program.c_source())
+    command = [compiler, "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "rates.c", "-o", "rates.so", "-lm"]
+    made = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert made.returncode == 0, made.stderr
+    rates = ctypes.CDLL(str(tmp_path / "rates.so")).rates
+    vector = lambda values: (ctypes.c_double * max(1, len(values)))(*map(float, values))  # noqa: E731
+    parameters = vector([x for leaf in jax.tree.leaves(PRINTED[name]) for x in np.ravel(leaf)])
+    for (t, q, y, inputs), expected in printed_states(PRINTED[name], program):
+        out = vector(np.zeros(len(expected)))
+        rates(parameters, ctypes.c_double(t), vector(q), vector(y), vector(inputs), out)
+        np.testing.assert_allclose(list(out), expected, rtol=1e-11, atol=1e-11)
+
+
+def test_what_is_printed_states_units_symbols_and_what_is_relied_on():
+    disc = jj.lower(MODELS["tilting-disc"]())
+    assert "SI units and radians): mass (kg), radius (m), gravity (m/s^2)" in str(disc)
+    assert "must stay positive, signs that are relied on: cos(lean)" in str(disc)
+    assert '"""What depends on the parameters of TiltingDisc alone: mass (kg), radius (m), gravity (m/s^2)."""' in disc.python_source()
+    assert "positive spin rolls forward" in disc.python_source()
+    assert "const double spin_rate = speeds[2];" in disc.c_source()
+    two = jj.lower(TwoLateralRows())
+    assert "rows left out, as the others imply them: second" in str(two)
+
+
+class TwoLateralRows(jj.models.ChaplyginSleigh):
+    """A sleigh whose one row is stated twice."""
+
+    def velocity_constraints(self, motion):
+        (row,) = super().velocity_constraints(motion).values()
+        return {"first": row, "second": 2.0 * row}
 
 
 def test_expressions_and_latex_are_there_for_small_scenes():
@@ -63,7 +134,10 @@ def test_expressions_and_latex_are_there_for_small_scenes():
     found = program.expressions()
     assert found["d_phi_rate"] == 0
     assert {"phi", "gravity", "slope"} <= {str(s) for s in found["d_psi1_rate"].free_symbols}
-    assert r"\dot{" in program.latex()
+    lines = program.latex().split(" \\\\\n")
+    assert r"\dot{\psi_{2}} &= - \frac{\mathrm{length} \dot{\phi}}{\mathrm{radius}} + \dot{\psi_{1}}" in lines
+    assert r"\ddot{\phi} &= 0" in lines
+    assert not any(line.startswith(r"\dot{\phi}") for line in lines)  # what a dot means needs no equation
 
 
 class Steered(jj.Scene):
@@ -120,18 +194,97 @@ def test_a_scene_without_scalar_form_runs_and_the_report_says_why():
     assert int(motion.result) == results.SUCCESS
 
 
-def test_a_scene_whose_program_differs_from_the_dense_path_is_not_lowered_and_the_rate_is_named():
-    with pytest.raises(jj.NotLowered, match=r"the rate of `x_rate` differs from the dense path by .*: a body, load or row has a derivative of its own"):
-        jj.lower(Mistaken())
+class MistakenRow(jj.models.ChaplyginSleigh):
+    """A sleigh whose blade is stated with a derivative rule that is wrong."""
+
+    def velocity_constraints(self, motion):
+        (row,) = super().velocity_constraints(motion).values()
+        return {"blade": row + 0.1 * _wrong_slope(motion.q.heading)}
 
 
-def test_a_program_that_grows_past_the_budget_is_not_lowered(monkeypatch):
+@pytest.mark.parametrize(("scene", "culprit"), [(Mistaken(), "body `point`"), (MistakenRow(), "row `blade`")])
+def test_a_scene_whose_program_differs_from_the_dense_path_is_not_lowered_and_the_body_or_row_is_named(scene, culprit):
+    with pytest.raises(jj.NotLowered, match=rf"the rate of `.*` differs from the dense path by .*: {culprit} has a derivative of its own there"):
+        jj.lower(scene)
+
+
+class AskingPython(Steered):
+    """A load that asks Python."""
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=self.answer(motion.q.x)),)
+
+    def answer(self, x):
+        return jax.pure_callback(lambda x: -x, jax.ShapeDtypeStruct((), x.dtype), x, vmap_method="sequential")
+
+
+class AskingWithRule(AskingPython):
+    """The same with a derivative."""
+
+    def answer(self, x):
+        asked = jax.custom_jvp(super().answer)
+        asked.defjvp(lambda primals, tangents: (asked(*primals), -tangents[0]))
+        return asked(x)
+
+
+class LargeMatrix(Steered):
+    """A load from a table of 250,000 numbers."""
+
+    def loads(self, motion):
+        table = jnp.sin(jnp.arange(250_000.0)).reshape(500, 500)
+        return (jj.generalized_force(motion, x_rate=-1e-6 * jnp.sum(table @ (motion.q.x * jnp.ones(500)))),)
+
+
+@pytest.mark.parametrize(
+    ("scene", "reason"),
+    [
+        (AskingPython(), "a function that JAX cannot differentiate (Pure callbacks do not support JVP) has no scalar form"),
+        (AskingWithRule(), "the operation `pure_callback` has no scalar form"),
+        (LargeMatrix(), "an array of 250000 numbers has no scalar form"),
+    ],
+)
+def test_callbacks_and_large_matrices_have_no_scalar_form_either(scene, reason):
+    with pytest.raises(jj.NotLowered, match=re.escape(reason)):
+        jj.lower(scene)
+    assert reason in jj.report(scene).lowering
+    assert int(jj.simulate(scene, {"x": 1.0}, ts=[0.5]).result) == results.SUCCESS
+
+
+def test_a_program_that_grows_past_the_budget_is_not_lowered_and_the_dense_path_is_taken_with_a_note(monkeypatch):
+    scene = MODELS["rattleback"]()
     monkeypatch.setattr(module, "MOST_OPERATIONS", 50)
     module._lowered.cache_clear()
-    found = lowered(MODELS["rattleback"]())
-    module._lowered.cache_clear()
-    assert isinstance(found, jj.NotLowered)
-    assert "more than 50" in str(found)
+    try:
+        with pytest.raises(jj.NotLowered, match="more than 50"):
+            jj.lower(scene)
+        assert "more than 50" in jj.report(scene).lowering
+        assert state_form(scene, jj.structure_of(scene)).lowered is None
+    finally:
+        module._lowered.cache_clear()
+
+
+def test_what_a_scene_has_not_costs_nothing():
+    free = jj.lower(Falling())
+    assert free.operations == 0  # no row, no rotation, no force that changes, no time
+    assert free.pivots == free.guards == ()
+    assert not {"sin", "cos", "sqrt"} & {free.graph.op[n] for n in free.graph.reachable([*free.qdot, *free.ydot])}
+    assert int(free.traced.t) not in free.graph.reachable([*free.qdot, *free.ydot])
+    assert jj.lower(MODELS["rosenberg-particle"]()).operations <= 6  # particles have no rotation
+    assert not needs_work(MODELS["tilting-disc"](), jj.structure_of(MODELS["tilting-disc"]()))  # nothing integrated but the motion
+
+
+class Falling(jj.Scene):
+    """A stone."""
+
+    mass: jnp.ndarray = jj.parameter(1.3, unit="kg", positive=True)
+    gravity: jnp.ndarray = jj.parameter(9.81, unit="m/s^2")
+    coordinates = jj.coordinates("x z")
+
+    def bodies(self, t, q):
+        return {"stone": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, q.z]))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, self.gravity),)
 
 
 def test_derivatives_through_the_program_agree_with_the_dense_path_in_first_and_second_order():

@@ -94,5 +94,5 @@ def test_a_motion_in_reversed_time_comes_back_from_its_file_with_its_inputs(tmp_
     chain = TrailerChain(trailers=0)
     back = jj.simulate(chain, {"forward0": 1.0}, t0=1.0, ts=[1.0, 0.5, 0.0], inputs={"turn": jj.Sampled([0, 1], [0, 2])})
     jj.save(back, tmp_path / "back.npz")
-    loaded = jj.load(tmp_path / "back.npz", TrailerChain)
+    loaded = jj.load_trajectory(tmp_path / "back.npz", TrailerChain)
     np.testing.assert_allclose([loaded.inputs(t)[1] for t in (0.0, 0.25, 1.0)], [0.0, 0.5, 2.0])

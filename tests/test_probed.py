@@ -11,6 +11,7 @@ from jourdain_jax.equations.probed import TIMED, probed
 from jourdain_jax.equations.probed_on_graph import probed_on_graph, sampled_on_graph
 from jourdain_jax.equations.sampling import _projected_by_jax, random_states, symmetric_configurations
 from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.program.interpret import Unsupported
 
 MODELS = ["skate", "tilting-disc-quaternion", "ball-on-turntable", "snakeboard", "rattleback", "double-pendulum-rods", "isokinetic-particle", "trailer-chain"]
 
@@ -63,6 +64,22 @@ def test_the_structure_of_a_scene_without_a_scalar_form_is_found_by_jax():
     expected, found = structure_of(jj.models.MODELS["chaplygin-sleigh"]()), structure_of(Called())
     assert (found.rank, found.independent, found.row_names) == (expected.rank, expected.independent, expected.row_names)
     assert found.worst_pivot == pytest.approx(expected.worst_pivot, abs=1e-12)
+
+
+def test_a_scene_with_a_derivative_of_its_own_is_probed_by_jax_which_believes_it():
+    @jax.custom_jvp
+    def doubled(x):
+        return x
+
+    doubled.defjvp(lambda x, dx: (x[0], 2 * dx[0]))
+
+    class Believed(jj.models.MODELS["chaplygin-sleigh"]):
+        def coordinate_rates(self, t, q, u):
+            return doubled(u.array)
+
+    with pytest.raises(Unsupported, match="derivatives of its own"):
+        probed_on_graph(Believed(), *(x[:2] for x in random_states(Believed(), 2, np.random.default_rng(0))), np.ones((2, 3)))
+    assert structure_of(Believed()).rank == 1
 
 
 def _moves(rates) -> bool:

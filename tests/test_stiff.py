@@ -3,14 +3,18 @@
 import warnings
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from oracles import skate
 from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.motion import results
+from jourdain_jax.motion.fallbacks import changed_options, next_way
+from jourdain_jax.motion.simulate import set_up
 
 TS = np.linspace(0.0, 2.0, 5)
 
@@ -107,6 +111,49 @@ def test_stiff_lanes_of_a_rollout_are_run_again_and_the_others_are_kept():
     assert "2 are stiff and were run with an implicit solver" in str(batch)
     for i in range(3):
         np.testing.assert_allclose(batch.lane(i)["x"], np.sin(TS), rtol=0, atol=1e-7)
+
+
+class TurnedSkate(jj.models.Skate):
+    """A skate that a stiff damper turns at 1.3 rad/s, in a domain too narrow for that: a partition seems to serve which fails at a right angle."""
+
+    damping: object = jj.parameter(0.0, unit="N m s")
+    domain = {"heading": (-0.5, 0.5)}
+
+    def loads(self, motion):
+        return (*super().loads(motion), jj.generalized_force(motion, heading_rate=-self.damping * (motion.u.heading_rate - 1.3)))
+
+
+TURNED = {"heading": 0.0, "heading_rate": 1.3}
+
+
+def test_every_other_way_is_tried_once_and_ways_add_up(damped):
+    form = set_up(TurnedSkate(), TURNED, t1=1.0).form
+    lost = lambda ways, code=results.SINGULAR_PARTITION: eqx.tree_at(  # noqa: E731
+        lambda m: (m.result, m.fallback), damped, (jnp.array(code), jnp.array(ways))
+    )
+    both = results.FULL_STATE | results.IMPLICIT
+    assert next_way(form, lost(results.AS_ASKED), 0.0, {}) == results.FULL_STATE
+    assert next_way(form, lost(results.IMPLICIT), 0.0, {}) == both
+    assert next_way(form, lost(both), 0.0, {}) == results.AS_ASKED
+    assert next_way(form, lost(results.AS_ASKED, results.SUCCESS), 0.0, {}) == results.AS_ASKED
+    assert next_way(form, lost(results.AS_ASKED), 0.0, {"state": "minimal"}) == results.AS_ASKED
+    assert changed_options(both, 1000) == {"state": "full", "lowering": False, "recover": None, "solver": jj.RadauIIA(), "max_steps": 100}
+    assert "full state and an implicit solver" in results.FALLBACKS[both]
+
+
+@pytest.mark.slow
+def test_a_lane_that_is_stiff_and_leaves_its_domain_is_run_with_the_full_state_and_an_implicit_solver():
+    scene, (rates, ts) = TurnedSkate(), (np.array([0.0, 1e6]), np.linspace(0.0, 2.0, 9))
+    both = results.FULL_STATE | results.IMPLICIT
+    batch = jj.rollout(scene, TURNED | {"x": np.zeros(2)}, parameters={"damping": rates}, ts=ts)
+    assert batch.lanes.fallback.tolist() == [results.FULL_STATE, both]
+    assert batch.continued == (0, 1)
+    assert [(batch.lane(i).solver, batch.lane(i).state_form) for i in range(2)] == [("Dopri8", "full"), ("RadauIIA", "full")]
+    alone = jj.simulate(scene.replace(damping=1e6), TURNED, ts=ts)
+    assert int(alone.raise_if_failed().fallback) == both
+    expected = skate.motion(ts, slope=0.3, gravity=9.81, u0=0.0, th0=0.0, th_rate=1.3)["x"]
+    for motion in (alone, batch.lane(0), batch.lane(1)):
+        np.testing.assert_allclose(motion["x"], expected, rtol=0, atol=1e-7)
 
 
 def test_steps_that_shrink_towards_a_singularity_are_named():

@@ -51,7 +51,7 @@ def test_a_saved_rollout_comes_back_to_the_bit_with_one_code_per_lane(discs, fil
 
 def test_a_lane_with_wrong_parameters_comes_back_from_a_file_of_its_own(discs, tmp_path):
     jj.save(discs.lane(1), tmp_path / "lane.npz")
-    loaded = jj.load(tmp_path / "lane.npz", TiltingDisc)
+    loaded = jj.load_trajectory(tmp_path / "lane.npz", TiltingDisc)
     assert_equal_to_the_bit(loaded, discs.lane(1))
     assert loaded.message.endswith("(`radius`); check where it was computed")
 
@@ -78,15 +78,15 @@ def test_a_motion_saved_at_its_steps_comes_back_with_its_inputs(tmp_path):
     steps = jj.simulate(OnBelt(), {"y": 0.1}, t1=0.5, saveat=diffrax.SaveAt(t0=True, ts=[0.0, 0.2], steps=True), inputs={"speed": 1.0}, max_steps=400)
     assert not np.all(np.isfinite(steps.ts))  # room for more steps than were taken
     jj.save(steps, tmp_path / "steps.npz")
-    loaded = jj.load(tmp_path / "steps.npz", OnBelt)
+    loaded = jj.load_trajectory(tmp_path / "steps.npz", OnBelt)
     np.testing.assert_array_equal(loaded.q, steps.q)
     np.testing.assert_array_equal(loaded.inputs(0.3), [1.0, 0.0])
 
 
 def test_files_of_the_wrong_kind_are_refused_with_what_reads_them(files):
     with pytest.raises(ValueError, match=r"holds a rollout, expected a trajectory; read it with `jj.load_rollout\(path, scene\)`"):
-        jj.load(files / "rollout.npz", TiltingDisc)
-    with pytest.raises(ValueError, match=r"holds a trajectory, expected a rollout; read it with `jj.load\(path, scene\)`"):
+        jj.load_trajectory(files / "rollout.npz", TiltingDisc)
+    with pytest.raises(ValueError, match=r"holds a trajectory, expected a rollout; read it with `jj.load_trajectory\(path, scene\)`"):
         jj.load_rollout(files / "trajectory.npz", TiltingDisc)
     with pytest.raises(ValueError, match="holds a rollout of `TiltingDisc`, expected `ChaplyginSleigh`"):
         jj.load_rollout(files / "rollout.npz", ChaplyginSleigh)
@@ -131,6 +131,26 @@ def test_damaged_and_foreign_files_are_refused_with_the_reason(files, tmp_path):
         jj.load_rollout(tmp_path / "none.npz", TiltingDisc)
 
 
+def test_files_written_before_later_fields_existed_are_read_with_what_was_true_then(discs, files, tmp_path):
+    later = ("last_step", "fallback", "quadrature_error")
+    first = lambda header: {name: value for name, value in header.items() if name not in ("ways", "recovered", "kind")}  # noqa: E731
+    rewritten(files / "trajectory.npz", tmp_path / "trajectory.npz", first, later)
+    loaded = jj.load_trajectory(tmp_path / "trajectory.npz", TiltingDisc)
+    np.testing.assert_array_equal(loaded.q, discs.lane(0).q)
+    assert (int(loaded.fallback), float(loaded.quadrature_error), loaded.recovered) == (results.AS_ASKED, 0.0, ())
+    assert np.isnan(float(loaded.last_step))
+    assert "recovered" not in str(loaded)
+    rewritten(files / "rollout.npz", tmp_path / "rollout.npz", lambda h: first(h) | {"kind": "rollout"}, later, continued=np.array([2]))
+    lanes = jj.load_rollout(tmp_path / "rollout.npz", TiltingDisc)
+    assert lanes.lanes.fallback.tolist() == [results.AS_ASKED, results.AS_ASKED, results.FULL_STATE]
+    assert lanes.ways == ()
+    assert jax.tree.map(lambda x: x.dtype, lanes.lanes) == jax.tree.map(lambda x: x.dtype, discs.lanes)
+
+
+def test_the_first_name_of_reading_a_trajectory_still_serves(files):
+    assert_equal_to_the_bit(jj.load(files / "trajectory.npz", TiltingDisc), jj.load_trajectory(files / "trajectory.npz", TiltingDisc))
+
+
 def test_a_field_that_cannot_be_stored_is_named(tmp_path):
     class Labelled(ChaplyginSleigh):
         labels: tuple = ("a",)
@@ -140,7 +160,7 @@ def test_a_field_that_cannot_be_stored_is_named(tmp_path):
         motion = jj.Trajectory(**{name: getattr(labelled, name) for name in labelled.__dataclass_fields__} | {"scene": Labelled(labels=labels)})
         if stored:
             jj.save(motion, tmp_path / "labels.npz")
-            assert jj.load(tmp_path / "labels.npz", Labelled).scene.labels == ("a",)
+            assert jj.load_trajectory(tmp_path / "labels.npz", Labelled).scene.labels == ("a",)
         else:
             with pytest.raises(ValueError, match=r"field `labels` of `Labelled` is .*, which `save` cannot store"):
                 jj.save(motion, tmp_path / "labels.npz")

@@ -16,6 +16,7 @@ from jourdain_jax.equations.probed import Probed, generic_inputs
 from jourdain_jax.equations.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.program.derivative import derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.interpret import Unsupported
 from jourdain_jax.scene.scene import Scene
 
 ITERATIONS = 25  # of Gauss-Newton, at most
@@ -23,14 +24,24 @@ _NEARLY_DEPENDENT = 1e-6  # of the triangular factor's diagonal: below, singular
 
 
 def probed_on_graph(scene: Scene, t, q, u, u_other) -> Probed:
-    """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`. `Unsupported` where the scene has no scalar form."""
-    return _AtStates(traced_scene(scene), scene, t, q, u, generic_inputs(scene)).probed(u_other)
+    """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`.
+
+    `Unsupported` where the scene has no scalar form, or derivatives of its own.
+    """
+    return _AtStates(_traced(scene), scene, t, q, u, generic_inputs(scene)).probed(u_other)
 
 
 def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States put on the rows, as by `project_positions` and `project_speeds`, and how far they miss the geometric rows; `Unsupported` as above."""
-    at = _AtStates(traced_scene(scene), scene, t, q, u, np.zeros(len(scene.inputs)))
+    at = _AtStates(_traced(scene), scene, t, q, u, np.zeros(len(scene.inputs)))
     return at.real(at.q), at.real(at.speeds_on_rows()), at.real(at.miss)
+
+
+def _traced(scene: Scene) -> TracedScene:
+    traced = traced_scene(scene)
+    if traced.own_derivatives:
+        raise Unsupported("a function with derivatives of its own")
+    return traced
 
 
 class _AtStates:

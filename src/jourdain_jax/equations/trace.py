@@ -25,7 +25,7 @@ from jourdain_jax.equations.probing import described_once
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import impressed, potential_energy, resultants
 from jourdain_jax.program.graph import Graph
-from jourdain_jax.program.interpret import Nodes, Unsupported, as_nodes, interpret
+from jourdain_jax.program.interpret import Nodes, Unsupported, as_nodes, has_own_derivatives, interpret
 from jourdain_jax.scene.answers import events_of, loads_of
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
@@ -122,6 +122,7 @@ class TracedScene:
     parameters: list[np.ndarray]  # nodes, one array per leaf of the scene
     at: VelocityQuantities
     particulars: Particulars
+    own_derivatives: bool  # some function has a rule of differentiation of its own, which JAX believes and the graph does not know
 
 
 def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
@@ -148,7 +149,10 @@ def _traced(scene: Scene, of_inputs: tuple[int, ...], with_events: bool):
         motion = motion_at(scene, t, q, u, inputs)
         return velocity_quantities(scene, motion, of_inputs, with_events), particulars_of(scene, motion)
 
-    return jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
+    try:
+        return jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
+    except (ValueError, NotImplementedError) as error:  # the power of potentials takes a derivative of all loads, which nothing else may need
+        raise Unsupported(f"a function that JAX cannot differentiate ({str(error).split('.')[0]})") from None
 
 
 def _on_graph(scene: Scene, closed, shape) -> TracedScene:
@@ -158,7 +162,7 @@ def _on_graph(scene: Scene, closed, shape) -> TracedScene:
     t, q, u, inputs = (_inputs(graph, name, size, True) for name, size in sizes.items())
     found = interpret(graph, closed, [Nodes(x) for x in (*parameters, t, q, u, inputs)])
     at, particulars = jax.tree.unflatten(jax.tree.structure(shape), [as_nodes(graph, x) for x in found])
-    return TracedScene(graph, int(t), q, u, inputs, parameters, at, particulars)
+    return TracedScene(graph, int(t), q, u, inputs, parameters, at, particulars, has_own_derivatives(closed.jaxpr))
 
 
 def _inputs(graph: Graph, name: str, shape, varies: bool) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 
 from jourdain_jax.equations.structure import Structure
 from jourdain_jax.equations.trace import TracedScene, VelocityQuantities
-from jourdain_jax.lowering.elimination import eliminate, solve_symmetric
+from jourdain_jax.lowering.elimination import eliminate, serves, solve_symmetric
 from jourdain_jax.lowering.multipliers import accelerations_by_multipliers, projected_coordinates, projected_speeds
 from jourdain_jax.program.derivative import along, columns, derivatives
 from jourdain_jax.program.evaluate import Probes
@@ -82,7 +82,7 @@ class AppellOnGraph:
     def build(self, strategy: Strategy) -> Equations:
         """The equations by one strategy."""
         forms = self._forms(strategy.keep_sines, strategy.most_terms)
-        held = {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in strategy.held}
+        held = self._at_reference(strategy.held)
         kinematics = _Kinematics(self, forms, held, strategy.explicit, strategy.free_z)
         forms_of_equations = self._forms(strategy.keep_sines, strategy.most_terms_of_equations)
         M, f = self._equations(kinematics, forms_of_equations)
@@ -107,11 +107,15 @@ class AppellOnGraph:
             power = power if np.allclose(*self.probes([power, true_power]), rtol=1e-9, atol=1e-9) else true_power
         return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots, *sines])), sorted(guards), power, events)
 
-    def projection(self, most_terms: int) -> "Projection":
+    def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
+        return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}
+
+    def projection(self, most_terms: int, ignorable: tuple[int, ...]) -> "Projection":
         """Nodes of the state put back onto quaternion norms and geometric rows, and (where rows are kept by multipliers) onto velocity rows."""
         g, at, q = self.graph, self.traced.at, self.traced.q.tolist()
         redundant = {s for s in range(len(at.closure)) if s not in self.rows and s not in self.multiplied}
         closure = [int(n) for s, n in enumerate(at.closure) if s not in redundant]
+        closure = g.substituted(closure, self.probes.unaffected(closure, self._at_reference(ignorable)))
         norms = [g.total(g.mul(n, n) for n in q[first : first + 4]) for first in self.quaternions]
         moved = list(q)
         if closure:
@@ -125,17 +129,6 @@ class AppellOnGraph:
         M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
         phi = [int(at.phi[s]) for s in self.multiplied]
         return Projection(moved, projected_speeds(g, M, self.traced.u.tolist(), phi, forms))
-
-    def _not_needed(self, held: dict[int, int]) -> dict[int, int]:
-        """The held coordinates on whose value no dependent speed and no rate depends, at any probe."""
-        nodes = [*(int(self.traced.at.phi[s]) for s in self.rows), *self.traced.at.qdot.tolist()]
-        here = self.probes(nodes)
-
-        def unchanged(n, value):
-            there = self.probes(self.graph.substituted(nodes, {n: value}))
-            return np.allclose(there, here, rtol=1e-9, atol=1e-9, equal_nan=True)
-
-        return {n: value for n, value in held.items() if unchanged(n, value)}
 
     def _may_vanish(self, pivot: int) -> bool:
         """Whether a pivot is small or not a number at some probe."""
@@ -179,7 +172,8 @@ class AppellOnGraph:
         """Dependent speeds and rates at the true coordinates: those that do not depend on held ones are taken over, the others follow."""
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
         simple = (lambda nodes: list(nodes)) if forms is None else (lambda nodes: [forms.simplified(n) for n in nodes])
-        phi = g.substituted([int(at.phi[s]) for s in self.rows], self._not_needed(kinematics.held))
+        phi = [int(at.phi[s]) for s in self.rows]
+        phi = g.substituted(phi, self.probes.unaffected([*phi, *at.qdot.tolist()], kinematics.held))
         A = [list(row) for row in zip(*columns(g, phi, u), strict=True)]
         phi_0 = g.substituted(phi, dict.fromkeys(u, g.zero))
         y = {k: u[k] for k in self.independent}
@@ -188,9 +182,9 @@ class AppellOnGraph:
             right = [[g.neg(g.add(rest, g.total(g.mul(row[k], n) for k, n in known.items())))] for row, rest in zip(A, phi_0, strict=True)]
             return eliminate(g, [[row[k] for k in columns] for row in A], right, self.probes)
 
-        true = self.probes([row[0] for row in solved(self.dependent, y).solution])
-        held = self.probes(kinematics.z)
-        same = np.all(np.isclose(true, held, rtol=1e-10, atol=1e-12) | ~np.isfinite(true), axis=1)
+        whole = solved(self.dependent, y)
+        true, held = self.probes([row[0] for row in whole.solution]), self.probes(kinematics.z)
+        same = np.all(np.isclose(true, held, rtol=1e-9, atol=1e-12) | ~serves(whole.pivots, self.probes) | ~np.isfinite(true), axis=1)
         known = y | {k: n for k, n, s in zip(self.dependent, kinematics.z, same, strict=True) if s}
         left = [k for k in self.dependent if k not in known]
         A, phi_0 = [simple(row) for row in A], simple(phi_0)

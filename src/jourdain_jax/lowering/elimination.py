@@ -8,7 +8,9 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool
 
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 
@@ -22,6 +24,12 @@ class Eliminated:
 
     solution: list[list[int]]
     pivots: list[int]
+
+
+def serves(pivots: list[int], probes: Probes) -> Bool[np.ndarray, "probes"]:
+    """At which probes what was divided by these pivots is more than round-off: none of them is small beside its usual size."""
+    sizes = np.abs(probes(pivots))
+    return np.all(sizes > SMALLEST_PIVOT * np.nanmedian(sizes, axis=1, keepdims=True), axis=0)
 
 
 def eliminate(graph: Graph, A: list[list[int]], right: list[list[int]], probes: Probes) -> Eliminated:

@@ -6,20 +6,42 @@ import numpy as np
 
 from jourdain_jax.program.source import PYTHON, C, statements, sympy_expressions
 
+SHORT, FEW = 60, 8  # characters of an expression in the summary, and how many there may be
+_IN_C = {"auto", "char", "const", "default", "do", "double", "enum", "extern", "float", "goto", "inline", "int", "long", "register", "restrict", "short"}
+_IN_C |= {"signed", "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "case"} | set(C.functions.values())
+_ARGUMENTS = ("parameters", "t", "coordinates", "speeds", "inputs", "out")
+
 
 def summary(lowered) -> str:
-    """Operations after each step, what was dropped and why, the privileged speeds, pivots and guards."""
-    fewer = ", ".join(lowered.held)
+    """Operations after each step, what was dropped and why, the privileged speeds, pivots and guards, parameters with their units."""
     lines = [
         f"Lowered equations of {lowered.scene_name}: {lowered.operations} operations for {len(lowered.qdot)} rates and {len(lowered.ydot)} accelerations",
         *(f"  {stage.operations:6d} operations: {stage.name}" for stage in lowered.stages),
         *_speeds(lowered),
-        f"  left out of the accelerations, which do not depend on them: {fewer or 'nothing'}",
-        f"  computed once per motion, from parameters alone: {len(lowered.fixed)} numbers",
-        f"  pivots that are watched: {len(lowered.pivots)}; signs that are relied on: {len(lowered.guards)}",
+        f"  left out of the accelerations, which do not depend on them: {', '.join(lowered.held) or 'nothing'}",
+        f"  recoverable by quadrature, as nothing else depends on them: {', '.join(lowered.coordinates[i] for i in lowered.recoverable()) or 'none'}",
+        *([f"  rows left out, as the others imply them: {', '.join(lowered.left_out)}"] if lowered.left_out else []),
+        f"  parameters, which stay inputs (SI units and radians): {_parameters(lowered) or 'none'}",
+        f"  computed once per motion, from parameters alone: {len(lowered.fixed)} number{'' if len(lowered.fixed) == 1 else 's'}",
+        f"  must not vanish, pivots that are watched: {_shown(lowered, lowered.pivots)}",
+        f"  must stay positive, signs that are relied on: {_shown(lowered, lowered.guards)}",
         f"  way: {lowered.way}; {lowered.seconds:.2f} s",
     ]
     return "\n".join(lines)
+
+
+def _parameters(lowered) -> str:
+    named = [(_identifier(name), unit) for name, unit in zip(lowered.parameters, lowered.units, strict=True)]
+    return ", ".join(f"{name} ({unit})" if unit else name for name, unit in named)
+
+
+def _shown(lowered, nodes) -> str:
+    """The nodes as expressions where these are short, otherwise how many there are."""
+    names = identifiers(lowered)
+    written = [statements(lowered.graph, [n], names, PYTHON) for n in nodes if len(nodes) <= FEW]
+    short = [text.replace("math.", "") for lines, (text,) in written if not lines and len(text) <= SHORT]
+    more = len(nodes) - len(short)
+    return ", ".join([*short, *([f"{more} longer expression{'s' if more > 1 else ''}"] if more else [])]) or "none"
 
 
 def _speeds(lowered) -> list[str]:
@@ -32,15 +54,23 @@ def _speeds(lowered) -> list[str]:
 
 
 def identifiers(lowered) -> dict[int, str]:
-    """A readable name for every input of the program."""
+    """A readable name for every input of the program, each its own."""
     traced = lowered.traced
-    names: dict[int, str] = {}
+    named = [(traced.t, "t")]
     for nodes, name in zip(traced.parameters, lowered.parameters, strict=True):
         flat = np.ravel(nodes).tolist()
-        names |= {n: _identifier(name if len(flat) == 1 else f"{name}_{i}") for i, n in enumerate(flat)}
-    names |= {traced.t: "t"} | {int(n): _identifier(name) for n, name in zip(traced.q, lowered.coordinates, strict=True)}
-    names |= {int(n): _identifier(name) for n, name in zip(traced.u, lowered.speeds, strict=True)}
-    return names | {int(n): _identifier(f"{name}_input" if name in names.values() else name) for n, name in zip(traced.inputs, lowered.inputs, strict=True)}
+        named += [(n, name if len(flat) == 1 else f"{name}_{i}") for i, n in enumerate(flat)]
+    for nodes, given in ((traced.q, lowered.coordinates), (traced.u, lowered.speeds), (traced.inputs, lowered.inputs)):
+        named += zip(nodes.tolist(), given, strict=True)
+    names: dict[int, str] = {}
+    taken = {"fixed", "math", "sign"}
+    for n, name in named:
+        own = _identifier(name)
+        while own in taken:
+            own += "_input" if n in traced.inputs and not own.endswith("_input") else "_"
+        names[n] = own
+        taken.add(own)
+    return names
 
 
 def _identifier(name: str) -> str:
@@ -53,54 +83,78 @@ def results(lowered) -> dict[str, int]:
     return rates | {f"d_{_identifier(lowered.speeds[i])}": n for i, n in zip(lowered.independent, lowered.ydot, strict=True)}
 
 
+def _prefix(letter: str, names) -> str:
+    """A prefix for numbered names of our own that no name of the scene has."""
+    return _prefix(letter + "_", names) if any(re.fullmatch(rf"{letter}\d+", name) for name in names) else letter
+
+
 def python_source(lowered) -> str:
     """Two functions: what depends on parameters alone, and the rates."""
     names, rates = identifiers(lowered), results(lowered)
+    c, k, s = (_prefix(letter, names.values()) for letter in "cks")
     parameters = [names[int(n)] for nodes in lowered.traced.parameters for n in np.ravel(nodes)]
-    first, fixed = statements(lowered.graph, lowered.fixed, names, PYTHON, "c")
-    known = names | {n: f"k{i}" for i, n in enumerate(lowered.fixed)}
-    second, outputs = statements(lowered.graph, list(rates.values()), known, PYTHON)
-    state = ", ".join(["t", *(_identifier(c) for c in lowered.coordinates), *(_identifier(lowered.speeds[i]) for i in lowered.independent)])
-    extra = "".join(f", {known[int(n)]}" for n in lowered.traced.inputs)
-    unpack = [f"    {', '.join(f'k{i}' for i in range(len(fixed)))}{',' if len(fixed) == 1 else ''} = fixed"] if fixed else []
+    first, fixed = statements(lowered.graph, lowered.fixed, names, PYTHON, c)
+    known = names | {n: f"{k}{i}" for i, n in enumerate(lowered.fixed)}
+    second, outputs = statements(lowered.graph, list(rates.values()), known, PYTHON, s)
+    given = [lowered.traced.t, *lowered.traced.q, *(lowered.traced.u[i] for i in lowered.independent), *lowered.traced.inputs]
+    state = ", ".join(names[int(n)] for n in given)
+    signed = any("sign(" in text for text in (*first, *fixed, *second, *outputs))
+    signs = ["", "def sign(x):", "    return 1.0 if x > 0 else -1.0 if x < 0 else 0.0", ""] if signed else []
+    unpack = [f"    {', '.join(f'{k}{i}' for i in range(len(fixed)))}{',' if len(fixed) == 1 else ''} = fixed"] if fixed else []
     return "\n".join(
         [
             "import math",
             "",
+            *signs,
             "",
             f"def fixed({', '.join(parameters)}):",
-            f'    """What depends on the parameters of {lowered.scene_name} alone."""',
+            f'    """What depends on the parameters of {lowered.scene_name} alone: {_parameters(lowered) or "none"}."""',
             *first,
             f"    return ({', '.join(fixed)}{',' if len(fixed) == 1 else ''})",
             "",
             "",
-            f"def rates(fixed, {state}{extra}):",
-            f'    """{", ".join(rates)}"""',
+            f"def rates(fixed, {state}):",
+            f'    """Time derivatives {", ".join(rates)}. {_conventions(lowered)}"""',
             *unpack,
             *second,
-            f"    return ({', '.join(outputs)},)",
+            "    return (",
+            *(f"        {text},  # {rate}" for rate, text in zip(rates, outputs, strict=True)),
+            "    )",
             "",
         ]
     )
 
 
+def _conventions(lowered) -> str:
+    """Units and axes, in a form that ends no docstring and no comment."""
+    said = lowered.conventions.replace('"', "'").replace("*/", "").rstrip()
+    return said if "SI units" in said else f"SI units, radians. {said}".rstrip()
+
+
 def c_source(lowered, name: str = "rates") -> str:
-    """One C function `void rates(const double *parameters, double t, const double *q, const double *y, const double *inputs, double *out)`."""
-    traced = lowered.traced
+    """One C function `void rates(parameters, t, coordinates, speeds, inputs, out)` of numbers; needs the mathematical library."""
+    traced, rates = lowered.traced, results(lowered)
+    names = {n: f"{given}_" if given in _IN_C or (given in _ARGUMENTS and n != traced.t) else given for n, given in identifiers(lowered).items()}
     flat = [int(n) for nodes in traced.parameters for n in np.ravel(nodes)]
-    places = {n: f"parameters[{i}]" for i, n in enumerate(flat)} | {traced.t: "t"}
-    places |= {int(n): f"q[{i}]" for i, n in enumerate(traced.q)} | {int(traced.u[k]): f"y[{i}]" for i, k in enumerate(lowered.independent)}
-    places |= {int(n): f"inputs[{i}]" for i, n in enumerate(traced.inputs)}
-    rates = results(lowered)
-    lines, outputs = statements(lowered.graph, list(rates.values()), places, C)
+    groups = {"parameters": flat, "coordinates": traced.q.tolist(), "speeds": [int(traced.u[k]) for k in lowered.independent]}
+    groups["inputs"] = [int(n) for n in traced.inputs]
+    lines, outputs = statements(lowered.graph, list(rates.values()), names, C, _prefix("s", names.values()))
+    used = {n for n in lowered.graph.reachable(rates.values()) if n in names}
+    unused = [group for group, nodes in groups.items() if not used.intersection(nodes)] + ([] if traced.t in used else ["t"])
+    signs = ["static inline double sign(double x) { return (x > 0) - (x < 0); }", ""] if any("sign(" in text for text in (*lines, *outputs)) else []
+    listed = {group: ", ".join(names[n] for n in nodes) or "none" for group, nodes in groups.items()}
     return "\n".join(
         [
             "#include <math.h>",
             "",
-            "static inline double sign(double x) { return (x > 0) - (x < 0); }",
-            "",
-            f"/* {lowered.scene_name}: out = {', '.join(rates)} */",
-            f"void {name}(const double *parameters, double t, const double *q, const double *y, const double *inputs, double *out) {{",
+            *signs,
+            f"/* {lowered.scene_name}. {_conventions(lowered)}",
+            f"   parameters: {_parameters(lowered) or 'none'}",
+            *(f"   {group}: {listed[group]}" for group in ("coordinates", "speeds", "inputs")),
+            f"   out, time derivatives: {', '.join(rates)} */",
+            f"void {name}(const double *parameters, double t, const double *coordinates, const double *speeds, const double *inputs, double *out) {{",
+            *(f"    (void){argument};" for argument in unused),
+            *(f"    const double {names[n]} = {group}[{i}];" for group, nodes in groups.items() for i, n in enumerate(nodes) if n in used),
             *lines,
             *(f"    out[{i}] = {text};  /* {rate} */" for i, (rate, text) in enumerate(zip(rates, outputs, strict=True))),
             "}",
@@ -116,10 +170,28 @@ def expressions(lowered) -> dict:
 
 
 def latex(lowered) -> str:
-    """One equation per rate, for an `align` environment; needs SymPy."""
+    """The equations for an `align` environment; needs SymPy. Speeds that are the rate of a coordinate stand as its derivative, which needs no equation."""
     import sympy
 
-    def dotted(name: str) -> str:
-        return rf"\dot{{{sympy.latex(sympy.Symbol(name.removeprefix('d_')))}}}"
+    names, traced = identifiers(lowered), lowered.traced
+    rate_of = {int(rate): _symbol(name) for name, rate in zip(lowered.coordinates, lowered.qdot, strict=True)}
+    shown = {n: _symbol(name) for n, name in names.items()}
+    shown |= {int(n): _symbol(name) for n, name in zip(traced.q, lowered.coordinates, strict=True)}
+    shown |= {n: rf"\dot{{{rate_of[n]}}}" for n in map(int, traced.u) if n in rate_of}
+    left = [rf"\dot{{{shown[int(n)]}}}" for n in traced.q]
+    left += [rf"\ddot{{{rate_of[n]}}}" if n in rate_of else rf"\dot{{{shown[n]}}}" for n in (int(traced.u[i]) for i in lowered.independent)]
+    symbols = {sympy.Symbol(names[n]): symbol for n, symbol in shown.items()}
+    lines = [f"{rate} &= {sympy.latex(value, symbol_names=symbols)}" for rate, value in zip(left, expressions(lowered).values(), strict=True)]
+    return " \\\\\n".join(line for line in lines if len(set(line.split(" &= "))) > 1)
 
-    return " \\\\\n".join(f"{dotted(name)} &= {sympy.latex(value)}" for name, value in expressions(lowered).items())
+
+def _symbol(name: str) -> str:
+    """A letter, Latin or Greek, with its number as index, in italics; words upright."""
+    import sympy
+
+    letter = name.rstrip("0123456789").rstrip("_")
+    number = name[len(letter) :].strip("_")
+    written = sympy.latex(sympy.Symbol(letter))
+    italic = len(letter) == 1 or (written.startswith("\\") and "_" not in letter)
+    base = written if italic else r"\mathrm{" + letter.strip("_.").replace("_", r"\_") + "}"
+    return f"{base}_{{{number}}}" if number else base

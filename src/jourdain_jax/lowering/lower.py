@@ -16,14 +16,17 @@ from jourdain_jax.equations.accelerations import bare_accelerations
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations
 from jourdain_jax.equations.probing import concretised, on_numbers, without_collecting
-from jourdain_jax.equations.reductions import SMALLEST_PIVOT, NullSpaceQR
+from jourdain_jax.equations.reductions import NullSpaceQR
 from jourdain_jax.equations.sampling import random_states
 from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.equations.trace import event_values, named_values, traced_scene
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
+from jourdain_jax.lowering.blame import blamed
+from jourdain_jax.lowering.elimination import serves
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.interpret import Unsupported
+from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 PROBES = 56  # at most
@@ -33,7 +36,7 @@ MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
 LARGE = 5000  # operations: above, fewer ways are tried, and fewer probes compared with the dense path
 FEW = 6  # of these probes
-TO_DENSE = 1e-8  # between the program and the dense path at the probes, relative to the size of the rates
+TO_DENSE = {"float64": 1e-8, "float32": 1e-3}  # between the program (in double precision) and the dense path at the probes, relative to the size of the rates
 AGREEMENT = 1e-9  # between programs at the probes, relative to the size of the rates
 
 
@@ -114,13 +117,15 @@ def _probes(scene: Scene, structure: Structure, graph) -> Probes:
     so that what is zero or equal by chance does not count.
     """
     generator = np.random.default_rng(1)
-    t, q = structure.times[:PROBES], structure.coordinates[:PROBES]
+    t, q = structure.times[:PROBES], np.array(structure.coordinates[:PROBES], np.float64)
+    for first, _ in scene.coordinates.quaternions:  # in single precision they are unit ones to seven digits
+        q[:, first : first + 4] /= np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
     u = random_states(scene, len(t), generator)[2]
     varied = jax.tree.map(lambda x: np.where(np.asarray(x) == 0, 0.05, np.asarray(x)) * (1 + 0.1 * generator.uniform(size=(len(t), *np.shape(x)))), scene)
     inputs = generator.normal(size=(len(t), len(scene.inputs)))
     values = named_values(scene, t, q, u, inputs)
     values |= {f"p{k}_{i}": column for k, leaf in enumerate(jax.tree.leaves(varied)) for i, column in enumerate(np.reshape(leaf, (len(t), -1)).T)}
-    return Probes(graph, values)
+    return Probes(graph, {name: np.asarray(value, np.float64) for name, value in values.items()})  # whatever precision motions have
 
 
 def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: float) -> Lowered:
@@ -137,22 +142,26 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     stages = [Stage("scalar program: structural zeros and ones removed, repeated parts shared", fewest)]
     plainly_held = graph.operations(_rates(builder.build(Strategy(first, held=held)))) if held else fewest
     stages.append(Stage("ignorable coordinates held in the accelerations", plainly_held))
-    for strategy in _strategies(held, plainly_held < SMALL, None if builder.multiplied else counts[True] / counts[False]):
+    for strategy in _strategies(held, plainly_held < SMALL, None if builder.multiplied else counts[True] / max(1, counts[False])):
         candidate = builder.build(strategy)
         count = graph.operations(graph.with_quotients(_rates(candidate)))
         if count < fewest and _agree(_values(candidate, probes), expected):
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
-    put_back = builder.projection(MOST_TERMS if fewest < SMALL else 0)
+    put_back = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
     groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power], best.events, put_back.q, put_back.u]
     outputs = graph.with_quotients([n for group in groups for n in group])
     ends = np.cumsum([len(group) for group in groups])
     qdot, ydot, z, pivots, guards, power, events, put_q, put_u = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
     names = scene.coordinate_names.entries
+    leaves = tuple(jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(scene)[0])
+    units = {f".{name}": metadata["unit"] for name, _, metadata in parameters_of(scene)}
     return Lowered(
         traced=builder.traced,
         scene_name=type(scene).__name__,
-        parameters=tuple(jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(scene)[0]),
+        parameters=leaves,
+        units=tuple(units.get(name, "") for name in leaves),
+        conventions=scene.conventions,
         coordinates=names,
         speeds=scene.speed_names.entries,
         inputs=scene.inputs.entries,
@@ -168,6 +177,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         events=events,
         projected_q=put_q,
         projected_u=put_u,
+        left_out=structure.redundant_rows,
         held=tuple(names[i] for i in held),
         stages=tuple(stages),
         way="rows kept by multipliers, by elimination" if builder.multiplied else way.description,
@@ -197,10 +207,12 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
     error = np.max(np.abs(values - expected)[:, usable] / size, axis=1, initial=0.0)
     if not _enough(usable):
         raise NotLowered("its scalar program serves at too few of the probed states")
-    if np.max(error) > TO_DENSE:
+    limit = TO_DENSE[jnp.result_type(float).name]
+    if np.max(error) > limit:
         worst = names[int(np.argmax(error))]
-        raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: a body, load or row has a derivative of its own there")
-    if found.events and not np.allclose(probes(found.events)[:, chosen][:, usable], dense_events.T[:, usable], rtol=TO_DENSE, atol=TO_DENSE, equal_nan=True):
+        culprit = blamed(scene, builder.traced, probes, limit, parameters, t, q, u, inputs)
+        raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: {culprit} has a derivative of its own there")
+    if found.events and not np.allclose(probes(found.events)[:, chosen][:, usable], dense_events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
         raise NotLowered("the value of a stop event differs from the dense path")
 
 
@@ -253,9 +265,7 @@ def _strategies(held: tuple[int, ...], small: bool, explicit_to_implicit: float 
 
 def _values(found: Equations, probes: Probes) -> np.ndarray:
     """Rates at all probes, NaN where a pivot is small: there the program does not serve."""
-    pivots = np.abs(probes(found.pivots))
-    good = np.all(pivots > SMALLEST_PIVOT * np.nanmedian(pivots, axis=1, keepdims=True), axis=0)
-    return np.where(good, probes(_rates(found)), np.nan)
+    return np.where(serves(found.pivots, probes), probes(_rates(found)), np.nan)
 
 
 def _agree(values: np.ndarray, expected: np.ndarray) -> bool:

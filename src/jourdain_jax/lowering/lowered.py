@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.equations.trace import TracedScene
 from jourdain_jax.lowering import export
 from jourdain_jax.lowering.jacobian import differentiable
+from jourdain_jax.lowering.recoverable import recoverable
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.scene.scene import Scene
@@ -35,6 +36,8 @@ class Lowered:
     traced: TracedScene
     scene_name: str
     parameters: tuple[str, ...]  # names of the scene's leaves
+    units: tuple[str, ...]  # of them, empty where none is stated
+    conventions: str  # the scene's own words on its axes
     coordinates: tuple[str, ...]
     speeds: tuple[str, ...]
     inputs: tuple[str, ...]
@@ -50,6 +53,7 @@ class Lowered:
     events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
     projected_q: tuple[int, ...]  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
     projected_u: tuple[int, ...]  # all speeds put back onto the rows; none where dependent speeds are eliminated
+    left_out: tuple[str, ...]  # rows that follow from the others
     held: tuple[str, ...]  # ignorable coordinates, set to the reference in the accelerations
     stages: tuple[Stage, ...]
     way: str  # which way of building it took fewest operations
@@ -66,6 +70,21 @@ class Lowered:
         """Operations per evaluation of all rates."""
         return self.graph.operations([*self.qdot, *self.ydot])
 
+    def recoverable(self, events: bool = True, projected: bool = True) -> tuple[int, ...]:
+        """Numbers of the coordinates that a quadrature recovers: no acceleration, no rate of the others, no stop event and no projection depends on them.
+
+        `events`, `projected`: whether the motion stops at events, and whether its states are put back onto the rows.
+        """
+        q = self.traced.q.tolist()
+        wanted = self._coordinates_in([*self.ydot, *self.guards, *(self.events if events else ()), *(self.projected_u if projected else ())])
+        for i, n in enumerate(self.projected_q if projected else ()):
+            wanted |= {i} | self._coordinates_in([n]) if n != q[i] else set()
+        return recoverable({i: self._coordinates_in([n]) for i, n in enumerate(self.qdot)}, wanted)
+
+    def _coordinates_in(self, nodes) -> frozenset[int]:
+        numbers = {int(n): i for i, n in enumerate(self.traced.q)}
+        return frozenset(numbers[n] for n in self.graph.reachable(nodes) if n in numbers)
+
     def summary(self) -> str:
         """Operations after each step, what was dropped and why, the chosen privileged speeds."""
         return export.summary(self)
@@ -74,11 +93,11 @@ class Lowered:
         return self.summary()
 
     def python_source(self) -> str:
-        """The program as readable Python: `fixed(parameters)` and `rates(fixed, t, state)`."""
+        """The program as readable Python, in SI units and radians: `fixed(parameters)` and `rates(fixed, t, state)`."""
         return export.python_source(self)
 
     def c_source(self, name: str = "rates") -> str:
-        """The program as one C function `name`."""
+        """The program as one C function `name`, in SI units and radians; its comment says which number is which."""
         return export.c_source(self, name)
 
     def expressions(self) -> dict:

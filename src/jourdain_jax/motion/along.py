@@ -37,6 +37,7 @@ class Record(Protocol):
     rejected: Int[Array, ""]
     last_step: Float[Array, ""]
     fallback: Int[Array, ""]
+    quadrature_error: Float[Array, ""]
     moved_q: Float[Array, ""]
     moved_u: Float[Array, ""]
     smallest_pivot: Float[Array, ""]
@@ -44,6 +45,7 @@ class Record(Protocol):
     reduction: str
     solver: str
     projected: bool
+    recovered: tuple[str, ...]
 
 
 @eqx.filter_jit

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from jourdain_jax.equations.probing import Seldom, on_numbers
 from jourdain_jax.equations.reactions import ContactForce
 from jourdain_jax.motion.along import Record, accelerations_along, contact_forces_along, energies, invariants, residuals
+from jourdain_jax.motion.recovery import TOO_LONG
 from jourdain_jax.motion.results import FALLBACKS
 
 
@@ -113,15 +114,20 @@ def _largest(values) -> Float[Array, ""]:
     return jnp.max(jnp.where(jnp.isnan(values), 0.0, jnp.abs(values)), initial=0.0)
 
 
-def warnings_of(found: Diagnostics, dtype) -> tuple[str, ...]:
-    """What the diagnostics of a motion of that floating-point type speak against, in words."""
+def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
+    """What the diagnostics of a motion speak against, in words."""
     low, high = (int(rank) for rank in found.rank)
     smallest = float(found.smallest_singular_value)
     warned = []
     if low != high:
         warned.append(f"rows change their rank along the motion, {low} to {high}: constraint forces and the motion beyond may not be unique")
-    elif smallest < np.sqrt(jnp.finfo(dtype).eps):
+    elif smallest < np.sqrt(jnp.finfo(trajectory.q.dtype).eps):
         warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
+    if float(trajectory.quadrature_error) > TOO_LONG:
+        warned.append(
+            f"steps were too long for the recovered coordinates {', '.join(trajectory.recovered)}: in one step {float(trajectory.quadrature_error):.0e} times "
+            "the error that the tolerances let pass; give more times to save at, or leave `recover`"
+        )
     pulled = [name for name, contact in found.contacts.items() if not contact.honest]
     return (*warned, *(f"contact `{name}` would have to pull: a real one lifts off" for name in pulled))
 
@@ -138,6 +144,7 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
         ("solver", f"{trajectory.solver}, {int(trajectory.accepted)} steps accepted, {int(trajectory.rejected)} rejected"),
         *([("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again "))] if int(trajectory.fallback) else []),
         ("state", f"{trajectory.state_form}, reduction: {trajectory.reduction}" + (", projected after each step" if trajectory.projected else "") + pivot),
+        *([("recovered", _recovered_text(trajectory))] if trajectory.recovered else []),
         ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}"),
         ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
         ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),
@@ -145,7 +152,12 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
     ]
     rows += [(f"invariant {name}", f"drift {float(drift):.2e}") for name, drift in found.invariant_drifts.items()]
     rows += [(f"contact {name}", _contact_text(contact)) for name, contact in found.contacts.items()]
-    return rows + [("warning", text) for text in warnings_of(found, trajectory.q.dtype) if not text.startswith("contact")]
+    return rows + [("warning", text) for text in warnings_of(found, trajectory) if not text.startswith("contact")]
+
+
+def _recovered_text(trajectory: Record) -> str:
+    error = float(trajectory.quadrature_error)
+    return f"{', '.join(trajectory.recovered)} by quadrature; error in one step at most {error:.1e} of what the tolerances let pass"
 
 
 def _contact_text(contact: ContactExtremes) -> str:

@@ -20,6 +20,7 @@ from jourdain_jax.motion.land_on import land_on
 from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
 from jourdain_jax.motion.quick_compilation import quickly_compiled
+from jourdain_jax.motion.recovery import LargestError, is_among
 from jourdain_jax.motion.solver_choice import controller_of
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
@@ -63,6 +64,7 @@ class Solved(eqx.Module):
     accepted: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
     last_step: Float[Array, "*lanes"]  # s, that the step-size control would take next; NaN where it keeps that to itself
+    quadrature_error: Float[Array, "*lanes"]  # largest, in one step, of the recovered coordinates, relative to what the step-size control lets pass
 
 
 class Setup(eqx.Module):
@@ -166,6 +168,7 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
         accepted=solved.accepted,
         rejected=solved.rejected,
         last_step=solved.last_step,
+        quadrature_error=solved.quadrature_error,
         fallback=jnp.zeros((), jnp.int32) + results.AS_ASKED,
         moved_q=start.moved_q,
         moved_u=start.moved_u,
@@ -175,6 +178,7 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
         reduction=form.reduction_name,
         solver=type(options.solver).__name__,
         projected=moving,
+        recovered=tuple(scene.coordinate_names.entries[i] for i in form.recovered),
         event_names=options.event_names,
     )
 
@@ -208,16 +212,18 @@ def _lean(setup: Setup, y0, args, ts, rates, project, events) -> Solved:
         args=args,
         project=project,
         events=events,
-        norm=_StateNorm(),
+        norm=_StateNorm(setup.form.recovered),
         rtol=jnp.broadcast_to(options.tolerances[0], setup.t0.shape),
         atol=jnp.broadcast_to(options.tolerances[1], setup.t0.shape),
         shortest=_shortest(setup.t0, setup.t1),
         max_steps=options.max_steps,
+        unseen=LargestError(setup.form.recovered) if setup.form.recovered else None,
     )
     kind: Literal["lax", "checkpointed"] = "lax" if isinstance(options.adjoint, diffrax.ForwardMode) else "checkpointed"
     goals = jnp.concatenate([ts, setup.t1[None]])
     ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, setup.t0, goals, options.dt0, kind)
-    return Solved(ts, jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h)
+    unseen = jnp.zeros_like(end.h) if end.unseen is None else end.unseen
+    return Solved(ts, jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, unseen)
 
 
 def _lanes_last(tree):
@@ -281,6 +287,7 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
         accepted=solution.stats["num_accepted_steps"],
         rejected=solution.stats["num_rejected_steps"],
         last_step=jnp.full_like(t_end, jnp.nan),
+        quadrature_error=jnp.zeros_like(t_end),
     )
 
 
@@ -312,14 +319,16 @@ def _result(code, y_end: Integrated, start: State, pivot):
 
 
 class _StateNorm(eqx.Module):
-    """Root mean square over coordinates and speeds; the work that rides along does not decide the step size.
+    """Root mean square over coordinates and speeds; the work that rides along and recovered coordinates do not decide the step size.
 
     What is not a number counts as infinite: the step shrinks and the motion ends, where NaN would be tried until the last allowed step.
     """
 
+    recovered: tuple[int, ...] = eqx.field(static=True, default=())
+
     def __call__(self, y: Integrated) -> Float[Array, "*lanes"]:
-        parts = jax.tree.leaves((y.q, y.v))
-        squared = sum(jnp.sum(part**2, axis=0) for part in parts) / sum(len(part) for part in parts)
+        q = jnp.where(is_among(self.recovered, y.q), 0.0, y.q) if self.recovered else y.q
+        squared = sum(jnp.sum(part**2, axis=0) for part in (q, y.v)) / (len(q) + len(y.v) - len(self.recovered))
         squared = jnp.where(jnp.isnan(squared), jnp.inf, squared)
         return jnp.where(squared == 0, 0.0, jnp.sqrt(jnp.where(squared == 0, 1.0, squared)))
 

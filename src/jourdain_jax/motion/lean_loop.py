@@ -68,6 +68,7 @@ class Progress(eqx.Module):
     rejected: Int[Array, "*lanes"]
     event: Int[Array, "*lanes"]  # index of the event that ended the motion, or -1
     search: Search | None  # for that event
+    unseen: Float[Array, "*lanes"] | None = None  # largest error so far of what does not decide the step size, 1: as much as it lets pass
 
 
 class Problem(eqx.Module):
@@ -82,6 +83,7 @@ class Problem(eqx.Module):
     atol: Float[Array, "*lanes"]
     shortest: Float[Array, "*lanes"]
     max_steps: int = eqx.field(static=True)
+    unseen: Callable | None = None  # of an error, relative to what step-size control lets pass: how large the part is that it does not see
 
 
 def integrate(
@@ -93,7 +95,8 @@ def integrate(
     """
     direction = jnp.sign(goals[-1] - t0)
     zero = jnp.zeros(jnp.shape(t0), jnp.int32)
-    start = Progress(t0, y0, jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0)), zero + RUNNING, zero, zero, zero - 1, None)
+    unseen = None if problem.unseen is None else jnp.zeros(jnp.shape(t0))
+    start = Progress(t0, y0, jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0)), zero + RUNNING, zero, zero, zero - 1, None, unseen)
     most_steps = problem.max_steps
     if problem.events is not None:
         start = _stopped_at_once(problem, start)
@@ -135,7 +138,8 @@ def _step(problem: Problem, method: Method, p: Progress, goal, last_goal, direct
     if problem.project is not None:
         y1 = problem.project(t1, y1, problem.args)
     scale = jax.tree.map(lambda a, b: problem.atol + problem.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), p.y, y1)
-    size_of_error = jax.lax.stop_gradient(problem.norm(jax.tree.map(lambda e, s: e / s, error, scale)))
+    relative = jax.lax.stop_gradient(jax.tree.map(lambda e, s: e / s, error, scale))
+    size_of_error = problem.norm(relative)
     accept = locating | (size_of_error <= 1)
     factor = SAFETY * jnp.where(size_of_error > 0, size_of_error, 1e-30) ** (-1 / method.order)
     factor = jnp.clip(jnp.where(jnp.isfinite(size_of_error), factor, 0.0), LEAST_FACTOR, jnp.where(accept, LARGEST_FACTOR, 1.0))
@@ -145,7 +149,8 @@ def _step(problem: Problem, method: Method, p: Progress, goal, last_goal, direct
     code = jnp.where(next_h < problem.shortest, results.STEP_TOO_SMALL, RUNNING)
     code = jnp.where((code == RUNNING) & (accepted + rejected >= problem.max_steps) & ~(accept & (t1 == last_goal)), results.MAX_STEPS, code).astype(jnp.int32)
     y = jax.tree.map(lambda new, old: jnp.where(accept, _as(new, old), old), y1, p.y)
-    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, accepted, rejected, p.event, p.search)
+    unseen = None if problem.unseen is None else jnp.where(accept & ~locating, jnp.maximum(p.unseen, problem.unseen(relative)), p.unseen)
+    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, accepted, rejected, p.event, p.search, unseen)
     return moved if problem.events is None else _watched(problem, p, moved, h, first_slope, accept)
 
 
@@ -186,7 +191,7 @@ def _stopped_at_once(problem: Problem, start: Progress) -> Progress:
     happened = jnp.any(beyond, axis=0)
     code = jnp.where(happened, results.EVENT, start.code).astype(jnp.int32)
     event = jnp.where(happened, jnp.argmax(beyond, axis=0), start.event).astype(jnp.int32)
-    return Progress(start.t, start.y, start.h, code, start.accepted, start.rejected, event, event_search.none(start.t))
+    return Progress(start.t, start.y, start.h, code, start.accepted, start.rejected, event, event_search.none(start.t), start.unseen)
 
 
 def _watched(problem: Problem, p: Progress, moved: Progress, h, first_slope, accept) -> Progress:
@@ -208,7 +213,7 @@ def _watched(problem: Problem, p: Progress, moved: Progress, h, first_slope, acc
     t = jnp.where(found, moved.t + search.shift, moved.t)
     y = jax.tree.map(lambda y, f: jnp.where(found, y + _as(search.shift, y) * f, y), moved.y, first_slope)
     code = jnp.where(happened, LOCATING, jnp.where(found, results.EVENT, jnp.where(locating, LOCATING, moved.code))).astype(jnp.int32)
-    return Progress(t, y, jnp.where(locating, p.h, moved.h), code, moved.accepted, moved.rejected, event, search)
+    return Progress(t, y, jnp.where(locating, p.h, moved.h), code, moved.accepted, moved.rejected, event, search, moved.unseen)
 
 
 def _chosen(index, values: Float[Array, "events *lanes"]) -> Float[Array, "*lanes"]:

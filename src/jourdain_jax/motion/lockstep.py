@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 from jourdain_jax.lowering.lowered import Lowered
 
 TOGETHER = 8  # lanes, where the loop is one function
-LARGEST_PROGRAM = 3000  # operations: beyond, the loop touches too much memory to become one function (the bicycle, 2144, is still one)
+LARGEST_PROGRAM = 3000  # operations: beyond, the loop touches too much memory to become one function (the bicycle, 2016, is still one)
 
 
 def in_blocks(function: Callable, lanes_at_once: int, *trees: PyTree) -> PyTree:

@@ -24,12 +24,14 @@ MESSAGES = {
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step (`dt0`), or look for a singularity there",
 }
 
-# In what other way a motion was run again after the first way had failed: `Trajectory.fallback`.
-AS_ASKED, FULL_STATE, IMPLICIT = range(3)
+# In what other ways a motion was run again after the first way had failed, which add up: `Trajectory.fallback`.
+AS_ASKED, FULL_STATE, IMPLICIT = 0, 1, 2
 FALLBACKS = {
     AS_ASKED: "",
     FULL_STATE: "run again with the full state: the privileged speeds came near where they do not determine the others",
     IMPLICIT: "run again with an implicit solver: the motion is stiff",
+    FULL_STATE | IMPLICIT: "run again with the full state and an implicit solver: the privileged speeds came near where they do not determine the others, and "
+    "the motion is stiff",
 }
 
 

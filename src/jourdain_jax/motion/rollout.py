@@ -10,21 +10,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from tqdm import tqdm
 
 from jourdain_jax.equations.probing import standing_in
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.motion import results
+from jourdain_jax.motion.fallbacks import changed_options, fallen_back, lost_codes, next_way
 from jourdain_jax.motion.integration import integrate_lanes
-from jourdain_jax.motion.radau import RadauIIA
-from jourdain_jax.motion.simulate import MOST_STEPS, fallen_back, lost_codes, may_be_another_form, set_up, state_form
-from jourdain_jax.motion.solver_choice import may_be_full
+from jourdain_jax.motion.simulate import MOST_STEPS, set_up, state_form
 from jourdain_jax.motion.span import check_span, saved_times
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.motion.state_form import StateForm
-from jourdain_jax.motion.stiff import OUT_OF_STEPS, implicit_steps, is_stiff
+from jourdain_jax.motion.stiff import OUT_OF_STEPS
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
@@ -34,7 +33,7 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 CHUNK = 512  # lanes whose stages fit the cache of a core
-WAYS = ("state_form", "reduction", "solver", "projected")  # static, of a trajectory
+WAYS = ("state_form", "reduction", "solver", "projected", "recovered")  # static, of a trajectory
 MEMORY = 2**30  # bytes of saved states per chunk, at most
 
 
@@ -99,7 +98,7 @@ class Rollout(Printed, eqx.Module):
             lines.append(f"  {lanes.size} {message}{named}")
         if self.continued:
             lines.append(f"  {len(self.continued)} left the domain of their privileged speeds and were run with the full state")
-        stiff = int(np.sum(np.asarray(self.lanes.fallback) == results.IMPLICIT))
+        stiff = int(np.count_nonzero(np.asarray(self.lanes.fallback) & results.IMPLICIT))
         if stiff:
             lines.append(f"  {stiff} are stiff and were run with an implicit solver")
         steps = np.asarray(self.lanes.accepted)
@@ -154,21 +153,17 @@ def rollout(
     bar.close()
     lanes = jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
 
-    def again(lanes, chosen, way: int, **other):
-        """`lanes` with the chosen ones run again with other options; how they were run."""
-        for first in range(0, len(chosen), chunk):
-            index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
-            with standing_in(sound):
-                new = _together(scene, fixed, options | other, *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
-            lanes, ways[way] = _replaced(lanes, fallen_back(new, way), index), tuple(getattr(new, name) for name in WAYS)
-        return lanes
-
     ways: dict[int, tuple] = {}
-    lost = _lost(scene, lanes, options)
-    lanes = again(lanes, lost, results.FULL_STATE, state="full", lowering=False)
-    steps = implicit_steps(options.get("max_steps", MOST_STEPS))
-    lanes = again(lanes, _stiff(scene, lanes, varied, options), results.IMPLICIT, solver=RadauIIA(), max_steps=steps)
-    return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(lost.tolist()), tuple(sorted(ways.items())))
+    while (again := _next_ways(scene, lanes, varied, options)).any():
+        for way in np.unique(again[again > 0]).tolist():
+            chosen, changed = np.flatnonzero(again == way), options | changed_options(way, options.get("max_steps", MOST_STEPS))
+            for first in range(0, len(chosen), chunk):
+                index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
+                with standing_in(sound):
+                    new = _together(scene, fixed, changed, *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+                lanes, ways[way] = _replaced(lanes, fallen_back(new, way), index), tuple(getattr(new, name) for name in WAYS)
+    continued = np.flatnonzero(np.asarray(lanes.fallback) & results.FULL_STATE)
+    return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(continued.tolist()), tuple(sorted(ways.items())))
 
 
 def _check_span_of_lanes(starts, options: dict) -> None:
@@ -190,23 +185,16 @@ def _sound_lane(scene: Scene, parameters: dict) -> Scene:
     return scene
 
 
-def _lost(scene: Scene, lanes: Trajectory, options: dict) -> np.ndarray:
-    """Lanes that another form of the state may bring to their end."""
-    form = _form(scene, options)
-    if options.get("state", "auto") not in may_be_another_form(form) or not may_be_full(options.get("solver")):
-        return np.zeros(0, int)
-    return np.flatnonzero(np.isin(lanes.result, lost_codes(form)))
-
-
-def _stiff(scene: Scene, lanes: Trajectory, starts, options: dict) -> np.ndarray:
-    """Lanes, run as asked by the default solver, that ran out of steps on a stiff motion."""
-    out = np.flatnonzero(np.isin(lanes.result, OUT_OF_STEPS) & (np.asarray(lanes.fallback) == results.AS_ASKED))
-    if not out.size or any(options.get(name) is not None for name in ("solver", "stepsize_controller")):
-        return np.zeros(0, int)
+def _next_ways(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int[np.ndarray, "lanes"]:
+    """In which ways each lane is run again, those it was run in already included; AS_ASKED: it is not."""
     own_times = isinstance(starts, State) and options.get("t0") is None
     begun = np.broadcast_to(np.asarray(starts.t if own_times else _first_time(options)), lanes.result.shape)
-    form = _form(scene, options)
-    return np.array([i for i in out if is_stiff(form, jax.tree.map(lambda x, i=i: x[i], lanes), begun[i])], int)
+    found = np.full(lanes.result.shape, results.AS_ASKED)
+    for tried in np.unique(lanes.fallback).tolist():
+        form = _form(scene, options | changed_options(tried, options.get("max_steps", MOST_STEPS)))
+        for i in np.flatnonzero((np.asarray(lanes.fallback) == tried) & np.isin(lanes.result, (*lost_codes(form), *OUT_OF_STEPS))):
+            found[i] = next_way(form, jax.tree.map(lambda x, i=i: x[i], lanes), begun[i], options)
+    return found
 
 
 def _form(scene: Scene, options: dict) -> StateForm:

@@ -4,7 +4,6 @@ The default state is the minimal one (coordinates and privileged speeds) where t
 domain and the rows are linear or affine; otherwise the full one (coordinates and all speeds), projected after every step.
 """
 
-import dataclasses
 import inspect
 import warnings
 
@@ -22,17 +21,17 @@ from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion import results
 from jourdain_jax.motion.arguments import check_options
+from jourdain_jax.motion.fallbacks import changed_options, fallen_back, next_way
 from jourdain_jax.motion.fixed_step import FixedStepSolver
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import Options, Setup, integrate
+from jourdain_jax.motion.recovery import recovering
 from jourdain_jax.motion.sensitivity import watched
-from jourdain_jax.motion.solver_choice import check_solver, fitted, may_be_full
+from jourdain_jax.motion.solver_choice import check_solver, fitted
 from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.state_form import StateForm, cutoff_of, default_reduction
-from jourdain_jax.motion.stiff import OUT_OF_STEPS, by_implicit, is_stiff
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
@@ -66,6 +65,7 @@ def simulate(
     work: bool = True,
     land_on_ts: bool = True,
     lowering: bool = True,
+    recover: str | None = None,
 ) -> Trajectory:
     """Integrate a scene's equations of motion from `start` over [t0, t1].
 
@@ -88,6 +88,9 @@ def simulate(
       its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
     - `lowering`: integrate the scene's scalar program (`jj.lower`) where it has one and neither `reduction` nor `stabilisation` is given; with False,
       the dense matrices.
+    - `recover`: "quadrature" leaves coordinates on which nothing else depends (`jj.lower(scene)` names them: x, y, yaw and spin of a rolling disc) out of
+      the control of step sizes; they are integrated by the same steps and of the same order. With the scalar program and the default solvers only.
+      `trajectory.quadrature_error` says whether the steps were short enough for them, and a warning where they were not.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
 
     Where nothing is traced, a motion that leaves the domain of its privileged speeds is run again with the full state, and a stiff one by an implicit
@@ -98,26 +101,15 @@ def simulate(
     **Raises** ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` where the adjoint does not
     support the mode of differentiation.
     """
-    setup = _set_up(**locals())
+    given = dict(locals())
+    setup = _set_up(**given)
     motion = watched(setup, integrate)
     if isinstance(motion.result, jax.core.Tracer):
         return motion
-    if state in may_be_another_form(setup.form) and may_be_full(solver) and int(motion.result) in lost_codes(setup.form):
-        # the motion left the domain in which the partition, or the program, was found to serve
-        form = state_form(setup.scene, structure_of(setup.scene), "full", reduction, stabilisation, projection, work, lowering=False)
-        setup = dataclasses.replace(setup, form=fitted(solver, setup.scene, form, "full"))
-        motion = fallen_back(watched(setup, integrate), results.FULL_STATE)
-    if solver is None and stepsize_controller is None and is_stiff(setup.form, motion, setup.t0):
-        motion = fallen_back(watched(by_implicit(setup), integrate), results.IMPLICIT)
+    while ways := next_way(setup.form, motion, setup.t0, given):
+        setup = _set_up(**(given | changed_options(ways, max_steps)))
+        motion = fallen_back(watched(setup, integrate), ways)
     return motion
-
-
-def fallen_back(motion: Trajectory, way: int) -> Trajectory:
-    """A motion, or several, marked as run again in that way; out of steps once more, it is called stiff."""
-    code = motion.result
-    if way == results.IMPLICIT:
-        code = jnp.where(jnp.isin(code, jnp.array(OUT_OF_STEPS)), results.STIFF, code).astype(code.dtype)
-    return eqx.tree_at(lambda m: (m.result, m.fallback), motion, (code, jnp.full_like(motion.fallback, way)))
 
 
 def set_up(scene: Scene, start=None, **options) -> Setup:
@@ -129,7 +121,7 @@ def set_up(scene: Scene, start=None, **options) -> Setup:
 
 def _set_up(
     *, scene, start, t0, t1, ts, saveat, rtol, atol, solver, stepsize_controller, dt0, adjoint, max_steps, state, reduction, stabilisation,
-    projection, inputs, events, work, land_on_ts, lowering,
+    projection, inputs, events, work, land_on_ts, lowering, recover,
 ) -> Setup:  # fmt: skip
     scene = as_scene(scene)
     switches = {"projection": projection, "events": events, "work": work, "land_on_ts": land_on_ts, "lowering": lowering}
@@ -154,6 +146,7 @@ def _set_up(
         saveat=None if saveat is None else _checked_saveat(saveat),
         event_names=names_of_events(scene) if events else (),
     )
+    form = recovering(form, recover, options)
     start = _on_constraints(scene, t0, start, inputs(t0), made_here) if projection else start
     return Setup(scene, start, inputs, t0, t1, ts, form, options)
 
@@ -221,17 +214,6 @@ def state_form(scene: Scene, structure: Structure, state="auto", reduction=None,
         affine=structure.affine,
         cutoff=cutoff,
     )
-
-
-def may_be_another_form(form: StateForm) -> tuple[str, ...]:
-    """For which `state` asked for a motion that was lost in this form is run again, with the full state and dense matrices."""
-    return ("auto", "full") if form.name == "full" and form.lowered is not None else ("auto",) if form.name == "minimal" else ()
-
-
-def lost_codes(form: StateForm) -> tuple[int, ...]:
-    """Result codes after which another form of the state may do better."""
-    guarded = form.lowered is not None and (form.lowered.guards or form.lowered.pivots)
-    return (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL, results.NOT_FINITE, results.UNSOLVED_STEP) if guarded else (results.SINGULAR_PARTITION,)
 
 
 @described_once

@@ -14,8 +14,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jourdain_jax.motion import results
-from jourdain_jax.motion.integration import Options, Setup
-from jourdain_jax.motion.radau import RadauIIA
 from jourdain_jax.motion.state_form import StateForm
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.numbers import is_traced
@@ -35,16 +33,6 @@ def is_stiff(form: StateForm, motion: Trajectory, t0) -> bool:
     step = abs(float(motion.t_end) - float(t0)) / int(motion.accepted) if np.isnan(step) else step
     J = np.asarray(_jacobian(form, motion)) * np.sign(float(motion.t_end) - float(t0))
     return bool(np.all(np.isfinite(J)) and step * np.max(-np.linalg.eigvals(J).real, initial=0.0) >= 1)
-
-
-def by_implicit(setup: Setup) -> Setup:
-    """The same motion by the implicit solver."""
-    return dataclasses.replace(setup, options=implicit_options(setup.options))
-
-
-def implicit_options(options: Options) -> Options:
-    """The same options but for the solver and its number of steps."""
-    return dataclasses.replace(options, solver=RadauIIA(), max_steps=implicit_steps(options.max_steps))
 
 
 def implicit_steps(max_steps: int) -> int:

@@ -32,6 +32,16 @@ class Probes:
         finite = value[np.isfinite(value)]
         return 0 if not finite.size or np.any(finite == 0) else int(np.sign(finite[0])) if np.all(np.sign(finite) == np.sign(finite[0])) else 0
 
+    def unaffected(self, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:
+        """The replacements, each of one node by another, that by themselves change none of the `nodes` at any probe."""
+        here = self(nodes)
+
+        def unchanged(old, new):
+            there = self(self.graph.substituted(nodes, {old: new}))
+            return np.allclose(there, here, rtol=1e-9, atol=1e-9, equal_nan=True)
+
+        return {old: new for old, new in replacement.items() if unchanged(old, new)}
+
     def _compute(self, nodes) -> None:
         graph, row = self.graph, self._row
         wanted = graph.needed(nodes, row)

@@ -38,6 +38,18 @@ def interpret(graph: Graph, closed, arguments: list[Value]) -> list[Value]:
     return _run(graph, closed.jaxpr, [_known(c) for c in closed.consts], arguments)
 
 
+def has_own_derivatives(jaxpr) -> bool:
+    """Whether a function among those traced has a rule of differentiation of its own, which the graph does not know."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name.startswith(("custom_jvp_call", "custom_vjp_call")):
+            return True
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")):
+            inner = getattr(inner, "jaxpr", inner)
+            if hasattr(inner, "eqns") and has_own_derivatives(inner):
+                return True
+    return False
+
+
 def as_nodes(graph: Graph, value: Value) -> np.ndarray:
     """The nodes of a value; numbers become constants."""
     if isinstance(value, Nodes):

@@ -19,17 +19,18 @@ class Language:
 
 PYTHON = Language(
     {n: f"math.{n}" for n in ("sin", "cos", "tan", "sqrt", "exp", "log", "tanh", "sinh", "cosh", "atan2", "asin", "acos", "atan")}
-    | {"abs": "abs", "max": "max", "min": "min", "sign": "sign", "is_finite": "math.isfinite"},
+    | {"abs": "abs", "max": "max", "min": "min", "sign": "sign", "is_finite": "math.isfinite", "and": "and", "or": "or", "not": "not "},
     "    {name} = {value}",
     "({b} if {c} else {a})",
 )
 C = Language(
     {n: n for n in ("sin", "cos", "tan", "sqrt", "exp", "log", "tanh", "sinh", "cosh", "atan2", "asin", "acos", "atan")}
-    | {"abs": "fabs", "max": "fmax", "min": "fmin", "sign": "sign", "is_finite": "isfinite"},
+    | {"abs": "fabs", "max": "fmax", "min": "fmin", "sign": "sign", "is_finite": "isfinite", "and": "&&", "or": "||", "not": "!"},
     "    const double {name} = {value};",
     "({c} ? {b} : {a})",
 )
-_INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2), "lt": ("<", 0), "le": ("<=", 0), "gt": (">", 0), "ge": (">=", 0)}
+_COMPARED = {"lt": "<", "le": "<=", "gt": ">", "ge": ">=", "eq": "==", "ne": "!="}
+_INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2)} | {op: (sign, 0) for op, sign in _COMPARED.items()}
 
 
 def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], language: Language, prefix: str = "s") -> tuple[list[str], list[str]]:
@@ -66,7 +67,10 @@ def _expression(graph: Graph, node: int, written, language: Language) -> tuple[s
     if op in _INFIX:
         sign, level = _INFIX[op]
         left, right = written[args[0]], written[args[1]]
-        return f"{_inside(left, level)} {sign} {_inside(right, level + (op in ('sub', 'div', 'lt', 'le', 'gt', 'ge', 'mul')))}", level
+        return f"{_inside(left, level)} {sign} {_inside(right, level + (op != 'add'))}", level
+    if op in ("and", "or", "not"):
+        *first, last = (f"({written[a][0]})" for a in args)
+        return f"({' '.join(first)} {language.functions[op]} {last})" if first else f"({language.functions[op]}{last})", 9
     if op == "select":
         c, a, b = (written[x][0] for x in args)
         return language.select.format(c=c, a=a, b=b), 9
@@ -84,7 +88,8 @@ def sympy_expressions(graph: Graph, outputs: Sequence[int], names: Mapping[int, 
 
     functions: dict = {"abs": sympy.Abs, "max": sympy.Max, "min": sympy.Min, "select": lambda c, a, b: sympy.Piecewise((b, c), (a, True))}
     functions |= {"add": lambda a, b: a + b, "sub": lambda a, b: a - b, "mul": lambda a, b: a * b, "div": lambda a, b: a / b, "neg": lambda a: -a}
-    functions |= {"lt": sympy.Lt, "le": sympy.Le, "gt": sympy.Gt, "ge": sympy.Ge}
+    functions |= {"lt": sympy.Lt, "le": sympy.Le, "gt": sympy.Gt, "ge": sympy.Ge, "eq": sympy.Eq, "ne": sympy.Ne}
+    functions |= {"and": sympy.And, "or": sympy.Or, "not": sympy.Not}
     values: dict = {n: sympy.Symbol(name) for n, name in names.items()}
     for node in graph.needed(outputs, values):
         op = graph.op[node]
