@@ -14,8 +14,9 @@ from seen_differently import Seen, other_names, views
 import jourdain_jax as jj
 from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, present
 from jourdain_jax.equations import virtual_power as equations_module
+from jourdain_jax.equations.explicit_power import power_of_loads
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
-from jourdain_jax.equations.power import power, power_of_loads
+from jourdain_jax.equations.power import power
 from jourdain_jax.equations.probing import standing_in
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
 from jourdain_jax.equations.reactions import row_reactions

@@ -14,9 +14,9 @@ from tolerances import tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.equations.trace import named_values
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.lowering.trace import named_values
 from jourdain_jax.models import MODELS
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.scene.parameters import parameters_of

@@ -18,8 +18,8 @@ from baselines.hand_derived import HAND_DERIVED, operations
 import jourdain_jax as jj
 from jourdain_jax.equations.minimal import speeds_from_privileged
 from jourdain_jax.equations.power import needs_work
+from jourdain_jax.equations.trace import event_values
 from jourdain_jax.lowering import lower as module
-from jourdain_jax.lowering.trace import event_values
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion import lockstep, results
 from jourdain_jax.motion.simulate import state_form

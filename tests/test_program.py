@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jourdain_jax.program.derivative import derivatives
+from jourdain_jax.program.derivative import along, derivatives
 from jourdain_jax.program.emit import run, sine_and_cosine
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
@@ -250,3 +250,26 @@ def test_a_singular_matrix_run_uncompiled_gives_nan_as_jax_does():
     f = jax.vmap(jnp.linalg.cholesky)
     A = np.stack([np.eye(2), -np.eye(2)])
     np.testing.assert_array_equal(np.isnan(uncompiled(f)(A)), np.isnan(f(A)))
+
+
+def test_operations_of_two_nodes_are_compared_by_what_they_do_not_share():
+    generator = np.random.default_rng(1)
+    for _ in range(300):
+        graph = Graph()
+        nodes = [graph.input(f"x{i}", i > 0) for i in range(4)]
+        for _ in range(generator.integers(2, 40)):
+            op, (a, b) = str(generator.choice(["add", "sub", "mul", "div", "sin", "cos", "neg"])), generator.choice(nodes, 2).tolist()
+            nodes.append(graph.call(op, a) if op in ("sin", "cos", "neg") else graph.call(op, a, b))
+        a, b = generator.choice(nodes, 2).tolist()
+        assert graph.more_operations(a, b) == graph.operations([a]) - graph.operations([b])
+
+
+def test_derivatives_along_many_directions_are_those_along_each():
+    graph = Graph()
+    x, y, z = (graph.input(name, True) for name in "xyz")
+    inner = graph.mul(x, graph.call("sin", y))
+    outputs = [graph.add(inner, z), graph.div(inner, graph.add(graph.one, graph.mul(z, z))), graph.const(2.0)]
+    directions = {0: {x: graph.one, inner: y}, 1: {z: x, inner: graph.zero}, 2: {y: graph.one, inner: z}}
+    together = along(graph, outputs, directions)
+    for k, direction in directions.items():
+        assert [row.get(k, graph.zero) for row in together] == derivatives(graph, outputs, direction)

@@ -31,7 +31,11 @@ class PoseNumbers(eqx.Module):
 
 def pose_numbers(scene: Scene, t, q) -> PoseNumbers:
     """What the scene gives for its bodies and planes at (t, q)."""
-    pose = pose_at(scene, t, q)
+    return numbers_of(scene, pose_at(scene, t, q))
+
+
+def numbers_of(scene: Scene, pose: Pose) -> PoseNumbers:
+    """The same from known poses."""
     rigid = {name: body.body for name, body in pose.bodies.items() if isinstance(body.body, RigidBody)}
     return PoseNumbers(
         mass={name: body.mass for name, body in pose.bodies.items()},

@@ -14,18 +14,17 @@ load depends on inputs, these do the work dV_i/df . df/dt besides. It is found w
 Source: Wang and Pao (2003), eqs. (71)-(73).
 """
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at
+from jourdain_jax.equations.explicit_power import explicit_rate, forces_for_potentials, power_of_loads
+from jourdain_jax.equations.kinematics import inertias, motion_at
 from jourdain_jax.equations.probing import described_once
 from jourdain_jax.equations.reductions import Accelerations, Reduced
 from jourdain_jax.equations.structure import Structure, structure_of
-from jourdain_jax.equations.virtual_power import newton_residual, potential_energy, resultants
+from jourdain_jax.equations.virtual_power import newton_residual, potential_energy
 from jourdain_jax.scene.answers import loads_of
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
@@ -82,7 +81,7 @@ def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) 
         # lambda . (A u), which is lambda . phi = 0 for rows homogeneous and linear in u
         rows=accelerations.constraint_force @ motion.u.array if _rows_work(structure) else zero,
         driven=_power_of_drives(scene, motion, accelerations.udot) if structure.driven else zero,
-        potential=_explicit_rate(scene, motion, potential_energy) if structure.driven or "potential" in structure.timed else zero,
+        potential=explicit_rate(scene, motion, potential_energy) if structure.driven or "potential" in structure.timed else zero,
         inertia=_power_of_changing_inertia(scene, motion) if structure.varying_inertia else zero,
     )
 
@@ -92,34 +91,7 @@ def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Re
 
     `of_inputs`: numbers of the loads whose potential depends on inputs; what they store (`stored_by_inputs`) is added to the integral.
     """
-    return power(scene, motion, accelerations).total + _forces_for_potentials(scene, motion, of_inputs)
-
-
-def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
-    """Potential energy in J of the loads with the numbers `of_inputs`."""
-    loads = tuple(loads_of(scene, motion))
-    return sum((loads[k].potential for k in of_inputs), start=jnp.zeros_like(motion.t))
-
-
-def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
-    """The part of `rate_of_work` that needs no accelerations: of loads without a potential, of potentials that depend on time or on inputs; W."""
-    by_time = power_of_loads(scene, motion, conservative=False) + _explicit_rate(scene, motion, potential_energy)
-    return by_time + _forces_for_potentials(scene, motion, of_inputs)
-
-
-def _forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
-    if not of_inputs:
-        return jnp.zeros_like(motion.t)
-    stored = _explicit_rate(scene, motion, lambda scene, motion: stored_by_inputs(scene, motion, of_inputs))
-    return power_of_loads(scene, motion, among=of_inputs) - stored
-
-
-def power_of_loads(scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None) -> Float[Array, ""]:
-    """`sum F.v + L.omega + Q_k u_k` in W; only loads with (`conservative=True`) or without a potential (`False`), or with the numbers `among`."""
-    loads = resultants(scene, motion, conservative=conservative, among=among)
-    v = jnp.stack([body.velocity for body in motion.bodies.values()])
-    omega = jnp.stack([body.angular_velocity for body in motion.bodies.values()])
-    return jnp.sum(loads.force * v) + jnp.sum(loads.torque * omega) + loads.direct @ motion.u.array
+    return power(scene, motion, accelerations).total + forces_for_potentials(scene, motion, of_inputs)
 
 
 def _power_of_drives(scene: Scene, motion: Motion, udot) -> Float[Array, ""]:
@@ -129,18 +101,6 @@ def _power_of_drives(scene: Scene, motion: Motion, udot) -> Float[Array, ""]:
     at_rest = motion_at(scene, t, q, jnp.zeros_like(u), inputs).bodies.values()
     v, omega = jnp.stack([body.velocity for body in at_rest]), jnp.stack([body.angular_velocity for body in at_rest])
     return jnp.sum(total.linear * v) + jnp.sum(total.angular * omega)
-
-
-def _explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Float[Array, ""]:
-    """`dV/dt` of a `potential` with all poses held, and with coordinates moving only as they do at `u = 0`."""
-    q = motion.q.array
-    nu = coordinate_rates(scene, motion.t, q, jnp.zeros_like(motion.u.array))
-
-    def V(t, q):
-        held = eqx.tree_at(lambda m: (m.t, m.q.array), motion, (t, q))
-        return potential(scene, held)
-
-    return jax.jvp(V, (motion.t, q), (jnp.ones_like(motion.t), nu))[1]
 
 
 def _power_of_changing_inertia(scene: Scene, motion: Motion) -> Float[Array, ""]:

@@ -50,15 +50,15 @@ def probed_once(probe):
 
 
 def described_once(describe: Callable) -> Callable:
-    """A function of a scene whose answer depends on its class and the shapes of its parameters only: worked out once."""
+    """A function of a scene (and of what else tells its cases apart) that depends on its class and the shapes of its parameters only: worked out once."""
     known: dict = {}
 
     @wraps(describe)
-    def of(scene: Scene):
+    def of(scene: Scene, *case: Hashable):
         leaves, treedef = jax.tree.flatten(scene)
-        key = (treedef, tuple(np.shape(x) for x in leaves), jax.config.jax_enable_x64)
+        key = (treedef, tuple(np.shape(x) for x in leaves), jax.config.jax_enable_x64, case)
         if key not in known:
-            known[key] = describe(scene)
+            known[key] = describe(scene, *case)
         return known[key]
 
     return of

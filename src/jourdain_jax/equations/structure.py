@@ -11,20 +11,17 @@ from dataclasses import dataclass, field
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Float
 
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
-from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, pose_at, velocities
-from jourdain_jax.equations.plausibility import implausible, pose_numbers
-from jourdain_jax.equations.probing import on_numbers, probed_once, without_collecting
-from jourdain_jax.equations.projection import project_positions
-from jourdain_jax.equations.rows import names_of_rows, position_residual, velocity_residual
-from jourdain_jax.equations.sampling import assembled, miss_of_rows, random_states, symmetric_configurations
-from jourdain_jax.equations.scaling import row_scale, speed_scale
-from jourdain_jax.equations.virtual_power import mass_matrix_at, potential_energy, resultants
-from jourdain_jax.scene.answers import loads_of
+from jourdain_jax.equations.plausibility import implausible
+from jourdain_jax.equations.probed import TIMED, Probed, probed
+from jourdain_jax.equations.probed_on_graph import probed_on_graph
+from jourdain_jax.equations.probing import probed_once, without_collecting
+from jourdain_jax.equations.rows import names_of_rows
+from jourdain_jax.equations.sampling import assembled, random_states, symmetric_configurations
+from jourdain_jax.program.interpret import Unsupported
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.numbers import described, is_traced
@@ -33,7 +30,6 @@ from jourdain_jax.scene.scene import Scene
 RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
 LONG = 24  # dependent speeds: of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
-TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")
 _EXHAUSTIVE = 3000
 _SHORTLIST = 40
 
@@ -82,85 +78,38 @@ class Structure:
         return self.worst_pivot >= WELL_CONDITIONED * min(1.0, LONG / max(self.rank, 1))
 
 
-class _Probed(eqx.Module):
-    """What is looked at, at one state."""
+class _Scaled(eqx.Module):
+    """What decides ranks and pivots, at every probed state."""
 
-    A: Float[Array, "rows speeds"]  # scaled rows in scaled speeds
-    M: Float[Array, "speeds speeds"]  # in scaled speeds
-    c: Float[Array, "speeds"]  # scales of the speeds
-    curved: Bool[Array, ""]  # A depends on the speeds
-    inhomogeneous: Bool[Array, ""]  # phi does not vanish at u = 0
-    timed: dict[str, Bool[Array, ""]]
-    driven: Bool[Array, ""]
-    varying_inertia: Bool[Array, ""]
-    potentials_of_inputs: Bool[Array, "loads"]
-    q: Float[Array, "coordinates"]  # on the geometric rows
-    miss: Float[Array, ""]  # of the geometric rows
-    numbers: PyTree  # of bodies and planes, for their plausibility
+    A: Float[np.ndarray, "states rows speeds"]  # scaled rows in scaled speeds
+    M: Float[np.ndarray, "states speeds speeds"]  # in scaled speeds
+    c: Float[np.ndarray, "states speeds"]  # scales of the speeds
 
 
-@on_numbers
-def _probe(scene, t, q, u, u_other):
-    def one(t, q, u, u_other):
-        q = project_positions(scene, t, q)
-        inputs = jnp.linspace(0.5, 1.0, len(scene.inputs), dtype=q.dtype)  # generic, so that no term passes for absent
-        M = mass_matrix_at(scene, t, q)
-        A, A_other = (jax.jacfwd(lambda v: velocity_residual(scene, t, q, v, inputs))(v) for v in (u, u_other))
-        c = speed_scale(M)
-        eps, size = jnp.finfo(q.dtype).eps, 1 + jnp.max(jnp.abs(A), initial=0.0)
-        at_rest = jnp.zeros_like(u)
-        qdot, nu = coordinate_rates(scene, t, q, u), coordinate_rates(scene, t, q, at_rest)
-        return _Probed(
-            A=row_scale(A * c)[:, None] * A * c,
-            M=c[:, None] * M * c,
-            c=c,
-            curved=jnp.max(jnp.abs(A - A_other), initial=0.0) > jnp.sqrt(eps) * size,
-            # near round-off: work that turns out as zero does less harm than work left out
-            inhomogeneous=jnp.max(jnp.abs(velocity_residual(scene, t, q, at_rest, inputs)), initial=0.0) > 32 * eps * size,
-            timed=_timed(scene, t, q, u, inputs),
-            driven=_moves((velocities(scene, t, q, at_rest), nu)),
-            varying_inertia=_moves(jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), qdot))[1]),
-            potentials_of_inputs=_potentials_of_inputs(scene, t, q, u, inputs),
-            q=q,
-            miss=miss_of_rows(scene, t, q),
-            numbers=pose_numbers(scene, t, q),
-        )
-
-    return jax.vmap(one)(t, q, u, u_other)
+def _scaled(found: Probed) -> _Scaled:
+    diagonal = np.diagonal(found.M, axis1=1, axis2=2)
+    c = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1)), 1)
+    A = found.A * c[:, None]
+    length = np.sqrt(np.sum(A**2, axis=2, keepdims=True))
+    return _Scaled(A / np.where(length > 0, length, 1), c[:, :, None] * found.M * c[:, None], c)
 
 
-def _timed(scene: Scene, t, q, u, inputs) -> dict[str, Bool[Array, ""]]:
-    """What changes in time while coordinates, speeds and inputs are held; forces at held poses too."""
-    motion = motion_at(scene, t, q, u, inputs)
-
-    def pieces(t):
-        held = eqx.tree_at(lambda m: m.t, motion, t)
-        return {
-            "rows": (velocity_residual(scene, t, q, u, inputs), position_residual(scene, t, q)),
-            "poses": [(body.position, body.orientation) for body in pose_at(scene, t, q).bodies.values()],
-            "inertias": inertias(scene, t, q),
-            "coordinate rates": coordinate_rates(scene, t, q, u),
-            "loads": resultants(scene, held),
-            "potential": potential_energy(scene, held),
-        }
-
-    rates = jax.jvp(pieces, (t,), (jnp.ones_like(t),))[1]
-    return {name: _moves(rates[name]) for name in TIMED}
-
-
-def _potentials_of_inputs(scene: Scene, t, q, u, inputs) -> Bool[Array, "loads"]:
-    """Whether the potential of each load changes with the inputs."""
-
-    def potentials(inputs):
-        return [0.0 * t if load.potential is None else load.potential for load in loads_of(scene, motion_at(scene, t, q, u, inputs))]
-
-    rates = jax.jvp(potentials, (inputs,), (inputs**2,))[1]  # in a generic direction
-    return jnp.stack([_moves(rate) for rate in rates]) if rates else jnp.zeros(0, bool)
-
-
-def _moves(rates) -> Bool[Array, ""]:
+def _moves(rates) -> bool:
     """Whether any rate is a number other than zero."""
-    return jnp.any(jnp.stack([jnp.any(jnp.isfinite(x) & (x != 0)) for x in jax.tree.leaves(rates)]))
+    return any(bool(np.any(np.isfinite(x) & (x != 0))) for x in jax.tree.leaves(rates))
+
+
+def _exceeds(difference: np.ndarray, tolerance: float, A: np.ndarray) -> bool:
+    """Whether any entry exceeds `tolerance (1 + max |A|)` at its state."""
+    size = 1 + np.max(np.abs(A), axis=(1, 2), initial=0.0)
+    return bool(np.any(np.max(np.abs(difference), axis=tuple(range(1, difference.ndim)), initial=0.0) > tolerance * size))
+
+
+def _look(scene: Scene, *states) -> Probed:
+    try:
+        return probed_on_graph(scene, *states)
+    except Unsupported:
+        return probed(scene, *states)
 
 
 def structure_of(scene: Scene) -> Structure:
@@ -184,41 +133,42 @@ def _probed_structure(scene: Scene) -> Structure:
     t, q, u = random_states(scene, RANDOM_PROBES, np.random.default_rng(0))
     symmetric = symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
-    found = _probe(scene, t, q, u, -u[::-1])
+    found = _look(scene, t, q, u, -u[::-1])
     generic = np.arange(len(t)) < RANDOM_PROBES
     on_rows = assembled(scene, found.miss, generic)
     faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
-    usable = np.all(np.isfinite(found.A), axis=(1, 2)) & on_rows
+    scaled = _scaled(found)
+    usable = np.all(np.isfinite(scaled.A), axis=(1, 2)) & on_rows
     if not faults and not usable.any():
-        finite = np.isfinite(found.A).all(axis=2)[on_rows].any(axis=0)
+        finite = np.isfinite(scaled.A).all(axis=2)[on_rows].any(axis=0)
         named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "the rows together"
         faults = (f"rows {named} of `{type(scene).__name__}` are not finite at any probed state, expected numbers; check how they are computed",)
-    t, q, generic, found = jax.tree.map(lambda x: x[usable], (t, q, generic, found))
-    ranks = [_rank(A) for A in found.A]
+    t, q, generic, found, scaled = jax.tree.map(lambda x: x[usable], (t, q, generic, found, scaled))
+    ranks = [_rank(A) for A in scaled.A]
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     if not faults:  # a negative mass is named as such
-        _check_inertia(scene, jax.tree.map(lambda x: x[generic & (np.array(ranks) == rank)], found), rank)
+        _check_inertia(scene, jax.tree.map(lambda x: x[generic & (np.array(ranks) == rank)], scaled), rank)
     independent, by_user = _user_choice(scene, count - rank), True
-    candidates = found.A[[r == rank for r in ranks]]  # at isolated losses of rank no partition of generic size exists
+    candidates = scaled.A[[r == rank for r in ranks]]  # at isolated losses of rank no partition of generic size exists
     if independent is None:
         independent, by_user = _choose(candidates, count, rank), False
     pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
-    full_everywhere = all(r == rank for r in ranks)
+    full_everywhere, eps = all(r == rank for r in ranks), np.finfo(found.A.dtype).eps
     return Structure(
         row_names=names,
         rank=rank,
         ranks=tuple(ranks),
-        redundant_rows=_redundant_rows(found.A, ranks, names),
+        redundant_rows=_redundant_rows(scaled.A, ranks, names),
         rank_losses=tuple(_describe(scene, c) for c, r in zip(q, ranks, strict=True) if r < rank),
         independent=independent,
         worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
         typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
-        affine=not bool(found.curved.any()),
-        homogeneous=not bool(found.inhomogeneous.any()),
-        timed=tuple(name for name in TIMED if found.timed[name].any()),
-        driven=bool(found.driven.any()),
-        varying_inertia=bool(found.varying_inertia.any()),
-        potentials_of_inputs=tuple(np.flatnonzero(found.potentials_of_inputs.any(axis=0)).tolist()),
+        affine=not _exceeds(found.A - found.A_other, np.sqrt(eps), found.A),
+        homogeneous=not _exceeds(found.phi_at_rest, 32 * eps, found.A),  # near round-off: work that turns out as zero does less harm than work left out
+        timed=tuple(name for name in TIMED if _moves(found.timed[name])),
+        driven=_moves(found.motion_at_rest),
+        varying_inertia=_moves(found.inertia_rates),
+        potentials_of_inputs=tuple(k for k, rate in enumerate(found.potential_rates.T) if _moves(rate)),
         chosen_by_user=by_user,
         faults=faults,
         times=t,
@@ -234,7 +184,7 @@ def _rank(A: np.ndarray) -> int:
     return int(np.sum(sigma > rank_cutoff(A.dtype) * sigma[0]))
 
 
-def _check_inertia(scene: Scene, found: _Probed, rank: int) -> None:
+def _check_inertia(scene: Scene, found: _Scaled, rank: int) -> None:
     """Raise a ValueError that names the speeds along which the rows leave a motion free that no body's inertia resists, at every generic state."""
     moved = []
     for A, M, c in zip(found.A, found.M, found.c, strict=True):

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jourdain_jax.equations.structure import Structure
+from jourdain_jax.equations.trace import TracedScene, VelocityQuantities
 from jourdain_jax.lowering.elimination import eliminate, serves, solve_symmetric
 from jourdain_jax.lowering.multipliers import accelerations_by_multipliers, projected_coordinates, projected_speeds
-from jourdain_jax.lowering.trace import TracedScene, VelocityQuantities
-from jourdain_jax.program.derivative import derivatives
+from jourdain_jax.program.derivative import along, columns, derivatives
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
 
@@ -71,9 +71,7 @@ class Projection:
 class AppellOnGraph:
     """The construction for one scene."""
 
-    def __init__(
-        self, traced: TracedScene, structure: Structure, by_multipliers: bool, probes: Probes, reference: np.ndarray, quaternions: tuple[int, ...]
-    ):
+    def __init__(self, traced: TracedScene, structure: Structure, by_multipliers: bool, probes: Probes, reference: np.ndarray, quaternions: tuple[int, ...]):
         self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
         every, rows = range(len(traced.u)), [s for s, name in enumerate(structure.row_names) if name not in structure.redundant_rows]
         self.independent = list(every) if by_multipliers else list(structure.independent)
@@ -176,7 +174,7 @@ class AppellOnGraph:
         simple = (lambda nodes: list(nodes)) if forms is None else (lambda nodes: [forms.simplified(n) for n in nodes])
         phi = [int(at.phi[s]) for s in self.rows]
         phi = g.substituted(phi, self.probes.unaffected([*phi, *at.qdot.tolist()], kinematics.held))
-        A = [list(row) for row in zip(*(derivatives(g, phi, {n: g.one}) for n in u), strict=True)]
+        A = [list(row) for row in zip(*columns(g, phi, u), strict=True)]
         phi_0 = g.substituted(phi, dict.fromkeys(u, g.zero))
         y = {k: u[k] for k in self.independent}
 
@@ -246,7 +244,7 @@ class _Kinematics:
     # Explicit: the dependent speeds are put into the velocities, which are then differentiated.
 
     def _explicitly(self) -> None:
-        A = self._transposed([self._at(column) for column in self._by(self.phi, self.u)])
+        A = [list(row) for row in zip(*(self._at(column) for column in self._by(self.phi, self.u)), strict=True)]
         self._solve(A, self._at(self.graph.substituted(self.phi, dict.fromkeys(self.u, self.graph.zero))))
         unheld = self.known if not self.held else _Kinematics(self.build, self.forms, {}, True).known
         raw, simple = self._velocities(unheld)
@@ -270,16 +268,15 @@ class _Kinematics:
         put = self._cut(levels)
         self._put = put
 
-        def rows_along(direction):
-            return self._at(g.substituted(derivatives(g, self.phi, direction), put))
-
-        A = []
+        directions = {}
         for k, column in enumerate(by_speed):
             parts = self._parts(column)
             direction = self._cut([(at.v, parts[0]), (at.turning, turn(parts)), (at.orientation, None), (at.position, None)])
-            A.append(rows_along(direction | {self.u[k]: g.one}))
+            directions[k] = direction | {self.u[k]: g.one}
+        A = [[row.get(k, g.zero) for k in directions] for row in along(g, self.phi, directions)]
+        A = np.reshape(self._at(g.substituted([n for row in A for n in row], put)), (len(A), len(self.u))).tolist()
         phi_0 = self._at(g.substituted(self.phi, dict.fromkeys(self.u, g.zero)))
-        self._solve(self._transposed(A), phi_0)
+        self._solve(A, phi_0)
         parts = self._parts(at_fixed_speeds)
         spun = [
             [[g.sub(g.mul(w[i - 2], R[3 * (i - 1) + j]), g.mul(w[i - 1], R[3 * (i - 2) + j])) for j in range(3)] for i in range(3)]
@@ -287,7 +284,7 @@ class _Kinematics:
         ]
         direction = self._cut([(at.v, parts[0]), (at.turning, turn(parts)), (at.orientation, spun), (at.position, value[0])])
         moving = {int(n): r for n, r in zip(build.traced.q, qdot, strict=True)}
-        drift = rows_along(moving | direction | {build.traced.t: g.one})
+        drift = self._at(g.substituted(derivatives(g, self.phi, moving | direction | {build.traced.t: g.one}), put))
         put_z = {} if self.free_z else self.known
         known = lambda nodes: self._simple(g.substituted(nodes, put_z))  # noqa: E731
         drift, at_fixed_speeds = known(drift), known(at_fixed_speeds)
@@ -331,10 +328,7 @@ class _Kinematics:
 
     def _by(self, nodes, variables) -> list[list[int]]:
         """Derivatives, one list per variable."""
-        return [derivatives(self.graph, nodes, {v: self.graph.one}) for v in variables]
-
-    def _transposed(self, columns) -> list[list[int]]:
-        return [[column[s] for column in columns] for s in range(len(self.phi))]
+        return columns(self.graph, nodes, variables)
 
     def _turned(self, R, w) -> list[int]:
         return [self.graph.dot(R[3 * i : 3 * i + 3], w) for i in range(3)]

@@ -14,7 +14,7 @@ import numpy as np
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows
-from jourdain_jax.lowering.trace import TracedScene, velocity_quantities
+from jourdain_jax.equations.trace import TracedScene, velocity_quantities
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.interpret import Unsupported
@@ -57,6 +57,6 @@ def _differing(scene: Scene, traced: TracedScene, probes: Probes, limit: float, 
 def _by_jax(parameters, t, q, u, inputs, along):
     def one(scene, t, q, u, inputs):
         real = tuple(jnp.asarray(x, q.dtype) for x in along)
-        return jax.jvp(lambda t, q, u: velocity_quantities(scene, t, q, u, inputs, with_events=False), (t, q, u), real)
+        return jax.jvp(lambda t, q, u: velocity_quantities(scene, motion_at(scene, t, q, u, inputs), with_events=False), (t, q, u), real)
 
     return jax.vmap(one)(parameters, t, q, u, inputs)

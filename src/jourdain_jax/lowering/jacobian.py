@@ -12,7 +12,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from jourdain_jax.program.derivative import derivatives
+from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.interpret import Unsupported
@@ -74,8 +74,8 @@ def _entries(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> 
     if operations * len(variables) > LARGEST_WORK:
         return None
     try:
-        columns = [derivatives(graph, outputs, dict.fromkeys(variables, graph.zero) | {variable: graph.one}) for variable in variables]
+        rows = jacobian(graph, outputs, variables)
     except Unsupported:
         return None
-    entries = [(i, j, node) for j, column in enumerate(columns) for i, node in enumerate(column) if node != graph.zero]
+    entries = [(i, j, rows[i][n]) for j, n in enumerate(variables) for i in range(len(rows)) if n in rows[i]]
     return entries if graph.operations([*outputs, *(node for *_, node in entries)]) <= LARGEST_GROWTH * max(operations, 10) else None

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.equations.trace import TracedScene
 from jourdain_jax.lowering import export
 from jourdain_jax.lowering.jacobian import differentiable
 from jourdain_jax.lowering.recoverable import recoverable
-from jourdain_jax.lowering.trace import TracedScene
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.scene.scene import Scene

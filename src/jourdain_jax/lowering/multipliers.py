@@ -12,7 +12,7 @@ Accelerations lose as many digits as that square is small.
 from typing import NamedTuple
 
 from jourdain_jax.lowering.elimination import quotient, solve_symmetric
-from jourdain_jax.program.derivative import derivatives
+from jourdain_jax.program.derivative import columns
 from jourdain_jax.program.graph import Graph
 
 Columns = list[list[int]]
@@ -49,14 +49,14 @@ def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Colu
 
 def projected_coordinates(graph: Graph, q: list[int], closure: list[int]) -> list[int]:
     """One step of Gauss-Newton towards `closure = 0`."""
-    G = [list(row) for row in zip(*(derivatives(graph, closure, {n: graph.one}) for n in q), strict=True)]
+    G = [list(row) for row in zip(*columns(graph, closure, q), strict=True)]
     correction = solve_symmetric(graph, _products(graph, G, G), [closure]).solution[0]
     return [graph.sub(n, graph.total(graph.mul(row[k], c) for row, c in zip(G, correction, strict=True))) for k, n in enumerate(q)]
 
 
 def projected_speeds(graph: Graph, M: Columns, u: list[int], phi: list[int], forms=None) -> list[int]:
     """The speeds on `phi = 0`, nearest in the metric of M."""
-    A = [list(row) for row in zip(*(derivatives(graph, phi, {n: graph.one}) for n in u), strict=True)]
+    A = [list(row) for row in zip(*columns(graph, phi, u), strict=True)]
     impulses = solve_symmetric(graph, M, A).solution
     multipliers = solve_symmetric(graph, _products(graph, A, impulses, forms), [phi]).solution[0]
     return [graph.sub(n, graph.total(graph.mul(x[k], m) for x, m in zip(impulses, multipliers, strict=True))) for k, n in enumerate(u)]

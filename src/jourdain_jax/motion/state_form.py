@@ -13,14 +13,15 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.equations.accelerations import Baumgarte, bare_accelerations
+from jourdain_jax.equations.explicit_power import stored_by_inputs
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations, speeds_and_pivot, speeds_from_privileged
-from jourdain_jax.equations.power import rate_of_work, stored_by_inputs
+from jourdain_jax.equations.power import rate_of_work
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
 from jourdain_jax.equations.structure import WELL_CONDITIONED, Structure
+from jourdain_jax.equations.trace import event_values
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.lowering.trace import event_values
 from jourdain_jax.scene.scene import Scene
 
 

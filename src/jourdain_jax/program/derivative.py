@@ -1,6 +1,6 @@
 """Derivatives on the graph, by forward mode: nodes for the derivative of nodes along a direction given at some of them."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.interpret import Unsupported
@@ -18,6 +18,38 @@ def derivatives(graph: Graph, outputs: Iterable[int], direction: dict[int, int])
         else:
             tangent[node] = _derivative(graph, node, [tangent[a] for a in graph.args[node]])
     return [tangent[n] for n in outputs]
+
+
+def jacobian(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[dict[int, int]]:
+    """Of each output, its derivatives by the variables (nodes that are not looked into) on which it depends."""
+    return along(graph, outputs, {n: {n: graph.one} for n in variables})
+
+
+def along(graph: Graph, outputs: Iterable[int], directions: Mapping[int, Mapping[int, int]]) -> list[dict[int, int]]:
+    """Of each output, its derivatives along those named directions in which it changes, in one sweep; `directions[k][n]` is dn/ds in direction k.
+
+    Nodes in any direction are not looked into in any other.
+    """
+    outputs = list(outputs)
+    tangents: dict[int, dict[int, int]] = {}
+    for k, direction in directions.items():
+        for n, rate in direction.items():
+            tangents.setdefault(n, {})
+            if rate != graph.zero:
+                tangents[n][k] = rate
+    for node in graph.needed(outputs, ()):
+        if node not in tangents:
+            of_args = [tangents[a] for a in graph.args[node]]
+            moving = dict.fromkeys(k for tangent in of_args for k in tangent)
+            found = {k: _derivative(graph, node, [tangent.get(k, graph.zero) for tangent in of_args]) for k in moving}
+            tangents[node] = {k: rate for k, rate in found.items() if rate != graph.zero}
+    return [tangents[n] for n in outputs]
+
+
+def columns(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[list[int]]:
+    """Derivatives of all outputs by each variable: the columns of the Jacobian, zeros among them."""
+    variables, rows = list(variables), jacobian(graph, outputs, variables)
+    return [[row.get(n, graph.zero) for row in rows] for n in variables]
 
 
 def _derivative(graph: Graph, node: int, dots: list[int]) -> int:

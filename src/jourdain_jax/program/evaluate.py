@@ -13,13 +13,14 @@ class Probes:
     def __init__(self, graph: Graph, inputs: Mapping[str, np.ndarray]):
         self.graph, self.inputs = graph, dict(inputs)
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
-        self._values: dict[int, np.ndarray | float] = {}
+        self._row: dict[int, int] = {}  # of the table, by node
+        self._table = np.empty((256, self.count))
 
     def __call__(self, nodes: Iterable[int]) -> np.ndarray:
         """Values, shape (nodes, probes)."""
         nodes = list(nodes)
         self._compute(nodes)
-        return np.array([np.broadcast_to(self._values[n], self.count) for n in nodes], float).reshape(len(nodes), self.count)
+        return self._table[np.array([self._row[n] for n in nodes], int)]
 
     def with_inputs(self, changes: Mapping[str, np.ndarray]) -> "Probes":
         """The same probes with some inputs changed."""
@@ -42,22 +43,23 @@ class Probes:
         return {old: new for old, new in replacement.items() if unchanged(old, new)}
 
     def _compute(self, nodes) -> None:
-        graph, values = self.graph, self._values
-        stack, wanted = [n for n in nodes if n not in values], set()
-        while stack:
-            node = stack.pop()
-            if node not in wanted:
-                wanted.add(node)
-                stack.extend(a for a in graph.args[node] if a not in values and a not in wanted)
+        graph, row = self.graph, self._row
+        wanted = graph.needed(nodes, row)
+        if len(row) + len(wanted) > len(self._table):
+            longer = np.empty((2 * (len(row) + len(wanted)), self.count))
+            longer[: len(row)] = self._table[: len(row)]
+            self._table = longer
+        table = self._table
         with np.errstate(all="ignore"):
-            for node in sorted(wanted):
-                op = graph.op[node]
+            for node in wanted:
+                op, place = graph.op[node], len(row)
                 if op == "const":
-                    values[node] = graph.value[node]
+                    table[place] = graph.value[node]
                 elif op == "input":
-                    values[node] = self.inputs[graph.value[node]]
+                    table[place] = self.inputs[graph.value[node]]
                 else:
-                    values[node] = FUNCTIONS[op](*(values[a] for a in graph.args[node]))
+                    table[place] = FUNCTIONS[op](*(table[row[a]] for a in graph.args[node]))
+                row[node] = place
 
 
 FUNCTIONS: dict[str, Callable] = {

@@ -4,6 +4,7 @@ Folded: constants, 0 + x, 0 x, 1 x, signs (pulled outwards, so that a - (-b) = a
 Arguments of sums and products are ordered, so that a b and b a are one node.
 """
 
+import heapq
 import math
 import operator
 from collections.abc import Callable, Iterable, Mapping
@@ -249,6 +250,27 @@ class Graph:
     def operations(self, outputs: Iterable[int]) -> int:
         """How many operations on varying quantities the outputs need; expressions of parameters alone do not count."""
         return sum(self.varies[n] and self.op[n] in OPERATIONS for n in self.reachable(outputs))
+
+    def more_operations(self, a: int, b: int) -> int:
+        """How many more operations node a needs than node b: only what they do not share is looked at."""
+        if a == b:
+            return 0
+        needed_by, newest_first = {a: 1, b: 2}, [-max(a, b), -min(a, b)]
+        unshared, more = 2, 0
+        while unshared:  # nodes that wait and are needed by one of the two only
+            node = -heapq.heappop(newest_first)
+            who = needed_by[node]
+            if who != 3:
+                unshared -= 1
+                if self.varies[node] and self.op[node] in OPERATIONS:
+                    more += 1 if who == 1 else -1
+            for arg in self.args[node]:
+                before = needed_by.get(arg, 0)
+                if not before:
+                    heapq.heappush(newest_first, -arg)
+                needed_by[arg] = before | who
+                unshared += (needed_by[arg] != 3) - (before in (1, 2))
+        return more
 
 
 COMPARISONS: dict[str, Callable] = {name: getattr(operator, name) for name in ("lt", "le", "gt", "ge", "eq", "ne")}

@@ -55,7 +55,7 @@ class NormalForms:
             form = self.rebuilt(self.expanded(node))
         except TooLarge:
             return node
-        return form if self.graph.operations([form]) <= self.graph.operations([node]) else node
+        return form if self.graph.more_operations(form, node) <= 0 else node
 
     # expansion
 

@@ -5,6 +5,8 @@ g                                    geometric rows at the level of positions
 F, L (body axes), Q_direct, power    impressed forces
 m, I                                 inertias
 c                                    stop events
+
+The same graph serves probing (`probed_on_graph`) and lowering. What JAX traced is kept per class and shapes of the parameters.
 """
 
 from dataclasses import dataclass
@@ -14,15 +16,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Num
+from jaxtyping import Array, Float, Num, PyTree
 
+from jourdain_jax.equations.explicit_power import explicit_power
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, velocities_of
-from jourdain_jax.equations.power import explicit_power
+from jourdain_jax.equations.plausibility import PoseNumbers, numbers_of
+from jourdain_jax.equations.probing import described_once
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
-from jourdain_jax.equations.virtual_power import impressed
+from jourdain_jax.equations.virtual_power import impressed, potential_energy, resultants
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.interpret import Nodes, Unsupported, as_nodes, interpret
-from jourdain_jax.scene.answers import events_of
+from jourdain_jax.scene.answers import events_of, loads_of
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
@@ -49,9 +53,37 @@ class VelocityQuantities(eqx.Module):
     events: Num[Entries, "events"]  # sorted by name
 
 
-def velocity_quantities(scene: Scene, t, q, u, inputs, of_inputs: tuple[int, ...] = (), with_events: bool = True) -> VelocityQuantities:
+class Particulars(eqx.Module):
+    """What only probing looks at; arrays of numbers, or of nodes."""
+
+    numbers: PoseNumbers
+    potentials: Num[Entries, "loads"]  # of the loads; zero where a load has none
+    explicit: dict[str, PyTree]  # rates in time of loads and potentials while the motion is held
+
+
+def particulars_of(scene: Scene, motion: Motion) -> Particulars:
+    """The same on numbers."""
+    return Particulars(numbers_of(scene, motion.pose()), potentials_of(scene, motion), explicit_rates(scene, motion))
+
+
+def potentials_of(scene: Scene, motion: Motion) -> Float[Array, "loads"]:
+    """The potential of each load, zero where it has none."""
+    stored = [0.0 * motion.t if load.potential is None else load.potential for load in loads_of(scene, motion)]
+    return jnp.stack(stored) if stored else jnp.zeros(0, motion.q.array.dtype)
+
+
+def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
+    """Rates in time of loads and potentials while the motion, poses included, is held."""
+
+    def pieces(t):
+        held = eqx.tree_at(lambda m: m.t, motion, t)
+        return {"loads": resultants(scene, held), "potential": potential_energy(scene, held)}
+
+    return jax.jvp(pieces, (motion.t,), (jnp.ones_like(motion.t),))[1]
+
+
+def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...] = (), with_events: bool = True) -> VelocityQuantities:
     """The same on numbers; `of_inputs`: numbers of the loads whose potential depends on inputs."""
-    motion = motion_at(scene, t, q, u, inputs)
     velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion)
     return VelocityQuantities(
         velocities.linear,
@@ -61,8 +93,8 @@ def velocity_quantities(scene: Scene, t, q, u, inputs, of_inputs: tuple[int, ...
         jnp.stack([body.orientation for body in motion.bodies.values()]),
         weights.mass,
         weights.inertia,
-        flatten_rows(velocity_rows(scene, motion), q.dtype),
-        flatten_rows(position_rows(scene, motion.pose()), q.dtype),
+        flatten_rows(velocity_rows(scene, motion), motion.t.dtype),
+        flatten_rows(position_rows(scene, motion.pose()), motion.t.dtype),
         motion.qdot.array,
         loads.force,
         loads.torque,
@@ -89,38 +121,47 @@ class TracedScene:
     inputs: np.ndarray
     parameters: list[np.ndarray]  # nodes, one array per leaf of the scene
     at: VelocityQuantities
+    particulars: Particulars
 
 
 def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
-    """The scene as a graph, without its stop events where these alone cannot be; `Unsupported` where it cannot be.
+    """The scene as a new graph, without its stop events where these alone cannot be; `Unsupported` where it cannot be.
 
     `of_inputs`: numbers of the loads whose potential depends on inputs.
     """
     try:
-        return _traced(scene, of_inputs, True)
+        return _on_graph(scene, *_traced(scene, of_inputs, True))
     except Unsupported:
-        return _traced(scene, of_inputs, False)
+        return _on_graph(scene, *_traced(scene, of_inputs, False))
 
 
-def _traced(scene: Scene, of_inputs: tuple[int, ...], with_events: bool) -> TracedScene:
+@described_once
+def _traced(scene: Scene, of_inputs: tuple[int, ...], with_events: bool):
+    """A jaxpr of the scene's quantities, and their shapes."""
     leaves, treedef = jax.tree.flatten(scene)
     real = jnp.result_type(float)
     state = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),), (len(scene.inputs),))]
     numbers = [jax.ShapeDtypeStruct(np.shape(x), real) for x in leaves]
 
     def quantities(leaves, t, q, u, inputs):
-        return velocity_quantities(jax.tree.unflatten(treedef, leaves), t, q, u, inputs, of_inputs, with_events)
+        scene = jax.tree.unflatten(treedef, leaves)
+        motion = motion_at(scene, t, q, u, inputs)
+        return velocity_quantities(scene, motion, of_inputs, with_events), particulars_of(scene, motion)
 
     try:
-        closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
+        return jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
     except (ValueError, NotImplementedError) as error:  # the power of potentials takes a derivative of all loads, which nothing else may need
         raise Unsupported(f"a function that JAX cannot differentiate ({str(error).split('.')[0]})") from None
+
+
+def _on_graph(scene: Scene, closed, shape) -> TracedScene:
     graph = Graph()
-    parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(leaves)]
-    t, q, u, inputs = (_inputs(graph, name, s.shape, True) for name, s in zip("tqui", state, strict=True))
+    parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(jax.tree.leaves(scene))]
+    sizes = {"t": (), "q": (len(scene.coordinate_names),), "u": (len(scene.speed_names),), "i": (len(scene.inputs),)}
+    t, q, u, inputs = (_inputs(graph, name, size, True) for name, size in sizes.items())
     found = interpret(graph, closed, [Nodes(x) for x in (*parameters, t, q, u, inputs)])
-    at = jax.tree.unflatten(jax.tree.structure(shape), [as_nodes(graph, x) for x in found])
-    return TracedScene(graph, int(t), q, u, inputs, parameters, at)
+    at, particulars = jax.tree.unflatten(jax.tree.structure(shape), [as_nodes(graph, x) for x in found])
+    return TracedScene(graph, int(t), q, u, inputs, parameters, at, particulars)
 
 
 def _inputs(graph: Graph, name: str, shape, varies: bool) -> np.ndarray:

@@ -1,0 +1,59 @@
+"""The part of the power of the loads and of potentials that needs no accelerations and nothing that is found by probing.
+
+sum F.v + L.omega + Q_k u_k           loads without a potential
+dV/dt at fixed poses                  potentials that depend on time
+F_i.v + L_i.omega + Q_i u - dV_i/dt   loads whose potential depends on inputs, in place of that potential
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.virtual_power import potential_energy, resultants
+from jourdain_jax.scene.answers import loads_of
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.scene import Scene
+
+
+def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
+    """Potential energy in J of the loads with the numbers `of_inputs`."""
+    loads = tuple(loads_of(scene, motion))
+    return sum((loads[k].potential for k in of_inputs), start=jnp.zeros_like(motion.t))
+
+
+def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
+    """The part of `rate_of_work` that needs no accelerations: of loads without a potential, of potentials that depend on time or on inputs; W."""
+    by_time = power_of_loads(scene, motion, conservative=False) + explicit_rate(scene, motion, potential_energy)
+    return by_time + forces_for_potentials(scene, motion, of_inputs)
+
+
+def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
+    """Power in W of the loads `of_inputs` less the explicit rate of what they store."""
+    if not of_inputs:
+        return jnp.zeros_like(motion.t)
+    stored = explicit_rate(scene, motion, lambda scene, motion: stored_by_inputs(scene, motion, of_inputs))
+    return power_of_loads(scene, motion, among=of_inputs) - stored
+
+
+def power_of_loads(scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None) -> Float[Array, ""]:
+    """`sum F.v + L.omega + Q_k u_k` in W; only loads with (`conservative=True`) or without a potential (`False`), or with the numbers `among`."""
+    loads = resultants(scene, motion, conservative=conservative, among=among)
+    v = jnp.stack([body.velocity for body in motion.bodies.values()])
+    omega = jnp.stack([body.angular_velocity for body in motion.bodies.values()])
+    return jnp.sum(loads.force * v) + jnp.sum(loads.torque * omega) + loads.direct @ motion.u.array
+
+
+def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Float[Array, ""]:
+    """`dV/dt` of a `potential` with all poses held, and with coordinates moving only as they do at `u = 0`."""
+    q = motion.q.array
+    nu = coordinate_rates(scene, motion.t, q, jnp.zeros_like(motion.u.array))
+
+    def V(t, q):
+        held = eqx.tree_at(lambda m: (m.t, m.q.array), motion, (t, q))
+        return potential(scene, held)
+
+    return jax.jvp(V, (motion.t, q), (jnp.ones_like(motion.t), nu))[1]

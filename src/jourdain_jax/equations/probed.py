@@ -1,0 +1,76 @@
+"""What is looked at of a scene at each probed state, by JAX: for scenes that have no scalar form (the others: `probed_on_graph`)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PyTree
+
+from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, pose_at, velocities
+from jourdain_jax.equations.plausibility import PoseNumbers, pose_numbers
+from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.equations.projection import project_positions
+from jourdain_jax.equations.rows import position_residual, velocity_residual
+from jourdain_jax.equations.sampling import miss_of_rows
+from jourdain_jax.equations.trace import Entries, explicit_rates, potentials_of
+from jourdain_jax.equations.virtual_power import mass_matrix_at
+from jourdain_jax.scene.scene import Scene
+
+TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")
+
+
+class Probed(eqx.Module):
+    """At one state, or with a leading axis at all; trees have arrays as leaves."""
+
+    q: Float[Entries, "*states coordinates"]  # on the geometric rows
+    miss: Float[Entries, "*states"]  # of the geometric rows, infinite where not a number
+    A: Float[Entries, "*states rows speeds"]
+    A_other: Float[Entries, "*states rows speeds"]  # at other speeds
+    M: Float[Entries, "*states speeds speeds"]
+    phi_at_rest: Float[Entries, "*states rows"]  # at u = 0
+    motion_at_rest: PyTree  # velocities and coordinate rates at u = 0
+    timed: dict[str, PyTree]  # rates in time by `TIMED`, while coordinates, speeds and inputs are held (for loads and potentials: the motion)
+    inertia_rates: PyTree  # along the motion
+    potential_rates: Float[Entries, "*states loads"]  # of each load's potential, along a generic change of the inputs
+    numbers: PoseNumbers
+
+
+def generic_inputs(scene: Scene) -> np.ndarray:
+    """Values of inputs at which no term passes for absent."""
+    return np.linspace(0.5, 1.0, len(scene.inputs))
+
+
+@on_numbers
+def probed(scene: Scene, t, q, u, u_other) -> Probed:
+    """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`."""
+
+    def one(t, q, u, u_other):
+        q = project_positions(scene, t, q)
+        inputs = jnp.asarray(generic_inputs(scene), q.dtype)
+        A, A_other = (jax.jacfwd(lambda v: velocity_residual(scene, t, q, v, inputs))(v) for v in (u, u_other))
+        at_rest = jnp.zeros_like(u)
+        qdot, motion = coordinate_rates(scene, t, q, u), motion_at(scene, t, q, u, inputs)
+
+        def pieces(t):
+            poses = [(body.position, body.orientation) for body in pose_at(scene, t, q).bodies.values()]
+            rows = velocity_residual(scene, t, q, u, inputs), position_residual(scene, t, q)
+            return {"rows": rows, "poses": poses, "inertias": inertias(scene, t, q), "coordinate rates": coordinate_rates(scene, t, q, u)}
+
+        def potentials(inputs):
+            return potentials_of(scene, motion_at(scene, t, q, u, inputs))
+
+        return Probed(
+            q=q,
+            miss=miss_of_rows(scene, t, q),
+            A=A,
+            A_other=A_other,
+            M=mass_matrix_at(scene, t, q),
+            phi_at_rest=velocity_residual(scene, t, q, at_rest, inputs),
+            motion_at_rest=(velocities(scene, t, q, at_rest), coordinate_rates(scene, t, q, at_rest)),
+            timed=jax.jvp(pieces, (t,), (jnp.ones_like(t),))[1] | explicit_rates(scene, motion),
+            inertia_rates=jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), qdot))[1],
+            potential_rates=jax.jvp(potentials, (inputs,), (inputs**2,))[1],
+            numbers=pose_numbers(scene, t, q),
+        )
+
+    return jax.vmap(one)(t, q, u, u_other)

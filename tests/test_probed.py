@@ -1,0 +1,61 @@
+"""What is looked at of a scene is the same by its scalar graph and by JAX's own derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+import jourdain_jax as jj
+from jourdain_jax.equations.probed import TIMED, probed
+from jourdain_jax.equations.probed_on_graph import probed_on_graph
+from jourdain_jax.equations.sampling import random_states, symmetric_configurations
+from jourdain_jax.equations.structure import structure_of
+
+MODELS = ["skate", "tilting-disc-quaternion", "ball-on-turntable", "snakeboard", "rattleback", "double-pendulum-rods", "isokinetic-particle", "trailer-chain"]
+
+
+class Swinging(jj.Scene):
+    """A bead on a wire that turns, is lifted, grows in time and hangs on a spring whose other end is an input."""
+
+    mass: Float[Array, ""] = jj.parameter(2.0)
+    coordinates = jj.coordinates("s")
+    inputs = jj.inputs("end")
+
+    def bodies(self, t, q):
+        place = jnp.stack([q.s * jnp.cos(0.3 * t), q.s * jnp.sin(0.3 * t), t**2])
+        return {"bead": jj.Particle(self.mass * (1 + 0.1 * t), place)}
+
+    def loads(self, motion):
+        return (jj.spring(motion["bead"].point(), jj.fixed_point(jnp.stack([motion.inputs.end, 1.0, 0.0])), 3.0 + jnp.sin(motion.t), 0.1),)
+
+
+@pytest.mark.parametrize("scene", [jj.models.MODELS[name]() for name in MODELS] + [Swinging()], ids=[*MODELS, "swinging"])
+def test_probing_on_the_graph_agrees_with_jax(scene):
+    t, q, u = random_states(scene, 6, np.random.default_rng(0))
+    symmetric = symmetric_configurations(scene)[:4]
+    states = np.append(t, np.zeros(len(symmetric))), np.concatenate([q, symmetric]), np.concatenate([u, u[: len(symmetric)]])
+    expected, found = probed(scene, *states, -states[2]), probed_on_graph(scene, *states, -states[2])
+    for name in ("q", "miss", "A", "A_other", "M", "phi_at_rest", "potential_rates"):
+        one, other = getattr(expected, name), getattr(found, name)
+        np.testing.assert_allclose(other, one, rtol=1e-11, atol=1e-11 * (1 + np.max(np.abs(one), initial=0.0)), err_msg=name)
+    for name in TIMED:
+        assert _moves(expected.timed[name]) == _moves(found.timed[name]), name
+    assert _moves(expected.motion_at_rest) == _moves(found.motion_at_rest)
+    assert _moves(expected.inertia_rates) == _moves(found.inertia_rates)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11), expected.numbers, found.numbers)
+
+
+def test_the_structure_of_a_scene_without_a_scalar_form_is_found_by_jax():
+    class Called(jj.models.MODELS["chaplygin-sleigh"]):
+        def loads(self, motion):
+            friction = jax.pure_callback(lambda u: -0.1 * u, jax.ShapeDtypeStruct((), motion.t.dtype), motion.u.heading_rate, vmap_method="expand_dims")
+            return (jj.generalized_force(motion, heading_rate=jax.lax.stop_gradient(friction)),)
+
+    expected, found = structure_of(jj.models.MODELS["chaplygin-sleigh"]()), structure_of(Called())
+    assert (found.rank, found.independent, found.row_names) == (expected.rank, expected.independent, expected.row_names)
+    assert found.worst_pivot == pytest.approx(expected.worst_pivot, abs=1e-12)
+
+
+def _moves(rates) -> bool:
+    return any(bool(np.any(np.isfinite(x) & (x != 0))) for x in jax.tree.leaves(rates))
