@@ -214,7 +214,7 @@ def _lean(setup: Setup, y0, args, ts, rates, project, events) -> Solved:
         shortest=_shortest(setup.t0, setup.t1),
         max_steps=options.max_steps,
     )
-    kind: Literal["lax", "checkpointed"] = "lax" if isinstance(options.adjoint, diffrax.ForwardMode) else "checkpointed"
+    kind: Literal["forward", "reverse"] = "forward" if isinstance(options.adjoint, diffrax.ForwardMode) else "reverse"
     goals = jnp.concatenate([ts, setup.t1[None]])
     ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, setup.t0, goals, options.dt0, kind)
     return Solved(ts, jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h)
