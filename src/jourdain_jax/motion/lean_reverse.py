@@ -20,9 +20,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jourdain_jax.motion import results
+from jourdain_jax.motion import lean_adjoint, results
 from jourdain_jax.motion.event_search import MOST_STEPS
-from jourdain_jax.motion.lean_step import RUNNING, Method, Problem, Progress, advanced, begun, chosen, replayed, running
+from jourdain_jax.motion.lean_step import RUNNING, Method, Problem, Progress, advanced, begun, chosen, running
 
 STEPS_ALONE, STEPS_TOGETHER = 2048, 512  # of a window: for one motion, for lanes in lockstep
 SPARE = 4  # this part of a window is left free, for the steps that it takes when it is integrated again
@@ -147,9 +147,9 @@ def _gone_back(residuals, cotangents, perturbed, moving, control, forward, metho
     if events is not None:
         g, g_events = _back_from_event(end, located, g, (differentiable, by_events), (fixed, fixed_events))
 
-    def step(t_0, t_1, y, differentiable):
+    def problem_of(differentiable):
         rates, project, args = eqx.combine(differentiable, fixed)
-        return replayed(replace(problem, rates=rates, project=project, args=args), method, t_0, t_1, y)
+        return replace(problem, rates=rates, project=project, args=args)
 
     def past_goals(g: _Cotangents, first, count) -> _Cotangents:
         """At a state where the goals number `first` to `count - 1` were reached."""
@@ -160,24 +160,24 @@ def _gone_back(residuals, cotangents, perturbed, moving, control, forward, metho
 
         return replace(g, y=jax.lax.while_loop(lambda carry: carry[1] > first, add, (g.y, count))[0])
 
-    def back(carry):
+    def step_back(carry):
         i, window, g = carry
         k = window.goal[i - 1]
         g = past_goals(g, k, window.goal[i])
         t_0, t_1, y = _at(window.t, i - 1), _at(window.t, i), _at(window.y, i - 1)
         idle = t_0 == t_1
-        _, pull = jax.vjp(step, t_0, t_1, y, differentiable)
-        by_t_0, by_t_1, by_y, by_shared = pull(_where(idle, jax.tree.map(jnp.zeros_like, g.y), g.y))
-        at_end = jnp.where(idle, g.t, g.t + by_t_1)
+        moving = _where(idle, jax.tree.map(jnp.zeros_like, g.y), g.y)
+        gone = lean_adjoint.back(problem_of, differentiable, method, t_0, t_1, y, moving)
+        at_end = jnp.where(idle, g.t, g.t + gone.t_1)
         # the end of a step is a number, but where it is a time that was asked for
         asked = (t_1 == goals[k]) & ~(located & (t_1 == end.t))
         by_goals = g.goals.at[k].add(jnp.where(asked, at_end, 0))
-        t = jnp.where(idle, jnp.where(asked, 0, at_end), by_t_0)
-        return i - 1, window, _Cotangents(t, _where(idle, g.y, by_y), jax.tree.map(jnp.add, g.shared, by_shared), by_goals)
+        t = jnp.where(idle, jnp.where(asked, 0, at_end), gone.t_0)
+        return i - 1, window, _Cotangents(t, _where(idle, g.y, gone.y), jax.tree.map(jnp.add, g.shared, gone.shared), by_goals)
 
     def window_back(carry):
         number, window, g = carry
-        _, _, g = jax.lax.while_loop(lambda carry: carry[0] > 0, back, (window.last, window, g))
+        _, _, g = jax.lax.while_loop(lambda carry: carry[0] > 0, step_back, (window.last, window, g))
         g = past_goals(g, record.beginnings.goal[number], window.goal[0])
         window, arrived = _again(replace(problem, events=None), method, record.beginnings, number - 1, window, goals, jnp.sign(goals[-1] - t0))
         return number - 1, window, replace(g, y=_where(arrived, g.y, jax.tree.map(lambda y: jnp.full_like(y, jnp.nan), g.y)))
@@ -227,8 +227,7 @@ def _back_from_event(end: Progress, located, g: _Cotangents, differentiable, fix
     f = rates(end.t, end.y, args)
     _, rate = jax.jvp(lambda t, y: chosen(end.event, events(t, y, args)), (end.t, end.y), (jnp.ones_like(end.t), f))
     usable = located & (rate != 0) & jnp.isfinite(rate)
-    weighed = [jnp.sum(g * f, axis=tuple(range(g.ndim - end.t.ndim))) for g, f in zip(jax.tree.leaves(g.y), jax.tree.leaves(f), strict=True)]
-    by_value = jnp.where(usable, -(g.t + sum(weighed)) / jnp.where(usable, rate, 1.0), 0.0)
+    by_value = jnp.where(usable, -(g.t + lean_adjoint.product(g.y, f, end.t.ndim)) / jnp.where(usable, rate, 1.0), 0.0)
 
     def value(y, differentiable):
         (_, _, args), events = eqx.combine(differentiable, fixed)

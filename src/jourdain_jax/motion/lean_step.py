@@ -90,12 +90,6 @@ def advanced(problem: Problem, method: Method, p: Progress, goal, last_goal, dir
     return jax.tree.map(lambda new, old: jnp.where(moving, new, old), _tried(problem, method, p, goal, last_goal, direction), p)
 
 
-def replayed(problem: Problem, method: Method, t_0, t_1, y: PyTree) -> PyTree:
-    """The state at `t_1` after one step from `y` at `t_0`."""
-    y, _ = _stages(problem, method, t_0, y, t_1 - t_0)
-    return y if problem.project is None else problem.project(t_1, y, problem.args)
-
-
 def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direction) -> Progress:
     locating = jnp.array(False) if p.search is None else p.code == LOCATING
     rest = jnp.abs(goal - p.t)
@@ -104,8 +98,8 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     shortened = size < p.h
     h = direction * size if p.search is None else jnp.where(locating, p.search.shift, direction * size)
     t1 = jnp.where(lands, goal, p.t + h)
-    y1, slopes = _stages(problem, method, p.t, p.y, h)
-    error = jax.tree.map(lambda k: _as(h, k) * _weighted(method.b_error, k), slopes)
+    y1, slopes, _ = stages(problem, method, p.t, p.y, h)
+    error = jax.tree.map(lambda k: as_in(h, k) * weighted(method.b_error, k), slopes)
     first_slope = jax.tree.map(lambda k: k[0], slopes)
     if problem.project is not None:
         y1 = problem.project(t1, y1, problem.args)
@@ -119,13 +113,13 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     accepted, rejected = p.accepted + (accept & ~locating).astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
     code = jnp.where(next_h < problem.shortest, results.STEP_TOO_SMALL, RUNNING)
     code = jnp.where((code == RUNNING) & (accepted + rejected >= problem.max_steps) & ~(accept & (t1 == last_goal)), results.MAX_STEPS, code).astype(jnp.int32)
-    y = jax.tree.map(lambda new, old: jnp.where(accept, _as(new, old), old), y1, p.y)
+    y = jax.tree.map(lambda new, old: jnp.where(accept, as_in(new, old), old), y1, p.y)
     moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, accepted, rejected, p.event, p.search)
     return moved if problem.events is None else _watched(problem, p, moved, h, first_slope, accept)
 
 
-def _stages(problem: Problem, method: Method, t, y: PyTree, h) -> tuple[PyTree, PyTree]:
-    """y_1, and the slopes of all stages (leading axis)."""
+def stages(problem: Problem, method: Method, t, y: PyTree, h) -> tuple[PyTree, PyTree, PyTree]:
+    """y_1; the slopes of all stages, and the states at which they were taken (leading axis)."""
     leaves, treedef = jax.tree.flatten(y)
 
     def stage(carried, row):
@@ -133,23 +127,23 @@ def _stages(problem: Problem, method: Method, t, y: PyTree, h) -> tuple[PyTree, 
         at, slopes = carried
         c, i, next_A = row
         found = jax.tree.leaves(problem.rates(t + c * h, treedef.unflatten(at), problem.args))
-        slopes = [jax.lax.dynamic_update_index_in_dim(k, _as(f, k), i, 0) for k, f in zip(slopes, found, strict=True)]
-        return ([y + _as(h, y) * _weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes), None
+        slopes = [jax.lax.dynamic_update_index_in_dim(k, as_in(f, k), i, 0) for k, f in zip(slopes, found, strict=True)]
+        return ([y + as_in(h, y) * weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes), at
 
     count = len(method.c) - (method.last_is_next_first and method.b_error[-1] == 0)  # a last stage that nothing else needs
     rows = (jnp.asarray(method.c[:count]), jnp.arange(count), jnp.asarray([*method.A[1:count], method.b]))
     slopes = [jnp.zeros((len(method.c), *y.shape), y.dtype) for y in leaves]
-    (y_1, slopes), _ = jax.lax.scan(stage, (leaves, slopes), rows)
-    return treedef.unflatten(y_1), treedef.unflatten(slopes)
+    (y_1, slopes), at = jax.lax.scan(stage, (leaves, slopes), rows)
+    return treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at)
 
 
-def _weighted(weights, slopes: Float[Array, "stages *shape"]) -> Float[Array, "*shape"]:
+def weighted(weights, slopes: Float[Array, "stages *shape"]) -> Float[Array, "*shape"]:
     """sum_j w_j k_j, element by element."""
     used = [j for j in range(len(slopes)) if isinstance(weights, jax.Array) or weights[j] != 0]
-    return sum((_as(weights[j], slopes) * slopes[j] for j in used[1:]), start=_as(weights[used[0]], slopes) * slopes[used[0]])
+    return sum((as_in(weights[j], slopes) * slopes[j] for j in used[1:]), start=as_in(weights[used[0]], slopes) * slopes[used[0]])
 
 
-def _as(x, like) -> Array:
+def as_in(x, like) -> Array:
     """In the precision of the state: time keeps its own."""
     return jnp.asarray(x, like.dtype)
 
@@ -171,7 +165,7 @@ def _watched(problem: Problem, p: Progress, moved: Progress, h, first_slope, acc
     # the last, vanishing, shift is along the slope
     found = locating & (search.left == 0)
     t = jnp.where(found, moved.t + search.shift, moved.t)
-    y = jax.tree.map(lambda y, f: jnp.where(found, y + _as(search.shift, y) * f, y), moved.y, first_slope)
+    y = jax.tree.map(lambda y, f: jnp.where(found, y + as_in(search.shift, y) * f, y), moved.y, first_slope)
     code = jnp.where(happened, LOCATING, jnp.where(found, results.EVENT, jnp.where(locating, LOCATING, moved.code))).astype(jnp.int32)
     return Progress(t, y, jnp.where(locating, p.h, moved.h), code, moved.accepted, moved.rejected, event, search)
 
