@@ -27,7 +27,7 @@ from jourdain_jax.motion.lean_step import RUNNING, Method, Problem, Progress, ad
 STEPS_ALONE, STEPS_TOGETHER = 2048, 512  # of a window: for one motion, for lanes in lockstep
 SPARE = 4  # this part of a window is left free, for the steps that it takes when it is integrated again
 _MEMORY = 2**27, 2**30  # bytes of a window and of the beginnings of all, at most where lanes are many,
-_FEWEST = 64, 256  # but so many steps and windows
+_FEWEST = 16, 256  # but so many steps and windows
 
 
 class _Window(eqx.Module):
@@ -129,12 +129,12 @@ def _recorded(perturbed, moving, control, forward, method):
     (end, record), (ys, reached) = jax.lax.scan(to_goal, (start, empty), jnp.arange(len(goals), dtype=jnp.int32))
     record = replace(record, window=record.window.towards(jnp.asarray(len(goals), jnp.int32)))
     end = replace(end, search=None)
-    return (ys, reached, end), (record, end)
+    return (ys, reached, end), (record, reached, end)
 
 
 @_motion.def_bwd
 def _gone_back(residuals, cotangents, perturbed, moving, control, forward, method):
-    record, end = residuals
+    record, reached, end = residuals
     shared, events, y0, t0, goals = moving
     problem = _problem(moving, control)
     g_ys, _, g_end = cotangents
@@ -145,6 +145,10 @@ def _gone_back(residuals, cotangents, perturbed, moving, control, forward, metho
     g = _Cotangents(g_t, g_y, jax.tree.map(jnp.zeros_like, differentiable), jnp.zeros_like(goals))
     located = (end.code == results.EVENT) & (end.accepted > 0)
     if events is not None:
+        # what was not reached repeats the state at the event
+        repeats = located & ~reached
+        g = replace(g, y=jax.tree.map(lambda y, at: y + jnp.sum(_on_states(repeats, at), axis=0), g.y, g_ys))
+        g_ys = jax.tree.map(lambda at: _on_states(~repeats, at), g_ys)
         g, g_events = _back_from_event(end, located, g, (differentiable, by_events), (fixed, fixed_events))
 
     def problem_of(differentiable):
@@ -250,7 +254,8 @@ def _empty(start: Progress, max_steps: int) -> _Record:
         return jax.tree.map(lambda x: jnp.zeros((count, *jnp.shape(x)), jnp.result_type(x)), tree)
 
     zero = jnp.zeros((), jnp.int32)
-    window = _Window(*room(length, (start.t, start.y, zero)), zero).added(start, zero, restart=True)
+    t, y, goal = room(length, (start.t, start.y, zero))
+    window = _Window(t, y, goal, zero).added(start, zero, restart=True)
     beginning = _Beginnings(start.t, start.y, start.h, zero)
     return _Record(window, _put(room(windows + 1, beginning), 0, beginning), zero)
 
@@ -261,6 +266,11 @@ def _at(tree, i):
 
 def _put(tree, i, values):
     return jax.tree.map(lambda x, value: jax.lax.dynamic_update_index_in_dim(x, jnp.asarray(value, x.dtype), i, 0), tree, values)
+
+
+def _on_states(chosen: Bool[Array, "times *lanes"], x: Float[Array, "times *shape"]):
+    """x of those that are chosen, zero elsewhere."""
+    return jnp.where(jnp.expand_dims(chosen, tuple(range(1, 1 + x.ndim - chosen.ndim))), x, 0)
 
 
 def _where(chosen, a, b):
