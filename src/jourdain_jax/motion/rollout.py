@@ -20,7 +20,15 @@ from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.radau import RadauIIA
 from jourdain_jax.motion.simulate import (
-    MOST_STEPS, TOLERANCE, default_solver, fallen_back, lost_codes, may_be_another_form, set_up, state_form, warn_float32,
+    MOST_STEPS,
+    TOLERANCE,
+    default_solver,
+    fallen_back,
+    lost_codes,
+    may_be_another_form,
+    set_up,
+    state_form,
+    warn_float32,
 )  # fmt: skip
 from jourdain_jax.motion.solver_choice import may_be_full
 from jourdain_jax.motion.span import check_span, saved_times
