@@ -11,7 +11,7 @@ from jourdain_jax.motion import lean_loop, results
 GRAVITY = 9.81
 
 
-def stopped(y0, value, *, rates, longest=2.0, solver=None, kind="lax", lanes=(), max_steps=500):
+def stopped(y0, value, *, rates, longest=2.0, solver=None, kind="forward", lanes=(), max_steps=500):
     """Where a motion from `y0` at t = 0 stopped; `value(t, y)` of the one event."""
     real = lambda x: jnp.full(lanes, x)  # noqa: E731
     problem = lean_loop.Problem(
@@ -48,7 +48,7 @@ def test_a_fall_is_located_with_derivatives_up_to_the_third(solver):
 
 def test_the_state_at_an_event_has_the_same_derivative_in_reverse_mode():
     def landing(height):
-        return stopped(jnp.stack([height, 0.0 * height]), lambda t, y: y[0], rates=falling, kind="checkpointed").y
+        return stopped(jnp.stack([height, 0.0 * height]), lambda t, y: y[0], rates=falling, kind="reverse").y
 
     speed = np.sqrt(2 * GRAVITY * 2.0)
     np.testing.assert_allclose(landing(2.0), [0.0, -speed], atol=1e-13)
@@ -82,5 +82,5 @@ def test_lanes_stop_each_at_its_own_event_and_the_steps_to_it_do_not_count():
     np.testing.assert_array_equal(lanes.code, [results.EVENT] * 3 + [results.SUCCESS])
     np.testing.assert_allclose(lanes.t[:3], np.sqrt(2 * heights[:3] / GRAVITY), rtol=1e-13)
     np.testing.assert_array_equal(lanes.accepted, [int(end.accepted) for end in alone])
-    few = stopped(y0[:, 1], lambda t, y: y[0], rates=falling, kind="checkpointed", max_steps=int(alone[1].accepted) + 1)
+    few = stopped(y0[:, 1], lambda t, y: y[0], rates=falling, kind="reverse", max_steps=int(alone[1].accepted) + 1)
     np.testing.assert_allclose(few.t, np.sqrt(2 / GRAVITY), rtol=1e-13)

@@ -357,6 +357,22 @@ def test_values_computed_together_are_the_same_and_have_the_same_derivatives():
     np.testing.assert_allclose(jax.hessian(lambda x: both(x)[0])(0.7), -2 * np.sin(0.7), rtol=1e-14)
 
 
+def test_rates_mapped_over_states_are_linearised_inside_jit():
+    """A rate that is the same in all lanes (a skate has one) has no axis of lanes, by itself and in the rule of differentiation."""
+    scene = MODELS["skate"]()
+    program = jj.lower(scene)
+    fixed, (_, q, u) = program.fixed_values(scene), jj.sample_states(scene, 3)
+    y = u[:, np.array(program.independent)]
+
+    def rates(y):
+        return program.rates(fixed, 0.0, tuple(q[0]), tuple(y), jnp.zeros(0))[:2]
+
+    values, slope = jax.linearize(jax.jit(jax.vmap(rates)), y)
+    for along, (value, expected) in ((y, jax.jvp(jax.vmap(rates), (y,), (y,))), (2 * y, jax.jvp(jax.vmap(rates), (y,), (2 * y,)))):
+        for a, b in zip(jax.tree.leaves((values, slope(along))), jax.tree.leaves((value, expected)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-14)
+
+
 def test_loops_over_steps_are_compiled_into_one_function():
     """Ten times the time per step hangs on it."""
     assert lockstep.loops_are_single_functions()

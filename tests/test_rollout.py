@@ -93,3 +93,23 @@ def test_wrong_lanes_are_refused_by_name(starts, parameters, sentence):
 def test_a_lane_that_does_not_exist_is_refused(sleighs):
     with pytest.raises(IndexError, match="lane 7 does not exist; this rollout has 7 lanes"):
         sleighs[2].lane(7)
+
+
+def test_another_tolerance_first_step_or_end_is_no_other_program():
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: compiled.append(event) if event.endswith("backend_compile_duration") else None)
+    spins = {"lean": 0.3, "spin_rate": np.linspace(-6.0, -3.0, 3)}
+
+    def ends(t1, **options):
+        return jj.rollout(TiltingDisc(), spins, t1=t1, ts=t1 * jnp.array([0.5, 1.0]), **options).lanes
+
+    loose = ends(1.0, rtol=1e-7, atol=1e-7, dt0=1e-3)
+    same = ends(1.0)
+    compiled.clear()
+    tight, longer = ends(1.0, rtol=1e-10, atol=1e-10), ends(1.5, rtol=1e-7)
+    np.testing.assert_allclose(ends(1.0, rtol=1e-7, atol=1e-7, dt0=2e-2).q_end, loose.q_end, rtol=1e-5)
+    assert not compiled
+    assert np.all(tight.accepted > same.accepted)
+    assert np.all(same.accepted > loose.accepted)
+    np.testing.assert_allclose(tight.q_end, loose.q_end, rtol=1e-5)
+    np.testing.assert_allclose(longer.t_end, 1.5)

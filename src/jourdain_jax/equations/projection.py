@@ -2,7 +2,7 @@
 
     q <- q - G+ g(q),  G = dg/dq               u <- u - M^-1 A' (A M^-1 A')+ phi(u)
 
-Each is iterated a fixed number of times, so that it can be differentiated in any mode; the iteration converges quadratically, and its
+Each is iterated until nothing changes any more, in a way that can be differentiated in any mode; the iteration converges quadratically, and its
 derivative with it. Unit norms of quaternions count as position rows here.
 """
 
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
+from jourdain_jax.calculus.settling import settled
 from jourdain_jax.equations.reductions import cholesky
 from jourdain_jax.equations.rows import names_of_position_rows, position_residual, velocity_residual
 from jourdain_jax.equations.scaling import row_scale, speed_scale
@@ -25,20 +26,20 @@ def closure_residual(scene: Scene, t, q) -> Float[Array, "closures"]:
 
 
 def project_positions(scene: Scene, t, q: Float[Array, "coordinates"], *, free: Bool[Array, "coordinates"] | None = None, iterations: int = 25):
-    """Coordinates on the geometric rows, near q; only coordinates that are `free` move."""
+    """Coordinates on the geometric rows, near q; only coordinates that are `free` move. At most so many `iterations`."""
     if jax.eval_shape(lambda s, q: closure_residual(s, 0.0, q), scene, q).shape[0] == 0:
         return q
     if free is None and not names_of_position_rows(scene):
         return _normalised(scene, q)
     free = jnp.ones(q.shape, bool) if free is None else free
 
-    def step(q, _):
+    def step(q):
         residual, G = closure_residual(scene, t, q), jax.jacfwd(lambda q: closure_residual(scene, t, q))(q)
         G = jnp.where(free, G, 0.0)
         d = row_scale(G)
-        return q - pseudo_inverse(d[:, None] * G) @ (d * residual), None
+        return q - pseudo_inverse(d[:, None] * G) @ (d * residual)
 
-    return jax.lax.scan(step, q, length=iterations)[0]
+    return settled(step, q, iterations)
 
 
 def miss_of_rows(scene: Scene, t, q) -> Float[Array, ""]:
@@ -71,11 +72,11 @@ def project_speeds(
     M = jnp.where(free[:, None] & free, c[:, None] * M * c, jnp.eye(u.shape[0], dtype=u.dtype))
     L, _ = cholesky(M)  # the identity where M is singular: then nearest in the scaled speeds
 
-    def step(u, _):
+    def step(u):
         phi, A = velocity_residual(scene, t, q, u, inputs), jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
         weighted = jax.scipy.linalg.solve_triangular(L, jnp.where(free, A * c, 0.0).T, lower=True).T  # A L'^-1
         d = row_scale(weighted)
         x = pseudo_inverse(d[:, None] * weighted, cutoff) @ (d * phi)
-        return u - jnp.where(free, c * jax.scipy.linalg.solve_triangular(L.T, x, lower=False), 0.0), None
+        return u - jnp.where(free, c * jax.scipy.linalg.solve_triangular(L.T, x, lower=False), 0.0)
 
-    return jax.lax.scan(step, u, length=iterations)[0]
+    return settled(step, u, iterations)

@@ -219,7 +219,7 @@ def _lean(setup: Setup, y0, args, ts, rates, project, events) -> Solved:
         max_steps=options.max_steps,
         unseen=LargestError(setup.form.recovered) if setup.form.recovered else None,
     )
-    kind: Literal["lax", "checkpointed"] = "lax" if isinstance(options.adjoint, diffrax.ForwardMode) else "checkpointed"
+    kind: Literal["forward", "reverse"] = "forward" if isinstance(options.adjoint, diffrax.ForwardMode) else "reverse"
     goals = jnp.concatenate([ts, setup.t1[None]])
     ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, setup.t0, goals, options.dt0, kind)
     unseen = jnp.zeros_like(end.h) if end.unseen is None else end.unseen

@@ -16,12 +16,12 @@ from tqdm import tqdm
 from jourdain_jax.equations.probing import standing_in
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.motion import results
+from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.fallbacks import changed_options, fallen_back, lost_codes, next_way
 from jourdain_jax.motion.integration import integrate_lanes
-from jourdain_jax.motion.simulate import MOST_STEPS, set_up, state_form
+from jourdain_jax.motion.simulate import MOST_STEPS, TOLERANCE, default_solver, set_up, state_form, warn_float32
 from jourdain_jax.motion.span import check_span, saved_times
 from jourdain_jax.motion.start import State
-from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.motion.state_form import StateForm
 from jourdain_jax.motion.stiff import OUT_OF_STEPS
 from jourdain_jax.motion.trajectory import Trajectory
@@ -139,14 +139,14 @@ def rollout(
         options["ts"] = saved_times(options["ts"])
     _check_span_of_lanes(starts, options)
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, fixed, varied, parameters))):
-        return Rollout(_together(scene, fixed, options, varied, parameters))  # being differentiated or batched: one piece, no host loop
+        return Rollout(_together(scene, fixed, _with_arrays(options), varied, parameters))  # being differentiated or batched: one piece, no host loop
     pieces = []
     sound = _sound_lane(scene, parameters)
     bar = tqdm(total=count, unit="lane", disable=not (count > chunk if progress is None else progress))
     for first in range(0, count, chunk):
         index = np.minimum(np.arange(first, first + chunk), count - 1)  # the last chunk is filled up with copies of its last lane
         with standing_in(sound):
-            piece = _together(scene, fixed, options, *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+            piece = _together(scene, fixed, _with_arrays(options), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
         kept = min(chunk, count - first)
         pieces.append(jax.tree.map(lambda x, kept=kept: np.asarray(x)[:kept], piece))
         bar.update(kept)
@@ -160,7 +160,7 @@ def rollout(
             for first in range(0, len(chosen), chunk):
                 index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
                 with standing_in(sound):
-                    new = _together(scene, fixed, changed, *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+                    new = _together(scene, fixed, _with_arrays(changed), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
                 lanes, ways[way] = _replaced(lanes, fallen_back(new, way), index), tuple(getattr(new, name) for name in WAYS)
     continued = np.flatnonzero(np.asarray(lanes.fallback) & results.FULL_STATE)
     return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(continued.tolist()), tuple(sorted(ways.items())))
@@ -223,11 +223,21 @@ def _together(scene, fixed, options, varied, parameters) -> Trajectory:
 
     def lane(varied, parameters):
         own = scene.replace(**parameters) if parameters else scene
-        at_start = {"t0": _first_time(options), "inputs": options.get("inputs")}
-        start = varied if isinstance(varied, State) else consistent_start(own, **at_start, **fixed, **varied)
-        return set_up(own, start, **options)
+        return set_up(own, varied if isinstance(varied, State) else {**fixed, **varied}, **options)
 
     return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
+
+
+def _with_arrays(options: dict) -> dict:
+    """Options with their numbers as arrays: another tolerance, first step or end is no other program."""
+    options = {"rtol": TOLERANCE, "atol": TOLERANCE} | options
+    numbers = {name: options[name] for name in ("rtol", "atol", "dt0", "t1") if options.get(name) is not None}
+    check_options(**{name: value for name, value in numbers.items() if name != "t1"})
+    if options.get("solver") is None:
+        options["solver"] = default_solver(options["rtol"])
+    real = jnp.result_type(float)
+    warn_float32(real, options["rtol"])
+    return options | {name: checked_real(value, f"`{name}`", ()).astype(real) for name, value in numbers.items()}
 
 
 def _first_time(options: dict):

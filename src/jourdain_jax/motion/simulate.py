@@ -9,6 +9,7 @@ import warnings
 
 import diffrax
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 
@@ -35,10 +36,12 @@ from jourdain_jax.motion.state_form import StateForm, cutoff_of, default_reducti
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 
 _STATE_FORMS = ("auto", "minimal", "full")
-MOST_STEPS = 100_000
+TOLERANCE, MOST_STEPS = 1e-8, 100_000
+_OFF = 1e4  # units of round-off: a residual that is more
 
 
 def simulate(
@@ -49,8 +52,8 @@ def simulate(
     t1: Number | None = None,
     ts=None,
     saveat: diffrax.SaveAt | None = None,
-    rtol: Number = 1e-8,
-    atol: Number = 1e-8,
+    rtol: Number = TOLERANCE,
+    atol: Number = TOLERANCE,
     solver: diffrax.AbstractSolver | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     dt0: Number | None = None,
@@ -80,7 +83,7 @@ def simulate(
       rtol >= 1e-6, Dopri8 below, and where these run out of steps on a stiff motion, `RadauIIA`; structure-preserving ones (`ImplicitMidpoint`,
       `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps of at most `dt0` between saved times.
       Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`
-      for forward mode of any order; `diffrax.DirectAdjoint()` for all. Beyond 4096 steps (512 in batches) at rtol < 1e-11, prefer forward mode.
+      for forward mode of any order; `diffrax.DirectAdjoint()` for all.
     - `state`: "minimal" (q and privileged speeds), "full" (q and u) or "auto"; `reduction`: as in `accelerations`.
     - `projection`: put the state back onto the constraints after each step, where the state form does not keep them by itself.
     - `stabilisation`: Baumgarte terms, for comparison; `inputs`: name -> number, function of time, or `Sampled`.
@@ -134,9 +137,9 @@ def _set_up(
     inputs = as_inputs(scene, inputs)
     start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs)
     form = fitted(solver, scene, state_form(scene, structure_of(scene), state, reduction, stabilisation, projection, work, lowering), state)
-    _warn_float32(start.q.dtype, rtol)
+    warn_float32(start.q.dtype, rtol)
     options = Options(
-        solver=(diffrax.Tsit5() if rtol >= 1e-6 else diffrax.Dopri8()) if solver is None else solver,
+        solver=default_solver(rtol) if solver is None else solver,
         controller=stepsize_controller,
         tolerances=(jnp.asarray(rtol, start.q.dtype), jnp.asarray(atol, start.q.dtype)),  # arrays: another tolerance is no other program
         dt0=_first_step(solver, dt0, t0, t1),  # diffrax's own guess costs two more copies of the vector field to compile
@@ -172,15 +175,28 @@ def _check_adjoint(adjoint) -> None:
 
 
 def _on_constraints(scene: Scene, t0, start: State, inputs, made_here: bool) -> State:
-    """The start on the constraints, with how far it has moved from what was given."""
-    state = consistent(scene, t0, start.q, start.u, inputs)
+    """The start on the constraints, with how far it has moved from what was given; one made here is there already, unless what was given kept it off."""
+
+    def moved_again(start: State) -> State:
+        state = consistent(scene, t0, start.q, start.u, inputs)
+        moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
+        return eqx.tree_at(lambda s: (s.moved_q, s.moved_u), state, tuple(moved))
+
     if not made_here:
-        return state
-    moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
-    return eqx.tree_at(lambda s: (s.moved_q, s.moved_u), state, tuple(moved))
+        return consistent(scene, t0, start.q, start.u, inputs)
+    off = start.residual > _OFF * jnp.finfo(start.q.dtype).eps
+    if is_traced(off):
+        return jax.lax.cond(eqxi.unvmap_any(off), moved_again, lambda start: start, start)
+    return moved_again(start) if off else start
 
 
-def _warn_float32(dtype, rtol) -> None:
+def default_solver(rtol: Number) -> diffrax.AbstractERK:
+    """The solver for this tolerance."""
+    return diffrax.Tsit5() if rtol >= 1e-6 else diffrax.Dopri8()
+
+
+def warn_float32(dtype, rtol) -> None:
+    """A warning where the precision does not hold the tolerance."""
     if dtype == jnp.float32 and not isinstance(rtol, jax.core.Tracer) and rtol < 1e-5:
         warnings.warn(
             f"rtol = {rtol} asks for more digits than float32 has; set jax.config.update('jax_enable_x64', True), or loosen rtol and atol to 1e-5",

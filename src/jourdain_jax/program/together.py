@@ -30,9 +30,12 @@ def _transpose(cotangents, *_):
 
 
 def _batched(values, axes):
-    lanes = next(x.shape[axis] for x, axis in zip(values, axes, strict=True) if axis is not None)
-    first = [jnp.broadcast_to(x, (lanes, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(values, axes, strict=True)]
-    return together_p.bind(*first), [0] * len(first)
+    # what is the same in all lanes stays so: a rule of differentiation must not give it an axis that the values by themselves do not have
+    alike = together(tuple(x for x, axis in zip(values, axes, strict=True) if axis is None))
+    lanes = together(tuple(jnp.moveaxis(x, axis, 0) for x, axis in zip(values, axes, strict=True) if axis is not None))
+    found = {None: iter(alike), 0: iter(lanes)}
+    new_axes = [None if axis is None else 0 for axis in axes]
+    return [next(found[axis]) for axis in new_axes], new_axes
 
 
 together_p = Primitive("together")

@@ -149,6 +149,7 @@ _ENTRYWISE: dict[str, Callable] = {
     "copy": lambda x: x,
     "copy_p": lambda x: x,
     "stop_gradient": lambda x: x,
+    "unvmap_any": np.any,
     "convert_element_type": lambda x: x,
 }
 del _ENTRYWISE["select"]
