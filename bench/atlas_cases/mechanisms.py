@@ -1,4 +1,4 @@
-"""Why a method fails, in one line each: the usual reason of every method, unless a case gives its own."""
+"""Why a method fails, in one line each: the usual reason of every method, unless a case gives its own, for the method or for its group."""
 
 from atlas_cases.case import Case
 from atlas_cases.methods import Method
@@ -39,6 +39,36 @@ USUAL = {
 }
 
 
+REGULAR = ("Schur, Cholesky", "KKT, LU", "pinv, 1e-10", "raw SVD basis", "raw QR basis")  # naive accelerations that are right where rows are independent
+ENGINE = ("engine", "reductions", "constraints", "integrators")
+STEPPED = dict.fromkeys(REGULAR, "its accelerations are right here; fixed steps of fourth order add up their truncation, and the motion amplifies it")
+UNPROJECTED = dict.fromkeys(REGULAR, "its accelerations are right here; rows hold for accelerations only, and nothing takes the drift off them back")
+NEAR_FLAT = dict.fromkeys(ENGINE, "round-off of the attitude counts 1/theta^2: the disc turns round a little lower, or not before the stop event")
+
+# Of a case, or of all cases of one number: method or group -> why it fails there.
+BY_CASE: dict[str, dict[str, str]] = {
+    "E1": {"fixed partition": "ydot = xdot tan(heading): division by cos(heading), which passes zero"},
+    "E1 disc": {"fixed partition": "rolldot = xdot / (R cos(heading)): division by zero at 90 degrees"},
+    "E2": STEPPED,
+    "E5": dict.fromkeys(
+        ("qr", "svd", "kkt", "udwadia-kalaba", "constraints", "integrators"),
+        "near parallel rows accelerations carry round-off over the smallest singular value: there no step meets a tight tolerance",
+    ),
+    "E6": {"naive": "it goes on where no motion does: what would stop the body at once is cut off, softened, or divided by round-off"},
+    "E8": dict.fromkeys(ENGINE, "the second row differs from the first by the angle: of the order of round-off, no cut-off can tell the rank")
+    | dict.fromkeys(("privileged", "gibbs-appell"), "every partition has a pivot of the size of the angle: too small to count as independent"),
+    "E9": UNPROJECTED,
+    "E11": dict.fromkeys(ENGINE, "one freedom becomes three: near there accelerations carry round-off over the distance to the singular configuration")
+    | {"naive": "one freedom becomes three: round-off chooses the branch on which it goes on"},
+    "E12": STEPPED,
+    "E12 angles": {"naive": "fixed steps across infinite rates of angles, to wherever their length puts it"},
+    "E13 ball": STEPPED,
+    "E14": NEAR_FLAT | {"naive": "fixed steps as long as the swing through the flat position"},
+    "E14 Euler": {"naive": "it goes on where the disc lies flat and no motion does"},
+    "E24": {"naive": "at rest the row has no slope, and whatever force comes out is made up"},
+}
+
+
 def mechanism(case: Case, method: Method, outcome: Outcome) -> str:
     """One line: why it failed, and what it said itself."""
     if outcome.outcome == RIGHT:
@@ -47,5 +77,6 @@ def mechanism(case: Case, method: Method, outcome: Outcome) -> str:
         return outcome.flag
     if case.flag_is_right and outcome.outcome == FLAGGED:
         return f"{case.reason} [{outcome.flag}]"
-    own = case.mechanisms.get(method.name, USUAL.get(method.name, ""))
+    here = BY_CASE.get(case.name, BY_CASE.get(case.name.split()[0], {}))
+    own = next((here[key] for key in (method.name, method.group) if key in here), USUAL[method.name])
     return " ".join(part for part in (own, f"[{outcome.flag}]" if outcome.flag else "") if part)
