@@ -12,8 +12,8 @@ USUAL = {
     "ridge 1e-6": "a regularised row is a soft row: it yields by 1e-6 of its multiplier, all the time",
     "raw SVD basis": "the factorisation assumes a rank and its derivative divides by differences of singular values",
     "raw QR basis": "without pivoting, dependent rows leave a wrong null space; the derivative divides by zero for rows along the axes",
-    "speeds in SVD basis": "LAPACK returns another rotation or sign of the basis at each call: speeds in it jump",
-    "speeds in QR basis": "signs of Householder vectors flip, and the basis with them: speeds in it jump",
+    "speeds in SVD basis": "LAPACK returns another rotation or sign of the basis at each call: speeds jump; their rate, by a difference, has half the digits",
+    "speeds in QR basis": "signs of Householder vectors flip, and the basis with them: speeds jump; their rate, by a difference, has half the digits",
     "no projection": "rows hold for accelerations only: round-off and truncation of velocities and positions are never taken back",
     "Baumgarte 5/s": "violations decay at a rate that has nothing to do with the motion, and their forces do work",
     "Baumgarte 1e4/s": "a pole at -1e4/s that the motion does not have: the step is bound to it",
@@ -41,9 +41,13 @@ USUAL = {
 
 REGULAR = ("Schur, Cholesky", "KKT, LU", "pinv, 1e-10", "raw SVD basis", "raw QR basis")  # naive accelerations that are right where rows are independent
 ENGINE = ("engine", "reductions", "constraints", "integrators")
-STEPPED = dict.fromkeys(REGULAR, "its accelerations are right here; fixed steps of fourth order add up their truncation, and the motion amplifies it")
-UNPROJECTED = dict.fromkeys(REGULAR, "its accelerations are right here; rows hold for accelerations only, and nothing takes the drift off them back")
-NEAR_FLAT = dict.fromkeys(ENGINE, "round-off of the attitude counts 1/theta^2: the disc turns round a little lower, or not before the stop event")
+STEPPED = dict.fromkeys(
+    (*REGULAR, "fixed partition"), "its accelerations are right here; fixed steps of fourth order add up their truncation, and the motion amplifies it"
+)
+UNPROJECTED = dict.fromkeys(REGULAR, "its accelerations are right here; rows hold for accelerations only, and nothing takes the drift off them back") | {
+    "fixed partition": "its speeds meet the rows; positions and norms of quaternions drift, and nothing takes that back"
+}
+NEAR_FLAT = dict.fromkeys(ENGINE, "round-off of the attitude counts 1/theta^2: the steps shrink, or the disc runs into its stop event")
 
 # Of a case, or of all cases of one number: method or group -> why it fails there.
 BY_CASE: dict[str, dict[str, str]] = {
@@ -59,11 +63,11 @@ BY_CASE: dict[str, dict[str, str]] = {
     | dict.fromkeys(("privileged", "gibbs-appell"), "every partition has a pivot of the size of the angle: too small to count as independent"),
     "E9": UNPROJECTED,
     "E11": dict.fromkeys(ENGINE, "one freedom becomes three: near there accelerations carry round-off over the distance to the singular configuration")
-    | {"naive": "one freedom becomes three: round-off chooses the branch on which it goes on"},
+    | {"naive": "one freedom becomes three: digits are lost near there, and round-off may choose the branch on which it goes on"},
     "E12": STEPPED,
     "E12 angles": {"naive": "fixed steps across infinite rates of angles, to wherever their length puts it"},
-    "E13 ball": STEPPED,
-    "E14": NEAR_FLAT | {"naive": "fixed steps as long as the swing through the flat position"},
+    "E13 ball": UNPROJECTED,
+    "E14": NEAR_FLAT | {"naive": "fixed steps too long for the swing through the flat position"},
     "E14 Euler": {"naive": "it goes on where the disc lies flat and no motion does"},
     "E24": {"naive": "at rest the row has no slope, and whatever force comes out is made up"},
 }
