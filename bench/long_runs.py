@@ -192,15 +192,17 @@ def draw(found: dict, path: Path) -> None:
                     axis.loglog(ts[1:], worst, color=colours[row.method], ls="--" if row.method in EXPLICIT else "-", lw=1.6)
         left.set_ylabel(f"{name}\nrelative error")
         left.set_title("energy", fontsize=10)
-        right.set_title(f"integral: {_integral(name)}", fontsize=10)
-        right.set_ylabel("error")
+        if _integral(name) is None:
+            right.set_axis_off()
+        else:
+            right.set(ylabel="error", xlabel="t (s)")
+            right.set_title(f"integral: {_integral(name)}", fontsize=10)
+            right.tick_params(labelbottom=True)
         for axis in (left, right):
             axis.grid(alpha=0.3)
             axis.set_ylim(1e-17, 10)
-        if rows[0][0].integral is None:
-            right.set_axis_off()
-    for axis in axes[-1]:
-        axis.set_xlabel("t (s)")
+        left.set_xlabel("t (s)")
+        left.tick_params(labelbottom=True)
     handles = [plt.Line2D([], [], color=colour, ls="--" if name in EXPLICIT else "-", lw=1.6) for name, colour in colours.items()]
     labels = [name if name in METHODS else f"{name}, at most the cost of midpoint" for name in colours]
     figure.legend(handles, labels, loc="upper center", ncol=3, frameon=False)
@@ -208,7 +210,7 @@ def draw(found: dict, path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def _integral(problem: str) -> str:
+def _integral(problem: str) -> str | None:
     return next(p.integral for p in PROBLEMS if p.name == problem)
 
 

@@ -47,6 +47,10 @@ STEPPED = dict.fromkeys(
 UNPROJECTED = dict.fromkeys(REGULAR, "its accelerations are right here; rows hold for accelerations only, and nothing takes the drift off them back") | {
     "fixed partition": "its speeds meet the rows; positions and norms of quaternions drift, and nothing takes that back"
 }
+PARALLEL = dict.fromkeys(
+    ("qr", "svd", "kkt", "udwadia-kalaba", "constraints", "integrators"),
+    "near parallel rows accelerations carry round-off over the smallest singular value: there no step meets a tight tolerance",
+)
 NEAR_FLAT = dict.fromkeys(ENGINE, "round-off of the attitude counts 1/theta^2: the steps shrink, or the disc runs into its stop event")
 
 # Of a case, or of all cases of one number: method or group -> why it fails there.
@@ -54,10 +58,8 @@ BY_CASE: dict[str, dict[str, str]] = {
     "E1": {"fixed partition": "ydot = xdot tan(heading): division by cos(heading), which passes zero"},
     "E1 disc": {"fixed partition": "rolldot = xdot / (R cos(heading)): division by zero at 90 degrees"},
     "E2": STEPPED,
-    "E5": dict.fromkeys(
-        ("qr", "svd", "kkt", "udwadia-kalaba", "constraints", "integrators"),
-        "near parallel rows accelerations carry round-off over the smallest singular value: there no step meets a tight tolerance",
-    ),
+    "E5": PARALLEL,
+    "E5 gradient": PARALLEL | {"rollout": "inside a derivative no lane can be run again with the full state"},
     "E6": {"naive": "it goes on where no motion does: what would stop the body at once is cut off, softened, or divided by round-off"},
     "E8": dict.fromkeys(ENGINE, "the second row differs from the first by the angle: of the order of round-off, no cut-off can tell the rank")
     | dict.fromkeys(("privileged", "gibbs-appell"), "every partition has a pivot of the size of the angle: too small to count as independent"),
@@ -69,6 +71,9 @@ BY_CASE: dict[str, dict[str, str]] = {
     "E13 ball": UNPROJECTED,
     "E14": NEAR_FLAT | {"naive": "fixed steps too long for the swing through the flat position"},
     "E14 Euler": {"naive": "it goes on where the disc lies flat and no motion does"},
+    "E18": dict.fromkeys((*REGULAR, "no projection"), "accelerations hold a violation constant: a velocity off its row stays off")
+    | dict.fromkeys(("fixed partition", "speeds in SVD basis", "speeds in QR basis"), "it drops the part off the row, but not M-orthogonally: another motion"),
+    "E19": {"Baumgarte 5/s": "backwards in time the terms drive violations apart, at 5/s"},
     "E24": {"naive": "at rest the row has no slope, and whatever force comes out is made up"},
 }
 
