@@ -51,7 +51,7 @@ PARALLEL = dict.fromkeys(
     ("qr", "svd", "kkt", "udwadia-kalaba", "constraints", "integrators"),
     "near parallel rows accelerations carry round-off over the smallest singular value: there no step meets a tight tolerance",
 )
-NEAR_FLAT = dict.fromkeys(ENGINE, "round-off of the attitude counts 1/theta^2: the steps shrink, or the disc runs into its stop event")
+NEAR_FLAT = dict.fromkeys(ENGINE, "errors of the attitude count 1/theta^2: the swing ends elsewhere, steps shrink, or the disc runs into its stop event")
 
 # Of a case, or of all cases of one number: method or group -> why it fails there.
 BY_CASE: dict[str, dict[str, str]] = {

@@ -105,16 +105,15 @@ def _in_words(cell) -> str:
 
 
 def _reasons(cells) -> Iterator[str]:
-    """Every mechanism once, without a method's own words (in brackets), with the method and the cases in which it was the reason."""
-    yield from ("## Why methods fail", "", "| method | mechanism | cases |", "|---|---|---|")
-    found: dict[tuple[str, str], list[str]] = {}
+    """Every mechanism once, without a method's own words (in brackets), with the methods and the cases for which it was the reason."""
+    yield from ("## Why methods fail", "", "| mechanism | methods | cases |", "|---|---|---|")
+    found: dict[str, tuple[dict, dict]] = {}
     for cell in cells:
         if cell["outcome"] not in (RIGHT, NOT_APPLICABLE):
-            cases = found.setdefault((cell["method"], cell["mechanism"].partition(" [")[0]), [])
-            cases += [cell["case"]] if cell["case"] not in cases else []
-    order = list(dict.fromkeys(cell["method"] for cell in cells))
-    for (method, mechanism), cases in sorted(found.items(), key=lambda item: order.index(item[0][0])):
-        yield f"| {method} | {mechanism} | {', '.join(cases)} |"
+            methods, cases = found.setdefault(cell["mechanism"].partition(" [")[0], ({}, {}))
+            methods[cell["method"]] = cases[cell["case"]] = None
+    for mechanism, (methods, cases) in found.items():
+        yield f"| {mechanism} | {', '.join(methods)} | {', '.join(cases)} |"
 
 
 def summary(cells: list[dict]) -> str:
