@@ -31,7 +31,6 @@ ADJOINTS: dict[str, Callable[[], diffrax.AbstractAdjoint]] = {
     "direct adjoint": diffrax.DirectAdjoint,
     "backsolve adjoint": diffrax.BacksolveAdjoint,
 }
-FEWER_STEPS = {"float64": 20_000, "float32": 5_000}  # for the reductions on the full state: a step takes a hundred times as long as one of the default
 STABILISED = {"no projection": 0.0, "Baumgarte 5/s": 5.0, "Baumgarte 1e4/s": 1e4}  # rates; one program serves all
 
 
@@ -85,8 +84,7 @@ class Method:
 
 
 def _by_reduction(name: str) -> Method:
-    options = lambda scene: {"state": "full", "reduction": reduction(scene, name), "max_steps": FEWER_STEPS[jnp.result_type(float).name]}  # noqa: E731
-    return Method(name, "reductions", options, reduction=name)
+    return Method(name, "reductions", lambda scene: {"state": "full", "reduction": reduction(scene, name)}, reduction=name)
 
 
 def _stabilised(name: str, rate: float) -> Method:
