@@ -1,8 +1,9 @@
 """The atlas of where methods fail: hard cases E1 to E24, every method, float64 and float32.
 
     python bench/atlas.py [--quick] [--json FILE] [--out DIR] [--case NAME ...] [--method NAME ...] [--cache DIR]
+    python bench/atlas.py --redraw FILE --out DIR
 
-Writes a list of {"case", "method", "dtype", "outcome", "error", "tolerance", "mechanism"}, a table (CSV and Markdown) and a picture (PNG and SVG).
+Writes a list of {"case", "method", "dtype", "outcome", "error", "tolerance", "mechanism"}, tables (CSV and Markdown) and a picture (PNG and SVG).
 The engine as it comes is the method `default`. Each floating-point type runs in a process of its own: JAX chooses it once.
 """
 
@@ -63,10 +64,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="seven cases")
     parser.add_argument("--json", type=Path, help="file for the list of cells")
-    parser.add_argument("--out", type=Path, help="folder for the picture and the table")
+    parser.add_argument("--out", type=Path, help="folder for the picture and the tables")
     parser.add_argument("--case", nargs="*", help="only these cases")
     parser.add_argument("--cache", type=Path, help="folder for compiled programs, which makes a second run much shorter")
     parser.add_argument("--method", nargs="*", help="only these methods")
+    parser.add_argument("--redraw", type=Path, metavar="FILE", help="measure nothing: picture and tables of what is in this file")
     parser.add_argument("--only-dtype", choices=("float64", "float32"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.cache:
@@ -74,7 +76,9 @@ def main() -> None:
 
         jax.config.update("jax_compilation_cache_dir", str(arguments.cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-    if arguments.only_dtype:
+    if arguments.redraw:
+        found = json.loads(arguments.redraw.read_text())
+    elif arguments.only_dtype:
         found = measure(arguments)
     else:
         found = [cell for dtype in ("float64", "float32") for cell in in_process(dtype, arguments)]

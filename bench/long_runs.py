@@ -3,8 +3,8 @@
     python bench/long_runs.py [--quick] [--steps 100000] [--json FILE] [--out bench/results]
 
 Every structure-preserving method takes the same number of steps of one length. Tsit5 and Dopri8 get the tightest tolerance (of 1e-3, ..., 1e-13) with
-which they need no more processor time than the implicit midpoint rule. Prints a table, writes it as JSON, and draws `long_runs.png`: the largest
-error so far against time. `--quick`: 2,000 steps and fewer methods, under two minutes.
+which they need no more processor time than the implicit midpoint rule. Prints a table, writes it as JSON and as Markdown (`long_runs.md`), and draws
+`long_runs.png`: the largest error so far against time. `--quick`: 2,000 steps and fewer methods, under two minutes.
 """
 
 import argparse
@@ -167,6 +167,17 @@ def _line(row: Outcome) -> str:
     return f"{row.problem:20s} {row.method:18s} {how:12s} {row.steps:7d} steps {row.seconds:7.2f} s  {energy}{integral}{ended}"
 
 
+def table(rows: list[Outcome]) -> str:
+    """The table of the documentation, in Markdown."""
+    lines = ["| scene | solver | h or tolerance | s | energy, relative | integral |", "|---|---|---|---|---|---|"]
+    for row in rows:
+        how = f"h = {row.step:g} s" if row.tolerance is None else f"{row.tolerance:.0e}"
+        errors = ["" if e is None else f"{e[0]:.0e} ({e[1]:.0e}, {e[2]:.0e})" for e in (row.energy, row.integral)]
+        ended = "" if row.result == "reached the end of its span" else f"; {row.result}"
+        lines.append(f"| {row.problem} | {row.method} | {how} | {row.seconds:.2g} | {errors[0]}{ended} | {errors[1]} |")
+    return "\n".join(lines) + "\n"
+
+
 def draw(found: dict, path: Path) -> None:
     """Largest error so far against time: a row per problem, energy and integral side by side."""
     import matplotlib.pyplot as plt
@@ -181,15 +192,17 @@ def draw(found: dict, path: Path) -> None:
                     axis.loglog(ts[1:], worst, color=colours[row.method], ls="--" if row.method in EXPLICIT else "-", lw=1.6)
         left.set_ylabel(f"{name}\nrelative error")
         left.set_title("energy", fontsize=10)
-        right.set_title(f"integral: {_integral(name)}", fontsize=10)
-        right.set_ylabel("error")
+        if _integral(name) is None:
+            right.set_axis_off()
+        else:
+            right.set(ylabel="error", xlabel="t (s)")
+            right.set_title(f"integral: {_integral(name)}", fontsize=10)
+            right.tick_params(labelbottom=True)
         for axis in (left, right):
             axis.grid(alpha=0.3)
             axis.set_ylim(1e-17, 10)
-        if rows[0][0].integral is None:
-            right.set_axis_off()
-    for axis in axes[-1]:
-        axis.set_xlabel("t (s)")
+        left.set_xlabel("t (s)")
+        left.tick_params(labelbottom=True)
     handles = [plt.Line2D([], [], color=colour, ls="--" if name in EXPLICIT else "-", lw=1.6) for name, colour in colours.items()]
     labels = [name if name in METHODS else f"{name}, at most the cost of midpoint" for name in colours]
     figure.legend(handles, labels, loc="upper center", ncol=3, frameon=False)
@@ -197,7 +210,7 @@ def draw(found: dict, path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def _integral(problem: str) -> str:
+def _integral(problem: str) -> str | None:
     return next(p.integral for p in PROBLEMS if p.name == problem)
 
 
@@ -213,6 +226,7 @@ def main() -> None:
     found = {problem.name: runs(problem, steps) for problem in (QUICK if options.quick else PROBLEMS)}
     options.out.mkdir(parents=True, exist_ok=True)
     draw(found, options.out / "long_runs.png")
+    (options.out / "long_runs.md").write_text(table([row for rows in found.values() for row, _ in rows]), encoding="utf-8")
     versions = {name: version(name) for name in ("jax", "diffrax")}
     document = {"versions": versions, "steps": steps, "runs": [asdict(row) for rows in found.values() for row, _ in rows]}
     path = options.out / "long_runs.json" if options.json is None else options.json

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 from atlas_cases.cases import CASES
-from atlas_cases.mechanisms import USUAL
-from atlas_cases.methods import METHODS
+from atlas_cases.mechanisms import BY_CASE, USUAL
+from atlas_cases.methods import GROUPS, METHODS
 from atlas_cases.outcomes import FLAGGED, NAN, OUTCOMES, RIGHT, WRONG, judged
+from atlas_cases.tables import BEGIN, END, write_tables
 
 import jourdain_jax as jj
 
@@ -56,6 +57,34 @@ def test_every_method_has_a_reason_to_fail_in_one_line():
     for method in METHODS:
         assert USUAL[method.name], method.name
         assert "\n" not in USUAL[method.name]
+
+
+def test_reasons_are_given_for_cases_and_methods_that_exist():
+    numbers = {name.split()[0] for name in BY_NAME}
+    for name, reasons in BY_CASE.items():
+        assert name in BY_NAME or name in numbers
+        assert set(reasons) <= {*USUAL, *GROUPS}
+
+
+def test_tables_replace_only_what_was_written_before(tmp_path):
+    def cell(method, dtype, outcome, error, mechanism=""):
+        return dict(zip(KEYS, ("E1", method, dtype, outcome, error, 1e-10, mechanism), strict=True))
+
+    cells = [cell("default", "float64", RIGHT, 3e-13), cell("default", "float32", RIGHT, 2e-11)]
+    cells += [
+        cell("fixed partition", "float64", WRONG, 0.5, "division by zero"),
+        cell("fixed partition", "float32", FLAGGED, None, "division by zero [said so]"),
+    ]
+    page = tmp_path / "atlas.md"
+    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n", encoding="utf-8")
+    write_tables(cells, tmp_path)
+    text = page.read_text(encoding="utf-8")
+    assert text.startswith(f"before\n{BEGIN}\n")
+    assert text.endswith(f"{END}\nafter\n")
+    assert "old" not in text
+    assert "| fixed partition | 1 |  |  | 1 |  |  | 1 |  | 1 |  |  |  |" in text
+    assert "| 1e-10 | right, 3e-13 | 0 / 0 / 1 / 0 / 0 | 1e-10 | right, 2e-11 | 0 / 1 / 0 / 0 / 0 |" in text
+    assert "| division by zero | fixed partition | E1 |" in text
 
 
 @pytest.mark.slow
@@ -107,5 +136,5 @@ def test_the_script_writes_cells_of_both_precisions_a_table_and_a_picture(tmp_pa
     assert all(cell["outcome"] in (NAN, WRONG) for cell in failed)  # a singular A M^-1 A'
     with (tmp_path / "atlas.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(cells)
-    for name in ("atlas.png", "atlas.svg", "atlas.md"):
+    for name in ("atlas.png", "atlas.svg", "atlas.md", "atlas_cells.md"):
         assert (tmp_path / name).stat().st_size > 500

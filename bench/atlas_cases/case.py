@@ -1,7 +1,7 @@
 """A case of the atlas: a name, tolerances with their reason, and a probe that any method can be put to."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import jax
@@ -28,7 +28,6 @@ class Case:
     tolerance: float  # float64
     tolerance32: float  # float32
     reason: str  # of both tolerances
-    mechanisms: Mapping[str, str] = field(default_factory=dict)  # method -> why it fails here, where that differs from its usual reason
     must_be_right: bool = False  # the default path, in float64
     flag_is_right: bool = False  # nothing but a flag is a right answer here
     quick: bool = False

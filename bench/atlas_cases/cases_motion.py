@@ -175,7 +175,8 @@ def near_fall(turn: float) -> Motion:
         error = against(scene, {name: known[f"c{name}"] for name in "xyz"}, dict.fromkeys("xyz", 0.3))
     else:
         error = lambda q, u: np.inf  # noqa: E731
-    return Motion(scene, start, ts, error, rtol=1e-9, atol=1e-9, steps=20_000)
+    most_steps = 20_000 if turn != 1e-4 else 100_000  # there the right answer takes more
+    return Motion(scene, start, ts, error, rtol=1e-9, atol=1e-9, steps=20_000, most_steps=most_steps)
 
 
 def eulers_disc() -> Motion:
@@ -263,7 +264,15 @@ CASES = (
     Case("E10", "stabilisation against projection: 2 s of a disc", disc_to_its_reference, 1e-7, 1e-3, "a run at rtol = atol = 1e-8 (float32: 1e-5, 1e-6)"),
     Case("E11", "a linkage through its singular configuration", linkage, 1e-6, 1e-2, "rtol 1e-12; errors grow as the inverse square of the distance to it"),
     Case("E12", "gimbal lock: a rattleback on its edge, quaternion", celt_on_edge, 1e-9, 1e-2, "a fall from an edge amplifies errors", must_be_right=True),
-    Case("E12 angles", "the same in angles, which are singular there", celt_on_edge_in_angles, 1e-9, 1e-2, "as E12", flag_is_right=True),
+    Case(
+        "E12 angles",
+        "the same in angles, which are singular there",
+        celt_on_edge_in_angles,
+        1e-9,
+        1e-2,
+        "rates of angles are infinite at the start",
+        flag_is_right=True,
+    ),
     Case("E13", "norm of the quaternion: a free top for 100 s", lambda: free_top(100.0), 1e-9, 2e-2, LONG_DRIFT, must_be_right=True),
     Case("E13 long", "norm of the quaternion: a free top for 10,000 s", lambda: free_top(1e4), 1e-7, 1.0, LONG_DRIFT, must_be_right=True),
     Case("E13 ball", "an eccentric ball rolls for 50 s", eccentric_ball, 1e-9, 2e-2, LONG_DRIFT, must_be_right=True),

@@ -163,7 +163,6 @@ CASES = (
         1e-10,
         1e-3,
         CLOSED,
-        {"fixed partition": "ydot = xdot tan(heading): division by cos(heading), which passes zero"},
         must_be_right=True,
         quick=True,
     ),
@@ -174,7 +173,6 @@ CASES = (
         1e-10,
         1e-3,
         CLOSED,
-        {"fixed partition": "rolldot = xdot / (R cos(heading)): division by zero at 90 degrees"},
         must_be_right=True,
     ),
     Case(

@@ -1,4 +1,4 @@
-"""The atlas as one picture: cases down, methods across, colour and mark by outcome, float64 beside float32."""
+"""The atlas as one picture: cases down, methods across, colour and mark by outcome; a cell is split where float64 and float32 differ."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Polygon, Rectangle
 
 from atlas_cases.case import Case
 from atlas_cases.cases import CASES
@@ -16,11 +16,11 @@ from atlas_cases.outcomes import FLAGGED, NAN, NOT_APPLICABLE, RIGHT, STALLED, W
 # Okabe and Ito's colours, which the colour-blind can tell apart, and a mark for print in grey.
 LOOKS = {
     RIGHT: ("#009E73", ""),
-    FLAGGED: ("#56B4E9", "f"),
+    FLAGGED: ("#8CCBF0", "f"),
     WRONG: ("#D55E00", "×"),
     NAN: ("#000000", "N"),
     STALLED: ("#F0E442", "s"),
-    NOT_APPLICABLE: ("#F1F1F1", ""),
+    NOT_APPLICABLE: ("#F3F3F3", ""),
 }
 WORDS = {
     RIGHT: "right within the tolerance",
@@ -30,53 +30,77 @@ WORDS = {
     STALLED: "s  out of steps",
     NOT_APPLICABLE: "not asked",
 }
-GAP = 0.35  # between groups of methods
+GROUP_GAP, CASE_GAP = 0.45, 0.22  # between groups of methods, and between hard cases E1, E2, ...
+CELL, LEFT, RIGHT_MARGIN, TOP, BOTTOM = 0.185, 4.3, 0.15, 0.95, 1.75  # inches
 
 
 def draw(cells: list[dict], out: Path) -> None:
     """`atlas.png` and `atlas.svg`."""
     types = list(dict.fromkeys(cell["dtype"] for cell in cells))
-    cases = [case for case in CASES if any(cell["case"] == case.name for cell in cells)]
-    methods = [method for method in METHODS if any(cell["method"] == method.name for cell in cells)]
-    columns, x = {}, 0.0
-    for k, method in enumerate(methods):
-        x += GAP if k and method.group != methods[k - 1].group else 0.0
-        columns[method.name] = x
-        x += 1.0
-    height, width = len(cases), x
-    figure, axes = plt.subplots(1, len(types), figsize=(5.2 + 0.27 * width * len(types), 2.6 + 0.235 * height), sharey=True, squeeze=False)
-    for ax, dtype in zip(axes[0], types, strict=True):
-        for row, case in enumerate(cases):
-            for cell in (c for c in cells if c["case"] == case.name and c["dtype"] == dtype):
-                _cell(ax, columns[cell["method"]], row, cell["outcome"])
-        ax.set(xlim=(-0.1, width + 0.1), ylim=(height, -0.1), title=dtype)
-        ax.set_xticks([c + 0.5 for c in columns.values()], list(columns), rotation=90, fontsize=8)
-        ax.set_yticks([r + 0.5 for r in range(height)], [_label(case) for case in cases], fontsize=8)
-        ax.tick_params(length=0)
-        for spine in ax.spines.values():
-            spine.set_visible(False)
-        for group in dict.fromkeys(method.group for method in methods):
-            inside = [columns[method.name] + 0.5 for method in methods if method.group == group]
-            ax.text(sum(inside) / len(inside), -0.35, group, ha="center", va="bottom", fontsize=7, style="italic")
-        ax.title.set_position((0.5, 1.0))
-        ax.set_title(dtype, pad=18, fontsize=11)
-        ax.add_patch(Rectangle((columns["default"] - 0.04, -0.02), 1.04, height + 0.04, fill=False, lw=1.6, ec="black")) if "default" in columns else None
-    handles = [Rectangle((0, 0), 1, 1, color=LOOKS[outcome][0]) for outcome in LOOKS]
-    figure.legend(handles, [WORDS[outcome] for outcome in LOOKS], loc="lower center", ncols=len(LOOKS), fontsize=9, frameon=False)
-    figure.suptitle("Where methods fail: hard cases of constrained dynamics. Framed: the engine with nothing chosen.", fontsize=12)
-    figure.tight_layout(rect=(0, 0.025, 1, 0.99))
+    asked = [method for method in METHODS if any(c["method"] == method.name and c["outcome"] != NOT_APPLICABLE for c in cells)]
+    columns = _places([method.name for method in asked], [method.group for method in asked], GROUP_GAP)
+    cases = sorted((case for case in CASES if any(cell["case"] == case.name for cell in cells)), key=_number)
+    rows = _places([case.name for case in cases], [_number(case) for case in cases], CASE_GAP)
+    width, height = max(columns.values()) + 1.0, max(rows.values()) + 1.0
+    size = (LEFT + CELL * width + RIGHT_MARGIN, TOP + CELL * height + BOTTOM)
+    figure = plt.figure(figsize=size)
+    ax = figure.add_axes((LEFT / size[0], BOTTOM / size[1], CELL * width / size[0], CELL * height / size[1]))
+    ax.set(xlim=(0, width), ylim=(height, 0))
+    ax.axis("off")
+    found = {(cell["case"], cell["method"], cell["dtype"]): cell["outcome"] for cell in cells}
+    for case, y in rows.items():
+        for method, x in columns.items():
+            _cell(ax, x, y, [found[case, method, dtype] for dtype in types])
+    for case in cases:
+        ax.text(-0.4, rows[case.name] + 0.54, _label(case), ha="right", va="center", fontsize=7.5)
+    for name, x in columns.items():
+        ax.text(x + 0.55, height + 0.3, name, ha="center", va="top", rotation=90, fontsize=7.5)
+    for group in dict.fromkeys(method.group for method in asked):
+        inside = [columns[method.name] for method in asked if method.group == group]
+        ax.text((min(inside) + max(inside) + 1) / 2, -0.45, group, ha="center", va="bottom", fontsize=8, style="italic")
+    if "default" in columns:
+        frame = Rectangle((columns["default"] - 0.03, -0.04), 1.06, height + 0.08, fill=False, lw=1.6, ec="black", clip_on=False)
+        ax.add_patch(frame)
+    centre = 0.5 * size[0]
+    figure.text(centre / size[0], 1 - 0.2 / size[1], "Where methods fail: hard cases of constrained dynamics", ha="center", va="top", fontsize=12)
+    how = f"Framed: the engine with nothing chosen. A cell is split where precisions differ: {types[0]} upper left, {types[-1]} lower right."
+    figure.text(centre / size[0], 1 - 0.44 / size[1], how, ha="center", va="top", fontsize=8.5)
+    handles = [Rectangle((0, 0), 1, 1, facecolor=colour, edgecolor="#BBBBBB", lw=0.5) for colour, _ in LOOKS.values()]
+    figure.legend(handles, [WORDS[outcome] for outcome in LOOKS], loc="lower center", ncols=3 if width < 30 else len(LOOKS), fontsize=8, frameon=False)
     for suffix in ("png", "svg"):
-        figure.savefig(out / f"atlas.{suffix}", dpi=130)
+        figure.savefig(out / f"atlas.{suffix}", dpi=150)
     plt.close(figure)
 
 
+def _places(names, groups, gap: float) -> dict[str, float]:
+    """Where each name begins, one apart, and `gap` more from one group to the next."""
+    places, at = {}, 0.0
+    for k, name in enumerate(names):
+        at += gap if k and groups[k] != groups[k - 1] else 0.0
+        places[name] = at
+        at += 1.0
+    return places
+
+
+def _number(case: Case) -> int:
+    return int(case.name.split()[0][1:])
+
+
 def _label(case: Case) -> str:
-    return f"{case.title}{' (no answer: f is right)' if case.flag_is_right else ''}   {case.name}"
+    return f"{case.title}{' (no answer: f is right)' if case.flag_is_right else ''}   $\\bf{{{case.name.split()[0]}}}$"
 
 
-def _cell(ax, x: float, y: float, outcome: str) -> None:
+def _cell(ax, x: float, y: float, outcomes: list[str]) -> None:
+    left, right, top, bottom = x + 0.05, x + 0.95, y + 0.05, y + 0.95
+    if len(set(outcomes)) == 1:
+        _filled(ax, [(left, top), (right, top), (right, bottom), (left, bottom)], outcomes[0], (x + 0.5, y + 0.53), 6.5)
+        return
+    _filled(ax, [(left, top), (right, top), (left, bottom)], outcomes[0], (x + 0.29, y + 0.33), 5)
+    _filled(ax, [(right, top), (right, bottom), (left, bottom)], outcomes[1], (x + 0.71, y + 0.74), 5)
+
+
+def _filled(ax, corners, outcome: str, middle: tuple[float, float], size: float) -> None:
     colour, mark = LOOKS[outcome]
-    ax.add_patch(Rectangle((x + 0.04, y + 0.05), 0.92, 0.9, color=colour, lw=0))
+    ax.add_patch(Polygon(corners, facecolor=colour, lw=0))
     if mark:
-        light = "white" if outcome in (WRONG, NAN) else "black"
-        ax.text(x + 0.5, y + 0.54, mark, ha="center", va="center", fontsize=7, color=light)
+        ax.text(*middle, mark, ha="center", va="center", fontsize=size, color="white" if outcome in (WRONG, NAN) else "black")

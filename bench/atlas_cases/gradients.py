@@ -14,6 +14,9 @@ from atlas_cases import naive
 from atlas_cases.case import by_type
 from atlas_cases.methods import Method
 from atlas_cases.outcomes import Outcome, judged, not_applicable, worst
+from jourdain_jax.motion import results
+
+FEWER_STEPS = 2000  # for the reductions, of which reverse mode takes seconds per thousand steps: ten times what a right answer took
 
 
 @dataclass
@@ -45,22 +48,30 @@ class DerivativeOfMotion:
         if method.naive is not None:
             return self._by_naive(method, x, tolerance)
         options = {**self.options, **method.options(self.begin(x)[0])}
+        options |= {"max_steps": FEWER_STEPS} if method.reduction else {}
         options |= {"rtol": by_type(self.rtol, self.rtol32), "atol": by_type(self.atol, self.atol32), "ts": self.ts}
 
         def value(x):
             scene, start = self.begin(x)
             if method.batch:
                 lanes = {name: jnp.stack([jnp.asarray(v, x.dtype)] * 2) for name, v in start.items()}
-                return self.value(jj.rollout(scene, lanes, **options).lane(1))
-            return self.value(jj.simulate(scene, start, **options))
+                motion = jj.rollout(scene, lanes, **options).lane(1)
+            else:
+                motion = jj.simulate(scene, start, **options)
+            return self.value(motion), motion.result
 
         forward = isinstance(options.get("adjoint"), diffrax.ForwardMode)
         try:
             with warnings.catch_warnings(record=True) as given:
                 warnings.simplefilter("always")
-                slope = jax.jvp(value, (x,), (jnp.ones_like(x),))[1] if forward else jax.grad(value)(x)
+                if forward:
+                    _, slope, code = jax.jvp(value, (x,), (jnp.ones_like(x),), has_aux=True)
+                else:
+                    slope, code = jax.grad(value, has_aux=True)(x)
         except (ValueError, jj.DifferentiationModeError) as refusal:
             return judged(np.nan, tolerance, f"{type(refusal).__name__}: {str(refusal)[:90]}")
+        if int(code) not in (results.SUCCESS, results.EVENT):
+            return judged(np.nan, tolerance, results.MESSAGES[int(code)], stalled=int(code) == results.MAX_STEPS)
         found = judged(worst(float(slope), self.known, self.scale), tolerance)
         said = [str(warning.message) for warning in given if issubclass(warning.category, jj.SensitivityWarning)]
         return found if found.outcome == "right" or not said else judged(worst(float(slope), self.known, self.scale), tolerance, f"warning: {said[0]}")

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,13 +11,9 @@ import jourdain_jax as jj
 from atlas_cases import naive
 from atlas_cases.methods import Method, reduction
 from atlas_cases.outcomes import Outcome, judged, not_applicable, worst
+from jourdain_jax.equations.probing import on_numbers
 
 ONLY_MOTION = "no motion is asked"
-
-
-@eqx.filter_jit
-def _solved(scene, q, u, way):
-    return jj.accelerations(scene, 0.0, q, u, reduction=way)
 
 
 @dataclass
@@ -41,7 +36,7 @@ class Instant:
         if method.naive is not None:
             udot = naive.accelerations(method.naive, self.scene, naive.settled(self.scene, q, u), 0.0, q, u)
             return judged(worst(udot, self.udot, self.scale), tolerance)
-        found = _solved(self.scene, q, u, reduction(self.scene, method.reduction))
+        found = jj.accelerations(self.scene, 0.0, q, u, reduction=reduction(self.scene, method.reduction))
         error = worst(found.udot, self.udot, self.scale)
         if self.force is not None:
             error = float(np.maximum(error, worst(found.constraint_force, self.force)))
@@ -73,7 +68,7 @@ class DerivativeOfAccelerations:
     weights: np.ndarray
     known: float
     scale: float | None = None
-    compiled: dict = field(default_factory=dict)  # one program serves all reductions
+    traced: dict = field(default_factory=dict)  # one program serves all reductions
 
     def cell(self, method: Method, tolerance: float) -> Outcome:
         """Outcome of one method."""
@@ -90,10 +85,10 @@ class DerivativeOfAccelerations:
             return weights @ jj.accelerations(scene, 0.0, q, u, reduction=way).udot
 
         key = method.naive or ("default" if method.reduction is None else "reductions")
-        if key not in self.compiled:
-            self.compiled[key] = eqx.filter_jit(jax.grad(value))
+        if key not in self.traced:
+            self.traced[key] = on_numbers(jax.grad(value))  # looked at once: compiling would take longer
         try:
-            slope = float(self.compiled[key](jnp.asarray(self.x, jnp.result_type(float)), reduction(scene, method.reduction)))
+            slope = float(self.traced[key](jnp.asarray(self.x, jnp.result_type(float)), reduction(scene, method.reduction)))
         except NotImplementedError as refusal:
             return judged(np.nan, tolerance, f"NotImplementedError: {str(refusal).splitlines()[0][:90]}")
         return judged(worst(slope, self.known, self.scale), tolerance)

@@ -1,4 +1,4 @@
-"""Why a method fails, in one line each: the usual reason of every method, unless a case gives its own."""
+"""Why a method fails, in one line each: the usual reason of every method, unless a case gives its own, for the method or for its group."""
 
 from atlas_cases.case import Case
 from atlas_cases.methods import Method
@@ -12,8 +12,8 @@ USUAL = {
     "ridge 1e-6": "a regularised row is a soft row: it yields by 1e-6 of its multiplier, all the time",
     "raw SVD basis": "the factorisation assumes a rank and its derivative divides by differences of singular values",
     "raw QR basis": "without pivoting, dependent rows leave a wrong null space; the derivative divides by zero for rows along the axes",
-    "speeds in SVD basis": "LAPACK returns another rotation or sign of the basis at each call: speeds in it jump",
-    "speeds in QR basis": "signs of Householder vectors flip, and the basis with them: speeds in it jump",
+    "speeds in SVD basis": "LAPACK returns another rotation or sign of the basis at each call: speeds jump; their rate, by a difference, has half the digits",
+    "speeds in QR basis": "signs of Householder vectors flip, and the basis with them: speeds jump; their rate, by a difference, has half the digits",
     "no projection": "rows hold for accelerations only: round-off and truncation of velocities and positions are never taken back",
     "Baumgarte 5/s": "violations decay at a rate that has nothing to do with the motion, and their forces do work",
     "Baumgarte 1e4/s": "a pole at -1e4/s that the motion does not have: the step is bound to it",
@@ -39,6 +39,45 @@ USUAL = {
 }
 
 
+REGULAR = ("Schur, Cholesky", "KKT, LU", "pinv, 1e-10", "raw SVD basis", "raw QR basis")  # naive accelerations that are right where rows are independent
+ENGINE = ("engine", "reductions", "constraints", "integrators")
+STEPPED = dict.fromkeys(
+    (*REGULAR, "fixed partition"), "its accelerations are right here; fixed steps of fourth order add up their truncation, and the motion amplifies it"
+)
+UNPROJECTED = dict.fromkeys(REGULAR, "its accelerations are right here; rows hold for accelerations only, and nothing takes the drift off them back") | {
+    "fixed partition": "its speeds meet the rows; positions and norms of quaternions drift, and nothing takes that back"
+}
+PARALLEL = dict.fromkeys(
+    ("qr", "svd", "kkt", "udwadia-kalaba", "constraints", "integrators"),
+    "near parallel rows accelerations carry round-off over the smallest singular value: there no step meets a tight tolerance",
+)
+NEAR_FLAT = dict.fromkeys(ENGINE, "errors of the attitude count 1/theta^2: the swing ends elsewhere, steps shrink, or the disc runs into its stop event")
+
+# Of a case, or of all cases of one number: method or group -> why it fails there.
+BY_CASE: dict[str, dict[str, str]] = {
+    "E1": {"fixed partition": "ydot = xdot tan(heading): division by cos(heading), which passes zero"},
+    "E1 disc": {"fixed partition": "rolldot = xdot / (R cos(heading)): division by zero at 90 degrees"},
+    "E2": STEPPED,
+    "E5": PARALLEL,
+    "E5 gradient": PARALLEL | {"rollout": "inside a derivative no lane can be run again with the full state"},
+    "E6": {"naive": "it goes on where no motion does: what would stop the body at once is cut off, softened, or divided by round-off"},
+    "E8": dict.fromkeys(ENGINE, "the second row differs from the first by the angle: of the order of round-off, no cut-off can tell the rank")
+    | dict.fromkeys(("privileged", "gibbs-appell"), "every partition has a pivot of the size of the angle: too small to count as independent"),
+    "E9": UNPROJECTED,
+    "E11": dict.fromkeys(ENGINE, "one freedom becomes three: near there accelerations carry round-off over the distance to the singular configuration")
+    | {"naive": "one freedom becomes three: digits are lost near there, and round-off may choose the branch on which it goes on"},
+    "E12": STEPPED,
+    "E12 angles": {"naive": "fixed steps across infinite rates of angles, to wherever their length puts it"},
+    "E13 ball": UNPROJECTED,
+    "E14": NEAR_FLAT | {"naive": "fixed steps too long for the swing through the flat position"},
+    "E14 Euler": {"naive": "it goes on where the disc lies flat and no motion does"},
+    "E18": dict.fromkeys((*REGULAR, "no projection"), "accelerations hold a violation constant: a velocity off its row stays off")
+    | dict.fromkeys(("fixed partition", "speeds in SVD basis", "speeds in QR basis"), "it drops the part off the row, but not M-orthogonally: another motion"),
+    "E19": {"Baumgarte 5/s": "backwards in time the terms drive violations apart, at 5/s"},
+    "E24": {"naive": "at rest the row has no slope, and whatever force comes out is made up"},
+}
+
+
 def mechanism(case: Case, method: Method, outcome: Outcome) -> str:
     """One line: why it failed, and what it said itself."""
     if outcome.outcome == RIGHT:
@@ -47,5 +86,6 @@ def mechanism(case: Case, method: Method, outcome: Outcome) -> str:
         return outcome.flag
     if case.flag_is_right and outcome.outcome == FLAGGED:
         return f"{case.reason} [{outcome.flag}]"
-    own = case.mechanisms.get(method.name, USUAL.get(method.name, ""))
+    here = BY_CASE.get(case.name, BY_CASE.get(case.name.split()[0], {}))
+    own = next((here[key] for key in (method.name, method.group) if key in here), USUAL[method.name])
     return " ".join(part for part in (own, f"[{outcome.flag}]" if outcome.flag else "") if part)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
+from jourdain_jax.equations.probing import at_once
 from jourdain_jax.equations.virtual_power import equations_and_rows
 
 
@@ -108,9 +109,12 @@ SPEEDS_IN_BASIS = ("speeds in SVD basis", "speeds in QR basis")
 def accelerations(name: str, scene, static: Static, t, q, u):
     """udot by the naive method `name`."""
     equations, rows = equations_and_rows(scene, t, q, u)
-    if rows.A.shape[0] == 0:
-        return jnp.linalg.solve(equations.M, equations.Q - equations.h)
-    return ACCELERATIONS[name](equations.M, equations.Q - equations.h, rows.A, -rows.drift, static)
+    return _solved(name, static, equations.M, equations.Q - equations.h, rows.A, -rows.drift)
+
+
+@at_once
+def _solved(name: str, static: Static, M, f, A, b):
+    return jnp.linalg.solve(M, f) if A.shape[0] == 0 else ACCELERATIONS[name](M, f, A, b, static)
 
 
 def motion(name: str, scene, static: Static, q, u, ts: np.ndarray, steps: int, *, alone: bool = False):

@@ -1,7 +1,8 @@
-"""The table behind the picture (CSV and Markdown), and the figures of the default path."""
+"""The tables behind the picture (CSV and Markdown), and the figures of the default path."""
 
 import csv
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 from atlas_cases.cases import CASES
@@ -12,13 +13,24 @@ KEYS = ("case", "method", "dtype", "outcome", "error", "tolerance", "mechanism")
 _SHORT = {RIGHT: "ok", FLAGGED: "flag", WRONG: "WRONG", NAN: "NaN", STALLED: "stall", NOT_APPLICABLE: ""}
 
 
+BEGIN, END = "<!-- from here on written by bench/atlas.py -->", "<!-- up to here -->"
+
+
 def write_tables(cells: list[dict], out: Path) -> None:
-    """`atlas.csv`, one line per cell, and `atlas.md`, outcomes by case and method and the mechanisms of all failures."""
-    with (out / "atlas.csv").open("w", newline="") as file:
+    """`atlas.csv`, one line per cell; `atlas_cells.md`, all cells and the mechanisms of all failures to read; `atlas.md`, the summary.
+
+    Of an `atlas.md` that is there, only what stands between `BEGIN` and `END` is replaced.
+    """
+    with (out / "atlas.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, KEYS)
         writer.writeheader()
         writer.writerows(cells)
-    (out / "atlas.md").write_text("\n".join([by_method(cells), "", *_outcomes(cells), "", *_failures(cells), ""]))
+    (out / "atlas_cells.md").write_text("\n".join([*_outcomes(cells), "", *_failures(cells), ""]), encoding="utf-8")
+    path = out / "atlas.md"
+    before, _, rest = (path.read_text(encoding="utf-8") if path.exists() else "").partition(BEGIN)
+    after = rest.partition(END)[2] or "\n"
+    written = "\n".join([BEGIN, "", *by_method(cells), "", *by_case(cells), "", *_reasons(cells), "", END])
+    path.write_text(before + written + after, encoding="utf-8")
 
 
 def _outcomes(cells):
@@ -48,14 +60,60 @@ def _failures(cells):
             yield f"| {cell['case']} | {cell['method']} | {cell['dtype']} | {cell['outcome']} | {cell['mechanism']} |"
 
 
-def by_method(cells: list[dict]) -> str:
-    """A Markdown table: how often each method was right, flagged, ..., in both types together."""
-    shown = [outcome for outcome in OUTCOMES if outcome != NOT_APPLICABLE]
-    lines = ["| method | " + " | ".join(shown) + " |", "|---|" + "---|" * len(shown)]
+SHOWN = (RIGHT, FLAGGED, WRONG, NAN, STALLED)
+
+
+def _types(cells) -> list[str]:
+    return list(dict.fromkeys(cell["dtype"] for cell in cells))
+
+
+def _counts(cells, dtype: str) -> Counter:
+    return Counter(cell["outcome"] for cell in cells if cell["dtype"] == dtype)
+
+
+def by_method(cells: list[dict]) -> Iterator[str]:
+    """How often each method was right, flagged, ..., and in how many cases it was asked."""
+    types = _types(cells)
+    yield from ("## Outcomes by method", "", "| method | " + " | ".join(f"{dtype}: asked | " + " | ".join(SHOWN) for dtype in types) + " |")
+    yield "|---|" + "---|" * (len(types) * (1 + len(SHOWN)))
     for method in dict.fromkeys(cell["method"] for cell in cells):
-        counts = Counter(cell["outcome"] for cell in cells if cell["method"] == method)
-        lines.append(f"| {method} | " + " | ".join(str(counts[outcome] or "") for outcome in shown) + " |")
-    return "\n".join(lines)
+        counts = [_counts([cell for cell in cells if cell["method"] == method], dtype) for dtype in types]
+        yield f"| {method} | " + " | ".join(f"{sum(c[o] for o in SHOWN)} | " + " | ".join(str(c[o] or "") for o in SHOWN) for c in counts) + " |"
+
+
+def by_case(cells: list[dict]) -> Iterator[str]:
+    """What the engine as it comes makes of each case, and how many of the other methods are right, flagged, ...."""
+    types, titles = _types(cells), {case.name: case.title for case in CASES}
+    yield from ("## Outcomes by case", "", "Other methods: " + " / ".join(SHOWN) + ".", "")
+    yield "| case | what | " + " | ".join(f"tolerance, {dtype} | default | others" for dtype in types) + " |"
+    yield "|---|---|" + "---|" * (3 * len(types))
+    for name in dict.fromkeys(cell["case"] for cell in cells):
+        here = [cell for cell in cells if cell["case"] == name]
+        shown = []
+        for dtype in types:
+            default = next((cell for cell in here if cell["method"] == "default" and cell["dtype"] == dtype), None)
+            counts = _counts([cell for cell in here if cell["method"] != "default"], dtype)
+            tolerance = next(cell["tolerance"] for cell in here if cell["dtype"] == dtype)
+            shown += [f"{tolerance:.0e}" if tolerance else "a flag", _in_words(default), " / ".join(str(counts[outcome]) for outcome in SHOWN)]
+        yield f"| {name} | {titles[name]} | " + " | ".join(shown) + " |"
+
+
+def _in_words(cell) -> str:
+    if cell is None or cell["outcome"] == NOT_APPLICABLE:
+        return ""
+    return f"{cell['outcome']}, {cell['error']:.0e}" if cell["outcome"] in (RIGHT, WRONG) and cell["error"] is not None else cell["outcome"]
+
+
+def _reasons(cells) -> Iterator[str]:
+    """Every mechanism once, without a method's own words (in brackets), with the methods and the cases for which it was the reason."""
+    yield from ("## Why methods fail", "", "| mechanism | methods | cases |", "|---|---|---|")
+    found: dict[str, tuple[dict, dict]] = {}
+    for cell in cells:
+        if cell["outcome"] not in (RIGHT, NOT_APPLICABLE):
+            methods, cases = found.setdefault(cell["mechanism"].partition(" [")[0], ({}, {}))
+            methods[cell["method"]] = cases[cell["case"]] = None
+    for mechanism, (methods, cases) in found.items():
+        yield f"| {mechanism} | {', '.join(methods)} | {', '.join(cases)} |"
 
 
 def summary(cells: list[dict]) -> str:

@@ -1,8 +1,8 @@
 """One step of an explicit Runge-Kutta method gone back over: cotangents of its start from those of its end.
 
-    Y_i = y_0 + h sum_j a_ij k_j,   k_i = f(t_0 + c_i h, Y_i, args),   y_1 = y_0 + h sum b_i k_i
-    v_i = b_i g_1 + sum_l a_li G_l,   (tau_i, G_i) = (df/dt, df/dy)' h v_i              from the last stage to the first
-    g_0 = g_1 + sum G_i,   g_args = sum (df/dargs)' h v_i,   g_h = sum v_i . k_i + c_i tau_i
+Y_i = y_0 + h sum_j a_ij k_j,   k_i = f(t_0 + c_i h, Y_i, args),   y_1 = y_0 + h sum b_i k_i
+v_i = b_i g_1 + sum_l a_li G_l,   (tau_i, G_i) = (df/dt, df/dy)' h v_i              from the last stage to the first
+g_0 = g_1 + sum G_i,   g_args = sum (df/dargs)' h v_i,   g_h = sum v_i . k_i + c_i tau_i
 """
 
 from collections.abc import Callable

@@ -211,9 +211,7 @@ def _again(problem: Problem, method: Method, beginnings: _Beginnings, number, wi
             p = advanced(problem, method, p, goal, target, jnp.sign(goal - p.t))
             return p, window.added(p, k)
 
-        p, window = jax.lax.while_loop(
-            lambda carry: eqxi.unvmap_any(running(carry[0], goal)) & (carry[1].last < room), step, (p, window.towards(k))
-        )
+        p, window = jax.lax.while_loop(lambda carry: eqxi.unvmap_any(running(carry[0], goal)) & (carry[1].last < room), step, (p, window.towards(k)))
         return p, window, k + 1
 
     exists = number >= 0
