@@ -11,7 +11,7 @@ from jourdain_jax.equations.probed import TIMED, probed
 from jourdain_jax.equations.probed_on_graph import probed_on_graph, sampled_on_graph
 from jourdain_jax.equations.sampling import _projected_by_jax, random_states, symmetric_configurations
 from jourdain_jax.equations.structure import structure_of
-from jourdain_jax.program.interpret import Unsupported
+from jourdain_jax.program.graph import Unsupported
 
 MODELS = ["skate", "tilting-disc-quaternion", "ball-on-turntable", "snakeboard", "rattleback", "double-pendulum-rods", "isokinetic-particle", "trailer-chain"]
 

@@ -12,8 +12,8 @@ import pytest
 from jourdain_jax.program.derivative import along, derivatives
 from jourdain_jax.program.emit import run, sine_and_cosine
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.graph import Graph
-from jourdain_jax.program.interpret import Nodes, Unsupported, as_nodes, interpret
+from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.program.polynomial import NormalForms, TooLarge
 from jourdain_jax.program.source import PYTHON, C, statements, sympy_expressions
 from jourdain_jax.program.uncompiled import uncompiled

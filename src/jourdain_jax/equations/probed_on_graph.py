@@ -16,7 +16,7 @@ from jourdain_jax.equations.probed import Probed, generic_inputs
 from jourdain_jax.equations.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.program.derivative import derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.interpret import Unsupported
+from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.scene import Scene
 
 ITERATIONS = 25  # of Gauss-Newton, at most

@@ -10,7 +10,7 @@ import numpy as np
 from jourdain_jax.equations.probed_on_graph import sampled_on_graph
 from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.projection import miss_of_rows, project_positions, project_speeds
-from jourdain_jax.program.interpret import Unsupported
+from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.scene import Scene
 
 SYMMETRIC_PROBES = 200

@@ -21,7 +21,7 @@ from jourdain_jax.equations.probed_on_graph import probed_on_graph
 from jourdain_jax.equations.probing import probed_once, without_collecting
 from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.sampling import assembled, random_states, symmetric_configurations
-from jourdain_jax.program.interpret import Unsupported
+from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.numbers import described, is_traced

@@ -24,8 +24,8 @@ from jourdain_jax.equations.plausibility import PoseNumbers, numbers_of
 from jourdain_jax.equations.probing import described_once
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import impressed, potential_energy, resultants
-from jourdain_jax.program.graph import Graph
-from jourdain_jax.program.interpret import Nodes, Unsupported, as_nodes, has_own_derivatives, interpret
+from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.interpret import Nodes, as_nodes, has_own_derivatives, interpret
 from jourdain_jax.scene.answers import events_of, loads_of
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene

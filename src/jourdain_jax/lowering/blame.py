@@ -17,7 +17,7 @@ from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.trace import TracedScene, velocity_quantities
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.interpret import Unsupported
+from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.scene import Scene
 
 

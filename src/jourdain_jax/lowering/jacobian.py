@@ -14,8 +14,7 @@ import jax.numpy as jnp
 
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.emit import run
-from jourdain_jax.program.graph import Graph
-from jourdain_jax.program.interpret import Unsupported
+from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.together import together
 
 LARGEST_WORK = 100_000  # operations times variables: beyond, deriving takes longer than it can save

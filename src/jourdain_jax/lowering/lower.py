@@ -25,7 +25,7 @@ from jourdain_jax.lowering.blame import blamed
 from jourdain_jax.lowering.elimination import serves
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.interpret import Unsupported
+from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 

@@ -2,8 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 
-from jourdain_jax.program.graph import Graph
-from jourdain_jax.program.interpret import Unsupported
+from jourdain_jax.program.graph import Graph, Unsupported
 
 
 def derivatives(graph: Graph, outputs: Iterable[int], direction: dict[int, int]) -> list[int]:

@@ -9,7 +9,12 @@ import math
 import operator
 from collections.abc import Callable, Iterable, Mapping
 
+MOST_NODES = 500_000  # of one graph: some seconds of building
 OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
+
+
+class Unsupported(Exception):
+    """What was traced cannot become a scalar program; the text says why."""
 
 
 class Graph:
@@ -27,6 +32,8 @@ class Graph:
         key = (op, args, value)
         node = self._known.get(key)
         if node is None:
+            if len(self.op) >= MOST_NODES:
+                raise Unsupported(f"a computation of more than {MOST_NODES} scalars")
             node = self._known[key] = len(self.op)
             self.op.append(op)
             self.args.append(args)

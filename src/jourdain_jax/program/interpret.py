@@ -12,13 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.graph import Graph, Unsupported
 
 LARGEST = 200_000  # scalars in one array
-
-
-class Unsupported(Exception):
-    """What was traced cannot become a scalar program; the text says why."""
 
 
 class Nodes:
