@@ -273,3 +273,10 @@ def test_derivatives_along_many_directions_are_those_along_each():
     together = along(graph, outputs, directions)
     for k, direction in directions.items():
         assert [row.get(k, graph.zero) for row in together] == derivatives(graph, outputs, direction)
+
+
+def test_a_computation_of_too_many_scalars_is_refused_before_it_is_built(monkeypatch):
+    monkeypatch.setattr("jourdain_jax.program.graph.MOST_NODES", 50)
+    graph = Graph()
+    with pytest.raises(Unsupported, match="more than 50 scalars"):
+        graph.total(graph.input(f"x{i}", True) for i in range(50))
