@@ -200,7 +200,7 @@ CASES = (
             f"nearly dependent rows: a second edge turned by {angle:g} rad",
             lambda angle=angle: two_edges(angle),
             1e-12 + 1e-15 / angle,
-            1e-6 + 3e-7 / angle,
+            min(1e-6 + 3e-7 / angle, 0.5),
             "round-off over the angle: the rows themselves are no better known",
             quick=angle == 1e-6,
         )

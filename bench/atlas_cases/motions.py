@@ -9,7 +9,7 @@ import numpy as np
 
 import jourdain_jax as jj
 from atlas_cases import naive
-from atlas_cases.case import by_type
+from atlas_cases.case import by_type, single
 from atlas_cases.methods import Method
 from atlas_cases.outcomes import NAN, Outcome, judged, not_applicable, worst
 from jourdain_jax.motion import results
@@ -37,7 +37,7 @@ class Motion:
     rtol32: float = 1e-5
     atol32: float = 1e-6
     steps: int = 400  # of the naive methods, between two times
-    most_steps: int = 20_000  # of the reductions on the full state (float32: 5,000), a hundred times as slow per step as the default, which has 100,000
+    most_steps: int = 20_000  # of reductions on the full state (float32: 5,000, constraints too), a hundred times as slow per step as the default
     independent: tuple[str, ...] | None = None  # speeds that the fixed partition keeps; None: the best at the start
     options: dict = field(default_factory=dict)  # of `simulate`, part of the set-up
     flags: Callable | None = None  # trajectory -> further flag in words
@@ -75,7 +75,8 @@ class Motion:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             steps = {"dt0": self.step} if method.even_steps else {}
-            steps |= {"max_steps": by_type(self.most_steps, 5_000)} if method.reduction else {}
+            if method.reduction or (single() and method.group == "constraints" and method.name not in SELDOM):
+                steps["max_steps"] = by_type(self.most_steps, 5_000)
             return jj.simulate(self.scene, self.start, ts=self.ts, **self.tolerances, **{**self.options, **method.options(self.scene), **steps})
 
     def _rollout(self):
