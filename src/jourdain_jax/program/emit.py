@@ -17,7 +17,7 @@ from jourdain_jax.program.graph import COMPARISONS, Graph
 from jourdain_jax.program.together import together
 
 DEEP = 120  # operations one after the other; measured: chains of links and trailers gain from 100 to 250 on, the bicycle (102) loses a quarter
-PIECE = 32  # operations
+PIECE = 128  # operations
 
 
 def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) -> list:
@@ -25,10 +25,13 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
     outputs = list(outputs)
     values = dict(known)
     waves: dict[int, tuple] = {}
-    needed = graph.needed(outputs, values)
-    pieces = [needed[k : k + PIECE] for k in range(0, len(needed), PIECE)] if _depth(graph, needed) > DEEP else [needed]
-    last_use = {a: node for node in needed for a in graph.args[node]} | dict.fromkeys(outputs, math.inf) if len(pieces) > 1 else {}
-    for piece in pieces:
+    pieces = [graph.needed(outputs, values)]
+    last_use: dict[int, float] = {}
+    if _depth(graph, pieces[0]) > DEEP:
+        order = _depth_first(graph, outputs, values)
+        pieces = [order[k : k + PIECE] for k in range(0, len(order), PIECE)]
+        last_use = {a: k for k, piece in enumerate(pieces) for node in piece for a in graph.args[node]} | dict.fromkeys(outputs, math.inf)
+    for k, piece in enumerate(pieces):
         for node in piece:
             op, args = graph.op[node], graph.args[node]
             if op == "const":
@@ -40,8 +43,25 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
             else:
                 values[node] = FUNCTIONS[op](*(values[a] for a in args))
         if len(pieces) > 1:
-            values |= _together([n for n in piece if last_use.get(n, -1) > piece[-1]], values)
+            values |= _together([n for n in piece if last_use.get(n, -1) > k], values)
     return [values[n] for n in outputs]
+
+
+def _depth_first(graph: Graph, outputs: list[int], known: Mapping[int, jax.Array]) -> list[int]:
+    """What must be computed, each node soon after its arguments, so that little is carried from piece to piece (measured: a quarter to a third less time)."""
+    seen, order = set(known), []
+    for output in outputs:
+        waiting = [] if output in seen else [(output, iter(graph.args[output]))]
+        seen.add(output)
+        while waiting:
+            args = waiting[-1][1]
+            arg = next((a for a in args if a not in seen), None)
+            if arg is None:
+                order.append(waiting.pop()[0])
+            else:
+                seen.add(arg)
+                waiting.append((arg, iter(graph.args[arg])))
+    return order
 
 
 def _depth(graph: Graph, nodes: list[int]) -> int:
