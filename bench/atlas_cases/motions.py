@@ -112,8 +112,7 @@ class Motion:
         if method.naive in naive.REDUCED_STATE and (not jj.structure_of(self.scene).affine or rows.A.shape[0] == 0):
             return not_applicable("no rows that are linear in the speeds")
         static = naive.settled(self.scene, q, u, independent=self.independent)
-        steps = by_type(self.steps, max(20, self.steps // 10))  # in float32 more of them would only add round-off
-        qs, us = naive.motion(method.naive, self.scene, static, q, u, self.ts, steps)
+        qs, us = naive.motion(method.naive, self.scene, static, q, u, self.ts, self.steps)
         qs, us = np.asarray(qs, float), np.asarray(us, float)
         if not (np.all(np.isfinite(qs)) and np.all(np.isfinite(us))):
             return Outcome(NAN)
