@@ -48,7 +48,8 @@ class DerivativeOfMotion:
         if method.naive is not None:
             return self._by_naive(method, x, tolerance)
         options = {**self.options, **method.options(self.begin(x)[0])}
-        options |= {"max_steps": FEWER_STEPS} if method.reduction else {}
+        if method.reduction:  # each by itself: reverse mode through the choice of one out of several has met NaN of the others
+            options |= {"max_steps": FEWER_STEPS, "reduction": jj.reductions(self.begin(x)[0])[method.reduction]}
         options |= {"rtol": by_type(self.rtol, self.rtol32), "atol": by_type(self.atol, self.atol32), "ts": self.ts}
 
         def value(x):

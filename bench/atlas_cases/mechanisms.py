@@ -41,9 +41,9 @@ USUAL = {
 
 REGULAR = ("Schur, Cholesky", "KKT, LU", "pinv, 1e-10", "raw SVD basis", "raw QR basis")  # naive accelerations that are right where rows are independent
 ENGINE = ("engine", "reductions", "constraints", "integrators")
-STEPPED = dict.fromkeys(
-    (*REGULAR, "fixed partition"), "its accelerations are right here; fixed steps of fourth order add up their truncation, and the motion amplifies it"
-)
+TRUNCATION = "its accelerations are right here; fixed steps of fourth order add up their truncation, and the motion amplifies it"
+ROUND_OFF = "its accelerations are right here; in float32 the round-off of thousands of short steps adds up"
+STEPPED = dict.fromkeys((*REGULAR, "fixed partition"), TRUNCATION)
 UNPROJECTED = dict.fromkeys(REGULAR, "its accelerations are right here; rows hold for accelerations only, and nothing takes the drift off them back") | {
     "fixed partition": "its speeds meet the rows; positions and norms of quaternions drift, and nothing takes that back"
 }
@@ -56,11 +56,15 @@ NEAR_FLAT = dict.fromkeys(ENGINE, "errors of the attitude count 1/theta^2: the s
 # Of a case, or of all cases of one number: method or group -> why it fails there.
 BY_CASE: dict[str, dict[str, str]] = {
     "E1": {"fixed partition": "ydot = xdot tan(heading): division by cos(heading), which passes zero"},
-    "E1 disc": {"fixed partition": "rolldot = xdot / (R cos(heading)): division by zero at 90 degrees"},
+    "E1 disc": dict.fromkeys(REGULAR, ROUND_OFF)
+    | {"fixed partition": "rolldot = xdot / (R cos(heading)): division by zero at 90 degrees"}
+    | {"ridge 1e-6": "a regularised row is a soft row; in float32 the round-off of thousands of short steps adds up, too"},
     "E2": STEPPED,
     "E5": PARALLEL,
     "E5 gradient": PARALLEL | {"rollout": "inside a derivative no lane can be run again with the full state"},
     "E6": {"naive": "it goes on where no motion does: what would stop the body at once is cut off, softened, or divided by round-off"},
+    "E7": {"fixed partition": ROUND_OFF},
+    "E7 copies": {},
     "E8": dict.fromkeys(ENGINE, "the second row differs from the first by the angle: of the order of round-off, no cut-off can tell the rank")
     | dict.fromkeys(("privileged", "gibbs-appell"), "every partition has a pivot of the size of the angle: too small to count as independent"),
     "E9": UNPROJECTED,
@@ -74,6 +78,15 @@ BY_CASE: dict[str, dict[str, str]] = {
     "E18": dict.fromkeys((*REGULAR, "no projection"), "accelerations hold a violation constant: a velocity off its row stays off")
     | dict.fromkeys(("fixed partition", "speeds in SVD basis", "speeds in QR basis"), "it drops the part off the row, but not M-orthogonally: another motion"),
     "E19": {"Baumgarte 5/s": "backwards in time the terms drive violations apart, at 5/s"},
+    "E20": {
+        "Kvaerno5": "the derivative of an inner solve, in a step beyond the event, is not finite, and the solver's library raises",
+        "reductions": "reverse mode through a step tried beyond the event, where a derivative overflows in float32; forward mode is right",
+    },
+    "E21": {"fixed partition": ROUND_OFF},
+    "E21 units": dict.fromkeys(REGULAR, TRUNCATION),
+    "E21 light": dict.fromkeys(
+        ("privileged", "gibbs-appell", "fixed partition"), "a mass ratio of 1e8 is more than float32 holds: the light part is lost in sums"
+    ),
     "E24": {"naive": "at rest the row has no slope, and whatever force comes out is made up"},
 }
 

@@ -36,9 +36,10 @@ def cells(cases: tuple[Case, ...], methods: tuple[Method, ...], progress=print) 
 
 
 def _asked(probe, method: Method, tolerance: float) -> Outcome:
-    """The method's outcome. An error of the engine's own kind is a flag; whatever else is raised is a wrong answer that says why."""
+    """The method's outcome. An error is a flag; but the engine as it comes must raise its own kind of error, any other is a wrong answer that says why."""
     try:
         return probe.cell(method, tolerance)
     except Exception as error:
-        own = isinstance(error, ValueError | SimulationError | DifferentiationModeError) and method.naive is None
-        return Outcome(FLAGGED if own else WRONG, None, f"raised {type(error).__name__}: {str(error).splitlines()[0][:120] if str(error) else ''}")
+        own = isinstance(error, ValueError | SimulationError | DifferentiationModeError)
+        said = f"raised {type(error).__name__}: {str(error).splitlines()[0][:120] if str(error) else ''}"
+        return Outcome(WRONG if method.group == "engine" and not own else FLAGGED, None, said)

@@ -125,7 +125,8 @@ def summary(cells: list[dict]) -> str:
     must = {case.name for case in CASES if case.must_be_right}
     for cell in cells:
         engine = cell["method"] in ("default", "rollout")
-        lost = cell["outcome"] in (WRONG, NAN, STALLED) or (cell["dtype"] == "float64" and cell["case"] in must and cell["outcome"] == FLAGGED)
+        required = cell["method"] == "default" and cell["dtype"] == "float64" and cell["case"] in must
+        lost = cell["outcome"] in (WRONG, NAN, STALLED) or (required and cell["outcome"] == FLAGGED)
         if engine and lost:
             lines.append(f"MARK MISSED: {cell['method']} in {cell['case']} ({cell['dtype']}): {cell['outcome']} {cell['error']} {cell['mechanism']}")
     return "\n".join(lines)
