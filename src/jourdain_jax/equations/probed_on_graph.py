@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.equations.probed import Probed, generic_inputs
+from jourdain_jax.equations.scaling import speed_scales
 from jourdain_jax.equations.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.program.derivative import derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes
@@ -118,8 +119,7 @@ class _AtStates:
         if not at.phi.size:
             return u
         M = self._mass_matrix(jacobian(self.graph, [*at.v.ravel().tolist(), *at.omega.ravel().tolist()], columns))
-        diagonal = np.diagonal(M, axis1=1, axis2=2)
-        c = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1)), 1)
+        c = speed_scales(M)
         metric = np.stack([_inverse_root(m) for m in c[:, :, None] * M * c[:, None]])  # L'^-1
         entries, moving = jacobian(self.graph, at.phi.tolist(), columns), np.arange(len(u))
         for _ in range(ITERATIONS):

@@ -8,6 +8,7 @@ The scales are constants to differentiation: the accelerations do not depend on 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.equations.rows import ConstraintRows
@@ -30,6 +31,12 @@ def speed_scale(M: Float[Array, "speeds speeds"]) -> Float[Array, "speeds"]:
     diagonal = jax.lax.stop_gradient(jnp.diagonal(M))
     heavy = diagonal > 0
     return jnp.where(heavy, 1 / jnp.sqrt(jnp.where(heavy, diagonal, 1)), 1)
+
+
+def speed_scales(M: Float[np.ndarray, "states speeds speeds"]) -> Float[np.ndarray, "states speeds"]:
+    """The same of numbers at many states, on NumPy."""
+    diagonal = np.diagonal(M, axis1=1, axis2=2)
+    return np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1)), 1)
 
 
 def row_scale(A: Float[Array, "rows speeds"]) -> Float[Array, "rows"]:

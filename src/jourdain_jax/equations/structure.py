@@ -21,6 +21,7 @@ from jourdain_jax.equations.probed_on_graph import probed_on_graph
 from jourdain_jax.equations.probing import probed_once, without_collecting
 from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.sampling import assembled, random_states, symmetric_configurations
+from jourdain_jax.equations.scaling import speed_scales
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import as_names
@@ -87,8 +88,7 @@ class _Scaled(eqx.Module):
 
 
 def _scaled(found: Probed) -> _Scaled:
-    diagonal = np.diagonal(found.M, axis1=1, axis2=2)
-    c = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1)), 1)
+    c = speed_scales(found.M)
     A = found.A * c[:, None]
     length = np.sqrt(np.sum(A**2, axis=2, keepdims=True))
     return _Scaled(A / np.where(length > 0, length, 1), c[:, :, None] * found.M * c[:, None], c)
