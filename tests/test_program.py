@@ -50,6 +50,16 @@ def test_what_is_known_while_building_is_folded(graph):
     assert graph.mul(root, root) == x
 
 
+def test_squares_of_a_sine_and_a_cosine_leave_what_they_multiply(graph):
+    w, x, y = (graph.input(name, True) for name in "wxy")
+    s, c = graph.call("sin", w), graph.call("cos", w)
+    assert graph.add(graph.mul(s, s), graph.mul(c, c)) == graph.one
+    left, right = graph.mul(graph.mul(s, x), graph.mul(y, s)), graph.mul(graph.mul(c, y), graph.mul(c, x))
+    assert graph.add(left, right) == graph.mul(x, y)
+    assert graph.op[graph.add(left, graph.mul(right, x))] == "add"
+    assert graph.op[graph.add(graph.mul(s, s), graph.mul(graph.call("cos", x), graph.call("cos", x)))] == "add"
+
+
 def test_only_operations_on_varying_quantities_count(graph):
     (x,) = _x(graph, "x")
     a = graph.input("a", False)

@@ -35,6 +35,15 @@ def applies(problem: Problem) -> bool:
         return False
 
 
+@functools.cache
+def states(problem: Problem) -> tuple[tuple[str, ...], np.ndarray, list[int]]:
+    """Names and start of the program's state (all speeds, where rows are kept by multipliers), and where in it the minimal state is."""
+    program = jj.lower(problem.scene)
+    names = (*program.coordinates, *(program.speeds[i] for i in program.independent))
+    start = np.concatenate([problem.state.q, np.asarray(problem.state.u)[list(program.independent)]])
+    return names, start, [names.index(name) for name in problem.minimal_names]
+
+
 def system(problem: Problem) -> list:
     """The engine's scalar program as equations of heyoka."""
     scene = problem.scene
@@ -44,7 +53,7 @@ def system(problem: Problem) -> list:
     exec(source, in_symbols)
     parameters = [float(getattr(scene, name)) for name in inspect.signature(in_numbers["fixed"]).parameters]
     taken = list(inspect.signature(in_symbols["rates"]).parameters)[2:]  # after `fixed` and t
-    y = heyoka.make_vars(*problem.minimal_names)
+    y = heyoka.make_vars(*states(problem)[0])
     inputs = [0.0] * (len(taken) - len(y))
     rates = in_symbols["rates"](in_numbers["fixed"](*parameters), heyoka.time, *y, *inputs)
     return list(zip(y, [heyoka.expression(rate) if isinstance(rate, float) else rate for rate in rates], strict=True))
@@ -56,39 +65,41 @@ def operations(problem: Problem) -> int:
 
 
 def extended(problem: Problem) -> dict[str, float]:
-    """Coordinates and privileged speeds at the end, in long double with a tolerance of 1e-18."""
-    start = problem.minimal_start.astype(np.longdouble)
+    """Coordinates and integrated speeds at the end, in long double with a tolerance of 1e-18."""
+    names, start, _ = states(problem)
+    start = start.astype(np.longdouble)
     solver = heyoka.taylor_adaptive(system(problem), start, tol=np.longdouble("1e-18"), fp_type=np.longdouble, compact_mode=True)
     solver.propagate_until(np.longdouble(problem.end))
-    return dict(zip(problem.minimal_names, solver.state.astype(float), strict=True))
+    return dict(zip(names, solver.state.astype(float), strict=True))
 
 
-def _prepared(problem: Problem, equations: list, compact: bool) -> Prepared:
+def _prepared(problem: Problem, equations: list, start: np.ndarray, minimal: list[int], compact: bool) -> Prepared:
     solvers: dict = {}
-    start = problem.minimal_start.tolist()
 
     def run(tolerance: float):
         if tolerance not in solvers:
-            solvers[tolerance] = heyoka.taylor_adaptive(equations, start, tol=tolerance, fast_math=True, compact_mode=compact)
+            solvers[tolerance] = heyoka.taylor_adaptive(equations, start.tolist(), tol=tolerance, fast_math=True, compact_mode=compact)
         solver = solvers[tolerance]
         solver.time = 0.0
-        solver.state[:] = problem.minimal_start
+        solver.state[:] = start
         found = solver.propagate_until(problem.end)
         return solver.state.copy(), found[3]
 
-    return Prepared(run, lambda raw: Solved(y=raw[0], steps=float(raw[1])))
+    return Prepared(run, lambda raw: Solved(y=raw[0][minimal], steps=float(raw[1])))
 
 
 def on_engines_equations(problem: Problem) -> Prepared:
     """One integrator per tolerance."""
-    return _prepared(problem, system(problem), compact=operations(problem) >= HUGE)
+    _, start, minimal = states(problem)
+    return _prepared(problem, system(problem), start, minimal, compact=operations(problem) >= HUGE)
 
 
 def on_disc_by_hand(problem: Problem) -> Prepared:
     """The disc's equations as an expert writes them."""
     y = heyoka.make_vars(*problem.minimal_names)
     qdot, vdot = tilting_disc(dense.DISC_PARAMETERS, heyoka.time, tuple(y[:5]), tuple(y[5:]), xp=heyoka)
-    return _prepared(problem, list(zip(y, (*qdot, *vdot), strict=True)), compact=False)
+    start = problem.minimal_start
+    return _prepared(problem, list(zip(y, (*qdot, *vdot), strict=True)), start, list(range(len(start))), compact=False)
 
 
 def _missing(problem: Problem) -> Prepared:

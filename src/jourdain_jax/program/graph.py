@@ -7,9 +7,11 @@ Arguments of sums and products are ordered, so that a b and b a are one node.
 import heapq
 import math
 import operator
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 
 MOST_NODES = 500_000  # of one graph: some seconds of building
+MOST_FACTORS = 8  # of a product that is looked at for squares of sines
 OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
 
 
@@ -85,7 +87,37 @@ class Graph:
             return self.args[a][0]
         if self.op[b] == "sub" and self.args[b][1] == a:
             return self.args[b][0]
+        if self.op[a] == "mul" and self.op[b] == "mul":
+            common = self._without_wave(a, b)
+            if common is not None:
+                return common
         return self._node("add", (a, b) if a < b else (b, a))
+
+    def _without_wave(self, a: int, b: int) -> int | None:
+        """x of a = sin(w)^2 x, b = cos(w)^2 x or the reverse; None where the products are not of this kind."""
+        left, right = Counter(self._factors(a)), Counter(self._factors(b))
+        more, less = left - right, right - left
+        if len(more) != 1 or len(less) != 1:
+            return None
+        (s, i), (c, j) = (*more.items(), *less.items())
+        if i != 2 or j != 2 or {self.op[s], self.op[c]} != {"sin", "cos"} or self.args[s] != self.args[c]:
+            return None
+        product = self.one
+        for factor in (left & right).elements():
+            product = self.mul(product, factor)
+        return product
+
+    def _factors(self, node: int) -> list[int]:
+        """Factors of a product of few; the node itself where it is none."""
+        factors, split = [node], True
+        while split and len(factors) < MOST_FACTORS:
+            split = False
+            for k, n in enumerate(factors):
+                if self.op[n] == "mul":
+                    factors[k : k + 1] = self.args[n]
+                    split = True
+                    break
+        return factors
 
     def sub(self, a: int, b: int) -> int:
         """a - b"""

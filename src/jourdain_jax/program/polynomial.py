@@ -62,12 +62,11 @@ class NormalForms:
     def expanded(self, node: int) -> Polynomial:
         """The polynomial of a node."""
         if node not in self._expanded:
-            for part in self.graph.reachable([node]):  # arguments first: no deep recursion
-                if part not in self._expanded:
-                    try:
-                        self._expanded[part] = self._expand(part)
-                    except TooLarge:
-                        self._expanded[part] = None
+            for part in self.graph.needed([node], self._expanded):  # arguments first: no deep recursion
+                try:
+                    self._expanded[part] = self._expand(part)
+                except TooLarge:
+                    self._expanded[part] = None
         found = self._expanded[node]
         if found is None:
             raise TooLarge
