@@ -16,6 +16,7 @@ from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion import lean_loop, results
 from jourdain_jax.motion.event_location import Located, locate
+from jourdain_jax.motion.finite_derivatives import Flat
 from jourdain_jax.motion.land_on import land_on
 from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
@@ -255,9 +256,11 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
     saveat = diffrax.SaveAt(ts=ts) if options.saveat is None else options.saveat
     moving = form.projects_positions or form.projects_speeds
     solver = for_adjoint(options.solver, options.adjoint)
+    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+    rates, project = (Flat(f, t0, y0) if implicit else f for f in (_rates, _project))
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(_rates),
-        ProjectedSolver(solver, _project) if moving else solver,
+        diffrax.ODETerm(rates),
+        ProjectedSolver(solver, project) if moving else solver,
         t0,
         t1,
         options.dt0,
