@@ -160,7 +160,7 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
         q_end=q[-1],
         u_end=u[-1],
         result=results.with_causes(
-            _result(solved.code, end.y, start, pivot),
+            _result(solved.code, end.y, start, pivot if form.needs_pivot else jnp.inf),
             parameters=begun.right,
             start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
             moved=solved.accepted > 0,
