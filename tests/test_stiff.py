@@ -185,14 +185,26 @@ def said(derivative, x) -> list[str]:
 def test_a_derivative_through_a_motion_that_amplifies_errors_warns_outside_of_jit():
     scene = Ridge(strength=16.0)
 
-    def end(x, rtol):  # exp(-8) m, on the way to rest on the ridge; the derivative is cosh(8) = 1490
-        return jj.simulate(scene, {"x": x, "x_rate": -4.0}, ts=TS[[0, -1]], rtol=rtol, atol=rtol).q_end[0]
+    def end(x, rtol, scene=scene, adjoint=None):  # exp(-8) m, on the way to rest on the ridge; the derivative is cosh(8) = 1490
+        return jj.simulate(scene, {"x": x, "x_rate": -4.0}, ts=TS[[0, 2, -1]], rtol=rtol, atol=rtol, adjoint=adjoint).q_end[0]
 
     (text,) = said(jax.grad(lambda x: end(x, 1e-6)), 1.0)
     assert "amplifies errors" in text
     assert "with rtol = 1e-06 in each of" in text
     assert said(jax.grad(lambda x: end(x, 1e-10)), 1.0) == []
     assert said(jax.jit(jax.grad(lambda x: end(x, 1e-6))), 1.0) == []  # no call back to Python in a program
+
+    forward = {"adjoint": diffrax.ForwardMode()}
+    of_start = lambda x, rtol: end(x, rtol, **forward)  # noqa: E731
+    of_scene = lambda s, rtol: end(1.0, rtol, Ridge(strength=s), **forward)  # noqa: E731
+    for value, x in ((of_start, 1.0), (of_scene, 16.0)):
+        (text,) = said(jax.jacfwd(lambda x, value=value: value(x, 1e-6)), x)
+        assert "amplifies errors" in text
+        assert said(jax.jacfwd(lambda x, value=value: value(x, 1e-10)), x) == []
+    (text,) = said(lambda x: jax.jvp(lambda x: of_start(x, 1e-6), (x,), (1.0,)), 1.0)
+    assert "with rtol = 1e-06 in each of" in text
+    assert said(jax.jit(jax.jacfwd(lambda x: of_start(x, 1e-6))), 1.0) == []
+    assert said(jax.jacfwd(jax.jacfwd(lambda x: of_start(x, 1e-10))), 1.0) == []
 
 
 @pytest.mark.parametrize("adjoint", [diffrax.ForwardMode(), None], ids=["forward", "reverse"])
