@@ -1,6 +1,7 @@
 """Markers that show what passes them in differentiation to a function of Python: they are identities.
 
-`shown_backwards(values, look)`: the cotangents, in reverse mode; `shown_forwards(values, look)`: the tangents, in forward mode, with a first axis of directions.
+`shown_backwards(values, look)`: the cotangents, in reverse mode; `shown_forwards(values, look)`: the tangents, in forward mode, with a first axis of
+directions.
 For derivatives taken outside of `jit` alone, where these are numbers: no program that is compiled holds a call back to Python.
 """
 
@@ -10,7 +11,6 @@ import jax
 import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-
 
 
 def _identity(name: str) -> Primitive:

@@ -111,7 +111,10 @@ def integrate_lanes(setups: Setup) -> Trajectory:
     if setups.options.lean and program is not None:
         solved = in_blocks(_lanes_by_lean_loop, width(program), setups, begun)
     else:
-        solved = eqx.filter_vmap(_solved)(setups, begun)
+        # lanes often share their times: what XLA knows to be the same in all of them it moves through diffrax's `nextafter`, one operation per pass
+        times = jax.lax.optimization_barrier((setups.t0, setups.t1, setups.options.dt0))
+        timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.options.dt0), setups, times)
+        solved = eqx.filter_vmap(_solved)(timed, begun)
     return eqx.filter_vmap(_finish)(setups, begun, solved)
 
 

@@ -130,7 +130,8 @@ class Trajectory(eqx.Module):
         """What speaks against a motion, in words, most serious first; empty where nothing does. The printed summary shows them.
 
         A failure; rows that gain or lose rank, or come near it, so that constraint forces and what follows may not be unique; privileged speeds of a
-        reduction that do not determine the others in this precision; steps too long for recovered coordinates; contacts that would have to pull. Computed where it is asked for; needs numbers: not under jit or vmap.
+        reduction that do not determine the others in this precision; steps too long for recovered coordinates; contacts that would have to pull.
+        Computed where it is asked for; needs numbers: not under jit or vmap.
         """
         failure = () if int(self.result) in (results.SUCCESS, results.EVENT) else (self.message,)
         return (*failure, *warnings_of(diagnose(self), self))
