@@ -64,7 +64,8 @@ class _Growth:
     """How far directions of the start, which tangents have as a first axis, have grown at the end."""
 
     def __init__(self, rtol: float, atol: float):
-        self.rtol, self.atol, self.begun = rtol, atol, []
+        self.rtol, self.atol = rtol, atol
+        self.begun: list[np.ndarray] = []
 
     def start(self, values):
         """What to do with the tangents of the start, which come first."""
