@@ -7,6 +7,7 @@ one run, times are the fastest of some repeats. Baselines, frozen: `bench/baseli
 """
 
 import argparse
+import importlib
 import json
 import os
 import platform
@@ -18,6 +19,7 @@ from collections.abc import Callable, Iterator
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +29,8 @@ from baselines.timing import fastest, seconds_per_evaluation
 
 import jourdain_jax as jj
 from jourdain_jax.models import PendulumChain, TrailerChain
+from jourdain_jax.motion import lockstep
+from jourdain_jax.motion.simulate import state_form
 
 Figure = dict
 BY_HAND_LANES, DENSE_LANES = 4096, 1024
@@ -219,7 +223,97 @@ def growth(quick: bool) -> Iterator[Figure]:
         yield figure(f"compile time at n = {many}, s", name, compile_time if complete else None, 60, 15)
 
 
-FIGURES = {f.__name__: f for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, cold_starts, growth)}
+class AngleChain(jj.Scene):
+    """A plane chain of massless links in its joint angles, a particle at the end of each: no rows, M full, where unrolled elimination is at its worst."""
+
+    links: int = eqx.field(static=True, default=4)
+    mass: object = jj.parameter(0.2, unit="kg", positive=True)
+    length: object = jj.parameter(0.3, unit="m", positive=True)
+
+    @property
+    def coordinates(self):
+        """The angle of every joint."""
+        return jj.coordinates(" ".join(f"angle{i}" for i in range(1, self.links + 1)))
+
+    def bodies(self, t, q):
+        """The particles, from the pivot on."""
+        bodies, turn, place = {}, 0.0, jnp.zeros(3)
+        for i in range(1, self.links + 1):
+            turn = turn + q[f"angle{i}"]
+            place = place + self.length * jnp.stack([jnp.sin(turn), 0.0 * turn, -jnp.cos(turn)])
+            bodies[f"particle {i}"] = jj.Particle(self.mass, place)
+        return bodies
+
+    def loads(self, motion):
+        """Weight."""
+        return (jj.gravity(motion, 9.81),)
+
+
+EVALUATIONS = 10
+
+
+def ten_times(rates: Callable, state):
+    """A state after so many explicit Euler steps of a microsecond."""
+    return jax.lax.fori_loop(0, EVALUATIONS, lambda _, y: jax.tree.map(lambda y, rate: y + 1e-6 * rate, y, rates(y)), state)
+
+
+def seconds_to_compile_and_run(function: Callable, state, lanes: int) -> tuple[float, float]:
+    """Seconds to compile `ten_times` of some rates, and per evaluation and lane."""
+    begin = time.perf_counter()
+    compiled = jax.jit(function).lower(state).compile()
+    taken = time.perf_counter() - begin
+    return taken, fastest(lambda: jax.block_until_ready(compiled(state)), 20 if lanes == 1 else 3) / (EVALUATIONS * lanes)
+
+
+BEYOND = 60_000  # operations, that `limit` asks for beyond the budget of the engine
+SIZES = (
+    ("angle-chain", lambda n: AngleChain(links=n), (4, 8, 12, 16, 24)),
+    ("pendulum-chain", lambda n: PendulumChain(links=n), (8, 16, 32)),
+    ("trailer-chain", lambda n: TrailerChain(trailers=n), (8, 16)),  # 32: minutes to compile densely
+)
+
+
+def ways_of(scene: jj.Scene, program: jj.Lowered) -> dict[str, tuple]:
+    """Way -> function of a state, the state, its lanes: by the program and densely, alone and in a batch as `rollout` runs it."""
+    form, fixed, inputs = state_form(scene, jj.structure_of(scene), lowering=False), program.fixed_values(scene), jnp.zeros(len(scene.inputs))
+    _, q, u = (jnp.asarray(x) for x in jj.sample_states(scene, DENSE_LANES))
+    by_program = lambda y: program.rates(fixed, 0.0, *y, inputs)[:2]  # noqa: E731
+    densely = lambda y: form.rates(scene, (), 0.0, y, inputs)  # noqa: E731
+    scalars, packed = (tuple(q.T), tuple(u[:, k] for k in program.independent)), jax.vmap(form.pack)(q, u)
+    first = lambda state: jax.tree.map(lambda x: x[0], state)  # noqa: E731
+    return {
+        "lowered": (lambda y: ten_times(by_program, y), first(scalars), 1),
+        "lowered, batch": (lambda y: lockstep.in_blocks(lambda y: ten_times(by_program, y), lockstep.width(program), y), scalars, DENSE_LANES),
+        "dense": (lambda y: ten_times(densely, y), first(packed), 1),
+        "dense, batch": (lambda y: ten_times(jax.vmap(densely), y), packed, DENSE_LANES),
+    }
+
+
+def limit(quick: bool) -> Iterator[Figure]:
+    """Lowered against dense over the size of a scene, beyond the budget of operations too: time per evaluation, and what it takes to compile."""
+    if quick:
+        return
+    lower_module = importlib.import_module("jourdain_jax.lowering.lower")
+    lower_module.MOST_OPERATIONS = BEYOND
+    for name, make, counts in SIZES:
+        for n in counts:
+            scene, begin = make(n), time.perf_counter()
+            try:
+                program = jj.lower(scene)
+            except jj.NotLowered as reason:
+                print(f"  {name}, n = {n}: {reason}", flush=True)
+                continue
+            built = time.perf_counter() - begin
+            found = {way: seconds_to_compile_and_run(*asked) for way, asked in ways_of(scene, program).items()}
+            print(f"  {name}, n = {n}: {program.operations} operations, lowered in {built:.1f} s", flush=True)
+            for way, (compiled, seconds) in found.items():
+                print(f"    {way}: compiled in {compiled:.1f} s, {1e6 * seconds:.2f} us per evaluation and lane", flush=True)
+            for where in ("", ", batch"):
+                ratio = found[f"lowered{where}"][1] / found[f"dense{where}"][1]
+                yield figure(f"time per evaluation, lowered / dense{where}, n = {n}, {program.operations} operations", name, ratio, 1, 0.1)
+
+
+FIGURES = {f.__name__: f for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, cold_starts, growth, limit)}
 
 
 def main() -> None:

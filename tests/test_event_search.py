@@ -55,6 +55,29 @@ def test_the_state_at_an_event_has_the_same_derivative_in_reverse_mode():
     np.testing.assert_allclose(jax.jacrev(landing)(2.0), [0.0, -GRAVITY / speed], atol=1e-10)
 
 
+def test_reverse_mode_to_an_event_does_not_depend_on_derivatives_beyond_it():
+    depth, stiffness, height = 0.05, 5e-3, 2.0
+    beyond = []
+
+    def push(x):  # k x^9.5 above -depth, zero below it, where reverse mode divides by sqrt(0)
+        return stiffness * x**9 * jnp.sqrt(jnp.maximum(x, 0.0))
+
+    def rates(t, y):
+        jax.debug.callback(lambda y: beyond.append(y < -depth), y[0])
+        return jnp.stack([y[1], -GRAVITY + push(y[0] + depth)])
+
+    def landing_speed(height):
+        return stopped(jnp.stack([height, 0.0 * height]), lambda t, y: y[0], rates=rates, kind="reverse", solver=diffrax.Tsit5()).y[1]
+
+    # v^2/2 + g z - k (z + d)^10.5/10.5 is constant
+    work = lambda z: GRAVITY * z - stiffness * (z + depth) ** 10.5 / 10.5  # noqa: E731
+    speed = np.sqrt(2 * (work(height) - work(0.0)))
+    assert np.isnan(jax.grad(push)(-depth))
+    np.testing.assert_allclose(landing_speed(height), -speed, rtol=1e-9)
+    assert any(beyond)
+    np.testing.assert_allclose(jax.grad(landing_speed)(height), -(GRAVITY - push(height + depth)) / speed, rtol=1e-7)
+
+
 @pytest.mark.parametrize(
     ("value", "digits"),
     [

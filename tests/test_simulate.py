@@ -268,6 +268,39 @@ def test_a_motion_that_leaves_the_domain_of_its_partition_is_continued_with_the_
     assert float(forced.smallest_pivot) < 0.02
 
 
+class Trolley(jj.Scene):
+    """A particle on a guide, stated twice, that a force of 1 N pulls; a wheel of radius 1 m rolls along."""
+
+    inertia: object = jj.parameter(1.0, unit="kg m^2", positive=True)
+    coordinates = jj.coordinates("x y turn")
+
+    def bodies(self, t, q):
+        place = jnp.stack([q.x, q.y, 0.0 * q.x])
+        wheel = jj.RigidBody(0.0, self.inertia * jnp.ones(3), place, jj.rot_z(q.turn))
+        return {"load": jj.Particle(1.0, place), "wheel": wheel}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=1.0),)
+
+    def velocity_constraints(self, motion):
+        u = motion.u
+        return {"guide": u.y_rate, "guide again": u.y_rate, "rolling": u.x_rate - u.turn_rate}
+
+
+def test_a_reduction_by_privileged_speeds_too_light_for_the_precision_is_warned_of():
+    def pulled(inertia, reduction):
+        return jj.simulate(Trolley(inertia=inertia), t1=2.0, ts=[0.0, 2.0], state="full", reduction=reduction)
+
+    by_wheel = jj.Privileged((2,))
+    for inertia, reduction in ((0.25, by_wheel), (1e-8, by_wheel), (1e-30, "qr")):
+        motion = pulled(inertia, reduction)
+        np.testing.assert_allclose(motion.q_end[0], 2 / (1 + inertia), rtol=1e-8)
+        assert motion.warnings == ()
+    lost = pulled(1e-30, by_wheel)  # the scaled row of the wheel hardly holds x: A_z is singular in 64-bit floats
+    assert float(lost.q_end[0]) < 1e-3
+    assert any("hardly determine the others, pivot 1.0e-15" in text for text in lost.warnings)
+
+
 def test_another_tolerance_or_first_step_is_no_other_program(monkeypatch):
     traced = []
     begin = integration._begin

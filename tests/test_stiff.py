@@ -57,6 +57,16 @@ class Ridge(OnALine):
         return -self.strength * pose.q.x**2 / 2
 
 
+class Drawn(OnALine):
+    """`xddot = -9.81 + strength sqrt(x + 0.02)`, which is no number a little below the floor at x = 0, where the motion stops."""
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-9.81 + self.strength * jnp.sqrt(motion.q.x + 0.02)),)
+
+    def events(self, motion):
+        return {"floor": motion.q.x}
+
+
 @pytest.fixture(scope="module")
 def damped():
     return jj.simulate(Damped(), {"x_rate": 1.0}, ts=TS)
@@ -175,14 +185,44 @@ def said(derivative, x) -> list[str]:
 def test_a_derivative_through_a_motion_that_amplifies_errors_warns_outside_of_jit():
     scene = Ridge(strength=16.0)
 
-    def end(x, rtol):  # exp(-8) m, on the way to rest on the ridge; the derivative is cosh(8) = 1490
-        return jj.simulate(scene, {"x": x, "x_rate": -4.0}, ts=TS[[0, -1]], rtol=rtol, atol=rtol).q_end[0]
+    def end(x, rtol, scene=scene, adjoint=None):  # exp(-8) m, on the way to rest on the ridge; the derivative is cosh(8) = 1490
+        return jj.simulate(scene, {"x": x, "x_rate": -4.0}, ts=TS[[0, 2, -1]], rtol=rtol, atol=rtol, adjoint=adjoint).q_end[0]
 
     (text,) = said(jax.grad(lambda x: end(x, 1e-6)), 1.0)
     assert "amplifies errors" in text
     assert "with rtol = 1e-06 in each of" in text
     assert said(jax.grad(lambda x: end(x, 1e-10)), 1.0) == []
     assert said(jax.jit(jax.grad(lambda x: end(x, 1e-6))), 1.0) == []  # no call back to Python in a program
+
+    forward = {"adjoint": diffrax.ForwardMode()}
+    of_start = lambda x, rtol: end(x, rtol, **forward)  # noqa: E731
+    of_scene = lambda s, rtol: end(1.0, rtol, Ridge(strength=s), **forward)  # noqa: E731
+    for value, x in ((of_start, 1.0), (of_scene, 16.0)):
+        (text,) = said(jax.jacfwd(lambda x, value=value: value(x, 1e-6)), x)
+        assert "amplifies errors" in text
+        assert said(jax.jacfwd(lambda x, value=value: value(x, 1e-10)), x) == []
+    (text,) = said(lambda x: jax.jvp(lambda x: of_start(x, 1e-6), (x,), (1.0,)), 1.0)
+    assert "with rtol = 1e-06 in each of" in text
+    assert said(jax.jit(jax.jacfwd(lambda x: of_start(x, 1e-6))), 1.0) == []
+    assert said(jax.jacfwd(jax.jacfwd(lambda x: of_start(x, 1e-10))), 1.0) == []
+
+
+@pytest.mark.parametrize("adjoint", [diffrax.ForwardMode(), None], ids=["forward", "reverse"])
+def test_an_implicit_solver_that_tries_steps_beyond_an_event_has_the_derivative_of_the_closed_form(adjoint):
+    def landing_speed(height):
+        motion = jj.simulate(Drawn(), {"x": height}, t1=3.0, ts=[0.0], rtol=1e-8, atol=1e-8, solver=diffrax.Kvaerno5(), adjoint=adjoint, work=False)
+        return motion.u_end[0], (motion.result, motion.rejected)
+
+    # v^2/2 + 9.81 x - (2/3) (x + 0.02)^(3/2) is constant
+    stored = lambda x: 9.81 * x - (x + 0.02) ** 1.5 * 2 / 3  # noqa: E731
+    speed = -np.sqrt(2 * (stored(1.0) - stored(0.0)))
+    if adjoint is None:
+        (found, (code, rejected)), slope = jax.value_and_grad(landing_speed, has_aux=True)(1.0)
+    else:
+        found, slope, (code, rejected) = jax.jvp(landing_speed, (1.0,), (1.0,), has_aux=True)
+    assert (int(code), int(rejected) > 0) == (results.EVENT, True)
+    np.testing.assert_allclose(found, speed, rtol=1e-7)
+    np.testing.assert_allclose(slope, (9.81 - np.sqrt(1.02)) / speed, rtol=1e-6)
 
 
 def test_zero_is_no_attitude():

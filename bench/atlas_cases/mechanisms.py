@@ -78,10 +78,6 @@ BY_CASE: dict[str, dict[str, str]] = {
     "E18": dict.fromkeys((*REGULAR, "no projection"), "accelerations hold a violation constant: a velocity off its row stays off")
     | dict.fromkeys(("fixed partition", "speeds in SVD basis", "speeds in QR basis"), "it drops the part off the row, but not M-orthogonally: another motion"),
     "E19": {"Baumgarte 5/s": "backwards in time the terms drive violations apart, at 5/s"},
-    "E20": {
-        "Kvaerno5": "the derivative of an inner solve, in a step beyond the event, is not finite, and the solver's library raises",
-        "reductions": "reverse mode through a step tried beyond the event, where a derivative overflows in float32; forward mode is right",
-    },
     "E21": {"fixed partition": ROUND_OFF},
     "E21 units": dict.fromkeys(REGULAR, TRUNCATION),
     "E21 light": dict.fromkeys(

@@ -1,6 +1,8 @@
-"""A marker that shows the cotangents that pass it in reverse mode to a function of Python: `shown_backwards(values, look)` is the identity.
+"""Markers that show what passes them in differentiation to a function of Python: they are identities.
 
-For derivatives taken outside of `jit` alone, where cotangents are numbers: no program that is compiled holds a call back to Python.
+`shown_backwards(values, look)`: the cotangents, in reverse mode; `shown_forwards(values, look)`: the tangents, in forward mode, with a first axis of
+directions.
+For derivatives taken outside of `jit` alone, where these are numbers: no program that is compiled holds a call back to Python.
 """
 
 from collections.abc import Callable
@@ -10,12 +12,19 @@ import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-_shown_p = Primitive("jourdain_shown_backwards")
-_shown_p.multiple_results = True
-_shown_p.def_impl(lambda *values, look: list(values))
-_shown_p.def_abstract_eval(lambda *values, look: list(values))
-mlir.register_lowering(_shown_p, lambda ctx, *values, look: list(values))
-batching.primitive_batchers[_shown_p] = lambda values, dims, *, look: (_shown_p.bind(*values, look=look), dims)
+
+def _identity(name: str) -> Primitive:
+    """A primitive that is the identity of several arrays."""
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    primitive.def_impl(lambda *values, look: list(values))
+    primitive.def_abstract_eval(lambda *values, look: list(values))
+    mlir.register_lowering(primitive, lambda ctx, *values, look: list(values))
+    batching.primitive_batchers[primitive] = lambda values, dims, *, look: (primitive.bind(*values, look=look), dims)
+    return primitive
+
+
+_shown_p, _forwards_p, _tangents_p = (_identity(f"jourdain_shown_{name}") for name in ("backwards", "forwards", "tangents"))
 
 
 def _transposed(cotangents, *values, look: Callable):
@@ -26,6 +35,35 @@ def _transposed(cotangents, *values, look: Callable):
 
 
 ad.deflinear2(_shown_p, _transposed)
+
+
+def _pushed(primals, tangents, *, look: Callable):
+    tangents = [ad.instantiate_zeros(tangent) for tangent in tangents]
+    return _forwards_p.bind(*primals, look=look), _tangents_p.bind(*tangents, look=look)
+
+
+def _seen(*tangents, look: Callable):
+    look([np.asarray(tangent)[None] for tangent in tangents])
+    return list(tangents)
+
+
+def _seen_together(tangents, dims, *, look: Callable):
+    """Several directions at once, of `jacfwd`."""
+    if not any(isinstance(tangent, jax.core.Tracer) for tangent in tangents):
+        look([np.asarray(x)[None] if dim is None else np.moveaxis(np.asarray(x), dim, 0) for x, dim in zip(tangents, dims, strict=True)])
+    return list(tangents), dims
+
+
+_tangents_p.def_impl(_seen)
+batching.primitive_batchers[_tangents_p] = _seen_together
+ad.primitive_jvps[_forwards_p] = _pushed
+ad.deflinear2(_tangents_p, lambda cotangents, *values, look: [ad.instantiate_zeros(ct) for ct in cotangents])
+ad.primitive_jvps[_tangents_p] = lambda primals, tangents, *, look: (_tangents_p.bind(*primals, look=look), list(tangents))
+
+
+def shown_forwards(values: tuple, look: Callable) -> tuple:
+    """`values`, a tuple of arrays; `look` is called with the list of their tangents, with a first axis of directions, where these are numbers."""
+    return tuple(_forwards_p.bind(*values, look=look))
 
 
 def shown_backwards(values: tuple, look: Callable) -> tuple:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.equations.probing import Seldom, on_numbers
 from jourdain_jax.equations.reactions import ContactForce
 from jourdain_jax.motion.along import Record, accelerations_along, contact_forces_along, energies, invariants, residuals
@@ -123,6 +124,13 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
         warned.append(f"rows change their rank along the motion, {low} to {high}: constraint forces and the motion beyond may not be unique")
     elif smallest < np.sqrt(jnp.finfo(trajectory.q.dtype).eps):
         warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
+    pivot, dense = float(trajectory.smallest_pivot), not trajectory.reduction.endswith("lowered")
+    # round-off over the square of the pivot is the error of an acceleration; other states than the full one end there
+    if trajectory.state_form == "full" and dense and pivot < passing_cutoff(trajectory.q.dtype):
+        warned.append(
+            f"the privileged speeds of the reduction hardly determine the others, pivot {pivot:.1e}: no digit of the accelerations is sure in "
+            f"{trajectory.q.dtype}; leave `reduction` at its default, or take float64"
+        )
     if float(trajectory.quadrature_error) > TOO_LONG:
         warned.append(
             f"steps were too long for the recovered coordinates {', '.join(trajectory.recovered)}: in one step {float(trajectory.quadrature_error):.0e} times "

@@ -16,6 +16,7 @@ from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion import lean_loop, results
 from jourdain_jax.motion.event_location import Located, locate
+from jourdain_jax.motion.finite_derivatives import Flat
 from jourdain_jax.motion.land_on import land_on
 from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
@@ -110,7 +111,10 @@ def integrate_lanes(setups: Setup) -> Trajectory:
     if setups.options.lean and program is not None:
         solved = in_blocks(_lanes_by_lean_loop, width(program), setups, begun)
     else:
-        solved = eqx.filter_vmap(_solved)(setups, begun)
+        # lanes often share their times: what XLA knows to be the same in all of them it moves through diffrax's `nextafter`, one operation per pass
+        times = jax.lax.optimization_barrier((setups.t0, setups.t1, setups.options.dt0))
+        timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.options.dt0), setups, times)
+        solved = eqx.filter_vmap(_solved)(timed, begun)
     return eqx.filter_vmap(_finish)(setups, begun, solved)
 
 
@@ -159,7 +163,7 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
         q_end=q[-1],
         u_end=u[-1],
         result=results.with_causes(
-            _result(solved.code, end.y, start, pivot),
+            _result(solved.code, end.y, start, pivot if form.needs_pivot else jnp.inf),
             parameters=begun.right,
             start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
             moved=solved.accepted > 0,
@@ -255,9 +259,11 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
     saveat = diffrax.SaveAt(ts=ts) if options.saveat is None else options.saveat
     moving = form.projects_positions or form.projects_speeds
     solver = for_adjoint(options.solver, options.adjoint)
+    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+    rates, project = (Flat(f, t0, y0) if implicit else f for f in (_rates, _project))
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(_rates),
-        ProjectedSolver(solver, _project) if moving else solver,
+        diffrax.ODETerm(rates),
+        ProjectedSolver(solver, project) if moving else solver,
         t0,
         t1,
         options.dt0,

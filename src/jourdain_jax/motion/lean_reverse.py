@@ -3,7 +3,8 @@
     y_(i+1) = step(t_i, t_(i+1), y_i, args)       g_i = (dstep/dy_i)' g_(i+1),   g_args += (dstep/dargs)' g_(i+1)
 
 The times t_i are data: step-size control, rejected steps and error estimates are no part of it. Only times that were asked for, the first time, and the
-time of an event have cotangents.
+time of an event have cotangents. The search for an event is no part of it either: from the last state before the event one step leads to it, and what lies
+beyond, where derivatives may not exist, is never met.
 
 Memory holds a window of steps with their states; when it is full, the state and step size there are kept and the next window begins. Going back, the
 last window is there already. An earlier one is integrated again, from the state at its beginning to end exactly where the next begins: whatever steps
@@ -22,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.motion import lean_adjoint, results
 from jourdain_jax.motion.event_search import MOST_STEPS
-from jourdain_jax.motion.lean_step import RUNNING, Method, Problem, Progress, advanced, begun, chosen, running
+from jourdain_jax.motion.lean_step import LOCATING, RUNNING, Method, Problem, Progress, advanced, begun, chosen, running
 
 STEPS_ALONE, STEPS_TOGETHER = 2048, 512  # of a window: for one motion, for lanes in lockstep
 SPARE = 4  # this part of a window is left free, for the steps that it takes when it is integrated again
@@ -43,6 +44,11 @@ class _Window(eqx.Module):
         i = jnp.where(restart, 0, self.last + self.passed(p)).astype(jnp.int32)
         t, y, goals = _put((self.t, self.y, self.goal), i, (p.t, p.y, goal))
         return _Window(t, y, goals, i)
+
+    def before_event(self, p: Progress) -> Progress:
+        """`p`, but lanes that are searching for an event still at the last state before it."""
+        t, y = _where(p.code == LOCATING, _at((self.t, self.y), self.last), (p.t, p.y))
+        return replace(p, t=t, y=y)
 
     def passed(self, p: Progress) -> Bool[Array, ""]:
         """Whether time has passed since the last state."""
@@ -116,11 +122,12 @@ def _recorded(perturbed, moving, control, forward, method):
         def step(carry):
             p, record = carry
             p = advanced(problem, method, p, goal, goals[-1], direction)
-            ended = record.window.last + record.window.passed(p) == full
+            kept = record.window.before_event(p)
+            ended = record.window.last + record.window.passed(kept) == full
             number = jnp.minimum(record.number + ended, places - 1)
-            kept = jnp.where(ended, number, places - 1)
-            beginnings = _put(record.beginnings, kept, _Beginnings(p.t, p.y, p.h, k))
-            return p, _Record(record.window.added(p, k, restart=ended), beginnings, number)
+            place = jnp.where(ended, number, places - 1)
+            beginnings = _put(record.beginnings, place, _Beginnings(kept.t, kept.y, kept.h, k))
+            return p, _Record(record.window.added(kept, k, restart=ended), beginnings, number)
 
         record = replace(record, window=record.window.towards(k))
         p, record = jax.lax.while_loop(lambda carry: eqxi.unvmap_any(running(carry[0], goal)), step, (p, record))

@@ -1,4 +1,4 @@
-"""Derivatives through motions that amplify errors: what reverse mode finds out anyway, said aloud.
+"""Derivatives through motions that amplify errors: what differentiation finds out anyway, said aloud.
 
 A value L of a motion has the cotangents g = dL/dy at the states it looks at and g_0 = dL/dy_0 at the start. With s = atol + rtol |y|, what the step-size
 control lets pass at one state,
@@ -6,6 +6,9 @@ control lets pass at one state,
     amplification = sum |g_0| s_0 / sum |g| s          relative error of a derivative <~ steps amplification rtol
 
 for every step adds an error of s, the derivative is taken along a path that is off by their sum, and changes along it as much as the motion itself does.
+Forward mode has tangents d instead, of the states saved and of the start, and s of the largest |y| of each:
+
+    amplification = max |d_1|/s / max |d_0|/s,   or its square from the middle of the motion on, where the start does not depend on what is varied
 """
 
 import warnings
@@ -15,7 +18,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jourdain_jax.calculus.cotangents import shown_backwards
+from jourdain_jax.calculus.cotangents import shown_backwards, shown_forwards
 from jourdain_jax.motion.integration import Setup
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.scene.numbers import is_traced
@@ -52,37 +55,76 @@ class _Sizes:
 
         def look(cotangents):
             begun, self.looked_at, ended = self.weighed(values, cotangents), 0.0, self.looked_at
-            error = self.steps * begun / ended * self.rtol if ended > 0 else 0.0
-            if error > LARGEST_ERROR:
-                warnings.warn(_text(begun / ended, self.rtol, self.steps, error), SensitivityWarning, stacklevel=2)
+            _judge(begun / ended if ended > 0 else 0.0, self.rtol, self.steps)
 
         return look
 
 
-def _text(amplification: float, rtol: float, steps: int, error: float) -> str:
-    return (
-        f"the derivative goes through a motion that amplifies errors {amplification:.1e} times: with rtol = {rtol:g} in each of {steps} steps its "
-        f"relative error may be {error:.0e}; tighten `rtol` and `atol` (in float64), or shorten the span"
-    )
+class _Growth:
+    """How far directions of the start, which tangents have as a first axis, have grown at the end."""
+
+    def __init__(self, rtol: float, atol: float):
+        self.rtol, self.atol = rtol, atol
+        self.begun: list[np.ndarray] = []
+
+    def start(self, values):
+        """What to do with the tangents of the start, which come first."""
+
+        def look(tangents):
+            self.begun = tangents
+
+        return look
+
+    def ends(self, values, steps: int):
+        """What to do with those of the states (saved, then last) that come after so many steps."""
+        (q, u, q_end, u_end), middle = values, len(values[0]) // 2
+        tops = [np.max(np.nan_to_num(np.abs(np.concatenate([x, last[None]]))), axis=0) for x, last in ((q, q_end), (u, u_end))]
+
+        def sizes(tangents):
+            parts = [np.max(np.abs(d) / (self.atol + self.rtol * top), axis=1, initial=0.0) for d, top in zip(tangents, tops, strict=True)]
+            return np.maximum(*parts)
+
+        def look(tangents):
+            ended = sizes(tangents[2:])
+            begun = sizes(self.begun) if self.begun else np.zeros_like(ended)  # a start that nothing varies is not asked
+            half = sizes([d[:, middle] for d in tangents[:2]]) if middle else np.zeros_like(ended)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                grown = np.where(begun > 0, ended / begun, np.where(half > 0, (ended / half) ** 2, 0.0))
+            _judge(float(np.max(grown)), self.rtol, steps)
+
+        return look
+
+
+def _judge(amplification: float, rtol: float, steps: int) -> None:
+    """A warning where so many steps, each as wrong as the tolerance lets it be, spoil a derivative."""
+    error = steps * amplification * rtol
+    if error > LARGEST_ERROR:
+        text = (
+            f"the derivative goes through a motion that amplifies errors {amplification:.1e} times: with rtol = {rtol:g} in each of {steps} steps its "
+            f"relative error may be {error:.0e}; tighten `rtol` and `atol` (in float64), or shorten the span"
+        )
+        warnings.warn(text, SensitivityWarning, stacklevel=3)
 
 
 def watched(setup: Setup, integrate) -> Trajectory:
-    """`integrate(setup)`; its derivative in reverse mode, taken outside of `jit`, warns where the motion amplifies errors too much."""
-    if isinstance(setup.options.adjoint, diffrax.ForwardMode) or not is_traced(setup):
+    """`integrate(setup)`; its derivative, taken outside of `jit`, warns where the motion amplifies errors too much."""
+    if not is_traced(setup):
         return integrate(setup)
+    forward = isinstance(setup.options.adjoint, diffrax.ForwardMode)
     start, (rtol, atol) = setup.start, setup.options.tolerances
     known = _known((start.q, start.u, rtol, atol))
     if known is None:
         return integrate(setup)
-    sizes = _Sizes(float(known[2]), float(known[3]))
-    at_start = shown_backwards((start.q, start.u), sizes.start(known[:2]))
+    sizes = (_Growth if forward else _Sizes)(float(known[2]), float(known[3]))
+    shown = shown_forwards if forward else shown_backwards
+    at_start = shown((start.q, start.u), sizes.start(known[:2]))
     motion = integrate(eqx.tree_at(lambda s: (s.start.q, s.start.u), setup, at_start))
     parts = (motion.q, motion.u, motion.q_end, motion.u_end)
     seen = _known((*parts, motion.accepted))
     if seen is None:
         return motion
-    shown = shown_backwards(parts, sizes.ends(seen[:-1], int(seen[-1])))
-    return eqx.tree_at(lambda m: (m.q, m.u, m.q_end, m.u_end), motion, shown)
+    at_ends = shown(parts, sizes.ends(seen[:-1], int(seen[-1])))
+    return eqx.tree_at(lambda m: (m.q, m.u, m.q_end, m.u_end), motion, at_ends)
 
 
 def _known(values) -> tuple | None:

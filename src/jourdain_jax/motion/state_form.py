@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.equations.accelerations import Baumgarte, bare_accelerations
 from jourdain_jax.equations.explicit_power import stored_by_inputs
+from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations, speeds_and_pivot, speeds_from_privileged
 from jourdain_jax.equations.power import rate_of_work
@@ -89,10 +90,21 @@ class StateForm(eqx.Module):
         return stored_by_inputs(scene, motion_at(scene, t, q, jnp.zeros(len(scene.speed_names), q.dtype), inputs), self.of_inputs)
 
     def pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, ""]:
-        """How well the privileged speeds determine the others, with a sign that changes where they do not (1 for the full state)."""
+        """How well the privileged speeds determine the others, with a sign that changes where they do not.
+
+        For the full state those of its reduction, without a sign; 1 where it has none.
+        """
         if self.lowered is not None:
             return self.lowered.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[1]
-        return jnp.ones(()) if self.independent is None else speeds_and_pivot(scene, self.independent, t, y.q, y.v, inputs)[1]
+        if self.independent is not None:
+            return speeds_and_pivot(scene, self.independent, t, y.q, y.v, inputs)[1]
+        partitioned = isinstance(self.reduction, Privileged | GibbsAppell)
+        return bare_accelerations(scene, t, y.q, y.v, inputs, reduction=self.reduction).pivot if partitioned else jnp.ones(())
+
+    @property
+    def needs_pivot(self) -> bool:
+        """Whether a small pivot, or one that changes sign, ends a motion: a state that is all there goes on, with a warning."""
+        return self.lowered is not None or self.independent is not None
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
         """Values of the stop events, sorted by name; lanes only where `lowers_events`."""

@@ -37,7 +37,8 @@ class Trajectory(eqx.Module):
     quadrature_error: Float[Array, ""]  # largest, in one step, of `recovered` coordinates, over what the step-size control lets pass; 0: there are none
     moved_q: Float[Array, ""]  # how far the start was moved onto the constraints
     moved_u: Float[Array, ""]
-    # of the privileged speeds, over the saved times (lowered: of the elimination, relative to its usual size); negative if it changed sign; 1: full state
+    # of the privileged speeds, over the saved times (lowered: of the elimination, relative to its usual size); negative if it changed sign;
+    # full state, dense: of those of the reduction, 1 where it has none
     smallest_pivot: Float[Array, ""]
     inputs: Inputs
     state_form: str = eqx.field(static=True)  # "minimal" or "full"
@@ -128,8 +129,9 @@ class Trajectory(eqx.Module):
     def warnings(self) -> tuple[str, ...]:
         """What speaks against a motion, in words, most serious first; empty where nothing does. The printed summary shows them.
 
-        A failure; rows that gain or lose rank, or come near it, so that constraint forces and what follows may not be unique; steps too long for recovered
-        coordinates; contacts that would have to pull. Computed where it is asked for; needs numbers: not under jit or vmap.
+        A failure; rows that gain or lose rank, or come near it, so that constraint forces and what follows may not be unique; privileged speeds of a
+        reduction that do not determine the others in this precision; steps too long for recovered coordinates; contacts that would have to pull.
+        Computed where it is asked for; needs numbers: not under jit or vmap.
         """
         failure = () if int(self.result) in (results.SUCCESS, results.EVENT) else (self.message,)
         return (*failure, *warnings_of(diagnose(self), self))
