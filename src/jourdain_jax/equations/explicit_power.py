@@ -10,6 +10,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array, Float
 
 from jourdain_jax.equations.kinematics import coordinate_rates
@@ -56,4 +57,16 @@ def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Float[Ar
         held = eqx.tree_at(lambda m: (m.t, m.q.array), motion, (t, q))
         return potential(scene, held)
 
-    return jax.jvp(V, (motion.t, q), (jnp.ones_like(motion.t), nu))[1]
+    return jax.jvp(_only_what_is_needed(V, motion.t, q), (motion.t, q), (jnp.ones_like(motion.t), nu))[1]
+
+
+def _only_what_is_needed(f: Callable, *like) -> Callable:
+    """`f` without what its result does not depend on: forces that the same loads state need not have a derivative."""
+    closed = jax.make_jaxpr(f)(*like)
+    needed, kept = {v for v in closed.jaxpr.outvars if not isinstance(v, Literal)}, []
+    for equation in reversed(closed.jaxpr.eqns):
+        if not needed.isdisjoint(equation.outvars):
+            kept.append(equation)
+            needed.update(v for v in equation.invars if not isinstance(v, Literal))
+    pruned = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr.replace(eqns=kept[::-1]), closed.consts))
+    return lambda *given: pruned(*given)[0]

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jourdain_jax.program.graph import COMPARISONS, Graph
+from jourdain_jax.program.calls import EMITTED
+from jourdain_jax.program.graph import ARRAYS, COMPARISONS, Graph
 from jourdain_jax.program.together import together
 
 DEEP = 120  # operations one after the other; measured: chains of links and trailers gain from 100 to 250 on, the bicycle (102) loses a quarter
@@ -40,10 +41,12 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
                 if args[0] not in waves:
                     waves[args[0]] = sine_and_cosine(values[args[0]])
                 values[node] = waves[args[0]][op == "cos"]
+            elif op in EMITTED:
+                values[node] = EMITTED[op](graph.value[node], *(values[a] for a in args))
             else:
                 values[node] = FUNCTIONS[op](*(values[a] for a in args))
         if len(pieces) > 1:
-            values |= _together([n for n in piece if last_use.get(n, -1) > k], values)
+            values |= _together([n for n in piece if last_use.get(n, -1) > k and graph.op[n] not in ARRAYS], values)
     return [values[n] for n in outputs]
 
 
