@@ -162,7 +162,7 @@ def _traced(scene: Scene, of_inputs: tuple[int, ...], with_events: bool):
         raise Unsupported(f"a function that JAX cannot differentiate ({str(error).split('.')[0]})") from None
 
 
-def _on_graph(scene: Scene, closed, shape, interpreted: Callable, most_multiplications: float) -> TracedScene:
+def _on_graph(scene: Scene, closed, shape, interpreted: Callable, most_multiplications: float | int) -> TracedScene:
     graph = Graph(most_multiplications)
     parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(jax.tree.leaves(scene))]
     sizes = {"t": (), "q": (len(scene.coordinate_names),), "u": (len(scene.speed_names),), "i": (len(scene.inputs),)}

@@ -327,13 +327,15 @@ def _operands(graph: Graph, call: int) -> list[int]:
 def _with_equal_calls_once(probes: Probes, outputs: list[int]) -> list[int]:
     """The outputs, with one call in place of those that compute the same of what is equal at all probes, though it is not written in the same way."""
     graph = probes.graph
-    first: dict = {}
-    for call in graph.calls(outputs):
-        alike = first.setdefault((graph.value[call], tuple(graph.value[a] for a in graph.args[call])), [])
+    calls = sorted(graph.calls(outputs), key=lambda call: (graph.operations(graph.args[call]), call))  # so none is replaced by one made from it
+    kept: dict = {}
+    same: dict[int, int] = {}
+    for call in calls:
+        alike = kept.setdefault((graph.value[call], tuple(graph.value[a] for a in graph.args[call])), [])
         given = probes(_operands(graph, call))
-        same = next((other for other in alike if np.allclose(probes(_operands(graph, other)), given, rtol=AGREEMENT, atol=AGREEMENT)), None)
-        if same is None:
+        found = next((other for other in alike if np.allclose(probes(_operands(graph, other)), given, rtol=AGREEMENT, atol=AGREEMENT)), None)
+        if found is None:
             alike.append(call)
         else:
-            outputs = graph.substituted(outputs, {call: same})
-    return outputs
+            same[call] = found
+    return graph.substituted(outputs, same)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
 from jourdain_jax.equations.trace import TracedScene
 from jourdain_jax.lowering import export
@@ -108,7 +108,7 @@ class Lowered:
         """One equation per rate, for an `align` environment; needs SymPy."""
         return export.latex(self)
 
-    def fixed_values(self, scene: Scene) -> tuple[Float[Array, ""], ...]:
+    def fixed_values(self, scene: Scene) -> tuple[Num[Array, "..."], ...]:
         """The values of what depends on parameters alone, for the parameters of `scene`; computed once per motion."""
         place = {int(n): (k, i) for k, nodes in enumerate(self.traced.parameters) for i, n in enumerate(np.ravel(nodes))}
         leaves = [jnp.reshape(leaf, -1) for leaf in jax.tree.leaves(scene)]

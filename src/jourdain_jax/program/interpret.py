@@ -75,6 +75,8 @@ def _run(graph: Graph, jaxpr, constants, arguments) -> list[Value]:
 
 def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
     """Results of one equation."""
+    if equation.effects:
+        raise Unsupported(f"the operation `{name}`, which has effects,")
     inner = inner_jaxpr(name, equation.params)
     if inner is not None:
         return _run(graph, inner.jaxpr, [_known(c) for c in inner.consts], inputs) if hasattr(inner, "jaxpr") else _run(graph, inner, [], inputs)
