@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.virtual_power import potential_energy, resultants
 from jourdain_jax.scene.answers import loads_of
+from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
@@ -26,9 +27,12 @@ def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -
     return sum((loads[k].potential for k in of_inputs), start=jnp.zeros_like(motion.t))
 
 
-def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
-    """The part of `rate_of_work` that needs no accelerations: of loads without a potential, of potentials that depend on time or on inputs; W."""
-    by_time = power_of_loads(scene, motion, conservative=False) + explicit_rate(scene, motion, potential_energy)
+def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], loads: tuple[Load, ...] | None = None) -> Float[Array, ""]:
+    """The part of `rate_of_work` that needs no accelerations: of loads without a potential, of potentials that depend on time or on inputs; W.
+
+    `loads`: of the scene at this motion, where they are known already.
+    """
+    by_time = power_of_loads(scene, motion, conservative=False, loads=loads) + explicit_rate(scene, motion, potential_energy)
     return by_time + forces_for_potentials(scene, motion, of_inputs)
 
 
@@ -40,12 +44,17 @@ def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ..
     return power_of_loads(scene, motion, among=of_inputs) - stored
 
 
-def power_of_loads(scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None) -> Float[Array, ""]:
-    """`sum F.v + L.omega + Q_k u_k` in W; only loads with (`conservative=True`) or without a potential (`False`), or with the numbers `among`."""
-    loads = resultants(scene, motion, conservative=conservative, among=among)
+def power_of_loads(
+    scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None, loads: tuple[Load, ...] | None = None
+) -> Float[Array, ""]:
+    """`sum F.v + L.omega + Q_k u_k` in W; only loads with (`conservative=True`) or without a potential (`False`), or with the numbers `among`.
+
+    `loads`: as in `explicit_power`.
+    """
+    total = resultants(scene, motion, conservative=conservative, among=among, loads=loads)
     v = jnp.stack([body.velocity for body in motion.bodies.values()])
     omega = jnp.stack([body.angular_velocity for body in motion.bodies.values()])
-    return jnp.sum(loads.force * v) + jnp.sum(loads.torque * omega) + loads.direct @ motion.u.array
+    return jnp.sum(total.force * v) + jnp.sum(total.torque * omega) + total.direct @ motion.u.array
 
 
 def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Float[Array, ""]:

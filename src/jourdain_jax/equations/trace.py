@@ -87,7 +87,8 @@ def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
 
 def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...] = (), with_events: bool = True) -> VelocityQuantities:
     """The same on numbers; `of_inputs`: numbers of the loads whose potential depends on inputs."""
-    velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion)
+    stated = loads_of(scene, motion)  # once: a second time a callback would be another one
+    velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion, stated)
     return VelocityQuantities(
         velocities.linear,
         velocities.angular,
@@ -102,7 +103,7 @@ def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]
         loads.force,
         loads.torque,
         loads.direct,
-        explicit_power(scene, motion, of_inputs),
+        explicit_power(scene, motion, of_inputs, stated),
         event_values(scene, motion) if with_events else jnp.zeros(0),
     )
 

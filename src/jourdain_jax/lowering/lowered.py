@@ -198,8 +198,8 @@ class Lowered:
         return jnp.stack([jnp.broadcast_to(jnp.asarray(c, jnp.result_type(*q)), jnp.shape(q[0])) for c in out])
 
     def _known(self, fixed, t, q, y, inputs) -> dict[int, Float[Array, "*lanes"]]:
-        # arrays among what is fixed have their lanes first
-        fixed = [jnp.moveaxis(x, 0, -1) if n in self._fixed_shapes and x.ndim > len(self._fixed_shapes[n]) else x for n, x in zip(self.fixed, fixed, strict=True)]
+        shapes = self._fixed_shapes
+        fixed = [jnp.moveaxis(x, 0, -1) if n in shapes and x.ndim > len(shapes[n]) else x for n, x in zip(self.fixed, fixed, strict=True)]  # lanes last
         return dict(zip(self._variables, (*fixed, t, *q, *y, *inputs), strict=True))
 
     @functools.cached_property

@@ -9,6 +9,7 @@ and those of one level that hang together are put together.
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import numpy as np
@@ -43,8 +44,8 @@ class _Variable:
 class _Step:
     """An equation; its inputs are variables or numbers."""
 
-    equation: object
-    around: object  # the jaxpr it comes from
+    equation: Any
+    around: Any  # the jaxpr it comes from
     inputs: list
     outputs: list[_Variable]
     kept: bool = False
@@ -72,7 +73,8 @@ class _Kept:
 
 def interpret_in_parts(graph: Graph, closed, arguments: list[Nodes]) -> list[Value]:
     """Outputs of a closed jaxpr at the given arguments, as `interpret`, with calls for the parts that have no scalar form."""
-    inputs, steps = [_Variable(v.aval) for v in closed.jaxpr.invars], []
+    inputs: list[_Variable] = [_Variable(v.aval) for v in closed.jaxpr.invars]
+    steps: list[_Step] = []
     outputs = _flat(closed.jaxpr, closed.consts, inputs, steps)
     steps = _needed(steps, outputs)
     numbers = _judged(Graph(graph.most_multiplications), steps, inputs)
@@ -131,7 +133,7 @@ def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict
         """New symbols, if a variable may be scalars."""
         if not v.may_be_scalars:
             return None
-        names = [f"{len(values)}_{i}" for i in range(v.aval.size)]
+        names = [f"{len(scratch.op)}_{i}" for i in range(v.aval.size)]
         return Nodes(np.array([scratch.input(name, True) for name in names], np.int64).reshape(v.aval.shape))
 
     for v in inputs:
@@ -147,10 +149,8 @@ def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict
             results = apply(scratch, step.equation.primitive.name, step.equation, given)
         except Unsupported as reason:
             step.kept, step.reason = True, str(reason)
-            results = []
-            for v in step.outputs:
-                values[v] = introduce(v)
-        values |= dict(zip(step.outputs, results)) if results else {}
+            results = [introduce(v) for v in step.outputs]
+        values |= dict(zip(step.outputs, results, strict=True))
     return {v: x for v, x in values.items() if isinstance(x, np.ndarray)}
 
 
