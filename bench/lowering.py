@@ -28,7 +28,7 @@ from baselines.hand_derived import HAND_DERIVED, operations
 from baselines.timing import fastest, seconds_per_evaluation
 
 import jourdain_jax as jj
-from jourdain_jax.models import PendulumChain, TrailerChain
+from jourdain_jax.models import PendulumChain, TiltingDisc, TrailerChain
 from jourdain_jax.motion import lockstep
 from jourdain_jax.motion.simulate import state_form
 
@@ -223,6 +223,54 @@ def growth(quick: bool) -> Iterator[Figure]:
         yield figure(f"compile time at n = {many}, s", name, compile_time if complete else None, 60, 15)
 
 
+class TabulatedDisc(TiltingDisc):
+    """With rolling resistance by a table."""
+
+    def loads(self, motion):
+        speeds = jnp.linspace(0.0, 10.0, 21)
+        resistance = jnp.sign(motion.u.spin_rate) * jnp.interp(jnp.abs(motion.u.spin_rate), speeds, 0.01 * jnp.sqrt(speeds))
+        return (*super().loads(motion), jj.generalized_force(motion, spin_rate=-resistance))
+
+
+class LearnedDisc(TiltingDisc):
+    """With torques by a network of two hidden layers of 32."""
+
+    first: object = eqx.field(default_factory=lambda: np.random.default_rng(0).normal(size=(32, 4)))
+    second: object = eqx.field(default_factory=lambda: np.random.default_rng(1).normal(size=(32, 32)) / 8)
+    last: object = eqx.field(default_factory=lambda: np.random.default_rng(2).normal(size=(2, 32)) / 100)
+
+    def loads(self, motion):
+        u = motion.u
+        state = jnp.stack([motion.q.lean, u.lean_rate, u.yaw_rate, u.spin_rate])
+        lean, spin = self.last @ jnp.tanh(self.second @ jnp.tanh(self.first @ state))
+        return (*super().loads(motion), jj.generalized_force(motion, lean_rate=lean, spin_rate=spin))
+
+
+class IteratedDisc(TiltingDisc):
+    """With rolling resistance by Newton's method."""
+
+    def loads(self, motion):
+        newton = lambda v: v - (v**3 + v - motion.u.spin_rate) / (3 * v * v + 1)  # noqa: E731
+        root = jax.lax.while_loop(lambda v: jnp.abs(newton(v) - v) > 1e-12, newton, jnp.zeros_like(motion.u.spin_rate))
+        return (*super().loads(motion), jj.generalized_force(motion, spin_rate=-0.01 * root))
+
+
+def kept_parts(quick: bool) -> Iterator[Figure]:
+    """2 s of a disc with a load that has no scalar form, alone and in a batch of 1024: our dense path relative to the lowered scene with a call."""
+    for scene in (TabulatedDisc(), LearnedDisc(), IteratedDisc()):
+        for lanes in (1,) if quick else (1, 1024):
+            lean = jnp.linspace(0.1, 0.3, lanes)
+            seconds = {}
+            for lowering in (True, False):
+                options = {"ts": jnp.array([2.0]), "rtol": 1e-8, "atol": 1e-8, "events": False, "lowering": lowering}
+                run = jax.jit(lambda lean, s=scene, o=options: jj.rollout(s, {"lean": lean, "spin_rate": -3.0}, **o).lanes.q_end)
+                if lanes == 1:
+                    run = jax.jit(lambda lean, s=scene, o=options: jj.simulate(s, {"lean": lean[0], "spin_rate": -3.0}, **o).q_end)
+                seconds[lowering] = fastest(lambda run=run, lean=lean: jax.block_until_ready(run(lean)), 5 if lowering else 2) / lanes
+            print(f"  {type(scene).__name__}, {lanes} lanes: {1e3 * seconds[True]:.3f} ms per trajectory, dense {1e3 * seconds[False]:.3f} ms", flush=True)
+            yield figure(f"2 s with a call, dense / lowered, {lanes} lanes", type(scene).__name__, seconds[False] / seconds[True], 5, 20, at_least=True)
+
+
 class AngleChain(jj.Scene):
     """A plane chain of massless links in its joint angles, a particle at the end of each: no rows, M full, where unrolled elimination is at its worst."""
 
@@ -313,7 +361,7 @@ def limit(quick: bool) -> Iterator[Figure]:
                 yield figure(f"time per evaluation, lowered / dense{where}, n = {n}, {program.operations} operations", name, ratio, 1, 0.1)
 
 
-FIGURES = {f.__name__: f for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, cold_starts, growth, limit)}
+FIGURES = {f.__name__: f for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, cold_starts, growth, kept_parts, limit)}
 
 
 def main() -> None:

@@ -177,4 +177,7 @@ def _wrapped(label: str, text: str) -> list[str]:
 
 def _lowering(scene: Scene) -> str:
     found = lowered(scene)
-    return f"a scalar program of {found.operations} operations" if isinstance(found, Lowered) else f"not lowered: {found}"
+    if not isinstance(found, Lowered):
+        return f"not lowered: {found}"
+    calls = "".join(f"; {reason} has no scalar form: kept as a call" for reason in found.calls)
+    return f"a scalar program of {found.operations} operations{calls}"

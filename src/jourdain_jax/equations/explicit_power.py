@@ -10,11 +10,13 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array, Float
 
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.virtual_power import potential_energy, resultants
 from jourdain_jax.scene.answers import loads_of
+from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
@@ -25,9 +27,12 @@ def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -
     return sum((loads[k].potential for k in of_inputs), start=jnp.zeros_like(motion.t))
 
 
-def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
-    """The part of `rate_of_work` that needs no accelerations: of loads without a potential, of potentials that depend on time or on inputs; W."""
-    by_time = power_of_loads(scene, motion, conservative=False) + explicit_rate(scene, motion, potential_energy)
+def explicit_power(scene: Scene, motion: Motion, of_inputs: tuple[int, ...], loads: tuple[Load, ...] | None = None) -> Float[Array, ""]:
+    """The part of `rate_of_work` that needs no accelerations: of loads without a potential, of potentials that depend on time or on inputs; W.
+
+    `loads`: of the scene at this motion, where they are known already.
+    """
+    by_time = power_of_loads(scene, motion, conservative=False, loads=loads) + explicit_rate(scene, motion, potential_energy)
     return by_time + forces_for_potentials(scene, motion, of_inputs)
 
 
@@ -39,12 +44,17 @@ def forces_for_potentials(scene: Scene, motion: Motion, of_inputs: tuple[int, ..
     return power_of_loads(scene, motion, among=of_inputs) - stored
 
 
-def power_of_loads(scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None) -> Float[Array, ""]:
-    """`sum F.v + L.omega + Q_k u_k` in W; only loads with (`conservative=True`) or without a potential (`False`), or with the numbers `among`."""
-    loads = resultants(scene, motion, conservative=conservative, among=among)
+def power_of_loads(
+    scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None, loads: tuple[Load, ...] | None = None
+) -> Float[Array, ""]:
+    """`sum F.v + L.omega + Q_k u_k` in W; only loads with (`conservative=True`) or without a potential (`False`), or with the numbers `among`.
+
+    `loads`: as in `explicit_power`.
+    """
+    total = resultants(scene, motion, conservative=conservative, among=among, loads=loads)
     v = jnp.stack([body.velocity for body in motion.bodies.values()])
     omega = jnp.stack([body.angular_velocity for body in motion.bodies.values()])
-    return jnp.sum(loads.force * v) + jnp.sum(loads.torque * omega) + loads.direct @ motion.u.array
+    return jnp.sum(total.force * v) + jnp.sum(total.torque * omega) + total.direct @ motion.u.array
 
 
 def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Float[Array, ""]:
@@ -56,4 +66,16 @@ def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Float[Ar
         held = eqx.tree_at(lambda m: (m.t, m.q.array), motion, (t, q))
         return potential(scene, held)
 
-    return jax.jvp(V, (motion.t, q), (jnp.ones_like(motion.t), nu))[1]
+    return jax.jvp(_only_what_is_needed(V, motion.t, q), (motion.t, q), (jnp.ones_like(motion.t), nu))[1]
+
+
+def _only_what_is_needed(f: Callable, *like) -> Callable:
+    """`f` without what its result does not depend on: forces that the same loads state need not have a derivative."""
+    closed = jax.make_jaxpr(f)(*like)
+    needed, kept = {v for v in closed.jaxpr.outvars if not isinstance(v, Literal)}, []
+    for equation in reversed(closed.jaxpr.eqns):
+        if not needed.isdisjoint(equation.outvars):
+            kept.append(equation)
+            needed.update(v for v in equation.invars if not isinstance(v, Literal))
+    pruned = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr.replace(eqns=kept[::-1]), closed.consts))
+    return lambda *given: pruned(*given)[0]

@@ -9,6 +9,8 @@ c                                    stop events
 The same graph serves probing (`probed_on_graph`) and lowering. What JAX traced is kept per class and shapes of the parameters.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -24,8 +26,9 @@ from jourdain_jax.equations.plausibility import PoseNumbers, numbers_of
 from jourdain_jax.equations.probing import described_once
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import impressed, potential_energy, resultants
-from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.graph import MOST_MULTIPLICATIONS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, has_own_derivatives, interpret
+from jourdain_jax.program.parts import interpret_in_parts
 from jourdain_jax.scene.answers import events_of, loads_of
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
@@ -84,7 +87,8 @@ def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
 
 def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...] = (), with_events: bool = True) -> VelocityQuantities:
     """The same on numbers; `of_inputs`: numbers of the loads whose potential depends on inputs."""
-    velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion)
+    stated = loads_of(scene, motion)  # once: a second time a callback would be another one
+    velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion, stated)
     return VelocityQuantities(
         velocities.linear,
         velocities.angular,
@@ -99,7 +103,7 @@ def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]
         loads.force,
         loads.torque,
         loads.direct,
-        explicit_power(scene, motion, of_inputs),
+        explicit_power(scene, motion, of_inputs, stated),
         event_values(scene, motion) if with_events else jnp.zeros(0),
     )
 
@@ -125,15 +129,19 @@ class TracedScene:
     own_derivatives: bool  # some function has a rule of differentiation of its own, which JAX believes and the graph does not know
 
 
-def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
+def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = (), calls: bool = True) -> TracedScene:
     """The scene as a new graph, without its stop events where these alone cannot be; `Unsupported` where it cannot be.
 
-    `of_inputs`: numbers of the loads whose potential depends on inputs.
+    `of_inputs`: numbers of the loads whose potential depends on inputs. `calls`: whether parts that have no scalar form become calls.
     """
-    try:
-        return _on_graph(scene, *_traced(scene, of_inputs, True))
-    except Unsupported:
-        return _on_graph(scene, *_traced(scene, of_inputs, False))
+    ways = [(interpret, True), (interpret_in_parts, True), (interpret, False), (interpret_in_parts, False)]
+    for interpreted, with_events in ways if calls else ways[::2]:
+        try:
+            closed, shape = _traced(scene, of_inputs, with_events)
+            return _on_graph(scene, closed, shape, interpreted, MOST_MULTIPLICATIONS if calls else math.inf)
+        except Unsupported as reason:
+            first = reason
+    raise first
 
 
 @described_once
@@ -155,12 +163,12 @@ def _traced(scene: Scene, of_inputs: tuple[int, ...], with_events: bool):
         raise Unsupported(f"a function that JAX cannot differentiate ({str(error).split('.')[0]})") from None
 
 
-def _on_graph(scene: Scene, closed, shape) -> TracedScene:
-    graph = Graph()
+def _on_graph(scene: Scene, closed, shape, interpreted: Callable, most_multiplications: float | int) -> TracedScene:
+    graph = Graph(most_multiplications)
     parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(jax.tree.leaves(scene))]
     sizes = {"t": (), "q": (len(scene.coordinate_names),), "u": (len(scene.speed_names),), "i": (len(scene.inputs),)}
     t, q, u, inputs = (_inputs(graph, name, size, True) for name, size in sizes.items())
-    found = interpret(graph, closed, [Nodes(x) for x in (*parameters, t, q, u, inputs)])
+    found = interpreted(graph, closed, [Nodes(x) for x in (*parameters, t, q, u, inputs)])
     at, particulars = jax.tree.unflatten(jax.tree.structure(shape), [as_nodes(graph, x) for x in found])
     return TracedScene(graph, int(t), q, u, inputs, parameters, at, particulars, has_own_derivatives(closed.jaxpr))
 

@@ -22,6 +22,7 @@ from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.scene.answers import loads_of, potential_of
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import described
@@ -44,12 +45,17 @@ class Resultants(eqx.Module):
     direct: Float[Array, "speeds"]
 
 
-def resultants(scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None) -> Resultants:
-    """Sum of the loads per body and per speed; only those with (`conservative=True`) or without a potential (`False`), or with the numbers `among`."""
+def resultants(
+    scene: Scene, motion: Motion, *, conservative: bool | None = None, among: tuple[int, ...] | None = None, loads: tuple[Load, ...] | None = None
+) -> Resultants:
+    """Sum of the loads per body and per speed; only those with (`conservative=True`) or without a potential (`False`), or with the numbers `among`.
+
+    `loads`: of the scene at this motion, where they are known already.
+    """
     force = {name: jnp.zeros_like(body.position) for name, body in motion.bodies.items()}
     torque = dict(force)
     direct = {name: jnp.zeros_like(motion.t) for name in scene.speed_names.entries}
-    for number, load in enumerate(loads_of(scene, motion)):
+    for number, load in enumerate(loads_of(scene, motion) if loads is None else loads):
         if conservative is not None and conservative != (load.potential is not None):
             continue
         if among is not None and number not in among:
@@ -144,12 +150,12 @@ def _generalized_forces(scene: Scene, motion: Motion, partial: Velocities) -> Fl
     return jnp.einsum("bik,bi->k", partial.linear, loads.force) + jnp.einsum("bik,bi->k", partial.angular, loads.torque) + loads.direct
 
 
-def impressed(scene: Scene, motion: Motion) -> Resultants:
-    """All impressed forces, the torques in body axes, and on the speeds also `-N' dV/dq` of the scene's own potential."""
-    loads = resultants(scene, motion)
+def impressed(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Resultants:
+    """All impressed forces, the torques in body axes, and on the speeds also `-N' dV/dq` of the scene's own potential; `loads`: as in `resultants`."""
+    total = resultants(scene, motion, loads=loads)
     orientation = jnp.stack([body.orientation for body in motion.bodies.values()])
-    torque = jnp.einsum("bji,bj->bi", orientation, loads.torque)
-    return Resultants(loads.force, torque, loads.direct - _potential_gradient(scene, motion))
+    torque = jnp.einsum("bji,bj->bi", orientation, total.torque)
+    return Resultants(total.force, torque, total.direct - _potential_gradient(scene, motion))
 
 
 def _potential_gradient(scene: Scene, motion: Motion) -> Float[Array, "speeds"]:

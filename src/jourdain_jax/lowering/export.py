@@ -20,6 +20,7 @@ def summary(lowered) -> str:
         *_speeds(lowered),
         f"  left out of the accelerations, which do not depend on them: {', '.join(lowered.held) or 'nothing'}",
         f"  recoverable by quadrature, as nothing else depends on them: {', '.join(lowered.coordinates[i] for i in lowered.recoverable()) or 'none'}",
+        *(f"  kept as a call of JAX, as it has no scalar form: {reason}" for reason in lowered.calls),
         *([f"  rows left out, as the others imply them: {', '.join(lowered.left_out)}"] if lowered.left_out else []),
         f"  parameters, which stay inputs (SI units and radians): {_parameters(lowered) or 'none'}",
         f"  computed once per motion, from parameters alone: {len(lowered.fixed)} number{'' if len(lowered.fixed) == 1 else 's'}",
@@ -38,7 +39,7 @@ def _parameters(lowered) -> str:
 def _shown(lowered, nodes) -> str:
     """The nodes as expressions where these are short, otherwise how many there are."""
     names = identifiers(lowered)
-    written = [statements(lowered.graph, [n], names, PYTHON) for n in nodes if len(nodes) <= FEW]
+    written = [statements(lowered.graph, [n], names, PYTHON) for n in nodes if len(nodes) <= FEW and not lowered.graph.calls([n])]
     short = [text.replace("math.", "") for lines, (text,) in written if not lines and len(text) <= SHORT]
     more = len(nodes) - len(short)
     return ", ".join([*short, *([f"{more} longer expression{'s' if more > 1 else ''}"] if more else [])]) or "none"

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.emit import run
-from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
 from jourdain_jax.program.together import together
 
 LARGEST_WORK = 100_000  # operations times variables: beyond, deriving takes longer than it can save
@@ -25,11 +25,12 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
     """A function of the values of `variables` (all that the outputs depend on) that returns those of `outputs`, as arrays of one shape, in the precision
     of the variable with number `like`.
     """
+    scalars = [i for i, n in enumerate(variables) if graph.op[n] not in ARRAYS]
     graph, outputs, variables = _on_its_own(graph, outputs, variables)
     entries = _entries(graph, outputs, variables)
 
     def values_of(nodes, values) -> tuple:
-        shape, real = jnp.broadcast_shapes(*map(jnp.shape, values)), jnp.result_type(values[like])
+        shape, real = jnp.broadcast_shapes(*(jnp.shape(values[i]) for i in scalars)), jnp.result_type(values[like])
         found = run(graph, nodes, dict(zip(variables, values, strict=True)))
         return tuple(jnp.broadcast_to(jnp.asarray(x, real), shape) for x in found)
 
@@ -63,13 +64,15 @@ def _on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) 
     inputs = [own.input(str(k), True) for k in range(len(variables))]
     new = dict(zip(variables, inputs, strict=True))
     for node in graph.needed(outputs, new):
-        new[node] = own.const(graph.value[node]) if graph.is_const(node) else own.call(graph.op[node], *(new[a] for a in graph.args[node]))
+        new[node] = own.const(graph.value[node]) if graph.is_const(node) else own.again(node, [new[a] for a in graph.args[node]], graph)
     return own, [new[n] for n in outputs], inputs
 
 
 def _entries(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> list[tuple[int, int, int]] | None:
     """Row, column and node of the entries that are not zero by structure; None where JAX does better."""
     operations = graph.operations(outputs)
+    if graph.calls(outputs):
+        return None
     if operations * len(variables) > LARGEST_WORK:
         return None
     try:

@@ -25,7 +25,7 @@ from jourdain_jax.lowering.blame import blamed
 from jourdain_jax.lowering.elimination import serves
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.graph import Unsupported
+from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -103,15 +103,27 @@ def _built(key: _Key) -> Lowered:
     if not (structure.affine or key.every_speed):
         raise NotLowered("its rows are nonlinear in the speeds")
     try:
-        traced = traced_scene(scene, structure.potentials_of_inputs)
-        probes = _probes(scene, structure, traced.graph)
-        quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
-        builder = AppellOnGraph(traced, structure, key.every_speed, probes, scene.coordinates.reference(), quaternions)
-        return _best(scene, structure, builder, begin)
+        return _with_calls_or_without(scene, structure, key.every_speed, begin)
     except Unsupported as reason:
         raise NotLowered(f"{reason} has no scalar form") from None
     except ZeroDivisionError:
         raise NotLowered("its rows are dependent in a way that no elimination order avoids") from None
+
+
+def _with_calls_or_without(scene: Scene, structure: Structure, every_speed: bool, begin: float) -> Lowered:
+    """With calls for the parts that have no scalar form; without any where such a part would have to be differentiated."""
+
+    def built(calls: bool) -> Lowered:
+        traced = traced_scene(scene, structure.potentials_of_inputs, calls)
+        probes = _probes(scene, structure, traced.graph)
+        quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
+        builder = AppellOnGraph(traced, structure, every_speed, probes, scene.coordinates.reference(), quaternions)
+        return _best(scene, structure, builder, begin)
+
+    try:
+        return built(True)
+    except Unsupported:
+        return built(False)
 
 
 def _probes(scene: Scene, structure: Structure, graph) -> Probes:
@@ -152,7 +164,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
     put_back = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
     groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power], best.events, put_back.q, put_back.u]
-    outputs = graph.with_quotients([n for group in groups for n in group])
+    outputs = graph.with_quotients(_with_equal_calls_once(probes, [n for group in groups for n in group]))
     ends = np.cumsum([len(group) for group in groups])
     qdot, ydot, z, pivots, guards, power, events, put_q, put_u = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
     names = scene.coordinate_names.entries
@@ -289,11 +301,18 @@ def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expec
     single = [(i,) for i in range(len(q)) if not any(i in attitude for attitude in attitudes)]
     here, reference = expected[len(equations.qdot) :], scene.coordinates.reference()
     accelerations = replace(equations, qdot=[])
-    used = set(builder.graph.reachable([*equations.ydot, *equations.pivots]))
+    graph = builder.graph
+    used = set(graph.reachable([*equations.ydot, *equations.pivots]))
+
+    # what a call or a branch does elsewhere no probe shows: what it is given must not change
+    given = [a for call in graph.calls([*equations.ydot, *equations.pivots]) for a in _operands(graph, call)]
+    given += graph.looked_at([*equations.ydot, *equations.pivots])
 
     def unchanged(changes):
-        values = _values(accelerations, probes.with_inputs(changes))
-        return _agree(values, np.where(np.isfinite(values), here, np.nan))
+        changed = probes.with_inputs(changes)
+        values = _values(accelerations, changed)
+        same = np.allclose(changed(given), probes(given), rtol=AGREEMENT, atol=AGREEMENT, equal_nan=True)
+        return same and _agree(values, np.where(np.isfinite(values), here, np.nan))
 
     held: list[int] = []
     for group in [*single, *attitudes]:
@@ -302,3 +321,25 @@ def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expec
         if used.isdisjoint(q[list(group)].tolist()) or (unchanged(shuffled) and unchanged(at_reference)):
             held += group
     return tuple(sorted(held))
+
+
+def _operands(graph: Graph, call: int) -> list[int]:
+    """The scalars that a call is given, those that other calls compute left out."""
+    return [n for a in graph.args[call] if graph.op[a] == "array" for n in graph.args[a]]
+
+
+def _with_equal_calls_once(probes: Probes, outputs: list[int]) -> list[int]:
+    """The outputs, with one call in place of those that compute the same of what is equal at all probes, though it is not written in the same way."""
+    graph = probes.graph
+    calls = sorted(graph.calls(outputs), key=lambda call: (graph.operations(graph.args[call]), call))  # so none is replaced by one made from it
+    kept: dict = {}
+    same: dict[int, int] = {}
+    for call in calls:
+        alike = kept.setdefault((graph.value[call], tuple(graph.value[a] for a in graph.args[call])), [])
+        given = probes(_operands(graph, call))
+        found = next((other for other in alike if np.allclose(probes(_operands(graph, other)), given, rtol=AGREEMENT, atol=AGREEMENT)), None)
+        if found is None:
+            alike.append(call)
+        else:
+            same[call] = found
+    return graph.substituted(outputs, same)

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Num
 
 from jourdain_jax.equations.trace import TracedScene
 from jourdain_jax.lowering import export
 from jourdain_jax.lowering.jacobian import differentiable
 from jourdain_jax.lowering.recoverable import recoverable
 from jourdain_jax.program.emit import run
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.graph import ARRAYS, Graph
 from jourdain_jax.scene.scene import Scene
 
 
@@ -108,12 +108,20 @@ class Lowered:
         """One equation per rate, for an `align` environment; needs SymPy."""
         return export.latex(self)
 
-    def fixed_values(self, scene: Scene) -> tuple[Float[Array, ""], ...]:
+    def fixed_values(self, scene: Scene) -> tuple[Num[Array, "..."], ...]:
         """The values of what depends on parameters alone, for the parameters of `scene`; computed once per motion."""
+        place = {int(n): (k, i) for k, nodes in enumerate(self.traced.parameters) for i, n in enumerate(np.ravel(nodes))}
+        leaves = [jnp.reshape(leaf, -1) for leaf in jax.tree.leaves(scene)]
         known: dict = {}
-        for nodes, leaf in zip(self.traced.parameters, jax.tree.leaves(scene), strict=True):
-            flat = jnp.reshape(leaf, -1)
-            known |= {int(n): flat[i] for i, n in enumerate(np.ravel(nodes))}
+        for n in self.graph.reachable(self.fixed):
+            args = self.graph.args[n]
+            owners = {place[a][0] for a in args if a in place} if self.graph.op[n] == "array" and all(a in place for a in args) else ()
+            if len(owners) == 1:  # entries of one parameter: taken together
+                known[n] = leaves[owners.pop()][np.array([place[a][1] for a in args])].reshape(self.graph.value[n][0])
+        for n in self.graph.needed(self.fixed, known):
+            if n in place:
+                leaf, i = place[n]
+                known[n] = leaves[leaf][i]
         return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known))
 
     def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Float[Array, "*lanes"] | None]:
@@ -190,7 +198,19 @@ class Lowered:
         return jnp.stack([jnp.broadcast_to(jnp.asarray(c, jnp.result_type(*q)), jnp.shape(q[0])) for c in out])
 
     def _known(self, fixed, t, q, y, inputs) -> dict[int, Float[Array, "*lanes"]]:
+        shapes = self._fixed_shapes
+        fixed = [jnp.moveaxis(x, 0, -1) if n in shapes and x.ndim > len(shapes[n]) else x for n, x in zip(self.fixed, fixed, strict=True)]  # lanes last
         return dict(zip(self._variables, (*fixed, t, *q, *y, *inputs), strict=True))
+
+    @functools.cached_property
+    def _fixed_shapes(self) -> dict[int, tuple[int, ...]]:
+        """Of the arrays among what is fixed: without lanes."""
+        return {n: self.graph.value[n][-2] for n in self.fixed if self.graph.op[n] in ARRAYS}
+
+    @functools.cached_property
+    def calls(self) -> tuple[str, ...]:
+        """Why each call of JAX in the rates and stop events is one: a part of a load or event that has no scalar form."""
+        return tuple(self.graph.value[n].reason for n in self.graph.calls([*self.qdot, *self.ydot, *self.events]))
 
 
 def fixed_nodes(graph: Graph, outputs) -> tuple[int, ...]:

@@ -57,6 +57,10 @@ def _derivative(graph: Graph, node: int, dots: list[int]) -> int:
         return graph.zero if dots[1] == dots[2] == graph.zero else graph.call("select", args[0], dots[1], dots[2])
     if all(d == graph.zero for d in dots):
         return graph.zero
+    if op == "array":  # that it moves; the call of it has no derivative here
+        return graph.one
+    if op == "kept":
+        raise Unsupported(graph.value[node].reason)
     if op not in _RULES:
         raise Unsupported(f"the derivative of `{op}`")
     return _RULES[op](graph, node, *args, *dots)

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jourdain_jax.program.graph import COMPARISONS, Graph
+from jourdain_jax.program.calls import EMITTED
+from jourdain_jax.program.graph import ARRAYS, COMPARISONS, Graph
 from jourdain_jax.program.repeats import Loop, deepest_first, sources, with_loops
 from jourdain_jax.program.rounds import Values, run_loop
 from jourdain_jax.program.together import together
@@ -37,7 +38,7 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
             run_loop(part, values, {n for n in part.nodes.ravel().tolist() if last_use.get(n, -1) > k}, _operation)
         else:
             _run_in_a_row(graph, part, values)
-            values |= _together([n for n in part if last_use.get(n, -1) > k], values)
+            values |= _together([n for n in part if last_use.get(n, -1) > k and graph.op[n] not in ARRAYS], values)
     return [values[n] for n in outputs]
 
 
@@ -54,7 +55,12 @@ def _run_in_a_row(graph: Graph, nodes: list[int], values: dict[int, jax.Array]) 
     waves: dict = {}
     for node in nodes:
         op, args = graph.op[node], graph.args[node]
-        values[node] = graph.value[node] if op == "const" else _operation(op, args, [values[a] for a in args], waves)
+        if op == "const":
+            values[node] = graph.value[node]
+        elif op in EMITTED:
+            values[node] = EMITTED[op](graph.value[node], *(values[a] for a in args))
+        else:
+            values[node] = _operation(op, args, [values[a] for a in args], waves)
 
 
 def _operation(op: str, key: Hashable, args: list, waves: dict) -> jax.Array:

@@ -1,10 +1,12 @@
 """Values of nodes on NumPy arrays, all probes at once: nothing is compiled."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.calls import AT_PROBES
+from jourdain_jax.program.entrywise import FUNCTIONS
+from jourdain_jax.program.graph import ARRAYS, Graph
 
 
 class Probes:
@@ -15,6 +17,7 @@ class Probes:
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
         self._row: dict[int, int] = {}  # of the table, by node
         self._table = np.empty((256, self.count))
+        self._arrays: dict[int, np.ndarray | list[np.ndarray]] = {}  # what is no scalar, with a leading axis of probes
 
     def __call__(self, nodes: Iterable[int]) -> np.ndarray:
         """Values, shape (nodes, probes)."""
@@ -34,6 +37,7 @@ class Probes:
 
     def unaffected(self, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:
         """The replacements, each of one node by another, that by themselves change none of the `nodes` at any probe."""
+        nodes = [*nodes, *self.graph.looked_at(nodes)]  # no probe need show what another branch does
         here = self(nodes)
 
         def unchanged(old, new):
@@ -53,38 +57,15 @@ class Probes:
         with np.errstate(all="ignore"):
             for node in wanted:
                 op, place = graph.op[node], len(row)
-                if op == "const":
+                if op in ARRAYS:
+                    args = [self._arrays[a] if graph.op[a] in ARRAYS else table[row[a]] for a in graph.args[node]]
+                    self._arrays[node] = AT_PROBES[op](graph.value[node], *args)
+                elif op == "entry":
+                    table[place] = AT_PROBES[op](graph.value[node], self._arrays[graph.args[node][0]])
+                elif op == "const":
                     table[place] = graph.value[node]
                 elif op == "input":
                     table[place] = self.inputs[graph.value[node]]
                 else:
                     table[place] = FUNCTIONS[op](*(table[row[a]] for a in graph.args[node]))
                 row[node] = place
-
-
-FUNCTIONS: dict[str, Callable] = {
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": np.divide,
-    "neg": np.negative,
-    "sqrt": np.sqrt,
-    "atan2": np.arctan2,
-    "asin": np.arcsin,
-    "acos": np.arccos,
-    "atan": np.arctan,
-    "max": np.maximum,
-    "min": np.minimum,
-    "lt": np.less,
-    "le": np.less_equal,
-    "gt": np.greater,
-    "ge": np.greater_equal,
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "and": np.logical_and,
-    "or": np.logical_or,
-    "not": np.logical_not,
-    "is_finite": np.isfinite,
-    "select": lambda c, a, b: np.where(c, b, a),
-    **{name: getattr(np, name) for name in ("sin", "cos", "tan", "exp", "log", "tanh", "sinh", "cosh", "sign", "abs")},
-}

@@ -10,8 +10,12 @@ import operator
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 
+import numpy as np
+
 MOST_NODES = 500_000  # of one graph: some seconds of building
 MOST_FACTORS = 8  # of a product that is looked at for squares of sines
+MOST_MULTIPLICATIONS = 512  # of one product of matrices taken apart; measured: at 16 x 16 scalars are faster in batches, from 24 x 24 on a call is
+ARRAYS = {"array", "kept", "output"}  # what is no scalar (`calls.py`)
 OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
 
 
@@ -20,9 +24,13 @@ class Unsupported(Exception):
 
 
 class Graph:
-    """Nodes are integers; `op[n]`, `args[n]` say what node n is, `value[n]` is the number of a constant or the name of an input."""
+    """Nodes are integers; `op[n]`, `args[n]` say what node n is, `value[n]` is the number of a constant, the name of an input, or what a call is.
 
-    def __init__(self) -> None:
+    Products of matrices with more than `most_multiplications` are not taken apart.
+    """
+
+    def __init__(self, most_multiplications: float = math.inf) -> None:
+        self.most_multiplications = most_multiplications
         self.op: list[str] = []
         self.args: list[tuple[int, ...]] = []
         self.value: list = []
@@ -220,6 +228,38 @@ class Graph:
             return args[1]
         return self._node(op, args)
 
+    # arrays and calls
+
+    def array(self, entries: Iterable[int], shape: tuple[int, ...], dtype: str) -> int:
+        """Scalars put together; if they are all entries of one array, in order, that array."""
+        entries = tuple(entries)
+        whole = self.args[entries[0]][0] if entries and self.op[entries[0]] == "entry" else None
+        if whole is not None and self.value[whole][1:] == (shape, dtype) and entries == tuple(self.entries(whole).ravel().tolist()):
+            return whole
+        return self._node("array", entries, (shape, dtype))
+
+    def kept(self, call, operands: Iterable[int], results: Iterable[tuple[tuple[int, ...], str]]) -> list[int]:
+        """The results of a call of arrays, given their shapes and types."""
+        node = self._node("kept", tuple(operands), call)
+        return [self._node("output", (node,), (k, *result)) for k, result in enumerate(results)]
+
+    def entries(self, output: int) -> np.ndarray:
+        """The entries of a result of a call."""
+        _, shape, _ = self.value[output]
+        return np.array([self._node("entry", (output,), (i, len(shape))) for i in range(math.prod(shape))], np.int64).reshape(shape)
+
+    def again(self, node: int, args: Iterable[int], of: "Graph | None" = None) -> int:
+        """The same operation on other arguments; `of`: the graph of the node, if another one."""
+        graph, args = of or self, tuple(args)
+        op, value = graph.op[node], graph.value[node]
+        if op == "array":
+            return self.array(args, *value)
+        return self._node(op, args, value) if op in ARRAYS or op == "entry" else self.call(op, *args)
+
+    def calls(self, nodes: Iterable[int]) -> list[int]:
+        """The calls that the nodes need."""
+        return [n for n in self.reachable(nodes) if self.op[n] == "kept"]
+
     def total(self, terms: Iterable[int]) -> int:
         """The sum of nodes."""
         result = self.zero
@@ -241,7 +281,7 @@ class Graph:
             elif not self.args[node] or all(new[a] == a for a in self.args[node]):
                 new[node] = node
             else:
-                new[node] = self.call(self.op[node], *(new[a] for a in self.args[node]))
+                new[node] = self.again(node, (new[a] for a in self.args[node]))
         return [new[n] for n in outputs]
 
     # what is in the graph
@@ -261,6 +301,10 @@ class Graph:
                 stack.extend(a for a in self.args[node] if a not in known)
         return sorted(seen)  # arguments are older than what uses them
 
+    def looked_at(self, outputs: Iterable[int]) -> list[int]:
+        """What decides between branches on the way to the outputs: arguments of comparisons, magnitudes and signs."""
+        return [a for node in self.reachable(outputs) if self.op[node] in BRANCHES for a in self.args[node]]
+
     def with_quotients(self, outputs: Iterable[int]) -> list[int]:
         """The outputs with `a (1/b)` as one division, where `1/b` serves only once."""
         outputs = list(outputs)
@@ -275,7 +319,7 @@ class Graph:
             if divided:
                 new[node] = self._node("div", (new[divided[0][0]], new[divided[0][1]]))
             else:
-                new[node] = self._node(self.op[node], tuple(new[a] for a in args)) if args else node
+                new[node] = self._node(self.op[node], tuple(new[a] for a in args), self.value[node]) if args else node
         return [new[n] for n in outputs]
 
     def _is_product(self, node: int) -> bool:
@@ -313,6 +357,7 @@ class Graph:
 
 
 COMPARISONS: dict[str, Callable] = {name: getattr(operator, name) for name in ("lt", "le", "gt", "ge", "eq", "ne")}
+BRANCHES = {*COMPARISONS, "max", "min", "abs", "sign"}
 _ARITHMETIC = {"add", "sub", "mul", "div", "neg"}
 _FOLDED: dict[str, Callable] = {
     "sin": math.sin,

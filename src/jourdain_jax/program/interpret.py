@@ -1,7 +1,7 @@
 """A jaxpr run over scalars: every array is an array of nodes of a `Graph`, every primitive acts on its entries.
 
 Integers and booleans that do not depend on inputs (indices, shapes, masks) stay NumPy arrays. A primitive without a rule raises
-`Unsupported`, and the scene is then not lowered.
+`Unsupported`; `parts.py` makes a call of what it belongs to.
 """
 
 from collections.abc import Callable
@@ -67,16 +67,22 @@ def _run(graph: Graph, jaxpr, constants, arguments) -> list[Value]:
 
     for equation in jaxpr.eqns:
         name, inputs = equation.primitive.name, [read(x) for x in equation.invars]
-        results = _apply(graph, name, equation, inputs)
+        results = apply(graph, name, equation, inputs)
         for variable, result in zip(equation.outvars, results, strict=True):
             environment[variable] = result
     return [read(x) for x in jaxpr.outvars]
 
 
-def _apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
-    inner = _inner_jaxpr(name, equation.params)
+def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
+    """Results of one equation."""
+    if equation.effects:
+        raise Unsupported(f"the operation `{name}`, which has effects,")
+    inner = inner_jaxpr(name, equation.params)
     if inner is not None:
         return _run(graph, inner.jaxpr, [_known(c) for c in inner.consts], inputs) if hasattr(inner, "jaxpr") else _run(graph, inner, [], inputs)
+    if name == "cond" and not isinstance(inputs[0], Nodes):
+        chosen = equation.params["branches"][int(inputs[0])]
+        return _run(graph, chosen.jaxpr, [_known(c) for c in chosen.consts], inputs[1:])
     symbolic = any(isinstance(x, Nodes) for x in inputs)
     out = equation.outvars[0].aval
     if name in _STRUCTURAL:
@@ -98,7 +104,8 @@ def _apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
     raise Unsupported(f"the operation `{name}`")
 
 
-def _inner_jaxpr(name: str, params):
+def inner_jaxpr(name: str, params):
+    """What a call of a function stands for; None where an equation is none."""
     if name in ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"):
         return params["jaxpr"]
     if name == "custom_jvp_call":
@@ -313,6 +320,18 @@ def _dot_general(graph: Graph, a: Value, b: Value, params) -> Nodes:
     batch = [x.shape[i] for i in batch_a]
     left = np.transpose(x, (*batch_a, *free_a, *over_a)).reshape(int(np.prod(batch)), int(np.prod([x.shape[i] for i in free_a])), -1)
     right = np.transpose(y, (*batch_b, *free_b, *over_b)).reshape(left.shape[0], int(np.prod([y.shape[i] for i in free_b])), -1)
+    _check_size(graph, left, right)
     result = [[[graph.dot(row, column) for column in rights] for row in lefts] for lefts, rights in zip(left.tolist(), right.tolist(), strict=True)]
     shape = batch + [x.shape[i] for i in free_a] + [y.shape[i] for i in free_b]
     return Nodes(np.array(result, dtype=np.int64).reshape(shape))
+
+
+def _check_size(graph: Graph, left: np.ndarray, right: np.ndarray) -> None:
+    """`Unsupported` for a product with more multiplications, not by 0, 1 and -1, than the graph is meant for."""
+    if left.size * right.shape[1] <= graph.most_multiplications:
+        return
+    trivial = {graph.zero, graph.one, graph.const(-1.0)}
+    rows, columns = (np.sum([[[n not in trivial for n in row] for row in matrix] for matrix in x.tolist()], axis=1) for x in (left, right))
+    count = int(np.sum(rows * columns))
+    if count > graph.most_multiplications:
+        raise Unsupported(f"a product of matrices with {count} multiplications")

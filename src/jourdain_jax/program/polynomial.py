@@ -9,7 +9,7 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping
 
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.graph import ARRAYS, Graph
 
 Monomial = tuple[int, ...]  # atoms in order, repeated as often as they occur
 Polynomial = dict[Monomial, float]
@@ -79,6 +79,8 @@ class NormalForms:
             return {(): graph.value[node]}
         if op == "input":
             return {(node,): 1.0}
+        if op in ARRAYS or op == "entry":
+            return {(node if not graph.varies[node] else graph.again(node, [self._rebuilt_or(a) for a in args]),): 1.0}
         parts = [p for p in (self._expanded[a] for a in args) if p is not None]
         if len(parts) < len(args):
             raise TooLarge
@@ -98,6 +100,11 @@ class NormalForms:
             return self._magnitude(self.rebuilt(parts[0]))
         atom = graph.call(op, *(self.rebuilt(p) for p in parts))
         return self._atom(atom) if graph.op[atom] == op else self.expanded(atom)
+
+    def _rebuilt_or(self, node: int) -> int:
+        """A node from its normal form, or itself where it has none."""
+        found = self._expanded[node]
+        return node if found is None else self.rebuilt(found)
 
     def _root(self, p: Polynomial) -> Polynomial:
         """sqrt p: |x| comes out of x^2 y, and |sin x| out of y (1 - cos(x)^2)."""

@@ -14,12 +14,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from jourdain_jax.program.graph import COMPARISONS, Graph
+from jourdain_jax.program.graph import ARRAYS, COMPARISONS, Graph
 
 LONGEST = 400  # operations of one round
 LEAST = 48  # operations that one loop must save
 WORTHWHILE = 1000  # operations that all loops of a program must save: with fewer, a row compiles in seconds and runs up to a fifth faster
-_LOGICAL = {*COMPARISONS, "and", "or", "not", "is_finite", "select"}
+_ALONE = {*ARRAYS, "entry", *COMPARISONS, "and", "or", "not", "is_finite", "select"}  # loops carry numbers
 _COMMUTATIVE = {"add", "mul", "max", "min"}
 
 
@@ -88,8 +88,8 @@ def with_loops(graph: Graph, order: Sequence[int]) -> list[list[int] | Loop]:
     """The same operations: loops, and what lies between them in a row; one row where loops would save little."""
     names = {name: k for k, name in enumerate(sorted({graph.op[n] for n in order}))}
     kinds = np.array([names[graph.op[n]] for n in order], int)
-    unlike = np.array([graph.op[n] in _LOGICAL for n in order], bool)
-    kinds[unlike] = -1 - np.arange(np.count_nonzero(unlike))  # loops carry numbers
+    alone = np.array([graph.op[n] in _ALONE for n in order], bool)
+    kinds[alone] = -1 - np.arange(np.count_nonzero(alone))
     parts: list[list[int] | Loop] = []
     for begin, length, rounds in _periods(kinds, 0, len(order)):
         for part in _parts(graph, order, begin, length, rounds):

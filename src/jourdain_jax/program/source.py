@@ -35,7 +35,7 @@ _INFIX = {"add": ("+", 1), "sub": ("-", 1), "mul": ("*", 2), "div": ("/", 2)} | 
 
 def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], language: Language, prefix: str = "s") -> tuple[list[str], list[str]]:
     """Lines that name what is used more than once, and the expressions of the outputs. `names`: of inputs and of nodes known already."""
-    nodes = graph.needed(outputs, names)
+    nodes = _needed(graph, outputs, names)
     uses: dict[int, int] = {}
     for node in nodes:
         for a in graph.args[node]:
@@ -52,6 +52,18 @@ def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], l
             text, binds = name, 9
         written[node] = text, binds
     return lines, [written[n][0] for n in outputs]
+
+
+def _needed(graph: Graph, outputs: Sequence[int], names: Mapping[int, str] | dict) -> list[int]:
+    """What is to be written, in order; a ValueError where a call of JAX is among it."""
+    nodes = graph.needed(outputs, names)
+    reasons = dict.fromkeys(graph.value[n].reason for n in nodes if graph.op[n] == "kept")
+    if reasons:
+        raise ValueError(
+            f"what is kept as a call of JAX ({'; '.join(reasons)}) cannot be written as text; "
+            "print the scene without the load it belongs to, or give that load a scalar form"
+        )
+    return nodes
 
 
 def _expression(graph: Graph, node: int, written, language: Language) -> tuple[str, int]:
@@ -91,7 +103,7 @@ def sympy_expressions(graph: Graph, outputs: Sequence[int], names: Mapping[int, 
     functions |= {"lt": sympy.Lt, "le": sympy.Le, "gt": sympy.Gt, "ge": sympy.Ge, "eq": sympy.Eq, "ne": sympy.Ne}
     functions |= {"and": sympy.And, "or": sympy.Or, "not": sympy.Not}
     values: dict = {n: sympy.Symbol(name) for n, name in names.items()}
-    for node in graph.needed(outputs, values):
+    for node in _needed(graph, outputs, values):
         op = graph.op[node]
         if op == "const":
             values[node] = sympy.nsimplify(graph.value[node], rational=True) if abs(graph.value[node]) < 1e6 else sympy.Float(graph.value[node])

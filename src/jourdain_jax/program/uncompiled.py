@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
-from jourdain_jax.program.evaluate import FUNCTIONS
+from jourdain_jax.program.entrywise import FUNCTIONS
 from jourdain_jax.program.indexing import gathered, scattered
 
 

@@ -1,0 +1,390 @@
+"""Loads and stop events with a part that has no scalar form: that part stays a call of JAX, everything else is lowered."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.equations.minimal import minimal_accelerations
+from jourdain_jax.equations.trace import event_values, traced_scene
+from jourdain_jax.models import ChaplyginSleigh, TiltingDisc
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.interpret import Nodes, as_nodes
+from jourdain_jax.program.parts import interpret_in_parts
+
+
+def by_table(force, numbers):
+    """A force over speed, in a table."""
+    return jnp.interp(force, jnp.linspace(-2.0, 2.0, 9), numbers)
+
+
+def by_iteration(x, numbers):
+    """The root of v^3 + v = x, by Newton's method."""
+    newton = lambda v: v - (v**3 + v - x) / (3 * v * v + 1)  # noqa: E731
+    return numbers[0] * jax.lax.while_loop(lambda v: jnp.abs(newton(v) - v) > 8 * jnp.finfo(v.dtype).eps * (1 + jnp.abs(v)), newton, jnp.zeros_like(x))
+
+
+def by_recursion(x, numbers):
+    """A filter of a few stages."""
+    return jax.lax.scan(lambda y, c: (jnp.tanh(y + c * x), y), 0.1 * x, numbers)[0]
+
+
+def by_branches(x, numbers):
+    """Another law on either side, and in every range."""
+    side = jax.lax.cond(x > 0, lambda x: numbers[0] * x, lambda x: numbers[1] * x**2, x)
+    return jax.lax.switch(jnp.int32(2 + jnp.floor(side)), [lambda x: x, jnp.sin, lambda x: 2.0 * x, jnp.cos], side)
+
+
+def by_network(x, numbers):
+    """Two hidden layers of 32."""
+    return (network(numbers)(jnp.stack([x, x**2])) * jnp.array([1.0, 0.5])).sum()
+
+
+MLP = eqx.nn.MLP(2, 2, 32, 2, activation=jax.nn.softplus, key=jax.random.key(0))
+
+
+def network(numbers):
+    return eqx.combine(numbers, eqx.filter(MLP, eqx.is_array, inverse=True))
+
+
+def by_matrix(x, numbers):
+    """A table of 40,000 numbers, one of them zero."""
+    return numbers[0] * jnp.mean(jnp.sin(jnp.arange(40_000.0)).reshape(200, 200) @ jnp.sin(x * jnp.ones(200)))
+
+
+def by_asking(x, numbers):
+    """A function in Python, of which no derivative is known."""
+    return jax.pure_callback(lambda x: -np.sin(x), jax.ShapeDtypeStruct(x.shape, x.dtype), x, vmap_method="expand_dims")
+
+
+@jax.custom_jvp
+def _asked(x):
+    return by_asking(x, None)
+
+
+_asked.defjvp(lambda x, dx: (_asked(*x), -jnp.cos(x[0]) * dx[0]))
+
+
+def by_asking_with_rule(x, numbers):
+    """The same with its derivative, to any order."""
+    return numbers[0] * _asked(x)
+
+
+class Acted(ChaplyginSleigh):
+    """A sleigh under a force along the blade that is some law of its forward speed."""
+
+    law: Callable = eqx.field(static=True, default=by_table)
+    numbers: object = eqx.field(default_factory=lambda: 0.1 * np.arange(9.0) ** 2)
+
+    def loads(self, motion):
+        sleigh = motion["sleigh"]
+        along = sleigh.orientation[:, 0]
+        return (jj.point_force(sleigh.point(jnp.zeros(3)), self.law(sleigh.velocity @ along, self.numbers) * along),)
+
+
+LAWS = {
+    "table": (Acted(), "the operation `scan`"),
+    "iteration": (Acted(law=by_iteration, numbers=np.array([0.3])), "the operation `while`"),
+    "recursion": (Acted(law=by_recursion, numbers=np.linspace(0.2, 0.5, 4)), "the operation `scan`"),
+    "branches": (Acted(law=by_branches, numbers=np.array([0.3, -0.2])), "an integer that depends on the state"),
+    "network": (Acted(law=by_network, numbers=eqx.filter(MLP, eqx.is_array)), "a product of matrices with 1024 multiplications"),
+    "matrix": (Acted(law=by_matrix, numbers=np.array([2.0])), "a product of matrices with 39999 multiplications"),
+    "callback": (Acted(law=by_asking, numbers=np.array([2.0])), "the operation `pure_callback`"),
+    "callback with a rule": (Acted(law=by_asking_with_rule, numbers=np.array([2.0])), "the operation `pure_callback`"),
+}
+SMOOTH_ENOUGH = ["table", "network", "callback with a rule", *(pytest.param(name, marks=pytest.mark.slow) for name in ("recursion", "branches"))]
+
+
+def rates_of(scene):
+    """The rates of a state (q, y) by the program and by the dense path, for scenes of this class."""
+    program = jj.lower(scene)
+
+    def by_program(scene, q, y):
+        qdot, ydot, _ = program.rates(program.fixed_values(scene), 0.0, tuple(q), tuple(y), jnp.zeros(0))
+        return jnp.stack([*qdot, *ydot])
+
+    def dense(scene, q, y):
+        _, motion, found = minimal_accelerations(scene, program.independent, jnp.zeros(()), q, y, jnp.zeros(0))
+        return jnp.concatenate([motion.qdot.array, found.udot[np.array(program.independent)]])
+
+    return by_program, dense
+
+
+def states_of(scene, count):
+    _, q, u = jj.sample_states(scene, count)
+    return jnp.asarray(q), jnp.asarray(u[:, np.array(jj.lower(scene).independent)])
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_only_the_part_without_a_scalar_form_is_kept_and_the_rates_are_those_of_the_dense_path(name):
+    scene, reason = LAWS[name]
+    program = jj.lower(scene)
+    assert len(program.calls) == len(program.graph.calls([*program.ydot, program.power])) == 1
+    assert reason in program.calls[0]
+    assert program.operations <= 60
+    assert f"kept as a call of JAX, as it has no scalar form: {program.calls[0]}" in str(program)
+    (by_program, dense), (q, y) = rates_of(scene), states_of(scene, 5)
+    expected = jax.jit(jax.vmap(lambda q, y: dense(scene, q, y)))(q, y)
+    np.testing.assert_allclose(jax.jit(jax.vmap(lambda q, y: by_program(scene, q, y)))(q, y), expected, rtol=1e-12, atol=1e-12)
+    lanes_last = jax.jit(lambda q, y: by_program(scene, q, y))(q.T, y.T)
+    np.testing.assert_allclose(lanes_last.T, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", SMOOTH_ENOUGH)
+def test_derivatives_through_a_call_are_those_of_the_dense_path(name):
+    scene = LAWS[name][0]
+    functions, (q, y) = rates_of(scene), states_of(scene, 1)
+    flat, rebuilt = jax.flatten_util.ravel_pytree((scene, q[0], y[0]))
+    v = jnp.cos(jnp.arange(len(flat)))
+
+    def derivatives(f):
+        of = lambda x: f(*rebuilt(x))  # noqa: E731
+        total = lambda x: jnp.sum(jnp.sin(of(x)))  # noqa: E731
+        return jax.jit(lambda x: (jax.jvp(of, (x,), (v,))[1], jax.grad(total)(x), jax.jvp(jax.grad(total), (x,), (v,))[1]))(flat)
+
+    (along, gradient, second), expected = map(derivatives, functions)
+    np.testing.assert_allclose(along, expected[0], rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(gradient, expected[1], rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(second, expected[2], rtol=1e-9, atol=1e-9)
+    assert np.any(gradient[: len(flat) - len(q[0]) - len(y[0])][3:] != 0)  # by the numbers of the law
+
+
+def test_an_iteration_has_derivatives_in_forward_mode_and_the_same_error_as_densely_in_reverse():
+    scene = LAWS["iteration"][0]
+    (by_program, dense), (q, y) = rates_of(scene), states_of(scene, 1)
+    np.testing.assert_allclose(*(jax.jit(jax.jacfwd(lambda y, f=f: f(scene, q[0], y)))(y[0]) for f in (by_program, dense)), rtol=1e-10, atol=1e-10)
+    for f in (by_program, dense):
+        with pytest.raises(ValueError, match="Reverse-mode differentiation does not work"):
+            jax.make_jaxpr(jax.jacrev(lambda y, f=f: f(scene, q[0], y)))(y[0])
+
+
+START = {"heading": 0.4, "x_rate": 0.8, "heading_rate": 0.9}
+OPTIONS = {"ts": np.array([0.5, 1.0]), "rtol": 1e-9, "atol": 1e-9}
+
+
+@pytest.mark.parametrize("name", ["iteration", "network", pytest.param("callback", marks=pytest.mark.slow)])
+def test_motions_with_a_call_are_the_dense_ones_alone_and_in_lockstep(name):
+    scene = LAWS[name][0]
+    program, dense = (jj.simulate(scene, START, lowering=lowering, **OPTIONS) for lowering in (True, False))
+    assert "lowered" in program.reduction
+    np.testing.assert_allclose(program.q, dense.q, atol=1e-8)
+    np.testing.assert_allclose(program.work, dense.work, atol=1e-9)
+    lanes = jj.rollout(scene, START | {"heading_rate": np.linspace(0.9, 1.2, 11)}, **OPTIONS)
+    np.testing.assert_allclose(lanes.lanes.q[0], dense.q, atol=1e-8)
+    assert np.all(np.isfinite(lanes.lanes.q_end))
+
+
+def test_a_networks_weights_have_gradients_through_a_motion_in_both_modes():
+    scene, step = LAWS["network"][0], 1e-5
+    weight = lambda scene: scene.numbers.layers[1].weight[3, 5]  # noqa: E731
+
+    def end(change, adjoint):
+        own = eqx.tree_at(lambda s: s.numbers.layers[1].weight, scene, scene.numbers.layers[1].weight.at[3, 5].add(change))
+        return jj.simulate(own, START, t1=0.5, rtol=1e-10, atol=1e-10, adjoint=adjoint).q_end[0]
+
+    assert weight(scene).shape == ()
+    forward, reverse = diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()
+    by_differences = (end(step, forward) - end(-step, forward)) / (2 * step)
+    np.testing.assert_allclose(jax.jvp(lambda c: end(c, forward), (0.0,), (1.0,))[1], by_differences, rtol=1e-5)
+    np.testing.assert_allclose(jax.grad(lambda c: end(c, reverse))(0.0), by_differences, rtol=1e-5)
+
+
+class OnCam(jj.Scene):
+    """A bead whose height is a table of where it is: the part without a scalar form would have to be differentiated."""
+
+    mass: jnp.ndarray = jj.parameter(1.0, positive=True)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, jnp.interp(q.x, jnp.linspace(-9.0, 9.0, 10), jnp.arange(10.0))]))}
+
+
+def test_a_pose_without_a_scalar_form_makes_the_whole_scene_dense():
+    with pytest.raises(jj.NotLowered, match="`OnCam` is not lowered: the operation `scan` has no scalar form"):
+        jj.lower(OnCam())
+    assert jj.simulate(OnCam(), {"x_rate": 1.0}, t1=0.5).reduction == "privileged"
+
+
+class Mixed(OnCam):
+    """A bead whose height is a product with a large matrix, which is one sine."""
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, jnp.mean(jnp.full((40, 40), 0.3) @ jnp.sin(q.x + jnp.arange(40.0)))]))}
+
+
+def test_a_large_product_in_a_pose_is_taken_apart_as_its_derivatives_are_needed():
+    found = jj.lower(Mixed())
+    assert found.calls == ()
+
+
+class Effective(OnCam):
+    """A load that prints."""
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        jax.debug.callback(lambda x: None, motion.q.x)
+        return (jj.generalized_force(motion, x_rate=-motion.q.x),)
+
+
+def test_a_load_with_effects_is_not_taken_out_of_its_place():
+    with pytest.raises(jj.NotLowered, match="the operation `debug_callback`"):
+        jj.lower(Effective())
+
+
+class FarWall(Effective):
+    """A spring by a table that is flat in the whole domain, and not beyond."""
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=jnp.interp(motion.q.x, jnp.array([-20.0, -10.0, 10.0, 20.0]), jnp.array([50.0, 0.0, 0.0, -50.0]))),)
+
+
+def test_what_a_call_depends_on_is_not_left_out_though_no_probe_shows_it():
+    scene = FarWall()
+    program = jj.lower(scene)
+    assert program.held == program.recoverable() == ()
+    fixed = program.fixed_values(scene)
+    _, ydot, _ = jax.jit(lambda x: program.rates(fixed, 0.0, (x,), (0.0 * x,), jnp.zeros(0)))(15.0)
+    np.testing.assert_allclose(ydot, [-25.0])
+
+
+class Twice(TiltingDisc):
+    """Resistance in roll and in yaw from one table of the spin, looked up wherever it is needed."""
+
+    def loads(self, motion):
+        return (*super().loads(motion), *(jj.generalized_force(motion, **{name: -self.resistance(motion)}) for name in ("spin_rate", "yaw_rate")))
+
+    def resistance(self, motion):
+        wheel = motion["disc"]
+        return by_table(wheel.angular_velocity @ wheel.orientation[:, 1], 0.01 * jnp.arange(9.0))
+
+
+def test_equal_calls_of_equal_operands_are_one_and_the_rest_is_as_short_as_without():
+    program, plain = jj.lower(Twice()), jj.lower(TiltingDisc())
+    assert len(program.graph.calls([*program.qdot, *program.ydot, program.power])) == 1
+    assert {"x", "y", "yaw"} <= set(program.held)
+    assert program.operations <= plain.operations + 25
+
+
+def test_the_report_and_the_summary_say_what_is_kept_and_why_and_printed_sources_refuse_it():
+    scene = LAWS["iteration"][0]
+    program = jj.lower(scene)
+    said = jj.report(scene).lowering
+    assert said == f"a scalar program of {program.operations} operations; the operation `while` has no scalar form: kept as a call"
+    for printed in (program.python_source, program.c_source):
+        with pytest.raises(ValueError, match=r"what is kept as a call of JAX \(the operation `while`\) cannot be written as text"):
+            printed()
+
+
+class WatchedDisc(TiltingDisc):
+    """Stops by a condition that has no scalar form."""
+
+    def events(self, motion):
+        return {"far": 0.5 - jnp.linalg.svd(jnp.stack([motion.q.x, motion.q.y])[None], compute_uv=False)[0]}
+
+
+def test_a_stop_event_without_a_scalar_form_is_a_call_and_leaves_the_program_as_it_is():
+    watched = WatchedDisc()
+    program = jj.lower(watched)
+    assert program.operations == jj.lower(TiltingDisc()).operations
+    assert program.calls == ("the operation `svd`",)
+    (t,), (q,), (u,) = jj.sample_states(watched, 1)
+    values = program.event_values(program.fixed_values(watched), t, tuple(q), tuple(u[np.array(program.independent)]), jnp.zeros(0))
+    np.testing.assert_allclose(values, event_values(watched, jj.motion_at(watched, t, q, u)), rtol=1e-14)
+    found = jj.simulate(watched, {"lean": 0.1, "spin_rate": -3.0}, t1=2.0)
+    np.testing.assert_allclose(jnp.hypot(found.q_end[0], found.q_end[1]), 0.5, rtol=1e-9)
+    lanes = jj.rollout(watched, {"lean": np.full(3, 0.1), "spin_rate": -3.0}, t1=2.0)
+    np.testing.assert_allclose(lanes.lanes.t_end, found.t_end, rtol=1e-7)
+
+
+SINGLE = """
+import json, sys
+sys.path[:0] = {path!r}
+import jax, numpy as np, test_kept_parts as here
+assert not jax.config.jax_enable_x64
+found = {{}}
+for name in ("network",):
+    both = [here.jj.simulate(here.LAWS[name][0], here.START, ts=here.OPTIONS["ts"], rtol=1e-5, atol=1e-6, lowering=way) for way in (True, False)]
+    found[name] = [both[0].reduction, str(both[0].q.dtype), *(motion.q.tolist() for motion in both)]
+print(json.dumps(found))
+"""
+
+
+def test_calls_run_in_single_precision():
+    run = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", SINGLE.format(path=sys.path)],
+        env=os.environ | {"JAX_ENABLE_X64": "0"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    for reduction, dtype, q, dense in json.loads(run.stdout).values():
+        assert (reduction, dtype) == ("privileged, lowered", "float32")
+        np.testing.assert_allclose(q, dense, atol=1e-4)
+
+
+# On the graph.
+
+
+def in_parts(f, *like):
+    graph = Graph()
+    inputs = [Nodes(np.array([graph.input(f"{k}_{i}", True) for i in range(np.size(x))]).reshape(np.shape(x))) for k, x in enumerate(like)]
+    return graph, [as_nodes(graph, x) for x in interpret_in_parts(graph, jax.make_jaxpr(f)(*like), inputs)]
+
+
+def test_parts_that_are_apart_are_calls_of_their_own_in_the_right_order():
+    def f(x):
+        first = by_iteration(x[0], jnp.ones(1))
+        between = jnp.sin(first) * x[1] + jnp.sort(x)[1]  # a scalar between two iterations
+        return by_iteration(between, jnp.ones(1)) + first, by_iteration(x[0], jnp.ones(1))
+
+    graph, nodes = in_parts(f, np.zeros(3))
+    flat = [int(n) for n in nodes]
+    assert len(graph.calls(flat)) == 3  # sorting, and two iterations: the third is the first again
+    x = np.random.default_rng(0).normal(size=(7, 3))
+    values = Probes(graph, {f"0_{i}": x[:, i] for i in range(3)})(flat)
+    np.testing.assert_allclose(values, np.stack(jax.vmap(f)(x)), rtol=1e-12)
+
+
+def test_functions_that_differ_in_a_constant_are_not_one_call():
+    def f(x):
+        table = lambda values: jnp.asarray(values)[jnp.int32(x)]  # noqa: E731
+        return table([1.0, 2.0, 3.0]) + 10 * table([1.0, 2.0, 4.0])
+
+    graph, (node,) = in_parts(f, 0.0)
+    np.testing.assert_allclose(Probes(graph, {"0_0": np.array([0.0, 1.0, 2.0])})([int(node)])[0], [11.0, 22.0, 43.0])
+
+
+def test_a_choice_that_is_known_is_made_and_numbers_stay_numbers():
+    def f(x):
+        sign = jax.lax.cond(jnp.arange(3)[1] == 1, lambda x: x, lambda x: -x, x)
+        return sign + jnp.sort(jnp.array([3.0, 1.0]))[0] + 0 * by_iteration(x, jnp.ones(1))
+
+    graph, (node,) = in_parts(f, 0.0)
+    assert graph.calls([int(node)]) == []
+    assert graph.operations([int(node)]) == 1
+
+
+def test_a_computation_of_too_many_scalars_is_refused_in_parts_too(monkeypatch):
+    monkeypatch.setattr("jourdain_jax.program.graph.MOST_NODES", 50)
+    with pytest.raises(Unsupported, match="more than 50 scalars"):
+        in_parts(lambda x: by_iteration(x[0], jnp.ones(1)) + jnp.prod(x + 1.0), np.zeros(40))
+
+
+def test_chains_and_the_bicycle_have_no_calls():
+    for scene in (jj.models.TrailerChain(trailers=16), jj.models.PendulumChain(links=16), jj.models.MODELS["whipple-bicycle"]()):
+        assert "kept" not in traced_scene(scene).graph.op
