@@ -45,11 +45,6 @@ class _Window(eqx.Module):
         t, y, goals = _put((self.t, self.y, self.goal), i, (p.t, p.y, goal))
         return _Window(t, y, goals, i)
 
-    def before_event(self, p: Progress) -> Progress:
-        """`p`, but lanes that are searching for an event still at the last state before it."""
-        t, y = _where(p.code == LOCATING, _at((self.t, self.y), self.last), (p.t, p.y))
-        return replace(p, t=t, y=y)
-
     def passed(self, p: Progress) -> Bool[Array, ""]:
         """Whether time has passed since the last state."""
         return eqxi.unvmap_any(p.t != _at(self.t, self.last))
@@ -116,27 +111,35 @@ def _recorded(perturbed, moving, control, forward, method):
     places = len(empty.beginnings.t)
 
     def to_goal(carry, k):
-        p, record = carry
+        p, kept, record = carry
         goal = goals[k]
 
         def step(carry):
-            p, record = carry
+            p, kept, record = carry
             p = advanced(problem, method, p, goal, goals[-1], direction)
-            kept = record.window.before_event(p)
+            kept = _before_event(p, kept)
             ended = record.window.last + record.window.passed(kept) == full
             number = jnp.minimum(record.number + ended, places - 1)
             place = jnp.where(ended, number, places - 1)
             beginnings = _put(record.beginnings, place, _Beginnings(kept.t, kept.y, kept.h, k))
-            return p, _Record(record.window.added(kept, k, restart=ended), beginnings, number)
+            return p, kept, _Record(record.window.added(kept, k, restart=ended), beginnings, number)
 
         record = replace(record, window=record.window.towards(k))
-        p, record = jax.lax.while_loop(lambda carry: eqxi.unvmap_any(running(carry[0], goal)), step, (p, record))
-        return (p, record), (p.y, p.t == goal)
+        p, kept, record = jax.lax.while_loop(lambda carry: eqxi.unvmap_any(running(carry[0], goal)), step, (p, kept, record))
+        return (p, kept, record), (p.y, p.t == goal)
 
-    (end, record), (ys, reached) = jax.lax.scan(to_goal, (start, empty), jnp.arange(len(goals), dtype=jnp.int32))
+    (end, _, record), (ys, reached) = jax.lax.scan(to_goal, (start, start, empty), jnp.arange(len(goals), dtype=jnp.int32))
     record = replace(record, window=record.window.towards(jnp.asarray(len(goals), jnp.int32)))
     end = replace(end, search=None)
     return (ys, reached, end), (record, reached, end)
+
+
+def _before_event(p: Progress, kept: Progress) -> Progress:
+    """`p`, but lanes that are searching for an event still at the last state before it, which is `kept`."""
+    if p.search is None:
+        return p
+    t, y = _where(p.code == LOCATING, (kept.t, kept.y), (p.t, p.y))
+    return replace(p, t=t, y=y)
 
 
 @_motion.def_bwd
