@@ -34,6 +34,7 @@ from jourdain_jax.motion.simulate import state_form
 
 Figure = dict
 BY_HAND_LANES, DENSE_LANES = 4096, 1024
+ALONE = 400  # evaluations per call for one lane: handing over hundreds of scalars takes longer than one evaluation
 COLD = """
 import time; begin = time.perf_counter()
 import jax, sys, jourdain_jax as jj
@@ -71,7 +72,7 @@ def evaluation_time(name: str, lanes: int) -> float:
     scene, program, state = states(name, lanes)
     fixed, inputs = program.fixed_values(scene), jnp.zeros(len(scene.inputs))
     one = lambda q, y: program.rates(fixed, 0.0, q, y, inputs)[:2]  # noqa: E731
-    return seconds_per_evaluation(lambda state: jax.vmap(one)(*state), state, len(state[0][0]), repeats=20)
+    return seconds_per_evaluation(lambda state: jax.vmap(one)(*state), state, len(state[0][0]), repeats=60)
 
 
 def evaluation_ratios(quick: bool) -> Iterator[Figure]:
@@ -79,12 +80,12 @@ def evaluation_ratios(quick: bool) -> Iterator[Figure]:
     for name in ("tilting-disc",) if quick else HAND_DERIVED:
         known, (scene, _, state) = HAND_DERIVED[name], states(name, BY_HAND_LANES)
         parameters = {key: getattr(scene, key) for key in known.parameters}
-        by_hand = seconds_per_evaluation(lambda y, known=known, p=parameters: known.rates(p, 0.0, *y), state, len(state[0][0]), repeats=20)
+        by_hand = seconds_per_evaluation(lambda y, known=known, p=parameters: known.rates(p, 0.0, *y), state, len(state[0][0]), repeats=60)
         yield figure("time per evaluation in a batch of 4096, lowered / by hand", name, evaluation_time(name, BY_HAND_LANES) / by_hand, 1.5, 1.1)
     scene = jj.models.MODELS["whipple-bicycle"]()
     _, q, u = jj.sample_states(scene, DENSE_LANES)
     rates = jax.vmap(lambda y: dense.bicycle_rates(dense.BICYCLE_PARAMETERS, 0.0, y))
-    by_dense = seconds_per_evaluation(rates, jnp.concatenate([q, u], axis=1), len(q), evaluations=10, repeats=10)
+    by_dense = seconds_per_evaluation(rates, jnp.concatenate([q, u], axis=1), len(q), evaluations=10, repeats=20)
     ratio = by_dense / evaluation_time("whipple-bicycle", DENSE_LANES)
     yield figure("time per evaluation in a batch of 1024, dense / lowered", "whipple-bicycle", ratio, 15, 40, at_least=True)
 
@@ -215,7 +216,7 @@ def growth(quick: bool) -> Iterator[Figure]:
             _, q, u = jj.sample_states(scene, 1)
             state = tuple(jnp.asarray(x) for x in q[0]), tuple(jnp.asarray(u[0, k]) for k in program.independent)
             rates = lambda s, p=program, scene=scene: p.rates(p.fixed_values(scene), 0.0, *s, jnp.zeros(len(scene.inputs)))[:2]  # noqa: E731
-            laps[n] = seconds_per_evaluation(rates, state, 1, repeats=10) / n
+            laps[n] = seconds_per_evaluation(rates, state, 1, evaluations=ALONE, repeats=20) / n
             compile_time = time.perf_counter() - begin
             print(f"  {name}, n = {n}: {program.operations} operations, {1e9 * laps[n]:.0f} ns per evaluation and link, built in {compile_time:.1f} s")
         complete = len(laps) == 2
@@ -297,32 +298,30 @@ class AngleChain(jj.Scene):
         return (jj.gravity(motion, 9.81),)
 
 
-EVALUATIONS = 10
-
-
-def ten_times(rates: Callable, state):
+def many_times(rates: Callable, state, evaluations: int):
     """A state after so many explicit Euler steps of a microsecond."""
-    return jax.lax.fori_loop(0, EVALUATIONS, lambda _, y: jax.tree.map(lambda y, rate: y + 1e-6 * rate, y, rates(y)), state)
+    return jax.lax.fori_loop(0, evaluations, lambda _, y: jax.tree.map(lambda y, rate: y + 1e-6 * rate, y, rates(y)), state)
 
 
 def seconds_to_compile_and_run(function: Callable, state, lanes: int) -> tuple[float, float]:
-    """Seconds to compile `ten_times` of some rates, and per evaluation and lane."""
+    """Seconds to compile `many_times` of some rates, and per evaluation and lane."""
+    evaluations, repeats = (ALONE, 20) if lanes == 1 else (10, 3)
     begin = time.perf_counter()
-    compiled = jax.jit(function).lower(state).compile()
+    compiled = jax.jit(lambda state: function(state, evaluations)).lower(state).compile()
     taken = time.perf_counter() - begin
-    return taken, fastest(lambda: jax.block_until_ready(compiled(state)), 20 if lanes == 1 else 3) / (EVALUATIONS * lanes)
+    return taken, fastest(lambda: jax.block_until_ready(compiled(state)), repeats) / (evaluations * lanes)
 
 
 BEYOND = 60_000  # operations, that `limit` asks for beyond the budget of the engine
 SIZES = (
-    ("angle-chain", lambda n: AngleChain(links=n), (4, 8, 12, 16, 24)),
+    ("angle-chain", lambda n: AngleChain(links=n), (4, 8, 12, 16, 20, 24)),
     ("pendulum-chain", lambda n: PendulumChain(links=n), (8, 16, 32)),
     ("trailer-chain", lambda n: TrailerChain(trailers=n), (8, 16)),  # 32: minutes to compile densely
 )
 
 
 def ways_of(scene: jj.Scene, program: jj.Lowered) -> dict[str, tuple]:
-    """Way -> function of a state, the state, its lanes: by the program and densely, alone and in a batch as `rollout` runs it."""
+    """Way -> function of a state and of how often, the state, its lanes: by the program and densely, alone and in a batch as `rollout` runs it."""
     form, fixed, inputs = state_form(scene, jj.structure_of(scene), lowering=False), program.fixed_values(scene), jnp.zeros(len(scene.inputs))
     _, q, u = (jnp.asarray(x) for x in jj.sample_states(scene, DENSE_LANES))
     by_program = lambda y: program.rates(fixed, 0.0, *y, inputs)[:2]  # noqa: E731
@@ -330,10 +329,10 @@ def ways_of(scene: jj.Scene, program: jj.Lowered) -> dict[str, tuple]:
     scalars, packed = (tuple(q.T), tuple(u[:, k] for k in program.independent)), jax.vmap(form.pack)(q, u)
     first = lambda state: jax.tree.map(lambda x: x[0], state)  # noqa: E731
     return {
-        "lowered": (lambda y: ten_times(by_program, y), first(scalars), 1),
-        "lowered, batch": (lambda y: lockstep.in_blocks(lambda y: ten_times(by_program, y), lockstep.width(program), y), scalars, DENSE_LANES),
-        "dense": (lambda y: ten_times(densely, y), first(packed), 1),
-        "dense, batch": (lambda y: ten_times(jax.vmap(densely), y), packed, DENSE_LANES),
+        "lowered": (lambda y, n: many_times(by_program, y, n), first(scalars), 1),
+        "lowered, batch": (lambda y, n: lockstep.in_blocks(lambda y: many_times(by_program, y, n), lockstep.width(program), y), scalars, DENSE_LANES),
+        "dense": (lambda y, n: many_times(densely, y, n), first(packed), 1),
+        "dense, batch": (lambda y, n: many_times(jax.vmap(densely), y, n), packed, DENSE_LANES),
     }
 
 
@@ -342,7 +341,7 @@ def limit(quick: bool) -> Iterator[Figure]:
     if quick:
         return
     lower_module = importlib.import_module("jourdain_jax.lowering.lower")
-    lower_module.MOST_OPERATIONS = BEYOND
+    budget, lower_module.MOST_OPERATIONS = lower_module.MOST_OPERATIONS, BEYOND
     for name, make, counts in SIZES:
         for n in counts:
             scene, begin = make(n), time.perf_counter()
@@ -356,6 +355,8 @@ def limit(quick: bool) -> Iterator[Figure]:
             print(f"  {name}, n = {n}: {program.operations} operations, lowered in {built:.1f} s", flush=True)
             for way, (compiled, seconds) in found.items():
                 print(f"    {way}: compiled in {compiled:.1f} s, {1e6 * seconds:.2f} us per evaluation and lane", flush=True)
+            if program.operations > budget:
+                continue  # the engine takes the dense path
             for where in ("", ", batch"):
                 ratio = found[f"lowered{where}"][1] / found[f"dense{where}"][1]
                 yield figure(f"time per evaluation, lowered / dense{where}, n = {n}, {program.operations} operations", name, ratio, 1, 0.1)
