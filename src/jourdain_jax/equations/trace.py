@@ -9,7 +9,6 @@ c                                    stop events
 The same graph serves probing (`probed_on_graph`) and lowering. What JAX traced is kept per class and shapes of the parameters.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -132,13 +131,13 @@ class TracedScene:
 def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = (), calls: bool = True) -> TracedScene:
     """The scene as a new graph, without its stop events where these alone cannot be; `Unsupported` where it cannot be.
 
-    `of_inputs`: numbers of the loads whose potential depends on inputs. `calls`: whether parts that have no scalar form become calls.
+    `of_inputs`: numbers of the loads whose potential depends on inputs. `calls`: whether parts without scalar form, or with their own derivative, become calls.
     """
     ways = [(interpret, True), (interpret_in_parts, True), (interpret, False), (interpret_in_parts, False)]
     for interpreted, with_events in ways if calls else ways[::2]:
         try:
             closed, shape = _traced(scene, of_inputs, with_events)
-            return _on_graph(scene, closed, shape, interpreted, MOST_MULTIPLICATIONS if calls else math.inf)
+            return _on_graph(scene, closed, shape, interpreted, Graph(MOST_MULTIPLICATIONS, keeps_rules=True) if calls else Graph())
         except Unsupported as reason:
             first = reason
     raise first
@@ -163,8 +162,7 @@ def _traced(scene: Scene, of_inputs: tuple[int, ...], with_events: bool):
         raise Unsupported(f"a function that JAX cannot differentiate ({str(error).split('.')[0]})") from None
 
 
-def _on_graph(scene: Scene, closed, shape, interpreted: Callable, most_multiplications: float | int) -> TracedScene:
-    graph = Graph(most_multiplications)
+def _on_graph(scene: Scene, closed, shape, interpreted: Callable, graph: Graph) -> TracedScene:
     parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(jax.tree.leaves(scene))]
     sizes = {"t": (), "q": (len(scene.coordinate_names),), "u": (len(scene.speed_names),), "i": (len(scene.inputs),)}
     t, q, u, inputs = (_inputs(graph, name, size, True) for name, size in sizes.items())

@@ -125,8 +125,9 @@ def _best_pair(graph: Graph, A, rows: set[int], columns: set[int], probes: Probe
     found = []
     for r, s in sorted({pair for c in columns for pair in combinations(users[c], 2)}):
         for c, d in combinations(sorted(used[r] & used[s]), 2):
-            determinant = forms.simplified(graph.sub(graph.mul(A[r][c], A[s][d]), graph.mul(A[r][d], A[s][c])))
-            if not graph.varies[determinant] and np.all(np.abs(probes([determinant])) > 0):
+            products = graph.mul(A[r][c], A[s][d]), graph.mul(A[r][d], A[s][c])
+            determinant = forms.simplified(graph.sub(*products))
+            if not graph.varies[determinant] and np.all(np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(products)), axis=0)):
                 fill = (len(used[r] | used[s]) - 2) * len({*users[c], *users[d]} - {r, s})
                 found.append((fill, r, s, c, d, determinant))
     if not found:

@@ -212,8 +212,9 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
     q, u, inputs = (np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0)) for p, n in zip("qui", sizes, strict=True))
     usable = np.all(np.isfinite(values), axis=0)
     large = builder.graph.operations(_rates(found)) > LARGE
+    alone = large or bool(builder.graph.calls(_rates(found)))  # callbacks may know no batches
     chosen = np.flatnonzero(usable)[:FEW] if large else np.arange(probes.count)
-    *dense, dense_events = _dense_rates(independent, bool(builder.dependent), large)(*jax.tree.map(lambda x: x[chosen], (parameters, t, q, u, inputs)))
+    *dense, dense_events = _dense_rates(independent, bool(builder.dependent), alone)(*jax.tree.map(lambda x: x[chosen], (parameters, t, q, u, inputs)))
     expected, values = np.concatenate(dense, axis=1).T, values[:, chosen]
     names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in independent)]
     usable = usable[chosen] & np.all(np.isfinite(expected), axis=0)
@@ -301,26 +302,33 @@ def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expec
     single = [(i,) for i in range(len(q)) if not any(i in attitude for attitude in attitudes)]
     here, reference = expected[len(equations.qdot) :], scene.coordinates.reference()
     accelerations = replace(equations, qdot=[])
-    graph = builder.graph
+    graph, at = builder.graph, builder.traced.at
     used = set(graph.reachable([*equations.ydot, *equations.pivots]))
 
     # what a call or a branch does elsewhere no probe shows: what it is given must not change
-    given = [a for call in graph.calls([*equations.ydot, *equations.pivots]) for a in _operands(graph, call)]
-    given += graph.looked_at([*equations.ydot, *equations.pivots])
+    deciding = [*equations.ydot, *equations.pivots, *map(int, (*at.phi, *at.qdot, at.power))]
+    given = [*(a for call in graph.calls(deciding) for a in _operands(graph, call)), *graph.looked_at(deciding)]
 
     def unchanged(changes):
         changed = probes.with_inputs(changes)
         values = _values(accelerations, changed)
-        same = np.allclose(changed(given), probes(given), rtol=AGREEMENT, atol=AGREEMENT, equal_nan=True)
-        return same and _agree(values, np.where(np.isfinite(values), here, np.nan))
+        return _equal(changed(given), probes(given)) and _agree(values, np.where(np.isfinite(values), here, np.nan))
 
+    seen = set(graph.reachable(given))
     held: list[int] = []
     for group in [*single, *attitudes]:
         shuffled = {f"q_{i}": np.roll(probes.inputs[f"q_{i}"], 1) for i in group}
         at_reference = {f"q_{i}": np.full(probes.count, reference[i]) for i in group}
-        if used.isdisjoint(q[list(group)].tolist()) or (unchanged(shuffled) and unchanged(at_reference)):
+        if (used | seen).isdisjoint(q[list(group)].tolist()) or (unchanged(shuffled) and unchanged(at_reference)):
             held += group
     return tuple(sorted(held))
+
+
+def _equal(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether rows of values at the probes are equal but for round-off, relative to their size."""
+    size = np.max(np.where(np.isfinite(b), np.abs(b), 0.0), axis=1, keepdims=True, initial=0.0)
+    with np.errstate(invalid="ignore"):
+        return bool(np.all((a == b) | (np.abs(a - b) <= AGREEMENT * size) | (np.isnan(a) & np.isnan(b))))
 
 
 def _operands(graph: Graph, call: int) -> list[int]:
@@ -329,15 +337,25 @@ def _operands(graph: Graph, call: int) -> list[int]:
 
 
 def _with_equal_calls_once(probes: Probes, outputs: list[int]) -> list[int]:
-    """The outputs, with one call in place of those that compute the same of what is equal at all probes, though it is not written in the same way."""
+    """The outputs, with one call in place of those that compute the same of what is equal at all probes, though it is not written in the same way.
+
+    What is equal there is equal everywhere, where it has no branches and contains no call.
+    """
     graph = probes.graph
+
+    def analytic(call):
+        return not graph.looked_at(operands(call)) and not graph.calls(operands(call))
+
+    def operands(call):
+        return _operands(graph, call)
+
     calls = sorted(graph.calls(outputs), key=lambda call: (graph.operations(graph.args[call]), call))  # so none is replaced by one made from it
     kept: dict = {}
     same: dict[int, int] = {}
     for call in calls:
         alike = kept.setdefault((graph.value[call], tuple(graph.value[a] for a in graph.args[call])), [])
-        given = probes(_operands(graph, call))
-        found = next((other for other in alike if np.allclose(probes(_operands(graph, other)), given, rtol=AGREEMENT, atol=AGREEMENT)), None)
+        mergeable = [other for other in alike if analytic(other)] if analytic(call) else []
+        found = next((other for other in mergeable if _equal(probes(operands(other)), probes(operands(call)))), None)
         if found is None:
             alike.append(call)
         else:

@@ -8,7 +8,8 @@ control lets pass at one state,
 for every step adds an error of s, the derivative is taken along a path that is off by their sum, and changes along it as much as the motion itself does.
 Forward mode has tangents d instead, of the states saved and of the start, and s of the largest |y| of each:
 
-    amplification = max |d_1|/s / max |d_0|/s,   or its square from the middle of the motion on, where the start does not depend on what is varied
+    amplification = max |d_1|/s / max |d_0|/s                  where nothing but the start depends on what is varied
+                    (max |d_1|/s / max |d_middle|/s)^2         otherwise, and the smaller of both where the start does, too
 """
 
 import warnings
@@ -63,8 +64,8 @@ class _Sizes:
 class _Growth:
     """How far directions of the start, which tangents have as a first axis, have grown at the end."""
 
-    def __init__(self, rtol: float, atol: float):
-        self.rtol, self.atol = rtol, atol
+    def __init__(self, rtol: float, atol: float, only_start: bool):
+        self.rtol, self.atol, self.only_start = rtol, atol, only_start
         self.begun: list[np.ndarray] = []
 
     def start(self, values):
@@ -89,7 +90,8 @@ class _Growth:
             begun = sizes(self.begun) if self.begun else np.zeros_like(ended)  # a start that nothing varies is not asked
             half = sizes([d[:, middle] for d in tangents[:2]]) if middle else np.zeros_like(ended)
             with np.errstate(divide="ignore", invalid="ignore"):
-                grown = np.where(begun > 0, ended / begun, np.where(half > 0, (ended / half) ** 2, 0.0))
+                from_start, from_middle = np.where(begun > 0, ended / begun, np.inf), np.where(half > 0, (ended / half) ** 2, 0.0)
+            grown = np.where(begun > 0, from_start, 0.0) if self.only_start else np.minimum(from_start, from_middle)
             _judge(float(np.max(grown)), self.rtol, steps)
 
         return look
@@ -115,7 +117,9 @@ def watched(setup: Setup, integrate) -> Trajectory:
     known = _known((start.q, start.u, rtol, atol))
     if known is None:
         return integrate(setup)
-    sizes = (_Growth if forward else _Sizes)(float(known[2]), float(known[3]))
+    only_start = not is_traced(eqx.tree_at(lambda s: s.start, setup, None))
+    tolerances = float(known[2]), float(known[3])
+    sizes = _Growth(*tolerances, only_start) if forward else _Sizes(*tolerances)
     shown = shown_forwards if forward else shown_backwards
     at_start = shown((start.q, start.u), sizes.start(known[:2]))
     motion = integrate(eqx.tree_at(lambda s: (s.start.q, s.start.u), setup, at_start))

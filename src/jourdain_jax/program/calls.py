@@ -47,13 +47,27 @@ class Call:
         operands = [x if axis is None else jnp.broadcast_to(x, (*a.shape, *lanes)) for x, a, axis in zip(operands, avals, axes, strict=True)]
         for _ in lanes:
             function = jax.vmap(function, in_axes=axes, out_axes=-1)
-        found = function(*operands)
+        try:
+            found = function(*operands)
+        except NotImplementedError as error:
+            if not lanes or "vmap" not in str(error):
+                raise
+            raise NotImplementedError(f"a callback in a load or stop event does not say how it takes a batch: {str(error).splitlines()[0]}") from None
         return tuple(jnp.asarray(x, jnp.result_type(*real)) if real and jnp.issubdtype(x.dtype, jnp.floating) else x for x in found)
 
     @functools.cached_property
     def at_probes(self) -> Callable[..., list[np.ndarray]]:
         """The results on NumPy, operands and results with a leading axis of probes."""
-        return uncompiled(jax.vmap(jaxpr_as_fun(self.closed)))
+        function = jaxpr_as_fun(self.closed)
+        together, alone = uncompiled(jax.vmap(function)), uncompiled(function)
+
+        def results(*operands):
+            try:
+                return together(*operands)
+            except NotImplementedError:  # a callback that takes one at a time
+                return [np.stack(x) for x in zip(*(alone(*one) for one in zip(*operands, strict=True)), strict=True)]
+
+        return results
 
 
 def _array(shape_and_type, *entries):

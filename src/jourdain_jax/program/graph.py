@@ -26,11 +26,11 @@ class Unsupported(Exception):
 class Graph:
     """Nodes are integers; `op[n]`, `args[n]` say what node n is, `value[n]` is the number of a constant, the name of an input, or what a call is.
 
-    Products of matrices with more than `most_multiplications` are not taken apart.
+    Products of matrices with more than `most_multiplications` are not taken apart; `keeps_rules`: nor are functions with a derivative of their own.
     """
 
-    def __init__(self, most_multiplications: float = math.inf) -> None:
-        self.most_multiplications = most_multiplications
+    def __init__(self, most_multiplications: float = math.inf, keeps_rules: bool = False) -> None:
+        self.most_multiplications, self.keeps_rules = most_multiplications, keeps_rules
         self.op: list[str] = []
         self.args: list[tuple[int, ...]] = []
         self.value: list = []

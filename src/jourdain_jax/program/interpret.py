@@ -4,7 +4,9 @@ Integers and booleans that do not depend on inputs (indices, shapes, masks) stay
 `Unsupported`; `parts.py` makes a call of what it belongs to.
 """
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeAlias
 
 import jax
@@ -15,6 +17,7 @@ from jax.extend.core import Literal
 from jourdain_jax.program.graph import Graph, Unsupported
 
 LARGEST = 200_000  # scalars in one array
+_HOMES = (f"{Path(jax.__file__).parent}{os.sep}", f"{Path(__file__).parent.parent}{os.sep}")  # where the source of JAX and of this package lies
 
 
 class Nodes:
@@ -75,8 +78,9 @@ def _run(graph: Graph, jaxpr, constants, arguments) -> list[Value]:
 
 def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
     """Results of one equation."""
-    if equation.effects:
-        raise Unsupported(f"the operation `{name}`, which has effects,")
+    refuse(name, equation)
+    if graph.keeps_rules and (rule := _own_rule(name, equation.params)) and any(isinstance(x, Nodes) for x in inputs):
+        raise Unsupported(rule)
     inner = inner_jaxpr(name, equation.params)
     if inner is not None:
         return _run(graph, inner.jaxpr, [_known(c) for c in inner.consts], inputs) if hasattr(inner, "jaxpr") else _run(graph, inner, [], inputs)
@@ -104,6 +108,14 @@ def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
     raise Unsupported(f"the operation `{name}`")
 
 
+def refuse(name: str, equation) -> None:
+    """`Unsupported` where an equation can neither be scalars nor a call; ValueError where it can be no part of a scene."""
+    if equation.effects:
+        raise Unsupported(f"the operation `{name}`, which has effects,")
+    if any(jnp.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in (*equation.invars, *equation.outvars)):
+        raise ValueError(f"a method of the scene draws random numbers (`{name}`); draw them outside, and give them as parameters or inputs")
+
+
 def inner_jaxpr(name: str, params):
     """What a call of a function stands for; None where an equation is none."""
     if name in ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"):
@@ -113,6 +125,16 @@ def inner_jaxpr(name: str, params):
     if name in ("custom_vjp_call", "custom_vjp_call_jaxpr"):
         return params.get("call_jaxpr", params.get("fun_jaxpr"))
     return None
+
+
+def _own_rule(name: str, params) -> str:
+    """What has a derivative that the graph does not know; nothing for functions of JAX and of this package, whose rules are those of what they compute."""
+    if name == "stop_gradient":
+        return "`stop_gradient`, whose derivative is zero by decree,"
+    if not name.startswith(("custom_jvp_call", "custom_vjp_call")):
+        return ""
+    info = getattr(inner_jaxpr(name, params).jaxpr.debug_info, "func_src_info", None) or "a function"
+    return "" if any(home in info for home in _HOMES) else f"`{info.split(' at ')[0]}`, which has a derivative of its own,"
 
 
 def _bind_concretely(equation, inputs):

@@ -17,7 +17,7 @@ from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
 from jourdain_jax.program.calls import Call
 from jourdain_jax.program.graph import Graph, Unsupported
-from jourdain_jax.program.interpret import Nodes, Value, apply, inner_jaxpr
+from jourdain_jax.program.interpret import Nodes, Value, apply, inner_jaxpr, refuse
 
 LARGE = 16  # entries of an array that is not taken apart beside a call
 LARGEST = 4096  # entries of an array of scalars
@@ -77,7 +77,7 @@ def interpret_in_parts(graph: Graph, closed, arguments: list[Nodes]) -> list[Val
     steps: list[_Step] = []
     outputs = _flat(closed.jaxpr, closed.consts, inputs, steps)
     steps = _needed(steps, outputs)
-    numbers = _judged(Graph(graph.most_multiplications), steps, inputs)
+    numbers = _judged(Graph(graph.most_multiplications, graph.keeps_rules), steps, inputs)
     steps = [step for step in steps if any(v not in numbers for v in step.outputs)]
     for step in steps:
         step.inputs = [numbers.get(x, x) if isinstance(x, _Variable) else x for x in step.inputs]
@@ -103,8 +103,7 @@ def _flat(jaxpr, constants, arguments, steps: list[_Step]) -> list:
 
     for equation in jaxpr.eqns:
         name, inputs = equation.primitive.name, [read(x) for x in equation.invars]
-        if equation.effects:
-            raise Unsupported(f"the operation `{name}`, which has effects,")
+        refuse(name, equation)
         inner = None if name.startswith("custom_") else inner_jaxpr(name, equation.params)
         if inner is None:
             results = [_Variable(v.aval) for v in equation.outvars]
@@ -215,4 +214,5 @@ def _call(part: list[_Step], operands: list[_Variable], results: list[_Variable]
         return [known[v] for v in results]
 
     closed = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in operands))
-    return Call(closed, tuple(dict.fromkeys(step.reason for step in part if step.reason)))
+    reasons = tuple(dict.fromkeys(step.reason for step in part if step.reason))
+    return Call(closed, reasons or ("what is made of the arrays of another call",))

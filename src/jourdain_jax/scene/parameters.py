@@ -26,7 +26,7 @@ def parameter(default=..., *, unit: str = "", positive: bool = False, non_negati
     - `default`: a number or an array; without it the parameter must be given. `unit` and `about` describe it.
     - `positive`, `non_negative`: checked (ValueError, as are numbers that are not finite) when the scene is built with known values.
     """
-    options = {} if default is ... else {"default": default}
+    options = {} if default is ... else {"default": default} if np.ndim(default) == 0 else {"default_factory": lambda: default}
     metadata = {"parameter": True, "unit": unit, "positive": positive, "non_negative": non_negative, "about": about}
     return eqx.field(converter=_as_leaf, metadata=metadata, **options)
 

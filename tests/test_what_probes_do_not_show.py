@@ -1,0 +1,180 @@
+"""Programs are judged at probes. What these cannot show, because a branch lies elsewhere or only derivatives differ, must not be concluded from them."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.models import ChaplyginSleigh
+
+KNOTS = jnp.linspace(-3.0, 3.0, 7)
+
+
+class Plane(jj.Scene):
+    """A particle in a plane."""
+
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+
+def ends(scene, start, **options):
+    """Of the lowered and of the dense motion."""
+    return [jj.simulate(scene, start, t1=1.0, rtol=1e-9, atol=1e-9, lowering=lowering, **options).q_end for lowering in (True, False)]
+
+
+class Limited(Plane):
+    """Two look-ups whose operands are equal until a limit, beyond all probes, is reached."""
+
+    limit: object = jj.parameter(5.0)
+
+    def loads(self, motion):
+        force = lambda x: -jnp.interp(x, KNOTS, jnp.sin(KNOTS))  # noqa: E731
+        x = motion.q.x
+        return (jj.generalized_force(motion, x_rate=force(x), y_rate=force(jnp.clip(x, -self.limit, self.limit))),)
+
+
+def test_calls_whose_operands_are_equal_at_the_probes_only_stay_two():
+    scene = Limited()
+    assert len(jj.lower(scene).graph.calls(jj.lower(scene).ydot)) == 2
+    np.testing.assert_allclose(*ends(scene.replace(limit=0.2), {"x": 1.8}), atol=1e-8)
+
+
+class Small(Plane):
+    """Two tables of tiny numbers, one the other with its sign changed."""
+
+    table: object = jj.parameter(1e-11 * np.array([5.0, 3.0, 2.0, 0.0, -2.0, -3.0, -5.0]))
+    scale: object = jj.parameter(1e11)
+
+    def loads(self, motion):
+        force = lambda table: self.scale * jnp.interp(motion.q.x, KNOTS, table)  # noqa: E731
+        return (jj.generalized_force(motion, x_rate=force(self.table), y_rate=force(-self.table)),)
+
+
+def test_operands_are_compared_relative_to_their_size():
+    np.testing.assert_allclose(*ends(Small(), {"x": 1.0}), atol=1e-8)
+
+
+class Belt(ChaplyginSleigh):
+    """Beside the sleigh a particle is carried along where x > 10, by a row."""
+
+    coordinates = jj.coordinates("x y heading px py")
+
+    def bodies(self, t, q):
+        return super().bodies(t, q) | {"particle": jj.Particle(1.0, jnp.stack([q.px, q.py, 0.0 * q.x]))}
+
+    def velocity_constraints(self, motion):
+        return super().velocity_constraints(motion) | {"belt": motion.u.py_rate - jnp.where(motion.q.px > 10.0, 1.0, 0.0)}
+
+    def invariants(self, motion):
+        return {}
+
+
+def test_a_branch_in_a_row_is_not_lost():
+    lowered, dense = ends(Belt(), {"px": 11.0, "px_rate": 1.0, "heading_rate": 0.9, "x_rate": -0.6})
+    np.testing.assert_allclose(lowered, dense, atol=1e-7)
+    assert lowered[4] == pytest.approx(1.0)
+
+
+@jax.custom_jvp
+def half_as_steep(x):
+    return jnp.sin(x)
+
+
+half_as_steep.defjvp(lambda primals, tangents: (half_as_steep(*primals), 0.5 * tangents[0]))
+
+
+class Decreed(Plane):
+    """A spring whose stiffness has no derivative by decree, and a force with a rule of its own."""
+
+    stiffness: object = jj.parameter(2.0)
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-jax.lax.stop_gradient(self.stiffness) * motion.q.x, y_rate=-half_as_steep(motion.q.y)),)
+
+
+def test_derivatives_by_decree_are_those_of_the_dense_path():
+    def slopes(lowering):
+        def end(stiffness, y):
+            scene = Decreed(stiffness=stiffness)
+            return jj.simulate(scene, {"x": 1.0, "y": y}, t1=1.0, lowering=lowering, projection=False, adjoint=diffrax.ForwardMode()).q_end
+
+        return jax.jacfwd(end, argnums=(0, 1))(2.0, 0.7)
+
+    lowered, dense = slopes(True), slopes(False)
+    np.testing.assert_allclose(lowered[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(lowered[1], dense[1], rtol=1e-6)
+    assert "half_as_steep" in jj.report(Decreed()).lowering
+    assert "stop_gradient" in jj.report(Decreed()).lowering
+
+
+class Called(Plane):
+    """A callback that takes one state at a time."""
+
+    def loads(self, motion):
+        force = jax.pure_callback(lambda x: np.asarray(-np.sin(x)), jax.ShapeDtypeStruct((), motion.q.x.dtype), motion.q.x)
+        return (jj.generalized_force(motion, x_rate=force),)
+
+
+def test_a_callback_that_knows_no_batches_runs_alone_and_is_refused_by_name_in_batches():
+    np.testing.assert_allclose(*ends(Called(), {"x": 1.0}, projection=False), atol=1e-7)
+    with pytest.raises(NotImplementedError, match="vmap"):
+        jj.rollout(Called(), {"x": jnp.array([1.0, 1.1])}, t1=0.1)
+
+
+class Sorted(Plane):
+    """A part that is kept only because of what it follows."""
+
+    table: object = jj.parameter(np.linspace(1.0, 2.0, 9))
+
+    def loads(self, motion):
+        order = jnp.argsort(self.table)
+        factor = jnp.sin(jnp.interp(motion.q.x, jnp.linspace(-3.0, 3.0, 9), self.table**2))
+        return (jj.generalized_force(motion, x_rate=jnp.take(self.table * factor, order) @ jnp.arange(9.0)),)
+
+
+def test_every_call_says_why_it_is_one():
+    assert all(jj.lower(Sorted()).calls)
+    assert ";  has" not in jj.report(Sorted()).lowering
+
+
+class Random(Plane):
+    """A load that draws a number."""
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.q.x * jax.random.normal(jax.random.key(0))),)
+
+
+def test_a_load_that_draws_numbers_is_refused_by_name():
+    with pytest.raises(ValueError, match="draws random numbers"):
+        jj.simulate(Random(), {"x": 1.0}, t1=1.0)
+
+
+class Oscillator(Plane):
+    """A spring."""
+
+    stiffness: object = jj.parameter(1.0)
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-self.stiffness * motion.q.x),)
+
+
+def test_a_start_that_hardly_depends_on_a_parameter_gives_no_warning(recwarn):
+    def end(k):
+        options = {"t1": 3.0, "rtol": 1e-8, "atol": 1e-8, "adjoint": diffrax.ForwardMode()}
+        return jj.simulate(Oscillator(stiffness=k), {"x": 1.0 + 1e-6 * k}, **options).q_end[0]
+
+    slope = jax.jvp(end, (1.0,), (1.0,))[1]
+    assert slope == pytest.approx(-1.5 * np.sin(3.0) + 1e-6 * np.cos(3.0) - 1.5e-6 * np.sin(3.0), rel=1e-6)
+    assert not [w for w in recwarn if issubclass(w.category, jj.SensitivityWarning)]
+
+
+def test_tables_are_parameters_and_differ_between_lanes():
+    tables = jnp.stack([1e-11 * jnp.array([5.0, 3.0, 2.0, 0.0, -2.0, -3.0, -5.0]) * k for k in (1.0, -2.0)])
+    lanes = jj.rollout(Small(), {"x": 1.0}, parameters={"table": tables}, t1=1.0).lanes.q_end
+    for end, table in zip(lanes, tables, strict=True):
+        np.testing.assert_allclose(end, jj.simulate(Small(table=table), {"x": 1.0}, t1=1.0).q_end, atol=1e-6)
+    assert abs(float(lanes[0, 0] - lanes[1, 0])) > 0.1
