@@ -101,7 +101,7 @@ LAWS = {
     "network": (Acted(law=by_network, numbers=eqx.filter(MLP, eqx.is_array)), "a product of matrices with 1024 multiplications"),
     "matrix": (Acted(law=by_matrix, numbers=np.array([2.0])), "a product of matrices with 39999 multiplications"),
     "callback": (Acted(law=by_asking, numbers=np.array([2.0])), "the operation `pure_callback`"),
-    "callback with a rule": (Acted(law=by_asking_with_rule, numbers=np.array([2.0])), "the operation `pure_callback`"),
+    "callback with a rule": (Acted(law=by_asking_with_rule, numbers=np.array([2.0])), "`_asked`, which has a derivative of its own"),
 }
 SMOOTH_ENOUGH = ["table", "network", "callback with a rule", *(pytest.param(name, marks=pytest.mark.slow) for name in ("recursion", "branches"))]
 
