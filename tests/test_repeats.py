@@ -92,6 +92,12 @@ def test_derivatives_are_those_of_the_recursion(program, values):
     np.testing.assert_allclose(*reverse, rtol=1e-11, atol=1e-11)
 
 
+def test_numbers_may_be_given_for_arrays(values):
+    graph, inputs, outputs = chain(LINKS)
+    found = emit.run(graph, outputs, dict(zip(inputs, values.tolist(), strict=True)))
+    np.testing.assert_allclose(jnp.stack([jnp.asarray(x) for x in found]), by_hand(values), rtol=1e-13)
+
+
 def test_single_precision_stays_so(program, values):
     found = jax.jit(program)(values.astype(jnp.float32))
     assert found.dtype == jnp.float32

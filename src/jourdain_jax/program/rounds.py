@@ -44,7 +44,7 @@ def run_loop(loop: Loop, values: Values, wanted: set[int], operation: Callable) 
     """Add the wanted nodes of a loop to the values; `operation(op, key, arguments, waves)` computes one of them."""
     outside = sources(loop)
     shape = jnp.broadcast_shapes(*(jnp.shape(values[n]) for n in outside))
-    real = jnp.result_type(*(values[n] for n in outside if isinstance(values[n], jax.Array)))
+    real = jnp.result_type(*([values[n] for n in outside if isinstance(values[n], jax.Array)] or [float]))
     slots = {slot: None for slots in loop.arguments for slot in slots}
     carried = [s for s in slots if isinstance(s, Before)]
     stacked = [s for s in slots if isinstance(s, Given) and len(set(s.nodes)) > 1]
