@@ -189,7 +189,8 @@ def _batches(entries: list[dict], path: Path) -> None:
             for method, look in BATCH_LOOKS.items():
                 if _curve(ax, [e for e in entries if e["problem"] == name and e["batch"] == size and e["method"] == method], look, _time):
                     drawn[method] = look
-            many = "alone" if size == 1 else f"batch of {size:,}"
+        for column, size in enumerate(sizes):  # when all curves of a row are there, which share its axes
+            ax, many = axes[k, column], "alone" if size == 1 else f"batch of {size:,}"
             _finish(ax, f"{TITLES[name]}, {many}", "largest error over the lanes" if k + 1 == len(problems) else "", "" if column else _TIME)
     looks = [look for method, look in BATCH_LOOKS.items() if method in drawn]
     _legend(figure, looks, "Batches with scattered starts: time per trajectory (lower left is better)", path, len(problems), len(sizes))
