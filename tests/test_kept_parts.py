@@ -126,7 +126,7 @@ def states_of(scene, count):
     return jnp.asarray(q), jnp.asarray(u[:, np.array(jj.lower(scene).independent)])
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow) if name in ("recursion", "branches", "matrix") else name for name in LAWS])
 def test_only_the_part_without_a_scalar_form_is_kept_and_the_rates_are_those_of_the_dense_path(name):
     scene, reason = LAWS[name]
     program = jj.lower(scene)

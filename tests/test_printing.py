@@ -48,6 +48,10 @@ def test_a_linearization_prints_its_matrices_by_name_and_its_eigenvalues():
     disc = jj.linearize(TiltingDisc(), {"spin_rate": -3.0}, ("lean", "yaw"))
     for part in ("M ", "C ", "K ", "lean", "yaw", "eigenvalues in 1/s: "):
         assert part in str(disc)
+
+
+@pytest.mark.slow
+def test_linearizations_of_a_batch_print_their_shape_and_names():
     small = jax.vmap(lambda s: jj.linearize(TiltingDisc(), jj.start(TiltingDisc(), spin_rate=s), ("lean",)))(jnp.array([-3.0, -4.0]))
     assert str(small) == "Linearizations of shape (2,); named coordinates: lean"
 

@@ -111,6 +111,7 @@ def test_what_was_recovered_is_said_and_steps_too_long_for_it_are_warned_of():
     np.testing.assert_allclose(near["x"], 4.0 * float(disc.radius) / 5.0 * np.sin(5.0 * near.ts), atol=1e-7)
 
 
+@pytest.mark.slow
 def test_derivatives_of_recovered_coordinates_are_those_of_the_motion():
     scene, start = disc_and_start()
 

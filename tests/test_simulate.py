@@ -93,7 +93,7 @@ def test_an_event_is_located_with_derivatives_up_to_the_third(derivative):
         fall_time = derivative(fall_time)
 
 
-@pytest.mark.parametrize("adjoint", [None, diffrax.DirectAdjoint()], ids=["default", "direct"])
+@pytest.mark.parametrize("adjoint", [None, pytest.param(diffrax.DirectAdjoint(), marks=pytest.mark.slow)], ids=["default", "direct"])
 def test_an_event_time_does_not_depend_on_the_times_saved(adjoint):
     def landing(longer):
         return jj.simulate(Falling(), ts=longer * jnp.linspace(0.0, 2.0, 5), adjoint=adjoint).t_end

@@ -31,8 +31,8 @@ from jourdain_jax.scene.scene import Scene
 
 PROBES = 56  # at most
 LEAST_PROBES = 12  # at which programs can be compared, where so many were found
-# Of the program before simplification; beyond, the dense path is taken. There a full mass matrix makes it the faster one for a motion alone (24 joint angles,
-# 20,859 operations: twice as fast, compiled in 7 s, not 50; in a batch 4 times slower). Below, it lost everywhere (`bench/lowering.py --only limit`).
+# Of the program before simplification; beyond, the dense path is taken. There XLA needs a minute more for the program than for dense matrices (24 joint angles,
+# 20,762 operations: 71 and 7.5 s), though an evaluation takes 0.15 of the time (in a batch 0.22). Below, the dense path lost everywhere (bench/README.md).
 MOST_OPERATIONS = 20_000
 MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
