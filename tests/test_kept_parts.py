@@ -121,6 +121,29 @@ def rates_of(scene):
     return by_program, dense
 
 
+def by_numbers(x, numbers):
+    """Hertz's law, a soft step, a sawtooth: functions of numbers, none of which need be kept."""
+    return numbers[0] * jnp.maximum(x, 0.0) ** 1.5 + jax.nn.sigmoid(x) + jnp.log1p(x**2) + jnp.mod(3 * x, 1.0)
+
+
+def test_functions_of_numbers_are_lowered():
+    scene = Acted(law=by_numbers, numbers=np.array([0.3]))
+    program = jj.lower(scene)
+    assert not program.calls
+    (by_program, dense), (q, y) = rates_of(scene), states_of(scene, 5)
+    np.testing.assert_allclose(*(jax.vmap(jax.jit(lambda q, y, f=f: f(scene, q, y)))(q, y) for f in (by_program, dense)), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("law", [lambda x, _: jax.nn.softplus(x), lambda x, _: jnp.sinc(x), lambda x, _: jax.nn.relu(x)], ids=["softplus", "sinc", "relu"])
+def test_functions_of_jax_have_their_derivatives_where_their_branches_meet(law):
+    scene = Acted(law=law)
+    assert "which has a derivative of its own" in jj.lower(scene).calls[0]
+    (by_program, dense), (q, y) = rates_of(scene), (jnp.zeros(3), jnp.zeros(2))
+    first, second = ([jax.jit(d(lambda y, f=f: f(scene, q, y)))(y) for f in (by_program, dense)] for d in (jax.jacfwd, jax.hessian))
+    np.testing.assert_allclose(*first, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(*second, rtol=1e-12, atol=1e-12)
+
+
 def states_of(scene, count):
     _, q, u = jj.sample_states(scene, count)
     return jnp.asarray(q), jnp.asarray(u[:, np.array(jj.lower(scene).independent)])

@@ -1,5 +1,6 @@
 """Derivatives on the graph, by forward mode: nodes for the derivative of nodes along a direction given at some of them."""
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 
 from jourdain_jax.program.graph import Graph, Unsupported
@@ -71,11 +72,35 @@ def _quotient(g: Graph, n, a, b, da, db):
 
 
 def _larger(g: Graph, n, a, b, da, db):
-    return g.call("select", g.call("ge", a, b), db, da)
+    return _halved_where_equal(g, a, b, g.call("select", g.call("gt", a, b), db, da), da, db)
 
 
 def _smaller(g: Graph, n, a, b, da, db):
-    return g.call("select", g.call("le", a, b), db, da)
+    return _halved_where_equal(g, a, b, g.call("select", g.call("lt", a, b), db, da), da, db)
+
+
+def _halved_where_equal(g: Graph, a, b, otherwise, da, db):
+    """Half of either, as JAX has it: log1p(exp(-|x|)) + max(x, 0) is smooth at x = 0."""
+    return g.call("select", g.call("eq", a, b), otherwise, g.mul(g.const(0.5), g.add(da, db)))
+
+
+def _real_power(g: Graph, n, a, b, da, db):
+    """(a^b)' = b a^(b-1) a' + a^b log(a) b'; the first term is zero where b is, the second where a is (a^b log a -> 0 for b > 0)"""
+    of_base, of_exponent = g.zero, g.zero
+    if da != g.zero:
+        of_base = g.mul(g.mul(b, g.call("pow", a, _unless_zero(g, b, g.sub(b, g.one)))), da)
+    if db != g.zero:
+        of_exponent = g.mul(g.mul(n, g.call("log", _unless_zero(g, a, a))), db)
+    return g.add(of_base, of_exponent)
+
+
+def _unless_zero(g: Graph, a, value):
+    """The value, and 1 where a is zero."""
+    return value if g.is_const(a) and g.value[a] else g.call("select", g.call("eq", a, g.zero), value, g.one)
+
+
+def _remainder(g: Graph, n, a, b, da, db):
+    return g.sub(da, g.mul(g.div(g.sub(a, n), b), db))  # a = k b + n with a whole k
 
 
 def _arctangent(g: Graph, n, y, x, dy, dx):
@@ -97,11 +122,23 @@ _RULES: dict[str, Callable] = {
     "tanh": lambda g, n, a, da: g.mul(g.sub(g.one, g.mul(n, n)), da),
     "sinh": lambda g, n, a, da: g.mul(g.call("cosh", a), da),
     "cosh": lambda g, n, a, da: g.mul(g.call("sinh", a), da),
+    "asin": lambda g, n, a, da: g.div(da, g.call("sqrt", g.sub(g.one, g.mul(a, a)))),
+    "acos": lambda g, n, a, da: g.neg(g.div(da, g.call("sqrt", g.sub(g.one, g.mul(a, a))))),
     "atan": lambda g, n, a, da: g.div(da, g.add(g.one, g.mul(a, a))),
+    "asinh": lambda g, n, a, da: g.div(da, g.call("sqrt", g.add(g.mul(a, a), g.one))),
+    "acosh": lambda g, n, a, da: g.div(da, g.mul(g.call("sqrt", g.sub(a, g.one)), g.call("sqrt", g.add(a, g.one)))),
+    "atanh": lambda g, n, a, da: g.div(da, g.sub(g.one, g.mul(a, a))),
+    "exp2": lambda g, n, a, da: g.mul(g.mul(n, g.const(math.log(2.0))), da),
+    "expm1": lambda g, n, a, da: g.mul(g.add(n, g.one), da),
+    "log1p": lambda g, n, a, da: g.div(da, g.add(g.one, a)),
+    "logistic": lambda g, n, a, da: g.mul(g.mul(n, g.sub(g.one, n)), da),
+    "cbrt": lambda g, n, a, da: g.div(da, g.mul(g.const(3.0), g.mul(n, n))),
+    "pow": _real_power,
+    "rem": _remainder,
     "atan2": _arctangent,
     "abs": lambda g, n, a, da: g.mul(g.call("sign", a), da),
     "sign": lambda g, n, a, da: g.zero,
     "max": _larger,
     "min": _smaller,
-    **{name: lambda g, n, *rest: g.zero for name in ("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite")},
+    **{name: lambda g, n, *rest: g.zero for name in ("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite", "floor", "ceil", "round")},
 }

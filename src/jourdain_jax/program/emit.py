@@ -99,6 +99,13 @@ FUNCTIONS: dict[str, Callable] = {
     "asin": jnp.arcsin,
     "acos": jnp.arccos,
     "atan": jnp.arctan,
+    "asinh": jnp.arcsinh,
+    "acosh": jnp.arccosh,
+    "atanh": jnp.arctanh,
+    "pow": jnp.power,
+    "logistic": lax.logistic,
+    "rem": jnp.fmod,
+    "round": jnp.round,
     "max": jnp.maximum,
     "min": jnp.minimum,
     **COMPARISONS,
@@ -108,6 +115,7 @@ FUNCTIONS: dict[str, Callable] = {
     "is_finite": jnp.isfinite,
     "select": lambda c, a, b: jnp.where(c, b, a),
     **{name: getattr(jnp, name) for name in ("sqrt", "tan", "exp", "log", "tanh", "sinh", "cosh", "sign", "abs")},
+    **{name: getattr(jnp, name) for name in ("exp2", "expm1", "log1p", "cbrt", "floor", "ceil")},
 }
 
 # pi/2 in three parts of 33 bits, and minimax polynomials on [-pi/4, pi/4] (K. C. Ng's, as in FreeBSD's libm)

@@ -357,7 +357,7 @@ class Graph:
 
 
 COMPARISONS: dict[str, Callable] = {name: getattr(operator, name) for name in ("lt", "le", "gt", "ge", "eq", "ne")}
-BRANCHES = {*COMPARISONS, "max", "min", "abs", "sign"}
+BRANCHES = {*COMPARISONS, "max", "min", "abs", "sign", "floor", "ceil", "round", "rem"}
 _ARITHMETIC = {"add", "sub", "mul", "div", "neg"}
 _FOLDED: dict[str, Callable] = {
     "sin": math.sin,

@@ -17,7 +17,7 @@ from jax.extend.core import Literal
 from jourdain_jax.program.graph import Graph, Unsupported
 
 LARGEST = 200_000  # scalars in one array
-_HOMES = (f"{Path(jax.__file__).parent}{os.sep}", f"{Path(__file__).parent.parent}{os.sep}")  # where the source of JAX and of this package lies
+_HOME = f"{Path(__file__).parent.parent}{os.sep}"  # where the source of this package lies
 
 
 class Nodes:
@@ -128,13 +128,16 @@ def inner_jaxpr(name: str, params):
 
 
 def _own_rule(name: str, params) -> str:
-    """What has a derivative that the graph does not know; nothing for functions of JAX and of this package, whose rules are those of what they compute."""
+    """What has a derivative that the graph does not know; nothing for functions of this package, whose rules are those of what they compute.
+
+    Those of JAX are not: `softplus` and `sinc` compute with branches, which hide their derivatives where two of them meet.
+    """
     if name == "stop_gradient":
         return "`stop_gradient`, whose derivative is zero by decree,"
     if not name.startswith(("custom_jvp_call", "custom_vjp_call")):
         return ""
     info = getattr(inner_jaxpr(name, params).jaxpr.debug_info, "func_src_info", None) or "a function"
-    return "" if any(home in info for home in _HOMES) else f"`{info.split(' at ')[0]}`, which has a derivative of its own,"
+    return "" if _HOME in info else f"`{info.split(' at ')[0]}`, which has a derivative of its own,"
 
 
 def _bind_concretely(equation, inputs):
@@ -307,9 +310,23 @@ def _select(graph: Graph, params, which, *cases):
     return graph.call("select", which, *cases)
 
 
+def _power(graph: Graph, x: int, y: int) -> int:
+    whole = graph.is_const(y) and graph.value[y].is_integer()
+    return graph.power(x, int(graph.value[y])) if whole else graph.call("pow", x, y)
+
+
+def _round(graph: Graph, method, x: int) -> int:
+    if method != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+        raise Unsupported("rounding half away from zero")
+    return graph.call("round", x)
+
+
 _ELEMENTWISE: dict[str, Callable] = {
     **{name: _call(name) for name in ("add", "sub", "mul", "div", "neg", "sin", "cos", "tan", "sqrt", "exp", "log", "tanh", "abs", "sign", "max", "min")},
     **{name: _call(name) for name in ("lt", "le", "gt", "ge", "eq", "ne", "atan2", "and", "or", "not", "asin", "acos", "atan", "sinh", "cosh", "is_finite")},
+    **{name: _call(name) for name in ("asinh", "acosh", "atanh", "exp2", "expm1", "log1p", "logistic", "cbrt", "floor", "ceil", "rem")},
+    "pow": lambda graph, params, x, y: _power(graph, x, y),
+    "round": lambda graph, params, x: _round(graph, params["rounding_method"], x),
     "add_any": _call("add"),
     "square": lambda graph, params, x: graph.mul(x, x),
     "rsqrt": lambda graph, params, x: graph.div(graph.one, graph.call("sqrt", x)),

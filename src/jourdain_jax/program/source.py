@@ -17,14 +17,19 @@ class Language:
     select: str
 
 
+_LIBRARY = ["sin", "cos", "tan", "sqrt", "exp", "log", "tanh", "sinh", "cosh", "atan2", "asin", "acos", "atan", "asinh", "acosh", "atanh"]
+_LIBRARY += ["exp2", "expm1", "log1p", "cbrt", "floor", "ceil", "pow"]
+
 PYTHON = Language(
-    {n: f"math.{n}" for n in ("sin", "cos", "tan", "sqrt", "exp", "log", "tanh", "sinh", "cosh", "atan2", "asin", "acos", "atan")}
+    {n: f"math.{n}" for n in _LIBRARY}
+    | {"rem": "math.fmod", "round": "round", "logistic": "1.0 / (1.0 + math.exp(-({0})))"}
     | {"abs": "abs", "max": "max", "min": "min", "sign": "sign", "is_finite": "math.isfinite", "and": "and", "or": "or", "not": "not "},
     "    {name} = {value}",
     "({b} if {c} else {a})",
 )
 C = Language(
-    {n: n for n in ("sin", "cos", "tan", "sqrt", "exp", "log", "tanh", "sinh", "cosh", "atan2", "asin", "acos", "atan")}
+    {n: n for n in _LIBRARY}
+    | {"rem": "fmod", "round": "rint", "logistic": "1.0 / (1.0 + exp(-({0})))"}
     | {"abs": "fabs", "max": "fmax", "min": "fmin", "sign": "sign", "is_finite": "isfinite", "and": "&&", "or": "||", "not": "!"},
     "    const double {name} = {value};",
     "({c} ? {b} : {a})",
@@ -86,7 +91,8 @@ def _expression(graph: Graph, node: int, written, language: Language) -> tuple[s
     if op == "select":
         c, a, b = (written[x][0] for x in args)
         return language.select.format(c=c, a=a, b=b), 9
-    return f"{language.functions.get(op, op)}({', '.join(written[a][0] for a in args)})", 9
+    function, operands = language.functions.get(op, op), ", ".join(written[a][0] for a in args)
+    return (f"({function.format(operands)})" if "{" in function else f"{function}({operands})"), 9
 
 
 def _inside(part: tuple[str, int], level: int) -> str:
@@ -101,6 +107,9 @@ def sympy_expressions(graph: Graph, outputs: Sequence[int], names: Mapping[int, 
     functions: dict = {"abs": sympy.Abs, "max": sympy.Max, "min": sympy.Min, "select": lambda c, a, b: sympy.Piecewise((b, c), (a, True))}
     functions |= {"add": lambda a, b: a + b, "sub": lambda a, b: a - b, "mul": lambda a, b: a * b, "div": lambda a, b: a / b, "neg": lambda a: -a}
     functions |= {"lt": sympy.Lt, "le": sympy.Le, "gt": sympy.Gt, "ge": sympy.Ge, "eq": sympy.Eq, "ne": sympy.Ne}
+    functions |= {"expm1": lambda a: sympy.exp(a) - 1, "log1p": lambda a: sympy.log(a + 1), "exp2": lambda a: 2**a, "pow": sympy.Pow}
+    functions |= {"logistic": lambda a: 1 / (1 + sympy.exp(-a)), "ceil": sympy.ceiling, "round": sympy.Function("round")}
+    functions["rem"] = lambda a, b: a - b * sympy.sign(a / b) * sympy.floor(sympy.Abs(a / b))
     functions |= {"and": sympy.And, "or": sympy.Or, "not": sympy.Not}
     values: dict = {n: sympy.Symbol(name) for n, name in names.items()}
     for node in _needed(graph, outputs, values):
