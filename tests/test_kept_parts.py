@@ -144,6 +144,32 @@ def test_functions_of_jax_have_their_derivatives_where_their_branches_meet(law):
     np.testing.assert_allclose(*second, rtol=1e-12, atol=1e-12)
 
 
+class Learned(ChaplyginSleigh):
+    """A sleigh with a field that is a network, and one that is a function."""
+
+    net: eqx.nn.MLP = eqx.field(default_factory=lambda: eqx.nn.MLP(1, 1, 3, 1, activation=jnp.tanh, key=jax.random.key(0)))
+    share: Callable = jnp.square
+
+    def loads(self, motion):
+        sleigh = motion["sleigh"]
+        along = sleigh.orientation[:, 0]
+        return (jj.point_force(sleigh.point(jnp.zeros(3)), self.share(self.net((sleigh.velocity @ along)[None])[0]) * along),)
+
+
+def test_a_field_may_be_a_network_which_is_differentiated_by_its_weights():
+    scene = Learned()
+    start = jj.start(scene, **scene.example)
+
+    def loss(net):
+        return jj.simulate(scene.replace(net=net), start, t1=0.5).q_end[0]
+
+    found = eqx.filter_jit(eqx.filter_grad(loss))(scene.net).layers[0].weight
+    weight, h = (lambda net: net.layers[0].weight), 1e-5
+    moved = [eqx.tree_at(weight, scene.net, weight(scene.net).at[1, 0].add(side)) for side in (h, -h)]
+    np.testing.assert_allclose(found[1, 0], (loss(moved[0]) - loss(moved[1])) / (2 * h), rtol=1e-7)
+    assert not jj.lower(scene).calls
+
+
 def states_of(scene, count):
     _, q, u = jj.sample_states(scene, count)
     return jnp.asarray(q), jnp.asarray(u[:, np.array(jj.lower(scene).independent)])

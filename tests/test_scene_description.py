@@ -130,6 +130,14 @@ def test_a_scene_with_an_init_of_its_own_takes_its_own_arguments():
         Heavy(wait=9.81)
 
 
+def test_a_text_must_be_a_static_field():
+    class Labelled(jj.models.Skate):
+        label: object = "blue"
+
+    with pytest.raises(ValueError, match=r"field `label` of `Labelled` holds the text 'blue', expected numbers; .*eqx.field\(static=True, default='blue'\)"):
+        Labelled()
+
+
 @pytest.mark.parametrize("value", [3, True])
 def test_a_count_or_a_switch_must_be_a_static_field(value):
     class Chain(Bead):

@@ -15,6 +15,7 @@ from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
 from jourdain_jax.scene.description import check_description, checked_arguments
+from jourdain_jax.scene.held_functions import hold_functions
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
@@ -54,6 +55,7 @@ class Scene(eqx.Module):
         if not isinstance(getattr(self, "coordinates", None), Coordinates):
             raise ValueError(f"scene `{type(self).__name__}` has no `coordinates`; state them as a class attribute: coordinates = jj.coordinates('x y ...')")
         check_description(self, Scene)
+        hold_functions(self)
         check_parameters(self)
 
     # What a scene says. -------------------------------------------------------------------------------------------
