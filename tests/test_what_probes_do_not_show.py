@@ -1,6 +1,9 @@
 """Programs are judged at probes. What these cannot show, because a branch lies elsewhere or only derivatives differ, must not be concluded from them."""
 
+from collections.abc import Callable
+
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,6 +44,76 @@ def test_calls_whose_operands_are_equal_at_the_probes_only_stay_two():
     scene = Limited()
     assert len(jj.lower(scene).graph.calls(jj.lower(scene).ydot)) == 2
     np.testing.assert_allclose(*ends(scene.replace(limit=0.2), {"x": 1.8}), atol=1e-8)
+
+
+class Fading(Plane):
+    """Two look-ups, one of whose operands leaves the other long after all probes."""
+
+    def loads(self, motion):
+        force = lambda x: -jnp.interp(x, KNOTS, jnp.sin(KNOTS))  # noqa: E731
+        x = motion.q.x
+        return (jj.generalized_force(motion, x_rate=force(x), y_rate=force(x * jax.nn.sigmoid((20.0 - motion.t) / 0.1))),)
+
+
+def test_calls_whose_operands_differ_later_stay_two():
+    assert len(jj.lower(Fading()).graph.calls(jj.lower(Fading()).ydot)) == 2
+
+
+class Pushed(Plane):
+    """Some force along x, often none near the probes."""
+
+    push: Callable = eqx.field(static=True)
+    size: object = jj.parameter(1e-10)
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=self.push(motion, self.size)),)
+
+
+PUSHES = {
+    "switched on": lambda motion, _: jnp.where(motion.t > 2.0, -4.0 * motion.q.x, 0.0),
+    "growing": lambda motion, _: -motion.q.x * jnp.maximum(motion.t - 2.0, 0.0),
+    "table in time": lambda motion, _: -motion.q.x * jnp.interp(motion.t, jnp.array([0.0, 2.0, 3.0]), jnp.array([0.0, 0.0, 4.0])),
+    "branch elsewhere": lambda motion, _: jnp.where(motion.q.y > 50.0, -4.0 * motion.q.x, 0.0),
+    "wall": lambda motion, _: -50.0 * jax.nn.sigmoid((motion.q.x - 5.0) / 0.02),
+    "hill": lambda motion, _: jnp.exp(-((motion.q.x - 20.0) ** 2)),
+    "tiny by its parameter": lambda motion, size: -size * motion.q.x,
+    "chosen by its parameter": lambda motion, size: jnp.where(size > 0.5, -motion.q.x, 0.0),
+}
+
+
+@pytest.mark.parametrize("name", PUSHES)
+def test_a_force_that_acts_later_elsewhere_or_for_other_parameters_is_there(name):
+    assert "x" not in jj.lower(Pushed(PUSHES[name])).held
+
+
+def test_a_force_that_sets_in_later_acts_and_one_program_serves_all_parameters():
+    later, spring = Pushed(PUSHES["switched on"]), Pushed(PUSHES["tiny by its parameter"])
+    assert jj.simulate(later, {"x": 1.0}, t1=3.0, rtol=1e-9, atol=1e-9).q_end[0] == pytest.approx(np.cos(2.0), abs=1e-7)
+    lanes = jj.rollout(spring, {"x": 1.0}, parameters={"size": jnp.array([1e-10, 4.0])}, t1=1.0, rtol=1e-9, atol=1e-9).lanes
+    np.testing.assert_allclose(lanes.q_end[:, 0], [1.0, np.cos(2.0)], atol=1e-7)
+
+
+class Ground(jj.Scene):
+    """A particle on ground that is flat, or has a bump far away, or a slope."""
+
+    coordinates = jj.coordinates("x y z")
+    bump: object = jj.parameter(0.0)
+    slope: object = jj.parameter(0.0)
+    with_bump: bool = eqx.field(static=True, default=False)
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, q.z]))}
+
+    def geometric_constraints(self, pose):
+        x, _, z = pose["particle"].position
+        return {"ground": z - self.slope * x - (self.bump * jnp.exp(-((x - 6.0) ** 2)) if self.with_bump else 0.0)}
+
+
+@pytest.mark.parametrize("scene", [Ground(slope=0.5), Ground(bump=0.3, with_bump=True)])
+def test_states_are_put_back_onto_rows_as_they_are_for_other_parameters_and_elsewhere(scene):
+    jj.lower(Ground(with_bump=scene.with_bump))  # built where the ground is flat
+    lowered, dense = ends(scene, {"x": 5.5, "x_rate": 1.0})
+    np.testing.assert_allclose(lowered, dense, atol=1e-7)
 
 
 class Small(Plane):

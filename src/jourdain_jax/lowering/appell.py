@@ -20,6 +20,7 @@ from jourdain_jax.lowering.elimination import eliminate, serves, solve_symmetric
 from jourdain_jax.lowering.multipliers import accelerations_by_multipliers, projected_coordinates, projected_speeds
 from jourdain_jax.program.derivative import along, columns, derivatives
 from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.formal import equal, formal, on_rows, unaffected
 from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
 
 SMALL_SINE = 0.02  # of the angle between rows: where it is smaller at some probe, the program watches it at every evaluation
@@ -78,6 +79,14 @@ class AppellOnGraph:
         self.dependent = [k for k in every if k not in self.independent]
         self.rows, self.multiplied = ([], rows) if by_multipliers else (rows, [])
         self.reference, self.quaternions = reference, quaternions
+        self.formal = self._formal()
+
+    def _formal(self) -> Probes:
+        """Generic states on the geometric rows, at generic parameters."""
+        g, q = self.graph, self.traced.q.tolist()
+        attitudes = {f"q_{first + i}": q[first + i] for first in self.quaternions for i in range(4)}
+        norms = [g.sub(g.total(g.mul(n, n) for n in q[first : first + 4]), g.one) for first in self.quaternions]
+        return on_rows(formal(self.probes, attitudes), self.probes, [*self.traced.at.closure.tolist(), *norms], {f"q_{i}": n for i, n in enumerate(q)})
 
     def build(self, strategy: Strategy) -> Equations:
         """The equations by one strategy."""
@@ -104,7 +113,7 @@ class AppellOnGraph:
             (power,) = self.graph.substituted([int(self.traced.at.power)], true_z)
         elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
-            power = power if np.allclose(*self.probes([power, true_power]), rtol=1e-9, atol=1e-9) else true_power
+            power = power if equal(self.formal([power]), self.formal([true_power])).all() else true_power
         return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots, *sines])), sorted(guards), power, events)
 
     def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
@@ -115,7 +124,7 @@ class AppellOnGraph:
         g, at, q = self.graph, self.traced.at, self.traced.q.tolist()
         redundant = {s for s in range(len(at.closure)) if s not in self.rows and s not in self.multiplied}
         closure = [int(n) for s, n in enumerate(at.closure) if s not in redundant]
-        closure = g.substituted(closure, self.probes.unaffected(closure, self._at_reference(ignorable)))
+        closure = g.substituted(closure, unaffected(self.formal, closure, self._at_reference(ignorable)))
         norms = [g.total(g.mul(n, n) for n in q[first : first + 4]) for first in self.quaternions]
         moved = list(q)
         if closure:
@@ -173,7 +182,7 @@ class AppellOnGraph:
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
         simple = (lambda nodes: list(nodes)) if forms is None else (lambda nodes: [forms.simplified(n) for n in nodes])
         phi = [int(at.phi[s]) for s in self.rows]
-        phi = g.substituted(phi, self.probes.unaffected([*phi, *at.qdot.tolist()], kinematics.held))
+        phi = g.substituted(phi, unaffected(self.formal, [*phi, *at.qdot.tolist()], kinematics.held))
         A = [list(row) for row in zip(*columns(g, phi, u), strict=True)]
         phi_0 = g.substituted(phi, dict.fromkeys(u, g.zero))
         y = {k: u[k] for k in self.independent}
@@ -183,8 +192,7 @@ class AppellOnGraph:
             return eliminate(g, [[row[k] for k in columns] for row in A], right, self.probes)
 
         whole = solved(self.dependent, y)
-        true, held = self.probes([row[0] for row in whole.solution]), self.probes(kinematics.z)
-        same = np.all(np.isclose(true, held, rtol=1e-9, atol=1e-12) | ~serves(whole.pivots, self.probes) | ~np.isfinite(true), axis=1)
+        same = equal(self.formal(kinematics.z), self.formal([row[0] for row in whole.solution]), serves(whole.pivots, self.formal))
         known = y | {k: n for k, n, s in zip(self.dependent, kinematics.z, same, strict=True) if s}
         left = [k for k in self.dependent if k not in known]
         A, phi_0 = [simple(row) for row in A], simple(phi_0)

@@ -25,6 +25,7 @@ from jourdain_jax.lowering.blame import blamed
 from jourdain_jax.lowering.elimination import serves
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
 from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.formal import equal
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -164,7 +165,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
     put_back = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
     groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power], best.events, put_back.q, put_back.u]
-    outputs = graph.with_quotients(_with_equal_calls_once(probes, [n for group in groups for n in group]))
+    outputs = graph.with_quotients(_with_equal_calls_once(builder.formal, [n for group in groups for n in group]))
     ends = np.cumsum([len(group) for group in groups])
     qdot, ydot, z, pivots, guards, power, events, put_q, put_u = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
     names = scene.coordinate_names.entries
@@ -296,39 +297,27 @@ def _enough(usable: np.ndarray) -> bool:
 
 
 def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:
-    """Coordinates (quaternions as a whole) whose value the privileged accelerations do not depend on, at any probe."""
-    probes, q = builder.probes, builder.traced.q
+    """Coordinates (quaternions as a whole) whose value the privileged accelerations do not depend on anywhere."""
+    probes, generic, q = builder.probes, builder.formal, builder.traced.q
     attitudes = [tuple(range(first, first + 4)) for first, _ in scene.coordinates.quaternions]
     single = [(i,) for i in range(len(q)) if not any(i in attitude for attitude in attitudes)]
-    here, reference = expected[len(equations.qdot) :], scene.coordinates.reference()
+    at_probes, reference = expected[len(equations.qdot) :], scene.coordinates.reference()
     accelerations = replace(equations, qdot=[])
-    graph, at = builder.graph, builder.traced.at
-    used = set(graph.reachable([*equations.ydot, *equations.pivots]))
+    used, here, regular = set(builder.graph.reachable(equations.ydot)), generic(equations.ydot), serves(equations.pivots, generic)
 
-    # what a call or a branch does elsewhere no probe shows: what it is given must not change
-    deciding = [*equations.ydot, *equations.pivots, *map(int, (*at.phi, *at.qdot, at.power))]
-    given = [*(a for call in graph.calls(deciding) for a in _operands(graph, call)), *graph.looked_at(deciding)]
+    def unchanged(group) -> bool:
+        shuffled = generic.with_inputs({f"q_{i}": np.roll(generic.inputs[f"q_{i}"], 1) for i in group})
+        return bool(np.all(equal(shuffled(equations.ydot), here, regular & serves(equations.pivots, shuffled))))
 
-    def unchanged(changes):
-        changed = probes.with_inputs(changes)
-        values = _values(accelerations, changed)
-        return _equal(changed(given), probes(given)) and _agree(values, np.where(np.isfinite(values), here, np.nan))
+    def regular_at_reference(group) -> bool:
+        values = _values(accelerations, probes.with_inputs({f"q_{i}": np.full(probes.count, reference[i]) for i in group}))
+        return _agree(values, np.where(np.isfinite(values), at_probes, np.nan))
 
-    seen = set(graph.reachable(given))
     held: list[int] = []
     for group in [*single, *attitudes]:
-        shuffled = {f"q_{i}": np.roll(probes.inputs[f"q_{i}"], 1) for i in group}
-        at_reference = {f"q_{i}": np.full(probes.count, reference[i]) for i in group}
-        if (used | seen).isdisjoint(q[list(group)].tolist()) or (unchanged(shuffled) and unchanged(at_reference)):
+        if used.isdisjoint(q[list(group)].tolist()) or (unchanged(group) and regular_at_reference(group)):
             held += group
     return tuple(sorted(held))
-
-
-def _equal(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether rows of values at the probes are equal but for round-off, relative to their size."""
-    size = np.max(np.where(np.isfinite(b), np.abs(b), 0.0), axis=1, keepdims=True, initial=0.0)
-    with np.errstate(invalid="ignore"):
-        return bool(np.all((a == b) | (np.abs(a - b) <= AGREEMENT * size) | (np.isnan(a) & np.isnan(b))))
 
 
 def _operands(graph: Graph, call: int) -> list[int]:
@@ -336,26 +325,16 @@ def _operands(graph: Graph, call: int) -> list[int]:
     return [n for a in graph.args[call] if graph.op[a] == "array" for n in graph.args[a]]
 
 
-def _with_equal_calls_once(probes: Probes, outputs: list[int]) -> list[int]:
-    """The outputs, with one call in place of those that compute the same of what is equal at all probes, though it is not written in the same way.
-
-    What is equal there is equal everywhere, where it has no branches and contains no call.
-    """
-    graph = probes.graph
-
-    def analytic(call):
-        return not graph.looked_at(operands(call)) and not graph.calls(operands(call))
-
-    def operands(call):
-        return _operands(graph, call)
-
+def _with_equal_calls_once(generic: Probes, outputs: list[int]) -> list[int]:
+    """The outputs, with one call in place of those that compute the same of what is equal, though it is not written in the same way."""
+    graph = generic.graph
     calls = sorted(graph.calls(outputs), key=lambda call: (graph.operations(graph.args[call]), call))  # so none is replaced by one made from it
     kept: dict = {}
     same: dict[int, int] = {}
     for call in calls:
         alike = kept.setdefault((graph.value[call], tuple(graph.value[a] for a in graph.args[call])), [])
-        mergeable = [other for other in alike if analytic(other)] if analytic(call) else []
-        found = next((other for other in mergeable if _equal(probes(operands(other)), probes(operands(call)))), None)
+        given = generic(_operands(graph, call))
+        found = next((other for other in alike if np.all(equal(given, generic(_operands(graph, other))))), None)
         if found is None:
             alike.append(call)
         else:

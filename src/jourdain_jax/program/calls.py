@@ -56,6 +56,11 @@ class Call:
         return tuple(jnp.asarray(x, jnp.result_type(*real)) if real and jnp.issubdtype(x.dtype, jnp.floating) else x for x in found)
 
     @functools.cached_property
+    def name(self) -> str:
+        """What tells it from calls of other functions."""
+        return f"{self.closed.jaxpr} {[np.asarray(x).tobytes() for x in self.closed.consts]}"
+
+    @functools.cached_property
     def at_probes(self) -> Callable[..., list[np.ndarray]]:
         """The results on NumPy, operands and results with a leading axis of probes."""
         function = jaxpr_as_fun(self.closed)

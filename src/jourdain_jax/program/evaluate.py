@@ -1,6 +1,6 @@
 """Values of nodes on NumPy arrays, all probes at once: nothing is compiled."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
@@ -12,8 +12,10 @@ from jourdain_jax.program.graph import ARRAYS, Graph
 class Probes:
     """Values of the nodes of a graph at sample inputs; what was computed once is kept."""
 
-    def __init__(self, graph: Graph, inputs: Mapping[str, np.ndarray]):
-        self.graph, self.inputs = graph, dict(inputs)
+    def __init__(
+        self, graph: Graph, inputs: Mapping[str, np.ndarray], functions: Mapping[str, Callable] = FUNCTIONS, arrays: Mapping[str, Callable] = AT_PROBES
+    ):
+        self.graph, self.inputs, self._functions, self._of_arrays = graph, dict(inputs), functions, arrays
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
         self._row: dict[int, int] = {}  # of the table, by node
         self._table = np.empty((256, self.count))
@@ -27,24 +29,13 @@ class Probes:
 
     def with_inputs(self, changes: Mapping[str, np.ndarray]) -> "Probes":
         """The same probes with some inputs changed."""
-        return Probes(self.graph, self.inputs | dict(changes))
+        return Probes(self.graph, self.inputs | dict(changes), self._functions, self._of_arrays)
 
     def sign(self, node: int) -> int:
         """1 or -1 where the node has this sign at every probe, 0 otherwise."""
         value = self([node])[0]
         finite = value[np.isfinite(value)]
         return 0 if not finite.size or np.any(finite == 0) else int(np.sign(finite[0])) if np.all(np.sign(finite) == np.sign(finite[0])) else 0
-
-    def unaffected(self, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:
-        """The replacements, each of one node by another, that by themselves change none of the `nodes` at any probe."""
-        nodes = [*nodes, *self.graph.looked_at(nodes)]  # no probe need show what another branch does
-        here = self(nodes)
-
-        def unchanged(old, new):
-            there = self(self.graph.substituted(nodes, {old: new}))
-            return np.allclose(there, here, rtol=1e-9, atol=1e-9, equal_nan=True)
-
-        return {old: new for old, new in replacement.items() if unchanged(old, new)}
 
     def _compute(self, nodes) -> None:
         graph, row = self.graph, self._row
@@ -59,13 +50,13 @@ class Probes:
                 op, place = graph.op[node], len(row)
                 if op in ARRAYS:
                     args = [self._arrays[a] if graph.op[a] in ARRAYS else table[row[a]] for a in graph.args[node]]
-                    self._arrays[node] = AT_PROBES[op](graph.value[node], *args)
+                    self._arrays[node] = self._of_arrays[op](graph.value[node], *args)
                 elif op == "entry":
-                    table[place] = AT_PROBES[op](graph.value[node], self._arrays[graph.args[node][0]])
+                    table[place] = self._of_arrays[op](graph.value[node], self._arrays[graph.args[node][0]])
                 elif op == "const":
                     table[place] = graph.value[node]
                 elif op == "input":
                     table[place] = self.inputs[graph.value[node]]
                 else:
-                    table[place] = FUNCTIONS[op](*(table[row[a]] for a in graph.args[node]))
+                    table[place] = self._functions[op](*(table[row[a]] for a in graph.args[node]))
                 row[node] = place
