@@ -287,6 +287,14 @@ class Trolley(jj.Scene):
         return {"guide": u.y_rate, "guide again": u.y_rate, "rolling": u.x_rate - u.turn_rate}
 
 
+def test_rows_that_a_motion_leaves_are_warned_of():
+    rods = jj.models.DoublePendulumRods()
+    options = {"t1": 2.0, "solver": diffrax.Euler(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": 5e-3}
+    kept, left = (jj.simulate(rods, rods.example, projection=projection, **options).warnings for projection in (True, False))
+    assert kept == ()
+    assert [text.split(" are violated")[0] for text in left] == ["geometric rows", "velocity rows"]
+
+
 def test_a_reduction_by_privileged_speeds_too_light_for_the_precision_is_warned_of():
     def pulled(inertia, reduction):
         return jj.simulate(Trolley(inertia=inertia), t1=2.0, ts=[0.0, 2.0], state="full", reduction=reduction)

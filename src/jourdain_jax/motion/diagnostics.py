@@ -79,6 +79,7 @@ def diagnose(trajectory: Record) -> Diagnostics:
 
 
 FEW_TIMES = 1000
+VIOLATED = 1e-4  # residual of a row, relative to the state
 _seldom = Seldom(often=100)
 
 
@@ -124,6 +125,9 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
         warned.append(f"rows change their rank along the motion, {low} to {high}: constraint forces and the motion beyond may not be unique")
     elif smallest < np.sqrt(jnp.finfo(trajectory.q.dtype).eps):
         warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
+    for kind, residual, state in (("geometric", found.position_residual, trajectory.q), ("velocity", found.velocity_residual, trajectory.u)):
+        if float(residual) > VIOLATED * (1.0 + float(_largest(state))):
+            warned.append(f"{kind} rows are violated by up to {float(residual):.1e} in their own units: take projection, smaller tolerances or smaller steps")
     pivot, dense = float(trajectory.smallest_pivot), not trajectory.reduction.endswith("lowered")
     # round-off over the square of the pivot is the error of an acceleration; other states than the full one end there
     if trajectory.state_form == "full" and dense and pivot < passing_cutoff(trajectory.q.dtype):
