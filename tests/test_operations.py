@@ -7,15 +7,16 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.program.derivative import derivatives
+from jourdain_jax.program.emit import run
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.program.polynomial import NormalForms
 from jourdain_jax.program.uncompiled import uncompiled
 
 
 def to_second_order(f, point):
-    """The value, all first and all second derivatives of f at a point, by the graph."""
+    """The value, all first and all second derivatives of f at a point, by the graph: on NumPy, and as JAX code."""
     graph = Graph()
     x = [graph.input(name, True) for name in "xyz"[: len(point)]]
     (found,) = interpret(graph, jax.make_jaxpr(f)(jnp.asarray(point)), [Nodes(x)])
@@ -23,7 +24,11 @@ def to_second_order(f, point):
     unit = [{n: graph.one if n == m else graph.zero for n in x} for m in x]
     first = [derivatives(graph, value, d)[0] for d in unit]
     second = [derivatives(graph, [n], d)[0] for n in first for d in unit]
-    return Probes(graph, dict(zip("xyz", np.asarray(point)[:, None], strict=False)))([*value, *first, *second])[:, 0]
+    nodes = [*value, *first, *second]
+    found = Probes(graph, dict(zip("xyz", np.asarray(point)[:, None], strict=False)))(nodes)[:, 0]
+    emitted = run(graph, nodes, dict(zip(x, map(jnp.float64, point), strict=True)))
+    np.testing.assert_allclose(np.array(emitted, float), found, rtol=1e-14, atol=1e-14)
+    return found
 
 
 def by_jax(f, point):
@@ -53,10 +58,16 @@ def test_what_holds_is_a_number_where_one_is_asked_for(name, point):
 @pytest.mark.parametrize("f", [lambda n: n & 1, lambda n: n | 2, lambda n: ~n, lambda n: n // 2, lambda n: jnp.bitwise_and.reduce(n[None] | 4)])
 def test_digits_of_integers_are_no_scalar_operation_and_bitwise_when_run_uncompiled(f):
     law = lambda x: jnp.float64(f(jnp.where(x[0] > 0, 3, 5)))  # noqa: E731
-    with pytest.raises(jj.program.graph.Unsupported, match=r"integer|while"):
+    with pytest.raises(Unsupported, match=r"integer|while"):
         to_second_order(law, (1.0,))
     for x in (1.0, -1.0):
         assert uncompiled(law)(np.array([x])) == law(jnp.array([x]))
+
+
+@pytest.mark.parametrize("f", [lambda x: jnp.mean(jnp.float32(x > 0)) * x[1], lambda x: jnp.float32(x[0]) * x[1]])
+def test_single_precision_among_double_is_not_computed_in_double(f):
+    with pytest.raises(Unsupported, match="float32"):
+        to_second_order(f, (1.0, 2.0))
 
 
 def test_integers_and_rounding_run_uncompiled_are_those_of_jax():

@@ -81,7 +81,7 @@ def _smaller(g: Graph, n, a, b, da, db):
 
 
 def _halved_where_equal(g: Graph, a, b, otherwise, da, db):
-    """Half of either, as JAX has it: log1p(exp(-|x|)) + max(x, 0) is smooth at x = 0."""
+    """Half of either, as JAX has it: max(x, 0) - max(-x, 0) is smooth at x = 0."""
     return g.call("select", g.call("eq", a, b), otherwise, g.mul(g.const(0.5), g.add(da, db)))
 
 

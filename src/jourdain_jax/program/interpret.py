@@ -101,10 +101,12 @@ def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
         return [np.asarray(x) for x in _bind_concretely(equation, inputs)]
     if out.dtype.kind in "iu" and name in _NOT_OF_INTEGERS:
         raise Unsupported("an integer that depends on the state")
+    if _is_rounded(out.dtype):
+        raise Unsupported(f"the operation `{name}` in {out.dtype}")
     if name in REDUCTIONS:
         return [Nodes(reduced(graph, as_nodes(graph, inputs[0]), equation.params["axes"], name))]
     if name == "dot_general":
-        return [Nodes(product(graph, *(as_nodes(graph, x) for x in inputs), equation.params["dimension_numbers"]))]
+        return [Nodes(product(graph, as_nodes(graph, inputs[0]), as_nodes(graph, inputs[1]), equation.params["dimension_numbers"]))]
     if name in _ELEMENTWISE:
         arrays = np.broadcast_arrays(*(as_nodes(graph, x) for x in inputs)) if len(inputs) > 1 else [as_nodes(graph, inputs[0])]
         flat = [np.ravel(a).tolist() for a in arrays]
@@ -257,8 +259,15 @@ def _same(graph, inputs, params, out):
     return _ids(inputs[0])
 
 
+def _is_rounded(dtype: np.dtype) -> bool:
+    """Whether numbers of a type have fewer digits than those of the program."""
+    return dtype.kind == "f" and dtype.itemsize < jnp.result_type(float).itemsize
+
+
 def _converted(graph: Graph, ids: np.ndarray, old: np.dtype, new: np.dtype) -> Nodes:
     """Nodes of another type: what holds or not is 1 or 0 as a number, a number holds where it is not zero."""
+    if old.kind == "f" and old.itemsize > new.itemsize and _is_rounded(new):
+        raise Unsupported(f"a number in {new}")
     if old.kind == new.kind or (old.kind, new.kind) == ("i", "f"):
         return Nodes(ids)
     if new.kind not in "fb":
