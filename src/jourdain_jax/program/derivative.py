@@ -1,5 +1,6 @@
 """Derivatives on the graph, by forward mode: nodes for the derivative of nodes along a direction given at some of them."""
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Mapping
 
@@ -80,23 +81,26 @@ def _smaller(g: Graph, n, a, b, da, db):
 
 
 def _halved_where_equal(g: Graph, a, b, otherwise, da, db):
-    """Half of either, as JAX has it: log1p(exp(-|x|)) + max(x, 0) is smooth at x = 0."""
+    """Half of either, as JAX has it: max(x, 0) - max(-x, 0) is smooth at x = 0."""
     return g.call("select", g.call("eq", a, b), otherwise, g.mul(g.const(0.5), g.add(da, db)))
 
 
 def _real_power(g: Graph, n, a, b, da, db):
-    """(a^b)' = b a^(b-1) a' + a^b log(a) b'; the first term is zero where b is, the second where a is (a^b log a -> 0 for b > 0)"""
+    """(a^b)' = b a^(b-1) a' + a^b log(a) b'; the first term is zero where a and b are, the second where a is (a^b log a -> 0 for b > 0)"""
     of_base, of_exponent = g.zero, g.zero
     if da != g.zero:
-        of_base = g.mul(g.mul(b, g.call("pow", a, _unless_zero(g, b, g.sub(b, g.one)))), da)
+        of_base = g.mul(g.mul(b, g.call("pow", a, _unless_zero(g, (a, b), g.sub(b, g.one)))), da)
     if db != g.zero:
-        of_exponent = g.mul(g.mul(n, g.call("log", _unless_zero(g, a, a))), db)
+        of_exponent = g.mul(g.mul(n, g.call("log", _unless_zero(g, (a,), a))), db)
     return g.add(of_base, of_exponent)
 
 
-def _unless_zero(g: Graph, a, value):
-    """The value, and 1 where a is zero."""
-    return value if g.is_const(a) and g.value[a] else g.call("select", g.call("eq", a, g.zero), value, g.one)
+def _unless_zero(g: Graph, nodes: tuple[int, ...], value):
+    """The value, and 1 where all of the nodes are zero."""
+    if any(g.is_const(n) and g.value[n] for n in nodes):
+        return value
+    vanish = [g.call("eq", n, g.zero) for n in nodes]
+    return g.call("select", functools.reduce(lambda a, b: g.call("and", a, b), vanish), value, g.one)
 
 
 def _remainder(g: Graph, n, a, b, da, db):
@@ -136,7 +140,7 @@ _RULES: dict[str, Callable] = {
     "pow": _real_power,
     "rem": _remainder,
     "atan2": _arctangent,
-    "abs": lambda g, n, a, da: g.mul(g.call("sign", a), da),
+    "abs": lambda g, n, a, da: g.mul(g.call("select", g.call("ge", a, g.zero), g.const(-1.0), g.one), da),  # 1 at zero: so powers of |x| are smooth
     "sign": lambda g, n, a, da: g.zero,
     "max": _larger,
     "min": _smaller,

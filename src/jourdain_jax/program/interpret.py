@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
+from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
 from jourdain_jax.program.graph import Graph, Unsupported
 
 LARGEST = 200_000  # scalars in one array
@@ -89,6 +90,8 @@ def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
         return _run(graph, chosen.jaxpr, [_known(c) for c in chosen.consts], inputs[1:])
     symbolic = any(isinstance(x, Nodes) for x in inputs)
     out = equation.outvars[0].aval
+    if name == "convert_element_type" and symbolic:
+        return [_converted(graph, as_nodes(graph, inputs[0]), equation.invars[0].aval.dtype, out.dtype)]
     if name in _STRUCTURAL:
         rule = _STRUCTURAL[name]
         if symbolic and name in _MIXED:
@@ -96,10 +99,14 @@ def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
         return _boxed(rule(graph, inputs, equation.params, out), symbolic)
     if not symbolic:
         return [np.asarray(x) for x in _bind_concretely(equation, inputs)]
-    if name in _REDUCTIONS:
-        return [_reduce(graph, inputs[0], equation.params["axes"], _REDUCTIONS[name])]
+    if out.dtype.kind in "iu" and name in _NOT_OF_INTEGERS:
+        raise Unsupported("an integer that depends on the state")
+    if _is_rounded(out.dtype):
+        raise Unsupported(f"the operation `{name}` in {out.dtype}")
+    if name in REDUCTIONS:
+        return [Nodes(reduced(graph, as_nodes(graph, inputs[0]), equation.params["axes"], name))]
     if name == "dot_general":
-        return [_dot_general(graph, inputs[0], inputs[1], equation.params)]
+        return [Nodes(product(graph, as_nodes(graph, inputs[0]), as_nodes(graph, inputs[1]), equation.params["dimension_numbers"]))]
     if name in _ELEMENTWISE:
         arrays = np.broadcast_arrays(*(as_nodes(graph, x) for x in inputs)) if len(inputs) > 1 else [as_nodes(graph, inputs[0])]
         flat = [np.ravel(a).tolist() for a in arrays]
@@ -252,13 +259,21 @@ def _same(graph, inputs, params, out):
     return _ids(inputs[0])
 
 
-def _convert(graph, inputs, params, out):
-    x = inputs[0]
-    if isinstance(x, Nodes):
-        if np.dtype(params["new_dtype"]).kind != "f" and np.dtype(params["new_dtype"]) != bool:
-            raise Unsupported("an integer that depends on the state")
-        return x.ids
-    return np.asarray(x).astype(params["new_dtype"])
+def _is_rounded(dtype: np.dtype) -> bool:
+    """Whether numbers of a type have fewer digits than those of the program."""
+    return dtype.kind == "f" and dtype.itemsize < jnp.result_type(float).itemsize
+
+
+def _converted(graph: Graph, ids: np.ndarray, old: np.dtype, new: np.dtype) -> Nodes:
+    """Nodes of another type: what holds or not is 1 or 0 as a number, a number holds where it is not zero."""
+    if old.kind == "f" and old.itemsize > new.itemsize and _is_rounded(new):
+        raise Unsupported(f"a number in {new}")
+    if old.kind == new.kind or (old.kind, new.kind) == ("i", "f"):
+        return Nodes(ids)
+    if new.kind not in "fb":
+        raise Unsupported("an integer that depends on the state")
+    one = (lambda n: graph.call("select", n, graph.zero, graph.one)) if old.kind == "b" else (lambda n: graph.call("ne", n, graph.zero))
+    return Nodes(np.array([one(n) for n in ids.ravel().tolist()], np.int64).reshape(ids.shape))
 
 
 _STRUCTURAL: dict[str, Callable] = {
@@ -282,7 +297,7 @@ _STRUCTURAL: dict[str, Callable] = {
     "copy_p": _same,
     "stop_gradient": _same,
     "optimization_barrier": lambda g, x, p, out: [_ids(y) for y in x],
-    "convert_element_type": _convert,
+    "convert_element_type": lambda g, x, p, out: np.asarray(x[0]).astype(out.dtype),
 }
 
 # Which arguments hold entries, where the others are indices: numbers among them become constants as soon as one is a node.
@@ -332,45 +347,7 @@ _ELEMENTWISE: dict[str, Callable] = {
     "rsqrt": lambda graph, params, x: graph.div(graph.one, graph.call("sqrt", x)),
     "integer_pow": lambda graph, params, x: graph.power(x, params["y"]),
     "select_n": _select,
+    "xor": _call("ne"),
 }
 
-_REDUCTIONS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul"}
-
-
-def _reduce(graph: Graph, x: Value, axes, op: str) -> Nodes:
-    ids = as_nodes(graph, x)
-    kept = [a for a in range(ids.ndim) if a not in axes]
-    rows = np.transpose(ids, (*kept, *axes)).reshape([ids.shape[a] for a in kept] + [-1])
-    result = np.empty(rows.shape[:-1], np.int64)
-    for place in np.ndindex(result.shape):
-        entries = rows[place].tolist()
-        total = entries[0] if entries else graph.zero
-        for entry in entries[1:]:
-            total = graph.call(op, total, entry)
-        result[place] = total
-    return Nodes(result)
-
-
-def _dot_general(graph: Graph, a: Value, b: Value, params) -> Nodes:
-    (over_a, over_b), (batch_a, batch_b) = params["dimension_numbers"]
-    x, y = as_nodes(graph, a), as_nodes(graph, b)
-    free_a = [i for i in range(x.ndim) if i not in (*over_a, *batch_a)]
-    free_b = [i for i in range(y.ndim) if i not in (*over_b, *batch_b)]
-    batch = [x.shape[i] for i in batch_a]
-    left = np.transpose(x, (*batch_a, *free_a, *over_a)).reshape(int(np.prod(batch)), int(np.prod([x.shape[i] for i in free_a])), -1)
-    right = np.transpose(y, (*batch_b, *free_b, *over_b)).reshape(left.shape[0], int(np.prod([y.shape[i] for i in free_b])), -1)
-    _check_size(graph, left, right)
-    result = [[[graph.dot(row, column) for column in rights] for row in lefts] for lefts, rights in zip(left.tolist(), right.tolist(), strict=True)]
-    shape = batch + [x.shape[i] for i in free_a] + [y.shape[i] for i in free_b]
-    return Nodes(np.array(result, dtype=np.int64).reshape(shape))
-
-
-def _check_size(graph: Graph, left: np.ndarray, right: np.ndarray) -> None:
-    """`Unsupported` for a product with more multiplications, not by 0, 1 and -1, than the graph is meant for."""
-    if left.size * right.shape[1] <= graph.most_multiplications:
-        return
-    trivial = {graph.zero, graph.one, graph.const(-1.0)}
-    rows, columns = (np.sum([[[n not in trivial for n in row] for row in matrix] for matrix in x.tolist()], axis=1) for x in (left, right))
-    count = int(np.sum(rows * columns))
-    if count > graph.most_multiplications:
-        raise Unsupported(f"a product of matrices with {count} multiplications")
+_NOT_OF_INTEGERS = {"div", "and", "or", "xor", "not", "reduce_and", "reduce_or"}  # by digits, or rounded

@@ -97,7 +97,7 @@ class NormalForms:
         if op == "sqrt":
             return self._root(parts[0])
         if op == "abs":
-            return self._magnitude(self.rebuilt(parts[0]))
+            return self._absolute(parts[0])
         atom = graph.call(op, *(self.rebuilt(p) for p in parts))
         return self._atom(atom) if graph.op[atom] == op else self.expanded(atom)
 
@@ -136,8 +136,18 @@ class NormalForms:
                 return [self.graph.call(self._square_of, self.graph.args[extra[0]][0])], {small: c}
         return None
 
+    def _absolute(self, p: Polynomial) -> Polynomial:
+        """|p|, a product factor by factor: what the sign of one is says nothing of another's."""
+        if len(p) != 1:
+            return self._magnitude(self.rebuilt(p))
+        ((monomial, c),) = p.items()
+        result: Polynomial = {(): abs(c)}
+        for atom in monomial:
+            result = self.product(result, self._magnitude(atom))
+        return result
+
     def _magnitude(self, node: int) -> Polynomial:
-        sign = self._sign(node)
+        sign = self._sign(node) if self.graph.varies[node] or self.graph.is_const(node) else 0  # parameters may have either sign
         if sign == 0:
             return self._atom(self.graph.call("abs", node))
         if not self.graph.is_const(node):

@@ -146,13 +146,24 @@ _ENTRYWISE: dict[str, Callable] = {
     "expm1": np.expm1,
     "floor": np.floor,
     "ceil": np.ceil,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "xor": np.bitwise_xor,
+    "not": np.invert,
     "copy": lambda x: x,
     "copy_p": lambda x: x,
     "stop_gradient": lambda x: x,
     "unvmap_any": np.any,
     "convert_element_type": lambda x: x,
 }
-del _ENTRYWISE["select"]
+del _ENTRYWISE["select"], _ENTRYWISE["round"]
+
+
+def _round(equation, x):
+    if equation.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+        return np.rint(x)
+    whole = np.trunc(x)
+    return whole + np.copysign(np.abs(x - whole) >= 0.5, x)  # half away from zero
 
 
 def _dot_general(equation, a, b):
@@ -295,6 +306,7 @@ _RULES: dict[str, Callable] = {
     "slice": _slice,
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
+    "round": _round,
     "select_n": lambda e, which, *cases: np.where(np.asarray(which, bool), cases[1], cases[0]) if len(cases) == 2 else np.choose(which, cases),
     "integer_pow": lambda e, x: np.asarray(x ** e.params["y"] if e.params["y"] >= 0 else 1 / x ** -e.params["y"]),
     "iota": _iota,
@@ -310,8 +322,8 @@ _RULES: dict[str, Callable] = {
     "reduce_max": _reduced(np.max, -np.inf),
     "reduce_min": _reduced(np.min, np.inf),
     "reduce_prod": _reduced(np.prod),
-    "reduce_and": _reduced(np.all),
-    "reduce_or": _reduced(np.any),
+    "reduce_and": _reduced(np.bitwise_and.reduce),
+    "reduce_or": _reduced(np.bitwise_or.reduce),
     "argmax": lambda e, x: np.argmax(x, axis=e.params["axes"][0]).astype(e.params["index_dtype"]),
     "optimization_barrier": lambda e, *xs: list(xs),
 }

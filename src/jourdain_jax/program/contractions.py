@@ -1,0 +1,64 @@
+"""Arrays of nodes taken together over some of their axes: sums, products, extremes, products of matrices."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jourdain_jax.program.graph import Graph, Unsupported
+
+_OPERATIONS = {"reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min", "reduce_and": "and", "reduce_or": "or"}
+_OF_NOTHING = {"add": 0.0, "mul": 1.0, "max": -np.inf, "min": np.inf, "and": 1.0, "or": 0.0}
+REDUCTIONS = frozenset(_OPERATIONS)
+
+
+def reduced(graph: Graph, ids: np.ndarray, axes: Sequence[int], name: str) -> np.ndarray:
+    """What one of the `REDUCTIONS` of JAX makes of an array of nodes."""
+    op = _OPERATIONS[name]
+    kept = [a for a in range(ids.ndim) if a not in axes]
+    rows = np.transpose(ids, (*kept, *axes)).reshape(*(ids.shape[a] for a in kept), int(np.prod([ids.shape[a] for a in axes])))
+    result = np.empty(rows.shape[:-1], np.int64)
+    for place in np.ndindex(result.shape):
+        result[place] = _of_all(graph, op, rows[place].tolist())
+    return result
+
+
+def _of_all(graph: Graph, op: str, entries: list[int]) -> int:
+    if not entries:
+        return graph.const(_OF_NOTHING[op])
+    total = entries[0]
+    for entry in entries[1:]:
+        total = graph.call(op, total, entry)
+    return _mean_of_those_equal(graph, entries, total) if op in ("max", "min") and len(entries) > 2 else total
+
+
+def _mean_of_those_equal(graph: Graph, entries: list[int], extreme: int) -> int:
+    """The extreme of more than two as the mean of those that reach it: where they meet, its derivative is the mean of theirs, as JAX has it."""
+    reached = [graph.call("eq", entry, extreme) for entry in entries]
+    total = graph.total(graph.call("select", reaches, graph.zero, entry) for reaches, entry in zip(reached, entries, strict=True))
+    return graph.div(total, graph.total(graph.call("select", reaches, graph.zero, graph.one) for reaches in reached))
+
+
+def product(graph: Graph, x: np.ndarray, y: np.ndarray, dimension_numbers) -> np.ndarray:
+    """What `dot_general` of JAX makes of two arrays of nodes."""
+    (over_x, over_y), (batch_x, batch_y) = dimension_numbers
+    free_x = [i for i in range(x.ndim) if i not in (*over_x, *batch_x)]
+    free_y = [i for i in range(y.ndim) if i not in (*over_y, *batch_y)]
+    batch = [x.shape[i] for i in batch_x]
+    sizes = [int(np.prod(s)) for s in (batch, [x.shape[i] for i in free_x], [y.shape[i] for i in free_y], [x.shape[i] for i in over_x])]
+    left = np.transpose(x, (*batch_x, *free_x, *over_x)).reshape(sizes[0], sizes[1], sizes[3])
+    right = np.transpose(y, (*batch_y, *free_y, *over_y)).reshape(sizes[0], sizes[2], sizes[3])
+    _check_size(graph, left, right)
+    result = [[[graph.dot(row, column) for column in rights] for row in lefts] for lefts, rights in zip(left.tolist(), right.tolist(), strict=True)]
+    shape = batch + [x.shape[i] for i in free_x] + [y.shape[i] for i in free_y]
+    return np.array(result, dtype=np.int64).reshape(shape)
+
+
+def _check_size(graph: Graph, left: np.ndarray, right: np.ndarray) -> None:
+    """`Unsupported` for a product with more multiplications, not by 0, 1 and -1, than the graph is meant for."""
+    if left.size * right.shape[1] <= graph.most_multiplications:
+        return
+    trivial = {graph.zero, graph.one, graph.const(-1.0)}
+    rows, columns = (np.sum([[[n not in trivial for n in row] for row in matrix] for matrix in x.tolist()], axis=1) for x in (left, right))
+    count = int(np.sum(rows * columns))
+    if count > graph.most_multiplications:
+        raise Unsupported(f"a product of matrices with {count} multiplications")

@@ -1,0 +1,150 @@
+"""Operations whose derivatives or types are easily got wrong: the graph and the uncompiled run against JAX."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.program.derivative import derivatives
+from jourdain_jax.program.emit import run
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
+from jourdain_jax.program.polynomial import NormalForms
+from jourdain_jax.program.uncompiled import uncompiled
+
+
+def to_second_order(f, point):
+    """The value, all first and all second derivatives of f at a point, by the graph: on NumPy, and as JAX code."""
+    graph = Graph()
+    x = [graph.input(name, True) for name in "xyz"[: len(point)]]
+    (found,) = interpret(graph, jax.make_jaxpr(f)(jnp.asarray(point)), [Nodes(x)])
+    value = [int(as_nodes(graph, found)[()])]
+    unit = [{n: graph.one if n == m else graph.zero for n in x} for m in x]
+    first = [derivatives(graph, value, d)[0] for d in unit]
+    second = [derivatives(graph, [n], d)[0] for n in first for d in unit]
+    nodes = [*value, *first, *second]
+    found = Probes(graph, dict(zip("xyz", np.asarray(point)[:, None], strict=False)))(nodes)[:, 0]
+    emitted = run(graph, nodes, dict(zip(x, map(jnp.float64, point), strict=True)))
+    np.testing.assert_allclose(np.array(emitted, float), found, rtol=1e-14, atol=1e-14)
+    return found
+
+
+def by_jax(f, point):
+    point = jnp.asarray(point, float)
+    return np.concatenate([np.ravel(g(point)) for g in (f, jax.jacfwd(f), jax.jacfwd(jax.jacfwd(f)))])
+
+
+TRUTHS = {
+    "sum": lambda x: (x[0] > 0) * 1.0 + (x[1] > 0) * 1.0,
+    "difference": lambda x: (x[0] > 0) * x[1] - (x[1] > 3) * 1.0,
+    "count": lambda x: 1.5 * jnp.stack([x[0] > 0, x[1] > 0, x[1] < 3]).astype(float).sum(),
+    "choice": lambda x: jnp.where(x[0] > 0, x[1] > 0, False) * 3.0 + jnp.where(x[0] < 0, x[1] > 0, True) * x[0],
+    "exactly one": lambda x: ((x[0] > 0) ^ (x[1] > 3)) * 2.0 + ((x[0] > 0) ^ (x[1] > 0)) * 5.0,
+    "all and any": lambda x: jnp.all(x > 0) * 2.0 + jnp.any(x > 4) * 1.0 + jnp.all(x[:0] > 0) * 7.0,
+    "numbers": lambda x: (x.astype(bool)).astype(float) @ jnp.array([1.0, 2.0]) * x[0],
+    "whole numbers": lambda x: jnp.where(x[0] > 0, 7, 3) * x[1] + jnp.max(jnp.where(x > 1, 5, 4)),
+    "of nothing": lambda x: x[0] * jnp.prod(x[:0]) + jnp.sum(x[:0]),
+}
+
+
+@pytest.mark.parametrize("name", TRUTHS)
+@pytest.mark.parametrize("point", [(1.0, 2.0), (-1.0, 2.0), (1.0, 4.0), (0.0, 0.0)])
+def test_what_holds_is_a_number_where_one_is_asked_for(name, point):
+    np.testing.assert_allclose(to_second_order(TRUTHS[name], point), by_jax(TRUTHS[name], point), atol=1e-14)
+
+
+@pytest.mark.parametrize("f", [lambda n: n & 1, lambda n: n | 2, lambda n: ~n, lambda n: n // 2, lambda n: jnp.bitwise_and.reduce(n[None] | 4)])
+def test_digits_of_integers_are_no_scalar_operation_and_bitwise_when_run_uncompiled(f):
+    law = lambda x: jnp.float64(f(jnp.where(x[0] > 0, 3, 5)))  # noqa: E731
+    with pytest.raises(Unsupported, match=r"integer|while"):
+        to_second_order(law, (1.0,))
+    for x in (1.0, -1.0):
+        assert uncompiled(law)(np.array([x])) == law(jnp.array([x]))
+
+
+@pytest.mark.parametrize("f", [lambda x: jnp.mean(jnp.float32(x > 0)) * x[1], lambda x: jnp.float32(x[0]) * x[1]])
+def test_single_precision_among_double_is_not_computed_in_double(f):
+    with pytest.raises(Unsupported, match="float32"):
+        to_second_order(f, (1.0, 2.0))
+
+
+def test_integers_and_rounding_run_uncompiled_are_those_of_jax():
+    n, flags = np.array([5, 6, -7]), np.array([True, False, True])
+    x = np.array([0.5, 1.5, 2.5, -0.5, -2.5, 0.49999999999999994, 3.2, -3.7])
+
+    def f(n, flags, x):
+        m = n[::-1]
+        of_integers = n & m, n | m, n ^ m, ~n, jnp.bitwise_and.reduce(n), jnp.bitwise_or.reduce(n)
+        of_flags = flags & flags[::-1], flags | flags[::-1], flags ^ flags[::-1], ~flags, jnp.all(flags), jnp.any(flags)
+        return of_integers, of_flags, jax.lax.round(x), jnp.round(x)
+
+    for found, expected in zip(jax.tree.leaves(uncompiled(f)(n, flags, x)), jax.tree.leaves(f(n, flags, x)), strict=True):
+        assert found.dtype == expected.dtype
+        np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("f", [lambda x: jnp.hypot(x[0], x[1]), lambda x: jnp.abs(x[1]) ** (2.0 + 0 * x[0]), lambda x: x[0] * jnp.abs(x[1]) ** 3])
+@pytest.mark.parametrize("y", [0.0, 0.3, -0.3])
+def test_smooth_functions_of_a_magnitude_have_their_second_derivatives_at_zero(f, y):
+    expected = by_jax(f, (1.2, y))
+    assert np.all(np.isfinite(expected))
+    np.testing.assert_allclose(to_second_order(f, (1.2, y)), expected, atol=1e-14)
+
+
+def test_the_derivative_of_a_magnitude_at_zero_is_that_of_jax():
+    np.testing.assert_array_equal(to_second_order(lambda x: jnp.abs(x[0]), (0.0,)), [0.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 1.5, 2.0, 2.5])
+@pytest.mark.parametrize("base", [0.0, 0.7])
+def test_powers_have_the_derivatives_of_jax(base, exponent):
+    constant = lambda x: x[0] ** exponent  # noqa: E731
+    of_both = lambda x: x[0] ** x[1]  # noqa: E731
+    for f, point in ((constant, (base,)), (of_both, (base, exponent))):
+        found, expected = to_second_order(f, point), by_jax(f, point)
+        finite = ~np.isnan(expected)  # 0^(b-1) b at b = 0 and its like are NaN in JAX
+        assert base == 0.0 or np.all(finite)
+        np.testing.assert_allclose(found[finite], expected[finite], rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("largest", [jnp.max, jnp.min])
+@pytest.mark.parametrize("point", [(1.0, 1.0, 1.0), (2.0, 1.0, 2.0), (1.0, 2.0, 2.0), (3.0, 1.0, 2.0), (0.1, 0.1, 0.1)])
+def test_the_derivative_of_an_extreme_is_shared_by_all_that_reach_it(largest, point):
+    for f in (lambda x: largest(x), lambda x: largest(jnp.stack([x[0], x[1], x[2], 1.0, x[0] * x[1]])) ** 2):
+        np.testing.assert_allclose(to_second_order(f, point), by_jax(f, point), rtol=1e-14, atol=1e-14)
+
+
+def test_nothing_is_assumed_of_the_sign_of_a_parameter():
+    graph = Graph()
+    p, x = graph.input("p", False), graph.input("x", True)
+    probes = Probes(graph, {"p": np.linspace(1.0, 2.0, 8), "x": np.linspace(0.5, 1.0, 8)})
+    forms = NormalForms(graph, 100, sign=probes.sign)
+    magnitude = graph.call("abs", graph.mul(p, graph.call("cos", x)))
+    root = graph.call("sqrt", graph.mul(graph.mul(p, p), graph.mul(x, x)))
+    nodes = [graph.call("abs", p), graph.call("sqrt", graph.mul(p, p)), magnitude, root]
+    found = [forms.rebuilt(forms.expanded(n)) for n in nodes]
+    assert forms.guards == {x, graph.call("cos", x)}
+    negative = probes.with_inputs({"p": np.linspace(-2.0, -1.0, 8)})
+    np.testing.assert_allclose(negative(found), negative(nodes), rtol=1e-14)
+
+
+class Weighed(jj.Scene):
+    """A particle drawn by magnitudes of a parameter."""
+
+    coordinates = jj.coordinates("x y")
+    p: object = jj.parameter(2.0)
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        q = motion.q
+        return (jj.generalized_force(motion, x_rate=-jnp.abs(self.p) * q.x - jnp.sqrt(self.p * self.p) * q.y),)
+
+
+def test_a_parameter_of_the_other_sign_is_no_other_domain():
+    motion = jax.vmap(lambda p: jj.simulate(Weighed(p=p), {"x": 1.0}, t1=1.0, rtol=1e-9, atol=1e-9))(jnp.array([1.5, -1.5]))
+    np.testing.assert_array_equal(motion.result, 0)
+    np.testing.assert_allclose(motion.q_end[:, 0], np.cos(np.sqrt(1.5)), rtol=1e-7)
