@@ -32,6 +32,7 @@ class Probed(eqx.Module):
     inertia_rates: PyTree  # along the motion
     potential_rates: Float[Entries, "*states loads"]  # of each load's potential, along a generic change of the inputs
     numbers: PoseNumbers
+    hidden: frozenset[str] = eqx.field(static=True, default=frozenset())  # what may be other than zero where no probe lies
 
 
 def generic_inputs(scene: Scene) -> np.ndarray:

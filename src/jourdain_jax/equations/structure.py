@@ -153,7 +153,7 @@ def _probed_structure(scene: Scene) -> Structure:
     if independent is None:
         independent, by_user = _choose(candidates, count, rank), False
     pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
-    full_everywhere, eps = all(r == rank for r in ranks), np.finfo(found.A.dtype).eps
+    full_everywhere, eps, hidden = all(r == rank for r in ranks), np.finfo(found.A.dtype).eps, found.hidden
     return Structure(
         row_names=names,
         rank=rank,
@@ -163,12 +163,13 @@ def _probed_structure(scene: Scene) -> Structure:
         independent=independent,
         worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
         typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
-        affine=not _exceeds(found.A - found.A_other, np.sqrt(eps), found.A),
-        homogeneous=not _exceeds(found.phi_at_rest, 32 * eps, found.A),  # near round-off: work that turns out as zero does less harm than work left out
-        timed=tuple(name for name in TIMED if _moves(found.timed[name])),
-        driven=_moves(found.motion_at_rest),
-        varying_inertia=_moves(found.inertia_rates),
-        potentials_of_inputs=tuple(k for k, rate in enumerate(found.potential_rates.T) if _moves(rate)),
+        affine="nonlinear" not in hidden and not _exceeds(found.A - found.A_other, np.sqrt(eps), found.A),
+        # near round-off: work that turns out as zero does less harm than work left out
+        homogeneous="rows at rest" not in hidden and not _exceeds(found.phi_at_rest, 32 * eps, found.A),
+        timed=tuple(name for name in TIMED if name in hidden or _moves(found.timed[name])),
+        driven="motion at rest" in hidden or _moves(found.motion_at_rest),
+        varying_inertia="inertia" in hidden or _moves(found.inertia_rates),
+        potentials_of_inputs=tuple(k for k, rate in enumerate(found.potential_rates.T) if f"potential {k}" in hidden or _moves(rate)),
         chosen_by_user=by_user,
         faults=faults,
         times=t,
