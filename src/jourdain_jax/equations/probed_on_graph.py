@@ -75,7 +75,8 @@ class _AtStates:
         along = {traced.t: g.one} | dict(zip(traced.q.tolist(), at.qdot.tolist(), strict=True))
         changed = {n: g.mul(n, n) for n in traced.inputs.tolist()}
         inertia_rates, potential_rates = derivatives(g, weights, along), derivatives(g, traced.particulars.potentials.tolist(), changed)
-        vanishing = {"rows at rest": at_rest[0], "motion at rest": at_rest[1], "inertia": inertia_rates}
+        row_rates = derivatives(g, at.phi.tolist(), changed)
+        vanishing = {"rows at rest": at_rest[0], "motion at rest": at_rest[1], "inertia": inertia_rates, "rows of inputs": row_rates}
         vanishing |= {f"potential {k}": [rate] for k, rate in enumerate(potential_rates)} | timed
         return Probed(
             q=self.real(self.q),
@@ -88,6 +89,7 @@ class _AtStates:
             timed=jax.tree.map(self._at, timed, is_leaf=lambda x: isinstance(x, list)),
             inertia_rates=self._at(inertia_rates),
             potential_rates=self._at(potential_rates),
+            row_rates_of_inputs=self._at(row_rates),
             numbers=jax.tree.map(lambda nodes: self.real(self._at(nodes)), traced.particulars.numbers),
             hidden=frozenset(name for name, nodes in vanishing.items() if any(may_be_hidden(g, _flat(nodes)))) | self._nonlinear(by_speed[:rows]),
         )

@@ -54,6 +54,7 @@ class Structure:
     driven: bool  # bodies or coordinates move, or bodies turn, while all speeds are zero
     varying_inertia: bool  # masses or central inertias change along the motion
     potentials_of_inputs: tuple[int, ...]  # numbers of the loads whose potential depends on inputs
+    rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
     chosen_by_user: bool
     faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, as sentences
     times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric rows
@@ -134,7 +135,7 @@ def _seen(found: Probed) -> frozenset[str]:
 
     size = 1 + np.max(np.abs(found.A), axis=(1, 2), initial=0.0)[:, None]
     vanishing = {"rows at rest": found.phi_at_rest / size, "motion at rest": found.motion_at_rest, "inertia": found.inertia_rates}
-    vanishing |= {"nonlinear": (found.A - found.A_other) / size[..., None], **found.timed}
+    vanishing |= {"rows of inputs": found.row_rates_of_inputs, "nonlinear": (found.A - found.A_other) / size[..., None], **found.timed}
     vanishing |= {f"potential {k}": rate for k, rate in enumerate(found.potential_rates.T)}
     return frozenset(name for name, rates in vanishing.items() if seen(rates))
 
@@ -197,6 +198,7 @@ def _probed_structure(scene: Scene) -> Structure:
         driven="motion at rest" in hidden or _moves(found.motion_at_rest),
         varying_inertia="inertia" in hidden or _moves(found.inertia_rates),
         potentials_of_inputs=tuple(k for k, rate in enumerate(found.potential_rates.T) if f"potential {k}" in hidden or _moves(rate)),
+        rows_of_inputs="rows of inputs" in hidden or _moves(found.row_rates_of_inputs),
         chosen_by_user=by_user,
         faults=faults,
         times=t,
