@@ -216,7 +216,8 @@ def state_form(
     minimal = state == "minimal" or (state == "auto" and structure.affine and structure.well_conditioned)
     independent = structure.independent if minimal else None
     with_work = work and needs_work(scene, structure)
-    plain = lowering and not inputs_in_rows and reduction is None and stabilisation is None and not (with_work and (structure.driven or structure.varying_inertia))
+    dense = inputs_in_rows or (with_work and (structure.driven or structure.varying_inertia))
+    plain = lowering and reduction is None and stabilisation is None and not dense
     program = lowered(scene, every_speed=not minimal) if plain else None
     program = program if isinstance(program, Lowered) else None
     cutoff = cutoff_of(structure) if reduction is None and not minimal else None
