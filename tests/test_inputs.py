@@ -180,3 +180,43 @@ def test_potentials_that_depend_on_inputs_are_found_and_named():
     assert jj.structure_of(PulledBead()).potentials_of_inputs == (1,)
     assert "potentials that depend on inputs" in jj.energy_balance(PulledBead()).changed_by
     assert jj.structure_of(OnBelt()).potentials_of_inputs == ()
+
+
+# Rows that depend on inputs. ------------------------------------------------------------------------------------------
+
+
+class Towed(jj.Scene):
+    """A particle on a belt at 45 degrees, which moves along y at the speed of an input."""
+
+    coordinates = jj.coordinates("x y")
+    inputs = jj.inputs("speed")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def velocity_constraints(self, motion):
+        return {"belt": motion.u.y_rate - motion.u.x_rate - motion.inputs.speed}
+
+
+@pytest.mark.parametrize("options", [{}, {"state": "full"}, {"solver": diffrax.Kvaerno5()}], ids=["minimal", "full state", "diffrax"])
+def test_rates_of_inputs_in_rows_accelerate_and_do_work(options):
+    motion = jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, rtol=1e-9, atol=1e-9, inputs={"speed": lambda t: t**2}, **options).raise_if_failed()
+    # x'' + y'' = 0, y'' - x'' = 2 t
+    np.testing.assert_allclose(motion.u_end, [-1.0, 3.0], atol=1e-8)
+    np.testing.assert_allclose(motion.q_end, [2.0 - 4.0 / 3.0, 2.0 + 4.0 / 3.0], atol=1e-7)
+    np.testing.assert_allclose(motion.work[-1], 4.0, atol=1e-7)
+    np.testing.assert_allclose(motion.accelerations().udot[-1], [-2.0, 2.0], atol=1e-8)
+
+
+def test_rates_of_samples_in_rows_are_their_slopes():
+    ramp = {"speed": jj.Sampled([0.0, 2.0], [0.0, 4.0])}
+    lanes = jj.rollout(Towed(), {"x_rate": np.array([1.0, 2.0])}, t1=2.0, inputs=ramp, progress=False).lanes
+    np.testing.assert_allclose(lanes.u_end, [[-1.0, 3.0], [0.0, 4.0]], atol=1e-7)
+
+
+def test_an_input_of_a_row_that_has_no_derivative_is_refused():
+    def measured(t):
+        return jax.pure_callback(lambda t: np.asarray(t) ** 2, jax.ShapeDtypeStruct((), t.dtype), t)
+
+    with pytest.raises(ValueError, match="rows depend on inputs, whose rates the accelerations need"):
+        jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": measured})

@@ -153,7 +153,7 @@ def test_the_first_name_of_reading_a_trajectory_still_serves(files):
 
 def test_a_field_that_cannot_be_stored_is_named(tmp_path):
     class Labelled(ChaplyginSleigh):
-        labels: tuple = ("a",)
+        labels: tuple = eqx.field(static=True, default=("a",))
 
     labelled = jj.simulate(ChaplyginSleigh(), ts=TS)
     for labels, stored in ((Labelled().labels, True), (("b",), False)):

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
+from jourdain_jax.equations import structure
 from jourdain_jax.models import ChaplyginSleigh
+from jourdain_jax.program.graph import Unsupported
 
 KNOTS = jnp.linspace(-3.0, 3.0, 7)
 
@@ -251,3 +253,111 @@ def test_tables_are_parameters_and_differ_between_lanes():
     for end, table in zip(lanes, tables, strict=True):
         np.testing.assert_allclose(end, jj.simulate(Small(table=table), {"x": 1.0}, t1=1.0).q_end, atol=1e-6)
     assert abs(float(lanes[0, 0] - lanes[1, 0])) > 0.1
+
+
+# What begins after t = 1, or outside the domain. ----------------------------------------------------------------------
+
+
+class LateBelt(Plane):
+    """A belt that starts to move at t = 2."""
+
+    def velocity_constraints(self, motion):
+        return {"belt": motion.u.y_rate - motion.u.x_rate - jnp.where(motion.t > 2.0, (motion.t - 2.0) ** 3, 0.0)}
+
+
+class FarBelt(Plane):
+    """A belt that moves where x > 10."""
+
+    def velocity_constraints(self, motion):
+        return {"belt": motion.u.y_rate - motion.u.x_rate - jnp.maximum(motion.q.x - 10.0, 0.0) ** 2}
+
+
+class LateStiffness(Plane):
+    """A spring that stiffens from t = 2 on."""
+
+    def loads(self, motion):
+        stiffness = 1.0 + 0.5 * jnp.where(motion.t > 2.0, (motion.t - 2.0) ** 2, 0.0)
+        return (jj.spring(motion["particle"].point(), jj.fixed_point(jnp.zeros(3)), stiffness, 0.5),)
+
+
+class LateMass(Plane):
+    """Matter joins from t = 2 on."""
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0 + jnp.maximum(t - 2.0, 0.0) ** 3, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.spring(motion["particle"].point(), jj.fixed_point(jnp.zeros(3)), 1.0, 0.5),)
+
+
+class LateLift(jj.Scene):
+    """A wire that is lifted by one metre near t = 3."""
+
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        lifted = jnp.exp(-jnp.exp(-40.0 * (t - 3.0)))
+        return {"particle": jj.Particle(1.0, jnp.stack([q.x, 0.3 * q.x + lifted, 0.0 * q.x]))}
+
+
+LATE = [
+    (LateBelt(), {"x_rate": 1.0}, 4.0, "homogeneous"),
+    (FarBelt(), {"x": 9.5, "x_rate": 1.0}, 2.0, "homogeneous"),
+    (LateStiffness(), {"x": 1.0, "y_rate": 0.3}, 4.0, "timed"),
+    (LateMass(), {"x": 1.0, "y_rate": 0.3}, 4.0, "varying_inertia"),
+    (LateLift(), {"x_rate": 1.0}, 3.5, "driven"),
+]
+
+
+@pytest.mark.parametrize(("scene", "start", "end", "fact"), LATE, ids=[type(case[0]).__name__ for case in LATE])
+def test_the_work_of_what_begins_late_or_far_off_is_counted(scene, start, end, fact):
+    assert bool(getattr(jj.structure_of(scene), fact)) == (fact != "homogeneous")
+    motion = jj.simulate(scene, start, ts=np.linspace(0.0, end, 41), rtol=1e-10, atol=1e-10).raise_if_failed()
+    changed = float(np.ptp(motion.energies().kinetic + motion.energies().potential))
+    assert changed > 0.05
+    np.testing.assert_allclose(motion.energies().balance, motion.energies().balance[0], atol=1e-4 * changed)
+
+
+def test_facts_without_a_graph_are_looked_for_far_off(monkeypatch):
+    def refuses(*_):
+        raise Unsupported("a graph")
+
+    monkeypatch.setattr(structure, "probed_on_graph", refuses)
+    found = [structure._probed_structure.__wrapped__(case[0]) for case in LATE[:4]]
+    assert [bool(getattr(s, case[3])) for s, case in zip(found, LATE, strict=False)] == [False, False, True, True]
+    plain = structure._probed_structure.__wrapped__(ChaplyginSleigh())
+    assert (plain.affine, plain.homogeneous, plain.timed, plain.driven, plain.varying_inertia) == (True, True, (), False, False)
+    assert not structure._probed_structure.__wrapped__(FastRow()).affine
+
+
+class FastRow(Plane):
+    """A row that is nonlinear in a speed beyond 3 m/s."""
+
+    def velocity_constraints(self, motion):
+        v = motion.u.x_rate
+        return {"lift": motion.u.y_rate - jnp.where(v > 3.0, (v - 3.0) ** 2, 0.0)}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=1.0, y_rate=-0.5),)
+
+
+def test_rows_that_are_nonlinear_at_speeds_beyond_the_probed_ones_hold():
+    for lowering in (True, False):
+        motion = jj.simulate(FastRow(), {"x_rate": 4.0}, t1=2.0, lowering=lowering).raise_if_failed()
+        np.testing.assert_allclose(motion.u_end, [4.0, 1.0], atol=1e-8)  # (1 + 4 (v-3)^2) vdot = 1 - (v-3), at rest where v = 4
+
+
+class Terrain(Plane):
+    """Branches that neither time nor speeds decide: nothing begins that is not there."""
+
+    def velocity_constraints(self, motion):
+        slope = jnp.where(motion.q.x > 0.0, jnp.tanh(motion.q.x), 0.0)
+        return {"ground": motion.u.y_rate - slope * motion.u.x_rate}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-jnp.maximum(motion.q.x, 0.0)),)
+
+
+def test_branches_of_coordinates_alone_leave_rows_linear_and_scleronomic():
+    found = jj.structure_of(Terrain())
+    assert (found.affine, found.homogeneous, found.timed, found.driven, found.varying_inertia) == (True, True, (), False, False)

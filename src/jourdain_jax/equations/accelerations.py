@@ -25,7 +25,7 @@ from jourdain_jax.equations.reductions import (
 from jourdain_jax.equations.rows import ConstraintRows, position_residual
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
-from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_scene, as_speeds, as_time
+from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import checked_real, described
 from jourdain_jax.scene.scene import Scene
@@ -93,14 +93,14 @@ def accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabili
 
         M udot + h = Q + A' lambda,   A udot = -drift
 
-    - `inputs`: values of the scene's inputs (default: zero).
+    - `inputs`: values of the scene's inputs (default: zero), which count as constant.
     - `reduction`: a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
     - `stabilisation`: Baumgarte terms (default: none).
 
     Pure: works under any nesting of jit, vmap, jvp and vjp, with right derivatives wherever the rank of the rows is constant. Look at `applicable`
     and `residual`: nothing is raised for a state that a reduction cannot serve. ValueError for an unknown reduction. Eqs. (41), (68)-(70).
     """
-    f = None if inputs is None else as_input_vector(scene, inputs)
+    f = inputs if inputs is None or isinstance(inputs, ChangingInputs) else as_input_vector(scene, inputs)
     arguments = as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f
     return _accelerations(scene, *arguments, as_reduction(scene, reduction), as_stabilisation(stabilisation))
 

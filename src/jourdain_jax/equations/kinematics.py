@@ -16,7 +16,7 @@ from jourdain_jax.calculus.reals import Numbers, as_real
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.equations.probing import at_once
 from jourdain_jax.scene.answers import bodies_of, coordinate_rates_of
-from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_speeds, as_time
+from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_speeds, as_time
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Pose
 from jourdain_jax.scene.scene import Scene
@@ -49,9 +49,9 @@ def pose_at(scene: Scene, t, q: Numbers) -> Pose:
 
 
 def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
-    """Poses and velocities (inertial frame) of all bodies at one instant. `inputs`: values of the scene's inputs (default: zero)."""
+    """Poses and velocities (inertial frame) of all bodies at one instant. `inputs`: values of the scene's inputs (default: zero), or how they change."""
     t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
-    inputs = as_input_vector(scene, inputs, q.dtype)
+    inputs = as_input_vector(scene, inputs(t) if isinstance(inputs, ChangingInputs) else inputs, q.dtype)
     qdot = coordinate_rates(scene, t, q, u)
     poses, rates = jax.jvp(lambda t, q: pose_at(scene, t, q).bodies, (t, q), (jnp.ones_like(t), qdot))
     bodies = {

@@ -31,7 +31,9 @@ class Probed(eqx.Module):
     timed: dict[str, PyTree]  # rates in time by `TIMED`, while coordinates, speeds and inputs are held (for loads and potentials: the motion)
     inertia_rates: PyTree  # along the motion
     potential_rates: Float[Entries, "*states loads"]  # of each load's potential, along a generic change of the inputs
+    row_rates_of_inputs: Float[Entries, "*states rows"]  # along the same change
     numbers: PoseNumbers
+    hidden: frozenset[str] = eqx.field(static=True, default=frozenset())  # what may be other than zero where no probe lies
 
 
 def generic_inputs(scene: Scene) -> np.ndarray:
@@ -55,6 +57,9 @@ def probed(scene: Scene, t, q, u, u_other) -> Probed:
             rows = velocity_residual(scene, t, q, u, inputs), position_residual(scene, t, q)
             return {"rows": rows, "poses": poses, "inertias": inertias(scene, t, q), "coordinate rates": coordinate_rates(scene, t, q, u)}
 
+        def rows(inputs):
+            return velocity_residual(scene, t, q, u, inputs)
+
         def potentials(inputs):
             return potentials_of(scene, motion_at(scene, t, q, u, inputs))
 
@@ -69,6 +74,7 @@ def probed(scene: Scene, t, q, u, u_other) -> Probed:
             timed=jax.jvp(pieces, (t,), (jnp.ones_like(t),))[1] | explicit_rates(scene, motion),
             inertia_rates=jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), qdot))[1],
             potential_rates=jax.jvp(potentials, (inputs,), (inputs**2,))[1],
+            row_rates_of_inputs=jax.jvp(rows, (inputs,), (inputs**2,))[1],
             numbers=pose_numbers(scene, t, q),
         )
 

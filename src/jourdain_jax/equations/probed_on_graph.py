@@ -18,6 +18,7 @@ from jourdain_jax.equations.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.program.derivative import derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Unsupported
+from jourdain_jax.program.hiding import decided_by, depend_on, may_be_hidden
 from jourdain_jax.scene.scene import Scene
 
 ITERATIONS = 25  # of Gauss-Newton, at most
@@ -70,8 +71,13 @@ class _AtStates:
         weights = [*at.mass.tolist(), *at.inertia.ravel().tolist()]
         poses = [*at.position.ravel().tolist(), *at.orientation.ravel().tolist()]
         by_time = {"rows": [*at.phi.tolist(), *at.closure.tolist()], "poses": poses, "inertias": weights, "coordinate rates": at.qdot.tolist()}
+        timed = {name: derivatives(g, nodes, {traced.t: g.one}) for name, nodes in by_time.items()} | traced.particulars.explicit
         along = {traced.t: g.one} | dict(zip(traced.q.tolist(), at.qdot.tolist(), strict=True))
         changed = {n: g.mul(n, n) for n in traced.inputs.tolist()}
+        inertia_rates, potential_rates = derivatives(g, weights, along), derivatives(g, traced.particulars.potentials.tolist(), changed)
+        row_rates = derivatives(g, at.phi.tolist(), changed)
+        vanishing = {"rows at rest": at_rest[0], "motion at rest": at_rest[1], "inertia": inertia_rates, "rows of inputs": row_rates}
+        vanishing |= {f"potential {k}": [rate] for k, rate in enumerate(potential_rates)} | timed
         return Probed(
             q=self.real(self.q),
             miss=self.real(self.miss),
@@ -80,12 +86,20 @@ class _AtStates:
             M=self.real(self._mass_matrix(by_speed[rows:])),
             phi_at_rest=self.real(self._at(at_rest[0])),
             motion_at_rest=self.real(self._at(at_rest[1])),
-            timed={name: self._at(derivatives(g, nodes, {traced.t: g.one})) for name, nodes in by_time.items()}
-            | jax.tree.map(self._at, traced.particulars.explicit),
-            inertia_rates=self._at(derivatives(g, weights, along)),
-            potential_rates=self._at(derivatives(g, traced.particulars.potentials.tolist(), changed)),
+            timed=jax.tree.map(self._at, timed, is_leaf=lambda x: isinstance(x, list)),
+            inertia_rates=self._at(inertia_rates),
+            potential_rates=self._at(potential_rates),
+            row_rates_of_inputs=self._at(row_rates),
             numbers=jax.tree.map(lambda nodes: self.real(self._at(nodes)), traced.particulars.numbers),
+            hidden=frozenset(name for name, nodes in vanishing.items() if any(may_be_hidden(g, _flat(nodes)))) | self._nonlinear(by_speed[:rows]),
         )
+
+    def _nonlinear(self, by_speed: list[dict[int, int]]) -> set[str]:
+        """{"nonlinear"} where rows may be so at speeds beyond the probed ones."""
+        g, u = self.graph, self.traced.u.tolist()
+        entries = [node for row in by_speed for node in row.values()]
+        bent = any(a and b for a, b in zip(depend_on(g, entries, u), may_be_hidden(g, entries), strict=True))
+        return {"nonlinear"} if bent or decided_by(g, self.traced.at.phi.tolist(), u) else set()
 
     def _at(self, nodes) -> np.ndarray:
         """Values of nodes, with a leading axis of states."""
@@ -157,6 +171,10 @@ class _AtStates:
                     break
         missed = np.max(np.abs(_values(self._probes(q, self.u), rows)), axis=1, initial=0.0)
         return q, np.where(np.isfinite(missed), missed, np.inf)
+
+
+def _flat(nodes) -> list[int]:
+    return [int(n) for part in jax.tree.leaves(nodes) for n in np.ravel(part)]
 
 
 def _values(probes: Probes, nodes: np.ndarray | Iterable[int]) -> np.ndarray:

@@ -7,7 +7,7 @@ parameters are traced (numbers near the class's defaults stand in), so that the 
 
 import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import equinox as eqx
 import jax
@@ -31,6 +31,7 @@ from jourdain_jax.scene.scene import Scene
 RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
 LONG = 24  # dependent speeds: of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
+FAR, FAR_PROBES = 100.0, 16  # where no graph is: further states, at times (s), coordinates and speeds up to this
 _EXHAUSTIVE = 3000
 _SHORTLIST = 40
 
@@ -53,6 +54,7 @@ class Structure:
     driven: bool  # bodies or coordinates move, or bodies turn, while all speeds are zero
     varying_inertia: bool  # masses or central inertias change along the motion
     potentials_of_inputs: tuple[int, ...]  # numbers of the loads whose potential depends on inputs
+    rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
     chosen_by_user: bool
     faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, as sentences
     times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric rows
@@ -109,7 +111,33 @@ def _look(scene: Scene, *states) -> Probed:
     try:
         return probed_on_graph(scene, *states)
     except Unsupported:
-        return probed(scene, *states)
+        return _looked_at_from_afar(scene, *states)
+
+
+def _looked_at_from_afar(scene: Scene, t, q, u, u_other) -> Probed:
+    """By JAX, where no graph says what the probes do not show; so a few states far off are looked at too."""
+    generator = np.random.default_rng(1)
+    far_q = q[:FAR_PROBES] * FAR ** generator.uniform(size=(FAR_PROBES, 1))
+    for first, _ in scene.coordinates.quaternions:
+        far_q[:, first : first + 4] = q[:FAR_PROBES, first : first + 4]
+    far = FAR * generator.uniform(size=FAR_PROBES), far_q, *(FAR * generator.uniform(-1, 1, (2, *u[:FAR_PROBES].shape)))
+    found = probed(scene, *(np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True)))
+    near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[: len(t)], np.s_[len(t) :]))
+    return replace(near, hidden=_seen(beyond))
+
+
+def _seen(found: Probed) -> frozenset[str]:
+    """What is other than zero at states far off, where it is more than round-off."""
+    limit = np.sqrt(np.finfo(found.A.dtype).eps)
+
+    def seen(rates) -> bool:
+        return any(bool(np.any(np.isfinite(x) & (np.abs(x) > FAR * limit))) for x in jax.tree.leaves(rates))
+
+    size = 1 + np.max(np.abs(found.A), axis=(1, 2), initial=0.0)[:, None]
+    vanishing = {"rows at rest": found.phi_at_rest / size, "motion at rest": found.motion_at_rest, "inertia": found.inertia_rates}
+    vanishing |= {"rows of inputs": found.row_rates_of_inputs, "nonlinear": (found.A - found.A_other) / size[..., None], **found.timed}
+    vanishing |= {f"potential {k}": rate for k, rate in enumerate(found.potential_rates.T)}
+    return frozenset(name for name, rates in vanishing.items() if seen(rates))
 
 
 def structure_of(scene: Scene) -> Structure:
@@ -153,7 +181,7 @@ def _probed_structure(scene: Scene) -> Structure:
     if independent is None:
         independent, by_user = _choose(candidates, count, rank), False
     pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
-    full_everywhere, eps = all(r == rank for r in ranks), np.finfo(found.A.dtype).eps
+    full_everywhere, eps, hidden = all(r == rank for r in ranks), np.finfo(found.A.dtype).eps, found.hidden
     return Structure(
         row_names=names,
         rank=rank,
@@ -163,12 +191,14 @@ def _probed_structure(scene: Scene) -> Structure:
         independent=independent,
         worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
         typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
-        affine=not _exceeds(found.A - found.A_other, np.sqrt(eps), found.A),
-        homogeneous=not _exceeds(found.phi_at_rest, 32 * eps, found.A),  # near round-off: work that turns out as zero does less harm than work left out
-        timed=tuple(name for name in TIMED if _moves(found.timed[name])),
-        driven=_moves(found.motion_at_rest),
-        varying_inertia=_moves(found.inertia_rates),
-        potentials_of_inputs=tuple(k for k, rate in enumerate(found.potential_rates.T) if _moves(rate)),
+        affine="nonlinear" not in hidden and not _exceeds(found.A - found.A_other, np.sqrt(eps), found.A),
+        # near round-off: work that turns out as zero does less harm than work left out
+        homogeneous="rows at rest" not in hidden and not _exceeds(found.phi_at_rest, 32 * eps, found.A),
+        timed=tuple(name for name in TIMED if name in hidden or _moves(found.timed[name])),
+        driven="motion at rest" in hidden or _moves(found.motion_at_rest),
+        varying_inertia="inertia" in hidden or _moves(found.inertia_rates),
+        potentials_of_inputs=tuple(k for k, rate in enumerate(found.potential_rates.T) if f"potential {k}" in hidden or _moves(rate)),
+        rows_of_inputs="rows of inputs" in hidden or _moves(found.row_rates_of_inputs),
         chosen_by_user=by_user,
         faults=faults,
         times=t,

@@ -12,6 +12,7 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reactions import ContactForce, RowReactions, contact_forces, row_reactions
 from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.scene.answers import invariants_of
@@ -49,13 +50,16 @@ class Record(Protocol):
 
 
 @eqx.filter_jit
-def along(f, record: Record):
-    """`f(scene, t, q, u, inputs)` at all times; NaN at times that were not reached. f must be a named function or a module (it is a cache key)."""
+def along(f, record: Record, by_inputs: bool = False):
+    """`f(scene, t, q, u, inputs)` at all times; NaN at times that were not reached. f must be a named function or a module (it is a cache key).
+
+    `by_inputs`: f needs the rates of the inputs.
+    """
 
     def one(t, q, u):
         reached = jnp.all(jnp.isfinite(q))
         t, q, u = (jnp.where(reached, a, b) for a, b in ((t, record.t_end), (q, record.q_end), (u, record.u_end)))
-        values = f(record.scene, t, q, u, record.inputs(t))
+        values = f(record.scene, t, q, u, record.inputs.near(t) if by_inputs else record.inputs(t))
         return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan) if eqx.is_inexact_array(x) else x, values)
 
     return jax.vmap(one)(record.ts, record.q, record.u)
@@ -79,17 +83,17 @@ def energies(record: Record) -> tuple[Float[Array, "times"], Float[Array, "times
 
 def accelerations_along(record: Record) -> Accelerations:
     """Accelerations, multipliers, rank and smallest singular value."""
-    return along(_accelerations, record)
+    return along(_accelerations, record, _needs_rates(record))
 
 
 def reactions_along(record: Record) -> RowReactions:
     """Constraint forces per row and per body."""
-    return along(_reactions, record)
+    return along(_reactions, record, _needs_rates(record))
 
 
 def contact_forces_along(record: Record) -> dict[str, ContactForce]:
     """Normal and tangential force and the friction coefficient needed, of every rolling contact."""
-    return along(_contacts, record)
+    return along(_contacts, record, _needs_rates(record))
 
 
 def residuals(record: Record) -> tuple[Float[Array, "times closures"], Float[Array, "times rows"]]:
@@ -100,6 +104,11 @@ def residuals(record: Record) -> tuple[Float[Array, "times closures"], Float[Arr
 def invariants(record: Record) -> dict[str, Float[Array, "times"]]:
     """The quantities that the scene is known to conserve."""
     return along(_invariants, record)
+
+
+def _needs_rates(record: Record) -> bool:
+    """Whether accelerations depend on the rates of the inputs."""
+    return not record.inputs.constant and structure_of(record.scene).rows_of_inputs
 
 
 class _Point(eqx.Module):

@@ -106,7 +106,7 @@ def _skew_times(args, t, q, v, gbar) -> Float[Array, "state"]:
 @eqx.filter_jit
 def _rates(args, t, q, v):
     form, scene, inputs, fixed = args
-    found = form.rates(scene, fixed, t, Integrated(q, v, None), inputs(t))
+    found = form.rates(scene, fixed, t, Integrated(q, v, None), form.now(inputs, t))
     return found.q, found.v
 
 

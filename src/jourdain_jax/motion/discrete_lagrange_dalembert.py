@@ -136,4 +136,4 @@ def _work(args, over: Interval, y: Integrated, q1, u1):
         return None
     form, scene, inputs, fixed = args
     t = (over.t0 + over.t1) / 2
-    return y.work + over.h * form.rates(scene, fixed, t, Integrated((y.q + q1) / 2, (y.v + u1) / 2, y.work), inputs(t)).work
+    return y.work + over.h * form.rates(scene, fixed, t, Integrated((y.q + q1) / 2, (y.v + u1) / 2, y.work), form.now(inputs, t)).work

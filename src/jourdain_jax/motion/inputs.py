@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import as_real
+from jourdain_jax.scene.arguments import ChangingInputs
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.scene import Scene
@@ -67,6 +68,24 @@ class Inputs(eqx.Module):
     def __call__(self, t) -> Float[Array, "inputs"]:
         """The vector of inputs at time t."""
         return jnp.stack([jnp.asarray(channel(t), jnp.result_type(float)) for channel in self.channels]) if self.channels else jnp.zeros(0)
+
+
+    @property
+    def constant(self) -> bool:
+        """Whether all are numbers."""
+        return all(isinstance(channel, Constant) for channel in self.channels)
+
+    def near(self, t) -> ChangingInputs:
+        """Values and rates at time t; a ValueError for functions that JAX cannot differentiate."""
+        t = jnp.asarray(t, jnp.result_type(float))
+        try:
+            values, rates = jax.jvp(self, (t,), (jnp.ones_like(t),))
+        except (ValueError, TypeError, NotImplementedError) as error:
+            said = str(error).splitlines()[0]
+            raise ValueError(
+                f"rows depend on inputs, whose rates the accelerations need, but one of them cannot be differentiated ({said}); give it as `jj.Sampled`"
+            ) from None
+        return ChangingInputs(t, values, rates)
 
 
 def _check_function(f: Callable, where: str) -> None:

@@ -342,7 +342,7 @@ class _StateNorm(eqx.Module):
 @eqx.filter_jit  # traced once, not once per stage and derivative
 def _rates(t, y, args):
     form, scene, inputs, fixed = args
-    return form.rates(scene, fixed, t, y, inputs(t))
+    return form.rates(scene, fixed, t, y, form.now(inputs, t))
 
 
 @eqx.filter_jit  # traced once, not once per stage and derivative

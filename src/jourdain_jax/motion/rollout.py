@@ -200,7 +200,7 @@ def _next_ways(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int[np
 
 def _form(scene: Scene, options: dict) -> StateForm:
     """How the lanes' state is integrated."""
-    how = {name: options[name] for name in ("state", "reduction", "stabilisation", "projection", "work", "lowering") if name in options}
+    how = {name: options[name] for name in ("state", "reduction", "stabilisation", "projection", "work", "lowering", "inputs") if name in options}
     return state_form(scene, structure_of(scene), **how)
 
 

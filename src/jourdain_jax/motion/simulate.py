@@ -136,7 +136,7 @@ def _set_up(
     made_here = not isinstance(start, State)
     inputs = as_inputs(scene, inputs)
     start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs)
-    form = fitted(solver, scene, state_form(scene, structure_of(scene), state, reduction, stabilisation, projection, work, lowering), state)
+    form = fitted(solver, scene, state_form(scene, structure_of(scene), state, reduction, stabilisation, projection, work, lowering, inputs), state)
     warn_float32(start.q.dtype, rtol)
     options = Options(
         solver=default_solver(rtol) if solver is None else solver,
@@ -204,8 +204,11 @@ def warn_float32(dtype, rtol) -> None:
         )
 
 
-def state_form(scene: Scene, structure: Structure, state="auto", reduction=None, stabilisation=None, projection=True, work=True, lowering=True) -> StateForm:
+def state_form(
+    scene: Scene, structure: Structure, state="auto", reduction=None, stabilisation=None, projection=True, work=True, lowering=True, inputs=None
+) -> StateForm:
     """How the scene's state is integrated, given what was asked."""
+    inputs_in_rows = structure.rows_of_inputs and not as_inputs(scene, inputs).constant
     if state not in _STATE_FORMS:
         raise ValueError(f"unknown state form `{state}`; {nearest(str(state), _STATE_FORMS)}")
     if state == "minimal" and not structure.affine:
@@ -213,7 +216,8 @@ def state_form(scene: Scene, structure: Structure, state="auto", reduction=None,
     minimal = state == "minimal" or (state == "auto" and structure.affine and structure.well_conditioned)
     independent = structure.independent if minimal else None
     with_work = work and needs_work(scene, structure)
-    plain = lowering and reduction is None and stabilisation is None and not (with_work and (structure.driven or structure.varying_inertia))
+    dense = inputs_in_rows or (with_work and (structure.driven or structure.varying_inertia))
+    plain = lowering and reduction is None and stabilisation is None and not dense
     program = lowered(scene, every_speed=not minimal) if plain else None
     program = program if isinstance(program, Lowered) else None
     cutoff = cutoff_of(structure) if reduction is None and not minimal else None
@@ -228,6 +232,7 @@ def state_form(scene: Scene, structure: Structure, state="auto", reduction=None,
         lowered=program,
         of_inputs=structure.potentials_of_inputs,
         affine=structure.affine,
+        inputs_in_rows=inputs_in_rows,
         cutoff=cutoff,
     )
 

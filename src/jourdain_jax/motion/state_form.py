@@ -48,6 +48,7 @@ class StateForm(eqx.Module):
     affine: bool = eqx.field(static=True, default=True)  # rows are, in the speeds
     recovered: tuple[int, ...] = eqx.field(static=True, default=())  # numbers of the coordinates that do not decide the step size
     own_equations: str = eqx.field(static=True, default="")  # of a solver that takes no accelerations: what it solves instead
+    inputs_in_rows: bool = eqx.field(static=True, default=False)  # some change in time, and rows depend on them: their rates are needed
     cutoff: float | None = eqx.field(static=True, default=None)  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     @property
@@ -71,6 +72,10 @@ class StateForm(eqx.Module):
     def fixed(self, scene: Scene) -> tuple:
         """What the lowered rates need of the scene: computed once per motion."""
         return () if self.lowered is None else self.lowered.fixed_values(scene)
+
+    def now(self, inputs, t):
+        """What the rates need of the inputs at a time: the values, with their own rates where rows depend on them."""
+        return inputs.near(t) if self.inputs_in_rows else inputs(t)
 
     def pack(self, q, u) -> Integrated:
         """The integrated state of (q, u)."""

@@ -50,7 +50,7 @@ def _jacobian(form: StateForm, motion: Trajectory) -> Float[Array, "state state"
 
     def rates(x):
         q, v = unravel(x)
-        found = form.rates(scene, fixed, t, dataclasses.replace(y, q=q, v=v), inputs(t))
+        found = form.rates(scene, fixed, t, dataclasses.replace(y, q=q, v=v), form.now(inputs, t))
         return jnp.concatenate([found.q, found.v])
 
     return jax.jacfwd(rates)(x)

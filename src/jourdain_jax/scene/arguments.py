@@ -5,6 +5,7 @@ Kinds and shapes are known while a function is traced: no compiled program conta
 
 from collections.abc import Mapping
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -44,6 +45,18 @@ def _as_vector(scene: Scene, what: str, x, names: Names) -> Array:
         raise ValueError(f"`{what}` of `{type(scene).__name__}` is a dictionary, expected a vector of {listed}; `jj.start(scene, **values)` makes one by name")
     advice = f"one number for each of {listed}; use `jax.vmap` or `rollout` for many states"
     return checked_real(x, f"`{what}` of `{type(scene).__name__}`", (len(names),), advice=advice)
+
+
+class ChangingInputs(eqx.Module):
+    """Inputs near one time: where rows depend on them, accelerations depend on their rates."""
+
+    t: Float[Array, ""]  # s
+    values: Float[Array, "inputs"]
+    rates: Float[Array, "inputs"]  # per s
+
+    def __call__(self, t) -> Float[Array, "inputs"]:
+        """The values near that time."""
+        return self.values + self.rates * (t - self.t)
 
 
 def as_input_vector(scene: Scene, inputs, dtype=None) -> Float[Array, "inputs"]:
