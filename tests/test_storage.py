@@ -3,6 +3,7 @@
 import json
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np

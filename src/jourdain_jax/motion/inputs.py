@@ -69,7 +69,6 @@ class Inputs(eqx.Module):
         """The vector of inputs at time t."""
         return jnp.stack([jnp.asarray(channel(t), jnp.result_type(float)) for channel in self.channels]) if self.channels else jnp.zeros(0)
 
-
     @property
     def constant(self) -> bool:
         """Whether all are numbers."""
