@@ -18,8 +18,6 @@ from jourdain_jax.program.evaluate import Probes
 KNOWN = ("add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos", "tan")  # taken for what they are
 STEPS, CLOSED = 30, 1e-11  # of Newton's method
 FAR = 10.0  # half of the probes lie so much further out
-
-
 AGREEMENT, ROUND_OFF = 1e-9, 1e-13  # relative to the values of one expression; to those of all at one probe, and to what they are made of
 FEWEST = 6  # probes at which an expression is a number
 

@@ -1,0 +1,67 @@
+"""Formal probes: what is equal at them is equal everywhere."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.formal import equal, formal, on_rows, unaffected
+from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.interpret import Nodes, as_nodes
+from jourdain_jax.program.parts import interpret_in_parts
+
+COUNT = 40
+
+
+def traced(f):
+    """Nodes of f(x, y, p), and formal probes that know nothing but numbers below one."""
+    graph = Graph(most_multiplications=512)
+    inputs = [graph.input(name, varies) for name, varies in (("q_0", True), ("q_1", True), ("p0_0", False))]
+    found = interpret_in_parts(graph, jax.make_jaxpr(f)(1.0, 1.0, 1.0), [Nodes(n) for n in inputs])
+    values = {graph.value[n]: np.linspace(0.1, 0.9, COUNT) for n in inputs}
+    return [int(as_nodes(graph, x)[()]) for x in found], inputs, formal(Probes(graph, values), ())
+
+
+def ramp_beyond(x):
+    return jnp.sqrt((x - 5.0) ** 2) + (x - 5.0)
+
+
+PAIRS = {
+    "waves": (lambda x, y, p: (jnp.sin(x + y), jnp.sin(x) * jnp.cos(y) + jnp.cos(x) * jnp.sin(y)), True),
+    "functions of what is equal": (lambda x, y, p: (jnp.tanh((x + y) ** 2), jnp.tanh(x * x + 2 * x * y + y * y)), True),
+    "a limit far off": (lambda x, y, p: (x, jnp.minimum(x, 50.0)), False),
+    "a root that turns far off": (lambda x, y, p: (0 * x, ramp_beyond(x)), False),
+    "a step that is flat here": (lambda x, y, p: (0 * x, jax.nn.sigmoid((x - 40.0) / 0.1)), False),
+    "a branch on time": (lambda x, y, p: (x, jnp.where(y > 1e3, 2 * x, x)), False),
+    "a parameter that is tiny here": (lambda x, y, p: (x, x + p * y), False),
+    "one function for another": (lambda x, y, p: (jnp.exp(x), jnp.exp2(x)), False),
+    "tables": (lambda x, y, p: (jnp.interp(x, jnp.arange(3.0), jnp.arange(3.0) ** 2), jnp.interp(x, jnp.arange(3.0), jnp.arange(3.0))), False),
+    "a table of what is equal": (lambda x, y, p: (jnp.interp(x + y, jnp.arange(3.0), jnp.arange(3.0) ** 2),) * 2, True),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_what_is_equal_at_formal_probes_is_equal_everywhere(name):
+    f, expected = PAIRS[name]
+    (a, b), _, probes = traced(f)
+    assert bool(equal(probes([a]), probes([b]))[0]) == expected
+
+
+def test_what_is_nowhere_a_number_is_equal_to_nothing():
+    (a,), _, probes = traced(lambda x, y, p: (jnp.sqrt(-1.0 - x * x),))
+    assert not equal(probes([a]), probes([a]))[0]
+
+
+def test_replacements_that_change_nothing_are_found_one_by_one():
+    (node,), (x, y, _), probes = traced(lambda x, y, p: ((x + y) ** 2 - x * x - 2 * x * y + p * jnp.tanh(x - x * 1.0),))
+    zero = probes.graph.zero
+    assert unaffected(probes, [node], {x: zero, y: zero}) == {x: zero}
+
+
+def test_coordinates_are_put_onto_rows_at_generic_parameters():
+    (row,), (x, y, _), probes = traced(lambda x, y, p: (x * x + y * y - p * p,))
+    near = Probes(probes.graph, {"q_0": np.full(COUNT, 0.6), "q_1": np.full(COUNT, 0.8), "p0_0": np.ones(COUNT)})
+    on_circle = on_rows(probes, near, [row], {"q_0": x, "q_1": y})
+    np.testing.assert_allclose(on_circle([row]), 0.0, atol=1e-11)
+    assert np.ptp(on_circle.inputs["p0_0"]) > 0.5
