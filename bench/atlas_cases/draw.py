@@ -32,6 +32,7 @@ WORDS = {
 }
 GROUP_GAP, CASE_GAP = 0.45, 0.22  # between groups of methods, and between hard cases E1, E2, ...
 CELL, LEFT, RIGHT_MARGIN, TOP, BOTTOM = 0.185, 4.3, 0.15, 0.95, 1.75  # inches
+NARROWEST = 9.0  # of the picture, for its title
 
 
 def draw(cells: list[dict], out: Path) -> None:
@@ -42,7 +43,7 @@ def draw(cells: list[dict], out: Path) -> None:
     cases = sorted((case for case in CASES if any(cell["case"] == case.name for cell in cells)), key=_number)
     rows = _places([case.name for case in cases], [_number(case) for case in cases], CASE_GAP)
     width, height = max(columns.values()) + 1.0, max(rows.values()) + 1.0
-    size = (LEFT + CELL * width + RIGHT_MARGIN, TOP + CELL * height + BOTTOM)
+    size = (max(NARROWEST, LEFT + CELL * width + RIGHT_MARGIN), TOP + CELL * height + BOTTOM)
     figure = plt.figure(figsize=size)
     ax = figure.add_axes((LEFT / size[0], BOTTOM / size[1], CELL * width / size[0], CELL * height / size[1]))
     ax.set(xlim=(0, width), ylim=(height, 0))
