@@ -61,6 +61,20 @@ def test_calls_whose_operands_differ_later_stay_two():
     assert len(jj.lower(Fading()).graph.calls(jj.lower(Fading()).ydot)) == 2
 
 
+class Filtered(Plane):
+    """Two calls of one kind: what they are given as numbers is the same, the arrays that other calls hand them are not."""
+
+    def loads(self, motion):
+        filtered = lambda x: jax.lax.scan(lambda c, k: (jnp.tanh(c + k * x), c), 0.1 * x, jnp.linspace(0.2, 1.0, 40))[1]  # noqa: E731
+        halved = lambda values: jax.lax.while_loop(lambda v: jnp.max(v) > 0.1, lambda v: 0.5 * v, values).sum()  # noqa: E731
+        common = 2.0 + jnp.sin(filtered(motion.u.x_rate)[3])
+        return (jj.generalized_force(motion, x_rate=-halved(common * filtered(motion.q.x)), y_rate=-halved(common * filtered(motion.q.y))),)
+
+
+def test_calls_of_what_different_calls_made_stay_two():
+    np.testing.assert_allclose(*ends(Filtered(), {"x": 1.0, "y": -0.4, "x_rate": 0.3}), atol=1e-7)
+
+
 class Pushed(Plane):
     """Some force along x, often none near the probes."""
 

@@ -332,7 +332,9 @@ def _with_equal_calls_once(generic: Probes, outputs: list[int]) -> list[int]:
     kept: dict = {}
     same: dict[int, int] = {}
     for call in calls:
-        alike = kept.setdefault((graph.value[call], tuple(graph.value[a] for a in graph.args[call])), [])
+        # what other calls hand it whole must be the same, not only of one shape
+        whole = tuple((graph.value[a], *(same.get(other, other) for other in graph.args[a] if graph.op[a] != "array")) for a in graph.args[call])
+        alike = kept.setdefault((graph.value[call], whole), [])
         given = generic(_operands(graph, call))
         found = next((other for other in alike if np.all(equal(given, generic(_operands(graph, other))))), None)
         if found is None:

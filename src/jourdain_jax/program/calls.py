@@ -58,7 +58,7 @@ class Call:
     @functools.cached_property
     def name(self) -> str:
         """What tells it from calls of other functions."""
-        return f"{self.closed.jaxpr} {[np.asarray(x).tobytes() for x in self.closed.consts]}"
+        return repr(self._described)
 
     @functools.cached_property
     def at_probes(self) -> Callable[..., list[np.ndarray]]:
