@@ -56,9 +56,11 @@ def speeds_and_pivot(scene: Scene, independent: tuple[int, ...], t, q, y, inputs
     return found.u, Partition(jax.lax.stop_gradient(found.split.A), independent).signed_pivot()
 
 
-def minimal_accelerations(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> tuple[Float[Array, "speeds"], Motion, Reduced]:
-    """All speeds, the motion they make, and the accelerations with the constraint force."""
-    known = minimal_kinematics(scene, independent, t, q, y, inputs)
+def minimal_accelerations(
+    scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None, *, known: MinimalKinematics | None = None
+) -> tuple[Float[Array, "speeds"], Motion, Reduced]:
+    """All speeds, the motion they make, and the accelerations with the constraint force; `known`: the kinematics, where they are at hand."""
+    known = minimal_kinematics(scene, independent, t, q, y, inputs) if known is None else known
     value, rate, motion = rates_along_motion(scene, t, q, known.u, inputs)
     equations = equations_of(scene, Instant(motion, known.weights, value, known.partial, rate))
     c = known.c

@@ -176,8 +176,12 @@ class Partition(eqx.Module):
 
     def signed_pivot(self) -> Float[Array, ""]:
         """The pivot with the sign of det A_z where A_z is square: a change of sign along a motion means that A_z was singular in between."""
+        return self.pivot() * self.orientation()
+
+    def orientation(self) -> Float[Array, ""]:
+        """The sign of det A_z, 1 where A_z is not square; a number to differentiation."""
         square = self.A.shape[0] == len(self.dependent) > 0
-        return self.pivot() * jnp.linalg.slogdet(self._A_z)[0] if square else self.pivot()
+        return jnp.linalg.slogdet(jax.lax.stop_gradient(self._A_z))[0] if square else jnp.ones((), self.A.dtype)
 
     @property
     def _A_z(self):

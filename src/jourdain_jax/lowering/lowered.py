@@ -129,14 +129,19 @@ class Lowered:
 
         `fixed`: from `fixed_values`; `q`, `y`: coordinates and privileged speeds, one scalar (or array of lanes) each; `inputs`: a vector.
         """
-        known = self._known(fixed, t, q, y, inputs)
-        found = list((self._with_power if with_power else self._without_power)(*known.values()))
-        count = len(found) - len(self.guards)
-        for guard in found[count:]:
+        return self.rates_and_pivots(fixed, t, q, y, inputs, with_power)[:3]
+
+    def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Array | None, tuple]:
+        """As `rates`, and the pivots relative to their usual sizes, which must keep their signs; they are numbers to differentiation."""
+        found = list((self._with_power if with_power else self._without_power)(*self._known(fixed, t, q, y, inputs).values()))
+        count = len(found) - len(self.pivots)
+        pivots = tuple(value / size for value, size in zip(found[count:], self.typical, strict=True))
+        count -= len(self.guards)
+        for guard in found[count : count + len(self.guards)]:
             found[0] = jnp.where(guard > 0, found[0], jnp.nan)
         at = len(self.qdot)
         power = found[count - 1] if with_power and self.power is not None else None
-        return tuple(found[:at]), tuple(found[at : at + len(self.ydot)]), power
+        return tuple(found[:at]), tuple(found[at : at + len(self.ydot)]), power, pivots
 
     @functools.cached_property
     def _without_power(self) -> Callable[..., tuple]:
@@ -148,7 +153,7 @@ class Lowered:
 
     def _rates_and(self, more: list[int]) -> Callable[..., tuple]:
         outputs = [*self.qdot, *self.ydot, *more, *self.guards]
-        return differentiable(self.graph, outputs, self._variables, like=len(self.fixed) + 1)
+        return differentiable(self.graph, outputs, self._variables, like=len(self.fixed) + 1, watched=self.pivots)
 
     @property
     def _variables(self) -> list[int]:

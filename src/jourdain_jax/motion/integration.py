@@ -17,9 +17,9 @@ from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion import lean_loop, results
 from jourdain_jax.motion.event_location import Located, locate
 from jourdain_jax.motion.finite_derivatives import Flat
+from jourdain_jax.motion.guarded_solver import GuardedSolver, for_adjoint
 from jourdain_jax.motion.land_on import land_on
 from jourdain_jax.motion.lockstep import in_blocks, width
-from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.recovery import LargestError, is_among
 from jourdain_jax.motion.solver_choice import controller_of
@@ -66,6 +66,7 @@ class Solved(eqx.Module):
     rejected: Int[Array, "*lanes"]
     last_step: Float[Array, "*lanes"]  # s, that the step-size control would take next; NaN where it keeps that to itself
     quadrature_error: Float[Array, "*lanes"]  # largest, in one step, of the recovered coordinates, relative to what the step-size control lets pass
+    pivot: Float[Array, "*lanes"]  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was watched
 
 
 class Setup(eqx.Module):
@@ -153,6 +154,7 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
     (q, u, work), pivots = jax.vmap(saved_state)(*with_end)
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
+    pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
     return Trajectory(
         scene=setup.scene,
         ts=solved.ts,
@@ -196,7 +198,7 @@ def _without_faults(scene: Scene, start: State):
 def _by_lean_loop(setup: Setup, begun: Begun) -> Solved:
     form, options = setup.form, setup.options
     moving = form.projects_positions or form.projects_speeds
-    return _lean(setup, begun.y0, begun.args, setup.ts, _rates, _project if moving else None, _events if options.event_names else None)
+    return _lean(setup, begun.y0, begun.args, setup.ts, _rates, _rates_and_pivots, _project if moving else None, _events if options.event_names else None)
 
 
 def _lanes_by_lean_loop(setups: Setup, begun: Begun) -> Solved:
@@ -205,11 +207,11 @@ def _lanes_by_lean_loop(setups: Setup, begun: Begun) -> Solved:
     moving = form.projects_positions or form.projects_speeds
     events = _events_of_lanes if options.event_names else None
     y0, ts = _lanes_last((begun.y0, setups.ts))
-    solved = _lean(setups, y0, begun.args, ts, _rates_of_lanes, _project_of_lanes if moving else None, events)
+    solved = _lean(setups, y0, begun.args, ts, _rates_of_lanes, _rates_and_pivots_of_lanes, _project_of_lanes if moving else None, events)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solved)
 
 
-def _lean(setup: Setup, y0, args, ts, rates, project, events) -> Solved:
+def _lean(setup: Setup, y0, args, ts, rates, rates_and_pivots, project, events) -> Solved:
     options = setup.options
     problem = lean_loop.Problem(
         rates=rates,
@@ -222,12 +224,13 @@ def _lean(setup: Setup, y0, args, ts, rates, project, events) -> Solved:
         shortest=_shortest(setup.t0, setup.t1),
         max_steps=options.max_steps,
         unseen=LargestError(setup.form.recovered) if setup.form.recovered else None,
+        rates_and_pivots=rates_and_pivots if setup.form.has_pivots else None,
     )
     kind: Literal["forward", "reverse"] = "forward" if isinstance(options.adjoint, diffrax.ForwardMode) else "reverse"
     goals = jnp.concatenate([ts, setup.t1[None]])
     ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, setup.t0, goals, options.dt0, kind)
     unseen = jnp.zeros_like(end.h) if end.unseen is None else end.unseen
-    return Solved(ts, jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, unseen)
+    return Solved(ts, jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, unseen, end.pivot)
 
 
 def _lanes_last(tree):
@@ -242,6 +245,11 @@ def _lane_by_lane(function):
 def _rates_of_lanes(t, y, args):
     form, scene, inputs, fixed = args
     return form.rates(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
+
+
+def _rates_and_pivots_of_lanes(t, y, args):
+    form, scene, inputs, fixed = args
+    return form.rates_and_pivots(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
 
 
 def _inputs_of_lanes(inputs, t) -> Float[Array, "inputs lanes"]:
@@ -261,15 +269,16 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
     solver = for_adjoint(options.solver, options.adjoint)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
     rates, project = (Flat(f, t0, y0) if implicit else f for f in (_rates, _project))
+    guarded = GuardedSolver(solver, project if moving else None, _pivots if form.has_pivots else None)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(rates),
-        ProjectedSolver(solver, project) if moving else solver,
+        guarded,
         t0,
         t1,
         options.dt0,
         y0,
         args,
-        saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)]),
+        saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)], solver_state=True),
         stepsize_controller=land_on(ts, controller) if land else controller,
         adjoint=options.adjoint,
         event=diffrax.Event({name: _EventValue(i) for i, name in enumerate(names)}, direction=False) if names else None,
@@ -280,7 +289,9 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
     code = jnp.where(solution.result == diffrax.RESULTS.max_steps_reached, results.MAX_STEPS, results.STEP_TOO_SMALL)
     code = jnp.where(solution.result == diffrax.RESULTS.successful, results.SUCCESS, code)
     unsolved = (solution.result == diffrax.RESULTS.nonlinear_divergence) | (solution.result == diffrax.RESULTS.nonlinear_max_steps_reached)
-    t_end = solution.ts[1][0]
+    t_end, seen = solution.ts[1][0], solution.solver_state[1]
+    if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):  # others cannot reject a step
+        code = jnp.where((seen.projected > results.MOST_PROJECTED) & (code == results.SUCCESS), results.OFF_CONSTRAINTS, code)
     return Solved(
         ts=solution.ts[0],
         ys=solution.ys[0],
@@ -294,6 +305,7 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
         rejected=solution.stats["num_rejected_steps"],
         last_step=jnp.full_like(t_end, jnp.nan),
         quadrature_error=jnp.zeros_like(t_end),
+        pivot=seen.pivot,
     )
 
 
@@ -343,6 +355,17 @@ class _StateNorm(eqx.Module):
 def _rates(t, y, args):
     form, scene, inputs, fixed = args
     return form.rates(scene, fixed, t, y, form.now(inputs, t))
+
+
+@eqx.filter_jit
+def _rates_and_pivots(t, y, args):
+    form, scene, inputs, fixed = args
+    return form.rates_and_pivots(scene, fixed, t, y, form.now(inputs, t))
+
+
+@eqx.filter_jit
+def _pivots(t, y, args):
+    return _rates_and_pivots(t, y, args)[1]
 
 
 @eqx.filter_jit  # traced once, not once per stage and derivative

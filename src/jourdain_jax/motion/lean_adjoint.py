@@ -30,7 +30,7 @@ def back(problem_of: Callable[[PyTree], Problem], shared: PyTree, method: Method
     """Cotangents of the step from `y` at `t_0` to `t_1`, given that of its end, `g`. `problem_of(shared)`: rates, projection and args."""
     problem, h = problem_of(shared), t_1 - t_0
     method = replace(method, b_error=np.zeros_like(method.b_error))  # no error is asked: a stage that only it needs is left out
-    y_1, slopes, at = stages(problem, method, t_0, y, h)
+    y_1, slopes, at, _ = stages(problem, method, t_0, y, h)
     by_t_1 = jnp.zeros_like(t_1)
     by_shared = jax.tree.map(jnp.zeros_like, shared)
     if problem.project is not None:

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.motion import lean_adjoint, results
 from jourdain_jax.motion.event_search import MOST_STEPS
-from jourdain_jax.motion.lean_step import LOCATING, RUNNING, Method, Problem, Progress, advanced, begun, chosen, running
+from jourdain_jax.motion.lean_step import LOCATING, RUNNING, Method, Problem, Progress, advanced, begun, chosen, no_pivot, running
 
 STEPS_ALONE, STEPS_TOGETHER = 2048, 512  # of a window: for one motion, for lanes in lockstep
 SPARE = 4  # this part of a window is left free, for the steps that it takes when it is integrated again
@@ -84,7 +84,7 @@ def motion(forward: Callable, problem: Problem, method: Method, y0: PyTree, t0, 
     """`forward` of the other arguments, with derivatives in reverse mode by `y0`, `t0`, `goals` and whatever the functions of `problem` depend on."""
     like = (t0, y0, problem.args)
     rates, project, events = (f if f is None else eqx.filter_closure_convert(f, *like) for f in (problem.rates, problem.project, problem.events))
-    control = problem.norm, *jax.lax.stop_gradient((problem.rtol, problem.atol, problem.shortest)), problem.max_steps, problem.unseen
+    control = problem.norm, *jax.lax.stop_gradient((problem.rtol, problem.atol, problem.shortest)), problem.max_steps, problem.unseen, problem.rates_and_pivots
     return _motion(((rates, project, problem.args), events, y0, t0, goals), (control, jax.lax.stop_gradient(jnp.asarray(dt0))), forward, method)
 
 
@@ -208,7 +208,7 @@ def _again(problem: Problem, method: Method, beginnings: _Beginnings, number, wi
     first = _at(beginnings, jnp.maximum(number, 0))
     target, last_goal = _at((beginnings.t, beginnings.goal), number + 1)
     zero = jnp.zeros(jnp.shape(first.t), jnp.int32)
-    start = Progress(first.t, first.y, first.h, zero + RUNNING, zero, zero, zero - 1, None, problem.nothing_unseen(first.t))
+    start = Progress(first.t, first.y, first.h, zero + RUNNING, zero, zero, zero - 1, None, problem.nothing_unseen(first.t), no_pivot(first.t))
     room = len(window.t) - 1
 
     def to_goal(carry):

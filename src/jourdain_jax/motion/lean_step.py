@@ -9,6 +9,7 @@ neighbours. A step ends at every time asked for; the step size found before such
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion import event_search, results
 from jourdain_jax.motion.event_search import Search
 
@@ -51,6 +53,7 @@ class Progress(eqx.Module):
     event: Int[Array, "*lanes"]  # index of the event that ended the motion, or -1
     search: Search | None  # for that event
     unseen: Float[Array, "*lanes"] | None  # largest error so far of what does not decide the step size, 1: as much as it lets pass
+    pivot: Float[Array, "*lanes"]  # smallest magnitude so far of a pivot, at any stage of an accepted step
 
 
 class Problem(eqx.Module):
@@ -66,6 +69,8 @@ class Problem(eqx.Module):
     shortest: Float[Array, "*lanes"]
     max_steps: int = eqx.field(static=True)
     unseen: Callable | None = None  # of an error, relative to what step-size control lets pass: how large the part is that it does not see
+    # as `rates`, and pivots (pivots, *lanes) that must keep their signs; None: the rates have none
+    rates_and_pivots: Callable | None = None
 
     def nothing_unseen(self, t: Float[Array, "*lanes"]) -> Float[Array, "*lanes"] | None:
         """What `Progress.unseen` begins with."""
@@ -75,7 +80,7 @@ class Problem(eqx.Module):
 def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0) -> Progress:
     """The start of a motion; one that starts beyond an event has no motion at all."""
     zero = jnp.zeros(jnp.shape(t0), jnp.int32)
-    start = Progress(t0, y0, jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0)), zero + RUNNING, zero, zero, zero - 1, None, problem.nothing_unseen(t0))
+    start = Progress(t0, y0, jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0)), zero + RUNNING, zero, zero, zero - 1, None, problem.nothing_unseen(t0), no_pivot(t0))
     if problem.events is None:
         return start
     beyond = problem.events(t0, y0, problem.args) <= 0
@@ -104,14 +109,19 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     shortened = size < p.h
     h = direction * size if p.search is None else jnp.where(locating, p.search.shift, direction * size)
     t1 = jnp.where(lands, goal, p.t + h)
-    y1, slopes, _ = stages(problem, method, p.t, p.y, h)
+    y1, slopes, _, pivots = stages(problem, method, p.t, p.y, h, watched=True)
     error = jax.tree.map(lambda k: as_in(h, k) * weighted(method.b_error, k), slopes)
     first_slope = jax.tree.map(lambda k: k[0], slopes)
     if problem.project is not None:
-        y1 = problem.project(t1, y1, problem.args)
+        free, y1 = y1, problem.project(t1, y1, problem.args)
+        # the projection removes what the error estimate does not see; it must be no larger than an error
+        error = jax.tree.map(lambda e, a, b: jnp.maximum(jnp.abs(e), jnp.abs(a - b)), error, y1, free)
     scale = jax.tree.map(lambda a, b: problem.atol + problem.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), p.y, y1)
     relative = jax.lax.stop_gradient(jax.tree.map(lambda e, s: e / s, error, scale))
     size_of_error = problem.norm(relative)
+    if pivots is not None:
+        # a step in which a pivot changes its sign passes over a singularity, which no error estimate need notice
+        size_of_error = jnp.where(pivots.changed_sign & ~locating, jnp.inf, size_of_error)
     accept = locating | (size_of_error <= 1)
     factor = SAFETY * jnp.where(size_of_error > 0, size_of_error, 1e-30) ** (-1 / method.order)
     factor = jnp.clip(jnp.where(jnp.isfinite(size_of_error), factor, 0.0), LEAST_FACTOR, jnp.where(accept, LARGEST_FACTOR, 1.0))
@@ -120,29 +130,72 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     accepted, rejected = p.accepted + (accept & ~locating).astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
     code = jnp.where(next_h < problem.shortest, results.STEP_TOO_SMALL, RUNNING)
     code = jnp.where((code == RUNNING) & (accepted + rejected >= problem.max_steps) & ~(accept & (t1 == last_goal)), results.MAX_STEPS, code).astype(jnp.int32)
+    pivot = p.pivot
+    if pivots is not None:
+        pivot = jnp.where(accept & ~locating, jnp.minimum(pivot, pivots.smallest), pivot)
+        code = jnp.where(pivot < SMALLEST_PIVOT, results.SINGULAR_PARTITION, code).astype(jnp.int32)
     y = jax.tree.map(lambda new, old: jnp.where(accept, as_in(new, old), old), y1, p.y)
     unseen = None if problem.unseen is None else jnp.where(accept & ~locating, jnp.maximum(p.unseen, problem.unseen(relative)), p.unseen)
-    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, accepted, rejected, p.event, p.search, unseen)
+    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, accepted, rejected, p.event, p.search, unseen, pivot)
     return moved if problem.events is None else _watched(problem, p, moved, h, first_slope, accept)
 
 
-def stages(problem: Problem, method: Method, t, y: PyTree, h) -> tuple[PyTree, PyTree, PyTree]:
-    """y_1; the slopes of all stages, and the states at which they were taken (leading axis)."""
+class Pivots(eqx.Module):
+    """What the pivots were at the stages of a step."""
+
+    smallest: Float[Array, "*lanes"]  # magnitude
+    changed_sign: Bool[Array, "*lanes"]  # whether any did
+
+
+class Stages(NamedTuple):
+    """The stages of one step; `slopes` and `states` have a leading axis of stages."""
+
+    y_1: PyTree
+    slopes: PyTree
+    states: PyTree
+    pivots: Pivots | None
+
+
+def stages(problem: Problem, method: Method, t, y: PyTree, h, watched: bool = False) -> Stages:
+    """y_1; the slopes of all stages, and the states at which they were taken; what the pivots were, where they are `watched`."""
     leaves, treedef = jax.tree.flatten(y)
+    watched = watched and problem.rates_and_pivots is not None
 
     def stage(carried, row):
         # k_i = f(y_i), then the next y_i: what is carried from stage to stage is computed once, whatever uses it
-        at, slopes = carried
+        at, slopes, extremes = carried
         c, i, next_A = row
-        found = jax.tree.leaves(problem.rates(t + c * h, treedef.unflatten(at), problem.args))
+        there = t + c * h, treedef.unflatten(at), problem.args
+        if watched:
+            found, pivots = problem.rates_and_pivots(*there)
+            extremes = jnp.minimum(extremes[0], pivots), jnp.maximum(extremes[1], pivots)
+        else:
+            found = problem.rates(*there)
+        found = jax.tree.leaves(found)
         slopes = [jax.lax.dynamic_update_index_in_dim(k, as_in(f, k), i, 0) for k, f in zip(slopes, found, strict=True)]
-        return ([y + as_in(h, y) * weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes), at
+        return ([y + as_in(h, y) * weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes, extremes), at
 
     count = len(method.c) - (method.last_is_next_first and method.b_error[-1] == 0)  # a last stage that nothing else needs
     rows = (jnp.asarray(method.c[:count]), jnp.arange(count), jnp.asarray([*method.A[1:count], method.b]))
     slopes = [jnp.zeros((len(method.c), *y.shape), y.dtype) for y in leaves]
-    (y_1, slopes), at = jax.lax.scan(stage, (leaves, slopes), rows)
-    return treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at)
+    (y_1, slopes, extremes), at = jax.lax.scan(stage, (leaves, slopes, _no_extremes(problem, t, y) if watched else None), rows)
+    return Stages(treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at), _pivots(extremes) if watched else None)
+
+
+def no_pivot(t: Float[Array, "*lanes"]) -> Float[Array, "*lanes"]:
+    """What `Progress.pivot` begins with."""
+    return jax.lax.stop_gradient(jnp.full_like(t, jnp.inf))
+
+
+def _no_extremes(problem: Problem, t, y: PyTree) -> tuple[Array, Array]:
+    """The lowest and the highest value of every pivot before any was seen."""
+    shape = jax.eval_shape(lambda: problem.rates_and_pivots(t, y, problem.args)[1])
+    return jnp.full(shape.shape, jnp.inf, shape.dtype), jnp.full(shape.shape, -jnp.inf, shape.dtype)
+
+
+def _pivots(extremes: tuple[Float[Array, "pivots *lanes"], Float[Array, "pivots *lanes"]]) -> Pivots:
+    lowest, highest = extremes
+    return Pivots(jnp.min(jnp.minimum(jnp.abs(lowest), jnp.abs(highest)), axis=0), jnp.any((lowest < 0) & (highest > 0), axis=0))
 
 
 def weighted(weights, slopes: Float[Array, "stages *shape"]) -> Float[Array, "*shape"]:
@@ -175,7 +228,7 @@ def _watched(problem: Problem, p: Progress, moved: Progress, h, first_slope, acc
     t = jnp.where(found, moved.t + search.shift, moved.t)
     y = jax.tree.map(lambda y, f: jnp.where(found, y + as_in(search.shift, y) * f, y), moved.y, first_slope)
     code = jnp.where(happened, LOCATING, jnp.where(found, results.EVENT, jnp.where(locating, LOCATING, moved.code))).astype(jnp.int32)
-    return Progress(t, y, jnp.where(locating, p.h, moved.h), code, moved.accepted, moved.rejected, event, search, moved.unseen)
+    return Progress(t, y, jnp.where(locating, p.h, moved.h), code, moved.accepted, moved.rejected, event, search, moved.unseen, moved.pivot)
 
 
 def chosen(index, values: Float[Array, "events *lanes"]) -> Float[Array, "*lanes"]:

@@ -4,7 +4,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START, UNSOLVED_STEP = range(10)
-SHRANK, STIFF = 10, 11
+SHRANK, STIFF, OFF_CONSTRAINTS = 10, 11, 12
+MOST_PROJECTED = 0.5  # of the change by a step
 
 MESSAGES = {
     SUCCESS: "reached the end of its span",
@@ -21,6 +22,8 @@ MESSAGES = {
     SHRANK: "ran out of steps, which had shrunk to less than a hundredth of their average: a singularity, a discontinuity or a stiff force near the last time",
     STIFF: "stiff: ran out of steps that stability, not accuracy, keeps short, and an implicit solver did not reach the end either; "
     "put a row in the place of a stiff spring or damper, or loosen the tolerances",
+    OFF_CONSTRAINTS: "a step of constant length ended so far from the constraints that the projection moved it by more than half of its change: take shorter "
+    "steps, step-size control (`stepsize_controller`), or look for rows that lose rank",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step (`dt0`), or look for a singularity there",
 }
 

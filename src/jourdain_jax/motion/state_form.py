@@ -16,7 +16,7 @@ from jourdain_jax.equations.accelerations import Baumgarte, bare_accelerations
 from jourdain_jax.equations.explicit_power import stored_by_inputs
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.equations.minimal import minimal_accelerations, speeds_and_pivot, speeds_from_privileged
+from jourdain_jax.equations.minimal import minimal_accelerations, minimal_kinematics, speeds_and_pivot, speeds_from_privileged
 from jourdain_jax.equations.power import rate_of_work
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
@@ -124,17 +124,30 @@ class StateForm(eqx.Module):
 
     def rates(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
         """Time derivative of the integrated state."""
+        return self.rates_and_pivots(scene, fixed, t, y, inputs)[0]
+
+    @property
+    def has_pivots(self) -> bool:
+        """Whether a change of sign of some pivot loses the state: the minimal one, where rows leave any speed dependent."""
         if self.lowered is not None:
-            qdot, vdot, power_now = self.lowered.rates(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
-            return Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power_now)
-        if self.independent is not None and self._by_appell:
-            _, motion, found = minimal_accelerations(scene, self.independent, t, y.q, y.v, inputs)
+            return self.independent is not None and bool(self.lowered.pivots)
+        return self.independent is not None
+
+    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots *lanes"]]:
+        """As `rates`, and what must keep its sign: the pivots of a lowered elimination relative to their usual sizes, otherwise the sign of det A_z."""
+        if self.lowered is not None:
+            qdot, vdot, power_now, pivots = self.lowered.rates_and_pivots(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
+            return Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power_now), jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
+        known = None if self.independent is None else minimal_kinematics(scene, self.independent, t, y.q, y.v, inputs)
+        if known is not None and self._by_appell:
+            _, motion, found = minimal_accelerations(scene, self.independent, t, y.q, y.v, inputs, known=known)
         else:
-            _, u = self.unpack(scene, fixed, t, y, inputs)
+            u = y.v if known is None else known.u
             motion = motion_at(scene, t, y.q, u, inputs)
             found = bare_accelerations(scene, t, y.q, u, inputs, reduction=self.reduction, stabilisation=self.stabilisation)
         v = found.udot if self.independent is None else found.udot[jnp.array(self.independent, jnp.int32)]
-        return Integrated(motion.qdot.array, v, rate_of_work(scene, motion, found, self.of_inputs) if self.with_work else None)
+        rates = Integrated(motion.qdot.array, v, rate_of_work(scene, motion, found, self.of_inputs) if self.with_work else None)
+        return rates, jnp.zeros(0, y.q.dtype) if known is None else known.split.orientation()[None]
 
     def project(self, scene: Scene, fixed, t, y: Integrated, inputs, iterations: int = 2) -> Integrated:
         """The state put back onto geometric rows, quaternion norms and (full state) velocity rows; lanes only where it is lowered."""

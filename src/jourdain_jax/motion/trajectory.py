@@ -37,7 +37,7 @@ class Trajectory(eqx.Module):
     quadrature_error: Float[Array, ""]  # largest, in one step, of `recovered` coordinates, over what the step-size control lets pass; 0: there are none
     moved_q: Float[Array, ""]  # how far the start was moved onto the constraints
     moved_u: Float[Array, ""]
-    # of the privileged speeds, over the saved times (lowered: of the elimination, relative to its usual size); negative if it changed sign;
+    # of the privileged speeds, along the whole motion (lowered: of the elimination, relative to its usual size); negative if it changed sign;
     # full state, dense: of those of the reduction, 1 where it has none
     smallest_pivot: Float[Array, ""]
     inputs: Inputs

@@ -1,0 +1,92 @@
+"""Between saved times too, a motion is right or flagged: pivots keep their signs, and a projection moves a step by no more than an error."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from linkages import NarrowPendulum, Parallelogram, SliderCrank, pendulum_angles, slider_crank_motion
+
+import jourdain_jax as jj
+from jourdain_jax.motion import results
+
+SPEEDS = np.linspace(5.0, 10.0, 16)  # of the pendulum's x, m/s: some swing beyond the horizontal, some go round
+ENDS = {"one save": np.array([2.0]), "many saves": np.linspace(0.1, 2.0, 20)}
+
+
+def _swinging(speeds):
+    return {"x": np.full(len(speeds), 0.3), "z": np.full(len(speeds), -np.sqrt(0.91)), "x_rate": speeds}
+
+
+def _error_of_pendulum(q, speeds, ts):
+    angles = pendulum_angles(speeds, ts)
+    return np.max(np.abs(np.asarray(q) - np.stack([np.sin(angles), -np.cos(angles)], axis=-1)), axis=(1, 2))
+
+
+@pytest.mark.parametrize(("saves", "rtol"), [("one save", 1e-3), ("one save", 1e-6), ("many saves", 1e-6), ("one save", 1e-8)])
+def test_a_pendulum_that_leaves_its_narrow_domain_is_run_again(saves, rtol):
+    ts = ENDS[saves]
+    found = jj.rollout(NarrowPendulum(), _swinging(SPEEDS), ts=ts, rtol=rtol, atol=rtol)
+    assert not found.failed.size
+    assert len(found.continued) == len(SPEEDS)
+    assert np.all(_error_of_pendulum(found.lanes.q, SPEEDS, ts) < 1e3 * rtol)
+
+
+def test_a_pendulum_that_leaves_its_narrow_domain_is_flagged_under_jit():
+    pendulum, ts = NarrowPendulum(), jnp.asarray(ENDS["one save"])
+    lanes = jax.jit(jax.vmap(lambda v: jj.simulate(pendulum, jj.start(pendulum, x=0.3, z=-np.sqrt(0.91), x_rate=v), ts=ts, rtol=1e-6, atol=1e-6)))
+    assert np.all(np.asarray(lanes(SPEEDS).result) == results.SINGULAR_PARTITION)
+    slow = lanes(np.linspace(0.1, 1.0, 4))  # these stay inside
+    assert np.all(np.asarray(slow.result) == results.SUCCESS)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"solver": diffrax.Tsit5(), "stepsize_controller": diffrax.PIDController(rtol=1e-6, atol=1e-6)},
+        {"solver": jj.RadauIIA(), "rtol": 1e-6, "atol": 1e-6},
+        {"solver": diffrax.Dopri5(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.01},
+        {"lowering": False, "rtol": 1e-6, "atol": 1e-6},
+    ],
+    ids=["controller", "implicit", "constant steps", "dense"],
+)
+def test_every_way_of_integrating_watches_its_pivots(options):
+    ts, speeds = ENDS["one save"], SPEEDS[::5]
+    asked = jj.rollout(NarrowPendulum(), _swinging(speeds), ts=ts, state="minimal", **options)
+    assert np.all(asked.result == results.SINGULAR_PARTITION)
+
+
+def _parallelograms(count: int, **options):
+    w, a_0, ts = np.linspace(0.5, 8.0, count), 0.7, np.linspace(0.0, 3.0, 201)
+    starts = {"a": np.full(count, a_0), "b": np.zeros(count), "c": np.full(count, a_0), "a_rate": w, "b_rate": 0 * w, "c_rate": w}
+    found = jj.rollout(Parallelogram(), starts, ts=ts, **options)
+    error = np.max(np.abs(np.asarray(found.lanes.q) - (a_0 + w[:, None] * ts)[..., None] * [1, 0, 1]), axis=(1, 2))
+    return found.result, error
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
+def test_a_parallelogram_passes_flat_on_its_branch_or_is_flagged(rtol):
+    result, error = _parallelograms(128, rtol=rtol, atol=rtol)
+    arrived = result == results.SUCCESS
+    assert np.mean(arrived) > 0.6
+    assert np.all(error[arrived] < 100 * rtol)
+
+
+def test_steps_of_constant_length_that_lose_their_rows_are_flagged():
+    result, error = _parallelograms(32, solver=diffrax.Tsit5(), stepsize_controller=diffrax.ConstantStepSize(), dt0=0.01, max_steps=2000)
+    arrived = result == results.SUCCESS
+    assert np.all(error[arrived] < 1e-3)
+
+
+@pytest.mark.parametrize("options", [{}, {"lowering": False}], ids=["lowered", "dense"])
+def test_a_slider_crank_of_equal_lengths_passes_the_axis_on_its_branch_or_is_flagged(options):
+    count = 64 if not options else 8
+    w, ts = np.linspace(0.5, 6.0, count), np.linspace(0.0, 2.0, 41)
+    starts = {"a": np.full(count, 0.5), "b": np.full(count, -0.5), "x": np.full(count, 2 * np.cos(0.5)), "a_rate": w}
+    found = jj.rollout(SliderCrank(), starts, ts=ts, state="full", **options)
+    arrived = found.result == results.SUCCESS
+    assert np.mean(arrived) > 0.6
+    for lane in np.flatnonzero(arrived):
+        a = slider_crank_motion(0.5, w[lane], ts)
+        error = np.abs(np.asarray(found.lanes.q[lane]) - np.stack([a, -a, 2 * np.cos(a)], axis=-1))
+        assert np.max(error) < 1e-5, f"a_rate = {w[lane]}"
