@@ -40,6 +40,7 @@ class Diagnostics(eqx.Module):
 
     energy_drift: Float[Array, ""]  # J, max - min of T + V, less the work done where it is tracked
     energy_kind: str = eqx.field(static=True)
+    energy_size: Float[Array, ""]  # J, largest kinetic energy, and max - min of the potential one: what a drift is judged against
     position_residual: Float[Array, ""]  # largest residual of the geometric rows and quaternion norms
     velocity_residual: Float[Array, ""]  # largest residual of the velocity rows
     smallest_singular_value: Float[Array, ""]  # of the scaled rows, smallest along the motion
@@ -80,6 +81,8 @@ def diagnose(trajectory: Record) -> Diagnostics:
 
 FEW_TIMES = 1000
 VIOLATED = 1e-4  # residual of a row, relative to the state
+DRIFTED = 1e-2  # of the energy that moves
+_ROUND_OFF = 1e-6  # of the whole energy: where less than that moves, as at rest, nothing is said of its drift
 _seldom = Seldom(often=100)
 
 
@@ -91,6 +94,7 @@ def _diagnosed(trajectory: Record) -> Diagnostics:
     return Diagnostics(
         energy_drift=_span(energy.balance),
         energy_kind=energy.kind,
+        energy_size=jnp.nanmax(energy.kinetic) + _span(energy.potential) + _ROUND_OFF * jnp.nanmax(jnp.abs(energy.balance)),
         position_residual=_largest(geometric),
         velocity_residual=_largest(rows),
         smallest_singular_value=jnp.nanmin(jnp.where(reached, motion.smallest_singular_value, jnp.nan)),
@@ -128,6 +132,10 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     for kind, residual, state in (("geometric", found.position_residual, trajectory.q), ("velocity", found.velocity_residual, trajectory.u)):
         if float(residual) > VIOLATED * (1.0 + float(_largest(state))):
             warned.append(f"{kind} rows are violated by up to {float(residual):.1e} in their own units: take projection, smaller tolerances or smaller steps")
+    drift, size = float(found.energy_drift), float(found.energy_size)
+    if drift > DRIFTED * size:
+        share = f"{drift:.1e} J, {drift / size:.0%} of the energy that moves"
+        warned.append(f"{found.energy_kind}, which is constant for a right motion, drifts by {share}: tighten `rtol`")
     pivot, dense = float(trajectory.smallest_pivot), not trajectory.reduction.endswith("lowered")
     # round-off over the square of the pivot is the error of an acceleration; other states than the full one end there
     if trajectory.state_form == "full" and dense and pivot < passing_cutoff(trajectory.q.dtype):

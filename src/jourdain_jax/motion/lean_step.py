@@ -80,7 +80,8 @@ class Problem(eqx.Module):
 def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0) -> Progress:
     """The start of a motion; one that starts beyond an event has no motion at all."""
     zero = jnp.zeros(jnp.shape(t0), jnp.int32)
-    start = Progress(t0, y0, jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0)), zero + RUNNING, zero, zero, zero - 1, None, problem.nothing_unseen(t0), no_pivot(t0))
+    h = jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0))
+    start = Progress(t0, y0, h, zero + RUNNING, zero, zero, zero - 1, None, problem.nothing_unseen(t0), no_pivot(t0))
     if problem.events is None:
         return start
     beyond = problem.events(t0, y0, problem.args) <= 0
