@@ -23,6 +23,9 @@ from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 
 
+MOST_CASES = 1024  # that are kept of one function
+
+
 @contextmanager
 def without_collecting() -> Iterator[None]:
     """Garbage collection off: what is built meanwhile is many small objects, nearly all of which stay, and looking through them takes a tenth of the time."""
@@ -58,6 +61,8 @@ def described_once(describe: Callable) -> Callable:
         leaves, treedef = jax.tree.flatten(scene)
         key = (treedef, tuple(np.shape(x) for x in leaves), jax.config.jax_enable_x64, case)
         if key not in known:
+            if len(known) >= MOST_CASES:
+                known.pop(next(iter(known)))  # the oldest
             known[key] = describe(scene, *case)
         return known[key]
 
