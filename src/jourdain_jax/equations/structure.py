@@ -22,6 +22,7 @@ from jourdain_jax.equations.probing import probed_once, without_collecting
 from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.sampling import assembled, random_states, symmetric_configurations
 from jourdain_jax.equations.scaling import speed_scales
+from jourdain_jax.equations.smoothness import check_smoothness
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import as_names
@@ -144,8 +145,8 @@ def structure_of(scene: Scene) -> Structure:
     """Static facts about a scene: rank of its rows, privileged velocities and their conditioning, kinds of rows; eqs. (25)-(31).
 
     Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers stand in for traced parameters.
-    ValueError where no admissible state is found, where a motion that the rows leave free has no inertia, or `privileged` names unknown or too few
-    speeds; for known parameters also where numbers of its bodies or planes cannot be.
+    ValueError where no admissible state is found, where bodies do not move smoothly, where a motion that the rows leave free has no inertia, or
+    `privileged` names unknown or too few speeds; for known parameters also where numbers of its bodies or planes cannot be.
     """
     with without_collecting():
         structure = _probed_structure(as_scene(scene))
@@ -162,6 +163,7 @@ def _probed_structure(scene: Scene) -> Structure:
     symmetric = symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
     found = _look(scene, t, q, u, -u[::-1])
+    check_smoothness(scene, found.q[:RANDOM_PROBES], u)
     generic = np.arange(len(t)) < RANDOM_PROBES
     on_rows = assembled(scene, found.miss, generic)
     faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
