@@ -25,7 +25,7 @@ from jourdain_jax.lowering.blame import blamed
 from jourdain_jax.lowering.elimination import serves
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.formal import equal
+from jourdain_jax.program.formal import FormalProbes, equal
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -306,8 +306,8 @@ def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expec
     used, here, regular = set(builder.graph.reachable(equations.ydot)), generic(equations.ydot), serves(equations.pivots, generic)
 
     def unchanged(group) -> bool:
-        shuffled = generic.with_inputs({f"q_{i}": np.roll(generic.inputs[f"q_{i}"], 1) for i in group})
-        return bool(np.all(equal(shuffled(equations.ydot), here, regular & serves(equations.pivots, shuffled))))
+        elsewhere = generic.exchanged([f"q_{i}" for i in group])
+        return bool(np.all(equal(elsewhere(equations.ydot), here, regular & serves(equations.pivots, elsewhere))))
 
     def regular_at_reference(group) -> bool:
         values = _values(accelerations, probes.with_inputs({f"q_{i}": np.full(probes.count, reference[i]) for i in group}))
@@ -325,7 +325,7 @@ def _operands(graph: Graph, call: int) -> list[int]:
     return [n for a in graph.args[call] if graph.op[a] == "array" for n in graph.args[a]]
 
 
-def _with_equal_calls_once(generic: Probes, outputs: list[int]) -> list[int]:
+def _with_equal_calls_once(generic: FormalProbes, outputs: list[int]) -> list[int]:
     """The outputs, with one call in place of those that compute the same of what is equal, though it is not written in the same way."""
     graph = generic.graph
     calls = sorted(graph.calls(outputs), key=lambda call: (graph.operations(graph.args[call]), call))  # so none is replaced by one made from it
