@@ -184,7 +184,7 @@ def _values(probes: Probes, nodes: np.ndarray | Iterable[int]) -> np.ndarray:
 
 def _still_moves(shift: np.ndarray, x: np.ndarray) -> np.ndarray:
     """At which states an iteration has not come to rest; where it is not a number it stays so."""
-    return np.max(np.abs(shift), axis=1) > 4 * np.finfo(float).eps * (1 + np.max(np.abs(x), axis=1))
+    return np.max(np.abs(shift), axis=1) > 4 * np.finfo(float).eps * np.max(np.abs(x), axis=1)
 
 
 def _inverse_root(M: np.ndarray) -> np.ndarray:

@@ -102,10 +102,15 @@ def _moves(rates) -> bool:
     return any(bool(np.any(np.isfinite(x) & (x != 0))) for x in jax.tree.leaves(rates))
 
 
-def _exceeds(difference: np.ndarray, tolerance: float, A: np.ndarray) -> bool:
-    """Whether any entry exceeds `tolerance (1 + max |A|)` at its state."""
-    size = 1 + np.max(np.abs(A), axis=(1, 2), initial=0.0)
-    return bool(np.any(np.max(np.abs(difference), axis=tuple(range(1, difference.ndim)), initial=0.0) > tolerance * size))
+def _exceeds(difference: np.ndarray, tolerance: float, size: np.ndarray) -> bool:
+    """Whether any entry exceeds `tolerance` times the size of its row, at its state or over all: rows may be stated in any unit."""
+    size = np.maximum(size, np.nanmedian(size, axis=0, keepdims=True)) if size.size else size
+    return bool(np.any(np.abs(difference) > tolerance * size))
+
+
+def _sizes(found: Probed) -> np.ndarray:
+    """The largest entry of every row, at every state."""
+    return np.max(np.abs(found.A), axis=2, initial=0.0)
 
 
 def _look(scene: Scene, *states) -> Probed:
@@ -124,21 +129,22 @@ def _looked_at_from_afar(scene: Scene, t, q, u, u_other) -> Probed:
     far = FAR * generator.uniform(size=FAR_PROBES), far_q, *(FAR * generator.uniform(-1, 1, (2, *u[:FAR_PROBES].shape)))
     found = probed(scene, *(np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True)))
     near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[: len(t)], np.s_[len(t) :]))
-    return replace(near, hidden=_seen(beyond))
+    return replace(near, hidden=_seen(beyond, far[2]))
 
 
-def _seen(found: Probed) -> frozenset[str]:
-    """What is other than zero at states far off, where it is more than round-off."""
-    limit = np.sqrt(np.finfo(found.A.dtype).eps)
-
-    def seen(rates) -> bool:
-        return any(bool(np.any(np.isfinite(x) & (np.abs(x) > FAR * limit))) for x in jax.tree.leaves(rates))
-
-    size = 1 + np.max(np.abs(found.A), axis=(1, 2), initial=0.0)[:, None]
-    vanishing = {"rows at rest": found.phi_at_rest / size, "motion at rest": found.motion_at_rest, "inertia": found.inertia_rates}
-    vanishing |= {"rows of inputs": found.row_rates_of_inputs, "nonlinear": (found.A - found.A_other) / size[..., None], **found.timed}
+def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
+    """What is other than zero at states far off; rows, where it is more than round-off."""
+    some = np.sqrt(np.finfo(found.A.dtype).eps)
+    vanishing = {"motion at rest": found.motion_at_rest, "inertia": found.inertia_rates, "rows of inputs": found.row_rates_of_inputs, **found.timed}
     vanishing |= {f"potential {k}": rate for k, rate in enumerate(found.potential_rates.T)}
-    return frozenset(name for name, rates in vanishing.items() if seen(rates))
+    rows = {"rows at rest"} if _exceeds(found.phi_at_rest, some, _speeds(found, u)) else set()
+    rows |= {"nonlinear"} if _exceeds(found.A - found.A_other, some, _sizes(found)[..., None]) else set()
+    return frozenset({name for name, rates in vanishing.items() if _moves(rates)} | rows)
+
+
+def _speeds(found: Probed, u: np.ndarray) -> np.ndarray:
+    """What the terms of every row amount to at the probed speeds."""
+    return np.einsum("srk,sk->sr", np.abs(found.A), np.abs(u))
 
 
 def structure_of(scene: Scene) -> Structure:
@@ -173,7 +179,7 @@ def _probed_structure(scene: Scene) -> Structure:
         finite = np.isfinite(scaled.A).all(axis=2)[on_rows].any(axis=0)
         named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "the rows together"
         faults = (f"rows {named} of `{type(scene).__name__}` are not finite at any probed state, expected numbers; check how they are computed",)
-    t, q, generic, found, scaled = jax.tree.map(lambda x: x[usable], (t, q, generic, found, scaled))
+    t, q, u, generic, found, scaled = jax.tree.map(lambda x: x[usable], (t, q, u, generic, found, scaled))
     ranks = [_rank(A) for A in scaled.A]
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     if not faults:  # a negative mass is named as such
@@ -193,9 +199,9 @@ def _probed_structure(scene: Scene) -> Structure:
         independent=independent,
         worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
         typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
-        affine="nonlinear" not in hidden and not _exceeds(found.A - found.A_other, np.sqrt(eps), found.A),
+        affine="nonlinear" not in hidden and not _exceeds(found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None]),
         # near round-off: work that turns out as zero does less harm than work left out
-        homogeneous="rows at rest" not in hidden and not _exceeds(found.phi_at_rest, 32 * eps, found.A),
+        homogeneous="rows at rest" not in hidden and not _exceeds(found.phi_at_rest, 32 * eps, _speeds(found, u)),
         timed=tuple(name for name in TIMED if name in hidden or _moves(found.timed[name])),
         driven="motion at rest" in hidden or _moves(found.motion_at_rest),
         varying_inertia="inertia" in hidden or _moves(found.inertia_rates),

@@ -39,8 +39,9 @@ MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
 LARGE = 5000  # operations: above, fewer ways are tried, and fewer probes compared with the dense path
 FEW = 6  # of these probes
-TO_DENSE = {"float64": 1e-8, "float32": 1e-3}  # between the program (in double precision) and the dense path at the probes, relative to the size of the rates
-AGREEMENT = 1e-9  # between programs at the probes, relative to the size of the rates
+TO_DENSE = {"float64": 1e-8, "float32": 1e-3}  # between the program (in double precision) and the dense path at the probes, relative to the size of each rate
+AGREEMENT = 1e-9  # between programs at the probes, relative to the size of each rate
+SHARED = 0.01  # of these, relative to the largest rate at a probe, whose round-off elimination spreads over all
 
 
 class NotLowered(Exception):
@@ -219,8 +220,7 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
     expected, values = np.concatenate(dense, axis=1).T, values[:, chosen]
     names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in independent)]
     usable = usable[chosen] & np.all(np.isfinite(expected), axis=0)
-    size = 1 + np.max(np.abs(expected[:, usable]), axis=0, initial=0.0)
-    error = np.max(np.abs(values - expected)[:, usable] / size, axis=1, initial=0.0)
+    error = np.max(np.abs(values - expected)[:, usable] / _sizes(expected[:, usable]), axis=1, initial=0.0)
     if not _enough(usable):
         raise NotLowered("its scalar program serves at too few of the probed states")
     limit = TO_DENSE[jnp.result_type(float).name]
@@ -287,8 +287,13 @@ def _values(found: Equations, probes: Probes) -> np.ndarray:
 def _agree(values: np.ndarray, expected: np.ndarray) -> bool:
     """Whether two programs agree wherever the second serves."""
     usable = np.all(np.isfinite(expected), axis=0)
-    size = 1 + np.max(np.abs(expected[:, usable]), axis=0, initial=0.0)
-    return bool(_enough(usable) and np.all(np.abs(values - expected)[:, usable] <= AGREEMENT * size))
+    return bool(_enough(usable) and np.all(np.abs(values - expected)[:, usable] <= AGREEMENT * _sizes(expected[:, usable])))
+
+
+def _sizes(rates: np.ndarray) -> np.ndarray:
+    """To which the errors of rates (first axis) at probes are related: the usual size of each, in its own unit."""
+    usual = np.max(np.abs(rates), axis=1, keepdims=True, initial=0.0)
+    return usual + SHARED * np.max(np.abs(rates), axis=0, initial=0.0) + np.finfo(float).tiny
 
 
 def _enough(usable: np.ndarray) -> bool:
@@ -311,7 +316,7 @@ def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expec
 
     def regular_at_reference(group) -> bool:
         values = _values(accelerations, probes.with_inputs({f"q_{i}": np.full(probes.count, reference[i]) for i in group}))
-        return _agree(values, np.where(np.isfinite(values), at_probes, np.nan))
+        return _enough(np.all(np.isfinite(values) & np.isfinite(at_probes), axis=0))
 
     held: list[int] = []
     for group in [*single, *attitudes]:

@@ -127,9 +127,10 @@ def on_rows(probes: FormalProbes, near: Probes, rows: Sequence[int], coordinates
         found = here(rows)
         values, J = np.nan_to_num(np.asarray(found)), np.nan_to_num(np.asarray(here(slopes))).reshape(len(moved), len(rows), -1)
         inverse = np.linalg.pinv(J.transpose(2, 1, 0), rcond=1e-9)
-        if turn < STEPS:
-            step = np.einsum("pqr,rp->qp", inverse, values)
-            q = q - step / np.maximum(1.0, np.max(np.abs(step), axis=0))
+        step = np.einsum("pqr,rp->qp", inverse, values)
+        if turn == STEPS or np.all(np.abs(step) <= EPS * np.max(np.abs(q), axis=0)):
+            break
+        q = q - step / np.maximum(1.0, np.max(np.abs(step), axis=0))
     errors = np.einsum("pqr,rp->qp", np.abs(inverse), np.abs(values) + found.error) + EPS * np.abs(q)
     errors[:, ~np.all(np.abs(values) <= CLOSED * found.error, axis=0)] = np.inf
     return probes.with_inputs(dict(zip(moved, q, strict=True)), dict(zip(moved, errors, strict=True)))
@@ -160,6 +161,11 @@ def _sum(x, y):
     both, half = x + y, len(x) // 2
     both[half:] += EPS * np.abs(both[:half])
     return both
+
+
+def _difference(x, y):
+    (a, ea), (b, eb) = _halves(x), _halves(y)
+    return _with(a - b, ea + eb)
 
 
 def _negative(x):
@@ -219,7 +225,7 @@ def _kept(call, *operands) -> np.ndarray:
 
 _SCALARS = {op: _generic(op) for op in FUNCTIONS} | {
     "add": _sum,
-    "sub": lambda x, y: _sum(x, _negative(y)),
+    "sub": _difference,
     "neg": _negative,
     "mul": _product,
     "div": _quotient,
