@@ -10,9 +10,10 @@ Nothing is compared with a fixed tolerance. With every value goes a bound of its
     a + b: e_a + e_b + eps |a + b|        a b: |a| e_b + |b| e_a + e_a e_b + eps |a b|        a/b: (e_a + |a/b| e_b)/(|b| - e_b) + eps |a/b|
 
 and two values are equal where they differ by no more. Numbers in the code of a scene may be far from one (1e-24, 1e16), and would hide or be hidden: they are
-replaced by |c|^alpha, alpha near 0.05 and another at every probe, which keeps what products and quotients of them have in common.
+written as c = m R^j, R = 2^40, with |m| between 2^-20 and 2^20, and R is drawn anew at every probe. What holds of any R holds of this one.
 """
 
+import math
 import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Self
@@ -27,8 +28,8 @@ from jourdain_jax.program.graph import Graph
 KNOWN = ("add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos", "tan")  # taken for what they are
 STEPS, CLOSED = 30, 1e3  # of Newton's method; bounds of round-off that rows may be off
 FAR = 10.0  # half of the probes lie so much further out
-MODERATE = 1e4  # numbers up to this, and down to its reciprocal, stay as they are
-EXPONENTS = 0.03, 0.07  # of the others
+DIGITS = 40  # binary ones, that numbers in the code of a scene may span among themselves
+RADIX = 1.5, 3.0  # in the place of 2^DIGITS
 EPS = float(np.finfo(float).eps)
 SURE = 16.0  # bounds of round-off that equal values may differ by: bounds are of first order
 LOST = 1e3  # bounds of round-off below which a divisor, or what a root is taken of, is not told from zero
@@ -48,9 +49,9 @@ class FormalProbes:
         self.graph, self.inputs, self._errors = graph, dict(inputs), dict(errors)
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
         both = {name: np.concatenate([np.broadcast_to(x, self.count), np.broadcast_to(self._errors.get(name, 0.0), self.count)]) for name, x in inputs.items()}
-        exponents = np.random.default_rng(4).uniform(*EXPONENTS, self.count)
+        radix = np.random.default_rng(4).uniform(*RADIX, self.count)
         # the bounds follow the values in one array, as if they were further probes
-        self._both = Probes(graph, both, _SCALARS, _ARRAYS, lambda value: _moderate(value, exponents))
+        self._both = Probes(graph, both, _SCALARS, _ARRAYS, lambda value: _moderate(value, radix))
 
     def __call__(self, nodes: Sequence[int]) -> Bounded:
         """Values, shape (nodes, probes)."""
@@ -136,12 +137,11 @@ def on_rows(probes: FormalProbes, near: Probes, rows: Sequence[int], coordinates
     return probes.with_inputs(dict(zip(moved, q, strict=True)), dict(zip(moved, errors, strict=True)))
 
 
-def _moderate(value: float, exponents: np.ndarray) -> np.ndarray:
-    """A number of the order of one in the place of another, and the bound of its round-off."""
-    if value == 0 or not np.isfinite(value) or 1 / MODERATE <= abs(value) <= MODERATE:
-        return np.concatenate([np.full_like(exponents, value), np.zeros_like(exponents)])
-    moderate = np.sign(value) * abs(value) ** exponents
-    return np.concatenate([moderate, 4 * EPS * np.abs(moderate)])
+def _moderate(value: float, radix: np.ndarray) -> np.ndarray:
+    """A number with R drawn anew, and the bound of its round-off."""
+    j = round(math.frexp(value)[1] / DIGITS) if math.isfinite(value) else 0
+    moderate = math.ldexp(value, -DIGITS * j) * radix**j
+    return np.concatenate([moderate, (2 * abs(j)) * EPS * np.abs(moderate)])
 
 
 # Functions of values and bounds, which follow one another in an array. -----------------------------------------------
