@@ -17,7 +17,7 @@ from jaxtyping import Float
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.equations.plausibility import implausible
 from jourdain_jax.equations.probed import TIMED, Probed, probed
-from jourdain_jax.equations.probed_on_graph import probed_on_graph
+from jourdain_jax.equations.probed_on_graph import follow_from_others, probed_on_graph
 from jourdain_jax.equations.probing import probed_once, without_collecting
 from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.sampling import assembled, random_states, symmetric_configurations
@@ -45,6 +45,7 @@ class Structure:
     rank: int  # of the rows at generic states
     ranks: tuple[int, ...]  # at all probed states
     redundant_rows: tuple[str, ...]  # may be left out together: the others keep the rank at every probed state
+    may_set_in: tuple[str, ...]  # those of them that no identity makes follow from the others: they may not, where no probe lies
     rank_losses: tuple[str, ...]  # configurations among the probed ones with fewer independent rows, as text
     independent: tuple[int, ...]  # privileged speeds, chosen by the user or by conditioning
     worst_pivot: float  # smallest singular value of the scaled A_z over all probes
@@ -79,7 +80,7 @@ class Structure:
     @property
     def well_conditioned(self) -> bool:
         """Whether the privileged velocities serve everywhere in the domain."""
-        return self.worst_pivot >= WELL_CONDITIONED * min(1.0, LONG / max(self.rank, 1))
+        return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, LONG / max(self.rank, 1))
 
 
 class _Scaled(eqx.Module):
@@ -129,7 +130,7 @@ def _looked_at_from_afar(scene: Scene, t, q, u, u_other) -> Probed:
     far = FAR * generator.uniform(size=FAR_PROBES), far_q, *(FAR * generator.uniform(-1, 1, (2, *u[:FAR_PROBES].shape)))
     found = probed(scene, *(np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True)))
     near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[: len(t)], np.s_[len(t) :]))
-    return replace(near, hidden=_seen(beyond, far[2]))
+    return replace(near, hidden=_seen(beyond, far[2]) | {"rank"})  # which nothing proves
 
 
 def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
@@ -190,11 +191,13 @@ def _probed_structure(scene: Scene) -> Structure:
         independent, by_user = _choose(candidates, count, rank), False
     pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
     full_everywhere, eps, hidden = all(r == rank for r in ranks), np.finfo(found.A.dtype).eps, found.hidden
+    redundant = _redundant_rows(scaled.A, ranks, names)
     return Structure(
         row_names=names,
         rank=rank,
         ranks=tuple(ranks),
-        redundant_rows=_redundant_rows(scaled.A, ranks, names),
+        redundant_rows=redundant,
+        may_set_in=redundant if redundant and "rank" in hidden and not _follow(scene, t, found.q, u, [names.index(name) for name in redundant]) else (),
         rank_losses=tuple(_describe(scene, c) for c, r in zip(q, ranks, strict=True) if r < rank),
         independent=independent,
         worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
@@ -251,6 +254,14 @@ def _redundant_rows(scaled: np.ndarray, ranks: list[int], names: tuple[str, ...]
         if all(_rank(A[rest]) == r for A, r in zip(scaled, ranks, strict=True)):
             kept = rest
     return tuple(name for s, name in enumerate(names) if s not in kept)
+
+
+def _follow(scene: Scene, *state_and_rows) -> bool:
+    """Whether rows that follow from the others at the probes do so by an identity."""
+    try:
+        return follow_from_others(scene, *state_and_rows)
+    except Unsupported:
+        return False
 
 
 def _describe(scene: Scene, q: np.ndarray) -> str:

@@ -80,7 +80,7 @@ class _Key:
         self.scene, self.structure, self.every_speed = scene, structure, every_speed
         leaves, treedef = jax.tree.flatten(scene)
         kept = (every_speed, None if every_speed else structure.independent, structure.redundant_rows, structure.affine, structure.driven)
-        kept += (structure.homogeneous, structure.potentials_of_inputs)
+        kept += (structure.homogeneous, structure.potentials_of_inputs, structure.may_set_in)
         self.key = (treedef, tuple(np.shape(x) for x in leaves), kept, jnp.result_type(float))
 
     def __hash__(self):
@@ -104,6 +104,9 @@ def _built(key: _Key) -> Lowered:
     scene, structure = key.scene, key.structure
     if not (structure.affine or key.every_speed):
         raise NotLowered("its rows are nonlinear in the speeds")
+    if structure.may_set_in:
+        named = ", ".join(f"`{name}`" for name in structure.may_set_in)
+        raise NotLowered(f"rows {named} follow from the others at all probed states, but nothing says that they do elsewhere or later")
     try:
         return _with_calls_or_without(scene, structure, key.every_speed, begin)
     except Unsupported as reason:

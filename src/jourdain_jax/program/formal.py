@@ -94,6 +94,17 @@ def unaffected(probes: FormalProbes, nodes: list[int], replacement: Mapping[int,
     return {old: new for old, new in replacement.items() if unchanged(old, new)}
 
 
+def is_combination(a: np.ndarray, error: np.ndarray, rows: np.ndarray, errors: np.ndarray) -> bool:
+    """Whether the vectors `a`, shape (probes, entries), are combinations of the `rows`, shape (probes, rows, entries), at all probes that say something."""
+    said = np.isfinite(a).all(axis=1) & np.isfinite(error).all(axis=1) & np.isfinite(rows).all(axis=(1, 2)) & np.isfinite(errors).all(axis=(1, 2))
+    for v, e, B, E in zip(a[said], error[said], rows[said], errors[said], strict=True):
+        x = np.linalg.lstsq(B.T, v, rcond=None)[0]
+        size = np.linalg.norm(v) + np.abs(x) @ np.linalg.norm(B, axis=1)
+        if np.linalg.norm(v - x @ B) > SURE * (np.linalg.norm(e) + np.abs(x) @ np.linalg.norm(E, axis=1) + B.size * EPS * size):
+            return False
+    return int(np.count_nonzero(said)) >= FEWEST
+
+
 def formal(probes: Probes, unchanged: Collection[str]) -> FormalProbes:
     """Such probes for the graph of `probes`; inputs named in `unchanged` (the parts of quaternions, which have a norm) keep their values.
 
