@@ -82,6 +82,7 @@ from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, p
 from jourdain_jax.scene.motion_state import fixed_point
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.spline import Spline
 
 __version__ = _version_of("jourdain-jax")
 
@@ -116,6 +117,7 @@ __all__ = [
     "Scene",
     "SensitivityWarning",
     "SimulationError",
+    "Spline",
     "State",
     "SteadyMotion",
     "Trajectory",

@@ -6,7 +6,7 @@
 A scene is traced once for it, where JAX (`probed`) traces it a dozen times through nested transformations, which takes most of the time for large scenes.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +15,9 @@ import numpy as np
 from jourdain_jax.equations.probed import Probed, generic_inputs
 from jourdain_jax.equations.scaling import speed_scales
 from jourdain_jax.equations.trace import TracedScene, named_values, traced_scene
-from jourdain_jax.program.derivative import derivatives, jacobian
+from jourdain_jax.program.derivative import columns, derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.formal import formal, is_combination, on_rows
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.program.hiding import decided_by, depend_on, may_be_hidden
 from jourdain_jax.scene.scene import Scene
@@ -37,6 +38,26 @@ def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.
     """States put on the rows, as by `project_positions` and `project_speeds`, and how far they miss the geometric rows; `Unsupported` as above."""
     at = _AtStates(_traced(scene), scene, t, q, u, np.zeros(len(scene.inputs)))
     return at.real(at.q), at.real(at.speeds_on_rows()), at.real(at.miss)
+
+
+def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
+    """Whether these velocity rows are combinations of the others wherever positions meet the geometric rows, at generic parameters; states as above.
+
+    `(A_s, phi_s(0)) = x' (A_k, phi_k(0))`, the residual of least squares being no more than the round-off of either side. `Unsupported` as above.
+    """
+    at = _AtStates(_traced(scene), scene, t, q, u, generic_inputs(scene))
+    graph, traced, speeds = at.graph, at.traced, at.traced.u.tolist()
+    attitudes = {f"q_{first + i}": int(traced.q[first + i]) for first, _ in scene.coordinates.quaternions for i in range(4)}
+    generic = on_rows(
+        formal(at.values, attitudes), at.values, [*traced.at.closure.tolist(), *at.norms()], {f"q_{i}": n for i, n in enumerate(traced.q.tolist())}
+    )
+    at_rest = graph.substituted(traced.at.phi.tolist(), dict.fromkeys(speeds, graph.zero))
+    columns_of_rows = [*columns(graph, traced.at.phi.tolist(), speeds), at_rest]
+    found = generic([n for column in columns_of_rows for n in column])
+    shape = len(columns_of_rows), len(traced.at.phi), -1
+    A, E = (np.moveaxis(np.reshape(x, shape), (2, 1), (0, 1)) for x in (np.asarray(found), found.error))
+    kept = [s for s in range(len(traced.at.phi)) if s not in rows]
+    return all(is_combination(A[:, s], E[:, s], A[:, kept], E[:, kept]) for s in rows)
 
 
 def _traced(scene: Scene) -> TracedScene:
@@ -78,6 +99,7 @@ class _AtStates:
         row_rates = derivatives(g, at.phi.tolist(), changed)
         vanishing = {"rows at rest": at_rest[0], "motion at rest": at_rest[1], "inertia": inertia_rates, "rows of inputs": row_rates}
         vanishing |= {f"potential {k}": [rate] for k, rate in enumerate(potential_rates)} | timed
+        vanishing["rank"] = [*at_rest[0], *(node for row in by_speed[:rows] for node in row.values())]
         return Probed(
             q=self.real(self.q),
             miss=self.real(self.miss),
@@ -147,13 +169,15 @@ class _AtStates:
                 break
         return u
 
+    def norms(self) -> list[int]:
+        """Of quaternions, as rows."""
+        g, quaternions = self.graph, [self.traced.q[first : first + 4].tolist() for first, _ in self.scene.coordinates.quaternions]
+        return [g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)) for wxyz in quaternions]
+
     def _on_rows(self, q) -> tuple[np.ndarray, np.ndarray]:
         """Coordinates on geometric rows and unit norms, and how far they miss them; as `project_positions`."""
-        g, q = self.graph, np.array(q, float)
-        norms = []
+        g, q, norms = self.graph, np.array(q, float), self.norms()
         for first, _ in self.scene.coordinates.quaternions:
-            wxyz = self.traced.q[first : first + 4].tolist()
-            norms.append(g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)))
             if not self.traced.at.closure.size:
                 length = np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
                 q[:, first : first + 4] /= np.where(length == 0, 1.0, length)
@@ -184,7 +208,7 @@ def _values(probes: Probes, nodes: np.ndarray | Iterable[int]) -> np.ndarray:
 
 def _still_moves(shift: np.ndarray, x: np.ndarray) -> np.ndarray:
     """At which states an iteration has not come to rest; where it is not a number it stays so."""
-    return np.max(np.abs(shift), axis=1) > 4 * np.finfo(float).eps * (1 + np.max(np.abs(x), axis=1))
+    return np.max(np.abs(shift), axis=1) > 4 * np.finfo(float).eps * np.max(np.abs(x), axis=1)
 
 
 def _inverse_root(M: np.ndarray) -> np.ndarray:

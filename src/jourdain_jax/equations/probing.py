@@ -23,6 +23,9 @@ from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 
 
+MOST_CASES = 1024  # that are kept of one function
+
+
 @contextmanager
 def without_collecting() -> Iterator[None]:
     """Garbage collection off: what is built meanwhile is many small objects, nearly all of which stay, and looking through them takes a tenth of the time."""
@@ -58,6 +61,8 @@ def described_once(describe: Callable) -> Callable:
         leaves, treedef = jax.tree.flatten(scene)
         key = (treedef, tuple(np.shape(x) for x in leaves), jax.config.jax_enable_x64, case)
         if key not in known:
+            if len(known) >= MOST_CASES:
+                known.pop(next(iter(known)))  # the oldest
             known[key] = describe(scene, *case)
         return known[key]
 
@@ -136,7 +141,10 @@ def _generic(x, near, place: int) -> np.ndarray:
     except (TypeError, ValueError):  # no numbers, or as many of them as do not fit
         near = np.full(np.shape(x), np.nan)
     if not np.all(np.isfinite(near)):
-        return np.asarray(1.0 + 0.1 * draws, x.dtype)
+        return np.asarray(1.0 + 0.1 * (np.sort(draws) if draws.ndim == 1 else draws), x.dtype)  # knots of a table increase
+    if near.ndim == 1 and near.size > 1 and np.all(np.diff(near) > 0):
+        steps = np.diff(near, append=2 * near[-1] - near[-2])
+        return np.asarray(near + 0.01 * draws * steps, x.dtype)
     return np.asarray(np.where(near == 0, 0.1, near) * (1.0 + 0.01 * draws), x.dtype)
 
 

@@ -17,11 +17,12 @@ from jaxtyping import Float
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.equations.plausibility import implausible
 from jourdain_jax.equations.probed import TIMED, Probed, probed
-from jourdain_jax.equations.probed_on_graph import probed_on_graph
+from jourdain_jax.equations.probed_on_graph import follow_from_others, probed_on_graph
 from jourdain_jax.equations.probing import probed_once, without_collecting
 from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.sampling import assembled, random_states, symmetric_configurations
 from jourdain_jax.equations.scaling import speed_scales
+from jourdain_jax.equations.smoothness import check_smoothness
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import as_names
@@ -44,6 +45,7 @@ class Structure:
     rank: int  # of the rows at generic states
     ranks: tuple[int, ...]  # at all probed states
     redundant_rows: tuple[str, ...]  # may be left out together: the others keep the rank at every probed state
+    may_set_in: tuple[str, ...]  # those of them that no identity makes follow from the others: they may not, where no probe lies
     rank_losses: tuple[str, ...]  # configurations among the probed ones with fewer independent rows, as text
     independent: tuple[int, ...]  # privileged speeds, chosen by the user or by conditioning
     worst_pivot: float  # smallest singular value of the scaled A_z over all probes
@@ -78,7 +80,7 @@ class Structure:
     @property
     def well_conditioned(self) -> bool:
         """Whether the privileged velocities serve everywhere in the domain."""
-        return self.worst_pivot >= WELL_CONDITIONED * min(1.0, LONG / max(self.rank, 1))
+        return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, LONG / max(self.rank, 1))
 
 
 class _Scaled(eqx.Module):
@@ -101,10 +103,15 @@ def _moves(rates) -> bool:
     return any(bool(np.any(np.isfinite(x) & (x != 0))) for x in jax.tree.leaves(rates))
 
 
-def _exceeds(difference: np.ndarray, tolerance: float, A: np.ndarray) -> bool:
-    """Whether any entry exceeds `tolerance (1 + max |A|)` at its state."""
-    size = 1 + np.max(np.abs(A), axis=(1, 2), initial=0.0)
-    return bool(np.any(np.max(np.abs(difference), axis=tuple(range(1, difference.ndim)), initial=0.0) > tolerance * size))
+def _exceeds(difference: np.ndarray, tolerance: float, size: np.ndarray) -> bool:
+    """Whether any entry exceeds `tolerance` times the size of its row, at its state or over all: rows may be stated in any unit."""
+    size = np.maximum(size, np.nanmedian(size, axis=0, keepdims=True)) if size.size else size
+    return bool(np.any(np.abs(difference) > tolerance * size))
+
+
+def _sizes(found: Probed) -> np.ndarray:
+    """The largest entry of every row, at every state."""
+    return np.max(np.abs(found.A), axis=2, initial=0.0)
 
 
 def _look(scene: Scene, *states) -> Probed:
@@ -123,29 +130,30 @@ def _looked_at_from_afar(scene: Scene, t, q, u, u_other) -> Probed:
     far = FAR * generator.uniform(size=FAR_PROBES), far_q, *(FAR * generator.uniform(-1, 1, (2, *u[:FAR_PROBES].shape)))
     found = probed(scene, *(np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True)))
     near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[: len(t)], np.s_[len(t) :]))
-    return replace(near, hidden=_seen(beyond))
+    return replace(near, hidden=_seen(beyond, far[2]) | {"rank"})  # which nothing proves
 
 
-def _seen(found: Probed) -> frozenset[str]:
-    """What is other than zero at states far off, where it is more than round-off."""
-    limit = np.sqrt(np.finfo(found.A.dtype).eps)
-
-    def seen(rates) -> bool:
-        return any(bool(np.any(np.isfinite(x) & (np.abs(x) > FAR * limit))) for x in jax.tree.leaves(rates))
-
-    size = 1 + np.max(np.abs(found.A), axis=(1, 2), initial=0.0)[:, None]
-    vanishing = {"rows at rest": found.phi_at_rest / size, "motion at rest": found.motion_at_rest, "inertia": found.inertia_rates}
-    vanishing |= {"rows of inputs": found.row_rates_of_inputs, "nonlinear": (found.A - found.A_other) / size[..., None], **found.timed}
+def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
+    """What is other than zero at states far off; rows, where it is more than round-off."""
+    some = np.sqrt(np.finfo(found.A.dtype).eps)
+    vanishing = {"motion at rest": found.motion_at_rest, "inertia": found.inertia_rates, "rows of inputs": found.row_rates_of_inputs, **found.timed}
     vanishing |= {f"potential {k}": rate for k, rate in enumerate(found.potential_rates.T)}
-    return frozenset(name for name, rates in vanishing.items() if seen(rates))
+    rows = {"rows at rest"} if _exceeds(found.phi_at_rest, some, _speeds(found, u)) else set()
+    rows |= {"nonlinear"} if _exceeds(found.A - found.A_other, some, _sizes(found)[..., None]) else set()
+    return frozenset({name for name, rates in vanishing.items() if _moves(rates)} | rows)
+
+
+def _speeds(found: Probed, u: np.ndarray) -> np.ndarray:
+    """What the terms of every row amount to at the probed speeds."""
+    return np.einsum("srk,sk->sr", np.abs(found.A), np.abs(u))
 
 
 def structure_of(scene: Scene) -> Structure:
     """Static facts about a scene: rank of its rows, privileged velocities and their conditioning, kinds of rows; eqs. (25)-(31).
 
     Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers stand in for traced parameters.
-    ValueError where no admissible state is found, where a motion that the rows leave free has no inertia, or `privileged` names unknown or too few
-    speeds; for known parameters also where numbers of its bodies or planes cannot be.
+    ValueError where no admissible state is found, where bodies do not move smoothly, where a motion that the rows leave free has no inertia, or
+    `privileged` names unknown or too few speeds; for known parameters also where numbers of its bodies or planes cannot be.
     """
     with without_collecting():
         structure = _probed_structure(as_scene(scene))
@@ -162,6 +170,7 @@ def _probed_structure(scene: Scene) -> Structure:
     symmetric = symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
     found = _look(scene, t, q, u, -u[::-1])
+    check_smoothness(scene, found.q[:RANDOM_PROBES], u)
     generic = np.arange(len(t)) < RANDOM_PROBES
     on_rows = assembled(scene, found.miss, generic)
     faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
@@ -171,7 +180,7 @@ def _probed_structure(scene: Scene) -> Structure:
         finite = np.isfinite(scaled.A).all(axis=2)[on_rows].any(axis=0)
         named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "the rows together"
         faults = (f"rows {named} of `{type(scene).__name__}` are not finite at any probed state, expected numbers; check how they are computed",)
-    t, q, generic, found, scaled = jax.tree.map(lambda x: x[usable], (t, q, generic, found, scaled))
+    t, q, u, generic, found, scaled = jax.tree.map(lambda x: x[usable], (t, q, u, generic, found, scaled))
     ranks = [_rank(A) for A in scaled.A]
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     if not faults:  # a negative mass is named as such
@@ -182,18 +191,20 @@ def _probed_structure(scene: Scene) -> Structure:
         independent, by_user = _choose(candidates, count, rank), False
     pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
     full_everywhere, eps, hidden = all(r == rank for r in ranks), np.finfo(found.A.dtype).eps, found.hidden
+    redundant = _redundant_rows(scaled.A, ranks, names)
     return Structure(
         row_names=names,
         rank=rank,
         ranks=tuple(ranks),
-        redundant_rows=_redundant_rows(scaled.A, ranks, names),
+        redundant_rows=redundant,
+        may_set_in=redundant if redundant and "rank" in hidden and not _follow(scene, t, found.q, u, [names.index(name) for name in redundant]) else (),
         rank_losses=tuple(_describe(scene, c) for c, r in zip(q, ranks, strict=True) if r < rank),
         independent=independent,
         worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
         typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
-        affine="nonlinear" not in hidden and not _exceeds(found.A - found.A_other, np.sqrt(eps), found.A),
+        affine="nonlinear" not in hidden and not _exceeds(found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None]),
         # near round-off: work that turns out as zero does less harm than work left out
-        homogeneous="rows at rest" not in hidden and not _exceeds(found.phi_at_rest, 32 * eps, found.A),
+        homogeneous="rows at rest" not in hidden and not _exceeds(found.phi_at_rest, 32 * eps, _speeds(found, u)),
         timed=tuple(name for name in TIMED if name in hidden or _moves(found.timed[name])),
         driven="motion at rest" in hidden or _moves(found.motion_at_rest),
         varying_inertia="inertia" in hidden or _moves(found.inertia_rates),
@@ -243,6 +254,14 @@ def _redundant_rows(scaled: np.ndarray, ranks: list[int], names: tuple[str, ...]
         if all(_rank(A[rest]) == r for A, r in zip(scaled, ranks, strict=True)):
             kept = rest
     return tuple(name for s, name in enumerate(names) if s not in kept)
+
+
+def _follow(scene: Scene, *state_and_rows) -> bool:
+    """Whether rows that follow from the others at the probes do so by an identity."""
+    try:
+        return follow_from_others(scene, *state_and_rows)
+    except Unsupported:
+        return False
 
 
 def _describe(scene: Scene, q: np.ndarray) -> str:

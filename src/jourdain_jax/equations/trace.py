@@ -143,6 +143,11 @@ def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = (), calls: bool = Tr
     raise first
 
 
+def jaxpr_of_scene(scene: Scene):
+    """A jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u and inputs, and their shapes; `Unsupported` as above."""
+    return _traced(scene, (), True)
+
+
 @described_once
 def _traced(scene: Scene, of_inputs: tuple[int, ...], with_events: bool):
     """A jaxpr of the scene's quantities, and their shapes."""

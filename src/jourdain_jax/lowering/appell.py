@@ -20,7 +20,7 @@ from jourdain_jax.lowering.elimination import eliminate, serves, solve_symmetric
 from jourdain_jax.lowering.multipliers import accelerations_by_multipliers, projected_coordinates, projected_speeds
 from jourdain_jax.program.derivative import along, columns, derivatives
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.formal import equal, formal, on_rows, unaffected
+from jourdain_jax.program.formal import FormalProbes, equal, formal, on_rows, unaffected
 from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
 
 SMALL_SINE = 0.02  # of the angle between rows: where it is smaller at some probe, the program watches it at every evaluation
@@ -81,7 +81,7 @@ class AppellOnGraph:
         self.reference, self.quaternions = reference, quaternions
         self.formal = self._formal()
 
-    def _formal(self) -> Probes:
+    def _formal(self) -> FormalProbes:
         """Generic states on the geometric rows, at generic parameters."""
         g, q = self.graph, self.traced.q.tolist()
         attitudes = {f"q_{first + i}": q[first + i] for first in self.quaternions for i in range(4)}

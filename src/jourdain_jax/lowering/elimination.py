@@ -16,6 +16,7 @@ from jaxtyping import Bool
 
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.formal import FormalProbes
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.polynomial import NormalForms
 
@@ -42,7 +43,7 @@ class Pivot:
     determinant: int
 
 
-def serves(pivots: list[int], probes: Probes) -> Bool[np.ndarray, "probes"]:
+def serves(pivots: list[int], probes: Probes | FormalProbes) -> Bool[np.ndarray, "probes"]:
     """At which probes what was divided by these pivots is more than round-off: none of them is small beside its usual size."""
     sizes = np.abs(probes(pivots))
     return np.all(sizes > SMALLEST_PIVOT * np.nanmedian(sizes, axis=1, keepdims=True), axis=0)

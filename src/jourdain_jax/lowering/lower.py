@@ -25,7 +25,7 @@ from jourdain_jax.lowering.blame import blamed
 from jourdain_jax.lowering.elimination import serves
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.formal import equal
+from jourdain_jax.program.formal import FormalProbes, equal
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -39,8 +39,9 @@ MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
 LARGE = 5000  # operations: above, fewer ways are tried, and fewer probes compared with the dense path
 FEW = 6  # of these probes
-TO_DENSE = {"float64": 1e-8, "float32": 1e-3}  # between the program (in double precision) and the dense path at the probes, relative to the size of the rates
-AGREEMENT = 1e-9  # between programs at the probes, relative to the size of the rates
+TO_DENSE = {"float64": 1e-8, "float32": 1e-3}  # between the program (in double precision) and the dense path at the probes, relative to the size of each rate
+AGREEMENT = 1e-9  # between programs at the probes, relative to the size of each rate
+SHARED = 0.01  # of these, relative to the largest rate at a probe, whose round-off elimination spreads over all
 
 
 class NotLowered(Exception):
@@ -79,7 +80,7 @@ class _Key:
         self.scene, self.structure, self.every_speed = scene, structure, every_speed
         leaves, treedef = jax.tree.flatten(scene)
         kept = (every_speed, None if every_speed else structure.independent, structure.redundant_rows, structure.affine, structure.driven)
-        kept += (structure.homogeneous, structure.potentials_of_inputs)
+        kept += (structure.homogeneous, structure.potentials_of_inputs, structure.may_set_in)
         self.key = (treedef, tuple(np.shape(x) for x in leaves), kept, jnp.result_type(float))
 
     def __hash__(self):
@@ -103,6 +104,9 @@ def _built(key: _Key) -> Lowered:
     scene, structure = key.scene, key.structure
     if not (structure.affine or key.every_speed):
         raise NotLowered("its rows are nonlinear in the speeds")
+    if structure.may_set_in:
+        named = ", ".join(f"`{name}`" for name in structure.may_set_in)
+        raise NotLowered(f"rows {named} follow from the others at all probed states, but nothing says that they do elsewhere or later")
     try:
         return _with_calls_or_without(scene, structure, key.every_speed, begin)
     except Unsupported as reason:
@@ -219,8 +223,7 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
     expected, values = np.concatenate(dense, axis=1).T, values[:, chosen]
     names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in independent)]
     usable = usable[chosen] & np.all(np.isfinite(expected), axis=0)
-    size = 1 + np.max(np.abs(expected[:, usable]), axis=0, initial=0.0)
-    error = np.max(np.abs(values - expected)[:, usable] / size, axis=1, initial=0.0)
+    error = np.max(np.abs(values - expected)[:, usable] / _sizes(expected[:, usable]), axis=1, initial=0.0)
     if not _enough(usable):
         raise NotLowered("its scalar program serves at too few of the probed states")
     limit = TO_DENSE[jnp.result_type(float).name]
@@ -287,8 +290,13 @@ def _values(found: Equations, probes: Probes) -> np.ndarray:
 def _agree(values: np.ndarray, expected: np.ndarray) -> bool:
     """Whether two programs agree wherever the second serves."""
     usable = np.all(np.isfinite(expected), axis=0)
-    size = 1 + np.max(np.abs(expected[:, usable]), axis=0, initial=0.0)
-    return bool(_enough(usable) and np.all(np.abs(values - expected)[:, usable] <= AGREEMENT * size))
+    return bool(_enough(usable) and np.all(np.abs(values - expected)[:, usable] <= AGREEMENT * _sizes(expected[:, usable])))
+
+
+def _sizes(rates: np.ndarray) -> np.ndarray:
+    """To which the errors of rates (first axis) at probes are related: the usual size of each, in its own unit."""
+    usual = np.max(np.abs(rates), axis=1, keepdims=True, initial=0.0)
+    return usual + SHARED * np.max(np.abs(rates), axis=0, initial=0.0) + np.finfo(float).tiny
 
 
 def _enough(usable: np.ndarray) -> bool:
@@ -306,12 +314,12 @@ def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expec
     used, here, regular = set(builder.graph.reachable(equations.ydot)), generic(equations.ydot), serves(equations.pivots, generic)
 
     def unchanged(group) -> bool:
-        shuffled = generic.with_inputs({f"q_{i}": np.roll(generic.inputs[f"q_{i}"], 1) for i in group})
-        return bool(np.all(equal(shuffled(equations.ydot), here, regular & serves(equations.pivots, shuffled))))
+        elsewhere = generic.exchanged([f"q_{i}" for i in group])
+        return bool(np.all(equal(elsewhere(equations.ydot), here, regular & serves(equations.pivots, elsewhere))))
 
     def regular_at_reference(group) -> bool:
         values = _values(accelerations, probes.with_inputs({f"q_{i}": np.full(probes.count, reference[i]) for i in group}))
-        return _agree(values, np.where(np.isfinite(values), at_probes, np.nan))
+        return _enough(np.all(np.isfinite(values) & np.isfinite(at_probes), axis=0))
 
     held: list[int] = []
     for group in [*single, *attitudes]:
@@ -325,7 +333,7 @@ def _operands(graph: Graph, call: int) -> list[int]:
     return [n for a in graph.args[call] if graph.op[a] == "array" for n in graph.args[a]]
 
 
-def _with_equal_calls_once(generic: Probes, outputs: list[int]) -> list[int]:
+def _with_equal_calls_once(generic: FormalProbes, outputs: list[int]) -> list[int]:
     """The outputs, with one call in place of those that compute the same of what is equal, though it is not written in the same way."""
     graph = generic.graph
     calls = sorted(graph.calls(outputs), key=lambda call: (graph.operations(graph.args[call]), call))  # so none is replaced by one made from it

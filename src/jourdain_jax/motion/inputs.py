@@ -13,6 +13,7 @@ from jourdain_jax.scene.arguments import ChangingInputs
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.what_is_read import WhatIsRead, is_function, is_read_by
 
 
 class Sampled(eqx.Module):
@@ -54,6 +55,11 @@ class FunctionOfTime(eqx.Module):
     """An input as a given function of time: no numbers of its own, so that motions with it can be batched."""
 
     function: Callable = eqx.field(static=True)
+    read: WhatIsRead  # globals and closures: a change of them makes another input
+
+    def __init__(self, function: Callable):
+        self.function = function
+        self.read = is_read_by(function) if is_function(function) else is_read_by()
 
     def __call__(self, t):
         """Value at time t."""

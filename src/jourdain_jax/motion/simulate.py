@@ -213,6 +213,9 @@ def state_form(
         raise ValueError(f"unknown state form `{state}`; {nearest(str(state), _STATE_FORMS)}")
     if state == "minimal" and not structure.affine:
         raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use state='full'")
+    if state == "minimal" and structure.may_set_in:
+        named = ", ".join(f"`{name}`" for name in structure.may_set_in)
+        raise ValueError(f"rows {named} of `{type(scene).__name__}` may set in where they do not follow from the others; use state='full'")
     minimal = state == "minimal" or (state == "auto" and structure.affine and structure.well_conditioned)
     independent = structure.independent if minimal else None
     with_work = work and needs_work(scene, structure)

@@ -13,9 +13,14 @@ class Probes:
     """Values of the nodes of a graph at sample inputs; what was computed once is kept."""
 
     def __init__(
-        self, graph: Graph, inputs: Mapping[str, np.ndarray], functions: Mapping[str, Callable] = FUNCTIONS, arrays: Mapping[str, Callable] = AT_PROBES
+        self,
+        graph: Graph,
+        inputs: Mapping[str, np.ndarray],
+        functions: Mapping[str, Callable] = FUNCTIONS,
+        arrays: Mapping[str, Callable] = AT_PROBES,
+        constant: Callable = float,
     ):
-        self.graph, self.inputs, self._functions, self._of_arrays = graph, dict(inputs), functions, arrays
+        self.graph, self.inputs, self._functions, self._of_arrays, self._constant = graph, dict(inputs), functions, arrays, constant
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
         self._row: dict[int, int] = {}  # of the table, by node
         self._table = np.empty((256, self.count))
@@ -29,7 +34,7 @@ class Probes:
 
     def with_inputs(self, changes: Mapping[str, np.ndarray]) -> "Probes":
         """The same probes with some inputs changed."""
-        return Probes(self.graph, self.inputs | dict(changes), self._functions, self._of_arrays)
+        return Probes(self.graph, self.inputs | dict(changes), self._functions, self._of_arrays, self._constant)
 
     def sign(self, node: int) -> int:
         """1 or -1 where the node has this sign at every probe, 0 otherwise."""
@@ -54,7 +59,7 @@ class Probes:
                 elif op == "entry":
                     table[place] = self._of_arrays[op](graph.value[node], self._arrays[graph.args[node][0]])
                 elif op == "const":
-                    table[place] = graph.value[node]
+                    table[place] = self._constant(graph.value[node])
                 elif op == "input":
                     table[place] = self.inputs[graph.value[node]]
                 else:

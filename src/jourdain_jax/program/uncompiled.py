@@ -3,8 +3,10 @@
 Primitives without a rule here run one by one in JAX, which compiles each: tens of milliseconds.
 """
 
+import os
 from collections.abc import Callable
 from functools import lru_cache, wraps
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,9 @@ from jax.extend.core import Literal
 
 from jourdain_jax.program.entrywise import FUNCTIONS
 from jourdain_jax.program.indexing import gathered, scattered
+
+MOST_TURNS = 5000  # of a loop that states none: more of them are for ever
+_NOT_THE_USERS = (str(Path(__file__).parents[1]), f"{os.sep}site-packages{os.sep}")
 
 
 def uncompiled(f: Callable) -> Callable:
@@ -55,6 +60,8 @@ def _closed(inner, inputs):
 
 def _apply(equation, inputs) -> list[np.ndarray]:
     name, params = equation.primitive.name, equation.params
+    if name == "while":
+        return _while(equation, inputs)
     if name in _CONTROL:
         return _CONTROL[name](params, inputs)
     if name in _ENTRYWISE:
@@ -94,15 +101,34 @@ def _equal(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
     return len(a) == len(b) and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 
 
-def _while(params, inputs) -> list[np.ndarray]:
+def _while(equation, inputs) -> list[np.ndarray]:
+    params = equation.params
     a, b = params["cond_nconsts"], params["body_nconsts"]
     of_condition, of_body, carry = inputs[:a], inputs[a : a + b], inputs[a + b :]
-    while True:
+    for _ in range(MOST_TURNS):
         going = np.asarray(_closed(params["cond_jaxpr"], [*of_condition, *carry])[0])
         if not np.any(going):
             return carry
         new = _closed(params["body_jaxpr"], [*of_body, *carry])
         carry = new if going.ndim == 0 else [np.where(going.reshape(going.shape + (1,) * (n.ndim - going.ndim)), n, o) for n, o in zip(new, carry, strict=True)]
+    if np.all(going):
+        raise ValueError(
+            f"a `while_loop` in {_where(equation)} does not end: it still turned after {MOST_TURNS} times; give it a count of turns at most, "
+            "such as `lambda state: (state[0] < 50) & ...`, and check what it waits for"
+        )
+    # where some lanes have ended, what the others would have found is not known
+    return [
+        np.where(going.reshape(going.shape + (1,) * (x.ndim - going.ndim)), np.nan, x).astype(x.dtype) if x.dtype.kind == "f" else x for x in carry
+    ]
+
+
+def _where(equation) -> str:
+    """The function of the user's that an equation comes from."""
+    traceback = equation.source_info.traceback
+    for frame in traceback.frames if traceback is not None else ():
+        if not any(part in frame.file_name for part in _NOT_THE_USERS):
+            return f"`{frame.function_name.rpartition('.')[2]}` (line {frame.line_num} of {os.path.basename(frame.file_name)})"
+    return "a function of the scene"
 
 
 def _cond(params, inputs) -> list[np.ndarray]:
@@ -122,7 +148,6 @@ def _call(key: str) -> Callable:
 
 _CONTROL: dict[str, Callable] = {
     "scan": _scan,
-    "while": _while,
     "cond": _cond,
     "jit": _call("jaxpr"),
     "pjit": _call("jaxpr"),

@@ -8,12 +8,18 @@ import equinox as eqx
 import jax
 
 from jourdain_jax.scene.numbers import described
+from jourdain_jax.scene.what_is_read import WhatIsRead, is_function, is_read_by
 
 
 class HeldFunction(eqx.Module):
     """A function that JAX takes for part of the structure of the scene, as it takes a static field."""
 
     function: Callable[..., Any] = eqx.field(static=True)
+    read: WhatIsRead
+
+    def __init__(self, function: Callable[..., Any]):
+        self.function = function
+        self.read = is_read_by(function) if is_function(function) else is_read_by()
 
     def __call__(self, *args, **kwargs):
         """What the function returns."""
@@ -26,8 +32,10 @@ def hold_functions(scene) -> None:
     def held(leaf):
         return HeldFunction(leaf) if callable(leaf) else leaf
 
+    static = tuple(value for field in fields(scene) if field.metadata.get("static") and is_function(value := getattr(scene, field.name)))
+    object.__setattr__(scene, "read_by_methods", is_read_by(type(scene), *static))
     for field in fields(scene):
-        if field.metadata.get("static") or field.metadata.get("parameter"):
+        if field.metadata.get("static") or field.metadata.get("parameter") or not field.init:
             continue
         value = getattr(scene, field.name)
         leaves = jax.tree.leaves(value)

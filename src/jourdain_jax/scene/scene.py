@@ -21,6 +21,7 @@ from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
 from jourdain_jax.scene.numbers import checked_real
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
+from jourdain_jax.scene.what_is_read import WhatIsRead, is_read_by
 
 
 class Scene(eqx.Module):
@@ -45,11 +46,14 @@ class Scene(eqx.Module):
     conventions: ClassVar[str] = "SI units, radians; right-handed inertial frame, z up."
     example: ClassVar[dict[str, float]] = {}
     example_span: ClassVar[float] = 5.0
+    read_by_methods: WhatIsRead = eqx.field(init=False, repr=False)  # globals, closures, attributes of the class: a change of them makes another scene
 
     def __new__(cls, *args, **kwargs):
         """Before any field is set: the arguments are parameters of the scene."""
         checked_arguments(cls, kwargs)
-        return super().__new__(cls)
+        scene = super().__new__(cls)
+        object.__setattr__(scene, "read_by_methods", is_read_by(cls))  # functions in fields come to it when they are known
+        return scene
 
     def __check_init__(self):
         if not isinstance(getattr(self, "coordinates", None), Coordinates):

@@ -1,0 +1,83 @@
+"""A smooth curve through samples: a cubic spline, for poses and prescribed coordinates that are known at some times only.
+
+On [t_k, t_k+1], of length h, with a = (t_k+1 - t)/h, b = 1 - a and the second derivatives m_k at the knots (Press et al., Numerical Recipes, 3.3):
+
+    s(t) = a v_k + b v_k+1 + ((a^3 - a) m_k + (b^3 - b) m_k+1) h^2/6
+    h_k-1 m_k-1 + 2 (h_k-1 + h_k) m_k + h_k m_k+1 = 6 ((v_k+1 - v_k)/h_k - (v_k - v_k-1)/h_k-1)
+
+with the third derivative continuous at the second and the last but one knot ("not a knot"). A piecewise linear curve has no second derivative but at its
+knots, where no integrator looks: what is moved along it exerts no force of inertia.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.scene.numbers import checked_real, described, is_traced
+
+
+class Spline(eqx.Module):
+    """A twice continuously differentiable function of time through `values` at the times `ts`; beyond the ends it goes on along its tangents.
+
+        class Cart(jj.Scene):
+            ...
+            drive: jj.Spline                                 # jj.Spline(ts, positions)
+
+            def prescribed(self, t):
+                return {"x": self.drive(t)}
+
+    **Arguments**
+    - `ts`: knots, s, increasing; `values`: one number per knot. Two of them give a line, three a parabola, more a cubic spline.
+
+    It is differentiable with respect to `values` and `ts`, and serves as a field of a scene, inside its methods, and as an input. Between samples of a
+    smooth motion at distances h its error is of order h^4. **Raises** ValueError for other shapes, times that do not increase, numbers that are not finite.
+    """
+
+    ts: Float[Array, "samples"]  # s
+    values: Float[Array, "samples"]
+
+    def __init__(self, ts, values):
+        self.ts = checked_real(ts, "`ts` of `Spline`", advice="give times in s")
+        self.values = checked_real(values, "`values` of `Spline`", advice="give one number per time")
+        if self.ts.ndim != 1 or self.ts.shape[0] < 2 or self.values.shape != self.ts.shape:
+            raise ValueError(
+                f"`Spline` was given times of shape {self.ts.shape} and values of shape {self.values.shape}, expected two vectors of one length, at least 2; "
+                "give one value per time, and one `Spline` per coordinate"
+            )
+        if not is_traced(self.ts) and not (np.all(np.isfinite(self.ts)) and np.all(np.diff(np.asarray(self.ts)) > 0)):
+            raise ValueError("the times of `Spline` must be finite and increase from one to the next; sort the samples by time and merge repeated ones")
+        if not is_traced(self.values) and not np.all(np.isfinite(self.values)):
+            first = int(np.argmin(np.isfinite(self.values)))
+            raise ValueError(f"value {first} of `Spline` is {float(self.values[first])}, expected finite numbers; leave samples out that were not measured")
+
+    def __call__(self, t):
+        """Value at time t (s)."""
+        return smooth_through_samples(jnp.asarray(t, jnp.result_type(float)), self.ts, self.values)
+
+
+@jax.jit  # so that its name stands in what JAX traces: it need not be looked at for kinks
+def smooth_through_samples(t, ts, values):
+    """The cubic spline through `values` at `ts`, at time(s) t."""
+    m, inside = _second_derivatives(ts, values), jnp.clip(t, ts[0], ts[-1])
+    k = jnp.clip(jnp.searchsorted(ts, inside, side="right") - 1, 0, ts.shape[0] - 2)
+    h, rise = ts[k + 1] - ts[k], values[k + 1] - values[k]
+    a, b = (ts[k + 1] - inside) / h, (inside - ts[k]) / h
+    value = a * values[k] + b * values[k + 1] + ((a**3 - a) * m[k] + (b**3 - b) * m[k + 1]) * h**2 / 6
+    slope = rise / h + ((3 * b**2 - 1) * m[k + 1] - (3 * a**2 - 1) * m[k]) * h / 6
+    return value + slope * (t - inside)
+
+
+def _second_derivatives(ts, values) -> Float[Array, "samples"]:
+    h = jnp.diff(ts)
+    bends = 6 * jnp.diff(jnp.diff(values) / h)
+    if bends.shape[0] == 0:
+        return jnp.zeros_like(values)
+    if bends.shape[0] == 1:  # a parabola
+        return jnp.broadcast_to(bends / (3 * (h[0] + h[1])), values.shape)
+    first, last = h[0] / h[1], h[-1] / h[-2]  # m_0 = (1 + first) m_1 - first m_2, and so at the other end
+    middle = (2 * (h[:-1] + h[1:])).at[0].add(h[0] * (1 + first)).at[-1].add(h[-1] * (1 + last))
+    below, above = h[:-1].at[0].set(0.0).at[-1].add(-h[-1] * last), h[1:].at[-1].set(0.0).at[0].add(-h[0] * first)
+    m = jax.lax.linalg.tridiagonal_solve(below, middle, above, bends[:, None])[:, 0]
+    return jnp.concatenate([(1 + first) * m[:1] - first * m[1:2], m, (1 + last) * m[-1:] - last * m[-2:-1]])

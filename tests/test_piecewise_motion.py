@@ -1,0 +1,213 @@
+"""What moves along samples exerts a force of inertia, or is refused: a piecewise linear motion has no second derivative where anyone looks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+TS = np.linspace(0.0, 2.0, 401)
+DRIVE = 0.1 * np.sin(3.0 * TS)
+LENGTH, GRAVITY = 1.0, 9.81
+
+
+def bob(x, angle):
+    return jj.Particle(1.0, jnp.stack([x + LENGTH * jnp.sin(angle), 0.0 * angle, -LENGTH * jnp.cos(angle)]))
+
+
+class Driven(jj.Scene):
+    """A pendulum on a cart that follows a curve; the curve is in the pose."""
+
+    coordinates = jj.coordinates("angle")
+    curve: object = None
+
+    def bodies(self, t, q):
+        return {"bob": bob(self.curve(t), q.angle)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, GRAVITY),)
+
+
+class Prescribed(Driven):
+    """The curve drives a coordinate."""
+
+    coordinates = jj.coordinates("x angle")
+
+    def bodies(self, t, q):
+        return {"bob": bob(q.x, q.angle), "cart": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def prescribed(self, t):
+        return {"x": self.curve(t)}
+
+
+class InGeometry(Prescribed):
+    """The curve stands in a geometric row."""
+
+    def prescribed(self, t):
+        return {}
+
+    def geometric_constraints(self, pose):
+        return {"rail": pose.q.x - self.curve(pose.t)}
+
+
+def ladder(t):
+    return jnp.where(t < 0.4, 0.1 * t, jnp.where(t < 0.9, 0.04 + 0.3 * (t - 0.4), 0.19 - 0.1 * (t - 0.9)))
+
+
+def gathered(t):
+    k = jnp.clip(jnp.searchsorted(jnp.asarray(TS), t) - 1, 0, len(TS) - 2)
+    h = TS[1] - TS[0]
+    return jnp.asarray(DRIVE)[k] + (t - jnp.asarray(TS)[k]) / h * (jnp.asarray(DRIVE)[k + 1] - jnp.asarray(DRIVE)[k])
+
+
+KINKED = {
+    "jnp.interp": lambda t: jnp.interp(t, jnp.asarray(TS), jnp.asarray(DRIVE)),
+    "few samples": lambda t: jnp.interp(t, jnp.array([0.0, 1.3, 2.0]), jnp.array([0.0, 1.0, 1.2])),
+    "a ladder of branches": ladder,
+    "jnp.piecewise": lambda t: jnp.piecewise(t, [t < 0.5, t >= 0.5], [lambda t: 0.2 * t, lambda t: 0.3 - 0.4 * t]),
+    "a gather": gathered,
+    "steps": lambda t: 0.01 * jnp.floor(20.0 * t),
+    "rounded": lambda t: jnp.round(5.0 * t) / 50.0,
+    "a saw": lambda t: 0.1 * jnp.mod(t, 0.7),
+    "a triangle": lambda t: 0.1 * jnp.abs(jnp.mod(t, 0.5) - 0.25),
+    "a late start": lambda t: 0.3 * jnp.maximum(t - 1.7, 0.0),
+    "jnp.interp inside a sine": lambda t: 0.1 * jnp.sin(jnp.interp(t, jnp.asarray(TS), jnp.asarray(10.0 * DRIVE))),
+    "a loop": lambda t: jax.lax.fori_loop(1, 5, lambda i, x: jnp.minimum(x, 0.1 * i + 0.1 * t), 0.5 * t),
+    "far times": lambda t: jnp.interp(t, jnp.asarray(TS) + 3.0, jnp.asarray(DRIVE)),
+}
+SMOOTH = {
+    "a ramp with a smooth step": lambda t: 0.3 * jnp.clip(t, 0.0, 1.0) ** 3 * (10 - 15 * jnp.clip(t, 0.0, 1.0) + 6 * jnp.clip(t, 0.0, 1.0) ** 2),
+    "truncated powers": lambda t: 0.2 * jnp.maximum(t - 0.7, 0.0) ** 3,
+    "pieces with equal slopes": lambda t: jnp.where(t < 1.0, t**2, 2.0 * t - 1.0),
+    "a guarded quotient": lambda t: jnp.where(t == 0.0, 1.0, jnp.sin(t) / jnp.where(t == 0.0, 1.0, t)),
+    "a root by iteration": lambda t: jax.lax.fori_loop(0, 30, lambda i, x: x - (x - 0.3 * jnp.sin(x) - t) / (1 - 0.3 * jnp.cos(x)), t),
+    "steep": lambda t: 1e-3 * jnp.tanh(200.0 * (t - 1.0)) + 0.0 * jnp.abs(t),
+    "a spline": jj.Spline(TS, DRIVE),
+}
+
+
+@pytest.mark.parametrize("kind, curve", [*((Driven, curve) for curve in KINKED), (Prescribed, "jnp.interp"), (Prescribed, "steps"), (InGeometry, "jnp.interp")])
+def test_a_motion_whose_velocity_jumps_is_refused(kind, curve):
+    scene = kind(curve=KINKED[curve])
+    with pytest.raises(ValueError, match=r"of `\w+` is not smooth.*jj\.Spline"):
+        jj.simulate(scene, {"angle": 0.1}, t1=1.0)
+
+
+@pytest.mark.parametrize("curve", SMOOTH)
+def test_a_smooth_motion_is_not_refused(curve):
+    assert jj.structure_of(Driven(curve=SMOOTH[curve])).degrees_of_freedom == 1
+
+
+class TableOfScene(Driven):
+    """The table is a field of the scene."""
+
+    ts: jax.Array = jj.parameter(TS)
+    values: jax.Array = jj.parameter(DRIVE)
+
+    def bodies(self, t, q):
+        return {"bob": bob(jnp.interp(t, self.ts, self.values), q.angle)}
+
+
+def test_a_table_among_the_parameters_is_refused_also_while_it_is_traced():
+    def end(values):
+        return jj.simulate(TableOfScene(values=values), {"angle": 0.1}, t1=1.0).q_end[0]
+
+    with pytest.raises(ValueError, match="the pose of body `bob` of `TableOfScene` is not smooth"):
+        jax.jit(jax.grad(end))(jnp.asarray(DRIVE))
+    with pytest.raises(ValueError, match="not smooth"):
+        jj.report(TableOfScene(ts=TS + 1.7e9))
+
+
+class Road(jj.Scene):
+    """A mass on a bumpy road."""
+
+    coordinates = jj.coordinates("x y")
+    domain = {"x": (0.0, 2.0)}
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, q.y, jnp.interp(q.x, jnp.asarray(TS), jnp.asarray(DRIVE))]))}
+
+
+def test_a_road_by_linear_interpolation_is_refused():
+    with pytest.raises(ValueError, match="the pose of body `mass` of `Road` is not smooth.*at several places"):
+        jj.simulate(Road(), {"x_rate": 1.0}, t1=1.0)
+
+
+class Pushed(Driven):
+    """Tables of forces are no matter: they need no derivative."""
+
+    def bodies(self, t, q):
+        return {"bob": bob(0.0 * t, q.angle)}
+
+    def loads(self, motion):
+        push = jnp.interp(motion.t, jnp.asarray(TS), jnp.asarray(DRIVE)) + jnp.floor(motion.q.angle)
+        return jj.gravity(motion, GRAVITY), jj.Load(generalized={"angle_rate": push})
+
+
+def test_tables_of_loads_are_not_refused():
+    assert jj.structure_of(Pushed()).degrees_of_freedom == 1
+
+
+def accelerations_at(t, angle, drive):
+    """l angledd = -g sin(angle) - xdd cos(angle)."""
+    return -GRAVITY * np.sin(angle) - drive * np.cos(angle)
+
+
+@pytest.mark.parametrize("kind", [Driven, Prescribed, InGeometry])
+def test_a_spline_exerts_the_force_of_inertia_of_what_it_goes_through(kind):
+    scene = kind(curve=jj.Spline(TS, DRIVE))
+    for t, angle in ((0.3, 0.2), (1.1, -0.7), (1.7031, 1.0)):
+        x, xdot = 0.1 * np.sin(3.0 * t), 0.3 * np.cos(3.0 * t)
+        q, u = (jnp.array([angle]), jnp.array([0.4])) if kind is Driven else (jnp.array([x, angle]), jnp.array([xdot, 0.4]))
+        found = jj.accelerations(scene, t, q, u)
+        assert float(found.udot[-1]) == pytest.approx(accelerations_at(t, angle, -0.9 * np.sin(3.0 * t)), abs=1e-3)
+
+
+def test_both_forms_of_the_state_move_alike_along_a_spline():
+    """Against a pendulum whose cart is stated as a sine."""
+    scene = Prescribed(curve=jj.Spline(TS, DRIVE))
+    exact = jj.simulate(Driven(curve=lambda t: 0.1 * jnp.sin(3.0 * t)), {"angle": 0.1}, t1=1.5)
+    for state in ("minimal", "full"):
+        motion = jj.simulate(scene, {"angle": 0.1}, ts=[1.5], state=state, rtol=1e-6, atol=1e-7, work=False).raise_if_failed()
+        assert float(motion.q_end[1]) == pytest.approx(float(exact.q_end[0]), abs=1e-5)
+
+
+@jax.jit
+def with_derivatives(spline, t):
+    first = jax.grad(spline.__call__)
+    return jax.vmap(lambda t: jnp.stack([spline(t), first(t), jax.grad(first)(t)]))(t).T
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 9])
+def test_a_spline_is_cubic_and_twice_continuously_differentiable(n):
+    generator = np.random.default_rng(n)
+    ts = np.sort(generator.uniform(0.0, 3.0, n)) + 0.3 * np.arange(n)
+    cubic, t = np.poly1d(generator.normal(size=min(n, 4))), np.linspace(ts[0], ts[-1], 2 * n + 1)
+    expected = [cubic(t), cubic.deriv()(t), cubic.deriv(2)(t)]
+    found = with_derivatives(jj.Spline(ts, cubic(ts)), t)
+    assert np.allclose(found[:2, 1:-1], np.array(expected)[:2, 1:-1], atol=1e-9)  # polynomials up to the third degree are met exactly
+    assert np.allclose(found[2, 1:-1], expected[2][1:-1], atol=1e-8)
+    values = generator.normal(size=n)
+    spline = jj.Spline(ts, values)
+    assert np.allclose(jax.vmap(spline)(ts), values, atol=1e-12)
+    at = np.concatenate([ts[1:-1] - 1e-9, ts[1:-1] + 1e-9, [ts[0] + 1e-12, ts[-1] - 1e-12, ts[0] - 1.0, ts[-1] + 2.0], np.full(n + 1, ts[0] + 0.1)])[: 2 * n + 1]
+    below, above, ends = np.split(with_derivatives(spline, at)[:, : 2 * n], [n - 2, 2 * n - 4], axis=1)
+    assert np.allclose(below, above, rtol=1e-5, atol=1e-5)
+    assert np.allclose(ends[0, 2:], [ends[0, 0] - ends[1, 0], ends[0, 1] + 2.0 * ends[1, 1]], atol=1e-6)  # along the tangents
+
+
+def test_a_spline_differentiates_with_respect_to_its_values():
+    def acceleration(values):
+        return jj.accelerations(Driven(curve=jj.Spline(TS[::40], values)), 0.71, jnp.array([0.2]), jnp.array([0.4])).udot[0]
+
+    values, direction = jnp.asarray(DRIVE[::40]), jnp.cos(jnp.arange(11.0))
+    slopes = jax.jit(jax.grad(acceleration))(values)
+    both = jax.jit(jax.vmap(acceleration))(jnp.stack([values + direction, values - direction]))  # linear in the values
+    assert float(slopes @ direction) == pytest.approx(float(both[0] - both[1]) / 2.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("given", [([0.0, 2.0, 1.0], [0.0, 1.0, 2.0]), ([0.0, 1.0], [0.0, np.nan]), ([0.0, 1.0], [0.0, 1.0, 2.0]), (0.0, 1.0), (["a"], [0])])
+def test_malformed_splines_are_refused(given):
+    with pytest.raises(ValueError, match="`Spline`"):
+        jj.Spline(*given)

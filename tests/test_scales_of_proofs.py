@@ -1,0 +1,133 @@
+"""What is proved of a scene does not depend on the size of its numbers: nothing is dropped for being small, nothing hidden by what is large elsewhere."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.formal import equal, formal
+from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.interpret import Nodes, as_nodes
+from jourdain_jax.program.parts import interpret_in_parts
+
+SCALES = [float(f"1e{k}") for k in (-30, -24, -16, -9, -3, 3, 9, 16, 24, 30)]
+COUNT = 40
+
+
+def judged(f):
+    """Whether the two results of f(x, y, p) are equal."""
+    graph = Graph(most_multiplications=512)
+    inputs = [graph.input(name, varies) for name, varies in (("q_0", True), ("q_1", True), ("p0_0", False))]
+    found = interpret_in_parts(graph, jax.make_jaxpr(f)(1.0, 1.0, 1.0), [Nodes(n) for n in inputs])
+    probes = formal(Probes(graph, {graph.value[n]: np.linspace(0.1, 0.9, COUNT) for n in inputs}), ())
+    a, b = ([int(n) for n in np.ravel(as_nodes(graph, x))] for x in found)
+    return equal(probes(a), probes(b)).tolist()
+
+
+DIFFERENT = {
+    "a small term beside a large one": lambda c, x, y, p: (y, y + c * x),
+    "a large term beside a small one": lambda c, x, y, p: (c * y, c * y + x),
+    "another function": lambda c, x, y, p: (y, y - c * jnp.exp(x / 0.1)),
+    "within a root": lambda c, x, y, p: (jnp.sqrt(1.0 + y * y), jnp.sqrt(1.0 + y * y + c * x)),
+    "in a divisor": lambda c, x, y, p: (1.0 / (2.0 + y), 1.0 / (2.0 + y + c * jnp.sin(x))),
+    "twice": lambda c, x, y, p: (y * p, (y + c * x) * (p + c)),
+}
+# but where a number and its double lie on either side of 2^20, 2^60, 2^100: there what is equal passes for different, which costs operations, never truth
+OF_IDENTITIES = [*SCALES[:-1], 1e28]
+EQUAL = {
+    "waves": lambda c, x, y, p: (c * jnp.sin(x + y), c * jnp.sin(x) * jnp.cos(y) + c * jnp.cos(x) * jnp.sin(y)),
+    "squares": lambda c, x, y, p: (c * (x + y) ** 2, c * x * x + 2.0 * (c * x) * y + (c * y) * y),
+    "a factor taken out": lambda c, x, y, p: ((c * x) / (c * y), x / y),
+    "a turned plane": lambda c, x, y, p: (c * (jnp.cos(x) ** 2 + jnp.sin(x) ** 2) * p, c * p),
+    "a difference of large numbers": lambda c, x, y, p: (c * x * y - c * y * x + p, p),
+}
+
+
+@pytest.mark.parametrize("name", DIFFERENT)
+def test_no_term_is_too_small_or_too_large_to_count(name):
+    assert [c for c in SCALES if judged(lambda x, y, p, c=c: DIFFERENT[name](c, x, y, p)) != [False]] == []
+
+
+@pytest.mark.parametrize("name", EQUAL)
+def test_identities_hold_at_every_scale(name):
+    assert [c for c in OF_IDENTITIES if judged(lambda x, y, p, c=c: EQUAL[name](c, x, y, p)) != [True]] == []
+
+
+def test_a_large_number_elsewhere_hides_nothing():
+    def f(x, y, p):
+        return jnp.stack([1e16 * jnp.sin(y) + p, x * 0.0, y]), jnp.stack([1e16 * jnp.sin(y) + p, jnp.sin(x), y])
+
+    assert judged(f) == [True, False, True]
+
+
+class TwoMasses(jj.Scene):
+    """Two masses on a line that do not know of one another; one force is `scale` times the other."""
+
+    coordinates = jj.coordinates("x y")
+    scale = 1.0
+    law = "exp"
+    mass: jax.Array = jj.parameter(1.0)
+
+    def bodies(self, t, q):
+        return {name: jj.Particle(self.mass, jnp.stack([z, 0.0 * z, 0.0 * z])) for name, z in (("one", q.x), ("two", q.y))}
+
+    def loads(self, motion):
+        x, y = motion.q.x, motion.q.y
+        return (jj.Load(generalized={"x_rate": -self.scale * jnp.exp(x / 0.1), "y_rate": -jnp.sin(y)}),)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-24, 1e-9, 1e16, 1e30])
+def test_coordinates_are_ignorable_at_no_scale_where_they_are_not(scale, monkeypatch):
+    monkeypatch.setattr(TwoMasses, "scale", scale)
+    program = jj.lower(TwoMasses())
+    assert program.held == ()
+    fixed = program.fixed_values(TwoMasses())
+    rates = [program.rates(fixed, 0.0, (x, 0.3), (0.0, 0.0), jnp.zeros(0))[1] for x in (0.0, 0.2)]
+    assert np.allclose(rates, [[-scale, -np.sin(0.3)], [-scale * np.exp(2.0), -np.sin(0.3)]], rtol=1e-12, atol=0.0)
+
+
+class Sleigh(jj.Scene):
+    """A knife edge with a row nonlinear in the speeds or not, a drive and a load; lengths, masses and times in any units."""
+
+    coordinates = jj.coordinates("x y heading")
+    units = (1.0, 1.0, 1.0)  # one metre, kilogram and second, in the units of the scene
+    kind = "affine"
+
+    @property
+    def domain(self):
+        metre, _, second = self.units
+        speed = metre / second
+        return {"x": (-metre, metre), "y": (-metre, metre), "x_rate": (-speed, speed), "y_rate": (-speed, speed), "heading_rate": (-1.0 / second, 1.0 / second)}
+
+    def bodies(self, t, q):
+        metre, kilogram, _ = self.units
+        position = jnp.stack([q.x + 0.1 * metre * jnp.cos(q.heading), q.y + 0.1 * metre * jnp.sin(q.heading), 0.0 * q.x])
+        return {"sleigh": jj.RigidBody(2.0 * kilogram, 0.05 * kilogram * metre**2 * jnp.eye(3), position, jj.rot_z(q.heading))}
+
+    def velocity_constraints(self, motion):
+        metre, _, second = self.units
+        speed = metre / second
+        across = -jnp.sin(motion.q.heading) * motion.u.x_rate + jnp.cos(motion.q.heading) * motion.u.y_rate
+        drift = {"affine": 1e-3 * speed, "homogeneous": 0.0, "nonlinear": 1e-2 * motion.u.heading_rate**2 * second**2 * speed}[self.kind]
+        return {"edge": across + drift}
+
+    def loads(self, motion):
+        metre, kilogram, second = self.units
+        return (jj.Load(generalized={"heading_rate": 0.1 * kilogram * metre**2 / second**2 * jnp.sin(motion.q.heading)}),)
+
+
+UNITS = {"m, kg, s": (1.0, 1.0, 1.0), "mm, t, s": (1e3, 1e-3, 1.0), "nm, kg, s": (1e9, 1.0, 1.0), "km, t, h": (1e-3, 1e-3, 1 / 3600)}
+
+
+@pytest.mark.parametrize("kind", ["affine", "homogeneous", "nonlinear"])
+def test_units_decide_nothing(kind, monkeypatch):
+    monkeypatch.setattr(Sleigh, "kind", kind)
+    said = {}
+    for name, units in UNITS.items():
+        monkeypatch.setattr(Sleigh, "units", units)
+        structure, program = jj.structure_of(Sleigh()), jj.lower(Sleigh())
+        said[name] = structure.rank, structure.affine, structure.homogeneous, structure.independent, structure.redundant_rows, program.held
+        assert said[name][1:3] == (kind != "nonlinear", kind != "affine")
+    assert len(set(said.values())) == 1, said
