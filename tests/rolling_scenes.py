@@ -1,0 +1,117 @@
+"""Scenes of bodies that roll on any ground, for the tests of contacts: free bodies with height rows, and carts on balls."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+import jourdain_jax as jj
+
+GRAVITY = 9.81
+PLACE = {"x": (-0.3, 0.3), "y": (-0.3, 0.3), "z": (-0.3, 0.3)}
+
+
+class Rolls(jj.Scene):
+    """A free body that rolls on a ground which `make_ground` gives for this scene, with a height row. `shape`: "ball", "ellipsoid", "disc" or "wheel"."""
+
+    mass: object = jj.parameter(1.3)
+    radius: object = jj.parameter(0.05)
+    tyre: object = jj.parameter(0.01)
+    moments: object = jj.parameter((0.4, 0.4, 0.4))  # over m a^2
+    size: object = jj.parameter(0.5)  # of the ground
+    shape: str = eqx.field(static=True, default="ball")
+    make_ground: object = eqx.field(static=True, default=None)
+
+    coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+    domain = PLACE
+
+    def bodies(self, t, q):
+        moments = self.moments * self.mass * self.radius**2
+        return {"body": jj.RigidBody(self.mass, moments, jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.attitude))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, GRAVITY),)
+
+    def contacts(self, pose):
+        return {"touch": self.contact(pose, self.make_ground(self, pose))}
+
+    def contact(self, pose, ground, height="row"):
+        body, a = pose["body"], self.radius
+        if self.shape == "ball":
+            return jj.ball_contact(body, a, ground=ground, height=height)
+        if self.shape == "ellipsoid":
+            return jj.ellipsoid_contact(body, a * jnp.array([1.0, 0.8, 0.6]), ground=ground, height=height)
+        if self.shape == "disc":
+            return jj.disc_contact(body, a, ground=ground, height=height)
+        return jj.wheel_contact(body, a, self.tyre, ground=ground, height=height)
+
+
+def hill(x, y):
+    """Height (m) of a smooth hill."""
+    return 0.06 * jnp.cos(2.0 * x) + 0.04 * jnp.sin(3.0 * y + 0.4) + 0.03 * x * y
+
+
+def egg(x, y, z):
+    """Positive outside of an ellipsoid with one blunt end."""
+    return x**2 / 0.25 + y**2 / 0.2 + z**2 / 0.16 + 0.4 * z * x**2 - 1.0
+
+
+AXIS = jnp.array([2.0, 1.0, 2.0]) / 3.0
+GROUNDS = {
+    "plane": lambda scene, pose: jj.Plane(normal=jnp.array([1.0, 2.0, 2.0]) / 3.0),
+    "within a cylinder": lambda scene, pose: jj.Cylinder(scene.size, AXIS, side="inside"),
+    "on a cylinder": lambda scene, pose: jj.Cylinder(scene.size, AXIS, side="outside"),
+    "within a sphere": lambda scene, pose: jj.Sphere(scene.size, side="inside"),
+    "on a sphere": lambda scene, pose: jj.Sphere(scene.size, side="outside"),
+    "on a hill": lambda scene, pose: jj.HeightMap(hill),
+    "on an egg": lambda scene, pose: jj.Surface(egg),
+}
+
+
+class Cart(jj.Scene):
+    """A chassis on balls that roll on a plane, kept level by its coordinates; pushed at a point of the chassis."""
+
+    places: object = jj.parameter(((0.5, 0.3), (0.5, -0.3), (-0.4, 0.0)))  # m, of the balls in the chassis
+    load: object = jj.parameter((0.05, 0.02, 0.3))  # m, mass centre of the chassis above the plane of the balls' centres
+    mass: object = jj.parameter(10.0)
+    slope: object = jj.parameter(0.2)
+    push: object = jj.parameter((3.0, -2.0, 1.0))  # N
+    radius: object = jj.parameter(0.1)
+    balls: int = eqx.field(static=True, default=3)
+
+    coordinates = jj.coordinates("x y heading", *(jj.quaternion(f"ball{i}") for i in range(3)))
+
+    def chassis(self, q):
+        return jnp.stack([q.x, q.y, self.radius + 0.0 * q.x]), jj.rot_z(q.heading)
+
+    def bodies(self, t, q):
+        at, frame = self.chassis(q)
+        made = {"chassis": jj.RigidBody(self.mass, jnp.array([0.5, 0.8, 1.0]), at + frame @ self.load, frame)}
+        for i in range(self.balls):
+            centre = at + frame @ jnp.append(self.places[i], 0.0)
+            made[f"ball{i}"] = jj.RigidBody.ball(1.0, self.radius, position=centre, orientation=jj.quaternion_to_matrix(q[f"ball{i}"]))
+        return made
+
+    def loads(self, motion):
+        down = jnp.stack([jnp.sin(self.slope), 0.0 * self.slope, -jnp.cos(self.slope)])
+        return jj.gravity(motion, GRAVITY, down), jj.point_force(motion["chassis"], self.push, jnp.array([0.1, 0.2, 0.1]))
+
+    height = "coordinates"
+
+    def contacts(self, pose):
+        return {f"ball{i}": jj.ball_contact(pose[f"ball{i}"], self.radius, height=self.height) for i in range(self.balls)}
+
+
+class CartOnRows(Cart):
+    """The cart with a free chassis, its balls kept on the plane by rows."""
+
+    coordinates = jj.coordinates("x y z", jj.quaternion("frame"), *(jj.quaternion(f"ball{i}") for i in range(3)))
+    height = "row"
+
+    def chassis(self, q):
+        return jnp.stack([q.x, q.y, q.z]), jj.quaternion_to_matrix(q.frame)
+
+
+def rates_of_normal(scene, t, q, u):
+    """Normal n of the contact, and dn/dt along the motion."""
+    normal = lambda t, q: scene.contacts(jj.pose_at(scene, t, q))["touch"].plane.normal  # noqa: E731
+    return jax.jvp(normal, (t, q), (jnp.ones_like(t), jj.coordinate_rates(scene, t, q, u)))
