@@ -115,3 +115,147 @@ def rates_of_normal(scene, t, q, u):
     """Normal n of the contact, and dn/dt along the motion."""
     normal = lambda t, q: scene.contacts(jj.pose_at(scene, t, q))["touch"].plane.normal  # noqa: E731
     return jax.jvp(normal, (t, q), (jnp.ones_like(t), jj.coordinate_rates(scene, t, q, u)))
+
+
+class BallInBowl(jj.Scene):
+    """A ball in a spherical bowl, in the level coordinates of its centre; the height is built in."""
+
+    mass: object = jj.parameter(0.7)
+    radius: object = jj.parameter(0.05)
+    bowl: object = jj.parameter(0.4)
+    gravity: object = jj.parameter(GRAVITY)
+
+    coordinates = jj.coordinates("x y", jj.quaternion("attitude"))
+    domain = {"x": (-0.15, 0.15), "y": (-0.15, 0.15)}
+
+    def bodies(self, t, q):
+        z = self.bowl - jnp.sqrt((self.bowl - self.radius) ** 2 - q.x**2 - q.y**2)
+        return {"ball": jj.RigidBody.ball(self.mass, self.radius, position=jnp.stack([q.x, q.y, z]), orientation=jj.quaternion_to_matrix(q.attitude))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, self.gravity),)
+
+    def contacts(self, pose):
+        o = 0.0 * self.bowl
+        bowl = jj.Sphere(self.bowl, side="inside", origin=jnp.stack([o, o, self.bowl]))
+        return {"bowl": jj.ball_contact(pose["ball"], self.radius, ground=bowl)}
+
+
+class BallInDrum(jj.Scene):
+    """A ball within a cylinder about a level or upright axis: angle around it, place along it; the gap is built in."""
+
+    mass: object = jj.parameter(0.7)
+    radius: object = jj.parameter(0.05)
+    drum: object = jj.parameter(0.4)
+    upright: bool = eqx.field(static=True, default=True)
+
+    coordinates = jj.coordinates("angle along", jj.quaternion("attitude"))
+
+    def bodies(self, t, q):
+        arm = self.drum - self.radius
+        across, down = arm * jnp.sin(q.angle), arm * jnp.cos(q.angle)
+        centre = jnp.stack([across, down, q.along]) if self.upright else jnp.stack([across, q.along, -down])
+        return {"ball": jj.RigidBody.ball(self.mass, self.radius, position=centre, orientation=jj.quaternion_to_matrix(q.attitude))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, GRAVITY),)
+
+    def contacts(self, pose):
+        axis = (0.0, 0.0, 1.0) if self.upright else (0.0, 1.0, 0.0)
+        return {"wall": jj.ball_contact(pose["ball"], self.radius, ground=jj.Cylinder(self.drum, axis, side="inside"))}
+
+
+class RouthSphere(jj.Scene):
+    """A ball on a plane, its mass centre off its middle, along the axis of its inertia."""
+
+    mass: object = jj.parameter(1.2)
+    radius: object = jj.parameter(0.3)
+    off: object = jj.parameter(0.08)
+    moments: object = jj.parameter((0.03, 0.03, 0.05))
+
+    coordinates = jj.coordinates("x y", jj.quaternion("attitude"))
+
+    def bodies(self, t, q):
+        R = jj.quaternion_to_matrix(q.attitude)
+        middle = jnp.stack([q.x, q.y, self.radius + 0.0 * q.x])
+        return {"ball": jj.RigidBody(self.mass, self.moments, middle - self.off * R[:, 2], R)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, GRAVITY),)
+
+    def contacts(self, pose):
+        return {"floor": jj.ball_contact(pose["ball"], self.radius, centre=jnp.stack([0.0 * self.off, 0.0 * self.off, self.off]))}
+
+    def invariants(self, motion):
+        # Jellett's and Routh's: L.r and w3 sqrt(A C + m r.I r), r from the contact to the mass centre
+        ball = motion["ball"]
+        r = ball.orientation.T @ (ball.position - self.contacts(motion.pose())["floor"].point)
+        w, I = ball.angular_velocity_body, self.moments
+        return {"Jellett": (I * w) @ r, "Routh": w[2] * jnp.sqrt(I[0] * I[2] + self.mass * jnp.sum(I * r * r))}
+
+
+class DiscOnHill(jj.Scene):
+    """A disc on a hill in angles: x, y of the contact, and yaw, lean and spin from the tangent plane there."""
+
+    mass: object = jj.parameter(1.3)
+    radius: object = jj.parameter(0.1)
+
+    coordinates = jj.coordinates("x y yaw lean spin")
+    domain = {"x": (-0.4, 0.4), "y": (-0.4, 0.4), "lean": (-0.6, 0.6)}
+
+    def bodies(self, t, q):
+        land = jj.HeightMap(hill)
+        point = land.point_at(q.x, q.y)
+        frame = land.plane_at(point).axes @ jj.rot_z(q.yaw) @ jj.rot_x(q.lean)
+        return {
+            "body": jj.RigidBody.thin_disc(self.mass, self.radius, axis="y", position=point + self.radius * frame[:, 2], orientation=frame @ jj.rot_y(q.spin))
+        }
+
+    def loads(self, motion):
+        return (jj.gravity(motion, GRAVITY),)
+
+    def contacts(self, pose):
+        land = jj.HeightMap(hill)
+        point = land.point_at(pose.q.x, pose.q.y)
+        return {"rim": jj.Contact(pose["body"], point, land.plane_at(point))}
+
+
+class TyredWheel(jj.Scene):
+    """A wheel with a tyre on a level plane, in angles; a thin disc where the tyre is zero."""
+
+    mass: object = jj.parameter(1.3)
+    radius: object = jj.parameter(0.35)
+    tyre: object = jj.parameter(0.05)
+
+    coordinates = jj.coordinates("x y yaw lean spin")
+    domain = {"yaw": (-3.2, 3.2), "lean": (-1.2, 1.2), "spin": (-3.2, 3.2)}
+
+    def bodies(self, t, q):
+        frame = jj.rot_z(q.yaw) @ jj.rot_x(q.lean)
+        o = 0.0 * q.x
+        centre = jnp.stack([q.x, q.y, o + self.tyre]) + (self.radius - self.tyre) * frame[:, 2]
+        return {"wheel": jj.RigidBody.thin_disc(self.mass, self.radius, axis="y", position=centre, orientation=frame @ jj.rot_y(q.spin))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, GRAVITY),)
+
+    def contacts(self, pose):
+        return {"tread": jj.wheel_contact(pose["wheel"], self.radius, self.tyre)}
+
+
+class TyredBicycle(jj.models.WhippleBicycle):
+    """The Whipple bicycle with tyres of circular section; x, y under the circle within the rear tyre."""
+
+    rear_tyre: object = jj.parameter(0.0)
+    front_tyre: object = jj.parameter(0.0)
+
+    def bodies(self, t, q):
+        up = (jj.rot_z(q.yaw) @ jj.rot_x(q.lean))[:, 2]
+        raised = self.rear_tyre * (jnp.stack([0.0 * q.x, 0.0 * q.x, 1.0 + 0.0 * q.x]) - up)
+        return {name: eqx.tree_at(lambda b: b.position, body, body.position + raised) for name, body in super().bodies(t, q).items()}
+
+    def contacts(self, pose):
+        return {
+            "rear": jj.wheel_contact(pose["rear wheel"], self.rR, self.rear_tyre),
+            "front": jj.wheel_contact(pose["front wheel"], self.rF, self.front_tyre, height="row"),
+        }
