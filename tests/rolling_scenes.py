@@ -93,7 +93,7 @@ class Cart(jj.Scene):
 
     def loads(self, motion):
         down = jnp.stack([jnp.sin(self.slope), 0.0 * self.slope, -jnp.cos(self.slope)])
-        return jj.gravity(motion, GRAVITY, down), jj.point_force(motion["chassis"], self.push, jnp.array([0.1, 0.2, 0.1]))
+        return jj.gravity(motion, GRAVITY, down), jj.point_force(motion["chassis"].point((0.1, 0.2, 0.1)), self.push)
 
     height = "coordinates"
 
