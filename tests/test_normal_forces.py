@@ -8,6 +8,7 @@ from rolling_scenes import GRAVITY, Cart, CartOnRows
 from tolerances import tolerance
 
 import jourdain_jax as jj
+from jourdain_jax.equations.normal_forces import Wrenches, normal_forces
 from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.reactions import contact_forces
 
@@ -163,8 +164,13 @@ def test_contacts_that_carry_bodies_of_their_own_share_nothing():
 
 
 def test_the_shares_have_gradients():
-    def front(ahead):
-        cart = TwoBalls(places=((0.6, 0.0), (-0.4, 0.0)), load=jnp.stack([ahead, 0.0, 0.2]), slope=0.0, push=(0.0, 0.0, 0.0), balls=2)
-        return forces(cart)["ball0"].normal
+    # a weight at x on a beam of two contacts: N_front = W (x + 0.4)
+    contacts = {name: jj.Contact("beam", (x, 0.0, 0.0)) for name, x in (("front", 0.6), ("rear", -0.4))}
+    nothing = Wrenches(jnp.zeros((0, 1, 3)), jnp.zeros((0, 1, 3)))
 
-    assert np.isclose(jax.grad(front)(0.1), 10.0 * GRAVITY, rtol=1e-9)
+    def front(x):
+        held = Wrenches(jnp.array([[0.0, 0.0, 20.0]]), jnp.zeros((1, 3)))
+        return normal_forces(contacts, ("beam",), jnp.stack([x, 0.0, 0.3])[None], held, nothing, jnp.asarray(20.0))["front"].normal
+
+    assert np.isclose(front(0.1), 10.0, rtol=1e-12)
+    assert np.isclose(jax.grad(front)(0.1), 20.0, rtol=1e-12)

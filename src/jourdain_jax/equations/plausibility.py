@@ -29,7 +29,7 @@ class PoseNumbers(eqx.Module):
     inertia: dict[str, Float[Array, "*states 3 3"]]  # of rigid bodies only
     orientation: dict[str, Float[Array, "*states 3 3"]]
     planes: dict[str, Float[Array, "*states 3"]]  # normal velocity by origin and tilt, by velocity and angular velocity; size of both, m/s
-    normals: dict[str, Float[Array, "*states"]]  # squares of the lengths of the normals of contacts
+    normals: dict[str, Float[Array, "*states 2"]]  # squares of the lengths of the normals of contacts; and how far out the contact is, m
     gaps: dict[str, Float[Array, "*states 2"]]  # where the coordinates keep them closed; and the distance of the contact from the mass centre, m
 
 
@@ -48,9 +48,13 @@ def numbers_of(scene: Scene, pose: Pose) -> PoseNumbers:
         inertia={name: body.inertia for name, body in rigid.items()},
         orientation={name: body.orientation for name, body in rigid.items()},
         planes=_normal_velocities(scene, pose, contacts),
-        normals={name: contact.plane.normal @ contact.plane.normal for name, contact in contacts.items()},
+        normals={name: _normal(contact) for name, contact in contacts.items()},
         gaps={name: _gap(pose, contact) for name, contact in contacts.items() if contact.height == "coordinates"},
     )
+
+
+def _normal(contact: Contact) -> Float[Array, "2"]:
+    return jnp.stack([contact.plane.normal @ contact.plane.normal, jnp.sum(jnp.abs(contact.point))])
 
 
 def _gap(pose: Pose, contact: Contact) -> Float[Array, "2"]:
@@ -142,7 +146,7 @@ def _of_normal(what: str, squares: np.ndarray) -> str:
             f"{what} finds no point where body and ground touch at any probed state; a ball must be smaller than the cylinder or sphere that it rolls in, "
             "a surface needs a gradient that does not vanish, coordinates a `domain` that lies near it"
         )
-    off = np.max(np.abs(np.sqrt(_finite(squares)) - 1), initial=0.0)
+    off = np.max(np.abs(np.sqrt(_finite(squares)[:, 0]) - 1), initial=0.0)
     return f"{what} has a normal whose length differs from 1 by {off:.2g}, expected a unit vector; divide it by its length" if off > _TOLERANCE else ""
 
 
