@@ -1,5 +1,8 @@
 """What cannot be a contact is refused by name: where it is known at once, otherwise when a scene is looked at."""
 
+import re
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -84,9 +87,15 @@ class OnACusp(BallInBowl):
         return {"bowl": jj.Contact(pose["ball"], point, jj.Surface(lambda x, y, z: (z - point[2]) ** 3).plane_at(point))}
 
 
-@pytest.mark.parametrize("scene", [TooLarge(), OnACusp()])
-def test_a_contact_that_touches_nowhere_is_named(scene):
-    with pytest.raises(ValueError, match="contact `bowl` of .* finds no point where body and ground touch at any probed state; a ball must be smaller"):
+@pytest.mark.parametrize(
+    ("scene", "sentence"),
+    [
+        (TooLarge(), "contact `bowl` of `TooLarge` finds no point where body and ground touch at any probed state; a ball must be smaller"),
+        (OnACusp(), "contact `bowl` of `OnACusp` (finds no point|has a normal whose length differs from 1)"),
+    ],
+)
+def test_a_contact_that_touches_nowhere_is_named(scene, sentence):
+    with pytest.raises(ValueError, match=sentence):
         jj.structure_of(scene)
 
 
@@ -110,3 +119,15 @@ def test_the_tangents_of_any_normal_are_a_right_handed_frame():
     assert np.allclose(np.swapaxes(axes, 1, 2) @ axes, np.eye(3), atol=1e-14)
     assert np.allclose(np.linalg.det(axes), 1.0)
     assert np.allclose(axes[:, :, 2], normals)
+
+
+def test_the_scenes_of_the_guide_to_contacts_roll_on_their_grounds():
+    text = (Path(__file__).parents[1] / "docs" / "contacts.md").read_text()
+    names = {"jj": jj, "jnp": jnp}
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(block, names)
+    for scene, contact, values in ((names["Bowl"](), "bowl", {"x": 0.1, "y": -0.05}), (names["DiscOnHill"](), "rim", {"x": 0.1, "y": 0.2, "lean": 0.3})):
+        pose = jj.pose_at(scene, 0.0, scene.named(**values)[0])
+        found = scene.contacts(pose)[contact]
+        assert abs(float(found.gap())) <= 1e-15
+        assert np.isclose(np.linalg.norm(found.point - next(iter(pose.bodies.values())).position), {"bowl": 0.05, "rim": 0.1}[contact], rtol=1e-12)

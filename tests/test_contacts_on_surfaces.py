@@ -62,8 +62,7 @@ def test_body_and_ground_are_nearest_where_their_normals_are_opposite(ground, sh
         pose = jj.pose_at(scene, 0.0, q)
         contact, earth, body = scene.contacts(pose)["touch"], scene.make_ground(scene, pose), pose["body"]
         n, foot = contact.plane.normal, contact.point - contact.gap() * contact.plane.normal
-        value = earth.height_of if isinstance(earth, jj.Plane) else earth.value
-        slope = jax.grad(value)(foot)
+        slope = jax.grad(earth.value)(foot)
         of_body = lambda p: outside(scene, body.position, body.orientation, p)  # noqa: E731
         outward = jax.grad(of_body)(contact.point)
         outward = outward / jnp.sqrt(outward @ outward)
@@ -76,7 +75,14 @@ def test_body_and_ground_are_nearest_where_their_normals_are_opposite(ground, sh
         else:
             off = of_body(contact.point)[None]
         axes = contact.plane.axes
-        parts = [value(foot)[None], n - slope / jnp.sqrt(slope @ slope), outward + n, off, (axes.T @ axes - jnp.eye(3)).ravel(), jnp.linalg.det(axes)[None] - 1]
+        parts = [
+            earth.value(foot)[None],
+            n - slope / jnp.sqrt(slope @ slope),
+            outward + n,
+            off,
+            (axes.T @ axes - jnp.eye(3)).ravel(),
+            jnp.linalg.det(axes)[None] - 1,
+        ]
         return jnp.concatenate(parts), contact.gap()
 
     error, gap = miss(poses(scene, 8))

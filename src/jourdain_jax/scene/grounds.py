@@ -71,6 +71,10 @@ class Plane(eqx.Module):
         """Signed distance (m) of the point at `position` (m, inertial frame) from the plane, positive along the normal."""
         return self.normal @ (as_real(position) - self.origin)
 
+    def value(self, point: Vector) -> Float[Array, ""]:
+        """f (m) at a `point` (m, inertial frame): its height above the plane."""
+        return self.height_of(point)
+
     def plane_at(self, point: Vector) -> "Plane":
         """The tangent plane at a `point` (m, inertial frame) of the plane: the plane itself."""
         checked_real(point, "point of a plane", (3,))
