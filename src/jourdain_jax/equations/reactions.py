@@ -68,7 +68,7 @@ class _PerMultiplier(eqx.Module):
 
     on_bodies: Wrenches  # leading axis: rows
     direct: Float[Array, "rows speeds"]
-    A: Float[Array, "rows speeds"]
+    spare: Float[Array, "rows rows"]  # columns: multipliers that change no motion
 
 
 @at_once
@@ -83,7 +83,7 @@ def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=No
 
 def _reactions(scene: Scene, motion: Motion, unit: _PerMultiplier, multipliers) -> RowReactions:
     force, torque = (multipliers[:, None, None] * part for part in (unit.on_bodies.force, unit.on_bodies.torque))
-    determined = determined_rows(unit.A) if unit.A.shape[0] else jnp.zeros(0, bool)
+    determined = jnp.diagonal(unit.spare) == 0  # a multiplier is unique where its row is no combination of the others
     return RowReactions(multipliers, force, torque, multipliers[:, None] * unit.direct, determined, names_of_rows(scene), tuple(motion.bodies))
 
 
@@ -91,7 +91,7 @@ def _per_multiplier(scene: Scene, motion: Motion, inputs) -> _PerMultiplier:
     bodies, q, u = motion.bodies.values(), motion.q.array, motion.u.array
     if not names_of_rows(scene):
         nothing = jnp.zeros((0, len(bodies), 3), q.dtype)
-        return _PerMultiplier(Wrenches(nothing, nothing), jnp.zeros((0, u.shape[0]), q.dtype), jnp.zeros((0, u.shape[0]), q.dtype))
+        return _PerMultiplier(Wrenches(nothing, nothing), jnp.zeros((0, u.shape[0]), q.dtype), jnp.zeros((0, 0), q.dtype))
 
     def rows(v, omega, u):
         return flatten_rows(velocity_rows(scene, _moving(scene, motion, v, omega, u)), q.dtype)
@@ -101,7 +101,7 @@ def _per_multiplier(scene: Scene, motion: Motion, inputs) -> _PerMultiplier:
     rigid = jnp.array([isinstance(body.body, RigidBody) for body in bodies])
     torque = jnp.where(rigid[:, None], torque, 0.0)  # a particle takes no torque
     A = jax.jacfwd(lambda u: velocity_residual(scene, motion.t, q, u, inputs))(u)
-    return _PerMultiplier(Wrenches(force, torque), direct, A)
+    return _PerMultiplier(Wrenches(force, torque), direct, _spare_multipliers(A))
 
 
 def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
@@ -109,11 +109,6 @@ def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
     bodies = {name: BodyMotion(name, body.body, v[j], omega[j]) for j, (name, body) in enumerate(motion.bodies.items())}
     qdot = coordinate_rates(scene, motion.t, motion.q.array, u)
     return Motion(motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies)
-
-
-def determined_rows(A: Float[Array, "rows speeds"]) -> Bool[Array, "rows"]:
-    """Which multipliers are unique: those whose row is no combination of the others, `(A A+)_ss = 1`."""
-    return jnp.diagonal(_spare_multipliers(A)) == 0
 
 
 def _spare_multipliers(A: Float[Array, "rows speeds"]) -> Float[Array, "rows rows"]:
@@ -145,7 +140,7 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
     size = _size_of_forces(scene, motion, total.linear)
     margin = rank_cutoff(size.dtype) * size
     held = Wrenches(total.linear - jnp.sum(rows.force, axis=0), total.angular - jnp.sum(rows.torque, axis=0))  # by construction of the coordinates
-    spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", _spare_multipliers(unit.A), part), unit.on_bodies)
+    spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", unit.spare, part), unit.on_bodies)
     positions = jnp.stack([body.position for body in motion.bodies.values()])
     built_in = normal_forces(contacts, rows.body_names, positions, held, spare, size)
     forces = {}
