@@ -214,6 +214,14 @@ PARTS: dict[str, Case] = {
     "jj.Plane(tilt='steep')": ("ValueError", "tilt of a plane is the text 'steep', expected real numbers; give one angle in rad"),
     "jj.Plane(velocity=1.0)": ("ValueError", "velocity of a plane has shape (), expected (3,)"),
     "jj.disc_contact(bead, 0.5)": ("ValueError", "body `bead` of a contact is a particle, which cannot roll; make it a `jj.RigidBody`"),
+    "jj.ball_contact(jj.pose_at(shaped(1.0, jnp.ones(3)), 0.0, two)['bead'], 0.5, ground=3.0)": (
+        "ValueError",
+        "`ground` of the contact of `bead` is a float, expected a `jj.Plane(...)`, `jj.Cylinder`, `jj.Sphere`, `jj.Surface` or `jj.HeightMap`, or None",
+    ),
+    "jj.Contact('bead', o, carried='bead')": (
+        "ValueError",
+        "`carried` of the contact of `bead` is the text 'bead', expected names of bodies; write (\"bead\",)",
+    ),
     "jj.disc_contact(bead, 0.5, height='rows')": ("ValueError", "contact height `rows` is unknown; expected `coordinates`"),
     "jj.ball_contact(b, 0.5)": ("ValueError", "the body of a contact is a Bead, expected the pose of a body"),
     "jj.ball_contact(jj.pose_at(shaped(1.0, jnp.ones(3)), 0.0, two)['bead'], 0.5, plane='ground')": (

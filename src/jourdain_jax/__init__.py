@@ -76,8 +76,9 @@ from jourdain_jax.plotting.animation import animate
 from jourdain_jax.plotting.quantities import plot
 from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
-from jourdain_jax.scene.contacts import Plane, ball_contact, disc_contact
+from jourdain_jax.scene.contacts import Contact, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
 from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, speeds
+from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
 from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
 from jourdain_jax.scene.motion_state import fixed_point
 from jourdain_jax.scene.parameters import parameter
@@ -89,6 +90,8 @@ __version__ = _version_of("jourdain-jax")
 __all__ = [
     "Accelerations",
     "Baumgarte",
+    "Contact",
+    "Cylinder",
     "DifferentiationModeError",
     "DiscreteGradient",
     "DiscreteLagrangeDAlembert",
@@ -96,6 +99,7 @@ __all__ = [
     "EnergyBalance",
     "Fit",
     "GibbsAppell",
+    "HeightMap",
     "ImplicitMidpoint",
     "Linearization",
     "Load",
@@ -117,9 +121,11 @@ __all__ = [
     "Scene",
     "SensitivityWarning",
     "SimulationError",
+    "Sphere",
     "Spline",
     "State",
     "SteadyMotion",
+    "Surface",
     "Trajectory",
     "UdwadiaKalaba",
     "Verification",
@@ -135,6 +141,7 @@ __all__ = [
     "derivative_exists",
     "diagnose",
     "disc_contact",
+    "ellipsoid_contact",
     "energy",
     "energy_balance",
     "fit",
@@ -192,4 +199,5 @@ __all__ = [
     "verify",
     "virtual_power",
     "weld",
+    "wheel_contact",
 ]

@@ -1,6 +1,7 @@
-"""Whether the numbers that a scene gives for its bodies and planes can be those of bodies and planes; looked at while it is probed.
+"""Whether the numbers that a scene gives for its bodies and contacts can be those of bodies and contacts; looked at while it is probed.
 
 m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
+n.n = 1,   gap = 0 where the coordinates keep a body on the ground
 d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's motion, stated twice: by o(t), n(t) and by v, w
 """
 
@@ -13,6 +14,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.scene.answers import contacts_of
 from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.motion_state import Pose
 from jourdain_jax.scene.scene import Scene
 
@@ -27,6 +29,8 @@ class PoseNumbers(eqx.Module):
     inertia: dict[str, Float[Array, "*states 3 3"]]  # of rigid bodies only
     orientation: dict[str, Float[Array, "*states 3 3"]]
     planes: dict[str, Float[Array, "*states 3"]]  # normal velocity by origin and tilt, by velocity and angular velocity; size of both, m/s
+    normals: dict[str, Float[Array, "*states 2"]]  # squares of the lengths of the normals of contacts; and how far out the contact is, m
+    gaps: dict[str, Float[Array, "*states 2"]]  # where the coordinates keep them closed; and the distance of the contact from the mass centre, m
 
 
 def pose_numbers(scene: Scene, t, q) -> PoseNumbers:
@@ -37,16 +41,27 @@ def pose_numbers(scene: Scene, t, q) -> PoseNumbers:
 def numbers_of(scene: Scene, pose: Pose) -> PoseNumbers:
     """The same from known poses."""
     rigid = {name: body.body for name, body in pose.bodies.items() if isinstance(body.body, RigidBody)}
+    contacts = contacts_of(scene, pose)
     return PoseNumbers(
         mass={name: body.mass for name, body in pose.bodies.items()},
         position={name: body.position for name, body in pose.bodies.items()},
         inertia={name: body.inertia for name, body in rigid.items()},
         orientation={name: body.orientation for name, body in rigid.items()},
-        planes=_normal_velocities(scene, pose),
+        planes=_normal_velocities(scene, pose, contacts),
+        normals={name: _normal(contact) for name, contact in contacts.items()},
+        gaps={name: _gap(pose, contact) for name, contact in contacts.items() if contact.height == "coordinates"},
     )
 
 
-def _normal_velocities(scene: Scene, pose: Pose) -> dict[str, Float[Array, "3"]]:
+def _normal(contact: Contact) -> Float[Array, "2"]:
+    return jnp.stack([contact.plane.normal @ contact.plane.normal, jnp.sum(jnp.abs(contact.point))])
+
+
+def _gap(pose: Pose, contact: Contact) -> Float[Array, "2"]:
+    return jnp.stack([contact.gap(), jnp.sum(jnp.abs(contact.point - pose[contact.body].position))])
+
+
+def _normal_velocities(scene: Scene, pose: Pose, contacts: dict[str, Contact]) -> dict[str, Float[Array, "3"]]:
     """Velocity of every contact's plane along its normal at the contact point, twice; and how large either could be."""
 
     def planes(t):
@@ -55,7 +70,7 @@ def _normal_velocities(scene: Scene, pose: Pose) -> dict[str, Float[Array, "3"]]
 
     found = {}
     _, rates = jax.jvp(planes, (pose.t,), (jnp.ones_like(pose.t),))
-    for name, contact in contacts_of(scene, pose).items():
+    for name, contact in contacts.items():
         plane, arm, (normal_rate, origin_rate) = contact.plane, contact.point - contact.plane.origin, rates[name]
         by_pose = plane.normal @ origin_rate - normal_rate @ arm
         by_velocity = plane.normal @ plane.velocity_at(contact.point)
@@ -73,6 +88,8 @@ def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
     sentences += [_of_inertia(f"body `{name}` of `{who}`", I) for name, I in numbers.inertia.items()]
     sentences += [_of_orientation(f"body `{name}` of `{who}`", R) for name, R in numbers.orientation.items()]
     sentences += [_of_plane(f"the plane of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.planes.items()]
+    sentences += [_of_normal(f"contact `{name}` of `{who}`", squares) for name, squares in numbers.normals.items()]
+    sentences += [_of_gap(f"contact `{name}` of `{who}`", gaps) for name, gaps in numbers.gaps.items()]
     return tuple(sentence for sentence in sentences if sentence)
 
 
@@ -120,6 +137,28 @@ def _of_plane(what: str, speeds: np.ndarray) -> str:
     return (
         f"{what} moves along its normal at {by_pose[k]:.4g} m/s by `origin` and `tilt`, but at {by_velocity[k]:.4g} m/s by `velocity` and "
         "`angular_velocity`; state the motion in both: velocity = d origin/dt, angular_velocity = (0, d tilt/dt, 0)"
+    )
+
+
+def _of_normal(what: str, squares: np.ndarray) -> str:
+    if len(squares) and not len(_finite(squares)):
+        return (
+            f"{what} finds no point where body and ground touch at any probed state; a ball must be smaller than the cylinder or sphere that it rolls in, "
+            "a surface needs a gradient that does not vanish, coordinates a `domain` that lies near it"
+        )
+    off = np.max(np.abs(np.sqrt(_finite(squares)[:, 0]) - 1), initial=0.0)
+    return f"{what} has a normal whose length differs from 1 by {off:.2g}, expected a unit vector; divide it by its length" if off > _TOLERANCE else ""
+
+
+def _of_gap(what: str, gaps: np.ndarray) -> str:
+    gap, size = _finite(gaps).T
+    off = np.abs(gap) - _TOLERANCE * size
+    if not np.any(off > 0):
+        return ""
+    k = int(np.argmax(off))
+    return (
+        f'{what} has height="coordinates", but at a probed state its body is {gap[k]:.4g} m off the ground; let the coordinates keep it there, '
+        'or write height="row"'
     )
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
+from jourdain_jax.equations.normal_forces import Wrenches, normal_forces
 from jourdain_jax.equations.probing import at_once
 from jourdain_jax.equations.reductions import Accelerations
 from jourdain_jax.equations.rows import flatten_rows, names_of_rows, velocity_residual, velocity_rows
@@ -62,6 +63,14 @@ class ContactForce(eqx.Module):
     determined: Bool[Array, ""]  # whether the rows at hand determine these numbers
 
 
+class _PerMultiplier(eqx.Module):
+    """What the rows exert where their multipliers are one."""
+
+    on_bodies: Wrenches  # leading axis: rows
+    direct: Float[Array, "rows speeds"]
+    spare: Float[Array, "rows rows"]  # columns: multipliers that change no motion
+
+
 @at_once
 def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=None) -> RowReactions:
     """Constraint forces per row and per body at (t, q, u), from the multipliers of known `accelerations`.
@@ -69,23 +78,30 @@ def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=No
     Their generalized forces add up to `A' lambda`: `sum_s beta' R^s + gamma' T^s + direct^s`.
     """
     motion = motion_at(scene, t, q, u, inputs)
-    names, bodies = names_of_rows(scene), tuple(motion.bodies)
-    multipliers = accelerations.multipliers
-    if not names:
+    return _reactions(scene, motion, _per_multiplier(scene, motion, inputs), accelerations.multipliers)
+
+
+def _reactions(scene: Scene, motion: Motion, unit: _PerMultiplier, multipliers) -> RowReactions:
+    force, torque = (multipliers[:, None, None] * part for part in (unit.on_bodies.force, unit.on_bodies.torque))
+    determined = jnp.diagonal(unit.spare) == 0  # a multiplier is unique where its row is no combination of the others
+    return RowReactions(multipliers, force, torque, multipliers[:, None] * unit.direct, determined, names_of_rows(scene), tuple(motion.bodies))
+
+
+def _per_multiplier(scene: Scene, motion: Motion, inputs) -> _PerMultiplier:
+    bodies, q, u = motion.bodies.values(), motion.q.array, motion.u.array
+    if not names_of_rows(scene):
         nothing = jnp.zeros((0, len(bodies), 3), q.dtype)
-        return RowReactions(multipliers, nothing, nothing, jnp.zeros((0, u.shape[0]), q.dtype), jnp.zeros(0, bool), names, bodies)
+        return _PerMultiplier(Wrenches(nothing, nothing), jnp.zeros((0, u.shape[0]), q.dtype), jnp.zeros((0, 0), q.dtype))
 
     def rows(v, omega, u):
         return flatten_rows(velocity_rows(scene, _moving(scene, motion, v, omega, u)), q.dtype)
 
-    v = jnp.stack([body.velocity for body in motion.bodies.values()])
-    omega = jnp.stack([body.angular_velocity for body in motion.bodies.values()])
-    by_velocity, by_turning, direct = jax.jacrev(rows, argnums=(0, 1, 2))(v, omega, u)
-    rigid = jnp.array([isinstance(body.body, RigidBody) for body in motion.bodies.values()])
-    by_turning = jnp.where(rigid[:, None], by_turning, 0.0)  # a particle takes no torque
-    force, torque = (multipliers[:, None, None] * d for d in (by_velocity, by_turning))
-    A = jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
-    return RowReactions(multipliers, force, torque, multipliers[:, None] * direct, determined_rows(A), names, bodies)
+    v, omega = jnp.stack([body.velocity for body in bodies]), jnp.stack([body.angular_velocity for body in bodies])
+    force, torque, direct = jax.jacrev(rows, argnums=(0, 1, 2))(v, omega, u)
+    rigid = jnp.array([isinstance(body.body, RigidBody) for body in bodies])
+    torque = jnp.where(rigid[:, None], torque, 0.0)  # a particle takes no torque
+    A = jax.jacfwd(lambda u: velocity_residual(scene, motion.t, q, u, inputs))(u)
+    return _PerMultiplier(Wrenches(force, torque), direct, _spare_multipliers(A))
 
 
 def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
@@ -95,11 +111,12 @@ def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
     return Motion(motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies)
 
 
-def determined_rows(A: Float[Array, "rows speeds"]) -> Bool[Array, "rows"]:
-    """Which multipliers are unique: those whose row is no combination of the others, `(A A+)_ss = 1`."""
-    A = jax.lax.stop_gradient(row_scale(A)[:, None] * A)
-    alone = jnp.diagonal(A @ pseudo_inverse(A))
-    return alone > 1 - jnp.sqrt(jnp.finfo(A.dtype).eps)
+def _spare_multipliers(A: Float[Array, "rows speeds"]) -> Float[Array, "rows rows"]:
+    """Columns: multipliers that change no motion, `A' lambda = 0`; all zero where the rows are independent."""
+    scale = row_scale(A)
+    A = jax.lax.stop_gradient(scale[:, None] * A)
+    spare = jnp.eye(A.shape[0], dtype=A.dtype) - A @ pseudo_inverse(A)
+    return scale[:, None] * jnp.where(jnp.abs(spare) > jnp.sqrt(jnp.finfo(A.dtype).eps), spare, 0.0)
 
 
 @at_once
@@ -107,49 +124,44 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
     """Normal and tangential force of every rolling contact, and the friction coefficient it needs to roll without slip.
 
     The tangential force is the multiplier of the no-slip rows. With `height="row"` the normal force is the multiplier of the
-    height row; with `height="coordinates"` it comes from Newton's equation (row S1): `n . sum (m a - F - R_rows)` over the bodies
-    that the contact carries. Forces given directly on speeds (`generalized_force`) are taken to have no resultant along n. Two
-    such contacts that carry the same body share a sum that nothing here can split; they are marked as not determined.
+    height row; with `height="coordinates"` it comes from Newton's equations (row S1) of the bodies that the contact carries, forces and moments:
+    `sum N n = sum (m a - F - R_rows)` and its moment, over all contacts that touch these bodies; of minimum norm, and marked as not determined, where
+    they do not tell it (four wheels on a plane). Contacts share what the forces alone leave open according to the moments; where moments are left
+    that no contact can bear (a guide keeps a robot level), such a share is marked as not determined, too. Forces given directly on speeds
+    (`generalized_force`) are taken to have no resultant force or moment on these bodies.
     """
     motion = motion_at(scene, t, q, u, inputs)
     contacts = contacts_of(scene, motion.pose())
     if not contacts:
         return {}
-    rows = row_reactions(scene, t, q, u, accelerations, inputs)
-    total = newton_residual(scene, t, q, u, accelerations.udot, inputs).linear
-    hidden = total - jnp.sum(rows.force, axis=0)  # what the coordinates hold by construction
-    margin = _round_off_of_forces(scene, motion, total)
-    by_coordinates = {name: contact for name, contact in contacts.items() if contact.height == "coordinates"}
-    carried = {name: _carried(contact, name, rows.body_names) for name, contact in by_coordinates.items()}
+    unit = _per_multiplier(scene, motion, inputs)
+    rows = _reactions(scene, motion, unit, accelerations.multipliers)
+    total = newton_residual(scene, t, q, u, accelerations.udot, inputs)
+    size = _size_of_forces(scene, motion, total.linear)
+    margin = rank_cutoff(size.dtype) * size
+    held = Wrenches(total.linear - jnp.sum(rows.force, axis=0), total.angular - jnp.sum(rows.torque, axis=0))  # by construction of the coordinates
+    spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", unit.spare, part), unit.on_bodies)
+    positions = jnp.stack([body.position for body in motion.bodies.values()])
+    built_in = normal_forces(contacts, rows.body_names, positions, held, spare, size)
     forces = {}
     for name, contact in contacts.items():
         slip = jnp.array([rows.row_names.index(f"{name} slip[{i}]") for i in range(2)])
         tangential, determined = rows.multipliers[slip], jnp.all(rows.determined[slip])
         if contact.height == "row":
             height = rows.row_names.index(f"{name} height")
-            normal, determined = rows.multipliers[height], determined & rows.determined[height]
+            normal, known = rows.multipliers[height], rows.determined[height]
         else:
-            normal = contact.plane.normal @ jnp.sum(hidden[jnp.array(carried[name])], axis=0)
-            shared = any(set(carried[name]) & set(other) for rival, other in carried.items() if rival != name)
-            determined = determined & (not shared)
-        forces[name] = _contact_force(normal, tangential, determined, margin)
+            normal, known = built_in[name].normal, built_in[name].determined
+        forces[name] = _contact_force(normal, tangential, determined & known, margin)
     return forces
 
 
-def _round_off_of_forces(scene: Scene, motion: Motion, total) -> Float[Array, ""]:
-    """Forces below this are round-off of those at hand: of `m a - F`, of F and of `m |v| |omega|` on the bodies (N)."""
+def _size_of_forces(scene: Scene, motion: Motion, total) -> Float[Array, ""]:
+    """Size of the forces at hand (N): of `m a - F`, of F and of `m |v| |omega|` on the bodies."""
     size = jnp.max(jnp.abs(total)) + jnp.max(jnp.abs(resultants(scene, motion).force))
     for body in motion.bodies.values():
         size = size + body.mass * jnp.max(jnp.abs(body.velocity)) * jnp.max(jnp.abs(body.angular_velocity))
-    return jax.lax.stop_gradient(rank_cutoff(size.dtype) * size)
-
-
-def _carried(contact, name: str, bodies: tuple[str, ...]) -> tuple[int, ...]:
-    """Numbers of the bodies that a contact holds up."""
-    for body in contact.carried or ():
-        if body not in bodies:
-            raise ValueError(f"contact `{name}` carries unknown body `{body}`; {nearest(body, bodies)}")
-    return tuple(range(len(bodies))) if contact.carried is None else tuple(bodies.index(body) for body in contact.carried)
+    return jax.lax.stop_gradient(size)
 
 
 def _contact_force(normal, tangential, determined, margin) -> ContactForce:

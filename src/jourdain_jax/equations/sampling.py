@@ -50,10 +50,18 @@ def assembled(scene: Scene, miss: np.ndarray, generic: np.ndarray) -> np.ndarray
     """Which states lie on the geometric rows; a ValueError where no random one does."""
     good = miss < np.sqrt(np.finfo(miss.dtype).eps)
     if not good[generic].any():
+        nowhere = (
+            ""
+            if np.isfinite(miss[generic]).any()
+            else (
+                "; no row is a finite number anywhere: a contact finds no point where a ball is larger than the cylinder or sphere that it rolls in, "
+                "or where the gradient of a surface vanishes"
+            )
+        )
         raise ValueError(
             f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by {np.min(miss[generic]):.1e} or "
             "more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, "
-            "numbers near their defaults stood in for them, or near one where they have none: give defaults near the values in use)"
+            "numbers near their defaults stood in for them, or near one where they have none: give defaults near the values in use)" + nowhere
         )
     return good
 

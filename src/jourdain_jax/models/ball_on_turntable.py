@@ -14,8 +14,9 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import quaternion_rate, quaternion_to_matrix
 from jourdain_jax.scene.bodies import RigidBody
-from jourdain_jax.scene.contacts import Plane, ball_contact
+from jourdain_jax.scene.contacts import ball_contact
 from jourdain_jax.scene.coordinates import coordinates, quaternion, speeds
+from jourdain_jax.scene.grounds import Plane
 from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import rot_x, rot_y, rot_z
 from jourdain_jax.scene.bodies import RigidBody
-from jourdain_jax.scene.contacts import Contact, Plane
+from jourdain_jax.scene.contacts import ellipsoid_contact
 from jourdain_jax.scene.coordinates import coordinates, speeds
 from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.parameters import parameter
@@ -81,17 +81,18 @@ class Rattleback(Scene):
         return (gravity(motion, self.gravity),)
 
     def contacts(self, pose):
-        stone = pose["stone"]
-        point = stone.place(self.contact_arm(-stone.orientation[2]))
-        return {"sole": Contact("stone", point, Plane(), "coordinates")}
+        return {"sole": ellipsoid_contact(pose["stone"], self._semi_axes(), centre=-self._below_centre())}
 
     def events(self, motion):
         return {"on edge": 1.4 - jnp.abs(motion.q.alpha)}
 
     def contact_arm(self, down: Float[Array, "3"]) -> Float[Array, "3"]:
         """rho (m), body axes: from the mass centre to the ellipsoid's lowest point when `down` is the downward vertical."""
-        weighted = jnp.stack([self.a**2, self.b**2, self.c**2]) * down
+        weighted = self._semi_axes() ** 2 * down
         return weighted / jnp.sqrt(down @ weighted) - self._below_centre()
+
+    def _semi_axes(self) -> Float[Array, "3"]:
+        return jnp.stack([self.a, self.b, self.c])
 
     def _below_centre(self) -> Float[Array, "3"]:
         return jnp.stack([0 * self.h, 0 * self.h, self.h])
@@ -102,7 +103,7 @@ class Rattleback(Scene):
 
     def _outline(self) -> Float[Array, "points 3"]:
         """Half of the ellipsoid that is down: its rim and two arcs."""
-        return jnp.stack([self.a, self.b, self.c]) * _half_sphere() - self._below_centre()
+        return self._semi_axes() * _half_sphere() - self._below_centre()
 
 
 def _half_sphere() -> np.ndarray:

@@ -100,7 +100,7 @@ def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
     contacts = _dictionary(scene, "contacts", scene.contacts(pose), '{"rim": jj.disc_contact(pose["disc"], radius)}')
     for name, contact in contacts.items():
         if not isinstance(contact, Contact):
-            raise ValueError(f"contact `{name}` of `{_name(scene)}` is {described(contact)}, expected a `jj.disc_contact(...)` or `jj.ball_contact(...)`")
+            raise ValueError(f"contact `{name}` of `{_name(scene)}` is {described(contact)}, expected a `jj.disc_contact(...)` or another contact")
     return contacts
 
 

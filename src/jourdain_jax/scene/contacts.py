@@ -1,119 +1,237 @@
-"""Rolling contacts without slip, of discs and balls, on planes at rest, moving or tilted.
+"""Rolling contacts without slip, of balls, ellipsoids, discs and wheels, on planes, cylinders, spheres, surfaces and height maps.
 
-A contact contributes two velocity rows (no slip along the plane's two tangents) and, with `height="row"`, one geometric row (the gap
-is zero). With `height="coordinates"` the coordinates keep the contact point on the plane by construction; then the normal force is
-found from Newton's equation (row S1) instead of from a multiplier.
+A contact contributes two velocity rows (no slip along the two tangents of the ground) and, with `height="row"`, one geometric row (the gap
+is zero). With `height="coordinates"` the coordinates keep the contact point on the ground by construction; then the normal force is
+found from Newton's equations (row S1) instead of from a multiplier. Nothing hinders spin about the normal.
 """
 
+from collections.abc import Iterable
+from typing import get_args
+
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Vector, as_real
 from jourdain_jax.scene.bodies import RigidBody, _axis_index
+from jourdain_jax.scene.contact_points import Ball, Ellipsoid, Shape, Wheel, touch
+from jourdain_jax.scene.grounds import Cylinder, Ground, Plane, Sphere, positive_length
 from jourdain_jax.scene.motion_state import BodyPose
-from jourdain_jax.scene.numbers import checked_real, described
+from jourdain_jax.scene.numbers import checked_real, described, is_traced
 
 _HEIGHTS = ("coordinates", "row")
 
 
-class Plane(eqx.Module):
-    """A plane through `origin` (m), at rest or in rigid motion: velocity of its point at p is `velocity + angular_velocity x (p - origin)`.
-
-    `Plane(origin, tilt, velocity, angular_velocity)`: the plane z = 0, turned by `tilt` (rad) about the y axis so that positive tilt slopes down
-    along x. `velocity` in m/s, `angular_velocity` in rad/s; all vectors in the inertial frame.
-
-    A moving plane states its motion twice: `origin` and `tilt` as functions of time, and `velocity` and `angular_velocity`, their rates and
-    what moves within the plane itself (a belt, a turntable). Along the normal both must agree, which is checked when a scene is probed.
-    """
-
-    origin: Float[Array, "3"]  # m
-    normal: Float[Array, "3"]  # unit vector, out of the ground
-    tangents: Float[Array, "2 3"]  # unit vectors along the no-slip rows
-    velocity: Float[Array, "3"]  # m/s, of the point at the origin
-    angular_velocity: Float[Array, "3"]  # rad/s
-
-    def __init__(self, origin=(0.0, 0.0, 0.0), tilt=0.0, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
-        """The plane z = 0, turned by `tilt` (rad) about the y axis so that positive tilt slopes down along x."""
-        tilt = checked_real(tilt, "tilt of a plane", (), advice="give one angle in rad")
-        c, s = jnp.cos(tilt), jnp.sin(tilt)
-        o, i = jnp.zeros_like(c), jnp.ones_like(c)
-        self.origin = checked_real(origin, "origin of a plane", (3,))
-        self.normal = jnp.stack([s, o, c])
-        self.tangents = jnp.stack([jnp.stack([c, o, -s]), jnp.stack([o, i, o])])
-        self.velocity = checked_real(velocity, "velocity of a plane", (3,))
-        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a plane", (3,))
-
-    def velocity_at(self, position: Vector) -> Float[Array, "3"]:
-        """Velocity (m/s, inertial frame) of the plane's material point at `position` (m, inertial frame)."""
-        return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.origin)
-
-    def height_of(self, position: Vector) -> Float[Array, ""]:
-        """Signed distance (m) of the point at `position` (m, inertial frame) from the plane, positive along the normal."""
-        return self.normal @ (as_real(position) - self.origin)
-
-
 class Contact(eqx.Module):
-    """A point contact of a body with a plane, rolling without slip."""
+    """A point contact of a body with the ground, rolling without slip; for what `ball_contact` and its like do not know.
+
+    - `body`: `pose["name"]`, or its name. `point` (m, inertial frame): the body's point that touches.
+    - `plane`: a `jj.Plane`, tangent to the ground at the point (default: z = 0 at rest); of other grounds `ground.plane_at(point)`.
+    - `height`: "coordinates" where they keep the point on the ground by themselves, "row" for a geometric row.
+    - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all of the scene), for the normal
+      force where `height="coordinates"`.
+    - `distance` (m): the gap, where it is not the point's height above the plane.
+
+    Where the point is known in the coordinates, this spares the search for it: `jj.Contact(pose["disc"], p, hill.plane_at(p))`.
+    ValueError for an unknown height, or anything of another kind or shape.
+    """
 
     body: str = eqx.field(static=True)
     point: Float[Array, "3"]  # m, inertial frame
     plane: Plane
     height: str = eqx.field(static=True)  # "coordinates" or "row"
-    carried: tuple[str, ...] | None = eqx.field(static=True, default=None)  # bodies this contact alone holds up; None: all of them
+    carried: tuple[str, ...] | None = eqx.field(static=True)  # bodies that this contact holds up; None: all of them
+    distance: Float[Array, ""] | None  # m; None: the point's height above the plane
+
+    def __init__(self, body, point, plane=None, height="coordinates", carried=None, distance=None):
+        """A contact of the `body` at its `point` with the tangent `plane` of a ground."""
+        if not isinstance(body, BodyPose | str):
+            raise ValueError(f'the body of a contact is {described(body)}, expected the pose of a body; write pose["name"]')
+        self.body = body if isinstance(body, str) else body.name
+        if plane is not None and not isinstance(plane, Plane):
+            advice = "; write ground.plane_at(point)" if isinstance(plane, get_args(Ground)) else ""
+            raise ValueError(f"`plane` of the contact of `{self.body}` is {described(plane)}, expected a `jj.Plane(...)`, or None for z = 0 at rest{advice}")
+        self.point = checked_real(point, f"point of the contact of `{self.body}`", (3,), advice="give three components in the inertial frame, m")
+        self.plane = Plane() if plane is None else plane
+        self.height = _checked_height(height)
+        self.carried = _checked_carried(carried, self.body)
+        self.distance = None if distance is None else checked_real(distance, f"distance of the contact of `{self.body}`", ())
 
     def gap(self) -> Float[Array, ""]:
-        """Signed distance of the contact point from the plane, m."""
-        return self.plane.height_of(self.point)
+        """Signed distance of the contact point from the ground, m."""
+        return self.plane.height_of(self.point) if self.distance is None else self.distance
+
+
+def ball_contact(
+    body: BodyPose,
+    radius,
+    *,
+    centre=None,
+    ground: Ground | None = None,
+    plane: Plane | None = None,
+    height: str = "coordinates",
+    carried: tuple[str, ...] | None = None,
+) -> Contact:
+    """Rolling of a ball on a ground, without slip; the contact point is `c - a n`.
+
+    - `body`: `pose["name"]`; `radius` a in m. `centre` c (3,) of the ball in m, body frame (default: the mass centre).
+    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest); `plane`: another word for it.
+    - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
+    - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
+      `height="coordinates"`.
+
+    Two velocity rows (m/s), along the ground's tangents. ValueError for an unknown height, or a ball that does not fit into the cylinder or sphere.
+    """
+    ground = _checked(body, ground, plane, height)
+    radius = positive_length(radius, f"radius of the contact of `{body.name}`")
+    _room(body, ground, radius, "radius")
+    return _rolling(body, Ball(_centre(body, centre), radius), ground, height, carried)
+
+
+def ellipsoid_contact(
+    body: BodyPose,
+    semi_axes,
+    *,
+    centre=None,
+    ground: Ground | None = None,
+    plane: Plane | None = None,
+    height: str = "coordinates",
+    carried: tuple[str, ...] | None = None,
+) -> Contact:
+    """Rolling of an ellipsoid on a ground, without slip; the contact point is `c - R S n'/sqrt(n'.S n')`, `n' = R' n`, `S = diag(a^2, b^2, c^2)`.
+
+    - `body`: `pose["name"]`; `semi_axes` (a, b, c) in m, along the axes of its body frame. `centre` (3,) of the ellipsoid in m, body frame (default: the
+      mass centre).
+    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest); `plane`: another word for it.
+    - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
+    - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
+      `height="coordinates"`.
+
+    Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown height. On all but planes the point is found by Newton's method.
+    """
+    ground = _checked(body, ground, plane, height)
+    semi_axes = checked_real(semi_axes, f"semi-axes of the contact of `{body.name}`", (3,), advice="give three lengths, m")
+    if not is_traced(semi_axes) and not np.all(np.asarray(semi_axes) > 0):
+        raise ValueError(f"semi-axes of the contact of `{body.name}` are {np.asarray(semi_axes).tolist()} m, expected positive numbers; give three lengths")
+    return _rolling(body, Ellipsoid(_centre(body, centre), body.orientation, semi_axes), ground, height, carried)
 
 
 def disc_contact(
-    body: BodyPose, radius, *, axis: str = "y", plane: Plane | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None
+    body: BodyPose,
+    radius,
+    *,
+    axis: str = "y",
+    centre=None,
+    ground: Ground | None = None,
+    plane: Plane | None = None,
+    height: str = "coordinates",
+    carried: tuple[str, ...] | None = None,
 ) -> Contact:
-    """Rolling of the edge of a thin disc (centre: the mass centre) on a plane, without slip.
+    """Rolling of the edge of a thin disc on a ground, without slip.
 
-    The contact is the lowest point of the circle, `r - a (n - (n.k) k)/|n - (n.k) k|` with plane normal n and disc axis k. Undefined for
+    The contact is the lowest point of the circle, `c - a (n - (n.k) k)/|n - (n.k) k|` with the ground's normal n and disc axis k. Undefined for
     a disc lying flat.
 
-    - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z".
-    - `plane`: default z = 0 at rest. `height`: "coordinates" where they keep the body on the plane by themselves, "row" for a geometric row.
-    - `carried`: names of the bodies that this contact holds up (default: all), for the normal force where `height="coordinates"`.
+    - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z". `centre` c (3,) in m, body frame (default: the mass centre).
+    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest); `plane`: another word for it.
+    - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
+    - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
+      `height="coordinates"`.
 
-    Two velocity rows (m/s), along the plane's tangents; ValueError for an unknown axis or height.
+    Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown axis or height. On a plane and a sphere the point is in closed form.
     """
-    _check_height(height)
-    radius, plane = _rolling(body, radius, plane)
-    k = body.orientation[:, _axis_index(axis)]
-    up = plane.normal - (plane.normal @ k) * k
-    point = body.position - radius * up / jnp.sqrt(up @ up)
-    return Contact(body.name, point, plane, height, carried)
+    return _wheel(body, radius, None, axis, centre, _checked(body, ground, plane, height), height, carried)
 
 
-def ball_contact(body: BodyPose, radius, *, plane: Plane | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None) -> Contact:
-    """Rolling of a ball (centre: the mass centre) on a plane, without slip; the contact point is `r - a n`.
+def wheel_contact(
+    body: BodyPose,
+    radius,
+    tyre,
+    *,
+    axis: str = "y",
+    centre=None,
+    ground: Ground | None = None,
+    plane: Plane | None = None,
+    height: str = "coordinates",
+    carried: tuple[str, ...] | None = None,
+) -> Contact:
+    """Rolling of a wheel with a tyre of circular section (a torus) on a ground, without slip.
 
-    - `body`: `pose["name"]`; `radius` a in m.
-    - `plane`: default z = 0 at rest. `height`: "coordinates" where they keep the body on the plane by themselves, "row" for a geometric row.
-    - `carried`: names of the bodies that this contact holds up (default: all), for the normal force where `height="coordinates"`.
+    The contact is the wheel's outermost point along `-n`: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n`, with the ground's normal n, the axle k. R is
+    the wheel's outer radius, R - r that of the circle within the tyre; a tyre of r = 0 makes a `disc_contact`. Undefined for a wheel lying flat.
 
-    Two velocity rows (m/s), along the plane's tangents; ValueError for an unknown height.
+    - `body`: `pose["name"]`; `radius` R and `tyre` r in m, `0 <= r < R`; `axis`: the body axis k, "x", "y" or "z". `centre` c (3,) in m, body frame
+      (default: the mass centre).
+    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest); `plane`: another word for it.
+    - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
+    - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
+      `height="coordinates"`.
+
+    Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown axis or height. On a plane and a sphere the point is in closed form.
     """
-    _check_height(height)
-    radius, plane = _rolling(body, radius, plane)
-    return Contact(body.name, body.position - radius * plane.normal, plane, height, carried)
+    tyre = checked_real(tyre, "tyre of a wheel's contact", ())
+    return _wheel(body, radius, tyre, axis, centre, _checked(body, ground, plane, height), height, carried)
 
 
-def _rolling(body, radius, plane) -> tuple[Float[Array, ""], Plane]:
-    """Radius and plane of the contact of a body that can roll; a ValueError otherwise."""
+def _wheel(body, radius, tyre, axis, centre, ground, height, carried) -> Contact:
+    radius = positive_length(radius, f"radius of the contact of `{body.name}`")
+    if tyre is not None and not is_traced(radius, tyre) and not 0 <= float(tyre) < float(radius):
+        advice = "give the radius of its section, smaller than that of the wheel"
+        raise ValueError(f"tyre of the contact of `{body.name}` is {float(tyre):.4g} m at a wheel of {float(radius):.4g} m, expected 0 <= r < R; {advice}")
+    if tyre is not None:
+        _room(body, ground, tyre, "tyre")
+    return _rolling(body, Wheel(_centre(body, centre), body.orientation[:, _axis_index(axis)], radius, tyre), ground, height, carried)
+
+
+def _rolling(body: BodyPose, shape: Shape, ground: Ground, height: str, carried) -> Contact:
+    found = touch(shape, ground)
+    return Contact(body, found.point, found.plane, height, carried, found.gap)
+
+
+def _centre(body: BodyPose, centre) -> Float[Array, "3"]:
+    """The centre of what rolls (m, inertial frame)."""
+    if centre is None:
+        return body.position
+    return body.place(checked_real(centre, f"centre of the contact of `{body.name}`", (3,), advice="give three components in its body frame, m"))
+
+
+def _checked(body, ground, plane, height: str) -> Ground:
+    """The ground of the contact of a body that can roll; a ValueError otherwise."""
+    _checked_height(height)
     if not isinstance(body, BodyPose):
         raise ValueError(f'the body of a contact is {described(body)}, expected the pose of a body; write pose["name"]')
     if not isinstance(body.body, RigidBody):
         raise ValueError(f"body `{body.name}` of a contact is a particle, which cannot roll; make it a `jj.RigidBody`")
-    if plane is not None and not isinstance(plane, Plane):
-        raise ValueError(f"`plane` of the contact of `{body.name}` is {described(plane)}, expected a `jj.Plane(...)`, or None for z = 0 at rest")
-    return checked_real(radius, f"radius of the contact of `{body.name}`", ()), Plane() if plane is None else plane
+    if ground is not None and plane is not None:
+        raise ValueError(f"the contact of `{body.name}` has both a `ground` and a `plane`, expected one of them; leave one away")
+    name, given = ("plane", plane) if ground is None else ("ground", ground)
+    if given is None:
+        return Plane()
+    if not isinstance(given, get_args(Ground)):
+        known = "`jj.Plane(...)`" if name == "plane" else "`jj.Plane(...)`, `jj.Cylinder`, `jj.Sphere`, `jj.Surface` or `jj.HeightMap`"
+        raise ValueError(f"`{name}` of the contact of `{body.name}` is {described(given)}, expected a {known}, or None for z = 0 at rest")
+    return given
 
 
-def _check_height(height: str) -> None:
+def _room(body: BodyPose, ground: Ground, radius, what: str) -> None:
+    """A ValueError where it is known that a hollow is too narrow; otherwise the contact is NaN there, which is said when a scene is probed."""
+    if not isinstance(ground, Cylinder | Sphere) or ground.side == "outside" or is_traced(radius, ground.radius):
+        return
+    if not float(radius) < float(ground.radius):
+        kind, size = type(ground).__name__.lower(), float(ground.radius)
+        advice = "take a smaller one, or roll on the outside"
+        raise ValueError(f"{what} of the contact of `{body.name}` is {float(radius):.4g} m inside a {kind} of {size:.4g} m, expected a smaller one; {advice}")
+
+
+def _checked_height(height: str) -> str:
     if height not in _HEIGHTS:
         raise ValueError(f"contact height `{height}` is unknown; expected `coordinates` (kept by the coordinates) or `row` (a geometric row)")
+    return height
+
+
+def _checked_carried(carried, body: str) -> tuple[str, ...] | None:
+    if carried is None:
+        return None
+    names = () if isinstance(carried, str) or not isinstance(carried, Iterable) else tuple(carried)
+    if not names or not all(isinstance(name, str) for name in names):
+        raise ValueError(f'`carried` of the contact of `{body}` is {described(carried)}, expected names of bodies; write ("{body}",)')
+    return names

@@ -1,0 +1,119 @@
+"""Normal forces of contacts that are built into the coordinates, from Newton's equations for the bodies that they carry.
+
+    sum_i N_i n_i = f = sum_j (m_j a_j - F_j - R_j)                                        over the carried bodies j and the contacts i that touch them
+    sum_i N_i (p_i - o) x n_i = sum_j (r_j - o) x (m_j a_j - F_j - R_j) + T_j              R_j, T_j: of the rows; T also of inertia and loads
+
+The coordinates may hold more than contacts can (a guide keeps a disc upright): the forces are met first, in the sense of least squares, then the moments
+as far as the forces leave room, and what is then still free has minimum norm. So the normal forces on a plane always add up to what the bodies press.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
+from jourdain_jax.scene.contacts import Contact
+from jourdain_jax.scene.names import nearest
+
+
+class Wrenches(eqx.Module):
+    """A force on every body and a torque about its mass centre, inertial frame."""
+
+    force: Float[Array, "*rows bodies 3"]  # N
+    torque: Float[Array, "*rows bodies 3"]  # N m
+
+
+class NormalForce(eqx.Module):
+    """What a contact presses with."""
+
+    normal: Float[Array, ""]  # N
+    determined: Bool[Array, ""]
+
+
+class _Support(eqx.Module):
+    """Some contacts, and the sets of bodies whose equations they share."""
+
+    contacts: tuple[str, ...] = eqx.field(static=True)
+    sets: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+
+def normal_forces(contacts: dict[str, Contact], bodies: tuple[str, ...], positions: Float[Array, "bodies 3"], hidden: Wrenches, spare: Wrenches, size):
+    """The normal force of every contact of `height="coordinates"`, by name.
+
+    - `bodies`, `positions`: names and mass centres (m) of all bodies. `hidden`: what no load and no row exerts on them.
+    - `spare`: what the rows exert for multipliers that change no motion, with a leading axis; zero where the rows are independent.
+    - `size`: of the forces at hand, N.
+    """
+    carried = {name: _carried(contact, name, bodies) for name, contact in contacts.items() if contact.height == "coordinates"}
+    found: dict[str, NormalForce] = {}
+    for support in _supports(carried):
+        found |= _of_support(support, contacts, carried, bodies, positions, hidden, spare, size)
+    return found
+
+
+def _supports(carried: dict[str, tuple[int, ...]]) -> list[_Support]:
+    """Contacts that carry bodies in common, directly or through others, belong together."""
+    groups: list[list[str]] = []
+    for name, own in carried.items():
+        together = [group for group in groups if any(set(own) & set(carried[other]) for other in group)]
+        groups = [group for group in groups if group not in together] + [[*(other for group in together for other in group), name]]
+    return [_Support(tuple(group), tuple(dict.fromkeys(carried[name] for name in group))) for group in groups]
+
+
+def _of_support(support: _Support, contacts, carried, bodies, positions, hidden: Wrenches, spare: Wrenches, size) -> dict[str, NormalForce]:
+    points = jnp.stack([contacts[name].point for name in support.contacts])
+    normals = jnp.stack([contacts[name].plane.normal for name in support.contacts])
+    here = jnp.mean(points, axis=0)
+    wrenches = [_resultant(wrench, positions, support.sets, here) for wrench in (hidden, spare)]
+    forces, moments = wrenches[0]
+    tolerance = jnp.sqrt(jnp.finfo(forces.dtype).eps)
+    if len(support.contacts) == 1:
+        normal = normals[0] @ forces
+        return {support.contacts[0]: NormalForce(normal, _unmoved(wrenches[1][0] @ normals.T, spare, tolerance)[0])}
+
+    touches = [[bodies.index(contacts[name].body) in own or carried[name] == own for name in support.contacts] for own in support.sets]
+    by_set = jnp.asarray(touches, normals.dtype)[:, None, :]
+    levers = points - here
+    length = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(levers * levers, axis=1))), jnp.finfo(levers.dtype).tiny)
+    by_force = (by_set * normals.T).reshape(-1, len(points))  # f = by_force N
+    by_moment = (by_set * jnp.cross(levers, normals).T).reshape(-1, len(points)) / length  # moment/length = by_moment N
+
+    first = pseudo_inverse(by_force)
+    left = jnp.eye(len(points)) - first @ by_force  # what the forces leave open
+    turning = by_moment @ left
+    turning = jnp.where(jnp.max(jnp.abs(turning)) > rank_cutoff(turning.dtype), turning, 0.0)
+    second = pseudo_inverse(turning)
+    open_still = left - second @ turning
+
+    def solved(f, m):
+        N = first @ f
+        return N + second @ (m / length - by_moment @ N)
+
+    N = solved(forces, moments)
+    missed = jnp.max(jnp.abs(by_force @ N - forces)), jnp.max(jnp.abs(by_moment @ N - moments / length))
+    met = (missed[0] <= tolerance * size) & (missed[1] <= tolerance * (size + jnp.max(jnp.abs(hidden.torque)) / length))
+    by_forces_alone, by_both = jnp.abs(jnp.diagonal(left)) <= tolerance, jnp.abs(jnp.diagonal(open_still)) <= tolerance
+    determined = jax.lax.stop_gradient((by_forces_alone | (by_both & met)) & _unmoved(jax.vmap(solved)(*wrenches[1]), spare, tolerance))
+    return {name: NormalForce(N[i], determined[i]) for i, name in enumerate(support.contacts)}
+
+
+def _resultant(wrench: Wrenches, positions, sets: tuple[tuple[int, ...], ...], here):
+    """Force and moment about a point of every set of bodies, one after the other."""
+    moment = wrench.torque + jnp.cross(positions - here, wrench.force)
+    summed = [[jnp.sum(part[..., jnp.array(own), :], axis=-2) for own in sets] for part in (wrench.force, moment)]
+    return tuple(jnp.concatenate(parts, axis=-1) for parts in summed)
+
+
+def _unmoved(changes: Float[Array, "rows contacts"], spare: Wrenches, tolerance) -> Bool[Array, "contacts"]:
+    """Which normal forces do not depend on multipliers that the motion leaves open."""
+    size = jnp.maximum(jnp.max(jnp.abs(spare.force), initial=0.0), jnp.max(jnp.abs(spare.torque), initial=0.0))
+    return jnp.max(jnp.abs(changes), axis=0, initial=0.0) <= tolerance * size
+
+
+def _carried(contact: Contact, name: str, bodies: tuple[str, ...]) -> tuple[int, ...]:
+    """Numbers of the bodies that a contact holds up."""
+    for body in contact.carried or ():
+        if body not in bodies:
+            raise ValueError(f"contact `{name}` carries unknown body `{body}`; {nearest(body, bodies)}")
+    return tuple(range(len(bodies))) if contact.carried is None else tuple(sorted({bodies.index(body) for body in contact.carried}))

@@ -1,0 +1,129 @@
+"""Where a convex body touches a ground: the two points with opposite normals, and the gap along the normal.
+
+    P(n)    the lowest point of the body where the unit vector n points up
+    x + gap n(x) = P(n(x)),   f(x) = 0
+
+On a plane n is known. A ball near a cylinder or sphere, and a wheel near a sphere, is a core (its centre, the circle within its tyre) and a distance
+from it, and the core's nearest point is known. For all others Newton's method solves for x and the gap, four unknowns, differentiable by the
+implicit function theorem; where it finds nothing, all is NaN.
+Source: P. Wriggers, Computational Contact Mechanics (2006), on closest points.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.newton import newton_root
+from jourdain_jax.scene.grounds import Cylinder, Ground, Plane, Sphere, normal_at
+
+_TOWARDS_THE_SURFACE = 3  # steps along the gradient before Newton's method for the contact itself
+
+
+class Ball(eqx.Module):
+    """A ball."""
+
+    centre: Float[Array, "3"]  # m, inertial frame
+    radius: Float[Array, ""]  # m
+
+    def lowest(self, n: Float[Array, "3"]) -> Float[Array, "3"]:
+        """The point farthest down where n is up: `c - a n`."""
+        return self.centre - self.radius * n
+
+
+class Wheel(eqx.Module):
+    """A wheel with a tyre of circular section: a torus; a thin disc where the tyre is None."""
+
+    centre: Float[Array, "3"]  # m, inertial frame
+    axle: Float[Array, "3"]  # unit vector
+    radius: Float[Array, ""]  # m, outer
+    tyre: Float[Array, ""] | None  # m, of the tyre's section
+
+    @property
+    def circle(self) -> Float[Array, ""]:
+        """Radius (m) of the circle of the centres of the tyre's sections."""
+        return self.radius if self.tyre is None else self.radius - self.tyre
+
+    def lowest(self, n: Float[Array, "3"]) -> Float[Array, "3"]:
+        """The point farthest down where n is up: `c - (R - r) (n - (n.k) k)/|n - (n.k) k| - r n` with the axle k."""
+        up = n - (n @ self.axle) * self.axle
+        point = self.centre - self.circle * up / jnp.sqrt(up @ up)
+        return point if self.tyre is None else point - self.tyre * n
+
+
+class Ellipsoid(eqx.Module):
+    """An ellipsoid."""
+
+    centre: Float[Array, "3"]  # m, inertial frame
+    orientation: Float[Array, "3 3"]  # columns: its axes
+    semi_axes: Float[Array, "3"]  # m
+
+    def lowest(self, n: Float[Array, "3"]) -> Float[Array, "3"]:
+        """The point farthest down where n is up: `c - R S n'/sqrt(n'.S n')`, `n' = R' n`, S the squares of the semi-axes."""
+        local = n @ self.orientation
+        weighted = self.semi_axes**2 * local
+        return self.centre - self.orientation @ (weighted / jnp.sqrt(local @ weighted))
+
+
+Shape = Ball | Wheel | Ellipsoid
+
+
+class Touch(eqx.Module):
+    """Where a body is nearest to a ground."""
+
+    point: Float[Array, "3"]  # m, inertial frame, of the body
+    plane: Plane  # tangent to the ground
+    gap: Float[Array, ""] | None  # m; None: the point's height above the plane
+
+
+def touch(shape: Shape, ground: Ground) -> Touch:
+    """The point of the body nearest to the ground, the ground's tangent plane there, and the gap."""
+    if isinstance(ground, Plane):
+        return Touch(shape.lowest(ground.normal), ground, None)
+    if isinstance(shape, Ball) and isinstance(ground, Cylinder | Sphere):
+        return _of_core(shape.centre, shape.radius, ground)
+    if isinstance(shape, Wheel) and isinstance(ground, Sphere):
+        return _of_core(_of_circle(shape, ground), jnp.zeros_like(shape.radius) if shape.tyre is None else shape.tyre, ground)
+    return _by_newton(shape, ground)
+
+
+def _of_circle(wheel: Wheel, sphere: Sphere) -> Float[Array, "3"]:
+    """The point of the circle within the tyre that is nearest to the sphere: nearest to its centre, or farthest from it when inside."""
+    arm = wheel.centre - sphere.origin
+    in_plane = arm - (arm @ wheel.axle) * wheel.axle
+    towards = in_plane / jnp.sqrt(in_plane @ in_plane)
+    return wheel.centre + wheel.circle * (towards if sphere.side == "inside" else -towards)
+
+
+def _of_core(core: Float[Array, "3"], distance: Float[Array, ""], ground: Cylinder | Sphere) -> Touch:
+    """The point at `distance` (m) from the core towards the ground; NaN where a hollow has no room for it."""
+    if ground.side == "inside":
+        distance = jnp.where(distance < ground.radius, distance, jnp.nan)
+    plane, arm = ground.plane_at(core), ground.arm_to(core)
+    away = jnp.sqrt(arm @ arm)
+    gap = ground.radius - distance - away if ground.side == "inside" else away - distance - ground.radius
+    return Touch(core - distance * plane.normal, plane, gap)
+
+
+def _by_newton(shape: Shape, ground: Ground) -> Touch:
+    def residual(unknown):
+        x, gap = unknown[:3], unknown[3]
+        n = normal_at(ground, x)
+        return jnp.append(x + gap * n - shape.lowest(n), ground.value(x))
+
+    guess = _guess(jax.lax.stop_gradient(shape), ground)
+    size = jnp.maximum(jnp.sqrt(jnp.sum((guess[:3] - shape.centre) ** 2)), jnp.finfo(guess.dtype).tiny)  # the radius, nearly
+    root = newton_root(residual, guess, jnp.full(4, jax.lax.stop_gradient(size)))
+    x, gap = root.x[:3], root.x[3]
+    found = root.converged
+    plane = ground.plane_at(jnp.where(found, x, jnp.nan))
+    return Touch(x + gap * plane.normal, plane, jnp.where(found, gap, jnp.nan))
+
+
+def _guess(shape: Shape, ground: Ground) -> Float[Array, "4"]:
+    """The point of the body towards the ground, and the point of the surface near it: x and the gap."""
+    x = point = shape.lowest(normal_at(ground, shape.centre))
+    for _ in range(_TOWARDS_THE_SURFACE):
+        value, slope = jax.value_and_grad(ground.value)(x)
+        x = x - value * slope / (slope @ slope)
+    return jax.lax.stop_gradient(jnp.append(x, normal_at(ground, x) @ (point - x)))

@@ -1,0 +1,316 @@
+"""The grounds that bodies roll on: planes, cylinders, spheres, surfaces `f(x, y, z) = 0` and height maps, at rest or in rigid motion.
+
+    n = grad f/|grad f|     unit normal out of the ground, on the side of the bodies, where f > 0
+    n x p = t1, t2          two unit tangents: the directions of the no-slip rows
+
+A moving ground states its motion twice: its shape as a function of time, and `velocity` and `angular_velocity`, the rates of that and what
+moves within the ground itself (a belt, a turntable). Along the normal both must agree, which is checked when a scene is probed.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.reals import Vector, as_real
+from jourdain_jax.scene.numbers import checked_real, described, is_traced
+
+_SIDES = ("inside", "outside")
+_UNIT = 1e-4  # a typed unit vector may have a few digits; a mistake is larger
+
+
+class Plane(eqx.Module):
+    """A plane through `origin` (m), at rest or in rigid motion: velocity of its point at p is `velocity + angular_velocity x (p - origin)`.
+
+    `Plane(origin, tilt, velocity, angular_velocity)`: the plane z = 0, turned by `tilt`: an angle (rad) about the y axis, so that positive tilt
+    slopes down along x, or a rotation matrix (3, 3), such as `jj.rot_x(0.1)`. `Plane(normal=n)`: the plane with this unit vector as normal, in place
+    of a tilt. `velocity` in m/s, `angular_velocity` in rad/s; all vectors in the inertial frame.
+
+    The no-slip rows are along the turned x and y axes. With `normal`: along the x and y axes after the shortest turn that takes z (or -z, where n
+    points down) to n; with `along` as well, any vector that is not normal to the plane: along it, as seen in the plane, and across.
+
+    A moving plane states its motion twice: `origin` and `tilt` or `normal` as functions of time, and `velocity` and `angular_velocity`, their rates and
+    what moves within the plane itself (a belt, a turntable). Along the normal both must agree, which is checked when a scene is probed.
+    ValueError: a normal that is no unit vector, an `along` that is normal to the plane, or both `tilt` and `normal`.
+    """
+
+    origin: Float[Array, "3"]  # m
+    normal: Float[Array, "3"]  # unit vector, out of the ground
+    tangents: Float[Array, "2 3"]  # unit vectors along the no-slip rows
+    velocity: Float[Array, "3"]  # m/s, of the point at the origin
+    angular_velocity: Float[Array, "3"]  # rad/s
+
+    def __init__(self, origin=(0.0, 0.0, 0.0), tilt=None, velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), *, normal=None, along=None):
+        """The plane z = 0, turned by `tilt` (rad, about y; or a rotation matrix); or the one with this `normal`, and its first tangent `along`."""
+        if tilt is not None and normal is not None:
+            raise ValueError("a plane has both a `tilt` and a `normal`, expected one of them; leave one away")
+        if normal is None:
+            axes = _turned(0.0 if tilt is None else tilt)
+            self.normal, tangents = axes[:, 2], axes[:, :2].T
+        else:
+            self.normal = unit_vector(normal, "normal of a plane")
+            tangents = tangents_of(self.normal)
+        self.tangents = tangents if along is None else _tangents_along(self.normal, along)
+        self.origin = checked_real(origin, "origin of a plane", (3,))
+        self.velocity = checked_real(velocity, "velocity of a plane", (3,))
+        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a plane", (3,))
+
+    @property
+    def axes(self) -> Float[Array, "3 3"]:
+        """Rotation matrix whose columns are the two tangents and the normal: from components in the plane to those in the inertial frame."""
+        return jnp.concatenate([self.tangents, self.normal[None]]).T
+
+    def velocity_at(self, position: Vector) -> Float[Array, "3"]:
+        """Velocity (m/s, inertial frame) of the plane's material point at `position` (m, inertial frame)."""
+        return self.velocity + jnp.cross(self.angular_velocity, as_real(position) - self.origin)
+
+    def height_of(self, position: Vector) -> Float[Array, ""]:
+        """Signed distance (m) of the point at `position` (m, inertial frame) from the plane, positive along the normal."""
+        return self.normal @ (as_real(position) - self.origin)
+
+    def value(self, point: Vector) -> Float[Array, ""]:
+        """f (m) at a `point` (m, inertial frame): its height above the plane."""
+        return self.height_of(point)
+
+    def plane_at(self, point: Vector) -> "Plane":
+        """The tangent plane at a `point` (m, inertial frame) of the plane: the plane itself."""
+        checked_real(point, "point of a plane", (3,))
+        return self
+
+
+class Cylinder(eqx.Module):
+    """A circular cylinder of the given `radius` (m) about the line through `origin` (m) along the unit vector `axis`.
+
+    `side`: "inside" or "outside", where the bodies are. `velocity` (m/s) of its material point at the origin, `angular_velocity` (rad/s): a drum that
+    turns has `angular_velocity = rate * axis`. All vectors in the inertial frame. The no-slip rows are along the axis and around it.
+    ValueError: an axis that is no unit vector, a radius that is not positive, an unknown side.
+    """
+
+    radius: Float[Array, ""]  # m
+    origin: Float[Array, "3"]  # m
+    axis: Float[Array, "3"]  # unit vector
+    side: str = eqx.field(static=True)  # "inside" or "outside"
+    velocity: Float[Array, "3"]  # m/s, of the point at the origin
+    angular_velocity: Float[Array, "3"]  # rad/s
+
+    def __init__(self, radius, axis, *, side: str, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
+        """A cylinder of `radius` (m) about the line through `origin` along the unit vector `axis`, touched from its `side`."""
+        self.radius, self.side = positive_length(radius, "radius of a cylinder"), _checked_side(side)
+        self.axis = unit_vector(axis, "axis of a cylinder")
+        self.origin = checked_real(origin, "origin of a cylinder", (3,))
+        self.velocity = checked_real(velocity, "velocity of a cylinder", (3,))
+        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a cylinder", (3,))
+
+    def arm_to(self, point: Vector) -> Float[Array, "3"]:
+        """From the nearest point of the axis to the `point` (m, inertial frame)."""
+        arm = as_real(point) - self.origin
+        return arm - (arm @ self.axis) * self.axis
+
+    def value(self, point: Vector) -> Float[Array, ""]:
+        """f (m) at a `point` (m, inertial frame): half of the difference of squared distance and squared radius, over the radius."""
+        return _round_value(self, self.arm_to(point))
+
+    def plane_at(self, point: Vector) -> Plane:
+        """The tangent plane where the cylinder is nearest to the `point` (m, inertial frame)."""
+        arm = self.arm_to(point)
+        out = arm / jnp.sqrt(arm @ arm)
+        normal = -out if self.side == "inside" else out
+        around = jnp.cross(normal, self.axis)
+        return _tangent_plane(self, as_real(point) - arm + self.radius * out, normal, jnp.stack([self.axis, around]))
+
+
+class Sphere(eqx.Module):
+    """A sphere of the given `radius` (m) about `origin` (m), touched from `side`: "inside" (a bowl) or "outside".
+
+    `velocity` (m/s) of its material point at the origin, `angular_velocity` (rad/s). All vectors in the inertial frame.
+    ValueError: a radius that is not positive, an unknown side.
+    """
+
+    radius: Float[Array, ""]  # m
+    origin: Float[Array, "3"]  # m
+    side: str = eqx.field(static=True)  # "inside" or "outside"
+    velocity: Float[Array, "3"]  # m/s, of the point at the origin
+    angular_velocity: Float[Array, "3"]  # rad/s
+
+    def __init__(self, radius, *, side: str, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
+        """A sphere of `radius` (m) about `origin` (m), touched from its `side`."""
+        self.radius, self.side = positive_length(radius, "radius of a sphere"), _checked_side(side)
+        self.origin = checked_real(origin, "origin of a sphere", (3,))
+        self.velocity = checked_real(velocity, "velocity of a sphere", (3,))
+        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a sphere", (3,))
+
+    def arm_to(self, point: Vector) -> Float[Array, "3"]:
+        """From the sphere's centre to the `point` (m, inertial frame)."""
+        return as_real(point) - self.origin
+
+    def value(self, point: Vector) -> Float[Array, ""]:
+        """f (m) at a `point` (m, inertial frame): half of the difference of squared distance and squared radius, over the radius."""
+        return _round_value(self, self.arm_to(point))
+
+    def plane_at(self, point: Vector) -> Plane:
+        """The tangent plane where the sphere is nearest to the `point` (m, inertial frame)."""
+        arm = self.arm_to(point)
+        out = arm / jnp.sqrt(arm @ arm)
+        normal = -out if self.side == "inside" else out
+        return _tangent_plane(self, self.origin + self.radius * out, normal, tangents_of(normal))
+
+
+class Surface(eqx.Module):
+    """The smooth surface `f(x, y, z) = 0`; f is positive on the side of the bodies.
+
+    `f`: a function of three numbers (m, inertial frame) to one, twice differentiable by JAX, with a gradient that does not vanish where it is touched;
+    it may close over traced numbers, a surface that moves over the time: `lambda x, y, z: z - rise * pose.t`. `velocity` (m/s) of its material point at
+    `origin` (m) and `angular_velocity` (rad/s), of a surface that moves; all in the inertial frame. ValueError: an `f` that is no such function.
+    """
+
+    f: Callable = eqx.field(static=True)  # (x, y, z) -> number, positive on the side of the bodies
+    origin: Float[Array, "3"]  # m
+    velocity: Float[Array, "3"]  # m/s, of the point at the origin
+    angular_velocity: Float[Array, "3"]  # rad/s
+
+    def __init__(self, f, *, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
+        """The surface on which `f(x, y, z)` is zero."""
+        self.f = _function(f, "a surface", "lambda x, y, z: z - 0.1 * x**2")
+        self.origin = checked_real(origin, "origin of a surface", (3,))
+        self.velocity = checked_real(velocity, "velocity of a surface", (3,))
+        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a surface", (3,))
+
+    def value(self, point: Vector) -> Float[Array, ""]:
+        """f at a `point` (m, inertial frame)."""
+        x, y, z = as_real(point)
+        return checked_real(self.f(x, y, z), "f(x, y, z) of a surface", (), advice="return one number, positive on the side of the bodies")
+
+    def plane_at(self, point: Vector) -> Plane:
+        """The tangent plane at a `point` (m, inertial frame) of the surface."""
+        point = as_real(point)
+        normal = normal_at(self, point)
+        return _tangent_plane(self, point, normal, tangents_of(normal))
+
+
+class HeightMap(eqx.Module):
+    """The surface `z = h(x, y)`, with the bodies above it.
+
+    `h`: a function of two numbers (m, inertial frame) to one (m), twice differentiable by JAX. `velocity` (m/s) of its material point at `origin` (m)
+    and `angular_velocity` (rad/s), of a surface that moves; all in the inertial frame. The first no-slip row is along x, as seen in the surface.
+    ValueError: an `h` that is no such function.
+    """
+
+    h: Callable = eqx.field(static=True)  # (x, y) -> height, m
+    origin: Float[Array, "3"]  # m
+    velocity: Float[Array, "3"]  # m/s, of the point at the origin
+    angular_velocity: Float[Array, "3"]  # rad/s
+
+    def __init__(self, h, *, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
+        """The surface of height `h(x, y)`."""
+        self.h = _function(h, "a height map", "lambda x, y: 0.1 * x**2")
+        self.origin = checked_real(origin, "origin of a height map", (3,))
+        self.velocity = checked_real(velocity, "velocity of a height map", (3,))
+        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a height map", (3,))
+
+    def height_at(self, x, y) -> Float[Array, ""]:
+        """h (m) at `x`, `y` (m)."""
+        return checked_real(self.h(x, y), "h(x, y) of a height map", (), advice="return one height, m")
+
+    def value(self, point: Vector) -> Float[Array, ""]:
+        """`z - h(x, y)` (m) at a `point` (m, inertial frame)."""
+        x, y, z = as_real(point)
+        return z - self.height_at(x, y)
+
+    def plane_at(self, point: Vector) -> Plane:
+        """The tangent plane at a `point` (m, inertial frame) of the surface; only its x and y count."""
+        x, y, _ = as_real(point)
+        o, i = jnp.zeros_like(x), jnp.ones_like(x)
+        height, along_x = jax.jvp(self.height_at, (x, y), (i, o))
+        _, along_y = jax.jvp(self.height_at, (x, y), (o, i))
+        first, normal = jnp.stack([i, o, along_x]), jnp.stack([-along_x, -along_y, i])
+        first, normal = first / jnp.sqrt(1 + along_x * along_x), normal / jnp.sqrt(1 + along_x * along_x + along_y * along_y)
+        return _tangent_plane(self, jnp.stack([x, y, height]), normal, jnp.stack([first, jnp.cross(normal, first)]))
+
+    def point_at(self, x, y) -> Float[Array, "3"]:
+        """The point (m, inertial frame) of the surface at `x`, `y` (m)."""
+        return jnp.stack([as_real(x), as_real(y), self.height_at(x, y)])
+
+
+Ground = Plane | Cylinder | Sphere | Surface | HeightMap
+
+
+def normal_at(ground: Ground, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """`grad f/|grad f|` at a point; NaN where the gradient vanishes."""
+    gradient = jnp.stack([jax.jvp(ground.value, (point,), (e,))[1] for e in jnp.eye(3, dtype=point.dtype)])
+    return gradient / jnp.sqrt(gradient @ gradient)
+
+
+def tangents_of(n: Float[Array, "3"]) -> Float[Array, "2 3"]:
+    """Two unit vectors normal to the unit vector n and to each other, with `t1 x t2 = n`: x and y after the shortest turn of z (or -z) to n.
+
+    No field of tangents is continuous on a whole sphere: these change at n_z = 0, and the no-slip rows with them, not what they say.
+    Source: T. Duff et al., J. Computer Graphics Techniques 6 (2017) 1.
+    """
+    x, y, z = n
+    s = jnp.where(z >= 0, jnp.ones_like(z), -jnp.ones_like(z))
+    a = -1 / (s + z)
+    return jnp.stack([jnp.stack([1 + s * x * x * a, s * x * y * a, -s * x]), jnp.stack([x * y * a, s + y * y * a, -y])])
+
+
+def unit_vector(value, what: str) -> Float[Array, "3"]:
+    """A unit vector; a ValueError where it is known to have another length. Traced ones are looked at when a scene is probed."""
+    vector = checked_real(value, what, (3,), advice="give a unit vector")
+    length = 1.0 if is_traced(vector) else float(np.linalg.norm(np.asarray(vector)))
+    if not abs(length - 1) <= _UNIT:
+        raise ValueError(f"{what} has length {length:.4g}, expected a unit vector; divide it by its length")
+    return vector
+
+
+def positive_length(value, what: str) -> Float[Array, ""]:
+    """A length (m); a ValueError where it is known not to be positive."""
+    length = checked_real(value, what, ())
+    if not is_traced(length) and not float(length) > 0:
+        raise ValueError(f"{what} is {float(length):.4g} m, expected a positive number; give it in m")
+    return length
+
+
+def _turned(tilt) -> Float[Array, "3 3"]:
+    """Columns: the turned x, y, z."""
+    tilt = checked_real(tilt, "tilt of a plane", advice="give one angle in rad, or a rotation matrix, such as jj.rot_x(0.1)")
+    if tilt.shape == (3, 3):
+        return tilt
+    tilt = checked_real(tilt, "tilt of a plane", (), advice="give one angle in rad, or a rotation matrix, such as jj.rot_x(0.1)")
+    c, s = jnp.cos(tilt), jnp.sin(tilt)
+    o, i = jnp.zeros_like(c), jnp.ones_like(c)
+    return jnp.stack([jnp.stack([c, o, s]), jnp.stack([o, i, o]), jnp.stack([-s, o, c])])
+
+
+def _tangents_along(n, along) -> Float[Array, "2 3"]:
+    along = checked_real(along, "`along` of a plane", (3,), advice="give a vector that is not normal to the plane")
+    first = along - (n @ along) * n
+    if not is_traced(first, along) and not float(first @ first) > _UNIT**2 * float(along @ along):
+        raise ValueError("`along` of a plane is normal to it, expected a direction within it; give another vector")
+    first = first / jnp.sqrt(first @ first)
+    return jnp.stack([first, jnp.cross(n, first)])
+
+
+def _tangent_plane(ground: Ground, origin, normal, tangents) -> Plane:
+    """A plane of known axes that moves with the ground."""
+    velocity = ground.velocity + jnp.cross(ground.angular_velocity, origin - ground.origin)
+    parts = lambda p: (p.origin, p.normal, p.tangents, p.velocity, p.angular_velocity)  # noqa: E731
+    return eqx.tree_at(parts, Plane(), (origin, normal, tangents, velocity, ground.angular_velocity))
+
+
+def _round_value(ground: Cylinder | Sphere, arm) -> Float[Array, ""]:
+    outward = (arm @ arm - ground.radius**2) / (2 * ground.radius)
+    return -outward if ground.side == "inside" else outward
+
+
+def _checked_side(side: str) -> str:
+    if side not in _SIDES:
+        raise ValueError(f"side `{side}` is unknown; expected `inside` or `outside`, where the bodies are")
+    return side
+
+
+def _function(f, what: str, example: str) -> Callable:
+    if not callable(f):
+        raise ValueError(f"{what} is given by {described(f)}, expected a function of numbers; write {example}")
+    return f

@@ -1,0 +1,251 @@
+"""Bodies that roll on planes, cylinders, spheres, surfaces and height maps: where they touch, how they move, and what presses them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rolling_scenes import GRAVITY, GROUNDS, BallInBowl, BallInDrum, DiscOnHill, Rolls, RouthSphere, TyredBicycle, TyredWheel
+from tolerances import tolerance
+
+import jourdain_jax as jj
+from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.equations.reactions import contact_forces
+
+UP = np.array([0.0, 0.0, 1.0])
+SHAPES = ("ball", "ellipsoid", "disc", "wheel")
+
+
+def poses(scene, count: int):
+    """Random coordinates of a free body; near the ground, but not on it."""
+    random = np.random.default_rng(7)
+    place = random.uniform(-1, 1, (count, 3))
+    if scene.shape_of_ground == "plane":
+        place = 0.1 * place
+    elif "cylinder" in scene.shape_of_ground or "sphere" in scene.shape_of_ground:
+        axis = np.array([2.0, 1.0, 2.0]) / 3 if "cylinder" in scene.shape_of_ground else np.zeros(3)
+        radial = place - np.outer(place @ axis, axis)
+        radial *= (0.52 if scene.shape_of_ground.startswith("on") else 0.43) / np.linalg.norm(radial, axis=1)[:, None]
+        place = radial + 0.2 * np.outer(random.uniform(-1, 1, count), axis)
+    elif scene.shape_of_ground == "on a hill":
+        place = place * np.array([0.3, 0.3, 0.02]) + np.array([0.0, 0.0, 0.13])
+    else:
+        place *= 0.55 / np.linalg.norm(place, axis=1)[:, None]
+    return jnp.asarray(np.hstack([place, random.normal(size=(count, 4))]))
+
+
+def rolling(ground: str, shape: str) -> Rolls:
+    scene = Rolls(make_ground=GROUNDS[ground], shape=shape, moments=(0.3, 0.4, 0.35))
+    object.__setattr__(scene, "shape_of_ground", ground)
+    return scene
+
+
+def outside(scene, place, R, point):
+    """A function that is zero on the body's surface and grows outwards, at a point; of a disc: off its edge, and off its plane."""
+    x, y, z = R.T @ (point - place)
+    a = scene.radius
+    if scene.shape == "ball":
+        return x**2 + y**2 + z**2 - a**2
+    if scene.shape == "ellipsoid":
+        return x**2 / a**2 + y**2 / (0.8 * a) ** 2 + z**2 / (0.6 * a) ** 2 - 1
+    r = scene.tyre if scene.shape == "wheel" else 0.0
+    return (jnp.sqrt(x**2 + z**2) - (a - r)) ** 2 + y**2 - r**2
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("ground", GROUNDS)
+def test_body_and_ground_are_nearest_where_their_normals_are_opposite(ground, shape):
+    scene = rolling(ground, shape)
+
+    @jax.jit
+    @jax.vmap
+    def miss(q):
+        pose = jj.pose_at(scene, 0.0, q)
+        contact, earth, body = scene.contacts(pose)["touch"], scene.make_ground(scene, pose), pose["body"]
+        n, foot = contact.plane.normal, contact.point - contact.gap() * contact.plane.normal
+        slope = jax.grad(earth.value)(foot)
+        of_body = lambda p: outside(scene, body.position, body.orientation, p)  # noqa: E731
+        outward = jax.grad(of_body)(contact.point)
+        outward = outward / jnp.sqrt(outward @ outward)
+        if shape == "disc":  # an edge has normals all round: nothing along the edge
+            arm = contact.point - body.position
+            outward, off = (
+                -n,
+                jnp.stack([arm @ arm - scene.radius**2, arm @ body.orientation[:, 1], n @ jnp.cross(body.orientation[:, 1], arm), (n @ arm > 0) + 0.0]),
+            )
+        else:
+            off = of_body(contact.point)[None]
+        axes = contact.plane.axes
+        parts = [
+            earth.value(foot)[None],
+            n - slope / jnp.sqrt(slope @ slope),
+            outward + n,
+            off,
+            (axes.T @ axes - jnp.eye(3)).ravel(),
+            jnp.linalg.det(axes)[None] - 1,
+        ]
+        return jnp.concatenate(parts), contact.gap()
+
+    error, gap = miss(poses(scene, 8))
+    assert np.max(np.abs(error)) <= tolerance("round_off")
+    assert np.all(np.isfinite(gap))
+    assert np.max(np.abs(gap)) > 1e-3
+
+
+MOVING = [(ground, "ball") for ground in GROUNDS if "hill" not in ground and "egg" not in ground] + [("within a sphere", "wheel"), ("plane", "ellipsoid")]
+MOVING += [("on a hill", "ball")]  # by Newton's method: its derivatives take long to compile
+MOVING += [pytest.param(*case, marks=pytest.mark.slow) for case in (("within a cylinder", "wheel"), ("on a hill", "disc"), ("on an egg", "ball"))]
+MOVING += [pytest.param("on an egg", "ellipsoid", marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize(("ground", "shape"), MOVING)
+def test_one_force_at_the_contact_moves_and_turns_a_body_that_rolls(ground, shape):
+    # m (v' + g z) = F,  I w' + w x I w = (p - c) x F,  no slip at p in any direction, now and an instant later; no moment about the normal
+    scene = rolling(ground, shape)
+    scene_moments = np.asarray(scene.moments * scene.mass * scene.radius**2)
+    turning = jnp.asarray(np.random.default_rng(3).normal(size=(5, 3)))
+
+    def slip(q, u):
+        motion = jj.motion_at(scene, 0.0, q, u)
+        return motion["body"].velocity_at(scene.contacts(motion.pose())["touch"].point)
+
+    @on_numbers
+    @jax.vmap
+    def look(q, turning):
+        contact = scene.contacts(jj.pose_at(scene, 0.0, q))["touch"]
+        q = q.at[:3].add(-contact.gap() * contact.plane.normal)
+        pose = jj.pose_at(scene, 0.0, q)
+        contact, R = scene.contacts(pose)["touch"], pose["body"].orientation
+        arm = contact.point - q[:3]
+        u = jnp.concatenate([-jnp.cross(R @ turning, arm), turning])
+        found = jj.accelerations(scene, 0.0, q, u)
+        force = contact_forces(scene, 0.0, q, u, found)["touch"]
+        _, slip_rate = jax.jvp(slip, (q, u), (jj.coordinate_rates(scene, 0.0, q, u), found.udot))
+        F = scene.mass * (found.udot[:3] + GRAVITY * UP)
+        torque = scene_moments * found.udot[3:] + jnp.cross(turning, scene_moments * turning)
+        return jnp.concatenate([slip_rate, R @ torque - jnp.cross(arm, F), slip(q, u)]), F, contact.plane, force
+
+    error, F, plane, force = look(poses(scene, 5), turning)
+    assert np.max(np.abs(error)) <= tolerance("ill_conditioned")
+    normal, along = np.einsum("bi,bi->b", F, plane.normal), np.einsum("bi,bji->bj", F, plane.tangents)
+    size = np.max(np.abs(F))
+    assert np.max(np.abs(force.normal - normal)) <= tolerance("ill_conditioned") * size
+    assert np.max(np.abs(force.tangential - along)) <= tolerance("ill_conditioned") * size
+    assert np.array_equal(force.pulls, normal < 0)
+    needed = np.where(normal > 0, np.linalg.norm(along, axis=1) / np.abs(normal), np.inf)
+    assert np.allclose(force.friction_needed, needed, rtol=1e-8)
+    assert np.all(force.determined)
+
+
+def test_a_ball_in_a_bowl_swings_with_the_frequency_of_five_sevenths_of_gravity():
+    bowl = BallInBowl()
+    length = bowl.bowl - bowl.radius
+    found = jj.linearize(bowl, {})
+    fastest = np.sort(np.abs(found.state_eigenvalues().imag))[-4:]
+    assert np.allclose(fastest, np.sqrt(5 * GRAVITY / (7 * length)), rtol=tolerance("linearization"))
+
+
+@pytest.mark.parametrize("spin", [0.0, 12.0])
+def test_a_ball_circles_in_a_bowl_at_the_rate_of_its_slope_and_spin(spin):
+    # (1 + k) l cos(theta) W^2 + k a w_n W = g, k = 2/5: Routh's equations with n turning at W
+    bowl = BallInBowl()
+    a, length, theta = float(bowl.radius), float(bowl.bowl - bowl.radius), 0.3
+    W = np.roots([1.4 * length * np.cos(theta), 0.4 * a * spin, -GRAVITY]).max()
+    x, normal = length * np.sin(theta), np.array([-np.sin(theta), 0.0, np.cos(theta)])
+    velocity = np.array([0.0, W * x, 0.0])
+    turn = np.cross(normal, velocity) / a + spin * normal
+    motion = jj.simulate(bowl, {"x": x, "y_rate": velocity[1], "attitude_omega": turn}, ts=np.linspace(0.0, 2.0, 9), rtol=1e-11, atol=1e-11)
+    assert np.allclose(motion["x"], x * np.cos(W * motion.ts), atol=1e-8)
+    assert np.allclose(motion["y"], x * np.sin(W * motion.ts), atol=1e-8)
+    # N: weight and the acceleration to the middle of the circle, along n
+    force = motion.contact_forces()["bowl"]
+    assert np.allclose(force.normal, bowl.mass * (GRAVITY * np.cos(theta) + W**2 * x * np.sin(theta)), rtol=1e-8)
+
+
+def test_a_ball_in_an_upright_cylinder_rises_again_with_the_rate_of_the_golf_ball():
+    # z = -5 g/(2 W^2) (1 - cos(sqrt(2/7) W t)): the ball sinks and comes back up
+    W = 6.0
+    drum = BallInDrum()
+    turn = -W * (drum.drum - drum.radius) / drum.radius  # about the axis: the wall does not slip
+    motion = jj.simulate(drum, {"angle": 0.4, "angle_rate": W, "attitude_omega": (0.0, 0.0, float(-turn))}, ts=np.linspace(0.0, 4.0, 9), rtol=1e-11, atol=1e-11)
+    expected = -5 * GRAVITY / (2 * W**2) * (1 - np.cos(np.sqrt(2 / 7) * W * np.asarray(motion.ts)))
+    assert np.allclose(motion["along"], expected, atol=1e-8)
+    assert np.allclose(motion.contact_forces()["wall"].normal, drum.mass * W**2 * (drum.drum - drum.radius), rtol=1e-8)
+
+
+def test_a_ball_in_a_level_cylinder_swings_as_a_pendulum_of_seven_fifths_of_its_length():
+    drum = BallInDrum(upright=False)
+    arm = float(drum.drum - drum.radius)
+    motion = jj.simulate(drum, {"angle": 1.0}, ts=np.linspace(0.0, 2.0, 9), rtol=1e-11, atol=1e-11)
+    # (7/10) (l angle')^2 = g l (cos angle - cos angle_0)
+    angle, rate = np.asarray(motion["angle"]), np.asarray(motion["angle_rate"])
+    assert np.allclose(0.7 * arm * rate**2, GRAVITY * (np.cos(angle) - np.cos(1.0)), atol=1e-8)
+    assert np.ptp(angle) > 1.9
+    force = motion.contact_forces()["wall"]
+    assert np.allclose(force.normal, drum.mass * GRAVITY * (17 * np.cos(angle) - 10 * np.cos(1.0)) / 7, rtol=1e-8)
+
+
+def test_rouths_sphere_keeps_the_integrals_of_jellett_and_routh():
+    motion = jj.simulate(
+        RouthSphere(), {"attitude": jj.quaternion_from_axis_angle((0.6, 0.8, 0.0), 0.9), "attitude_omega": (1.0, 2.0, 9.0)}, t1=3.0, rtol=1e-11, atol=1e-11
+    )
+    drifts = jj.diagnose(motion).invariant_drifts
+    assert max(float(drift) for drift in drifts.values()) <= tolerance("drift")
+    assert float(jj.diagnose(motion).energy_drift) <= tolerance("drift")
+
+
+def test_a_disc_on_a_hill_moves_by_its_angles_as_by_the_search_for_its_contact():
+    by_angles, by_search = DiscOnHill(), Rolls(make_ground=GROUNDS["on a hill"], shape="disc", radius=0.1, moments=(0.25, 0.5, 0.25))
+    motion = jj.simulate(by_angles, {"x": 0.1, "lean": 0.2, "yaw": 0.3, "spin_rate": 9.0, "yaw_rate": 0.4}, ts=np.linspace(0.0, 0.6, 5), rtol=1e-11, atol=1e-11)
+    assert float(jj.diagnose(motion).energy_drift) <= tolerance("drift")
+
+    @jax.jit
+    @jax.vmap
+    def both(t, q, u):
+        pose = jj.motion_at(by_angles, t, q, u)["body"]
+        q7, u6 = jnp.concatenate([pose.position, quaternion_of(pose.orientation)]), jnp.concatenate([pose.velocity, pose.angular_velocity_body])
+        udot = jj.accelerations(by_search, t, q7, u6).udot
+        found = jj.accelerations(by_angles, t, q, u)
+        # the angles' accelerations as those of the mass centre
+        rate = lambda q, u: jj.motion_at(by_angles, t, q, u)["body"].velocity  # noqa: E731
+        centre = jax.jvp(rate, (q, u), (jj.coordinate_rates(by_angles, t, q, u), found.udot))[1]
+        return centre - udot[:3], jj.velocity_residual(by_search, t, q7, u6)
+
+    difference, residual = both(motion.ts, motion.q, motion.u)
+    assert np.max(np.abs(residual)) <= 1e-8
+    assert np.max(np.abs(difference)) <= 1e-6
+
+
+def quaternion_of(R):
+    """A quaternion of a rotation that is less than half a turn."""
+    w = jnp.sqrt(1 + jnp.trace(R)) / 2
+    return jnp.stack([w, (R[2, 1] - R[1, 2]) / (4 * w), (R[0, 2] - R[2, 0]) / (4 * w), (R[1, 0] - R[0, 1]) / (4 * w)])
+
+
+@pytest.mark.parametrize("tyre", [0.0, 0.05, 0.2])
+def test_a_wheel_with_a_tyre_topples_by_its_slender_part_alone(tyre):
+    # lean: (I + m R^2) s^2 = m g (R - r) - (J + m R^2) J W^2/I; rolling straight at W
+    W, wheel = 3.0, TyredWheel(tyre=tyre)
+    m, R = float(wheel.mass), float(wheel.radius)
+    I, J = m * R**2 / 4, m * R**2 / 2
+    squared = (m * GRAVITY * (R - tyre) - (J + m * R**2) * J * W**2 / I) / (I + m * R**2)
+    found = jj.linearize(wheel, {"spin_rate": W})
+    roots = np.asarray(found.state_eigenvalues())
+    largest = roots[np.argmax(np.abs(roots))]
+    assert np.isclose(largest**2, squared, rtol=1e-9)
+
+
+def test_a_bicycle_with_tyres_is_the_whipple_bicycle_whose_wheels_widen():
+    # a tyre adds r N lean^2/2 of its wheel to the potential: K0 + N_R r_R (1, 0)(1, 0)' + N_F r_F (1, sin lam)(1, sin lam)'
+    M = np.array([[80.81722, 2.319413322087091], [2.319413322087091, 0.2978418819968556]])
+    C1 = np.array([[0, 33.86641391492494], [-0.8503564145697844, 1.6854039739755967]])
+    K0 = 9.81 * np.array([[-80.95, -2.5995168524987164], [-2.5995168524987164, -0.8032948845861769]])
+    K2 = np.array([[0, 76.5973458957322], [0, 2.654315237946040]])
+    rear_load, front_load, v = 612.836470588236, 309.303529411765, 5.0
+    for rear, front in ((0.0, 0.0), (0.03, 0.02), (0.1, 0.06)):
+        across = np.array([1.0, np.sin(np.pi / 10)])
+        K = K0 + v**2 * K2 + rear_load * rear * np.diag([1.0, 0.0]) + front_load * front * np.outer(across, across)
+        expected = np.linalg.eigvals(np.block([[np.zeros((2, 2)), np.eye(2)], [-np.linalg.solve(M, K), -np.linalg.solve(M, v * C1)]]))
+        bicycle = TyredBicycle(rear_tyre=rear, front_tyre=front)
+        found = np.asarray(jj.linearize(bicycle, bicycle.upright(v), coordinates=("lean", "steer")).eigenvalues())
+        nearest = np.min(np.abs(expected[:, None] - found[None, :]), axis=1)
+        assert np.max(nearest) <= 1e-8 * np.max(np.abs(expected))

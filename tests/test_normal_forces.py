@@ -1,0 +1,176 @@
+"""Normal forces of contacts that are built into the coordinates: by the forces and moments of the bodies that they carry."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rolling_scenes import GRAVITY, Cart, CartOnRows
+from tolerances import tolerance
+
+import jourdain_jax as jj
+from jourdain_jax.equations.normal_forces import Wrenches, normal_forces
+from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.equations.reactions import contact_forces
+
+
+def forces(scene, q=None, u=None, **values):
+    """Contact forces of a scene at a state that rolls."""
+    if q is None:
+        q, u, _ = scene.named(**values)
+    return contact_forces(scene, 0.0, q, u, jj.accelerations(scene, 0.0, q, u))
+
+
+def rolling_state(cart, along, turn):
+    """Coordinates and speeds of a cart that runs at `along` (m/s) and turns at `turn` (rad/s), its balls rolling."""
+    values = {"x_rate": along[0], "y_rate": along[1], "heading_rate": turn}
+    for i in range(cart.balls):
+        x, y = np.asarray(cart.places)[i]
+        v = np.array([along[0] - turn * y, along[1] + turn * x])
+        values[f"ball{i}_omega"] = np.array([-v[1], v[0], 0.3]) / float(cart.radius)  # w = n x v/a, and some spin
+    return values
+
+
+def test_the_balls_of_a_cart_on_three_press_as_multipliers_of_height_rows_say():
+    # the same cart with a free chassis: there the normal forces are multipliers
+    random = np.random.default_rng(5)
+
+    @on_numbers
+    @jax.vmap
+    def both(load, push, slope, along, turn, angular):
+        made = {"load": load, "push": push, "slope": slope}
+        level, free = Cart(**made), CartOnRows(**made)
+        o, i, radius = jnp.zeros(()), jnp.ones(()), level.radius
+        balls = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), 3)
+        q, q_free = jnp.concatenate([jnp.zeros(3), balls]), jnp.concatenate([jnp.stack([o, o, radius, i, o, o, o]), balls])
+        turns = []
+        for k in range(3):
+            x, y = level.places[k]
+            v = along + turn * jnp.stack([-y, x])
+            turns += [-v[1] / radius, v[0] / radius, angular[k]]
+        ball_u = jnp.stack(turns)
+        u, u_free = jnp.concatenate([along, turn[None], ball_u]), jnp.concatenate([along, jnp.stack([o, o, o, turn]), ball_u])
+        first, second = (contact_forces(s, 0.0, x, y, jj.accelerations(s, 0.0, x, y)) for s, x, y in ((level, q, u), (free, q_free, u_free)))
+        press = [jnp.stack([found[f"ball{k}"].normal for k in range(3)]) for found in (first, second)]
+        slide = [jnp.stack([found[f"ball{k}"].tangential for k in range(3)]) for found in (first, second)]
+        known = jnp.stack([found[f"ball{k}"].determined for found in (first, second) for k in range(3)])
+        return press[0] - press[1], slide[0] - slide[1], press[1], known, jj.velocity_residual(free, 0.0, q_free, u_free)
+
+    n = 6
+    inputs = (random.normal(size=(n, 3)) * 0.1, random.normal(size=(n, 3)) * 5, random.uniform(-0.3, 0.3, n), random.normal(size=(n, 2)))
+    inputs += (random.normal(size=n), random.normal(size=(n, 3)))
+    press, slide, expected, known, residual = both(*(jnp.asarray(x) for x in inputs))
+    assert np.max(np.abs(residual)) <= tolerance("round_off")
+    assert np.max(np.abs(press)) <= tolerance("round_off") * np.max(np.abs(expected)) * 10  # ten: a system of 18 unknowns
+    assert np.max(np.abs(slide)) <= tolerance("round_off") * np.max(np.abs(expected)) * 10
+    assert np.all(known)
+    assert np.ptp(expected) > 1.0
+
+
+class Row(Cart):
+    """A cart on up to four balls, at rest, not turned."""
+
+    coordinates = jj.coordinates("x y heading", *(jj.quaternion(f"ball{i}") for i in range(4)))
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.15])
+def test_four_wheels_share_the_weight_by_minimum_norm_and_say_that_they_do(shift):
+    corners = ((0.5, 0.3), (0.5, -0.3), (-0.5, 0.3), (-0.5, -0.3))
+    cart = Row(places=corners, load=(shift, 0.0, 0.0), slope=0.0, push=(0.0, 0.0, 0.0), balls=4)
+    found = forces(cart)
+    weight = 14.0 * GRAVITY
+    normal = np.array([found[f"ball{i}"].normal for i in range(4)])
+    # of all that carry the weight and its moment, the shortest vector: one plane through the four
+    ahead = 10.0 * GRAVITY * shift / (4 * 0.5)
+    assert np.allclose(normal, weight / 4 + ahead * np.array([1, 1, -1, -1]), rtol=1e-12)
+    assert not any(bool(force.determined) for force in found.values())
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.1, -0.2])
+def test_two_balls_in_line_share_the_weight_by_moments(ahead):
+    cart = TwoBalls(places=((0.6, 0.0), (-0.4, 0.0)), load=(ahead, 0.0, 0.2), slope=0.0, push=(0.0, 0.0, 0.0), balls=2)
+    found = forces(cart)
+    front, rear = (float(found[f"ball{i}"].normal) for i in range(2))
+    chassis = 10.0 * GRAVITY
+    assert np.isclose(front, GRAVITY + chassis * (ahead + 0.4), rtol=1e-12)
+    assert np.isclose(rear, GRAVITY + chassis * (0.6 - ahead), rtol=1e-12)
+    assert found["ball0"].determined
+    assert found["ball1"].determined
+
+
+class TwoBalls(Cart):
+    """A cart on two balls."""
+
+    coordinates = jj.coordinates("x y heading", *(jj.quaternion(f"ball{i}") for i in range(2)))
+
+
+def test_a_moment_that_no_contact_can_bear_marks_the_shares_but_not_their_sum():
+    # pushed upwards beside the line of its balls: a guide must keep it from tilting
+    cart = TwoBalls(places=((0.5, 0.0), (-0.5, 0.0)), load=(0.0, 0.1, 0.0), slope=0.0, push=(0.0, 0.0, 0.0), balls=2)
+    found = forces(cart)
+    assert np.isclose(sum(float(force.normal) for force in found.values()), 12.0 * GRAVITY, rtol=1e-12)
+    assert not any(bool(force.determined) for force in found.values())
+
+
+class Robot(jj.Scene):
+    """Two driven discs on an axle and a body above it that may pitch: balanced on two wheels."""
+
+    track: object = jj.parameter(0.5)
+    height: object = jj.parameter(0.4)
+    body: object = jj.parameter(9.0)
+    wheel: object = jj.parameter(1.5)
+    radius: object = jj.parameter(0.12)
+
+    coordinates = jj.coordinates("x y heading pitch left right")
+
+    def bodies(self, t, q):
+        frame, o = jj.rot_z(q.heading), 0.0 * q.x
+        middle = jnp.stack([q.x, q.y, o + self.radius])
+        turned = frame @ jj.rot_y(q.pitch)
+        made = {"body": jj.RigidBody(self.body, jnp.array([0.3, 0.25, 0.1]), middle + self.height * turned[:, 2], turned)}
+        for name, side in (("left", 1.0), ("right", -1.0)):
+            centre = middle + 0.5 * side * self.track * frame[:, 1]
+            made[name] = jj.RigidBody.thin_disc(self.wheel, self.radius, axis="y", position=centre, orientation=frame @ jj.rot_y(q[name]))
+        return made
+
+    def loads(self, motion):
+        return (jj.gravity(motion, GRAVITY),)
+
+    def contacts(self, pose):
+        return {name: jj.disc_contact(pose[name], self.radius) for name in ("left", "right")}
+
+
+@pytest.mark.parametrize(("v", "turn"), [(0.0, 0.0), (1.2, 0.0), (1.5, 0.8), (-1.0, 1.3)])
+def test_the_wheels_of_a_robot_carry_half_of_it_and_lean_on_the_outer_one_in_a_turn(v, turn):
+    robot = Robot()
+    rates = {"x_rate": v, "heading_rate": turn}
+    rates |= {"left_rate": (v - 0.25 * turn) / 0.12, "right_rate": (v + 0.25 * turn) / 0.12}
+    found = forces(robot, **rates)
+    left, right = (float(found[name].normal) for name in ("left", "right"))
+    weight = 12.0 * GRAVITY
+    # the body stands upright: its own pitch and the weight hold the balance; the centripetal forces and the wheels' momentum turn it outwards
+    spin = 0.5 * 1.5 * 0.12**2 * turn * (rates["left_rate"] + rates["right_rate"])
+    outwards = (9.0 * 0.52 + 3.0 * 0.12) * v * turn + spin
+    assert np.isclose(left + right, weight, rtol=1e-9)
+    assert np.isclose(right - left, 2 * outwards / 0.5, rtol=1e-9, atol=1e-9)
+    if v == turn == 0:
+        assert np.isclose(left, weight / 2, rtol=1e-12)
+
+
+def test_contacts_that_carry_bodies_of_their_own_share_nothing():
+    scene = jj.models.TwoWheelAxleCoordinates()
+    found = forces(scene)
+    for force in found.values():
+        assert np.isclose(force.normal, scene.mass * GRAVITY * np.cos(scene.slope), rtol=1e-12)
+
+
+def test_the_shares_have_gradients():
+    # a weight at x on a beam of two contacts: N_front = W (x + 0.4)
+    contacts = {name: jj.Contact("beam", (x, 0.0, 0.0)) for name, x in (("front", 0.6), ("rear", -0.4))}
+    nothing = Wrenches(jnp.zeros((0, 1, 3)), jnp.zeros((0, 1, 3)))
+
+    def front(x):
+        held = Wrenches(jnp.array([[0.0, 0.0, 20.0]]), jnp.zeros((1, 3)))
+        return normal_forces(contacts, ("beam",), jnp.stack([x, 0.0, 0.3])[None], held, nothing, jnp.asarray(20.0))["front"].normal
+
+    assert np.isclose(front(0.1), 10.0, rtol=1e-12)
+    assert np.isclose(jax.grad(front)(0.1), 20.0, rtol=1e-12)
