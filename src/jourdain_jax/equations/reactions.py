@@ -19,6 +19,7 @@ from jourdain_jax.equations.probing import at_once
 from jourdain_jax.equations.reductions import Accelerations
 from jourdain_jax.equations.rows import flatten_rows, names_of_rows, velocity_residual, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
+from jourdain_jax.equations.structure import plain_row_lengths
 from jourdain_jax.equations.virtual_power import newton_residual, resultants
 from jourdain_jax.scene.answers import contacts_of
 from jourdain_jax.scene.bodies import RigidBody
@@ -85,7 +86,7 @@ def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=No
     by_turning = jnp.where(rigid[:, None], by_turning, 0.0)  # a particle takes no torque
     force, torque = (multipliers[:, None, None] * d for d in (by_velocity, by_turning))
     A = jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
-    return RowReactions(multipliers, force, torque, multipliers[:, None] * direct, determined_rows(A), names, bodies)
+    return RowReactions(multipliers, force, torque, multipliers[:, None] * direct, determined_rows(A, plain_row_lengths(scene)), names, bodies)
 
 
 def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
@@ -95,9 +96,9 @@ def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
     return Motion(motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies)
 
 
-def determined_rows(A: Float[Array, "rows speeds"]) -> Bool[Array, "rows"]:
-    """Which multipliers are unique: those whose row is no combination of the others, `(A A+)_ss = 1`."""
-    A = jax.lax.stop_gradient(row_scale(A)[:, None] * A)
+def determined_rows(A: Float[Array, "rows speeds"], typical: Float[Array, "rows"] | None = None) -> Bool[Array, "rows"]:
+    """Which multipliers are unique: those whose row is no combination of the others, `(A A+)_ss = 1`; `typical`: lengths of the rows, as in `row_scale`."""
+    A = jax.lax.stop_gradient(row_scale(A, typical)[:, None] * A)
     alone = jnp.diagonal(A @ pseudo_inverse(A))
     return alone > 1 - jnp.sqrt(jnp.finfo(A.dtype).eps)
 
