@@ -18,7 +18,29 @@ from jourdain_jax.scene.scene import Scene
 
 SYMMETRIC_PROBES = 200
 FEW_INSIDE = 8  # random states inside the domain: with fewer, those nearest to it are used as well
+NEAR = 0.1  # of the domain: where states are looked for about one that was given
 NEARLY_INSIDE = 0.05  # of the width of the domain
+
+
+class NoStateFoundError(ValueError):
+    """No state of a scene's domain was found on its geometric rows."""
+
+
+_seen: dict[type, np.ndarray] = {}  # configurations on the rows that were given for scenes of a class in whose domain none was found
+
+
+def seen_on_rows(scene: Scene, q: np.ndarray) -> None:
+    """A configuration on the geometric rows of a scene in whose domain none was found: where that is so, states are looked for near it."""
+    _seen.setdefault(type(scene), np.asarray(q, float))
+
+
+def states_near_what_was_seen(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """States near a configuration that was given for this class of scenes, not yet on the rows; None where there is none."""
+    if type(scene) not in _seen or len(_seen[type(scene)]) != len(scene.coordinate_names):
+        return None
+    t, q, u = random_states(scene, count, generator)
+    low, high = coordinate_bounds(scene)
+    return t, _seen[type(scene)] + NEAR * (q - (low + high) / 2), u
 
 
 def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -33,6 +55,10 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
     t, q, u = random_states(scene, drawn, np.random.default_rng(seed))
     q, u, found = _projected(scene, t, q, u)
+    near = None if np.isfinite(found.error).any() else states_near_what_was_seen(scene, drawn, np.random.default_rng(seed))
+    if near is not None:
+        t, q, u = near
+        q, u, found = _projected(scene, t, q, u)
     good = np.flatnonzero(usable_states(scene, found, np.ones(drawn, bool)))[:count]
     return t[good], q[good], u[good]
 
@@ -55,7 +81,7 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
     """
     good = np.isfinite(found.error)
     if not good[generic].any():
-        raise ValueError(
+        raise NoStateFoundError(
             f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by {np.min(found.miss[generic]):.1e} "
             "or more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, "
             "numbers near their defaults stood in for them, or near one where they have none: give defaults near the values in use)"

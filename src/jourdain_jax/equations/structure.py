@@ -20,7 +20,7 @@ from jourdain_jax.equations.probed import TIMED, Probed, probed
 from jourdain_jax.equations.probed_on_graph import probed_on_graph
 from jourdain_jax.equations.probing import probed_once, without_collecting
 from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, names_of_rows
-from jourdain_jax.equations.sampling import random_states, symmetric_configurations, usable_states
+from jourdain_jax.equations.sampling import random_states, states_near_what_was_seen, symmetric_configurations, usable_states
 from jourdain_jax.equations.scaling import speed_scales, typical_row_lengths
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
@@ -63,6 +63,7 @@ class Structure:
     plain_row_lengths: np.ndarray = field(compare=False, repr=False)  # in the speeds as they are
     times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric rows
     coordinates: np.ndarray = field(compare=False, repr=False)  # of the same; random ones first
+    random: int  # how many of them are random ones
 
     @property
     def rheonomic(self) -> bool:
@@ -183,11 +184,11 @@ def usual_rows(scene: Scene) -> UsualRows:
 def _probed_structure(scene: Scene) -> Structure:
     names = names_of_rows(scene)
     count = len(scene.speed_names)
-    t, q, u = random_states(scene, RANDOM_PROBES, np.random.default_rng(0))
-    symmetric = symmetric_configurations(scene)
-    t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
-    generic = np.arange(len(t)) < RANDOM_PROBES
-    found = _look(scene, t, q, u, -u[::-1], generic)
+    generator = np.random.default_rng(0)
+    t, u, generic, found = _at_probes(scene, *random_states(scene, RANDOM_PROBES, generator))
+    near = None if np.isfinite(found.error[generic]).any() else states_near_what_was_seen(scene, RANDOM_PROBES, generator)
+    if near is not None:
+        t, u, generic, found = _at_probes(scene, *near)
     on_rows = usable_states(scene, found, generic)
     faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
     A = found.A * speed_scales(found.M)[:, None]
@@ -233,7 +234,16 @@ def _probed_structure(scene: Scene) -> Structure:
         plain_row_lengths=typical_row_lengths(found.A[generic], beyond),
         times=t,
         coordinates=found.q,
+        random=int(np.sum(generic)),
     )
+
+
+def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
+    """What is found at the given random states and at the symmetric ones; their times and speeds, and which are random."""
+    symmetric = symmetric_configurations(scene)
+    t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
+    generic = np.arange(len(t)) < RANDOM_PROBES
+    return t, u, generic, _look(scene, t, q, u, -u[::-1], generic)
 
 
 def _rank(A: np.ndarray, error: float) -> int:
