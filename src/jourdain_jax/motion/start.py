@@ -31,7 +31,8 @@ from jourdain_jax.scene.scene import Scene
 
 
 FAR = 10.0  # widths of the domain: a coordinate that Newton's method moves by more has run away
-GUESSES = 12  # of each kind
+GUESSES = 8  # of each kind
+NEAR = 0.1  # of the domain: how far the first guesses are from what was given
 
 
 class State(Printed, eqx.Module):
@@ -168,6 +169,7 @@ def _searched(scene: Scene, t, q, free, usual: _Usual, guesses) -> tuple[Float[A
     here, still, at = jax.lax.stop_gradient((q, scene, t))
     every = jnp.where(free, jnp.concatenate([here[None], guesses]), here)
     G = jax.vmap(jax.jacfwd(lambda q: closure_residual(still, at, q)))(every)
+    every = jnp.where(jnp.any(G != 0, axis=(0, 1)), every, here)  # coordinates that no row depends on stay
     d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
     tolerance = 16 * float(jnp.finfo(q.dtype).eps)
     found = jax.vmap(lambda guess: damped_root(lambda q: d * closure_residual(still, at, q), guess, size, tolerance))(every)
@@ -227,13 +229,14 @@ def _structure(scene: Scene, t, q, free_q) -> Structure:
 
 
 def _guesses(scene: Scene, known: Structure, q, free_q) -> Float[Array, "guesses coordinates"]:
-    """Configurations on the rows, those first whose given coordinates are nearest, and some of the domain."""
+    """Configurations near q, on the rows (those first whose given coordinates are nearest), and elsewhere in the domain."""
     low, high = coordinate_bounds(scene)
     on_rows = jnp.asarray(known.coordinates[: known.random], q.dtype)
     apart = jnp.where(free_q, 0.0, (on_rows - jax.lax.stop_gradient(q)) / np.where(high > low, high - low, 1.0))
     nearest_first = jnp.argsort(jnp.sum(apart**2, axis=1))[:GUESSES]
-    elsewhere = np.random.default_rng(3).uniform(low, high, (GUESSES, len(low)))
-    return jnp.concatenate([on_rows[nearest_first], jnp.asarray(elsewhere, q.dtype)])
+    elsewhere = np.random.default_rng(3).uniform(low, high, (2 * GUESSES, len(low)))
+    near = jax.lax.stop_gradient(q) + NEAR * jnp.asarray(elsewhere[:GUESSES] - (low + high) / 2, q.dtype)
+    return jnp.concatenate([near, on_rows[nearest_first], jnp.asarray(elsewhere[GUESSES:], q.dtype)])
 
 
 def _resting(scene: Scene, known: Structure, given: tuple[str, ...]) -> tuple[str, ...]:
