@@ -16,6 +16,7 @@ from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.reductions import reduce
 from jourdain_jax.equations.scaling import row_scale
+from jourdain_jax.equations.structure import plain_row_lengths, usual_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
@@ -34,7 +35,7 @@ def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) 
     """
     if jax.tree.structure(direction) != jax.tree.structure(scene):
         raise ValueError(f"`direction` is {described(direction)}, expected a change of every parameter, as a scene like `scene`: a `{type(scene).__name__}`")
-    A, dA, size = _row_change(scene, t, as_real(q), as_real(u), direction, as_real(dq), inputs)
+    A, dA, size = _row_change(scene, t, as_real(q), as_real(u), direction, as_real(dq), inputs, plain_row_lengths(scene))
     if A.size == 0:
         return True
     P = np.asarray(pseudo_inverse(jnp.asarray(A)))
@@ -43,12 +44,12 @@ def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) 
 
 
 @on_numbers
-def _row_change(scene, t, q, u, direction, dq, inputs):
+def _row_change(scene, t, q, u, direction, dq, inputs, typical):
     moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
 
     def A(parameters, q):
         rows = constraint_rows(eqx.combine(parameters, fixed), t, q, u, inputs)
-        return jax.lax.stop_gradient(row_scale(rows.A))[:, None] * rows.A
+        return jax.lax.stop_gradient(row_scale(rows.A, typical))[:, None] * rows.A
 
     value, change = jax.jvp(A, (moving, q), (eqx.filter(direction, eqx.is_inexact_array), dq))
     return value, change, jnp.max(jnp.abs(value), initial=1.0)
@@ -72,7 +73,7 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
     if not derivative_exists(scene, t, q, u, eqx.combine(relative, fixed), dq, inputs):
         relative = jax.tree.map(jnp.zeros_like, relative)
         note = "parameters left out: a change of them splits rows that are dependent, and accelerations have no derivative there"
-    arguments = (ways, weights, t, inputs, fixed)
+    arguments = (ways, weights, t, inputs, fixed, usual_rows(scene))
     point, direction = (moving, q, u), (relative, dq, du)
     forward, size = _forward(arguments, point, direction)
     reverse = _reverse(arguments, point, direction)
@@ -89,10 +90,11 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
 
 def _outcome(arguments, point) -> Float[Array, "reductions"]:
     """A random combination of accelerations and constraint forces, by every reduction."""
-    ways, weights, t, inputs, fixed = arguments
+    ways, weights, t, inputs, fixed, usual = arguments
     parameters, q, u = point
     scene = eqx.combine(parameters, fixed)
     equations, rows = equations_and_rows(scene, t, q, u, inputs)
+    rows = rows.judged_by(usual)
     found = [by_reduction(reductions(scene)[way], scene, t, q, u, equations, rows) for way in ways]
     return jnp.stack([weights @ jnp.concatenate([a.udot, a.constraint_force]) for a in found])
 

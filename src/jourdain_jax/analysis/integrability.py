@@ -14,7 +14,6 @@ Source: Wang and Pao (2003), section II; for the growth vector A. M. Vershik and
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +21,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.reductions import Partition
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.sampling import sample_states
@@ -87,7 +87,7 @@ def _frobenius_violation(w: np.ndarray, derivative: np.ndarray, frame: np.ndarra
     return float(np.max(np.abs(two_form), initial=0.0) / (size + np.max(np.abs(derivative))))
 
 
-@eqx.filter_jit
+@on_numbers
 def _forms_at(scene: Scene, t, q, u):
     """Forms over (t, q), derivatives (component, direction), a frame of the possible velocities, and which rows are nonlinear."""
 
@@ -226,8 +226,8 @@ class _Fields:
         return values[:count], derivatives[:count]
 
 
-@eqx.filter_jit
-def _fields_along(scene: Scene, with_time: bool, u, x, direction):
+@on_numbers
+def _fields_along(scene: Scene, with_time, u, x, direction):
     return jax.vmap(lambda x, direction: jax.jvp(lambda x: _fields_at(scene, with_time, u, x), (x,), (direction,)))(x, direction)
 
 

@@ -20,7 +20,7 @@ from jourdain_jax.equations.reductions import Privileged
 from jourdain_jax.equations.rows import names_of_position_rows, position_residual
 from jourdain_jax.equations.sampling import sample_states
 from jourdain_jax.equations.scaling import row_scale, scaled
-from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.structure import structure_of, usual_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.names import as_names, nearest
@@ -49,7 +49,7 @@ def flow_of(scene: Scene, privileged: tuple[int, ...]):
 
     def flow(t, q, u, f):
         equations, rows = equations_and_rows(scene, t, q, u, f)
-        problem = scaled(equations, rows)
+        problem = scaled(equations, rows.judged_by(usual_rows(scene)))
         w, _, _ = Privileged(privileged).solve(problem)
         return Flow(coordinate_rates(scene, t, q, u), problem.c * w, rows.phi, position_residual(scene, t, q)), equations.M
 

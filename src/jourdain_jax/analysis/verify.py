@@ -33,7 +33,7 @@ from jourdain_jax.equations.reactions import row_reactions
 from jourdain_jax.equations.reductions import diagnosed
 from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
-from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.structure import plain_row_lengths, structure_of, usual_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows, kinetic_energy, newton_residual, potential_energy
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State
@@ -66,7 +66,7 @@ def verify(scene: Scene, state: State | dict | None = None, inputs: Numbers | di
     inputs = as_input_vector(as_scene(scene), inputs)
     state = as_state(scene, state, what="state", inputs=inputs)
     t, q, u = state.t, state.q, state.u
-    found = _evaluate(scene, t, q, u, inputs)
+    found = _evaluate(scene, t, q, u, inputs, usual_rows(scene), plain_row_lengths(scene))
     applicable = [name for name, ok in found["applicable"].items() if ok]
     Z = jnp.asarray(found["directions"])
     checks = statement_checks(scene, t, q, u, inputs, Z, seed)
@@ -76,8 +76,9 @@ def verify(scene: Scene, state: State | dict | None = None, inputs: Numbers | di
 
 
 @on_numbers
-def _evaluate(scene, t, q, u, inputs) -> dict:
+def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
     equations, rows = equations_and_rows(scene, t, q, u, inputs)
+    rows = rows.judged_by(usual)
     ways = {name: diagnosed(by_reduction(way, scene, t, q, u, equations, rows), equations, rows) for name, way in reductions(scene).items()}
     c = speed_scale(equations.M)
     reference = ways["svd"]
@@ -103,8 +104,8 @@ def _evaluate(scene, t, q, u, inputs) -> dict:
         "M": c[:, None] * equations.M * c,
         "h": c * equations.h,
         "forms": {name: (c[:, None] * form.M * c, c * form.h) for name, form in forms.items()},
-        "Z": null_space_svd(row_scale(rows.A * c)[:, None] * rows.A * c),
-        "directions": null_space_svd(row_scale(rows.A)[:, None] * rows.A),
+        "Z": null_space_svd(row_scale(rows.A * c, usual.lengths)[:, None] * rows.A * c),
+        "directions": null_space_svd(row_scale(rows.A, plain)[:, None] * rows.A),
         "newton": by_body * c,
         "rows": by_row * c,
         "reference": reference.constraint_force * c,

@@ -22,8 +22,8 @@ from jourdain_jax.equations.reductions import (
     diagnosed,
     reduce,
 )
-from jourdain_jax.equations.rows import ConstraintRows, position_residual
-from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.rows import ConstraintRows, UsualRows, position_residual
+from jourdain_jax.equations.structure import structure_of, usual_rows
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
 from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.names import nearest
@@ -88,7 +88,7 @@ def as_stabilisation(stabilisation) -> Baumgarte | None:
     return stabilisation
 
 
-def accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None) -> Accelerations:
+def accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None, usual: UsualRows | None = None) -> Accelerations:
     """Accelerations, multipliers and diagnostics of a scene at (t, q, u).
 
         M udot + h = Q + A' lambda,   A udot = -drift
@@ -96,29 +96,32 @@ def accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabili
     - `inputs`: values of the scene's inputs (default: zero), which count as constant.
     - `reduction`: a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
     - `stabilisation`: Baumgarte terms (default: none).
+    - `usual`: what the rows are at most states, by which is judged whether they lose rank at this one (default: as found for this scene).
 
     Pure: works under any nesting of jit, vmap, jvp and vjp, with right derivatives wherever the rank of the rows is constant. Look at `applicable`
     and `residual`: nothing is raised for a state that a reduction cannot serve. ValueError for an unknown reduction. Eqs. (41), (68)-(70).
     """
     f = inputs if inputs is None or isinstance(inputs, ChangingInputs) else as_input_vector(scene, inputs)
     arguments = as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f
-    return _accelerations(scene, *arguments, as_reduction(scene, reduction), as_stabilisation(stabilisation))
+    usual = usual_rows(scene) if usual is None else usual
+    return _accelerations(scene, *arguments, as_reduction(scene, reduction), as_stabilisation(stabilisation), usual)
 
 
 @at_once
-def _accelerations(scene: Scene, t, q, u, inputs, reduction, stabilisation) -> Accelerations:
-    return diagnosed(*_reduced(scene, t, q, u, inputs, reduction, stabilisation))
+def _accelerations(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> Accelerations:
+    return diagnosed(*_reduced(scene, t, q, u, inputs, reduction, stabilisation, usual))
 
 
 def bare_accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None) -> Reduced:
     """Accelerations and constraint force alone, as `accelerations` but without multipliers and diagnostics: for use inside integration."""
-    return _reduced(scene, t, q, u, inputs, reduction, stabilisation)[0]
+    return _reduced(scene, t, q, u, inputs, reduction, stabilisation, usual_rows(scene))[0]
 
 
-def _reduced(scene: Scene, t, q, u, inputs, reduction, stabilisation) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
+def _reduced(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
     q, u = as_coordinates(scene, q), as_speeds(scene, u)
     reduction = as_reduction(scene, reduction)
     equations, rows = equations_and_rows(scene, t, q, u, inputs)
+    rows = rows.judged_by(usual)
     if as_stabilisation(stabilisation) is not None:
         rows = _stabilised(scene, t, q, rows, stabilisation)
     if isinstance(reduction, GibbsAppell):
@@ -130,4 +133,4 @@ def _stabilised(scene: Scene, t, q, rows: ConstraintRows, terms: Baumgarte) -> C
     g = position_residual(scene, t, q)
     count = g.shape[0]
     extra = jnp.concatenate([2 * terms.alpha * rows.phi[:count] + terms.beta**2 * g, terms.alpha * rows.phi[count:]])
-    return ConstraintRows(rows.phi, rows.A, rows.drift + extra, rows.names)
+    return ConstraintRows(rows.phi, rows.A, rows.drift + extra, rows.names, rows.usual)

@@ -21,7 +21,7 @@ from jourdain_jax.equations.reductions import Partition, Privileged, reduce
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.sampling import sample_states
 from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.structure import structure_of, usual_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows, potential_resultants, resultants
 from jourdain_jax.scene.scene import Scene
 
@@ -147,7 +147,8 @@ def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
     inertia = jnp.einsum("bij,bjk,blk->bil", turned, inertias(scene, t, q).inertia, turned)
     loads, potential = resultants(scene, motion), potential_resultants(scene, motion)
     forces = [loads.force, loads.torque, loads.direct @ rates.C, potential.force, potential.torque, potential.direct @ rates.C]
-    udot = reduce(Privileged(independent), *equations_and_rows(scene, t, q, u)).udot
+    equations, rows = equations_and_rows(scene, t, q, u)
+    udot = reduce(Privileged(independent), equations, rows.judged_by(usual_rows(scene))).udot
     return {
         "rates": rates.B @ y + rates.b,
         "accelerations": jnp.concatenate([udot[chosen], y]),  # y, which depends on nothing, gives free motion a size

@@ -6,11 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
 
+from jourdain_jax.equations.assembling import Assembled, assemble, without_rows
+from jourdain_jax.equations.domain import coordinate_bounds
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, pose_at, velocities
 from jourdain_jax.equations.plausibility import PoseNumbers, pose_numbers
 from jourdain_jax.equations.probing import on_numbers
-from jourdain_jax.equations.projection import miss_of_rows, project_positions
-from jourdain_jax.equations.rows import position_residual, velocity_residual
+from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.equations.rows import names_of_position_rows, position_residual, velocity_residual
 from jourdain_jax.equations.trace import Entries, explicit_rates, potentials_of
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene
@@ -22,9 +24,12 @@ class Probed(eqx.Module):
     """At one state, or with a leading axis at all; trees have arrays as leaves."""
 
     q: Float[Entries, "*states coordinates"]  # on the geometric rows
-    miss: Float[Entries, "*states"]  # of the geometric rows, infinite where not a number
+    miss: Float[Entries, "*states"]  # of these rows, as the next two from `Assembled`
+    error: Float[Entries, "*states"]  # of the coordinates
+    outside: Float[Entries, "*states"]  # of the domain
     A: Float[Entries, "*states rows speeds"]
     A_other: Float[Entries, "*states rows speeds"]  # at other speeds
+    A_beyond: Float[Entries, "*states rows speeds"]  # at the coordinates as they were before they were put on the geometric rows
     M: Float[Entries, "*states speeds speeds"]
     phi_at_rest: Float[Entries, "*states rows"]  # at u = 0
     motion_at_rest: PyTree  # velocities and coordinate rates at u = 0
@@ -41,14 +46,45 @@ def generic_inputs(scene: Scene) -> np.ndarray:
     return np.linspace(0.5, 1.0, len(scene.inputs))
 
 
-@on_numbers
-def probed(scene: Scene, t, q, u, u_other) -> Probed:
-    """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`."""
+def probed(scene: Scene, t, q, u, u_other, generic) -> Probed:
+    """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`. `generic`: which states are random ones."""
+    found = assembled_by_jax(scene, t, q, generic)
+    return _probed(scene, t, found.q, np.asarray(q, found.q.dtype), u, u_other, found.miss, found.error, found.outside)
 
-    def one(t, q, u, u_other):
-        q = project_positions(scene, t, q)
+
+def assembled_by_jax(scene: Scene, t, q, generic) -> Assembled:
+    """Coordinates on geometric rows and unit norms, inside the domain where that can be."""
+    q = np.array(q, float)
+    for first, _ in scene.coordinates.quaternions:
+        length = np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
+        q[:, first : first + 4] /= np.where(length == 0, 1.0, length)
+    if not names_of_position_rows(scene):
+        return without_rows(q)
+
+    def look(some, which):  # always at all states: one traced program
+        every = np.array(q)
+        every[which] = some
+        return tuple(np.asarray(x, float)[which] for x in _closures(scene, t, every))
+
+    return assemble(look, q, *coordinate_bounds(scene), generic)
+
+
+@on_numbers
+def _closures(scene: Scene, t, q):
+    """Residuals of the geometric rows and unit norms, and their slopes."""
+
+    def one(t, q):
+        return closure_residual(scene, t, q), jax.jacfwd(lambda q: closure_residual(scene, t, q))(q)
+
+    return jax.vmap(one)(t, q)
+
+
+@on_numbers
+def _probed(scene: Scene, t, q, q_beyond, u, u_other, miss, error, outside) -> Probed:
+    def one(t, q, q_beyond, u, u_other, miss, error, outside):
         inputs = jnp.asarray(generic_inputs(scene), q.dtype)
         A, A_other = (jax.jacfwd(lambda v: velocity_residual(scene, t, q, v, inputs))(v) for v in (u, u_other))
+        A_beyond = jax.jacfwd(lambda v: velocity_residual(scene, t, q_beyond, v, inputs))(u)
         at_rest = jnp.zeros_like(u)
         qdot, motion = coordinate_rates(scene, t, q, u), motion_at(scene, t, q, u, inputs)
 
@@ -65,9 +101,12 @@ def probed(scene: Scene, t, q, u, u_other) -> Probed:
 
         return Probed(
             q=q,
-            miss=miss_of_rows(scene, t, q),
+            miss=miss,
+            error=error,
+            outside=outside,
             A=A,
             A_other=A_other,
+            A_beyond=A_beyond,
             M=mass_matrix_at(scene, t, q),
             phi_at_rest=velocity_residual(scene, t, q, at_rest, inputs),
             motion_at_rest=(velocities(scene, t, q, at_rest), coordinate_rates(scene, t, q, at_rest)),
@@ -78,4 +117,4 @@ def probed(scene: Scene, t, q, u, u_other) -> Probed:
             numbers=pose_numbers(scene, t, q),
         )
 
-    return jax.vmap(one)(t, q, u, u_other)
+    return jax.vmap(one)(t, q, q_beyond, u, u_other, miss, error, outside)

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.equations.assembling import ITERATIONS, Assembled, assemble, shortest, typical_lengths, without_rows
+from jourdain_jax.equations.domain import coordinate_bounds
 from jourdain_jax.equations.probed import Probed, generic_inputs
 from jourdain_jax.equations.scaling import speed_scales
 from jourdain_jax.equations.trace import TracedScene, named_values, traced_scene
@@ -22,22 +24,19 @@ from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.program.hiding import decided_by, depend_on, may_be_hidden
 from jourdain_jax.scene.scene import Scene
 
-ITERATIONS = 25  # of Gauss-Newton, at most
-_NEARLY_DEPENDENT = 1e-6  # of the triangular factor's diagonal: below, singular values decide
 
-
-def probed_on_graph(scene: Scene, t, q, u, u_other) -> Probed:
-    """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`.
+def probed_on_graph(scene: Scene, t, q, u, u_other, generic) -> Probed:
+    """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`. `generic`: which states are random ones.
 
     `Unsupported` where the scene has no scalar form, or derivatives of its own.
     """
-    return _AtStates(_traced(scene), scene, t, q, u, generic_inputs(scene)).probed(u_other)
+    return _AtStates(_traced(scene), scene, t, q, u, generic_inputs(scene), generic).probed(u_other)
 
 
-def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States put on the rows, as by `project_positions` and `project_speeds`, and how far they miss the geometric rows; `Unsupported` as above."""
-    at = _AtStates(_traced(scene), scene, t, q, u, np.zeros(len(scene.inputs)))
-    return at.real(at.q), at.real(at.speeds_on_rows()), at.real(at.miss)
+def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
+    """Coordinates and speeds put on the rows, and how well that went for the coordinates; `Unsupported` as above."""
+    at = _AtStates(_traced(scene), scene, t, q, u, np.zeros(len(scene.inputs)), np.ones(len(q), bool))
+    return at.real(at.q), at.real(at.speeds_on_rows()), at.found
 
 
 def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
@@ -45,7 +44,7 @@ def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
 
     `(A_s, phi_s(0)) = x' (A_k, phi_k(0))`, the residual of least squares being no more than the round-off of either side. `Unsupported` as above.
     """
-    at = _AtStates(_traced(scene), scene, t, q, u, generic_inputs(scene))
+    at = _AtStates(_traced(scene), scene, t, q, u, generic_inputs(scene), np.ones(len(t), bool))
     graph, traced, speeds = at.graph, at.traced, at.traced.u.tolist()
     attitudes = {f"q_{first + i}": int(traced.q[first + i]) for first, _ in scene.coordinates.quaternions for i in range(4)}
     generic = on_rows(
@@ -70,15 +69,17 @@ def _traced(scene: Scene) -> TracedScene:
 class _AtStates:
     """Values on the graph at the probed states."""
 
-    def __init__(self, traced: TracedScene, scene: Scene, t, q, u, inputs):
+    def __init__(self, traced: TracedScene, scene: Scene, t, q, u, inputs, generic):
         self.traced, self.graph, self.scene = traced, traced.graph, scene
         self.inputs = np.tile(inputs, (len(t), 1))
-        self.t, self.u = t, u
-        self.q, self.miss = self._on_rows(q)
+        self.t, self.u, self.generic = t, u, generic
+        self.q_beyond, self.found = np.array(q, float), self._assembled(q)
+        self.q = self.found.q
         self.values = self._probes(self.q, u)
 
     def _probes(self, q, u, which=slice(None)) -> Probes:
-        named = named_values(self.scene, self.t[which], q[which], u[which], self.inputs[which])
+        """The graph at coordinates and speeds of the states numbered `which`."""
+        named = named_values(self.scene, self.t[which], q, u, self.inputs[which])
         return Probes(self.graph, {name: np.asarray(value, float) for name, value in named.items()})
 
     def probed(self, u_other) -> Probed:
@@ -102,8 +103,11 @@ class _AtStates:
         vanishing["rank"] = [*at_rest[0], *(node for row in by_speed[:rows] for node in row.values())]
         return Probed(
             q=self.real(self.q),
-            miss=self.real(self.miss),
+            error=self.found.error,
+            miss=self.found.miss,
+            outside=self.found.outside,
             A=self.real(self._matrices(self.values, by_speed[:rows], u)),
+            A_beyond=self.real(self._matrices(self._probes(self.q_beyond, self.u), by_speed[:rows], u)),
             A_other=self.real(self._matrices(self._probes(self.q, u_other), by_speed[:rows], u)),
             M=self.real(self._mass_matrix(by_speed[rows:])),
             phi_at_rest=self.real(self._at(at_rest[0])),
@@ -157,14 +161,15 @@ class _AtStates:
         M = self._mass_matrix(jacobian(self.graph, [*at.v.ravel().tolist(), *at.omega.ravel().tolist()], columns))
         c = speed_scales(M)
         metric = np.stack([_inverse_root(m) for m in c[:, :, None] * M * c[:, None]])  # L'^-1
-        entries, moving = jacobian(self.graph, at.phi.tolist(), columns), np.arange(len(u))
+        entries, moving, typical = jacobian(self.graph, at.phi.tolist(), columns), np.arange(len(u)), None
         for _ in range(ITERATIONS):
-            probes = self._probes(self.q, u, moving)
-            A = self._matrices(probes, entries, columns) * c[moving, None]
-            x = _shortest(A @ metric[moving], _values(probes, at.phi))
+            probes = self._probes(self.q[moving], u[moving], moving)
+            weighted = self._matrices(probes, entries, columns) * c[moving, None] @ metric[moving]
+            typical = typical_lengths(np.linalg.norm(weighted, axis=2)) if typical is None else typical
+            x = shortest(weighted, _values(probes, at.phi), typical)
             shift = c[moving] * np.einsum("sij,sj->si", metric[moving], x)
             u[moving] -= shift
-            moving = moving[_still_moves(shift, u[moving])]
+            moving = moving[np.max(np.abs(shift), axis=1) > 4 * np.finfo(float).eps * (1 + np.max(np.abs(u[moving]), axis=1))]
             if not moving.size:
                 break
         return u
@@ -174,27 +179,22 @@ class _AtStates:
         g, quaternions = self.graph, [self.traced.q[first : first + 4].tolist() for first, _ in self.scene.coordinates.quaternions]
         return [g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)) for wxyz in quaternions]
 
-    def _on_rows(self, q) -> tuple[np.ndarray, np.ndarray]:
-        """Coordinates on geometric rows and unit norms, and how far they miss them; as `project_positions`."""
+    def _assembled(self, q) -> Assembled:
+        """Coordinates on geometric rows and unit norms, inside the domain where that can be."""
         g, q, norms = self.graph, np.array(q, float), self.norms()
         for first, _ in self.scene.coordinates.quaternions:
-            if not self.traced.at.closure.size:
-                length = np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
-                q[:, first : first + 4] /= np.where(length == 0, 1.0, length)
+            length = np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
+            q[:, first : first + 4] /= np.where(length == 0, 1.0, length)
+        if not self.traced.at.closure.size:
+            return without_rows(q)
         rows, columns = [*self.traced.at.closure.tolist(), *norms], self.traced.q.tolist()
-        if self.traced.at.closure.size:
-            entries = jacobian(g, rows, columns)
-            moving = np.arange(len(q))
-            for _ in range(ITERATIONS):
-                probes = self._probes(q, self.u, moving)
-                G, residual = self._matrices(probes, entries, columns), _values(probes, rows)
-                shift = _shortest(G, residual)
-                q[moving] -= shift
-                moving = moving[_still_moves(shift, q[moving])]
-                if not moving.size:
-                    break
-        missed = np.max(np.abs(_values(self._probes(q, self.u), rows)), axis=1, initial=0.0)
-        return q, np.where(np.isfinite(missed), missed, np.inf)
+        entries = jacobian(g, rows, columns)
+
+        def look(q, which):
+            probes = self._probes(q, self.u[which], which)
+            return _values(probes, rows), self._matrices(probes, entries, columns)
+
+        return assemble(look, q, *coordinate_bounds(self.scene), self.generic)
 
 
 def _flat(nodes) -> list[int]:
@@ -206,11 +206,6 @@ def _values(probes: Probes, nodes: np.ndarray | Iterable[int]) -> np.ndarray:
     return np.moveaxis(probes(nodes.ravel().tolist()), -1, 0).reshape(probes.count, *nodes.shape)
 
 
-def _still_moves(shift: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """At which states an iteration has not come to rest; where it is not a number it stays so."""
-    return np.max(np.abs(shift), axis=1) > 4 * np.finfo(float).eps * np.max(np.abs(x), axis=1)
-
-
 def _inverse_root(M: np.ndarray) -> np.ndarray:
     """`L'^-1` with `M = L L'`; the identity where M is singular: then nearest in the scaled speeds."""
     try:
@@ -219,21 +214,3 @@ def _inverse_root(M: np.ndarray) -> np.ndarray:
         return np.eye(len(M))
     definite = np.min(np.diagonal(root), initial=1.0) ** 2 > 16 * len(M) * np.finfo(float).eps
     return np.linalg.inv(root).T if definite else np.eye(len(M))
-
-
-def _shortest(G: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """The shortest x with `G x = residual`, at every state; least squares where the rows are (nearly) dependent."""
-    length = np.linalg.norm(G, axis=2)
-    d = 1 / np.where(length > 0, length, 1.0)
-    G, residual = d[..., None] * G, d * residual
-    finite = np.all(np.isfinite(G), axis=(1, 2)) & np.all(np.isfinite(residual), axis=1)
-    x = np.full((len(G), G.shape[2]), np.nan)
-    Q, R = np.linalg.qr(np.swapaxes(G[finite], 1, 2))  # G = R' Q'
-    diagonal = np.abs(np.diagonal(R, axis1=1, axis2=2))
-    regular = np.min(diagonal, axis=1, initial=1.0) > _NEARLY_DEPENDENT if G.shape[1] <= G.shape[2] else np.zeros(len(R), bool)
-    places = np.flatnonzero(finite)
-    if regular.any():
-        x[places[regular]] = (Q[regular] @ np.linalg.solve(np.swapaxes(R[regular], 1, 2), residual[places[regular], :, None]))[..., 0]
-    for k in places[~regular]:
-        x[k] = np.linalg.lstsq(G[k], residual[k], rcond=_NEARLY_DEPENDENT**1.5)[0]
-    return x

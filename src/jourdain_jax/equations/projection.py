@@ -25,8 +25,13 @@ def closure_residual(scene: Scene, t, q) -> Float[Array, "closures"]:
     return jnp.concatenate([position_residual(scene, t, q), *norms])
 
 
-def project_positions(scene: Scene, t, q: Float[Array, "coordinates"], *, free: Bool[Array, "coordinates"] | None = None, iterations: int = 25):
-    """Coordinates on the geometric rows, near q; only coordinates that are `free` move. At most so many `iterations`."""
+def project_positions(
+    scene: Scene, t, q: Float[Array, "coordinates"], *, free: Bool[Array, "coordinates"] | None = None, iterations: int = 25, typical=None
+) -> Float[Array, "coordinates"]:
+    """Coordinates on the geometric rows, near q; only coordinates that are `free` move. At most so many `iterations`.
+
+    `typical`: lengths of the rows by which one counts as vanishing, from `closure_lengths` (default: none does, unless it is zero).
+    """
     if jax.eval_shape(lambda s, q: closure_residual(s, 0.0, q), scene, q).shape[0] == 0:
         return q
     if free is None and not names_of_position_rows(scene):
@@ -36,7 +41,7 @@ def project_positions(scene: Scene, t, q: Float[Array, "coordinates"], *, free: 
     def step(q):
         residual, G = closure_residual(scene, t, q), jax.jacfwd(lambda q: closure_residual(scene, t, q))(q)
         G = jnp.where(free, G, 0.0)
-        d = row_scale(G)
+        d = row_scale(G, typical)
         return q - pseudo_inverse(d[:, None] * G) @ (d * residual)
 
     return settled(step, q, iterations)
@@ -58,11 +63,13 @@ def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "c
 
 
 def project_speeds(
-    scene: Scene, t, q, u: Float[Array, "speeds"], inputs=None, *, free: Bool[Array, "speeds"] | None = None, iterations: int = 8, cutoff: float | None = None
-):
+    scene: Scene, t, q, u: Float[Array, "speeds"], inputs=None, *, free: Bool[Array, "speeds"] | None = None, iterations: int = 8, cutoff: float | None = None,
+    typical=None
+) -> Float[Array, "speeds"]:
     """Speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are `free` move.
 
-    Rows count as dependent below `cutoff` (default: `rank_cutoff`).
+    Rows count as dependent below `cutoff` (default: `rank_cutoff`). `typical`: lengths of the rows in scaled speeds by which one counts as vanishing,
+    from `usual_rows` (default: none does, unless it is zero).
     """
     if jax.eval_shape(lambda s, q, u: velocity_residual(s, 0.0, q, u), scene, q, u).shape[0] == 0:
         return u
@@ -75,7 +82,7 @@ def project_speeds(
     def step(u):
         phi, A = velocity_residual(scene, t, q, u, inputs), jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
         weighted = jax.scipy.linalg.solve_triangular(L, jnp.where(free, A * c, 0.0).T, lower=True).T  # A L'^-1
-        d = row_scale(weighted)
+        d = row_scale(weighted, typical)
         x = pseudo_inverse(d[:, None] * weighted, cutoff) @ (d * phi)
         return u - jnp.where(free, c * jax.scipy.linalg.solve_triangular(L.T, x, lower=False), 0.0)
 

@@ -20,6 +20,7 @@ from jourdain_jax.equations.probing import at_once
 from jourdain_jax.equations.reductions import Accelerations
 from jourdain_jax.equations.rows import flatten_rows, names_of_rows, velocity_residual, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
+from jourdain_jax.equations.structure import plain_row_lengths
 from jourdain_jax.equations.virtual_power import newton_residual, resultants
 from jourdain_jax.scene.answers import contacts_of
 from jourdain_jax.scene.bodies import RigidBody
@@ -101,7 +102,7 @@ def _per_multiplier(scene: Scene, motion: Motion, inputs) -> _PerMultiplier:
     rigid = jnp.array([isinstance(body.body, RigidBody) for body in bodies])
     torque = jnp.where(rigid[:, None], torque, 0.0)  # a particle takes no torque
     A = jax.jacfwd(lambda u: velocity_residual(scene, motion.t, q, u, inputs))(u)
-    return _PerMultiplier(Wrenches(force, torque), direct, _spare_multipliers(A))
+    return _PerMultiplier(Wrenches(force, torque), direct, _spare_multipliers(A, plain_row_lengths(scene)))
 
 
 def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
@@ -111,9 +112,9 @@ def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
     return Motion(motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies)
 
 
-def _spare_multipliers(A: Float[Array, "rows speeds"]) -> Float[Array, "rows rows"]:
-    """Columns: multipliers that change no motion, `A' lambda = 0`; all zero where the rows are independent."""
-    scale = row_scale(A)
+def _spare_multipliers(A: Float[Array, "rows speeds"], typical: Float[Array, "rows"] | None = None) -> Float[Array, "rows rows"]:
+    """Columns: multipliers that change no motion, `A' lambda = 0`; all zero where the rows are independent; `typical`: lengths of the rows, as in `row_scale`."""
+    scale = row_scale(A, typical)
     A = jax.lax.stop_gradient(scale[:, None] * A)
     spare = jnp.eye(A.shape[0], dtype=A.dtype) - A @ pseudo_inverse(A)
     return scale[:, None] * jnp.where(jnp.abs(spare) > jnp.sqrt(jnp.finfo(A.dtype).eps), spare, 0.0)

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, present
 from jourdain_jax.calculus.pseudo_inverse import numerical_rank, pseudo_inverse, rank_cutoff, singular_values
-from jourdain_jax.equations.rows import ConstraintRows
+from jourdain_jax.equations.rows import ConstraintRows, UsualRows
 from jourdain_jax.equations.scaling import ScaledProblem, scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations
 
@@ -42,7 +42,7 @@ class Accelerations(eqx.Module):
     multipliers: Float[Array, "rows"]  # lambda of minimum norm: the constraint force on the speeds is A' lambda
     constraint_force: Float[Array, "speeds"]  # A' lambda = M udot + h - Q
     rank: Int[Array, ""]  # of the rows at this state
-    smallest_singular_value: Float[Array, ""]  # of the scaled rows, the smallest that counts (1 without rows); reduction's own pivot if it has one
+    smallest_singular_value: Float[Array, ""]  # of the scaled rows, the last one of their usual rank (1 without rows); the reduction's own pivot where smaller
     residual: Float[Array, ""]  # |A udot + drift| in scaled rows; large where rows contradict each other
     applicable: Bool[Array, ""]  # whether this reduction works at this state
 
@@ -88,16 +88,21 @@ def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: Constrain
         multipliers=pseudo_inverse(rows.A).T @ found.constraint_force,
         constraint_force=found.constraint_force,
         rank=numerical_rank(sigma),
-        smallest_singular_value=jax.lax.stop_gradient(jnp.minimum(found.pivot, smallest_that_counts(sigma))),
+        smallest_singular_value=jax.lax.stop_gradient(jnp.minimum(found.pivot, smallest_that_counts(sigma, rows.usual))),
         residual=jnp.max(jnp.abs(problem.d * (rows.A @ found.udot + rows.drift)), initial=0.0),
         applicable=found.applicable & jnp.all(jnp.isfinite(found.udot)),
     )
 
 
-def smallest_that_counts(sigma: Float[Array, "values"]) -> Float[Array, ""]:
-    """The smallest singular value above the cut-off; 1 where there is none."""
+def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None = None) -> Float[Array, ""]:
+    """The last singular value of the usual rank, which goes to zero where rank is lost; where that is not known, the smallest above the cut-off.
+
+    1 where there is none.
+    """
     if sigma.shape[0] == 0:
         return jnp.ones((), sigma.dtype)
+    if usual is not None:
+        return jnp.min(jnp.where(jnp.arange(sigma.shape[0]) < usual.rank, sigma, 1.0), initial=1.0)
     counts = sigma > rank_cutoff(sigma.dtype) * sigma[0]
     return jnp.min(jnp.where(counts, sigma, jnp.inf), initial=1.0)
 

@@ -10,7 +10,8 @@ Source: Wang and Pao (2003), eqs. (5)-(9), (19), (25).
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.equations.kinematics import motion_at, pose_at
@@ -22,6 +23,13 @@ from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.scene import Scene
 
 
+class UsualRows(eqx.Module):
+    """What the rows are at most states of a scene: what they are at one state is judged by this."""
+
+    lengths: Float[Array | np.ndarray, "rows"]  # of `A` in scaled speeds
+    rank: Int[Array | np.ndarray, ""]
+
+
 class ConstraintRows(eqx.Module):
     """The rows at one state, linearised: `A udot = -drift`."""
 
@@ -29,6 +37,11 @@ class ConstraintRows(eqx.Module):
     A: Float[Array, "rows speeds"]
     drift: Float[Array, "rows"]
     names: tuple[str, ...] = eqx.field(static=True)
+    usual: UsualRows | None = None  # None: each row is judged by its length at this state
+
+    def judged_by(self, usual: UsualRows | None) -> "ConstraintRows":
+        """These rows, judged by what they usually are (`structure.usual_rows`)."""
+        return ConstraintRows(self.phi, self.A, self.drift, self.names, usual)
 
 
 def position_rows(scene: Scene, pose: Pose) -> dict[str, Array]:

@@ -7,16 +7,40 @@ import itertools
 import jax
 import numpy as np
 
+from jourdain_jax.equations.assembling import Assembled
+from jourdain_jax.equations.domain import coordinate_bounds, speed_bounds
+from jourdain_jax.equations.probed import Probed, assembled_by_jax
 from jourdain_jax.equations.probed_on_graph import sampled_on_graph
 from jourdain_jax.equations.probing import on_numbers
-from jourdain_jax.equations.projection import miss_of_rows, project_positions, project_speeds
+from jourdain_jax.equations.projection import project_speeds
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.scene import Scene
 
 SYMMETRIC_PROBES = 200
-# Where a scene states no domain: wide enough that an angle meets every direction, so that no partition passes by luck.
-COORDINATE_DOMAIN = (-3.2, 3.2)
-SPEED_DOMAIN = (-1.0, 1.0)
+FEW_INSIDE = 8  # random states inside the domain: with fewer, those nearest to it are used as well
+NEAR = 0.1  # of the domain: where states are looked for about one that was given
+NEARLY_INSIDE = 0.05  # of the width of the domain
+
+
+class NoStateFoundError(ValueError):
+    """No state of a scene's domain was found on its geometric rows."""
+
+
+_seen: dict[type, np.ndarray] = {}  # configurations on the rows that were given for scenes of a class in whose domain none was found
+
+
+def seen_on_rows(scene: Scene, q: np.ndarray) -> None:
+    """A configuration on the geometric rows of a scene in whose domain none was found: where that is so, states are looked for near it."""
+    _seen.setdefault(type(scene), np.asarray(q, float))
+
+
+def states_near_what_was_seen(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """States near a configuration that was given for this class of scenes, not yet on the rows; None where there is none."""
+    if type(scene) not in _seen or len(_seen[type(scene)]) != len(scene.coordinate_names):
+        return None
+    t, q, u = random_states(scene, count, generator)
+    low, high = coordinate_bounds(scene)
+    return t, _seen[type(scene)] + NEAR * (q - (low + high) / 2), u
 
 
 def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -30,15 +54,19 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
         raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
     t, q, u = random_states(scene, drawn, np.random.default_rng(seed))
-    q, u, miss = _projected(scene, t, q, u)
-    good = np.flatnonzero(assembled(scene, miss, np.ones(drawn, bool)))[:count]
+    q, u, found = _projected(scene, t, q, u)
+    near = None if np.isfinite(found.error).any() else states_near_what_was_seen(scene, drawn, np.random.default_rng(seed))
+    if near is not None:
+        t, q, u = near
+        q, u, found = _projected(scene, t, q, u)
+    good = np.flatnonzero(usable_states(scene, found, np.ones(drawn, bool)))[:count]
     return t[good], q[good], u[good]
 
 
 def random_states(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States from the domain, not yet on the rows."""
-    q_low, q_high = _bounds(scene, scene.coordinate_names.entries, COORDINATE_DOMAIN)
-    u_low, u_high = _bounds(scene, scene.speed_names.entries, SPEED_DOMAIN)
+    q_low, q_high = coordinate_bounds(scene)
+    u_low, u_high = speed_bounds(scene)
     q = generator.uniform(q_low, q_high, (count, len(q_low)))
     for first, _ in scene.coordinates.quaternions:
         wxyz = generator.normal(size=(count, 4))
@@ -46,50 +74,46 @@ def random_states(scene: Scene, count: int, generator: np.random.Generator) -> t
     return generator.uniform(0, 1, count), q, generator.uniform(u_low, u_high, (count, len(u_low)))
 
 
-def assembled(scene: Scene, miss: np.ndarray, generic: np.ndarray) -> np.ndarray:
-    """Which states lie on the geometric rows; a ValueError where no random one does."""
-    good = miss < np.sqrt(np.finfo(miss.dtype).eps)
+def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) -> np.ndarray:
+    """Which states serve: on the geometric rows to round-off, and inside the domain; where few random ones are inside, those nearest to it as well.
+
+    ValueError where no random state lies on the rows.
+    """
+    good = np.isfinite(found.error)
     if not good[generic].any():
         nowhere = (
             ""
-            if np.isfinite(miss[generic]).any()
+            if np.isfinite(found.miss[generic]).any()
             else (
                 "; no row is a finite number anywhere: a contact finds no point where a ball is larger than the cylinder or sphere that it rolls in, "
                 "or where the gradient of a surface vanishes"
             )
         )
-        raise ValueError(
-            f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by {np.min(miss[generic]):.1e} or "
-            "more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, "
+        raise NoStateFoundError(
+            f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by {np.min(found.miss[generic]):.1e} "
+            "or more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, "
             "numbers near their defaults stood in for them, or near one where they have none: give defaults near the values in use)" + nowhere
         )
-    return good
+    outside = np.sort(found.outside[good & generic])
+    return good & (found.outside <= max(outside[min(FEW_INSIDE, len(outside)) - 1], NEARLY_INSIDE))
 
 
-def _bounds(scene: Scene, names, default) -> tuple[np.ndarray, np.ndarray]:
-    pairs = [scene.domain.get(name, default) for name in names]
-    return np.array([p[0] for p in pairs], float), np.array([p[1] for p in pairs], float)
-
-
-def _projected(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _projected(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
     try:
         return sampled_on_graph(scene, t, q, u)
     except Unsupported:
-        return _projected_by_jax(scene, t, q, u)
+        found = assembled_by_jax(scene, t, q, np.ones(len(q), bool))
+        return found.q, _speeds_by_jax(scene, t, found.q, u), found
 
 
 @on_numbers
-def _projected_by_jax(scene, t, q, u):
-    def one(t, q, u):
-        q = project_positions(scene, t, q)
-        return q, project_speeds(scene, t, q, u), miss_of_rows(scene, t, q)
-
-    return jax.vmap(one)(t, q, u)
+def _speeds_by_jax(scene, t, q, u):
+    return jax.vmap(lambda t, q, u: project_speeds(scene, t, q, u))(t, q, u)
 
 
 def symmetric_configurations(scene: Scene) -> np.ndarray:
     """Zero, and right angles (within the domain) in one or two coordinates."""
-    low, high = _bounds(scene, scene.coordinate_names.entries, COORDINATE_DOMAIN)
+    low, high = coordinate_bounds(scene)
     reference = scene.coordinates.reference()
     attitude = {i + k for i, _ in scene.coordinates.quaternions for k in range(4)}
     turns = [(i, a) for i in range(len(low)) if i not in attitude for a in (np.pi / 2, -np.pi / 2) if low[i] <= a <= high[i]]

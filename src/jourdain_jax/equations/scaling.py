@@ -1,8 +1,8 @@
-"""Units out of the linear algebra: speeds scaled by their own inertia, rows to unit length, before any rank is decided.
+"""Units out of the linear algebra: speeds scaled by their own inertia, rows by their length, before any rank is decided.
 
-    M^ = c M c,  f^ = c (Q - h),  A^ = d A c,  b^ = -d drift,   udot = c w,   c_i = M_ii^(-1/2),  d_s = 1/|A_s c|
+    M^ = c M c,  f^ = c (Q - h),  A^ = d A c,  b^ = -d drift,   udot = c w,   c_i = M_ii^(-1/2),  d_s = 1/max(|A_s c|, l_s)
 
-The scales are constants to differentiation: the accelerations do not depend on them.
+l_s: the typical length of the row (`structure_of`), so that a row that vanishes at a configuration is not blown up to a direction of round-off. The scales are constants to differentiation: the accelerations do not depend on them.
 """
 
 import equinox as eqx
@@ -39,14 +39,36 @@ def speed_scales(M: Float[np.ndarray, "states speeds speeds"]) -> Float[np.ndarr
     return np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1)), 1)
 
 
-def row_scale(A: Float[Array, "rows speeds"]) -> Float[Array, "rows"]:
-    """One over the length of each row, and 1 for a row that vanishes."""
+def row_scale(A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray, "rows"] | None = None) -> Float[Array, "rows"]:
+    """One over the length of each row, or over its `typical` length where it is shorter than that; 1 for a row that vanishes, where none is known.
+
+    So a row that shrinks along a motion counts less and less, and not at all once it is round-off of what it typically is.
+    """
     length = jnp.sqrt(jnp.sum(jax.lax.stop_gradient(A) ** 2, axis=1))
+    if typical is not None:
+        length = jnp.maximum(length, jnp.asarray(typical, length.dtype))
     return jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1), 1)
+
+
+def typical_row_lengths(A: Float[np.ndarray, "states rows speeds"], elsewhere: Float[np.ndarray, "states rows speeds"]) -> Float[np.ndarray, "rows"]:
+    """The length of each row at most states: the median, or the largest for a row that vanishes at half of them.
+
+    A row that is round-off at all `A` of what it is `elsewhere`, off the geometric rows, keeps that length, and so counts as zero.
+    """
+    length, beyond = (_usual(np.sqrt(np.sum(x**2, axis=2))) for x in (A, elsewhere))
+    return np.where(length > np.sqrt(np.finfo(A.dtype).eps) * beyond, length, beyond)
+
+
+def _usual(length: Float[np.ndarray, "states rows"]) -> Float[np.ndarray, "rows"]:
+    length = length[np.all(np.isfinite(length), axis=1)]
+    if not len(length):
+        return np.zeros(length.shape[1], length.dtype)
+    median = np.median(length, axis=0)
+    return np.where(median > 0, median, length.max(axis=0))
 
 
 def scaled(equations: UnconstrainedEquations, rows: ConstraintRows) -> ScaledProblem:
     """The scaled problem of one state."""
     c = speed_scale(equations.M)
-    d = row_scale(rows.A * c)
+    d = row_scale(rows.A * c, None if rows.usual is None else rows.usual.lengths)
     return ScaledProblem(c[:, None] * equations.M * c, c * (equations.Q - equations.h), d[:, None] * rows.A * c, -d * rows.drift, c, d)

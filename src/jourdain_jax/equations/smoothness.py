@@ -139,7 +139,7 @@ def _in_time(scene: Scene, q: np.ndarray) -> tuple[tuple, tuple, tuple]:
     for leaf in jax.tree.leaves(scene):
         knots = np.unique(np.asarray(leaf, float)) if np.ndim(leaf) == 1 else np.zeros(0)
         knots = knots[np.isfinite(knots)]
-        if 2 <= knots.size:
+        if knots.size >= 2:
             middle = (knots[:-1] + knots[1:]) / 2
             chosen = np.unique(np.linspace(0, max(knots.size - 3, 0), min(KNOTS, max(knots.size - 2, 1))).astype(int))
             low.append(middle[chosen] if knots.size > 2 else knots[:1])

@@ -19,9 +19,9 @@ from jourdain_jax.equations.plausibility import implausible
 from jourdain_jax.equations.probed import TIMED, Probed, probed
 from jourdain_jax.equations.probed_on_graph import follow_from_others, probed_on_graph
 from jourdain_jax.equations.probing import probed_once, without_collecting
-from jourdain_jax.equations.rows import names_of_rows
-from jourdain_jax.equations.sampling import assembled, random_states, symmetric_configurations
-from jourdain_jax.equations.scaling import speed_scales
+from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, names_of_rows
+from jourdain_jax.equations.sampling import random_states, states_near_what_was_seen, symmetric_configurations, usable_states
+from jourdain_jax.equations.scaling import speed_scales, typical_row_lengths
 from jourdain_jax.equations.smoothness import check_smoothness
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
@@ -33,6 +33,8 @@ RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
 LONG = 24  # dependent speeds: of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
 FAR, FAR_PROBES = 100.0, 16  # where no graph is: further states, at times (s), coordinates and speeds up to this
+ERRORS = 100.0  # of a configuration: singular values below are of the error, not of the rows
+TRACED = 1e-3  # of the typical lengths of rows, where parameters are traced
 _EXHAUSTIVE = 3000
 _SHORTLIST = 40
 
@@ -59,8 +61,11 @@ class Structure:
     rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
     chosen_by_user: bool
     faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, as sentences
+    row_lengths: np.ndarray = field(compare=False, repr=False)  # typical ones, in scaled speeds: what the length of a row is judged by
+    plain_row_lengths: np.ndarray = field(compare=False, repr=False)  # in the speeds as they are
     times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric rows
     coordinates: np.ndarray = field(compare=False, repr=False)  # of the same; random ones first
+    random: int  # how many of them are random ones
 
     @property
     def rheonomic(self) -> bool:
@@ -91,10 +96,11 @@ class _Scaled(eqx.Module):
     c: Float[np.ndarray, "states speeds"]  # scales of the speeds
 
 
-def _scaled(found: Probed) -> _Scaled:
+def _scaled(found: Probed, typical: np.ndarray) -> _Scaled:
+    """`d A c` with the scales that the accelerations use (`scaling.row_scale`)."""
     c = speed_scales(found.M)
     A = found.A * c[:, None]
-    length = np.sqrt(np.sum(A**2, axis=2, keepdims=True))
+    length = np.maximum(np.sqrt(np.sum(A**2, axis=2, keepdims=True)), typical[:, None])
     return _Scaled(A / np.where(length > 0, length, 1), c[:, :, None] * found.M * c[:, None], c)
 
 
@@ -114,21 +120,21 @@ def _sizes(found: Probed) -> np.ndarray:
     return np.max(np.abs(found.A), axis=2, initial=0.0)
 
 
-def _look(scene: Scene, *states) -> Probed:
+def _look(scene: Scene, *states_and_generic) -> Probed:
     try:
-        return probed_on_graph(scene, *states)
+        return probed_on_graph(scene, *states_and_generic)
     except Unsupported:
-        return _looked_at_from_afar(scene, *states)
+        return _looked_at_from_afar(scene, *states_and_generic)
 
 
-def _looked_at_from_afar(scene: Scene, t, q, u, u_other) -> Probed:
+def _looked_at_from_afar(scene: Scene, t, q, u, u_other, generic) -> Probed:
     """By JAX, where no graph says what the probes do not show; so a few states far off are looked at too."""
     generator = np.random.default_rng(1)
     far_q = q[:FAR_PROBES] * FAR ** generator.uniform(size=(FAR_PROBES, 1))
     for first, _ in scene.coordinates.quaternions:
         far_q[:, first : first + 4] = q[:FAR_PROBES, first : first + 4]
     far = FAR * generator.uniform(size=FAR_PROBES), far_q, *(FAR * generator.uniform(-1, 1, (2, *u[:FAR_PROBES].shape)))
-    found = probed(scene, *(np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True)))
+    found = probed(scene, *(np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True)), np.pad(generic, (0, FAR_PROBES)))
     near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[: len(t)], np.s_[len(t) :]))
     return replace(near, hidden=_seen(beyond, far[2]) | {"rank"})  # which nothing proves
 
@@ -162,26 +168,49 @@ def structure_of(scene: Scene) -> Structure:
     return structure
 
 
+def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
+    """Typical lengths of the rows of `A` in the units of the speeds; of a scene whose parameters are traced, as in `usual_rows`."""
+    return structure_of(scene).plain_row_lengths * (TRACED if is_traced(scene) else 1.0)
+
+
+def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
+    """Typical lengths of the geometric rows and of quaternion norms in the coordinates, for `project_positions`; of the former as rates."""
+    geometric = plain_row_lengths(scene)[: len(names_of_position_rows(scene))]
+    return np.concatenate([geometric, np.full(len(scene.coordinates.quaternions), 1.0, geometric.dtype)])
+
+
+def usual_rows(scene: Scene) -> UsualRows:
+    """Typical lengths of the rows in scaled speeds, and their rank at generic states.
+
+    Of a scene whose parameters are traced, numbers stand in that may be of another order: only what is shorter than a thousandth of those lengths counts less.
+    """
+    known = structure_of(scene)
+    return UsualRows(known.row_lengths * (TRACED if is_traced(scene) else 1.0), np.asarray(known.rank, np.int32))
+
+
 @probed_once
 def _probed_structure(scene: Scene) -> Structure:
     names = names_of_rows(scene)
     count = len(scene.speed_names)
-    t, q, u = random_states(scene, RANDOM_PROBES, np.random.default_rng(0))
-    symmetric = symmetric_configurations(scene)
-    t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
-    found = _look(scene, t, q, u, -u[::-1])
+    generator = np.random.default_rng(0)
+    t, u, generic, found = _at_probes(scene, *random_states(scene, RANDOM_PROBES, generator))
+    near = None if np.isfinite(found.error[generic]).any() else states_near_what_was_seen(scene, RANDOM_PROBES, generator)
+    if near is not None:
+        t, u, generic, found = _at_probes(scene, *near)
     check_smoothness(scene, found.q[:RANDOM_PROBES], u)
-    generic = np.arange(len(t)) < RANDOM_PROBES
-    on_rows = assembled(scene, found.miss, generic)
+    on_rows = usable_states(scene, found, generic)
     faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
-    scaled = _scaled(found)
-    usable = np.all(np.isfinite(scaled.A), axis=(1, 2)) & on_rows
+    A = found.A * speed_scales(found.M)[:, None]
+    usable = np.all(np.isfinite(A), axis=(1, 2)) & on_rows
     if not faults and not usable.any():
-        finite = np.isfinite(scaled.A).all(axis=2)[on_rows].any(axis=0)
+        finite = np.isfinite(A).all(axis=2)[on_rows].any(axis=0)
         named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "the rows together"
         faults = (f"rows {named} of `{type(scene).__name__}` are not finite at any probed state, expected numbers; check how they are computed",)
-    t, q, u, generic, found, scaled = jax.tree.map(lambda x: x[usable], (t, q, u, generic, found, scaled))
-    ranks = [_rank(A) for A in scaled.A]
+    typical = typical_row_lengths(A[usable & generic], (found.A_beyond * speed_scales(found.M)[:, None])[generic])
+    beyond = found.A_beyond[generic]
+    t, u, generic, found = jax.tree.map(lambda x: x[usable], (t, u, generic, found))
+    scaled = _scaled(found, typical)
+    ranks = [_rank(A, error) for A, error in zip(scaled.A, found.error, strict=True)]
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     if not faults:  # a negative mass is named as such
         _check_inertia(scene, jax.tree.map(lambda x: x[generic & (np.array(ranks) == rank)], scaled), rank)
@@ -191,14 +220,14 @@ def _probed_structure(scene: Scene) -> Structure:
         independent, by_user = _choose(candidates, count, rank), False
     pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
     full_everywhere, eps, hidden = all(r == rank for r in ranks), np.finfo(found.A.dtype).eps, found.hidden
-    redundant = _redundant_rows(scaled.A, ranks, names)
+    redundant = _redundant_rows(scaled.A, found.error, ranks, names)
     return Structure(
         row_names=names,
         rank=rank,
         ranks=tuple(ranks),
         redundant_rows=redundant,
         may_set_in=redundant if redundant and "rank" in hidden and not _follow(scene, t, found.q, u, [names.index(name) for name in redundant]) else (),
-        rank_losses=tuple(_describe(scene, c) for c, r in zip(q, ranks, strict=True) if r < rank),
+        rank_losses=tuple(_describe(scene, c) for c, r in zip(found.q, ranks, strict=True) if r < rank),
         independent=independent,
         worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
         typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
@@ -212,17 +241,28 @@ def _probed_structure(scene: Scene) -> Structure:
         rows_of_inputs="rows of inputs" in hidden or _moves(found.row_rates_of_inputs),
         chosen_by_user=by_user,
         faults=faults,
+        row_lengths=typical,
+        plain_row_lengths=typical_row_lengths(found.A[generic], beyond),
         times=t,
         coordinates=found.q,
+        random=int(np.sum(generic)),
     )
 
 
-def _rank(A: np.ndarray) -> int:
-    """Rank of scaled rows, by the cut-off that the accelerations use."""
+def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
+    """What is found at the given random states and at the symmetric ones; their times and speeds, and which are random."""
+    symmetric = symmetric_configurations(scene)
+    t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
+    generic = np.arange(len(t)) < RANDOM_PROBES
+    return t, u, generic, _look(scene, t, q, u, -u[::-1], generic)
+
+
+def _rank(A: np.ndarray, error: float) -> int:
+    """Rank of scaled rows, by the cut-off that the accelerations use, or by the `error` of the configuration they belong to."""
     if not A.size:
         return 0
     sigma = np.linalg.svd(A, compute_uv=False)
-    return int(np.sum(sigma > rank_cutoff(A.dtype) * sigma[0]))
+    return int(np.sum(sigma > max(rank_cutoff(A.dtype), ERRORS * error) * sigma[0]))
 
 
 def _check_inertia(scene: Scene, found: _Scaled, rank: int) -> None:
@@ -244,14 +284,14 @@ def _check_inertia(scene: Scene, found: _Scaled, rank: int) -> None:
     )
 
 
-def _redundant_rows(scaled: np.ndarray, ranks: list[int], names: tuple[str, ...]) -> tuple[str, ...]:
+def _redundant_rows(scaled: np.ndarray, errors: np.ndarray, ranks: list[int], names: tuple[str, ...]) -> tuple[str, ...]:
     """Rows that may be left out, later ones first, so that the rest keeps its rank at every probed state."""
     kept = list(range(len(names)))
     for s in reversed(range(len(names))):
         if len(kept) in ranks:
             break  # somewhere those that are left are independent
         rest = [i for i in kept if i != s]
-        if all(_rank(A[rest]) == r for A, r in zip(scaled, ranks, strict=True)):
+        if all(_rank(A[rest], error) == r for A, error, r in zip(scaled, errors, ranks, strict=True)):
             kept = rest
     return tuple(name for s, name in enumerate(names) if s not in kept)
 

@@ -11,8 +11,8 @@ from jourdain_jax.equations.accelerations import Accelerations, accelerations
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reactions import ContactForce, RowReactions, contact_forces, row_reactions
-from jourdain_jax.equations.rows import velocity_residual
-from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.rows import UsualRows, velocity_residual
+from jourdain_jax.equations.structure import structure_of, usual_rows
 from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.scene.answers import invariants_of
@@ -81,9 +81,9 @@ def energies(record: Record) -> tuple[Float[Array, "times"], Float[Array, "times
     return along(_energies, record)
 
 
-def accelerations_along(record: Record) -> Accelerations:
-    """Accelerations, multipliers, rank and smallest singular value."""
-    return along(_accelerations, record, _needs_rates(record))
+def accelerations_along(record: Record, usual: UsualRows | None = None) -> Accelerations:
+    """Accelerations, multipliers, rank and smallest singular value; `usual`: from `usual_rows`, for a record whose parameters are traced."""
+    return along(_Accelerations(jax.tree.map(jnp.asarray, usual_rows(record.scene) if usual is None else usual)), record, _needs_rates(record))
 
 
 def reactions_along(record: Record) -> RowReactions:
@@ -121,6 +121,13 @@ class _Point(eqx.Module):
 
 def _energies(scene, t, q, u, inputs):
     return kinetic_energy(scene, t, q, u), potential_energy(scene, motion_at(scene, t, q, u, inputs))
+
+
+class _Accelerations(eqx.Module):
+    usual: UsualRows
+
+    def __call__(self, scene, t, q, u, inputs):
+        return accelerations(scene, t, q, u, inputs, reduction="svd", usual=self.usual)
 
 
 def _accelerations(scene, t, q, u, inputs):

@@ -11,6 +11,8 @@ from jaxtyping import Array, Float, Int
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.equations.probing import Seldom, on_numbers
 from jourdain_jax.equations.reactions import ContactForce
+from jourdain_jax.equations.rows import UsualRows
+from jourdain_jax.equations.structure import usual_rows
 from jourdain_jax.motion.along import Record, accelerations_along, contact_forces_along, energies, invariants, residuals
 from jourdain_jax.motion.recovery import TOO_LONG
 from jourdain_jax.motion.results import FALLBACKS
@@ -75,8 +77,8 @@ def diagnose(trajectory: Record) -> Diagnostics:
     Times that were not reached do not count.
     """
     if trajectory.ts.shape[0] <= FEW_TIMES and _seldom((jax.tree.structure(trajectory), trajectory.ts.shape), trajectory):
-        return jax.tree.map(jnp.asarray, _uncompiled(trajectory))
-    return _diagnosed(trajectory)
+        return jax.tree.map(jnp.asarray, _uncompiled(trajectory, usual_rows(trajectory.scene)))
+    return _diagnosed(trajectory, usual_rows(trajectory.scene))
 
 
 FEW_TIMES = 1000
@@ -86,10 +88,10 @@ _ROUND_OFF = 1e-6  # of the whole energy: where less than that moves, as at rest
 _seldom = Seldom(often=100)
 
 
-def _diagnosed(trajectory: Record) -> Diagnostics:
+def _diagnosed(trajectory: Record, usual: UsualRows) -> Diagnostics:
     energy = energies_of(trajectory, trajectory.work)
     geometric, rows = residuals(trajectory)
-    motion = accelerations_along(trajectory)
+    motion = accelerations_along(trajectory, usual)
     reached = jnp.all(jnp.isfinite(trajectory.q), axis=-1)
     return Diagnostics(
         energy_drift=_span(energy.balance),

@@ -6,22 +6,32 @@ g(t, q) = 0,  phi(t, q, u) = 0
 from collections.abc import Mapping
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from jourdain_jax.calculus.damped import damped_root
 from jourdain_jax.calculus.reals import Number, Numbers
+from jourdain_jax.equations.domain import coordinate_bounds
 from jourdain_jax.equations.probing import Seldom, on_numbers
-from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
+from jourdain_jax.equations.projection import closure_residual, miss_of_rows, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
-from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.sampling import NoStateFoundError, seen_on_rows
+from jourdain_jax.equations.scaling import row_scale
+from jourdain_jax.equations.structure import Structure, closure_lengths, structure_of, usual_rows
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
+
+FAR = 10.0  # widths of the domain: a coordinate that Newton's method moves by more has run away
+GUESSES = 8  # of each kind
+NEAR = 0.1  # of the domain: how far the first guesses are from what was given
 
 
 class State(Printed, eqx.Module):
@@ -37,6 +47,7 @@ class State(Printed, eqx.Module):
     moved_u: Float[Array, ""]  # largest change of a speed by the projection
     residual: Float[Array, ""]  # what is left of rows and quaternion norms
     names: tuple[Names, Names] = eqx.field(static=True)
+    guess: Int[Array, ""] = eqx.field(default=0, converter=lambda k: jnp.asarray(k, jnp.int32))  # that led here: 0, what was given; then others (`start`)
 
     def __getitem__(self, name: str):
         """A coordinate, speed, quaternion or angular velocity by name."""
@@ -48,6 +59,8 @@ class State(Printed, eqx.Module):
             return f"States of shape {self.q.shape[:-1]}: {', '.join((*self.names[0].entries, *self.names[1].entries))}"
         pairs = [f"{n} = {v:.6g}" for names, x in zip(self.names, (self.q, self.u), strict=True) for n, v in zip(names.entries, np.asarray(x), strict=True)]
         moved = f"moved by {self.moved_q:.2e} (q), {self.moved_u:.2e} (u) onto the constraints; residual {self.residual:.1e}"
+        if int(self.guess):
+            moved += f"; from guess {int(self.guess)}: coordinates that were not given begin elsewhere in the domain, those near the reference lead nowhere"
         return f"State at t = {self.t:.6g} s: " + ", ".join(pairs) + f"\n{moved}"
 
 
@@ -66,22 +79,108 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
         if name not in known:
             raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, known)}")
     free_q, free_u = (np.array([name not in held for name in names.entries], bool) for names in (scene.coordinate_names, scene.speed_names))
-    project = _uncompiled_projection if _seldom(jax.tree.structure(scene), (scene, t, q, u, inputs)) else _compiled_projection
-    near_q, near_u, moved_q, moved_u, residual = (jnp.asarray(x) for x in project(scene, t, q, u, inputs, free_q, free_u))
-    return State(t, near_q, near_u, moved_q, moved_u, residual, (scene.coordinate_names, scene.speed_names))
+    return _consistent(scene, t, q, u, inputs, free_q, free_u, jnp.zeros((0, q.shape[0]), q.dtype))
+
+
+def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Float[Array, "guesses coordinates"]) -> State:
+    """The nearest state; where Newton's method does not arrive, the nearest that a damped search finds, from q and then from the other `guesses`."""
+    arguments = (scene, t, q, u, inputs, free_q, free_u, _usual(scene))
+    if is_traced(arguments):
+        found = _put_onto_constraints(*arguments, guesses)
+    else:
+        project = _uncompiled_projection if _seldom(jax.tree.structure(scene), ()) else _compiled_projection
+        found = project(*arguments, None)
+        if not found.arrived and _can_search(scene):
+            found = _uncompiled_projection(*arguments, guesses)
+    found = jax.tree.map(jnp.asarray, found)
+    return State(t, found.q, found.u, found.moved_q, found.moved_u, found.residual, (scene.coordinate_names, scene.speed_names), found.guess)
 
 
 _seldom = Seldom(often=8)
 
 
-def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u):
-    """q and u on the constraints; the largest changes of both and the largest residual, infinite where a number is not finite."""
-    near_q = project_positions(scene, t, q, free=jnp.asarray(free_q))
-    near_u = project_speeds(scene, t, near_q, u, inputs, free=jnp.asarray(free_u))
+class _Found(eqx.Module):
+    """A state, how far it is from the guess, what is left of the rows (infinite where a number is not finite), and which guess led to it."""
+
+    q: Float[Array, "coordinates"]
+    u: Float[Array, "speeds"]
+    moved_q: Float[Array, ""]
+    moved_u: Float[Array, ""]
+    residual: Float[Array, ""]
+    guess: Int[Array, ""]
+    arrived: Bool[Array, ""]  # whether the coordinates did, and are within reach of the domain
+
+
+class _Usual(eqx.Module):
+    """Sizes by which rows and coordinates are measured."""
+
+    closures: Float[np.ndarray, "closures"]
+    rows: Float[np.ndarray, "rows"]
+    width: Float[np.ndarray, "coordinates"]  # of the domain
+
+
+def _usual(scene: Scene) -> _Usual:
+    low, high = coordinate_bounds(scene)
+    width = np.where(high > low, high - low, 1.0).astype(jnp.result_type(float))
+    try:
+        return _Usual(closure_lengths(scene), usual_rows(scene).lengths, width)
+    except ValueError:  # of a scene that is wrong in itself; said where its structure is asked for
+        norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
+        return _Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width)
+
+
+def _can_search(scene: Scene) -> bool:
+    return bool(names_of_position_rows(scene) or scene.coordinates.quaternions)
+
+
+def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: _Usual, guesses) -> _Found:
+    """q and u on the constraints; no search where `guesses` is None."""
+    free = jnp.asarray(free_q)
+    near_q, guess = project_positions(scene, t, q, free=free, typical=usual.closures), jnp.zeros((), jnp.int32)
+    arrived = _arrived(scene, t, q, near_q, usual)
+    if guesses is not None and _can_search(scene):
+        lost = jax.lax.stop_gradient(~arrived)
+        other_q, other = jax.lax.cond(eqxi.unvmap_any(lost), lambda: _searched(scene, t, q, free, usual, guesses), lambda: (near_q, guess))
+        better = lost & (_left(scene, t, other_q) <= _left(scene, t, near_q))
+        near_q, guess = jnp.where(better, other_q, near_q), jnp.where(better, other, guess)
+    near_u = project_speeds(scene, t, near_q, u, inputs, free=jnp.asarray(free_u), typical=usual.rows)
     left = jnp.concatenate([closure_residual(scene, t, near_q), velocity_residual(scene, t, near_q, near_u, inputs)])
     finite = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left])))
     moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
-    return near_q, near_u, moved_q, moved_u, jnp.where(finite, residual, jnp.inf)
+    return _Found(near_q, near_u, moved_q, moved_u, jnp.where(finite, residual, jnp.inf), guess, arrived)
+
+
+def _left(scene: Scene, t, q) -> Float[Array, ""]:
+    """Largest residual of the geometric rows that counts: what is no number is infinite, what is round-off is zero."""
+    left = jax.lax.stop_gradient(miss_of_rows(scene, t, q))
+    return jnp.where(left < _tolerance(q.dtype), 0.0, left)
+
+
+def _arrived(scene: Scene, t, q, near_q, usual: _Usual) -> Bool[Array, ""]:
+    """Whether the rows are met, without running far away."""
+    close = jnp.all(jnp.abs(near_q - q) <= FAR * usual.width)  # never where it is not a number
+    return jax.lax.stop_gradient(close & (_left(scene, t, near_q) == 0))
+
+
+def _searched(scene: Scene, t, q, free, usual: _Usual, guesses) -> tuple[Float[Array, "coordinates"], Int[Array, ""]]:
+    """Coordinates from the first guess that leads to the rows, q itself counting as the first; and its number."""
+    size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
+    here, still, at = jax.lax.stop_gradient((q, scene, t))
+    every = jnp.where(free, jnp.concatenate([here[None], guesses]), here)
+    G = jax.vmap(jax.jacfwd(lambda q: closure_residual(still, at, q)))(every)
+    every = jnp.where(jnp.any(G != 0, axis=(0, 1)), every, here)  # coordinates that no row depends on stay
+    d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
+    tolerance = 16 * float(jnp.finfo(q.dtype).eps)
+    found = jax.vmap(lambda guess: damped_root(lambda q: d * closure_residual(still, at, q), guess, size, tolerance))(every)
+    good = found.left <= float(jnp.finfo(q.dtype).eps) ** 0.5
+    guess = jnp.where(jnp.any(good), jnp.argmax(good), jnp.argmin(found.left)).astype(jnp.int32)
+    begin = jnp.where(free, found.x[guess], q)
+    # derivatives come from the last steps of Newton's method; where the rows cannot be met, those would run away
+    return jnp.where(good[guess], project_positions(scene, t, begin, free=free, typical=usual.closures), begin), guess
+
+
+def _tolerance(dtype) -> float:
+    return 1e3 * float(np.sqrt(np.finfo(dtype).eps))
 
 
 _compiled_projection = eqx.filter_jit(_put_onto_constraints)  # one program for every choice of what is held
@@ -91,7 +190,9 @@ _uncompiled_projection = on_numbers(_put_onto_constraints)
 def start(scene: Scene, *, t0: Number = 0.0, inputs=None, **values) -> State:
     """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`.
 
-    `values` that are given are kept, at time `t0` (s). Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;
+    `values` that are given are kept, at time `t0` (s). Coordinates that are not given begin at zero (a quaternion at the identity) and follow from the rows;
+    where that leads nowhere, they begin at those of states of the domain, nearest first, and the state says so (`guess`).
+    Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;
     where dependent speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
     `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; what they are at `t0` counts where velocity rows depend on them.
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
@@ -103,15 +204,44 @@ def named_start(scene: Scene, values: Mapping, t0, inputs: Float[Array, "inputs"
     """The same from a dictionary of `values`, and the `inputs` at time `t0` as a vector."""
     q, u, given = as_scene(scene).named(**values)
     _check_finite({**values, "t0": t0})
-    state = consistent(scene, t0, q, u, inputs, held=(*given, *_resting(scene, given)))
+    t, free_q = as_time(t0), np.array([name not in given for name in scene.coordinate_names.entries], bool)
+    known = _structure(scene, t, q, free_q)
+    free_u = np.array([name not in (*given, *_resting(scene, known, given)) for name in scene.speed_names.entries], bool)
+    q, u = as_coordinates(scene, q), as_speeds(scene, u)
+    state = _consistent(scene, t, q, u, as_input_vector(scene, inputs, q.dtype), free_q, free_u, _guesses(scene, known, q, free_q))
     _check_residual(scene, state, inputs, given)
     return state
 
 
-def _resting(scene: Scene, given: tuple[str, ...]) -> tuple[str, ...]:
+def _structure(scene: Scene, t, q, free_q) -> Structure:
+    """The structure of a scene; where no state of its domain was found, of the neighbourhood of a start that is on the rows."""
+    try:
+        return structure_of(scene)
+    except NoStateFoundError:
+        if is_traced((scene, t, q)):
+            raise
+        near = np.asarray(project_positions(scene, t, as_coordinates(scene, q), free=jnp.asarray(free_q)))
+        if not float(_left(scene, t, jnp.asarray(near))) == 0:
+            raise
+        seen_on_rows(scene, near)
+        return structure_of(scene)
+
+
+def _guesses(scene: Scene, known: Structure, q, free_q) -> Float[Array, "guesses coordinates"]:
+    """Configurations near q, on the rows (those first whose given coordinates are nearest), and elsewhere in the domain."""
+    low, high = coordinate_bounds(scene)
+    on_rows = jnp.asarray(known.coordinates[: known.random], q.dtype)
+    apart = jnp.where(free_q, 0.0, (on_rows - jax.lax.stop_gradient(q)) / np.where(high > low, high - low, 1.0))
+    nearest_first = jnp.argsort(jnp.sum(apart**2, axis=1))[:GUESSES]
+    elsewhere = np.random.default_rng(3).uniform(low, high, (2 * GUESSES, len(low)))
+    near = jax.lax.stop_gradient(q) + NEAR * jnp.asarray(elsewhere[:GUESSES] - (low + high) / 2, q.dtype)
+    return jnp.concatenate([near, on_rows[nearest_first], jnp.asarray(elsewhere[GUESSES:], q.dtype)])
+
+
+def _resting(scene: Scene, known: Structure, given: tuple[str, ...]) -> tuple[str, ...]:
     """Privileged speeds that stay at zero: those not given, where no dependent speed was."""
     names = scene.speed_names.entries
-    privileged = [names[i] for i in structure_of(scene).independent]
+    privileged = [names[i] for i in known.independent]
     if any(name in names and name not in privileged for name in given):
         return ()
     return tuple(name for name in privileged if name not in given)
@@ -124,7 +254,7 @@ def _check_finite(values: Mapping) -> None:
 
 
 def _check_residual(scene: Scene, state: State, inputs, given: tuple[str, ...]) -> None:
-    if isinstance(state.residual, jax.core.Tracer) or float(state.residual) < 1e3 * np.sqrt(np.finfo(state.q.dtype).eps):
+    if isinstance(state.residual, jax.core.Tracer) or float(state.residual) < _tolerance(state.q.dtype):
         return
     g = np.abs(np.asarray(closure_residual(scene, state.t, state.q)))
     phi = np.abs(np.asarray(velocity_residual(scene, state.t, state.q, state.u, inputs)))

@@ -20,7 +20,7 @@ from jourdain_jax.equations.minimal import minimal_accelerations, minimal_kinema
 from jourdain_jax.equations.power import rate_of_work
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
-from jourdain_jax.equations.structure import WELL_CONDITIONED, Structure
+from jourdain_jax.equations.structure import WELL_CONDITIONED, Structure, closure_lengths, usual_rows
 from jourdain_jax.equations.trace import event_values
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.scene.scene import Scene
@@ -154,8 +154,10 @@ class StateForm(eqx.Module):
         if self.lowered is not None:
             q, v = self.lowered.projected(fixed, t, tuple(y.q), tuple(y.v), inputs, self.affine)
             return Integrated(jnp.stack(q), jnp.stack(v) if v else y.v, y.work)
-        q = project_positions(scene, t, y.q, iterations=iterations) if self.projects_positions else y.q
-        v = project_speeds(scene, t, q, y.v, inputs, iterations=iterations, cutoff=self.cutoff) if self.projects_speeds else y.v
+        q = project_positions(scene, t, y.q, iterations=iterations, typical=closure_lengths(scene)) if self.projects_positions else y.q
+        v = y.v
+        if self.projects_speeds:
+            v = project_speeds(scene, t, q, v, inputs, iterations=iterations, cutoff=self.cutoff, typical=usual_rows(scene).lengths)
         return Integrated(q, v, y.work)
 
 

@@ -1,0 +1,62 @@
+"""Levenberg-Marquardt from one guess: a root of rows that Newton's method runs away from, where there is one near enough.
+
+    min |f(x)|^2:   x <- x - J' (J J' + damping)^-1 f,   J = df/dx
+
+No derivative passes through: take it at the root (`calculus.settling`). Runs under `jit` and `vmap`, where all lanes go on until the last has ended.
+Source: J. Nocedal and S. Wright, Numerical Optimization (2006), section 10.3.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+MOST_STEPS = 80
+_FARTHEST = 0.25  # of the size of the unknowns, in one step
+_GIVEN_UP = 1e7  # damping: no step makes the rows smaller
+
+
+class Nearest(eqx.Module):
+    """Where a search ended, and what is left of the rows there."""
+
+    x: Float[Array, "unknowns"]
+    left: Float[Array, ""]  # largest of the rows
+
+
+class _Search(eqx.Module):
+    trial: Float[Array, "unknowns"]
+    best: Float[Array, "unknowns"]
+    f: Float[Array, "rows"]  # at the best, and their slopes
+    J: Float[Array, "rows unknowns"]
+    damping: Float[Array, ""]
+    steps: Int[Array, ""]
+    going: Bool[Array, ""]
+
+
+def damped_root(rows: Callable, guess: Float[Array, "unknowns"], size: Float[Array, "unknowns"], tolerance: float) -> Nearest:
+    """x near `guess` at which no entry of `rows(x)` exceeds the `tolerance`, or where they are smallest.
+
+    `size`: of each unknown, by which steps are measured; zero for one that is held. Rows should be of order one where unknowns change by their size.
+    """
+
+    def look(x):
+        f, slope = jax.linearize(rows, x)
+        return f, jax.vmap(slope, out_axes=1)(jnp.diag(size))  # per unit of size
+
+    def once(search: _Search) -> _Search:
+        f, J = look(search.trial)
+        better = (f @ f < search.f @ search.f) & jnp.all(jnp.isfinite(J))  # never where it is not a number
+        best, f, J = (jnp.where(better, a, b) for a, b in ((search.trial, search.best), (f, search.f), (J, search.J)))
+        damping = jnp.clip(jnp.where(better, search.damping / 6, search.damping * 5), 1e-14, 1e8)
+        step = -J.T @ jnp.linalg.solve(J @ J.T + damping * jnp.eye(f.shape[0], dtype=f.dtype), f)
+        step = step * jnp.minimum(1.0, _FARTHEST / jnp.maximum(jnp.max(jnp.abs(step), initial=0.0), jnp.finfo(f.dtype).tiny))
+        going = (jnp.max(jnp.abs(f), initial=0.0) > tolerance) & (damping < _GIVEN_UP) & (search.steps < MOST_STEPS) & jnp.all(jnp.isfinite(f))
+        return _Search(best + size * step, best, f, J, damping, search.steps + 1, going)
+
+    f, J = jax.eval_shape(look, guess)
+    start = _Search(guess, guess, jnp.full(f.shape, jnp.inf, f.dtype), jnp.zeros(J.shape, J.dtype), jnp.full((), 6e-2, f.dtype), jnp.zeros((), jnp.int32), jnp.array(True))
+    found = jax.lax.while_loop(lambda search: search.going, once, start)
+    left = jnp.max(jnp.abs(found.f), initial=0.0)
+    return Nearest(found.best, jnp.where(jnp.isfinite(left), left, jnp.inf))
