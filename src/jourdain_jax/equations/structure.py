@@ -31,6 +31,7 @@ from jourdain_jax.scene.scene import Scene
 RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
 LONG = 24  # dependent speeds: of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
+KEPT = 0.2  # of the smallest singular value, at every probe, by the rows that stay where others are left out
 FAR, FAR_PROBES = 100.0, 16  # where no graph is: further states, at times (s), coordinates and speeds up to this
 _EXHAUSTIVE = 3000
 _SHORTLIST = 40
@@ -214,6 +215,11 @@ def _rank(A: np.ndarray) -> int:
     return int(np.sum(sigma > rank_cutoff(A.dtype) * sigma[0]))
 
 
+def _smallest(A: np.ndarray, rank: int) -> float:
+    """The smallest singular value that counts."""
+    return float(np.linalg.svd(A, compute_uv=False)[rank - 1]) if rank else 1.0
+
+
 def _check_inertia(scene: Scene, found: _Scaled, rank: int) -> None:
     """Raise a ValueError that names the speeds along which the rows leave a motion free that no body's inertia resists, at every generic state."""
     moved = []
@@ -234,13 +240,17 @@ def _check_inertia(scene: Scene, found: _Scaled, rank: int) -> None:
 
 
 def _redundant_rows(scaled: np.ndarray, ranks: list[int], names: tuple[str, ...]) -> tuple[str, ...]:
-    """Rows that may be left out, later ones first, so that the rest keeps its rank at every probed state."""
+    """Rows that may be left out, later ones first, so that the rest keeps its rank at every probed state, and does not come near to losing it.
+
+    A row that is a combination of the others with coefficients c takes a smallest singular value down to `1/sqrt(1 + |c|^2)` of it. Where that
+    is much, the coefficients grow without bounds between the probes: so do those of one wheel's row along x by its row along y, where its heading turns.
+    """
     kept = list(range(len(names)))
     for s in reversed(range(len(names))):
         if len(kept) in ranks:
             break  # somewhere those that are left are independent
         rest = [i for i in kept if i != s]
-        if all(_rank(A[rest]) == r for A, r in zip(scaled, ranks, strict=True)):
+        if all(_rank(A[rest]) == r and _smallest(A[rest], r) > KEPT * _smallest(A[kept], r) for A, r in zip(scaled, ranks, strict=True)):
             kept = rest
     return tuple(name for s, name in enumerate(names) if s not in kept)
 

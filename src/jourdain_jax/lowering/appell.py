@@ -11,12 +11,14 @@ simple. *Implicit*: speeds are differentiated as they stand, and the rates of z 
 """
 
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
 from jourdain_jax.equations.structure import Structure
 from jourdain_jax.equations.trace import TracedScene, VelocityQuantities
 from jourdain_jax.lowering.elimination import eliminate, serves, solve_symmetric
+from jourdain_jax.lowering.far import at_full_turns
 from jourdain_jax.lowering.multipliers import accelerations_by_multipliers, projected_coordinates, projected_speeds
 from jourdain_jax.program.derivative import along, columns, derivatives
 from jourdain_jax.program.evaluate import Probes
@@ -80,13 +82,21 @@ class AppellOnGraph:
         self.rows, self.multiplied = ([], rows) if by_multipliers else (rows, [])
         self.reference, self.quaternions = reference, quaternions
         self.formal = self._formal()
+        self.far = cache(self._far)
 
     def _formal(self) -> Probes:
         """Generic states on the geometric rows, at generic parameters."""
-        g, q = self.graph, self.traced.q.tolist()
+        q = self.traced.q.tolist()
         attitudes = {f"q_{first + i}": q[first + i] for first in self.quaternions for i in range(4)}
-        norms = [g.sub(g.total(g.mul(n, n) for n in q[first : first + 4]), g.one) for first in self.quaternions]
-        return on_rows(formal(self.probes, attitudes), self.probes, [*self.traced.at.closure.tolist(), *norms], {f"q_{i}": n for i, n in enumerate(q)})
+        return on_rows(formal(self.probes, attitudes), self.probes, self._closure(), {f"q_{i}": n for i, n in enumerate(q)})
+
+    def _far(self) -> Probes:
+        return at_full_turns(self.probes, self._closure(), self.traced.q.tolist(), self.quaternions)
+
+    def _closure(self) -> list[int]:
+        """Geometric rows and what quaternions' norms miss."""
+        g, q = self.graph, self.traced.q.tolist()
+        return [*self.traced.at.closure.tolist(), *(g.sub(g.total(g.mul(n, n) for n in q[first : first + 4]), g.one) for first in self.quaternions)]
 
     def build(self, strategy: Strategy) -> Equations:
         """The equations by one strategy."""
@@ -189,7 +199,7 @@ class AppellOnGraph:
 
         def solved(columns, known):
             right = [[g.neg(g.add(rest, g.total(g.mul(row[k], n) for k, n in known.items())))] for row, rest in zip(A, phi_0, strict=True)]
-            return eliminate(g, [[row[k] for k in columns] for row in A], right, self.probes)
+            return eliminate(g, [[row[k] for k in columns] for row in A], right, self.probes, self.far)
 
         whole = solved(self.dependent, y)
         same = equal(self.formal(kinematics.z), self.formal([row[0] for row in whole.solution]), serves(whole.pivots, self.formal))
@@ -296,7 +306,7 @@ class _Kinematics:
         put_z = {} if self.free_z else self.known
         known = lambda nodes: self._simple(g.substituted(nodes, put_z))  # noqa: E731
         drift, at_fixed_speeds = known(drift), known(at_fixed_speeds)
-        zdot = self._simple([row[0] for row in eliminate(g, self._A_z, [[g.neg(d)] for d in drift], build.probes).solution])
+        zdot = self._simple([row[0] for row in eliminate(g, self._A_z, [[g.neg(d)] for d in drift], build.probes, build.far).solution])
         dependent = [by_speed[k] for k in build.dependent]
         partial = [
             self._simple([g.add(d, g.total(g.mul(row[i], by_z[n]) for row, by_z in zip(self.B, dependent, strict=True))) for n, d in enumerate(by_speed[y])])
@@ -311,7 +321,7 @@ class _Kinematics:
         g, build = self.graph, self.build
         right = [[*(g.neg(row[i]) for i in build.independent), g.neg(rest)] for row, rest in zip(A, phi_0, strict=True)]
         self._A_z = [[row[d] for d in build.dependent] for row in A]
-        eliminated = eliminate(g, self._A_z, right, build.probes)
+        eliminated = eliminate(g, self._A_z, right, build.probes, build.far)
         self.pivots = eliminated.pivots
         solution = [self._simple(row) for row in eliminated.solution]
         self.B, self.b = [row[:-1] for row in solution], [row[-1] for row in solution]
