@@ -53,6 +53,7 @@ class Structure:
     homogeneous: bool  # phi vanishes at u = 0
     timed: tuple[str, ...]  # what depends on time by itself, out of `TIMED`
     driven: bool  # bodies or coordinates move, or bodies turn, while all speeds are zero
+    massless: bool  # M is singular: nothing has inertia along some motion that the rows hold
     varying_inertia: bool  # masses or central inertias change along the motion
     potentials_of_inputs: tuple[int, ...]  # numbers of the loads whose potential depends on inputs
     rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
@@ -75,6 +76,11 @@ class Structure:
     def degrees_of_freedom(self) -> int:
         """Number of independent speeds at generic states."""
         return len(self.independent)
+
+    @property
+    def dependent_rows(self) -> bool:
+        """Whether rows depend on each other although none may be left out: each is needed somewhere."""
+        return len(self.row_names) - len(self.redundant_rows) > self.rank
 
     @property
     def well_conditioned(self) -> bool:
@@ -197,6 +203,7 @@ def _probed_structure(scene: Scene) -> Structure:
         homogeneous="rows at rest" not in hidden and not _exceeds(found.phi_at_rest, 32 * eps, found.A),
         timed=tuple(name for name in TIMED if name in hidden or _moves(found.timed[name])),
         driven="motion at rest" in hidden or _moves(found.motion_at_rest),
+        massless=_is_singular(scaled.M[generic]),
         varying_inertia="inertia" in hidden or _moves(found.inertia_rates),
         potentials_of_inputs=tuple(k for k, rate in enumerate(found.potential_rates.T) if f"potential {k}" in hidden or _moves(rate)),
         rows_of_inputs="rows of inputs" in hidden or _moves(found.row_rates_of_inputs),
@@ -218,6 +225,11 @@ def _rank(A: np.ndarray) -> int:
 def _smallest(A: np.ndarray, rank: int) -> float:
     """The smallest singular value that counts."""
     return float(np.linalg.svd(A, compute_uv=False)[rank - 1]) if rank else 1.0
+
+
+def _is_singular(M: np.ndarray) -> bool:
+    """Whether scaled inertias are singular at all of some states."""
+    return bool(M.size) and bool(np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * np.finfo(M.dtype).eps))
 
 
 def _check_inertia(scene: Scene, found: _Scaled, rank: int) -> None:

@@ -19,7 +19,8 @@ from jourdain_jax.equations.structure import Structure
 from jourdain_jax.equations.trace import TracedScene, VelocityQuantities
 from jourdain_jax.lowering.elimination import eliminate, serves, solve_symmetric
 from jourdain_jax.lowering.far import at_full_turns
-from jourdain_jax.lowering.multipliers import accelerations_by_multipliers, projected_coordinates, projected_speeds
+from jourdain_jax.lowering.multipliers import accelerations_by_multipliers, projected_coordinates, projected_speeds, with_inertia_of_rows
+from jourdain_jax.lowering.partition import Partition
 from jourdain_jax.program.derivative import along, columns, derivatives
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.formal import equal, formal, on_rows, unaffected
@@ -74,12 +75,17 @@ class Projection:
 class AppellOnGraph:
     """The construction for one scene."""
 
-    def __init__(self, traced: TracedScene, structure: Structure, by_multipliers: bool, probes: Probes, reference: np.ndarray, quaternions: tuple[int, ...]):
+    def __init__(
+        self, traced: TracedScene, structure: Structure, by_multipliers: bool, probes: Probes, reference: np.ndarray, quaternions: tuple[int, ...], massless: bool
+    ):
         self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
         every, rows = range(len(traced.u)), [s for s, name in enumerate(structure.row_names) if name not in structure.redundant_rows]
         self.independent = list(every) if by_multipliers else list(structure.independent)
         self.dependent = [k for k in every if k not in self.independent]
         self.rows, self.multiplied = ([], rows) if by_multipliers else (rows, [])
+        # where multipliers are not determined
+        self.by_partition = by_multipliers and (massless or structure.dependent_rows) and structure.well_conditioned
+        self.massless = massless and not self.by_partition
         self.reference, self.quaternions = reference, quaternions
         self.formal = self._formal()
         self.far = cache(self._far)
@@ -107,12 +113,16 @@ class AppellOnGraph:
         M, f = self._equations(kinematics, forms_of_equations)
         if self.multiplied:
             A, drift = kinematics.rows_along_motion(self.multiplied)
-            ydot, sines, margins = accelerations_by_multipliers(self.graph, M, f, A, drift, forms)
+            if self.by_partition:
+                ydot, sines = self._partition.accelerations(M, f, A, drift, forms)
+                margins = []
+            else:
+                ydot, sines, margins = accelerations_by_multipliers(self.graph, self._inertia(M, A), f, A, drift, forms)
         else:
             ydot, sines, margins = self._solved(M, f, forms_of_equations if strategy.by_determinants else None), [], []
         z, qdot, pivots = self._true_rates(kinematics, forms) if held else (kinematics.z, kinematics.qdot, [])
         guards = {node for made in (forms, forms_of_equations) if made is not None for node in made.guards}
-        guards |= {margin for sine, margin in zip(sines, margins, strict=True) if self._may_vanish(sine)}
+        guards |= {margin for sine, margin in zip(sines, margins, strict=False) if self._may_vanish(sine)}
         power = self._power(kinematics, ydot)
         if strategy.free_z:
             *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
@@ -144,10 +154,26 @@ class AppellOnGraph:
                 moved[first : first + 4] = [g.div(part, g.call("sqrt", n)) for part in q[first : first + 4]]
         if not self.multiplied:
             return Projection(moved, [])
-        forms = self._forms(False, most_terms)
-        M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
+        forms, u = self._forms(False, most_terms), self.traced.u.tolist()
         phi = [int(at.phi[s]) for s in self.multiplied]
-        return Projection(moved, projected_speeds(g, M, self.traced.u.tolist(), phi, forms))
+        if self.by_partition:
+            return Projection(moved, self._partition.projected_speeds(u, phi))
+        M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
+        A = [list(row) for row in zip(*columns(g, phi, u), strict=True)]
+        return Projection(moved, projected_speeds(g, self._inertia(M, A), u, phi, forms))
+
+    @property
+    def _partition(self) -> Partition:
+        chosen = self.structure.independent
+        return Partition(self.graph, chosen, [k for k in self.independent if k not in chosen], self.probes, self.far)
+
+    def _inertia(self, M, A):
+        """M, with inertia added along the rows where it may be singular: of the size of its own."""
+        if not self.massless:
+            return M
+        heavy = np.nanmedian(np.max(np.abs(self.probes([row[i] for i, row in enumerate(M)])), axis=0))
+        sizes = [np.nanmedian(np.sum(self.probes(row) ** 2, axis=0)) for row in A]
+        return with_inertia_of_rows(self.graph, M, A, [float(2.0 ** np.round(np.log2(heavy / size))) if size > 0 else 1.0 for size in sizes])
 
     def _may_vanish(self, pivot: int) -> bool:
         """Whether a pivot is small or not a number at some probe."""

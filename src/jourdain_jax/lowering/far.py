@@ -1,9 +1,13 @@
-"""Probes at full turns of all angles: a pivot that is large in a scene's domain may vanish where its headings have turned."""
+"""Probes elsewhere: at full turns of all angles, since a pivot that is large in a scene's domain may vanish where its headings have turned; and with
+speeds on the velocity rows, since rows that depend on each other have a solution there only.
+"""
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from jourdain_jax.equations.trace import TracedScene
+from jourdain_jax.program.derivative import columns
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.formal import on_rows
 
@@ -27,3 +31,14 @@ def at_full_turns(probes: Probes, rows: Sequence[int], coordinates: Sequence[int
         inputs |= {f"q_{first + k}": part for k, part in enumerate(wxyz / np.linalg.norm(wxyz, axis=0))}
     far = probes.with_inputs(inputs)
     return on_rows(far, far, rows, {f"q_{i}": n for i, n in enumerate(coordinates)})
+
+
+def on_velocity_rows(probes: Probes, traced: TracedScene, affine: bool) -> Probes:
+    """The probes with speeds on the rows, as near as they can be; `affine`: rows are."""
+    phi, u = traced.at.phi.tolist(), traced.u.tolist()
+    slopes = [n for column in columns(traced.graph, phi, u) for n in column]
+    for _ in range(2 if affine else 8):
+        values, A = np.nan_to_num(probes(phi)), np.nan_to_num(probes(slopes)).reshape(len(u), len(phi), -1)
+        change = np.einsum("pus,sp->up", np.linalg.pinv(A.transpose(2, 1, 0), rcond=1e-9), values)
+        probes = probes.with_inputs({f"u_{k}": probes.inputs[f"u_{k}"] - step for k, step in enumerate(change)})
+    return probes
