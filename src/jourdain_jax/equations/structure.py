@@ -6,7 +6,7 @@ parameters are traced (numbers near the class's defaults stand in), so that the 
 """
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import equinox as eqx
@@ -31,7 +31,7 @@ from jourdain_jax.scene.scene import Scene
 RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
 LONG = 24  # dependent speeds: of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
-KEPT = 0.2  # of the smallest singular value, at every probe, by the rows that stay where others are left out
+LARGE_COEFFICIENT = 5.0  # of the rows that stay, in a row that is left out, at every probe
 FAR, FAR_PROBES = 100.0, 16  # where no graph is: further states, at times (s), coordinates and speeds up to this
 _EXHAUSTIVE = 3000
 _SHORTLIST = 40
@@ -165,7 +165,7 @@ def structure_of(scene: Scene) -> Structure:
 def _probed_structure(scene: Scene) -> Structure:
     names = names_of_rows(scene)
     count = len(scene.speed_names)
-    t, q, u = random_states(scene, RANDOM_PROBES, np.random.default_rng(0))
+    t, q, u = drawn = random_states(scene, RANDOM_PROBES, np.random.default_rng(0))
     symmetric = symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
     found = _look(scene, t, q, u, -u[::-1])
@@ -193,7 +193,7 @@ def _probed_structure(scene: Scene) -> Structure:
         row_names=names,
         rank=rank,
         ranks=tuple(ranks),
-        redundant_rows=_redundant_rows(scaled.A, ranks, names),
+        redundant_rows=_redundant_rows(scaled.A, ranks, names, lambda: _far_rows(scene, *drawn)),
         rank_losses=tuple(_describe(scene, c) for c, r in zip(q, ranks, strict=True) if r < rank),
         independent=independent,
         worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
@@ -222,11 +222,6 @@ def _rank(A: np.ndarray) -> int:
     return int(np.sum(sigma > rank_cutoff(A.dtype) * sigma[0]))
 
 
-def _smallest(A: np.ndarray, rank: int) -> float:
-    """The smallest singular value that counts."""
-    return float(np.linalg.svd(A, compute_uv=False)[rank - 1]) if rank else 1.0
-
-
 def _is_singular(M: np.ndarray) -> bool:
     """Whether scaled inertias are singular at all of some states."""
     return bool(M.size) and bool(np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * np.finfo(M.dtype).eps))
@@ -251,20 +246,41 @@ def _check_inertia(scene: Scene, found: _Scaled, rank: int) -> None:
     )
 
 
-def _redundant_rows(scaled: np.ndarray, ranks: list[int], names: tuple[str, ...]) -> tuple[str, ...]:
+def _redundant_rows(scaled: np.ndarray, ranks: list[int], names: tuple[str, ...], far: Callable[[], np.ndarray]) -> tuple[str, ...]:
     """Rows that may be left out, later ones first, so that the rest keeps its rank at every probed state, and does not come near to losing it.
 
-    A row that is a combination of the others with coefficients c takes a smallest singular value down to `1/sqrt(1 + |c|^2)` of it. Where that
-    is much, the coefficients grow without bounds between the probes: so do those of one wheel's row along x by its row along y, where its heading turns.
+    A row that is left out is a combination of the others. Where its coefficients are large somewhere, they have no bounds: so those of one wheel's row
+    along y, by its row along x and the rows of the wheel beside it, are tangents of the heading. `far`: rows at full turns of all angles.
     """
-    kept = list(range(len(names)))
+    kept, elsewhere = list(range(len(names))), None
     for s in reversed(range(len(names))):
         if len(kept) in ranks:
             break  # somewhere those that are left are independent
         rest = [i for i in kept if i != s]
-        if all(_rank(A[rest]) == r and _smallest(A[rest], r) > KEPT * _smallest(A[kept], r) for A, r in zip(scaled, ranks, strict=True)):
+        if not all(_rank(A[rest]) == r for A, r in zip(scaled, ranks, strict=True)):
+            continue
+        if elsewhere is None:
+            elsewhere = far()
+        if all(_combines(A[rest], A[s]) for A in (*scaled, *(A for A in elsewhere if _rank(A) == max(ranks)))):
             kept = rest
     return tuple(name for s, name in enumerate(names) if s not in kept)
+
+
+def _combines(A: np.ndarray, row: np.ndarray) -> bool:
+    """Whether a row is a combination of others with coefficients that are not large."""
+    coefficients = row @ np.linalg.pinv(A, rcond=rank_cutoff(A.dtype))
+    return bool(np.linalg.norm(row - coefficients @ A) < 1e-6 and np.linalg.norm(coefficients) < LARGE_COEFFICIENT)
+
+
+def _far_rows(scene: Scene, t, q, u) -> np.ndarray:
+    """Scaled rows with coordinates up to half a turn away from those given, where they are on the geometric rows."""
+    generator = np.random.default_rng(4)
+    t, q, u = (x[:RANDOM_PROBES].repeat(2, 0) for x in (t, q, u))
+    turned = q + generator.uniform(-np.pi, np.pi, q.shape)
+    for first, _ in scene.coordinates.quaternions:
+        turned[:, first : first + 4] = q[:, first : first + 4]
+    found = _look(scene, t, turned, u, -u)
+    return _scaled(found).A[(found.miss < np.sqrt(np.finfo(found.miss.dtype).eps)) & np.all(np.isfinite(found.A), axis=(1, 2))]
 
 
 def _describe(scene: Scene, q: np.ndarray) -> str:

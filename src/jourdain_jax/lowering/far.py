@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jourdain_jax.equations.trace import TracedScene
+from jourdain_jax.lowering.pivots import turns
 from jourdain_jax.program.derivative import columns
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.formal import on_rows
@@ -29,6 +30,9 @@ def at_full_turns(probes: Probes, rows: Sequence[int], coordinates: Sequence[int
     for first in quaternions:
         wxyz = generator.normal(size=(4, count))
         inputs |= {f"q_{first + k}": part for k, part in enumerate(wxyz / np.linalg.norm(wxyz, axis=0))}
+    graph = probes.graph
+    for name in {str(graph.value[graph.args[n][0]]) for n in range(len(graph.op)) if turns(graph, n)}:
+        inputs[name] = inputs[name] + generator.uniform(-np.pi, np.pi, count)
     far = probes.with_inputs(inputs)
     return on_rows(far, far, rows, {f"q_{i}": n for i, n in enumerate(coordinates)})
 

@@ -202,6 +202,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         events=events,
         projected_q=put_q,
         projected_u=put_u,
+        by_partition=builder.by_partition,
         left_out=structure.redundant_rows,
         held=tuple(names[i] for i in held),
         stages=tuple(stages),

@@ -82,7 +82,7 @@ class Pivots:
         nodes = [A[r][c] for r, c in places]
         in_row, in_column = Counter(r for r, _ in places), Counter(c for _, c in places)
         worst = _smallest(self.probes(nodes), places, self._sizes_at(places, self.probes.count))
-        fixed = [not graph.varies[n] and w > 0 for n, w in zip(nodes, worst, strict=True)]
+        fixed = [self._is_fixed(n) and w > 0 for n, w in zip(nodes, worst, strict=True)]
         good = [k for k in range(len(places)) if fixed[k] or worst[k] > GOOD]
 
         def cost(k):
@@ -100,6 +100,11 @@ class Pivots:
         if serving is not None:
             return self._single(*places[serving])
         return self._by_column(places[good[0] if good else int(np.argmax(worst))])
+
+    def _is_fixed(self, node: int) -> bool:
+        """Whether a node depends on parameters alone, none of which turns it through zero."""
+        graph = self.graph
+        return not graph.varies[node] and (graph.is_const(node) or not any(turns(graph, n) for n in graph.reachable([node])))
 
     def _single(self, row: int, column: int, watched: int | None = None) -> Pivot:
         entry = self.A[row][column]
@@ -300,6 +305,11 @@ def _smallest(values, places, sizes) -> np.ndarray:
     """The smallest ratio of each entry at any probe."""
     ratio = _ratios(values, places, sizes)
     return np.min(np.where(np.isfinite(ratio), ratio, 0.0), axis=1)
+
+
+def turns(graph: Graph, node: int) -> bool:
+    """Whether a node is the sine or cosine of a parameter, which may be any angle."""
+    return graph.op[node] in ("sin", "cos") and graph.op[graph.args[node][0]] == "input" and not graph.varies[node]
 
 
 def _least(ratio: Float[np.ndarray, "probes"]) -> float:
