@@ -131,14 +131,15 @@ class BeadOnCurve(jj.Scene):
         return {"x": float(self.a * c), "y": float(self.a * s), "s_rate": speed}
 
 
-def drawn(seed: int):
-    """The scene with this number."""
+def drawn(seed: int, narrow: bool | None = None):
+    """The scene with this number; `narrow`: whether its domain is, default drawn too."""
     draw = np.random.default_rng(seed)
     turned = float(draw.uniform(-3, 3))
     if seed % 4 == 3:
         sides = draw.uniform(0.7, 1.4, 2)
-        return BeadOnCurve(by_rate=bool(draw.integers(2)), narrow=bool(draw.integers(2)), a=float(sides[0]), b=float(sides[1]), turned=turned)
-    maximal, by_rate, narrow, massless = draw.integers(2, size=4).astype(bool).tolist()
+        return BeadOnCurve(by_rate=bool(draw.integers(2)), narrow=bool(draw.integers(2)) if narrow is None else narrow, a=float(sides[0]), b=float(sides[1]), turned=turned)
+    maximal, by_rate, small, massless = draw.integers(2, size=4).astype(bool).tolist()
+    narrow = small if narrow is None else narrow
     weight = {"trailer_mass": 0.0, "trailer_inertia": 0.0} if massless else {}
     hitch, length = draw.uniform([0.0, 0.6], [0.2, 1.0]).tolist()
     trailers = int(draw.integers(3))

@@ -31,7 +31,7 @@ from jourdain_jax.scene.scene import Scene
 RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
 LONG = 24  # dependent speeds: of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
-LARGE_COEFFICIENT = 5.0  # of the rows that stay, in a row that is left out, at every probe
+LARGE_COEFFICIENT, TAIL = 20.0, 3.0  # of the rows that stay, in a row that is left out: at any probe; with both signs, beside the median
 FAR, FAR_PROBES = 100.0, 16  # where no graph is: further states, at times (s), coordinates and speeds up to this
 _EXHAUSTIVE = 3000
 _SHORTLIST = 40
@@ -92,6 +92,7 @@ class _Scaled(eqx.Module):
     """What decides ranks and pivots, at every probed state."""
 
     A: Float[np.ndarray, "states rows speeds"]  # scaled rows in scaled speeds
+    lengths: Float[np.ndarray, "states rows"]  # of the rows before
     M: Float[np.ndarray, "states speeds speeds"]  # in scaled speeds
     c: Float[np.ndarray, "states speeds"]  # scales of the speeds
 
@@ -100,7 +101,7 @@ def _scaled(found: Probed) -> _Scaled:
     c = speed_scales(found.M)
     A = found.A * c[:, None]
     length = np.sqrt(np.sum(A**2, axis=2, keepdims=True))
-    return _Scaled(A / np.where(length > 0, length, 1), c[:, :, None] * found.M * c[:, None], c)
+    return _Scaled(A / np.where(length > 0, length, 1), length[..., 0], c[:, :, None] * found.M * c[:, None], c)
 
 
 def _moves(rates) -> bool:
@@ -193,7 +194,7 @@ def _probed_structure(scene: Scene) -> Structure:
         row_names=names,
         rank=rank,
         ranks=tuple(ranks),
-        redundant_rows=_redundant_rows(scaled.A, ranks, names, lambda: _far_rows(scene, *drawn)),
+        redundant_rows=_redundant_rows(scaled, ranks, generic, names, lambda: _far_rows(scene, *drawn)),
         rank_losses=tuple(_describe(scene, c) for c, r in zip(q, ranks, strict=True) if r < rank),
         independent=independent,
         worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
@@ -246,33 +247,48 @@ def _check_inertia(scene: Scene, found: _Scaled, rank: int) -> None:
     )
 
 
-def _redundant_rows(scaled: np.ndarray, ranks: list[int], names: tuple[str, ...], far: Callable[[], np.ndarray]) -> tuple[str, ...]:
+def _redundant_rows(found: _Scaled, ranks: list[int], generic: np.ndarray, names: tuple[str, ...], far: Callable[[], _Scaled]) -> tuple[str, ...]:
     """Rows that may be left out, later ones first, so that the rest keeps its rank at every probed state, and does not come near to losing it.
 
     A row that is left out is a combination of the others. Where its coefficients are large somewhere, they have no bounds: so those of one wheel's row
-    along y, by its row along x and the rows of the wheel beside it, are tangents of the heading. `far`: rows at full turns of all angles.
+    along y, by its row along x and the rows of the wheel beside it, are tangents of the heading. `generic`: which of the states `found` are random;
+    `far`: rows at full turns of all angles.
     """
-    kept, elsewhere = list(range(len(names))), None
+    kept, everywhere = list(range(len(names))), None
     for s in reversed(range(len(names))):
         if len(kept) in ranks:
             break  # somewhere those that are left are independent
         rest = [i for i in kept if i != s]
-        if not all(_rank(A[rest]) == r for A, r in zip(scaled, ranks, strict=True)):
+        if not all(_rank(A[rest]) == r for A, r in zip(found.A, ranks, strict=True)):
             continue
-        if elsewhere is None:
-            elsewhere = far()
-        if all(_combines(A[rest], A[s]) for A in (*scaled, *(A for A in elsewhere if _rank(A) == max(ranks)))):
+        if everywhere is None:
+            everywhere = jax.tree.map(lambda *x: np.concatenate(x), jax.tree.map(lambda x: x[generic], found), far())
+        if _are_bounded(_coefficients(everywhere, rest, s, max(ranks))):
             kept = rest
     return tuple(name for s, name in enumerate(names) if s not in kept)
 
 
-def _combines(A: np.ndarray, row: np.ndarray) -> bool:
-    """Whether a row is a combination of others with coefficients that are not large."""
-    coefficients = row @ np.linalg.pinv(A, rcond=rank_cutoff(A.dtype))
-    return bool(np.linalg.norm(row - coefficients @ A) < 1e-6 and np.linalg.norm(coefficients) < LARGE_COEFFICIENT)
+def _coefficients(found: _Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
+    """Of the rows `rest` in row s, each in its usual length, at states where all rows have their rank; infinite where they do not give it."""
+    tiny, made = np.finfo(found.A.dtype).tiny, []
+    lengths = np.maximum(found.lengths, tiny)
+    usual = np.median(lengths, axis=0)
+    for A, length in zip(found.A, lengths, strict=True):
+        if _rank(A) == rank:
+            c = A[s] @ np.linalg.pinv(A[rest], rcond=rank_cutoff(A.dtype))
+            given = np.linalg.norm(A[s] - c @ A[rest]) < np.sqrt(np.finfo(A.dtype).eps)
+            made.append(c * (length[s] / usual[s]) / (length[rest] / usual[rest]) if given else np.full(len(rest), np.inf))
+    return np.array(made).reshape(-1, len(rest))
 
 
-def _far_rows(scene: Scene, t, q, u) -> np.ndarray:
+def _are_bounded(c: np.ndarray) -> bool:
+    """Whether coefficients at many states are: none is large, nor far beyond its usual size with both signs, as tangents are."""
+    usual = TAIL * np.median(np.abs(c), axis=0) + np.sqrt(np.finfo(c.dtype).eps)
+    poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)
+    return bool(np.all(np.abs(c) < LARGE_COEFFICIENT) and not np.any(poles & (np.max(np.abs(c), axis=0, initial=0.0) > 1)))
+
+
+def _far_rows(scene: Scene, t, q, u) -> _Scaled:
     """Scaled rows with coordinates up to half a turn away from those given, where they are on the geometric rows."""
     generator = np.random.default_rng(4)
     t, q, u = (x[:RANDOM_PROBES].repeat(2, 0) for x in (t, q, u))
@@ -280,7 +296,8 @@ def _far_rows(scene: Scene, t, q, u) -> np.ndarray:
     for first, _ in scene.coordinates.quaternions:
         turned[:, first : first + 4] = q[:, first : first + 4]
     found = _look(scene, t, turned, u, -u)
-    return _scaled(found).A[(found.miss < np.sqrt(np.finfo(found.miss.dtype).eps)) & np.all(np.isfinite(found.A), axis=(1, 2))]
+    good = (found.miss < np.sqrt(np.finfo(found.miss.dtype).eps)) & np.all(np.isfinite(found.A), axis=(1, 2))
+    return jax.tree.map(lambda x: x[good], _scaled(found))
 
 
 def _describe(scene: Scene, q: np.ndarray) -> str:
