@@ -285,7 +285,7 @@ def _are_bounded(c: np.ndarray) -> bool:
     """Whether coefficients at many states are: none is large, nor far beyond its usual size with both signs, as tangents are."""
     usual = TAIL * np.median(np.abs(c), axis=0) + np.sqrt(np.finfo(c.dtype).eps)
     poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)
-    return bool(np.all(np.abs(c) < LARGE_COEFFICIENT) and not np.any(poles & (np.max(np.abs(c), axis=0, initial=0.0) > 1)))
+    return bool(np.all(np.abs(c) < LARGE_COEFFICIENT) and not np.any(poles & (np.max(np.abs(c), axis=0, initial=0.0) > 2)))
 
 
 def _far_rows(scene: Scene, t, q, u) -> _Scaled:
