@@ -137,7 +137,9 @@ def drawn(seed: int, narrow: bool | None = None):
     turned = float(draw.uniform(-3, 3))
     if seed % 4 == 3:
         sides = draw.uniform(0.7, 1.4, 2)
-        return BeadOnCurve(by_rate=bool(draw.integers(2)), narrow=bool(draw.integers(2)) if narrow is None else narrow, a=float(sides[0]), b=float(sides[1]), turned=turned)
+        return BeadOnCurve(
+            by_rate=bool(draw.integers(2)), narrow=bool(draw.integers(2)) if narrow is None else narrow, a=float(sides[0]), b=float(sides[1]), turned=turned
+        )
     maximal, by_rate, small, massless = draw.integers(2, size=4).astype(bool).tolist()
     narrow = small if narrow is None else narrow
     weight = {"trailer_mass": 0.0, "trailer_inertia": 0.0} if massless else {}

@@ -5,22 +5,20 @@
     M = sum m beta' beta + gamma' I gamma,   f = sum beta' (F - m a_0) + gamma' (L - I alpha_0 - omega x I omega) + Q_direct
     M ydot = f                                                                                             (41), (50), (56)
 
-Rows that are not eliminated are kept by multipliers instead (`multipliers.py`).
+Rows that are not eliminated are kept instead (`kept_rows.py`).
 Two ways lead there. *Explicit*: z, as an expression in (q, y), is put into the velocities before they are differentiated; best where z is
 simple. *Implicit*: speeds are differentiated as they stand, and the rates of z come from the rates of the rows; best where z is not.
 """
 
 from dataclasses import dataclass, field
-from functools import cache
 
 import numpy as np
 
 from jourdain_jax.equations.structure import Structure
 from jourdain_jax.equations.trace import TracedScene, VelocityQuantities
 from jourdain_jax.lowering.elimination import eliminate, serves, solve_symmetric
-from jourdain_jax.lowering.far import at_full_turns
-from jourdain_jax.lowering.multipliers import accelerations_by_multipliers, projected_coordinates, projected_speeds, with_inertia_of_rows
-from jourdain_jax.lowering.partition import Partition
+from jourdain_jax.lowering.kept_rows import KeptRows
+from jourdain_jax.lowering.multipliers import projected_coordinates
 from jourdain_jax.program.derivative import along, columns, derivatives
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.formal import equal, formal, on_rows, unaffected
@@ -75,34 +73,21 @@ class Projection:
 class AppellOnGraph:
     """The construction for one scene."""
 
-    def __init__(
-        self, traced: TracedScene, structure: Structure, by_multipliers: bool, probes: Probes, reference: np.ndarray, quaternions: tuple[int, ...], massless: bool
-    ):
+    def __init__(self, traced: TracedScene, structure: Structure, kept: KeptRows | None, probes: Probes, far, reference, quaternions: tuple[int, ...]):
         self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
         every, rows = range(len(traced.u)), [s for s, name in enumerate(structure.row_names) if name not in structure.redundant_rows]
-        self.independent = list(every) if by_multipliers else list(structure.independent)
+        self.independent = list(every) if kept else list(structure.independent)
         self.dependent = [k for k in every if k not in self.independent]
-        self.rows, self.multiplied = ([], rows) if by_multipliers else (rows, [])
-        # where multipliers are not determined
-        self.by_partition = by_multipliers and (massless or structure.dependent_rows) and structure.well_conditioned
-        self.massless = massless and not self.by_partition
-        self.reference, self.quaternions = reference, quaternions
+        self.kept, self.rows, self.multiplied = kept, *(([], rows) if kept else (rows, []))
+        self.reference, self.quaternions, self.far = reference, quaternions, far
         self.formal = self._formal()
-        self.far = cache(self._far)
 
     def _formal(self) -> Probes:
         """Generic states on the geometric rows, at generic parameters."""
-        q = self.traced.q.tolist()
-        attitudes = {f"q_{first + i}": q[first + i] for first in self.quaternions for i in range(4)}
-        return on_rows(formal(self.probes, attitudes), self.probes, self._closure(), {f"q_{i}": n for i, n in enumerate(q)})
-
-    def _far(self) -> Probes:
-        return at_full_turns(self.probes, self._closure(), self.traced.q.tolist(), self.quaternions)
-
-    def _closure(self) -> list[int]:
-        """Geometric rows and what quaternions' norms miss."""
         g, q = self.graph, self.traced.q.tolist()
-        return [*self.traced.at.closure.tolist(), *(g.sub(g.total(g.mul(n, n) for n in q[first : first + 4]), g.one) for first in self.quaternions)]
+        attitudes = {f"q_{first + i}": q[first + i] for first in self.quaternions for i in range(4)}
+        norms = [g.sub(g.total(g.mul(n, n) for n in q[first : first + 4]), g.one) for first in self.quaternions]
+        return on_rows(formal(self.probes, attitudes), self.probes, [*self.traced.at.closure.tolist(), *norms], {f"q_{i}": n for i, n in enumerate(q)})
 
     def build(self, strategy: Strategy) -> Equations:
         """The equations by one strategy."""
@@ -111,13 +96,8 @@ class AppellOnGraph:
         kinematics = _Kinematics(self, forms, held, strategy.explicit, strategy.free_z)
         forms_of_equations = self._forms(strategy.keep_sines, strategy.most_terms_of_equations)
         M, f = self._equations(kinematics, forms_of_equations)
-        if self.multiplied:
-            A, drift = kinematics.rows_along_motion(self.multiplied)
-            if self.by_partition:
-                ydot, sines = self._partition.accelerations(M, f, A, drift, forms)
-                margins = []
-            else:
-                ydot, sines, margins = accelerations_by_multipliers(self.graph, self._inertia(M, A), f, A, drift, forms)
+        if self.kept and self.multiplied:
+            ydot, sines, margins = self.kept.accelerations(M, f, *kinematics.rows_along_motion(self.multiplied), forms)
         else:
             ydot, sines, margins = self._solved(M, f, forms_of_equations if strategy.by_determinants else None), [], []
         z, qdot, pivots = self._true_rates(kinematics, forms) if held else (kinematics.z, kinematics.qdot, [])
@@ -152,28 +132,12 @@ class AppellOnGraph:
         else:
             for first, n in zip(self.quaternions, norms, strict=True):
                 moved[first : first + 4] = [g.div(part, g.call("sqrt", n)) for part in q[first : first + 4]]
-        if not self.multiplied:
+        if not (self.kept and self.multiplied):
             return Projection(moved, [])
-        forms, u = self._forms(False, most_terms), self.traced.u.tolist()
-        phi = [int(at.phi[s]) for s in self.multiplied]
-        if self.by_partition:
-            return Projection(moved, self._partition.projected_speeds(u, phi))
+        forms = self._forms(False, most_terms)
         M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
-        A = [list(row) for row in zip(*columns(g, phi, u), strict=True)]
-        return Projection(moved, projected_speeds(g, self._inertia(M, A), u, phi, forms))
-
-    @property
-    def _partition(self) -> Partition:
-        chosen = self.structure.independent
-        return Partition(self.graph, chosen, [k for k in self.independent if k not in chosen], self.probes, self.far)
-
-    def _inertia(self, M, A):
-        """M, with inertia added along the rows where it may be singular: of the size of its own."""
-        if not self.massless:
-            return M
-        heavy = np.nanmedian(np.max(np.abs(self.probes([row[i] for i, row in enumerate(M)])), axis=0))
-        sizes = [np.nanmedian(np.sum(self.probes(row) ** 2, axis=0)) for row in A]
-        return with_inertia_of_rows(self.graph, M, A, [float(2.0 ** np.round(np.log2(heavy / size))) if size > 0 else 1.0 for size in sizes])
+        phi = [int(at.phi[s]) for s in self.multiplied]
+        return Projection(moved, self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms))
 
     def _may_vanish(self, pivot: int) -> bool:
         """Whether a pivot is small or not a number at some probe."""

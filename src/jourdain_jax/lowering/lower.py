@@ -23,7 +23,8 @@ from jourdain_jax.equations.trace import event_values, named_values, traced_scen
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.blame import blamed
 from jourdain_jax.lowering.elimination import serves
-from jourdain_jax.lowering.far import on_velocity_rows
+from jourdain_jax.lowering.far import full_turns, on_velocity_rows
+from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
 from jourdain_jax.lowering.massless import may_be_massless
 from jourdain_jax.program.evaluate import Probes
@@ -104,7 +105,7 @@ def _lowered(key: _Key) -> Lowered | NotLowered:
 
 def _built(key: _Key) -> Lowered:
     begin = time.perf_counter()
-    scene, structure = key.scene, key.structure
+    structure = key.structure
     if not (structure.affine or key.every_speed):
         raise NotLowered("its rows are nonlinear in the speeds")
     if key.every_speed and structure.dependent_rows and not structure.well_conditioned:
@@ -128,7 +129,9 @@ def _with_calls_or_without(key: _Key, begin: float) -> Lowered:
         if key.every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
             probes = on_velocity_rows(probes, traced, structure.affine)
         quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
-        builder = AppellOnGraph(traced, structure, key.every_speed, probes, scene.coordinates.reference(), quaternions, key.massless)
+        far = full_turns(probes, traced, quaternions)
+        kept = KeptRows(traced.graph, structure, key.massless, probes, far) if key.every_speed else None
+        builder = AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference(), quaternions)
         return _best(scene, structure, builder, begin)
 
     try:
@@ -202,21 +205,14 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         events=events,
         projected_q=put_q,
         projected_u=put_u,
-        by_partition=builder.by_partition,
+        by_partition=builder.kept is not None and builder.kept.by_partition,
         left_out=structure.redundant_rows,
         held=tuple(names[i] for i in held),
         stages=tuple(stages),
-        way=_kept(builder) if builder.multiplied else way.description,
+        way=builder.kept.description if builder.kept else way.description,
         seconds=time.perf_counter() - begin,
         fixed=fixed_nodes(graph, outputs),
     )
-
-
-def _kept(builder: AppellOnGraph) -> str:
-    """How rows are kept where all speeds stay in the state."""
-    if builder.by_partition:
-        return "all speeds in the state, their accelerations by privileged ones"
-    return "rows kept by multipliers, by elimination" + (", with inertia along the rows" if builder.massless else "")
 
 
 def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations, values: np.ndarray) -> None:

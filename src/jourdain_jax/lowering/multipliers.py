@@ -27,8 +27,8 @@ class Accelerations(NamedTuple):
     """Nodes of the solution, and of what must not vanish on the way."""
 
     udot: list[int]
-    sines: list[int]  # one per row, between that row and those before it
-    margins: list[int]  # must stay positive: squared sines above their least, times the diagonal entry
+    sines: list[int]  # one per row, between that row and those before it; or the pivots of privileged speeds
+    margins: list[int]  # of the former: must stay positive: squared sines above their least, times the diagonal entry
 
 
 def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], forms=None) -> Accelerations:

@@ -271,9 +271,7 @@ class Pivots:
         for size, r in enumerate(rows, 1):
             more = {}
             for chosen in combinations(columns, size):
-                signed = (
-                    (graph.mul(self.A[r][c], minors[(*chosen[:k], *chosen[k + 1 :])]), (k + size) % 2) for k, c in enumerate(chosen)
-                )
+                signed = ((graph.mul(self.A[r][c], minors[(*chosen[:k], *chosen[k + 1 :])]), (k + size) % 2) for k, c in enumerate(chosen))
                 more[chosen] = graph.total(n if odd else graph.neg(n) for n, odd in signed)
             minors = more
         return minors[tuple(columns)]

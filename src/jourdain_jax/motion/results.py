@@ -31,7 +31,8 @@ FALLBACKS = {
     AS_ASKED: "",
     FULL_STATE: "run again with the full state and dense matrices: the first way came near where it does not serve",
     IMPLICIT: "run again with an implicit solver: the motion is stiff",
-    FULL_STATE | IMPLICIT: "run again with the full state, dense matrices and an implicit solver: the first way came near where it does not serve, and the motion "
+    FULL_STATE
+    | IMPLICIT: "run again with the full state, dense matrices and an implicit solver: the first way came near where it does not serve, and the motion "
     "is stiff",
 }
 
