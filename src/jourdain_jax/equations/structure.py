@@ -6,7 +6,7 @@ parameters are traced (numbers near the class's defaults stand in), so that the 
 """
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import equinox as eqx
@@ -32,6 +32,7 @@ from jourdain_jax.scene.scene import Scene
 RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
 LONG = 24  # dependent speeds: of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
+LARGE_COEFFICIENT, TAIL = 20.0, 3.0  # of the rows that stay, in a row that is left out: at any probe; with both signs, beside the median
 FAR, FAR_PROBES = 100.0, 16  # where no graph is: further states, at times (s), coordinates and speeds up to this
 ERRORS = 100.0  # of a configuration: singular values below are of the error, not of the rows
 TRACED = 1e-3  # of the typical lengths of rows, where parameters are traced
@@ -56,6 +57,7 @@ class Structure:
     homogeneous: bool  # phi vanishes at u = 0
     timed: tuple[str, ...]  # what depends on time by itself, out of `TIMED`
     driven: bool  # bodies or coordinates move, or bodies turn, while all speeds are zero
+    massless: bool  # M is singular: nothing has inertia along some motion that the rows hold
     varying_inertia: bool  # masses or central inertias change along the motion
     potentials_of_inputs: tuple[int, ...]  # numbers of the loads whose potential depends on inputs
     rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
@@ -83,6 +85,11 @@ class Structure:
         return len(self.independent)
 
     @property
+    def dependent_rows(self) -> bool:
+        """Whether rows depend on each other although none may be left out: each is needed somewhere."""
+        return len(self.row_names) - len(self.redundant_rows) > self.rank
+
+    @property
     def well_conditioned(self) -> bool:
         """Whether the privileged velocities serve everywhere in the domain."""
         return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, LONG / max(self.rank, 1))
@@ -92,6 +99,7 @@ class _Scaled(eqx.Module):
     """What decides ranks and pivots, at every probed state."""
 
     A: Float[np.ndarray, "states rows speeds"]  # scaled rows in scaled speeds
+    lengths: Float[np.ndarray, "states rows"]  # of the rows before
     M: Float[np.ndarray, "states speeds speeds"]  # in scaled speeds
     c: Float[np.ndarray, "states speeds"]  # scales of the speeds
 
@@ -101,7 +109,7 @@ def _scaled(found: Probed, typical: np.ndarray) -> _Scaled:
     c = speed_scales(found.M)
     A = found.A * c[:, None]
     length = np.maximum(np.sqrt(np.sum(A**2, axis=2, keepdims=True)), typical[:, None])
-    return _Scaled(A / np.where(length > 0, length, 1), c[:, :, None] * found.M * c[:, None], c)
+    return _Scaled(A / np.where(length > 0, length, 1), length[..., 0], c[:, :, None] * found.M * c[:, None], c)
 
 
 def _moves(rates) -> bool:
@@ -193,9 +201,11 @@ def _probed_structure(scene: Scene) -> Structure:
     names = names_of_rows(scene)
     count = len(scene.speed_names)
     generator = np.random.default_rng(0)
-    t, u, generic, found = _at_probes(scene, *random_states(scene, RANDOM_PROBES, generator))
+    drawn = random_states(scene, RANDOM_PROBES, generator)
+    t, u, generic, found = _at_probes(scene, *drawn)
     near = None if np.isfinite(found.error[generic]).any() else states_near_what_was_seen(scene, RANDOM_PROBES, generator)
     if near is not None:
+        drawn = near
         t, u, generic, found = _at_probes(scene, *near)
     check_smoothness(scene, found.q[:RANDOM_PROBES], u)
     on_rows = usable_states(scene, found, generic)
@@ -220,7 +230,7 @@ def _probed_structure(scene: Scene) -> Structure:
         independent, by_user = _choose(candidates, count, rank), False
     pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
     full_everywhere, eps, hidden = all(r == rank for r in ranks), np.finfo(found.A.dtype).eps, found.hidden
-    redundant = _redundant_rows(scaled.A, found.error, ranks, names)
+    redundant = _redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
     return Structure(
         row_names=names,
         rank=rank,
@@ -236,6 +246,7 @@ def _probed_structure(scene: Scene) -> Structure:
         homogeneous="rows at rest" not in hidden and not _exceeds(found.phi_at_rest, 32 * eps, _speeds(found, u)),
         timed=tuple(name for name in TIMED if name in hidden or _moves(found.timed[name])),
         driven="motion at rest" in hidden or _moves(found.motion_at_rest),
+        massless=_is_singular(scaled.M[generic]),
         varying_inertia="inertia" in hidden or _moves(found.inertia_rates),
         potentials_of_inputs=tuple(k for k, rate in enumerate(found.potential_rates.T) if f"potential {k}" in hidden or _moves(rate)),
         rows_of_inputs="rows of inputs" in hidden or _moves(found.row_rates_of_inputs),
@@ -265,6 +276,11 @@ def _rank(A: np.ndarray, error: float) -> int:
     return int(np.sum(sigma > max(rank_cutoff(A.dtype), ERRORS * error) * sigma[0]))
 
 
+def _is_singular(M: np.ndarray) -> bool:
+    """Whether scaled inertias are singular at all of some states."""
+    return bool(M.size) and bool(np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * np.finfo(M.dtype).eps))
+
+
 def _check_inertia(scene: Scene, found: _Scaled, rank: int) -> None:
     """Raise a ValueError that names the speeds along which the rows leave a motion free that no body's inertia resists, at every generic state."""
     moved = []
@@ -284,14 +300,25 @@ def _check_inertia(scene: Scene, found: _Scaled, rank: int) -> None:
     )
 
 
-def _redundant_rows(scaled: np.ndarray, errors: np.ndarray, ranks: list[int], names: tuple[str, ...]) -> tuple[str, ...]:
-    """Rows that may be left out, later ones first, so that the rest keeps its rank at every probed state."""
-    kept = list(range(len(names)))
+def _redundant_rows(
+    found: _Scaled, errors: np.ndarray, ranks: list[int], generic: np.ndarray, names: tuple[str, ...], far: Callable[[], _Scaled]
+) -> tuple[str, ...]:
+    """Rows that may be left out, later ones first, so that the rest keeps its rank at every probed state, and does not come near to losing it.
+
+    A row that is left out is a combination of the others. Where its coefficients are large somewhere, they have no bounds: so those of one wheel's row
+    along y, by its row along x and the rows of the wheel beside it, are tangents of the heading. `generic`: which of the states `found` are random;
+    `far`: rows at full turns of all angles.
+    """
+    kept, everywhere = list(range(len(names))), None
     for s in reversed(range(len(names))):
         if len(kept) in ranks:
             break  # somewhere those that are left are independent
         rest = [i for i in kept if i != s]
-        if all(_rank(A[rest], error) == r for A, error, r in zip(scaled, errors, ranks, strict=True)):
+        if not all(_rank(A[rest], error) == r for A, error, r in zip(found.A, errors, ranks, strict=True)):
+            continue
+        if everywhere is None:
+            everywhere = jax.tree.map(lambda *x: np.concatenate(x), jax.tree.map(lambda x: x[generic], found), far())
+        if _are_bounded(_coefficients(everywhere, rest, s, max(ranks))):
             kept = rest
     return tuple(name for s, name in enumerate(names) if s not in kept)
 
@@ -302,6 +329,38 @@ def _follow(scene: Scene, *state_and_rows) -> bool:
         return follow_from_others(scene, *state_and_rows)
     except Unsupported:
         return False
+
+
+def _coefficients(found: _Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
+    """Of the rows `rest` in row s, each in its usual length, at states where all rows have their rank; infinite where they do not give it."""
+    tiny, made = np.finfo(found.A.dtype).tiny, []
+    lengths = np.maximum(found.lengths, tiny)
+    usual = np.median(lengths, axis=0)
+    for A, length in zip(found.A, lengths, strict=True):
+        if _rank(A, 0.0) == rank:
+            c = A[s] @ np.linalg.pinv(A[rest], rcond=rank_cutoff(A.dtype))
+            given = np.linalg.norm(A[s] - c @ A[rest]) < np.sqrt(np.finfo(A.dtype).eps)
+            made.append(c * (length[s] / usual[s]) / (length[rest] / usual[rest]) if given else np.full(len(rest), np.inf))
+    return np.array(made).reshape(-1, len(rest))
+
+
+def _are_bounded(c: np.ndarray) -> bool:
+    """Whether coefficients at many states are: none is large, nor far beyond its usual size with both signs, as tangents are."""
+    usual = TAIL * np.median(np.abs(c), axis=0) + np.sqrt(np.finfo(c.dtype).eps)
+    poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)
+    return bool(np.all(np.abs(c) < LARGE_COEFFICIENT) and not np.any(poles & (np.max(np.abs(c), axis=0, initial=0.0) > 2)))
+
+
+def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> _Scaled:
+    """Scaled rows with coordinates up to half a turn away from those given, where they are on the geometric rows."""
+    generator = np.random.default_rng(4)
+    t, q, u = (x[:RANDOM_PROBES].repeat(2, 0) for x in (t, q, u))
+    turned = q + generator.uniform(-np.pi, np.pi, q.shape)
+    for first, _ in scene.coordinates.quaternions:
+        turned[:, first : first + 4] = q[:, first : first + 4]
+    found = _look(scene, t, turned, u, -u, np.zeros(len(t), bool))
+    good = np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2))
+    return jax.tree.map(lambda x: x[good], _scaled(found, typical))
 
 
 def _describe(scene: Scene, q: np.ndarray) -> str:

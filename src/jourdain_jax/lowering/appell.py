@@ -5,7 +5,7 @@
     M = sum m beta' beta + gamma' I gamma,   f = sum beta' (F - m a_0) + gamma' (L - I alpha_0 - omega x I omega) + Q_direct
     M ydot = f                                                                                             (41), (50), (56)
 
-Rows that are not eliminated are kept by multipliers instead (`multipliers.py`).
+Rows that are not eliminated are kept instead (`kept_rows.py`).
 Two ways lead there. *Explicit*: z, as an expression in (q, y), is put into the velocities before they are differentiated; best where z is
 simple. *Implicit*: speeds are differentiated as they stand, and the rates of z come from the rates of the rows; best where z is not.
 """
@@ -17,7 +17,8 @@ import numpy as np
 from jourdain_jax.equations.structure import Structure
 from jourdain_jax.equations.trace import TracedScene, VelocityQuantities
 from jourdain_jax.lowering.elimination import eliminate, serves, solve_symmetric
-from jourdain_jax.lowering.multipliers import accelerations_by_multipliers, projected_coordinates, projected_speeds
+from jourdain_jax.lowering.kept_rows import KeptRows
+from jourdain_jax.lowering.multipliers import projected_coordinates
 from jourdain_jax.program.derivative import along, columns, derivatives
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.formal import FormalProbes, equal, formal, on_rows, unaffected
@@ -72,13 +73,13 @@ class Projection:
 class AppellOnGraph:
     """The construction for one scene."""
 
-    def __init__(self, traced: TracedScene, structure: Structure, by_multipliers: bool, probes: Probes, reference: np.ndarray, quaternions: tuple[int, ...]):
+    def __init__(self, traced: TracedScene, structure: Structure, kept: KeptRows | None, probes: Probes, far, reference, quaternions: tuple[int, ...]):
         self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
         every, rows = range(len(traced.u)), [s for s, name in enumerate(structure.row_names) if name not in structure.redundant_rows]
-        self.independent = list(every) if by_multipliers else list(structure.independent)
+        self.independent = list(every) if kept else list(structure.independent)
         self.dependent = [k for k in every if k not in self.independent]
-        self.rows, self.multiplied = ([], rows) if by_multipliers else (rows, [])
-        self.reference, self.quaternions = reference, quaternions
+        self.kept, self.rows, self.multiplied = kept, *(([], rows) if kept else (rows, []))
+        self.reference, self.quaternions, self.far = reference, quaternions, far
         self.formal = self._formal()
 
     def _formal(self) -> FormalProbes:
@@ -95,14 +96,13 @@ class AppellOnGraph:
         kinematics = _Kinematics(self, forms, held, strategy.explicit, strategy.free_z)
         forms_of_equations = self._forms(strategy.keep_sines, strategy.most_terms_of_equations)
         M, f = self._equations(kinematics, forms_of_equations)
-        if self.multiplied:
-            A, drift = kinematics.rows_along_motion(self.multiplied)
-            ydot, sines, margins = accelerations_by_multipliers(self.graph, M, f, A, drift, forms)
+        if self.kept and self.multiplied:
+            ydot, sines, margins = self.kept.accelerations(M, f, *kinematics.rows_along_motion(self.multiplied), forms)
         else:
             ydot, sines, margins = self._solved(M, f, forms_of_equations if strategy.by_determinants else None), [], []
         z, qdot, pivots = self._true_rates(kinematics, forms) if held else (kinematics.z, kinematics.qdot, [])
         guards = {node for made in (forms, forms_of_equations) if made is not None for node in made.guards}
-        guards |= {margin for sine, margin in zip(sines, margins, strict=True) if self._may_vanish(sine)}
+        guards |= {margin for sine, margin in zip(sines, margins, strict=False) if self._may_vanish(sine)}
         power = self._power(kinematics, ydot)
         if strategy.free_z:
             *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
@@ -132,12 +132,12 @@ class AppellOnGraph:
         else:
             for first, n in zip(self.quaternions, norms, strict=True):
                 moved[first : first + 4] = [g.div(part, g.call("sqrt", n)) for part in q[first : first + 4]]
-        if not self.multiplied:
+        if not (self.kept and self.multiplied):
             return Projection(moved, [])
         forms = self._forms(False, most_terms)
         M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
         phi = [int(at.phi[s]) for s in self.multiplied]
-        return Projection(moved, projected_speeds(g, M, self.traced.u.tolist(), phi, forms))
+        return Projection(moved, self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms))
 
     def _may_vanish(self, pivot: int) -> bool:
         """Whether a pivot is small or not a number at some probe."""
@@ -189,7 +189,7 @@ class AppellOnGraph:
 
         def solved(columns, known):
             right = [[g.neg(g.add(rest, g.total(g.mul(row[k], n) for k, n in known.items())))] for row, rest in zip(A, phi_0, strict=True)]
-            return eliminate(g, [[row[k] for k in columns] for row in A], right, self.probes)
+            return eliminate(g, [[row[k] for k in columns] for row in A], right, self.probes, self.far)
 
         whole = solved(self.dependent, y)
         same = equal(self.formal(kinematics.z), self.formal([row[0] for row in whole.solution]), serves(whole.pivots, self.formal))
@@ -296,7 +296,7 @@ class _Kinematics:
         put_z = {} if self.free_z else self.known
         known = lambda nodes: self._simple(g.substituted(nodes, put_z))  # noqa: E731
         drift, at_fixed_speeds = known(drift), known(at_fixed_speeds)
-        zdot = self._simple([row[0] for row in eliminate(g, self._A_z, [[g.neg(d)] for d in drift], build.probes).solution])
+        zdot = self._simple([row[0] for row in eliminate(g, self._A_z, [[g.neg(d)] for d in drift], build.probes, build.far).solution])
         dependent = [by_speed[k] for k in build.dependent]
         partial = [
             self._simple([g.add(d, g.total(g.mul(row[i], by_z[n]) for row, by_z in zip(self.B, dependent, strict=True))) for n, d in enumerate(by_speed[y])])
@@ -311,7 +311,7 @@ class _Kinematics:
         g, build = self.graph, self.build
         right = [[*(g.neg(row[i]) for i in build.independent), g.neg(rest)] for row, rest in zip(A, phi_0, strict=True)]
         self._A_z = [[row[d] for d in build.dependent] for row in A]
-        eliminated = eliminate(g, self._A_z, right, build.probes)
+        eliminated = eliminate(g, self._A_z, right, build.probes, build.far)
         self.pivots = eliminated.pivots
         solution = [self._simple(row) for row in eliminated.solution]
         self.B, self.b = [row[:-1] for row in solution], [row[-1] for row in solution]

@@ -23,7 +23,10 @@ from jourdain_jax.equations.trace import event_values, named_values, traced_scen
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.blame import blamed
 from jourdain_jax.lowering.elimination import serves
+from jourdain_jax.lowering.far import full_turns, on_velocity_rows
+from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
+from jourdain_jax.lowering.massless import may_be_massless
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.formal import FormalProbes, equal
 from jourdain_jax.program.graph import Graph, Unsupported
@@ -55,7 +58,8 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
     """
     structure = structure_of(scene)
     every_speed = not (structure.affine and structure.well_conditioned) if every_speed is None else every_speed
-    return _lowered(_Key(concretised(scene), structure, every_speed or not structure.row_names))
+    every_speed = every_speed or not structure.row_names
+    return _lowered(_Key(concretised(scene), structure, every_speed, bool(every_speed and structure.row_names) and may_be_massless(scene, structure)))
 
 
 def lower(scene: Scene, every_speed: bool | None = None) -> Lowered:
@@ -76,11 +80,12 @@ def lower(scene: Scene, every_speed: bool | None = None) -> Lowered:
 class _Key:
     """What the program depends on: not on the values of parameters."""
 
-    def __init__(self, scene: Scene, structure: Structure, every_speed: bool):
-        self.scene, self.structure, self.every_speed = scene, structure, every_speed
+    def __init__(self, scene: Scene, structure: Structure, every_speed: bool, massless: bool):
+        self.scene, self.structure, self.every_speed, self.massless = scene, structure, every_speed, massless
         leaves, treedef = jax.tree.flatten(scene)
         kept = (every_speed, None if every_speed else structure.independent, structure.redundant_rows, structure.affine, structure.driven)
-        kept += (structure.homogeneous, structure.potentials_of_inputs, structure.may_set_in)
+        kept += (structure.homogeneous, structure.potentials_of_inputs, structure.may_set_in, massless)
+        kept += (structure.dependent_rows, structure.well_conditioned and structure.independent) if every_speed else ()
         self.key = (treedef, tuple(np.shape(x) for x in leaves), kept, jnp.result_type(float))
 
     def __hash__(self):
@@ -101,28 +106,36 @@ def _lowered(key: _Key) -> Lowered | NotLowered:
 
 def _built(key: _Key) -> Lowered:
     begin = time.perf_counter()
-    scene, structure = key.scene, key.structure
+    structure = key.structure
     if not (structure.affine or key.every_speed):
         raise NotLowered("its rows are nonlinear in the speeds")
     if structure.may_set_in:
         named = ", ".join(f"`{name}`" for name in structure.may_set_in)
         raise NotLowered(f"rows {named} follow from the others at all probed states, but nothing says that they do elsewhere or later")
+    if key.every_speed and structure.dependent_rows and not structure.well_conditioned:
+        raise NotLowered("its rows depend on each other, though none may be left out everywhere")
     try:
-        return _with_calls_or_without(scene, structure, key.every_speed, begin)
+        return _with_calls_or_without(key, begin)
     except Unsupported as reason:
         raise NotLowered(f"{reason} has no scalar form") from None
     except ZeroDivisionError:
         raise NotLowered("its rows are dependent in a way that no elimination order avoids") from None
 
 
-def _with_calls_or_without(scene: Scene, structure: Structure, every_speed: bool, begin: float) -> Lowered:
+def _with_calls_or_without(key: _Key, begin: float) -> Lowered:
     """With calls for the parts that have no scalar form; without any where such a part would have to be differentiated."""
+
+    scene, structure = key.scene, key.structure
 
     def built(calls: bool) -> Lowered:
         traced = traced_scene(scene, structure.potentials_of_inputs, calls)
         probes = _probes(scene, structure, traced.graph)
+        if key.every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
+            probes = on_velocity_rows(probes, traced, structure.affine)
         quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
-        builder = AppellOnGraph(traced, structure, every_speed, probes, scene.coordinates.reference(), quaternions)
+        far = full_turns(probes, traced, quaternions)
+        kept = KeptRows(traced.graph, structure, key.massless, probes, far) if key.every_speed else None
+        builder = AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference(), quaternions)
         return _best(scene, structure, builder, begin)
 
     try:
@@ -196,10 +209,11 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         events=events,
         projected_q=put_q,
         projected_u=put_u,
+        by_partition=builder.kept is not None and builder.kept.by_partition,
         left_out=structure.redundant_rows,
         held=tuple(names[i] for i in held),
         stages=tuple(stages),
-        way="rows kept by multipliers, by elimination" if builder.multiplied else way.description,
+        way=builder.kept.description if builder.kept else way.description,
         seconds=time.perf_counter() - begin,
         fixed=fixed_nodes(graph, outputs),
     )

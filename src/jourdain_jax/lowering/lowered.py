@@ -53,6 +53,7 @@ class Lowered:
     events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
     projected_q: tuple[int, ...]  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
     projected_u: tuple[int, ...]  # all speeds put back onto the rows; none where dependent speeds are eliminated
+    by_partition: bool  # all speeds are in the state, but the accelerations come from privileged ones
     left_out: tuple[str, ...]  # rows that follow from the others
     held: tuple[str, ...]  # ignorable coordinates, set to the reference in the accelerations
     stages: tuple[Stage, ...]

@@ -7,6 +7,8 @@
 S is symmetric and positive definite where the rows are independent, and as sparse as the rows are local: tridiagonal for a chain. What is
 left of a diagonal entry of S after elimination, relative to the entry, is the squared sine of the angle between that row and those before it.
 Accelerations lose as many digits as that square is small.
+
+Where M is singular, though no admissible velocity is without inertia, M + A' W A stands in its place: A udot is known, so only the multipliers change.
 """
 
 from typing import NamedTuple
@@ -25,8 +27,8 @@ class Accelerations(NamedTuple):
     """Nodes of the solution, and of what must not vanish on the way."""
 
     udot: list[int]
-    sines: list[int]  # one per row, between that row and those before it
-    margins: list[int]  # must stay positive: squared sines above their least, times the diagonal entry
+    sines: list[int]  # one per row, between that row and those before it; or the pivots of privileged speeds
+    margins: list[int]  # of the former: must stay positive: squared sines above their least, times the diagonal entry
 
 
 def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], forms=None) -> Accelerations:
@@ -45,6 +47,17 @@ def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Colu
     left = [(pivot, S[r][r]) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
     sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, diagonal))) for pivot, diagonal in left]
     return Accelerations(udot, sines, [graph.sub(pivot, graph.mul(graph.const(LEAST_SQUARE), diagonal)) for pivot, diagonal in left])
+
+
+def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, weights: list[float]) -> Columns:
+    """`M + A' W A`, positive definite where M is for the velocities that the rows admit."""
+    made, speeds = [list(row) for row in M], range(len(M))
+    for w, row in zip(weights, A, strict=True):
+        weighted = [graph.mul(graph.const(w), n) for n in row]
+        for i in (i for i in speeds if row[i] != graph.zero):
+            for j in (j for j in speeds if row[j] != graph.zero):
+                made[i][j] = graph.add(made[i][j], graph.mul(weighted[min(i, j)], row[max(i, j)]))
+    return made
 
 
 def projected_coordinates(graph: Graph, q: list[int], closure: list[int]) -> list[int]:

@@ -13,10 +13,11 @@ MESSAGES = {
     MAX_STEPS: "ran out of steps; raise `max_steps`, loosen the tolerances, give solver=jj.RadauIIA() where forces are stiff, or look for a singularity "
     "near the last time",
     STEP_TOO_SMALL: "the step size shrank to nothing: a singularity, a discontinuity, or rows that cannot be met near the last time",
-    NOT_FINITE: "the accelerations are not finite or not determined (no inertia along a free direction); look at the last state with "
-    "`accelerations` and `verify`",
+    NOT_FINITE: "the accelerations are not finite near the last time: a load, pose or row is no number there, or they are not determined (rows that lose "
+    "rank, no inertia along a free direction); look at the last state with `accelerations` and `verify`",
     INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them",
-    SINGULAR_PARTITION: "the privileged speeds came near a configuration where they do not determine the others; use state='full'",
+    SINGULAR_PARTITION: "the motion came near a configuration where the rows, as they are solved here, do not determine all speeds: another choice of "
+    "`privileged` may serve there, and state='full', lowering=False does unless the rows lose rank",
     BAD_PARAMETER: "a parameter is not finite or has the wrong sign",
     BAD_START: "the start is not finite; check where its values were computed",
     SHRANK: "ran out of steps, which had shrunk to less than a hundredth of their average: a singularity, a discontinuity or a stiff force near the last time",
@@ -31,10 +32,11 @@ MESSAGES = {
 AS_ASKED, FULL_STATE, IMPLICIT = 0, 1, 2
 FALLBACKS = {
     AS_ASKED: "",
-    FULL_STATE: "run again with the full state: the privileged speeds came near where they do not determine the others",
+    FULL_STATE: "run again with the full state and dense matrices: the first way came near where it does not serve",
     IMPLICIT: "run again with an implicit solver: the motion is stiff",
-    FULL_STATE | IMPLICIT: "run again with the full state and an implicit solver: the privileged speeds came near where they do not determine the others, and "
-    "the motion is stiff",
+    FULL_STATE
+    | IMPLICIT: "run again with the full state, dense matrices and an implicit solver: the first way came near where it does not serve, and the motion "
+    "is stiff",
 }
 
 

@@ -224,7 +224,7 @@ def state_form(
     program = lowered(scene, every_speed=not minimal) if plain else None
     program = program if isinstance(program, Lowered) else None
     cutoff = cutoff_of(structure) if reduction is None and not minimal else None
-    reduction = as_reduction(scene, default_reduction(structure, independent, program is not None) if reduction is None else reduction)
+    reduction = as_reduction(scene, default_reduction(structure, independent, program) if reduction is None else reduction)
     return StateForm(
         independent=independent,
         reduction=reduction,

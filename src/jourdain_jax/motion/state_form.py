@@ -166,8 +166,10 @@ def cutoff_of(structure: Structure) -> float | None:
     return passing_cutoff(jnp.result_type(float)) if structure.typical_pivot >= WELL_CONDITIONED else None
 
 
-def default_reduction(structure: Structure, independent: tuple[int, ...] | None, by_program: bool) -> Reduction:
-    """Privileged velocities for the minimal state; for the full one multipliers in a lowered program, otherwise the null space by QR."""
+def default_reduction(structure: Structure, independent: tuple[int, ...] | None, program: Lowered | None) -> Reduction:
+    """Privileged velocities for the minimal state; for the full one what a lowered program does, otherwise the null space by QR."""
     if independent is not None:
         return Privileged(independent)
-    return Multipliers() if by_program else NullSpaceQR(cutoff_of(structure))
+    if program is None:
+        return NullSpaceQR(cutoff_of(structure))
+    return Privileged(structure.independent) if program.by_partition else Multipliers()

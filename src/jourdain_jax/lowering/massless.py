@@ -1,0 +1,41 @@
+"""Whether the inertias of a scene are singular for parameters in use, or for those that traced ones may stand for."""
+
+from dataclasses import fields
+
+import jax
+import numpy as np
+
+from jourdain_jax.equations.probing import concretised
+from jourdain_jax.equations.structure import Structure, structure_of
+from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.scene import Scene
+
+
+def may_be_massless(scene: Scene, structure: Structure) -> bool:
+    """Whether M is singular at the parameters of `scene`, or with zero for those traced ones that need not be positive.
+
+    These are parameters declared `non_negative` and those whose default is zero; where privileged speeds serve, so that it costs nothing, all that are not
+    declared `positive`.
+    """
+    if structure.massless or not is_traced(scene):
+        return structure.massless
+    without = _with_zeros(scene, every=structure.well_conditioned)
+    if without is None:
+        return False
+    try:
+        return structure_of(without).massless
+    except ValueError:  # all of them at once cannot be zero; some may
+        return True
+
+
+def _with_zeros(scene: Scene, every: bool) -> Scene | None:
+    """Numbers for the scene's parameters, with all zeros that may be; None where there are none."""
+    may_vanish = {f.name for f in fields(scene) if (every and not f.metadata.get("positive")) or f.metadata.get("non_negative") or _is_zero(f.default)}
+    given, treedef = jax.tree_util.tree_flatten_with_path(scene)
+    zeros = [is_traced(x) and jax.tree_util.keystr(path[:1]).strip(".") in may_vanish for path, x in given]
+    leaves = [np.zeros_like(y) if zero else y for zero, y in zip(zeros, jax.tree.leaves(concretised(scene)), strict=True)]
+    return jax.tree.unflatten(treedef, leaves) if any(zeros) else None
+
+
+def _is_zero(default) -> bool:
+    return isinstance(default, int | float) and default == 0

@@ -1,0 +1,320 @@
+"""What a linear system of nodes is eliminated by: pivots that are large wherever the system itself is regular.
+
+A pivot that is a number or depends on parameters alone cannot vanish on the way and is taken first; the others are judged by the smallest
+value they take, relative to their row, at all probes. Among good pivots the one that fills in least is taken. Where only entries that may
+vanish are left, two rows and two columns are eliminated together if their determinant cannot vanish: components of a vector in turned axes, such as
+the velocity of a hitch, have one that depends on parameters alone, while each entry is zero at some angle.
+Where no order of elimination serves, rows are combined: those of one column, a_1, a_2, ..., into one row with the pivot sum w_i a_i^2, from which the
+others are made orthogonal. Rows of a rolling wheel along the world's axes so become rows along and across its heading. In exact numbers such a pivot is
+the squared distance of its column from those before it, which is no smaller than the smallest singular value squared, and it serves as well where there
+are more rows than unknowns and each row vanishes somewhere.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float
+
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.polynomial import NormalForms
+
+GOOD = 0.02  # of a pivot, relative to its row, at the worst probe
+NEAR = 0.25  # one with both signs that is so small somewhere vanishes in between
+REGULAR = 0.02  # smallest singular value of a scaled system that a pivot has to serve
+TERMS = 32  # of a determinant in normal form
+FEW = 12  # equations: with more, the operations that lead to a pivot are not counted when it is chosen
+LIKE = 8.0  # rows whose sizes differ by more are combined with weights
+MOST_SIGNED = 5  # equations: of so many, rows combined keep the sign of their determinant
+
+
+@dataclass(frozen=True)
+class Pivot:
+    """Rows and columns eliminated together: one of each, or two."""
+
+    rows: tuple[int, ...]
+    columns: tuple[int, ...]
+    inverse: tuple[tuple[int, ...], ...]  # of A[rows][columns]
+    watched: int  # must not vanish
+
+
+class Pivots:
+    """The system `A x = right` while it is eliminated, and the choice of the next pivot. `probes`: of the domain; `far`: at full turns of all angles."""
+
+    def __init__(self, graph: Graph, A: Sequence[Sequence[int]], right: Sequence[Sequence[int]], probes: Probes, far: Callable[[], Probes] | None):
+        self.graph, self.probes, self.forms = graph, probes, NormalForms(graph, TERMS, sign=probes.sign)
+        self.A, self.right = [list(row) for row in A], [list(row) for row in right]
+        self.rows, self.columns = set(range(len(self.A))), set(range(len(self.A[0]) if self.A else 0))
+        self._far, self._kept_regular = far, None
+        self._given = [list(row) for row in A]
+        self._tall = len(self.rows) > len(self.columns)
+        self._sizes: dict[int, np.ndarray] = {}  # of what a row was made of
+        self._combined: list[Pivot] = []  # by columns, since a determinant is known
+        self._determinant: int | None = None
+
+    def eliminated(self, pivot: Pivot) -> None:
+        """Subtract multiples of the pivot's rows from the rows that are left."""
+        graph, A = self.graph, self.A
+        self.rows -= set(pivot.rows)
+        self.columns -= set(pivot.columns)
+        for other in sorted(self.rows):
+            factors = products(graph, [A[other][c] for c in pivot.columns], zip(*pivot.inverse, strict=True))
+            for factor, r in zip(factors, pivot.rows, strict=True):
+                if factor == graph.zero:
+                    continue
+                if self._tall:
+                    self._sizes[other] = self._size(other) + np.abs(self._at([factor])[0]) * self._size(r)
+                for k in (k for k in self.columns if A[r][k] != graph.zero):
+                    A[other][k] = graph.sub(A[other][k], graph.mul(factor, A[r][k]))
+                self.right[other] = [graph.sub(a, graph.mul(factor, b)) for a, b in zip(self.right[other], self.right[r], strict=True)]
+
+    def best(self) -> Pivot:
+        """The next pivot. Rows may be combined for it."""
+        graph, A, rows = self.graph, self.A, self.rows
+        if self._determinant is not None:
+            return self._by_column(None)
+        places = [(r, c) for r in sorted(rows) for c in sorted(self.columns) if A[r][c] != graph.zero]
+        if not places:
+            raise ZeroDivisionError("the rows are dependent")
+        nodes = [A[r][c] for r, c in places]
+        in_row, in_column = Counter(r for r, _ in places), Counter(c for _, c in places)
+        worst = _smallest(self.probes(nodes), places, self._sizes_at(places, self.probes.count))
+        fixed = [self._is_fixed(n) and w > 0 for n, w in zip(nodes, worst, strict=True)]
+        good = [k for k in range(len(places)) if fixed[k] or worst[k] > GOOD]
+
+        def cost(k):
+            r, c = places[k]
+            fill = (in_row[r] - 1) * (in_column[c] - 1)
+            return fill, not fixed[k], graph.operations([nodes[k]]) if len(rows) <= FEW else 0, -worst[k]
+
+        good.sort(key=cost)
+        if good and fixed[good[0]]:
+            return self._single(*places[good[0]])
+        pair = self._best_pair()
+        if pair is not None:
+            return pair
+        serving = next((k for k in good if fixed[k] or self._serves_everywhere(places[k])), None)
+        if serving is not None:
+            return self._single(*places[serving])
+        return self._by_column(places[good[0] if good else int(np.argmax(worst))])
+
+    def _is_fixed(self, node: int) -> bool:
+        """Whether a node depends on parameters alone, none of which turns it through zero."""
+        graph = self.graph
+        return not graph.varies[node] and (graph.is_const(node) or not any(turns(graph, n) for n in graph.reachable([node])))
+
+    def _single(self, row: int, column: int, watched: int | None = None) -> Pivot:
+        entry = self.A[row][column]
+        return Pivot((row,), (column,), ((self.graph.div(self.graph.one, entry),),), entry if watched is None else watched)
+
+    # judgement: at the probes of the domain, and at full turns of all angles where the system itself is regular
+
+    def _serves_everywhere(self, place: tuple[int, int]) -> bool:
+        """Whether an entry stays away from zero also outside of the domain, wherever the system is regular."""
+        ratio = self._beside_row(place)
+        ratio = ratio[self._regular & np.isfinite(ratio)]
+        size = np.min(np.abs(ratio), initial=np.inf)
+        return bool(size > NEAR or (size > GOOD and not ratio.min() < 0 < ratio.max()))
+
+    def _beside_row(self, place: tuple[int, int]) -> Float[np.ndarray, "probes"]:
+        """An entry beside the largest of its row, with its sign."""
+        r, c = place
+        columns = [k for k in sorted(self.columns) if self.A[r][k] != self.graph.zero]
+        places, values = [(r, k) for k in columns], self._at([self.A[r][k] for k in columns])
+        k = columns.index(c)
+        return np.sign(values[k]) * _ratios(values, places, self._sizes_at(places))[k]
+
+    @property
+    def _regular(self) -> np.ndarray:
+        """At which probes the given system is: its rows and columns scaled, at the probes of the domain and the far ones."""
+        if self._kept_regular is None:
+            count = len(self._given[0])
+            A = np.moveaxis(self._at([n for row in self._given for n in row]).reshape(len(self._given), count, -1), -1, 0)
+            finite = np.all(np.isfinite(A), axis=(1, 2))
+            A = np.where(finite[:, None, None], A, 0.0)
+            lengths = np.linalg.norm(A, axis=2, keepdims=True)
+            usual = np.median(lengths[finite], axis=0, keepdims=True) if finite.any() else lengths[:1]
+            A = A / np.where(usual > 0, usual, 1.0)
+            width = np.sqrt(np.mean(np.sum(A**2, axis=1), axis=0))
+            sigma = np.linalg.svd(A / np.where(width > 0, width, 1.0), compute_uv=False)[:, count - 1]
+            self._kept_regular = finite & (sigma > REGULAR)
+        return self._kept_regular
+
+    def _at(self, nodes) -> np.ndarray:
+        """Values at the probes of the domain and the far ones."""
+        near = self.probes(nodes)
+        return near if self._far is None else np.concatenate([near, self._far()(nodes)], axis=1)
+
+    def _size(self, row: int) -> np.ndarray:
+        """Of what a row was made of, at all probes."""
+        if row not in self._sizes:
+            self._sizes[row] = np.max(np.abs(self._at(self.A[row])), axis=0)
+        return self._sizes[row]
+
+    def _sizes_at(self, places, count: int | None = None) -> np.ndarray | None:
+        """What entries are compared with besides their row, at the first probes; None where a row that vanishes makes the system singular anyway."""
+        if not self._tall:
+            return None
+        return np.stack([np.fmax(self._size(r), np.nanmedian(self._size(r)))[:count] for r, _ in places])
+
+    # two rows and two columns
+
+    def _best_pair(self) -> Pivot | None:
+        """Two rows and columns whose determinant depends on parameters alone, with the least fill-in; None where there are none."""
+        graph, A, probes = self.graph, self.A, self.probes
+        used = {r: {c for c in self.columns if A[r][c] != graph.zero} for r in self.rows}
+        users = {c: [r for r in sorted(self.rows) if c in used[r]] for c in self.columns}
+        found = []
+        for r, s in sorted({pair for c in self.columns for pair in combinations(users[c], 2)}):
+            for c, d in combinations(sorted(used[r] & used[s]), 2):
+                both = graph.mul(A[r][c], A[s][d]), graph.mul(A[r][d], A[s][c])
+                determinant = self.forms.simplified(graph.sub(*both))
+                if not graph.varies[determinant] and np.all(np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(both)), axis=0)):
+                    fill = (len(used[r] | used[s]) - 2) * len({*users[c], *users[d]} - {r, s})
+                    found.append((fill, r, s, c, d, determinant))
+        if not found:
+            return None
+        _, r, s, c, d, determinant = min(found)
+        over = [graph.div(n, determinant) for n in (A[s][d], A[r][d], A[s][c], A[r][c])]
+        return Pivot((r, s), (c, d), ((over[0], graph.neg(over[1])), (graph.neg(over[2]), over[3])), determinant)
+
+    # rows combined
+
+    def _by_column(self, single: tuple[int, int] | None) -> Pivot:
+        """One column by all rows that hold it, combined; the entry at the place `single` where that is no better."""
+        graph, A, regular = self.graph, self.A, self._regular
+        found = []
+        for c in sorted(self.columns):
+            users = [r for r in sorted(self.rows) if A[r][c] != graph.zero]
+            if not users or (len(users) == 1 and single is not None):
+                continue
+            weights = self._weights(users)
+            terms = [graph.mul(graph.const(w), graph.mul(A[r][c], A[r][c])) for r, w in zip(users, weights, strict=True)]
+            squares = self.forms.simplified(graph.total(terms))
+            size = sum(w * self._size(r) ** 2 for r, w in zip(users, weights, strict=True))
+            with np.errstate(all="ignore"):
+                worst = _least(np.sqrt(self._at([squares])[0] / size)[regular])
+            fill = len({k for r in users for k in self.columns if A[r][k] != graph.zero}) * len(users)
+            found.append((worst <= GOOD, graph.varies[squares], fill, -worst, c, users, weights, squares))
+        if single is not None and (not found or -min(found)[3] <= _least(np.abs(self._beside_row(single))[regular])):
+            return self._single(*single)
+        if not found:
+            raise ZeroDivisionError("the rows are dependent")
+        *_, c, users, weights, squares = min(found)
+        if len(users) == 1:
+            pivot = self._single(users[0], c)
+        elif len(users) == 2 and not self._tall_left:
+            pivot = self._turned(c, users, weights, squares)
+        else:
+            if single is not None and not self._tall_left and len(self.columns) <= MOST_SIGNED:
+                self._determinant = self._determinant_left()
+            pivot = self._orthogonal(c, users, weights, squares)
+        return self._signed(pivot)
+
+    @property
+    def _tall_left(self) -> bool:
+        return len(self.rows) > len(self.columns)
+
+    def _weights(self, rows: list[int]) -> list[float]:
+        """Of rows in a combination: one where their sizes are alike."""
+        sizes = [float(np.nanmedian(self._size(r))) for r in rows]
+        largest = max(sizes)
+        if min(sizes) * LIKE > largest:
+            return [1.0] * len(rows)
+        return [4.0 ** round(np.log2(largest / size)) if size > 0 else 1.0 for size in sizes]
+
+    def _turned(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
+        """Two rows turned into one with the pivot and one without: `a r + w b s` and `b r - a s`; the determinant keeps its sign."""
+        graph, A, (r, s) = self.graph, self.A, users
+        a, b = A[r][c], A[s][c]
+        first, second = (graph.mul(graph.const(w), n) for w, n in zip(weights, (a, b), strict=True))
+        sizes = [np.abs(self._at([a])[0]), np.abs(self._at([b])[0])]
+        self._sizes[r], self._sizes[s] = (
+            weights[0] * sizes[0] * self._size(r) + weights[1] * sizes[1] * self._size(s),
+            sizes[1] * self._size(r) + sizes[0] * self._size(s),
+        )
+        for row in (A, self.right):
+            pairs = list(zip(row[r], row[s], strict=True))
+            row[r] = [self.forms.simplified(graph.add(graph.mul(first, x), graph.mul(second, y))) for x, y in pairs]
+            row[s] = [self.forms.simplified(graph.sub(graph.mul(b, x), graph.mul(a, y))) for x, y in pairs]
+        A[r][c], A[s][c] = squares, graph.zero
+        return self._single(r, c, graph.call("sqrt", squares))
+
+    def _orthogonal(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
+        """All rows of a column combined into a new one, and made orthogonal to the column (Gram and Schmidt)."""
+        graph, A = self.graph, self.A
+        new = len(A)
+        over = graph.div(graph.one, squares)
+        entries = [(r, graph.mul(graph.const(w), A[r][c]), A[r][c]) for r, w in zip(users, weights, strict=True)]
+        self._sizes[new] = sum(np.abs(self._at([wa])[0]) * self._size(r) for r, wa, _ in entries)
+        for row in (A, self.right):
+            made = [self.forms.simplified(graph.total(graph.mul(wa, row[r][k]) for r, wa, _ in entries)) for k in range(len(row[users[0]]))]
+            row.append(made)
+        for r, _, a in entries:
+            factor = graph.mul(a, over)
+            self._sizes[r] = self._size(r) + np.abs(self._at([factor])[0]) * self._sizes[new]
+            for row in (A, self.right):
+                row[r] = [self.forms.simplified(graph.sub(x, graph.mul(factor, p))) for x, p in zip(row[r], row[new], strict=True)]
+            A[r][c] = graph.zero
+        A[new][c] = squares
+        self.rows.add(new)
+        self._tall = True
+        return self._single(new, c, graph.call("sqrt", squares))
+
+    def _determinant_left(self) -> int:
+        """Of the rows and columns that are left, by minors."""
+        graph, rows, columns = self.graph, sorted(self.rows), sorted(self.columns)
+        minors: dict[tuple[int, ...], int] = {(): graph.one}
+        for size, r in enumerate(rows, 1):
+            more = {}
+            for chosen in combinations(columns, size):
+                signed = ((graph.mul(self.A[r][c], minors[(*chosen[:k], *chosen[k + 1 :])]), (k + size) % 2) for k, c in enumerate(chosen))
+                more[chosen] = graph.total(n if odd else graph.neg(n) for n, odd in signed)
+            minors = more
+        return minors[tuple(columns)]
+
+    def _signed(self, pivot: Pivot) -> Pivot:
+        """The last of the pivots whose rows were combined gets the sign of the determinant, of which they are the factors."""
+        if self._determinant is None:
+            return pivot
+        self._combined.append(pivot)
+        if len(self.columns) > 1:
+            return pivot
+        others = self.graph.one
+        for other in self._combined[:-1]:
+            others = self.graph.mul(others, other.watched)
+        return Pivot(pivot.rows, pivot.columns, pivot.inverse, self.graph.div(self._determinant, others))
+
+
+def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.ndarray:
+    """Entries beside the largest of their row, which come one after another, and beside `sizes`."""
+    values = np.abs(values)
+    starts = np.flatnonzero([k == 0 or places[k][0] != places[k - 1][0] for k in range(len(places))])  # places come row by row
+    largest = np.repeat(np.maximum.reduceat(values, starts), np.diff([*starts, len(places)]), axis=0)
+    largest = largest if sizes is None else np.fmax(largest, sizes)
+    with np.errstate(all="ignore"):
+        return values / np.where(largest > 0, largest, 1.0)
+
+
+def _smallest(values, places, sizes) -> np.ndarray:
+    """The smallest ratio of each entry at any probe."""
+    ratio = _ratios(values, places, sizes)
+    return np.min(np.where(np.isfinite(ratio), ratio, 0.0), axis=1)
+
+
+def turns(graph: Graph, node: int) -> bool:
+    """Whether a node is the sine or cosine of a parameter, which may be any angle."""
+    return graph.op[node] in ("sin", "cos") and graph.op[graph.args[node][0]] == "input" and not graph.varies[node]
+
+
+def _least(ratio: Float[np.ndarray, "probes"]) -> float:
+    """The smallest; zero where none is a number."""
+    return float(np.min(ratio[np.isfinite(ratio)], initial=np.inf)) if np.isfinite(ratio).any() else 0.0
+
+
+def products(graph: Graph, a: Sequence[int], rows) -> list[int]:
+    """The products of a vector with some rows."""
+    return [graph.dot(row, a) for row in rows]

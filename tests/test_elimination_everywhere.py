@@ -1,0 +1,199 @@
+"""The scalar program divides by nothing that vanishes where the rows themselves determine the speeds: at any heading, with no mass, with dependent rows."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from generated_robots import BeadOnCurve, PlanarRobot, drawn
+
+import jourdain_jax as jj
+from jourdain_jax.equations.accelerations import bare_accelerations
+from jourdain_jax.equations.minimal import minimal_accelerations
+from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT, NullSpaceQR
+from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.trace import named_values
+from jourdain_jax.lowering.lower import lowered
+from jourdain_jax.models.trailer_chain import TrailerChain
+from jourdain_jax.motion import results
+from jourdain_jax.program.evaluate import Probes
+
+WEIGHTLESS = {"trailer_mass": 0.0, "trailer_inertia": 0.0}
+ROBOT = {"left_rate": 3.0, "right_rate": 20.0}
+
+
+@on_numbers
+def dense_accelerations(scene, t, q, u):
+    return jax.vmap(lambda t, q, u: bare_accelerations(scene, t, q, u, jnp.zeros(0), reduction=NullSpaceQR()).udot)(t, q, u)
+
+
+@on_numbers
+def privileged_accelerations(scene, t, q, y):
+    independent = structure_of(PlanarRobot(turned=0.4)).independent
+    return minimal_accelerations(scene, independent, t, q, y)[2].udot[jnp.array(independent)]
+
+
+def at_states(scene, program, t, q, u, nodes):
+    """Values of nodes of a program at states of a scene."""
+    values = named_values(scene, t, q, u, np.zeros((len(t), 0)))
+    values |= {f"p{k}_{i}": np.full(len(t), x) for k, leaf in enumerate(jax.tree.leaves(scene)) for i, x in enumerate(np.ravel(leaf))}
+    return Probes(program.graph, {name: np.asarray(value, float) for name, value in values.items()})(nodes)
+
+
+@pytest.mark.parametrize("seed", [1, 3, 5, 12, 15])
+def test_robots_and_beads_have_right_accelerations_at_every_heading(seed):
+    anywhere = drawn(seed, narrow=False)
+    t, q, u = jj.sample_states(anywhere, 64, seed=1)
+    expected = dense_accelerations(anywhere, t, q, u)
+    for every_speed in (None, True):
+        program = lowered(anywhere, every_speed)
+        found = at_states(anywhere, program, t, q, u, [*program.ydot, *program.pivots])
+        udot, pivots = found[: len(program.ydot)].T, found[len(program.ydot) :]
+        wanted = expected[:, list(program.independent)]
+        size = 1 + np.max(np.abs(expected), axis=1, keepdims=True)
+        assert np.max(np.abs(udot - wanted) / size) <= 1e-9
+        if structure_of(anywhere).well_conditioned:
+            assert np.all(np.abs(pivots) > 20 * SMALLEST_PIVOT * np.reshape(program.typical, (-1, 1)))
+
+
+def motion_and_reference(scene, start, t1, *, traced=(), **options):
+    """Under `jit`, `traced` parameters traced as well, and by dense matrices."""
+
+    def run(values, start):
+        return jj.simulate(scene.replace(**values) if values else scene, start, ts=jnp.linspace(0.0, t1, 9), rtol=1e-10, atol=1e-10, work=False, **options)
+
+    values = {name: getattr(scene, name) for name in traced}
+    reference = jj.simulate(scene, start, ts=jnp.array([t1]), state="full", lowering=False, rtol=1e-11, atol=1e-11, work=False)
+    return jax.jit(run)(values, jj.start(scene, **start)), reference
+
+
+@pytest.mark.parametrize(
+    ("scene", "start"),
+    [
+        (BeadOnCurve(), BeadOnCurve().start()),
+        (PlanarRobot(trailers=1, turned=0.4), PlanarRobot(trailers=1).start(**ROBOT)),
+    ],
+    ids=["bead on a ring", "robot with a trailer"],
+)
+@pytest.mark.parametrize("state", ["auto", "full"])
+def test_motions_through_full_turns_are_served_by_one_program(scene, start, state):
+    motion, reference = motion_and_reference(scene, start, 3.0, state=state)
+    assert int(motion.result) == results.SUCCESS
+    assert "lowered" in motion.reduction
+    assert motion.smallest_pivot > 0.1
+    np.testing.assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
+
+
+def test_rows_along_axes_at_any_angle_that_is_traced_are_served():
+    scene = PlanarRobot(trailers=1)
+    start = jj.start(scene, **scene.start(**ROBOT))
+    angles = jnp.array([0.0, 0.4, np.pi / 2, -2.0])
+    ends = jax.jit(jax.vmap(lambda a: jj.simulate(scene.replace(turned=a), start, ts=jnp.array([2.0]), rtol=1e-10, atol=1e-10, work=False)))(angles)
+    assert np.all(np.asarray(ends.result) == results.SUCCESS)
+    np.testing.assert_allclose(ends.q_end, jnp.broadcast_to(ends.q_end[0], ends.q_end.shape), atol=1e-8)
+
+
+def test_every_lane_of_beads_on_a_ring_arrives():
+    scene = BeadOnCurve()
+    speeds = jnp.linspace(7.0, 11.0, 9)
+    starts = jax.vmap(lambda v: jj.start(scene, **{**scene.start(), "s_rate": v}))(speeds)
+    lanes = jj.rollout(scene, starts, ts=jnp.array([3.0]), rtol=1e-10, atol=1e-10, work=False)
+    assert np.all(np.asarray(lanes.result) == results.SUCCESS)
+    assert not np.any(np.asarray(lanes.lanes.fallback))
+    one = jj.simulate(scene, {**scene.start(), "s_rate": speeds[4]}, ts=jnp.array([3.0]), state="full", lowering=False, rtol=1e-11, atol=1e-11, work=False)
+    np.testing.assert_allclose(lanes.lanes.q_end[4], one.q_end, atol=1e-8)
+
+
+@pytest.mark.parametrize("state", ["auto", "full"])
+@pytest.mark.parametrize(
+    ("scene", "start"),
+    [
+        (PlanarRobot(trailers=1, maximal=True, **WEIGHTLESS), PlanarRobot(trailers=1, maximal=True).start(**ROBOT)),
+        (TrailerChain(trailers=1, **WEIGHTLESS), TrailerChain(trailers=1).towing([0.0, 0.3], forward=1.0, turn=0.8)),
+    ],
+    ids=["robot", "car"],
+)
+def test_massless_trailers_follow_also_where_their_masses_are_traced(scene, start, state):
+    motion, reference = motion_and_reference(scene, start, 2.0, traced=WEIGHTLESS, state=state)
+    assert int(motion.result) == results.SUCCESS
+    np.testing.assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
+
+
+class LightKnee(jj.Scene):
+    """A pendulum with a knee of no mass half-way, in Cartesian coordinates: at right angles no two speeds determine the others, and M is singular."""
+
+    knee: object = jj.parameter(0.0, unit="kg", non_negative=True)
+    coordinates = jj.coordinates("x z x_end z_end")
+    domain = {"x": (-0.9, 0.9), "z": (-1.2, 1.0), "x_end": (-0.9, 0.9), "z_end": (-2.2, 2.0)}
+
+    def bodies(self, t, q):
+        o = 0 * q.x
+        return {"knee": jj.Particle(self.knee, jnp.stack([q.x, o, q.z])), "bob": jj.Particle(1.0, jnp.stack([q.x_end, o, q.z_end]))}
+
+    def geometric_constraints(self, pose):
+        q = pose.q
+        return {"rod": q.x**2 + q.z**2 - 1.0, "straight": jnp.stack([q.x_end - 2 * q.x, q.z_end - 2 * q.z])}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81, (0.0, 0.0, -1.0)),)
+
+
+@pytest.mark.parametrize("knee", [0.0, 0.7])
+def test_multipliers_serve_where_a_body_that_rows_hold_has_no_mass(knee):
+    start = {"x": 0.6, "z": -0.8, "x_end": 1.2, "z_end": -1.6, "x_rate": 4.0}
+    motion, reference = motion_and_reference(LightKnee(knee=knee), start, 2.0, traced=("knee",))
+    assert int(motion.result) == results.SUCCESS
+    np.testing.assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
+    energy = motion.energies().balance
+    np.testing.assert_allclose(energy, jnp.full(len(energy), energy[0]), atol=1e-7)
+
+
+class Twice(PlanarRobot):
+    """The robot with a row written twice, at another scale."""
+
+    def velocity_constraints(self, m):
+        rows = super().velocity_constraints(m)
+        return rows | {"again": -3.0 * rows["left"]}
+
+
+@pytest.mark.parametrize("state", ["auto", "full"])
+def test_dependent_rows_are_served_in_both_forms_of_the_state(state):
+    scene = Twice(turned=0.3)
+    structure = structure_of(scene)
+    assert structure.rank == 3
+    assert structure.redundant_rows == ("again[0]", "again[1]")
+    assert structure.dependent_rows  # what is left of them still depends on each other
+    motion, reference = motion_and_reference(scene, scene.start(**ROBOT), 2.0, state=state, traced=("turned",))
+    assert int(motion.result) == results.SUCCESS
+    np.testing.assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
+
+
+@pytest.mark.parametrize("turned", [0.0, 0.1, 0.7, 2.5])
+def test_no_row_of_two_wheels_on_an_axle_is_called_redundant(turned):
+    structure = structure_of(PlanarRobot(turned=turned))
+    assert structure.rank == 3
+    assert structure.redundant_rows == ()
+
+
+def test_rates_may_be_differentiated_where_rows_were_combined():
+    scene = PlanarRobot(turned=0.4)
+    program = lowered(scene)
+    t, q, u = (x[:1] for x in jj.sample_states(scene, 1, seed=2))
+    weights = np.cos(np.arange(len(scene.speed_names)))[list(program.independent)]
+
+    def end(track, q):
+        y = tuple(u[0, k] for k in program.independent)
+        ydot = program.rates(program.fixed_values(scene.replace(track=track)), t[0], tuple(q), y, jnp.zeros(0))[1]
+        return weights @ jnp.stack(ydot)
+
+    slopes = jnp.concatenate([jnp.ravel(x) for x in jax.jit(jax.grad(end, (0, 1)))(scene.track, jnp.asarray(q[0]))])
+
+    def by_matrices(track, q):
+        moved = scene.replace(track=track)
+        return weights @ privileged_accelerations(moved, t[0], q, u[0, list(program.independent)])
+
+    steps, by_hand = 1e-5 * np.eye(1 + q.shape[1]), []
+    for step in steps:
+        ends = [by_matrices(float(scene.track) + sign * step[0], q[0] + sign * step[1:]) for sign in (1, -1)]
+        by_hand.append((ends[0] - ends[1]) / 2e-5)
+    np.testing.assert_allclose(slopes, by_hand, atol=1e-7)
