@@ -22,7 +22,6 @@ from jourdain_jax.program.uncompiled import uncompiled
 from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 
-
 MOST_CASES = 1024  # that are kept of one function
 
 

@@ -100,7 +100,7 @@ class _Search:
     def kinks(self, a, b, direction) -> Iterator[tuple[int, float]]:
         """Which entry has a kink, and at which time, for every interval with one between the states `a` and `b`, of times and coordinates."""
         dt, dq = direction
-        at_a, at_b = self._entries(*a, dt, dq), self._entries(*b, dt, dq)
+        at_a, at_b = (self._entries(t, q, dt, dq) for t, q in (a, b))
         largest = np.nanmax(np.abs(np.concatenate([at_a, at_b])), axis=0, initial=0.0)
         size = np.maximum(largest, self.floor * np.max(largest, axis=-1, keepdims=True)) + np.finfo(largest.dtype).tiny
         for turn in range(ALL):
@@ -139,7 +139,7 @@ def _in_time(scene: Scene, q: np.ndarray) -> tuple[tuple, tuple, tuple]:
     for leaf in jax.tree.leaves(scene):
         knots = np.unique(np.asarray(leaf, float)) if np.ndim(leaf) == 1 else np.zeros(0)
         knots = knots[np.isfinite(knots)]
-        if 2 <= knots.size:
+        if knots.size >= 2:
             middle = (knots[:-1] + knots[1:]) / 2
             chosen = np.unique(np.linspace(0, max(knots.size - 3, 0), min(KNOTS, max(knots.size - 2, 1))).astype(int))
             low.append(middle[chosen] if knots.size > 2 else knots[:1])

@@ -15,6 +15,7 @@ import numpy as np
 from jourdain_jax.equations.accelerations import bare_accelerations
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations
+from jourdain_jax.equations.probed_on_graph import sampled_on_graph
 from jourdain_jax.equations.probing import concretised, on_numbers, without_collecting
 from jourdain_jax.equations.reductions import NullSpaceQR
 from jourdain_jax.equations.sampling import random_states
@@ -120,7 +121,7 @@ def _with_calls_or_without(scene: Scene, structure: Structure, every_speed: bool
 
     def built(calls: bool) -> Lowered:
         traced = traced_scene(scene, structure.potentials_of_inputs, calls)
-        probes = _probes(scene, structure, traced.graph)
+        probes = _probes(scene, structure, traced.graph, every_speed)
         quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
         builder = AppellOnGraph(traced, structure, every_speed, probes, scene.coordinates.reference(), quaternions)
         return _best(scene, structure, builder, begin)
@@ -131,17 +132,27 @@ def _with_calls_or_without(scene: Scene, structure: Structure, every_speed: bool
         return built(False)
 
 
-def _probes(scene: Scene, structure: Structure, graph) -> Probes:
+def _probes(scene: Scene, structure: Structure, graph, every_speed: bool) -> Probes:
     """Configurations on the geometric rows, random and symmetric ones, as the structure was found at, with any speeds, and parameters off their values,
     so that what is zero or equal by chance does not count.
+
+    Where rows are left out and the others kept by multipliers, speeds are on the rows and parameters as they are: elsewhere what is left out does not follow.
     """
+    exact = every_speed and bool(structure.redundant_rows)
     generator = np.random.default_rng(1)
     t, q = structure.times[:PROBES], np.array(structure.coordinates[:PROBES], np.float64)
     for first, _ in scene.coordinates.quaternions:  # in single precision they are unit ones to seven digits
         q[:, first : first + 4] /= np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
     u = random_states(scene, len(t), generator)[2]
-    varied = jax.tree.map(lambda x: np.where(np.asarray(x) == 0, 0.05, np.asarray(x)) * (1 + 0.1 * generator.uniform(size=(len(t), *np.shape(x)))), scene)
-    inputs = generator.normal(size=(len(t), len(scene.inputs)))
+    if exact:
+        q, u = (np.asarray(x, np.float64) for x in sampled_on_graph(scene, t, q, u)[:2])
+
+    def off(x):
+        near = np.where(np.asarray(x) == 0, 0.05, np.asarray(x))
+        return np.broadcast_to(x, (len(t), *np.shape(x))) if exact else near * (1 + 0.1 * generator.uniform(size=(len(t), *np.shape(x))))
+
+    varied = jax.tree.map(off, scene)
+    inputs = np.zeros((len(t), len(scene.inputs))) if exact else generator.normal(size=(len(t), len(scene.inputs)))
     values = named_values(scene, t, q, u, inputs)
     values |= {f"p{k}_{i}": column for k, leaf in enumerate(jax.tree.leaves(varied)) for i, column in enumerate(np.reshape(leaf, (len(t), -1)).T)}
     return Probes(graph, {name: np.asarray(value, np.float64) for name, value in values.items()})  # whatever precision motions have
@@ -230,7 +241,7 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
     if np.max(error) > limit:
         worst = names[int(np.argmax(error))]
         culprit = blamed(scene, builder.traced, probes, limit, parameters, t, q, u, inputs)
-        raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: {culprit} has a derivative of its own there")
+        raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: {culprit}")
     if found.events and not np.allclose(probes(found.events)[:, chosen][:, usable], dense_events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
         raise NotLowered("the value of a stop event differs from the dense path")
 
