@@ -87,7 +87,9 @@ SMOOTH = {
 }
 
 
-@pytest.mark.parametrize("kind, curve", [*((Driven, curve) for curve in KINKED), (Prescribed, "jnp.interp"), (Prescribed, "steps"), (InGeometry, "jnp.interp")])
+@pytest.mark.parametrize(
+    ("kind", "curve"), [*((Driven, name) for name in KINKED), (Prescribed, "jnp.interp"), (Prescribed, "steps"), (InGeometry, "jnp.interp")]
+)
 def test_a_motion_whose_velocity_jumps_is_refused(kind, curve):
     scene = kind(curve=KINKED[curve])
     with pytest.raises(ValueError, match=r"of `\w+` is not smooth.*jj\.Spline"):
@@ -130,7 +132,7 @@ class Road(jj.Scene):
 
 
 def test_a_road_by_linear_interpolation_is_refused():
-    with pytest.raises(ValueError, match="the pose of body `mass` of `Road` is not smooth.*at several places"):
+    with pytest.raises(ValueError, match=r"the pose of body `mass` of `Road` is not smooth.*at several places"):
         jj.simulate(Road(), {"x_rate": 1.0}, t1=1.0)
 
 
@@ -191,7 +193,8 @@ def test_a_spline_is_cubic_and_twice_continuously_differentiable(n):
     values = generator.normal(size=n)
     spline = jj.Spline(ts, values)
     assert np.allclose(jax.vmap(spline)(ts), values, atol=1e-12)
-    at = np.concatenate([ts[1:-1] - 1e-9, ts[1:-1] + 1e-9, [ts[0] + 1e-12, ts[-1] - 1e-12, ts[0] - 1.0, ts[-1] + 2.0], np.full(n + 1, ts[0] + 0.1)])[: 2 * n + 1]
+    inside, outside = ts[1:-1], [ts[0] + 1e-12, ts[-1] - 1e-12, ts[0] - 1.0, ts[-1] + 2.0, ts[0]]
+    at = np.concatenate([inside - 1e-9, inside + 1e-9, outside])
     below, above, ends = np.split(with_derivatives(spline, at)[:, : 2 * n], [n - 2, 2 * n - 4], axis=1)
     assert np.allclose(below, above, rtol=1e-5, atol=1e-5)
     assert np.allclose(ends[0, 2:], [ends[0, 0] - ends[1, 0], ends[0, 1] + 2.0 * ends[1, 1]], atol=1e-6)  # along the tangents

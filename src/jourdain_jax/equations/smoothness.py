@@ -100,7 +100,7 @@ class _Search:
     def kinks(self, a, b, direction) -> Iterator[tuple[int, float]]:
         """Which entry has a kink, and at which time, for every interval with one between the states `a` and `b`, of times and coordinates."""
         dt, dq = direction
-        at_a, at_b = self._entries(*a, dt, dq), self._entries(*b, dt, dq)
+        at_a, at_b = (self._entries(t, q, dt, dq) for t, q in (a, b))
         largest = np.nanmax(np.abs(np.concatenate([at_a, at_b])), axis=0, initial=0.0)
         size = np.maximum(largest, self.floor * np.max(largest, axis=-1, keepdims=True)) + np.finfo(largest.dtype).tiny
         for turn in range(ALL):

@@ -22,18 +22,30 @@ from jourdain_jax.scene.scene import Scene
 
 
 def blamed(scene: Scene, traced: TracedScene, probes: Probes, limit: float, parameters: Scene, t, q, u, inputs) -> str:
-    """What has derivatives of its own, by name; in general terms where nothing is found.
+    """What differs between graph and JAX, by name, and how; where no body, load or row does, that it is the solution of the equations.
 
     `limit`: of the difference, relative to the size of the quantity at the probes; `parameters`, `t`, `q`, `u`, `inputs`: the probes, with a leading axis.
     """
     try:
-        here = list(dict.fromkeys(_differing(scene, traced, probes, limit, parameters, t, q, u, inputs)))
-    except Unsupported:
-        here = []
-    return " and ".join(here) if here else "a body, load or row"
+        found = list(_differing(scene, traced, probes, limit, parameters, t, q, u, inputs))
+    except Unsupported as reason:
+        return f"{reason} has no derivative in scalars"
+    values = list(dict.fromkeys(owner for owner, in_value in found if in_value))
+    rates = list(dict.fromkeys(owner for owner, in_value in found if not in_value))
+    if values:
+        return f"{' and '.join(values)} come to another value there"
+    if rates:
+        return f"{' and '.join(rates)} {_HAS_ITS_OWN if traced.own_derivatives else _HAS_TWO}"
+    return _NOBODY
 
 
-def _differing(scene: Scene, traced: TracedScene, probes: Probes, limit: float, parameters, t, q, u, inputs) -> Iterator[str]:
+_NOBODY = "bodies, loads and rows agree, but not the solutions of the equations; rows, or the inertia along what they leave free, may be nearly singular there"
+_HAS_ITS_OWN = "has a derivative of its own there"
+_HAS_TWO = "has more than one derivative there, at a kink"
+
+
+def _differing(scene: Scene, traced: TracedScene, probes: Probes, limit: float, parameters, t, q, u, inputs) -> Iterator[tuple[str, bool]]:
+    """Owners of what differs, and whether it differs itself (otherwise in its rate)."""
     g, along = traced.graph, (1.0, np.cos(1.0 + np.arange(q.shape[1])), np.sin(1.0 + np.arange(u.shape[1])))
     direction = {n: g.const(x) for n, x in zip([traced.t, *traced.q.tolist(), *traced.u.tolist()], np.hstack(along).tolist(), strict=True)}
     values, rates = _by_jax(parameters, t, q, u, inputs, along)
@@ -47,10 +59,11 @@ def _differing(scene: Scene, traced: TracedScene, probes: Probes, limit: float, 
         flat = nodes.ravel().tolist()
         found = probes([*flat, *derivatives(g, flat, direction)]).reshape(2, *nodes.shape, probes.count)
         expected = np.moveaxis(np.stack([getattr(values, field), getattr(rates, field)]), 1, -1)
-        size = 1 + np.nanmax(np.abs(expected), initial=0.0)
+        size = np.nanmax(np.abs(expected), initial=np.finfo(float).tiny)
         for i, owner in enumerate(owners):
-            if np.any(np.abs(found - expected)[:, i] > limit * size):
-                yield owner
+            in_value, in_rate = (np.any(np.abs(found - expected)[k, i] > limit * size) for k in range(2))
+            if in_value or in_rate:
+                yield owner, bool(in_value)
 
 
 @on_numbers

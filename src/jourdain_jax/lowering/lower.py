@@ -244,7 +244,7 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
     if np.max(error) > limit:
         worst = names[int(np.argmax(error))]
         culprit = blamed(scene, builder.traced, probes, limit, parameters, t, q, u, inputs)
-        raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: {culprit} has a derivative of its own there")
+        raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: {culprit}")
     if found.events and not np.allclose(probes(found.events)[:, chosen][:, usable], dense_events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
         raise NotLowered("the value of a stop event differs from the dense path")
 

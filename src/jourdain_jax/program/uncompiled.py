@@ -117,9 +117,7 @@ def _while(equation, inputs) -> list[np.ndarray]:
             "such as `lambda state: (state[0] < 50) & ...`, and check what it waits for"
         )
     # where some lanes have ended, what the others would have found is not known
-    return [
-        np.where(going.reshape(going.shape + (1,) * (x.ndim - going.ndim)), np.nan, x).astype(x.dtype) if x.dtype.kind == "f" else x for x in carry
-    ]
+    return [np.where(going.reshape(going.shape + (1,) * (x.ndim - going.ndim)), np.nan, x).astype(x.dtype) if x.dtype.kind == "f" else x for x in carry]
 
 
 def _where(equation) -> str:

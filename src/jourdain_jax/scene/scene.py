@@ -36,6 +36,9 @@ class Scene(eqx.Module):
       for coordinates, (-1, 1) for speeds.
     - `conventions`: one text: axes, signs, frames.
     - `example`: coordinate or speed name -> value, a typical start; `example_span`: its duration in s.
+
+    Methods may read globals, variables of enclosing functions and attributes of classes: a change of these is noticed at the next call, as is a method that is
+    replaced. Not noticed is what only shows while a method runs (`globals()[name]`, a file), and what a `jax.jit` of your own inside a method has traced.
     """
 
     coordinates: ClassVar[Coordinates]
