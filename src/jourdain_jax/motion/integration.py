@@ -17,6 +17,7 @@ from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion import lean_loop, results
 from jourdain_jax.motion.event_location import Located, locate
 from jourdain_jax.motion.finite_derivatives import Flat
+from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.land_on import land_on
 from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
@@ -92,7 +93,8 @@ class Begun(eqx.Module):
 
 def integrate(setup: Setup) -> Trajectory:
     """The motion of one setup."""
-    return (_integrate_dense if setup.form.lowered is None else _integrate_lowered)(setup)
+    compiled = _integrate_dense if setup.form.lowered is None else _integrate_lowered
+    return compiled(setup.inputs.programs)(setup)
 
 
 def _one_motion(setup: Setup) -> Trajectory:
@@ -100,10 +102,9 @@ def _one_motion(setup: Setup) -> Trajectory:
     return _finish(setup, begun, _solved(setup, begun))
 
 
-_integrate_dense, _integrate_lowered = eqx.filter_jit(_one_motion), quickly_compiled(_one_motion)
+_integrate_dense, _integrate_lowered = (for_programs(_one_motion, compiled_by) for compiled_by in (by_itself, quickly_compiled))
 
 
-@eqx.filter_jit
 def integrate_lanes(setups: Setup) -> Trajectory:
     """The motions of all lanes: `lockstep.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
     begun = eqx.filter_vmap(_begin)(setups)

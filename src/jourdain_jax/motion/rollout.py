@@ -18,6 +18,8 @@ from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.motion import results
 from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.fallbacks import changed_options, fallen_back, lost_codes, next_way
+from jourdain_jax.motion.input_programs import by_itself, for_programs
+from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.simulate import MOST_STEPS, TOLERANCE, default_solver, set_up, state_form, warn_float32
 from jourdain_jax.motion.span import check_span, saved_times
@@ -139,7 +141,8 @@ def rollout(
     if options.get("ts") is not None:
         options["ts"] = saved_times(options["ts"])
     _check_span_of_lanes(starts, options)
-    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, fixed, varied, parameters))):
+    options["inputs"] = as_inputs(scene, options.get("inputs"))
+    if is_traced((scene, fixed, varied, parameters, options)):
         return Rollout(_together(scene, fixed, _with_arrays(options), varied, parameters))  # being differentiated or batched: one piece, no host loop
     pieces = []
     sound = _sound_lane(scene, parameters)
@@ -218,15 +221,21 @@ def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajec
     return jax.tree.unflatten(treedef, new)
 
 
-@eqx.filter_jit
 def _together(scene, fixed, options, varied, parameters) -> Trajectory:
     """All given lanes in lockstep; compiled once for scenes and lanes of one shape."""
+    return _compiled(options["inputs"].programs)(scene, fixed, options, varied, parameters)
+
+
+def _lanes_in_lockstep(scene, fixed, options, varied, parameters) -> Trajectory:
 
     def lane(varied, parameters):
         own = scene.replace(**parameters) if parameters else scene
         return set_up(own, varied if isinstance(varied, State) else {**fixed, **varied}, **options)
 
     return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
+
+
+_compiled = for_programs(_lanes_in_lockstep, by_itself)
 
 
 def _with_arrays(options: dict) -> dict:
