@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.calculus.guards import forward_only, reverse_only
+from jourdain_jax.equations.plausibility import body_faults
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion import lean_loop, results
 from jourdain_jax.motion.event_location import Located, locate
@@ -24,6 +25,7 @@ from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.recovery import LargestError, is_among
 from jourdain_jax.motion.solver_choice import controller_of
+from jourdain_jax.motion.span import times_fit
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
 from jourdain_jax.motion.trajectory import Trajectory
@@ -85,7 +87,8 @@ class Setup(eqx.Module):
 class Begun(eqx.Module):
     """The start of the integration, marked for the adjoint."""
 
-    right: Bool[Array, ""]  # whether all parameters are
+    right: Bool[Array, ""]  # whether all parameters are, and the masses and inertias that they make
+    timely: Bool[Array, ""]  # whether the times go together
     start: State
     args: tuple  # form, scene, inputs, what the rates need of the scene
     y0: Integrated
@@ -98,8 +101,8 @@ def integrate(setup: Setup) -> Trajectory:
 
 
 def _one_motion(setup: Setup) -> Trajectory:
-    begun = _begin(setup)
-    return _finish(setup, begun, _solved(setup, begun))
+    begun, fitting = _begin(setup), _fitting(setup)
+    return _finish(setup, fitting, begun, _solved(fitting, begun))
 
 
 _integrate_dense, _integrate_lowered = (for_programs(_one_motion, compiled_by) for compiled_by in (by_itself, quickly_compiled))
@@ -107,30 +110,41 @@ _integrate_dense, _integrate_lowered = (for_programs(_one_motion, compiled_by) f
 
 def integrate_lanes(setups: Setup) -> Trajectory:
     """The motions of all lanes: `lockstep.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
-    begun = eqx.filter_vmap(_begin)(setups)
+    begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(_fitting)(setups)
     program = setups.form.lowered
     if setups.options.lean and program is not None:
-        solved = in_blocks(_lanes_by_lean_loop, width(program), setups, begun)
+        solved = in_blocks(_lanes_by_lean_loop, width(program), fitting, begun)
     else:
         # lanes often share their times: what XLA knows to be the same in all of them it moves through diffrax's `nextafter`, one operation per pass
-        times = jax.lax.optimization_barrier((setups.t0, setups.t1, setups.options.dt0))
-        timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.options.dt0), setups, times)
+        times = jax.lax.optimization_barrier((fitting.t0, fitting.t1, fitting.options.dt0))
+        timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.options.dt0), fitting, times)
         solved = eqx.filter_vmap(_solved)(timed, begun)
-    return eqx.filter_vmap(_finish)(setups, begun, solved)
+    return eqx.filter_vmap(_finish)(setups, fitting, begun, solved)
 
 
 def _begin(setup: Setup) -> Begun:
-    right, start = _without_faults(setup.scene, setup.start)
+    timely = times_fit(setup.ts, setup.t0, setup.t1)
+    right, start = _without_faults(setup.scene, setup.t0, setup.start, timely)
     scene, start, inputs = _mark_inputs(setup.options.adjoint, (setup.scene, start, setup.inputs))
     form = setup.form
-    return Begun(right, start, (form, scene, inputs, form.fixed(scene)), form.pack(start.q, start.u))
+    return Begun(right, timely, start, (form, scene, inputs, form.fixed(scene)), form.pack(start.q, start.u))
+
+
+def _fitting(setup: Setup) -> Setup:
+    """The setup, with a span and times that serve any loop where its own do not go together; then the start is NaN, and the motion ends at once."""
+    t0, t1, ts, dt0 = setup.t0, setup.t1, setup.ts, setup.options.dt0
+    fits = times_fit(ts, t0, t1)
+    ts = jnp.where((t1 - ts) * jnp.sign(t1 - t0) < 0, t1, jnp.where((ts - t0) * jnp.sign(t1 - t0) < 0, t0, ts))  # beyond an end by round-off
+    others = jnp.zeros_like(t0), jnp.ones_like(t1), jnp.linspace(0.0, 1.0, ts.shape[-1], dtype=ts.dtype), 1e-4 * jnp.ones_like(dt0)
+    chosen = tuple(jnp.where(fits, own, other) for own, other in zip((t0, t1, ts, dt0), others, strict=True))
+    return eqx.tree_at(lambda s: (s.t0, s.t1, s.ts, s.options.dt0), setup, chosen)
 
 
 def _solved(setup: Setup, begun: Begun) -> Solved:
     return (_by_lean_loop if setup.options.lean else _by_diffrax)(setup, begun)
 
 
-def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
+def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
     t0, t1, form, options, adjoint = setup.t0, setup.t1, setup.form, setup.options, setup.options.adjoint
     start, args = begun.start, begun.args
     _, scene, inputs, fixed = args
@@ -156,16 +170,17 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
     return Trajectory(
         scene=setup.scene,
-        ts=solved.ts,
+        ts=jnp.where(begun.timely, solved.ts, given.ts) if options.saveat is None else solved.ts,
         q=q[:-1],
         u=u[:-1],
         work=None if work is None else work[:-1],
-        t_end=end.t,
+        t_end=jnp.where(begun.timely, end.t, given.t0),
         q_end=q[-1],
         u_end=u[-1],
         result=results.with_causes(
             _result(solved.code, end.y, start, pivot if form.needs_pivot else jnp.inf),
             parameters=begun.right,
+            times=begun.timely,
             start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
             moved=solved.accepted > 0,
         ),
@@ -188,10 +203,11 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
     )
 
 
-def _without_faults(scene: Scene, start: State):
-    """Whether all parameters are right, and the start: NaN where they are not, so that such a lane ends at once."""
-    right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values()]))
-    return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
+def _without_faults(scene: Scene, t0, start: State, timely):
+    """Whether all parameters are right, and the bodies they make; and the start: NaN where they are not, or times are not, so that such a lane ends at once."""
+    faults = *parameter_faults(scene).values(), *body_faults(scene, t0, start.q).values()
+    right = ~jnp.any(jnp.stack([jnp.array(False), *faults]))
+    return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right & timely, x, jnp.nan) for x in (start.q, start.u)))
 
 
 def _by_lean_loop(setup: Setup, begun: Begun) -> Solved:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START, UNSOLVED_STEP = range(10)
-SHRANK, STIFF = 10, 11
+SHRANK, STIFF, BAD_TIMES = 10, 11, 12
 
 MESSAGES = {
     SUCCESS: "reached the end of its span",
@@ -16,11 +16,12 @@ MESSAGES = {
     "`accelerations` and `verify`",
     INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them",
     SINGULAR_PARTITION: "the privileged speeds came near a configuration where they do not determine the others; use state='full'",
-    BAD_PARAMETER: "a parameter is not finite or has the wrong sign",
+    BAD_PARAMETER: "a parameter is not finite or has the wrong sign, or makes a mass or an inertia that cannot be",
     BAD_START: "the start is not finite; check where its values were computed",
     SHRANK: "ran out of steps, which had shrunk to less than a hundredth of their average: a singularity, a discontinuity or a stiff force near the last time",
     STIFF: "stiff: ran out of steps that stability, not accuracy, keeps short, and an implicit solver did not reach the end either; "
     "put a row in the place of a stiff spring or damper, or loosen the tolerances",
+    BAD_TIMES: "the times to save at leave the span or are not in order, or the span is empty or not finite; give increasing `ts` between `t0` and `t1`",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step (`dt0`), or look for a singularity there",
 }
 
@@ -35,11 +36,19 @@ FALLBACKS = {
 }
 
 
-def with_causes(code, *, parameters: Bool[Array, ""], start: Bool[Array, ""], moved: Bool[Array, ""]) -> Int[Array, ""]:
-    """The code with the cause where one is known: whether the `parameters` are right, the `start` is finite, and any step was accepted (`moved`)."""
+def is_success(code: Int[Array, "*lanes"]) -> Bool[Array, "*lanes"]:
+    """Whether a motion reached the end of its span, or an event."""
+    return (jnp.asarray(code) == SUCCESS) | (jnp.asarray(code) == EVENT)
+
+
+def with_causes(code, *, parameters: Bool[Array, ""], times: Bool[Array, ""], start: Bool[Array, ""], moved: Bool[Array, ""]) -> Int[Array, ""]:
+    """The code with the cause where one is known: whether the `parameters` are right, the `times` go together, the `start` is finite, and any step was
+    accepted (`moved`).
+    """
     # no step, however short: the accelerations themselves are at fault
     code = jnp.where((code == STEP_TOO_SMALL) & ~moved, NOT_FINITE, code)
     code = jnp.where(start, code, BAD_START)
+    code = jnp.where(times, code, BAD_TIMES)
     return jnp.where(parameters, code, BAD_PARAMETER).astype(jnp.int32)
 
 
