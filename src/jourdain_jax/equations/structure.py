@@ -147,7 +147,7 @@ def structure_of(scene: Scene) -> Structure:
     ValueError where no admissible state is found, where a motion that the rows leave free has no inertia, or `privileged` names unknown or too few
     speeds; for known parameters also where numbers of its bodies or planes cannot be.
     """
-    with without_collecting():
+    with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
         structure = _probed_structure(as_scene(scene))
     if structure.faults and not is_traced(scene):  # numbers that stand in for traced parameters prove nothing
         raise ValueError(structure.faults[0])

@@ -53,6 +53,9 @@ class Rollout(Printed, eqx.Module):
         """A coordinate or speed by name, of all lanes at all times."""
         return jax.vmap(lambda lane: lane[name])(self.lanes)
 
+    def __contains__(self, name: str) -> bool:
+        return name in self.lanes
+
     def lane(self, index: int) -> Trajectory:
         """The motion of the lane with number `index`, as a `Trajectory`; IndexError where there is none."""
         if not -len(self) <= index < len(self):

@@ -43,6 +43,9 @@ class State(Printed, eqx.Module):
         coordinates, speeds = (names.view(x) for names, x in zip(self.names, (self.q, self.u), strict=True))
         return coordinates[name] if name in coordinates else speeds[name]
 
+    def __contains__(self, name: str) -> bool:
+        return any(name in names for names in self.names)
+
     def _text(self) -> str:
         if self.q.ndim > 1:
             return f"States of shape {self.q.shape[:-1]}: {', '.join((*self.names[0].entries, *self.names[1].entries))}"

@@ -12,8 +12,10 @@ What came after the first files of format 1 may be absent: `kind` is then "traje
 continued), `quadrature_error` 0, `ways` and `recovered` empty.
 """
 
+import contextlib
 import json
 import os
+import secrets
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -26,6 +28,7 @@ import numpy as np
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.results import AS_ASKED, BAD_PARAMETER, FULL_STATE
 from jourdain_jax.motion.rollout import Rollout
+from jourdain_jax.motion.storage_checks import COUNTS, check_arrays, check_fields, check_header, check_scenes, refused
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.motion.versions import version_of
 from jourdain_jax.scene.names import nearest
@@ -33,8 +36,7 @@ from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
-_COUNTS = ("result", "event", "accepted", "rejected", "fallback")
-_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", *_COUNTS, "last_step", "quadrature_error", "moved_q", "moved_u", "smallest_pivot")
+_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", *COUNTS, "last_step", "quadrature_error", "moved_q", "moved_u", "smallest_pivot")
 _TEXTS = ("state_form", "reduction", "solver", "projected")
 _HEADER = ("scene", "coordinates", "speeds", "input_names", "static", "event_names", *_TEXTS)
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
@@ -43,6 +45,7 @@ _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load
 def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
     """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of `motion/storage.py`).
 
+    A file that is there already is replaced at once, when the new one is whole: an interruption leaves the old one.
     Inputs are stored as samples at the saved times. ValueError where the path is a folder, or the scene has a field that is no array, number or text.
     Read it with `load_trajectory` or `load_rollout`.
     """
@@ -71,8 +74,22 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
         "recovered": trajectory.recovered,
         "versions": {name: version_of(name) for name in ("jourdain-jax", "jax", "diffrax", "numpy")},
     }
-    with open(path, "wb") as file:  # a handle, so that numpy does not append a suffix to the name
-        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+    _write(os.path.realpath(path), {"header": np.array(json.dumps(header)), **arrays})
+
+
+def _write(path: str, arrays: dict) -> None:
+    """The whole file or, where writing is interrupted, what was there before: written beside it under another name, which then takes its place."""
+    beside = os.path.join(os.path.dirname(path), f".{os.path.basename(path)}.{secrets.token_hex(8)}")
+    try:
+        with open(beside, "xb") as file:  # a handle, so that numpy does not append a suffix to the name
+            np.savez_compressed(file, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(beside)
+        raise
 
 
 def _sampled(inputs: Inputs, ts):
@@ -118,8 +135,11 @@ def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Traj
     kind = _checked_class(path, scene, header, arrays)
     arrays["input_ts"], arrays["inputs"] = _samples(arrays["ts"], arrays["inputs"])
     if int(arrays["result"]) == BAD_PARAMETER:  # what cannot be built by itself: as a lane, where parameters are not looked at
-        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), _lanes(kind, header, {name: x[None] for name, x in arrays.items()}))
-    return _trajectory(kind, header, arrays)
+        lanes = _lanes(path, kind, header, {name: x[None] for name, x in arrays.items()})
+        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), lanes)
+    motion = _trajectory(path, kind, header, arrays)
+    check_scenes(path, motion.scene, motion.result, many=False)
+    return motion
 
 
 def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout:
@@ -136,17 +156,23 @@ def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout
     arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in lanes])
     arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in lanes])
     ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header.get("ways", ()))
-    return Rollout(_lanes(kind, header, arrays), continued, ways)
+    return Rollout(_lanes(path, kind, header, arrays), continued, ways)
 
 
-def _lanes(kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
+def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
     """Trajectories from arrays with a leading axis of lanes, which may be failed ones: built under `vmap`, where no value is refused."""
-    return jax.vmap(lambda arrays: _trajectory(kind, header, arrays))(arrays)
+    lanes = jax.vmap(lambda arrays: _trajectory(path, kind, header, arrays))(arrays)
+    check_scenes(path, lanes.scene, lanes.result, many=True)
+    return lanes
 
 
-def _trajectory(kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
+def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
     values = {name.removeprefix("parameter:"): value for name, value in arrays.items() if name.startswith("parameter:")}
-    scene = kind(**values, **header["static"])
+    try:
+        scene = kind(**values, **header["static"])
+    except TypeError as error:
+        raise refused(path, f"does not hold what makes a `{kind.__name__}` ({str(error).splitlines()[0]})") from None
+    check_fields(path, scene, {*values, *header["static"]}, {*_array_fields(scene), *(name for name, _ in _static_fields(scene))})
     for name, now in (("coordinates", scene.coordinate_names), ("speeds", scene.speed_names), ("input_names", scene.inputs)):
         if tuple(header[name]) != now.entries:
             raise ValueError(
@@ -182,10 +208,11 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
     for name in (*(name.removeprefix("parameter:") for name in arrays if name.startswith("parameter:")), *header["static"]):
         if name not in known:
             raise ValueError(f"`{path}` has a parameter `{name}` that `{kind.__name__}` has not; {nearest(name, known)}")
-    counts = {"coordinates": arrays["q"].shape[-1], "speeds": arrays["u"].shape[-1], "input_names": arrays["inputs"].shape[-1]}
-    for name, count in counts.items():
-        if len(header[name]) != count:
-            raise ValueError(f"`{path}` has {count} columns for {len(header[name])} {name.replace('_', ' ')}; it is damaged or was not written by `save`")
+    for name, value in arrays.items():
+        if name.startswith("parameter:") and value.dtype.kind not in "fiub":
+            raise refused(path, f"has `{name.removeprefix('parameter:')}` of type {value.dtype}, expected numbers")
+        if name.startswith("parameter:") and header["kind"] == "rollout" and value.shape[:1] != arrays["result"].shape:
+            raise refused(path, f"has `{name.removeprefix('parameter:')}` of shape {value.shape}, expected one value for each of {len(arrays['result'])} lanes")
     return kind
 
 
@@ -212,7 +239,9 @@ def _read(path, kind: str) -> tuple[dict, dict]:
     missing = [name for name in (*_ARRAYS, "inputs", *(["continued"] if kind == "rollout" else [])) if name not in arrays]
     missing += [name for name in _HEADER if name not in header]
     if missing:
-        raise ValueError(f"`{path}` lacks `{missing[0]}`; it is damaged or was not written by `save`")
+        raise refused(path, f"lacks `{missing[0]}`")
+    check_header(path, header)
+    check_arrays(path, header, arrays)
     return header, arrays
 
 

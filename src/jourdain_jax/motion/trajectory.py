@@ -74,7 +74,7 @@ class Trajectory(eqx.Module):
         return results.is_success(self.result)
 
     @property
-    def valid(self) -> Bool[Array, "times"]:
+    def valid(self) -> Bool[Array, "*lanes times"]:
         """Which times were reached."""
         return jnp.all(jnp.isfinite(self.q), axis=-1)
 
@@ -84,7 +84,7 @@ class Trajectory(eqx.Module):
         """Poses and velocities (inertial frame) of all bodies at all times (leading axis: times)."""
         return along.motions(self)
 
-    def point(self, body: str, local=(0.0, 0.0, 0.0)) -> Float[Array, "times 3"]:
+    def point(self, body: str, local=(0.0, 0.0, 0.0)) -> Float[Array, "*lanes times 3"]:
         """Path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m, from the mass centre)."""
         return along.path(self, body, local)
 
@@ -104,11 +104,11 @@ class Trajectory(eqx.Module):
         """Normal and tangential force (N) on the body and friction coefficient needed, of every rolling contact at all times."""
         return along.contact_forces_along(self)
 
-    def residuals(self) -> tuple[Float[Array, "times closures"], Float[Array, "times rows"]]:
+    def residuals(self) -> tuple[Float[Array, "*lanes times closures"], Float[Array, "*lanes times rows"]]:
         """Residuals of the geometric rows (and quaternion norms), and of the velocity rows, at all times."""
         return along.residuals(self)
 
-    def invariants(self) -> dict[str, Float[Array, "times"]]:
+    def invariants(self) -> dict[str, Float[Array, "*lanes times"]]:
         """The quantities that the scene states to be conserved, by name at all times; without the energy."""
         return along.invariants(self)
 
