@@ -66,7 +66,8 @@ def _without_rules(described):
         return described
     if len(described) == 4 and isinstance(described[0], Primitive) and described[0].name.startswith("custom_"):
         primitive, inputs, parameters, outputs = described
-        return primitive, inputs, tuple((name, None if callable(value) else _without_rules(value)) for name, value in parameters), outputs
+        kept = tuple((name, _without_rules(value)) for name, value in parameters if isinstance(value, tuple | str | int | None))
+        return primitive, inputs, kept, outputs
     return tuple(map(_without_rules, described))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import as_real
-from jourdain_jax.motion.input_programs import FunctionOfTime, traced
+from jourdain_jax.motion.input_programs import FunctionOfTime, by_itself, for_programs, traced
 from jourdain_jax.scene.arguments import ChangingInputs
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import checked_real, described, is_traced
@@ -60,6 +60,10 @@ class Inputs(eqx.Module):
         """The vector of inputs at time t."""
         return jnp.stack([jnp.asarray(channel(t), jnp.result_type(float)) for channel in self.channels]) if self.channels else jnp.zeros(0)
 
+    def at(self, t) -> Float[Array, "inputs"]:
+        """The same; compiled where all is known, instead of one operation after another."""
+        return self(t) if self.constant or is_traced(self, t) else _compiled_inputs(self.programs)(self, jnp.asarray(t, jnp.result_type(float)))
+
     @property
     def constant(self) -> bool:
         """Whether all are numbers."""
@@ -81,6 +85,9 @@ class Inputs(eqx.Module):
                 f"rows depend on inputs, whose rates the accelerations need, but one of them cannot be differentiated ({said}); give it as `jj.Sampled`"
             ) from None
         return ChangingInputs(t, values, rates)
+
+
+_compiled_inputs = for_programs(lambda inputs, t: inputs(t), by_itself)
 
 
 def _as_channel(f: Callable, where: str) -> Callable:

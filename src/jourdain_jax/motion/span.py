@@ -28,7 +28,7 @@ def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs):
         t0 = as_end("t", start.t if isinstance(start, State) else 0.0)
     if t1 is None:
         t1 = t0 + scene.example_span if ts is None else ts[-1]
-    start = as_state(scene, start, t0=t0, inputs=None if isinstance(start, State) else inputs(t0))
+    start = as_state(scene, start, t0=t0, inputs=None if isinstance(start, State) else inputs.at(t0))
     if not is_traced(t0, t1):
         check_span(t0, t1)
     if ts is None:

@@ -99,7 +99,7 @@ def start(scene: Scene, *, t0: Number = 0.0, inputs=None, **values) -> State:
     `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; what they are at `t0` counts where velocity rows depend on them.
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
     """
-    return named_start(scene, values, t0, as_inputs(as_scene(scene), inputs)(as_time(t0)))
+    return named_start(scene, values, t0, as_inputs(as_scene(scene), inputs).at(as_time(t0)))
 
 
 def named_start(scene: Scene, values: Mapping, t0, inputs: Float[Array, "inputs"]) -> State:

@@ -4,12 +4,13 @@ Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `
 `result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `fallback`, `quadrature_error`, `inputs` (times, inputs;
 sampled at `ts`), and `parameter:NAME` for every field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
 `speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
-`state_form`, `reduction`, `solver`, `projected`, `event_names`, `recovered`, `versions`.
+`state_form`, `reduction`, `solver`, `projected`, `event_names`, `recovered`, `arrays` (names of all arrays), `versions`.
 `kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `continued` holds
 the numbers of the lanes that were run again with the full state; `ways` in its header says how lanes with a `fallback` were run.
 
 What came after the first files of format 1 may be absent: `kind` is then "trajectory", `last_step` NaN, `fallback` 0 (or 1 in lanes that were
-continued), `quadrature_error` 0, `ways` and `recovered` empty.
+continued), `quadrature_error` 0, `ways`, `recovered` and `arrays` empty. What else is absent, or is not what the names and the number of times ask for, is an
+error, and so is a parameter of the scene's class that the file lacks.
 """
 
 import contextlib
@@ -72,6 +73,7 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
         "static": dict(_static_fields(scene)),
         "event_names": trajectory.event_names,
         "recovered": trajectory.recovered,
+        "arrays": sorted(arrays),
         "versions": {name: version_of(name) for name in ("jourdain-jax", "jax", "diffrax", "numpy")},
     }
     _write(os.path.realpath(path), {"header": np.array(json.dumps(header)), **arrays})
@@ -230,14 +232,15 @@ def _read(path, kind: str) -> tuple[dict, dict]:
         raise ValueError(f"there is no file `{path}`; check the path") from None
     except (OSError, ValueError, TypeError, AttributeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"`{path}` is no {kind} file, or is damaged ({error}); expected an .npz written by `save`") from None
-    if header.get("format") != 1:
+    if header.get("format") != 1 or isinstance(header["format"], bool):
         raise ValueError(f"`{path}` has format {header.get('format')}, expected 1; read it with the version of jourdain-jax that wrote it")
     found = header.setdefault("kind", "trajectory")
     if found != kind:
-        raise ValueError(f"`{path}` holds a {found}, expected a {kind}; read it with `{_READERS.get(found, 'the version of jourdain-jax that wrote it')}`")
+        raise ValueError(f"`{path}` holds a {found}, expected a {kind}; read it with `{_READERS.get(str(found), 'the version of jourdain-jax that wrote it')}`")
     arrays = _later(arrays) | arrays
     missing = [name for name in (*_ARRAYS, "inputs", *(["continued"] if kind == "rollout" else [])) if name not in arrays]
     missing += [name for name in _HEADER if name not in header]
+    missing += [name for name in (header["arrays"] if isinstance(header.get("arrays"), list) else ()) if name not in arrays and not str(name).startswith("parameter:")]
     if missing:
         raise refused(path, f"lacks `{missing[0]}`")
     check_header(path, header)
@@ -252,7 +255,8 @@ def _later(arrays: dict) -> dict:
     like = arrays["t_end"]
     lanes = np.arange(np.size(arrays["result"])).reshape(np.shape(arrays["result"]))
     fallback = np.where(np.isin(lanes, arrays.get("continued", ())), FULL_STATE, AS_ASKED).astype(arrays["result"].dtype)
-    return {"last_step": np.full_like(like, np.nan), "quadrature_error": np.zeros_like(like), "fallback": fallback}
+    real = like.dtype if like.dtype.kind == "f" else float
+    return {"last_step": np.full(like.shape, np.nan, real), "quadrature_error": np.zeros(like.shape, real), "fallback": fallback}
 
 
 def _array_fields(scene: Scene) -> list[str]:

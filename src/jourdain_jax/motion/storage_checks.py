@@ -19,7 +19,7 @@ _STATES = {"q": "coordinates", "u": "speeds", "inputs": "input_names"}  # at all
 _ENDS = {"q_end": "coordinates", "u_end": "speeds"}
 _NUMBERS = ("t_end", "last_step", "quadrature_error", "moved_q", "moved_u", "smallest_pivot")
 _TEXTS = ("scene", "state_form", "reduction", "solver")
-_LISTS = ("coordinates", "speeds", "input_names", "event_names", "recovered")
+_LISTS = ("coordinates", "speeds", "input_names", "event_names", "recovered", "arrays")
 
 
 def refused(path, sentence: str) -> ValueError:
