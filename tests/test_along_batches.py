@@ -58,7 +58,8 @@ def test_the_constraint_forces_hold_the_disc_against_its_weight_and_acceleration
 def test_points_of_bodies_along_a_motion_are_those_at_each_time(moved):
     motions, local = moved.motions(), np.array([0.1, -0.2, 0.3])
     for name, body in motions.bodies.items():
-        assert name in motions and body.orientation.shape == (len(TS), 3, 3)
+        assert name in motions
+        assert body.orientation.shape == (len(TS), 3, 3)
         point = body.point(local)
         np.testing.assert_allclose(point.position, moved.point(name, local), rtol=0, atol=1e-14)
         for i in range(len(TS)):
@@ -91,11 +92,18 @@ def test_a_batch_is_asked_as_its_lanes_are(lanes, quantity):
 def test_names_say_what_they_hold(lanes):
     scene = lanes.lanes.scene
     for name in scene.coordinate_names.entries:
-        assert name in scene.coordinate_names and name in lanes and name in lanes.lane(0)
-    assert "phi" not in scene.coordinate_names and "phi" not in lanes and 3 not in scene.speed_names
+        assert name in scene.coordinate_names
+        assert name in lanes
+        assert name in lanes.lane(0)
+    assert "phi" not in scene.coordinate_names
+    assert "phi" not in lanes
+    assert 3 not in scene.speed_names
     assert list(scene.speed_names) == list(scene.speed_names.entries)
     start = jj.start(SCENES["disc"][0], **SCENES["disc"][1])
-    assert "attitude" in start and "attitude_omega" in start and "t" in lanes and "lean" not in start
+    assert "attitude" in start
+    assert "attitude_omega" in start
+    assert "t" in lanes
+    assert "lean" not in start
 
 
 @pytest.mark.parametrize("kind", ["coordinate", "speed"])
@@ -130,6 +138,9 @@ def test_a_failed_motion_gives_nan_where_it_is_asked_to_and_its_neighbours_keep_
 
     slope, (done, last, end, q, u_end) = jax.grad(loss, has_aux=True)(0.5, jnp.array([1.0, 1e8]))
     assert done.tolist() == [True, False]
-    assert np.isfinite(last).all() and np.isnan(end[1]).all() and np.isnan(q[1]).all() and np.isnan(u_end[1]).all()
+    assert np.isfinite(last).all()
+    assert np.isnan(end[1]).all()
+    assert np.isnan(q[1]).all()
+    assert np.isnan(u_end[1]).all()
     np.testing.assert_allclose(end[0], 0.5 * np.cos(1.0), rtol=1e-7)
     np.testing.assert_allclose(slope, np.cos(1.0), rtol=1e-7)

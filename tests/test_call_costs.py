@@ -1,5 +1,6 @@
 """What a call of `simulate` with functions of time costs: nothing is compiled twice, what is compiled is dropped again, and numbers stay numbers."""
 
+import functools
 import gc
 
 import diffrax
@@ -32,8 +33,8 @@ class Pushed(jj.Scene):
 TS = np.array([0.0, 0.5, 1.0])
 
 
-def moved(f, **options):
-    return jj.simulate(Pushed(), {"x": 0.1}, ts=TS, inputs={"f": f}, **options)
+def moved(f, start=None, **options):
+    return jj.simulate(Pushed(), {"x": 0.1} if start is None else start, ts=TS, inputs={"f": f}, **options)
 
 
 def pulled(k):
@@ -53,14 +54,15 @@ def test_a_new_function_with_other_numbers_compiles_nothing(compilations):
     table = np.array([0.0, 1.0, 3.0])
     kinds = {
         "number": lambda k: lambda t: k * jnp.sin(t),
-        "array": lambda k: lambda t, a=jnp.asarray(k): a * jnp.sin(t),
+        "array": lambda k: functools.partial(lambda a, t: a * jnp.sin(t), jnp.asarray(k)),
         "table": lambda k: lambda t: k * jnp.sin(t) + 0.0 * jnp.interp(t, table, k * table),
     }
+    options = {"start": jj.start(Pushed(), x=0.1), "projection": False}
     for make in kinds.values():
-        moved(make(1.0))
+        moved(make(1.0), **options)
         before = len(compilations)
         for k in (2.0, 3.5):
-            np.testing.assert_allclose(moved(make(k))["x"][-1], pulled(k), atol=1e-7)
+            np.testing.assert_allclose(moved(make(k), **options)["x"][-1], pulled(k), atol=1e-7)
         assert len(compilations) == before
 
 
@@ -103,7 +105,14 @@ def test_a_function_whose_global_or_closure_has_changed_is_another_function():
 
 def test_programs_that_differ_are_told_apart():
     real = jnp.result_type(float)
-    functions = [lambda t: t**2, lambda t: t**3, lambda t: jnp.where(t < 1.0, 1.0, 0.0), lambda t: jnp.where(t < 1.0, 2.0, 0.0), lambda t: 3.0, lambda t: t - 1.0]
+    functions = [
+        lambda t: t**2,
+        lambda t: t**3,
+        lambda t: jnp.where(t < 1.0, 1.0, 0.0),
+        lambda t: jnp.where(t < 1.0, 2.0, 0.0),
+        lambda t: 3.0,
+        lambda t: t - 1.0,
+    ]
     functions += [lambda t: 1.0 - t, lambda t: -t, lambda t: jnp.maximum(t, 0.5), lambda t: jnp.maximum(t, 0.25), lambda t: t / 4.0, lambda t: 4.0 / (t + 1.0)]
     for f in functions:
         traced, shape = input_programs.traced(f, real)
@@ -115,18 +124,18 @@ def test_programs_that_differ_are_told_apart():
 
 
 def test_what_is_compiled_for_functions_is_dropped_when_others_are_used():
-    client, most = jax.devices()[0].client, input_programs.MOST_COMPILED
+    client, most, x = jax.devices()[0].client, input_programs.MOST_COMPILED, jnp.ones(3)
     compiled = input_programs.for_programs(lambda x: jnp.sin(x) + jnp.sum(x), input_programs.by_itself)
 
     def alive(programs):
         for n in programs:
-            compiled((n,))(jnp.ones(n + 1))
+            compiled((n,))(x)
         gc.collect()
         return len(client.live_executables())
 
-    full = alive(range(1, 2 * most))
-    jax.clear_caches()  # what makes the arguments
-    assert alive(range(2 * most, 4 * most)) < full + most + 8
+    none, full = alive(()), alive(range(most))
+    assert full >= none + most
+    assert alive(range(most, 3 * most)) <= full
     kept = input_programs.traced(lambda t: t**2, jnp.result_type(float))[0].program
     for n in range(3, 4 + input_programs.MOST_PROGRAMS):
         input_programs.traced(lambda t, n=n: t**n, jnp.result_type(float))
@@ -135,11 +144,8 @@ def test_what_is_compiled_for_functions_is_dropped_when_others_are_used():
 
 LOSSES = {
     "default": {},
-    "loose": {"rtol": 1e-6, "atol": 1e-6},
     "dense": {"lowering": False},
     "Kvaerno5": {"solver": diffrax.Kvaerno5()},
-    "RadauIIA": {"solver": jj.RadauIIA()},
-    "direct": {"adjoint": diffrax.DirectAdjoint()},
 }
 
 
@@ -173,7 +179,9 @@ def test_inputs_of_any_kind_are_what_they_were_given_as():
     inputs = as_inputs(Pushed(), given)
     for t in (0.1, 0.6, 1.4):
         np.testing.assert_allclose(inputs(t), [np.interp(t, ts, ts**2)] * 2, rtol=1e-14)
-    assert inputs.programs and not inputs.constant and as_inputs(Pushed(), inputs) is inputs
+    assert inputs.programs
+    assert not inputs.constant
+    assert as_inputs(Pushed(), inputs) is inputs
 
 
 def test_motions_go_on_after_the_precision_is_switched():
@@ -181,7 +189,8 @@ def test_motions_go_on_after_the_precision_is_switched():
         found = []
         for scene in (jj.models.Skate(), jj.models.DoublePendulumRods()):
             motion = jj.simulate(scene, t1=0.1, rtol=1e-5, atol=1e-5)
-            assert str(motion) and int(motion.result) == 0
+            assert str(motion)
+            assert int(motion.result) == 0
             found.append(np.asarray(motion.q_end))
         found.append(np.asarray(moved(lambda t: jnp.sin(t), rtol=1e-5, atol=1e-5).q_end))
         return found

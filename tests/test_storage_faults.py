@@ -100,7 +100,7 @@ def _is_as_it_was(read, motion, allowed):
 
 
 def test_whatever_happens_to_an_array_is_noticed(saved, tmp_path):
-    kind, motion, path = saved
+    kind, _, path = saved
     arrays, _ = _contents(path)
     silent = []
     for k, (what, change) in enumerate(spoilt_arrays(arrays)):
@@ -113,10 +113,9 @@ def test_whatever_happens_to_an_array_is_noticed(saved, tmp_path):
             may_be = name == "parameter:drag"  # zero is a drag
         try:
             READ[kind](new, Belt)
-        except ValueError as error:
-            assert str(new) in str(error) or "parameter `" in str(error), (what, str(error))
-        else:
             silent += [] if may_be else [what]
+        except ValueError as error:
+            silent += [] if str(new) in str(error) or "parameter `" in str(error) else [f"{what}: {error}"]
     assert not silent
 
 
@@ -128,12 +127,11 @@ def test_whatever_happens_to_an_entry_of_the_header_is_noticed(saved, tmp_path):
         new, name = rewritten(path, tmp_path / f"{k}.npz", header=change), what.split()[0]
         try:
             read = READ[kind](new, Belt)
-        except ValueError as error:
-            assert str(new) in str(error) or "the file holds" in str(error), (what, str(error))
-        else:
-            labels = name == "arrays" or name in ("reduction", "solver", "projected", "event_names", "recovered", "state_form")
+            labels = name in ("arrays", "reduction", "solver", "projected", "event_names", "recovered", "state_form")
             allowed = name in INFORMATIVE or (name in LATER and "removed" in what) or labels
             silent += [] if _is_as_it_was(read, motion, allowed) else [what]
+        except ValueError as error:
+            silent += [] if str(new) in str(error) or "the file holds" in str(error) else [f"{what}: {error}"]
     assert not silent
 
 
@@ -142,7 +140,6 @@ def test_a_parameter_that_the_file_lacks_is_not_the_default(saved, tmp_path):
     new = rewritten(path, tmp_path / "less.npz", {"parameter:drag": None})
     with pytest.raises(ValueError, match="lacks the parameter `drag` of `Belt`"):
         READ[kind](new, Belt)
-    arrays, header = _contents(path)
     new = rewritten(path, tmp_path / "count.npz", header={"static": {}})
     with pytest.raises(ValueError, match="lacks the parameter `sides` of `Belt`"):
         READ[kind](new, Belt)
@@ -171,9 +168,11 @@ def test_an_interrupted_save_leaves_the_old_file_and_nothing_else(motions, tmp_p
     with pytest.raises(KeyboardInterrupt):
         jj.save(motions["trajectory"], path)
     monkeypatch.undo()
-    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["kept.npz"]
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["kept.npz"]
     jj.save(motions["trajectory"], path)
     jj.load_trajectory(path, Belt)
     (tmp_path / "link.npz").symlink_to(path)
     jj.save(motions["trajectory"], tmp_path / "link.npz")
-    assert (tmp_path / "link.npz").is_symlink() and len(list(tmp_path.iterdir())) == 2
+    assert (tmp_path / "link.npz").is_symlink()
+    assert len(list(tmp_path.iterdir())) == 2

@@ -181,7 +181,7 @@ def _probed_structure(scene: Scene) -> Structure:
     if independent is None:
         independent, by_user = _choose(candidates, count, rank), False
     pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
-    full_everywhere, eps, hidden = all(r == rank for r in ranks), np.finfo(found.A.dtype).eps, found.hidden
+    full_everywhere, eps, hidden = all(r == rank for r in ranks), float(np.finfo(found.A.dtype).eps), found.hidden
     return Structure(
         row_names=names,
         rank=rank,

@@ -61,6 +61,7 @@ def along(f, record: Record, by_inputs: bool = False):
 def _along(f, record: Record, by_inputs: bool):
     if record.q.ndim > 2:
         return eqx.filter_vmap(lambda record: _along(f, record, by_inputs))(record)
+
     def one(t, q, u):
         reached = jnp.all(jnp.isfinite(q))
         t, q, u = (jnp.where(reached, a, b) for a, b in ((t, record.t_end), (q, record.q_end), (u, record.u_end)))

@@ -25,7 +25,7 @@ from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.recovery import LargestError, is_among
 from jourdain_jax.motion.solver_choice import controller_of
-from jourdain_jax.motion.span import times_fit
+from jourdain_jax.motion.span import fitting_times, times_fit
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
 from jourdain_jax.motion.trajectory import Trajectory
@@ -124,20 +124,16 @@ def integrate_lanes(setups: Setup) -> Trajectory:
 
 def _begin(setup: Setup) -> Begun:
     timely = times_fit(setup.ts, setup.t0, setup.t1)
-    right, start = _without_faults(setup.scene, setup.t0, setup.start, timely)
+    right, start = _without_faults(setup.scene, setup.t0, setup.start)
     scene, start, inputs = _mark_inputs(setup.options.adjoint, (setup.scene, start, setup.inputs))
     form = setup.form
     return Begun(right, timely, start, (form, scene, inputs, form.fixed(scene)), form.pack(start.q, start.u))
 
 
 def _fitting(setup: Setup) -> Setup:
-    """The setup, with a span and times that serve any loop where its own do not go together; then the start is NaN, and the motion ends at once."""
-    t0, t1, ts, dt0 = setup.t0, setup.t1, setup.ts, setup.options.dt0
-    fits = times_fit(ts, t0, t1)
-    ts = jnp.where((t1 - ts) * jnp.sign(t1 - t0) < 0, t1, jnp.where((ts - t0) * jnp.sign(t1 - t0) < 0, t0, ts))  # beyond an end by round-off
-    others = jnp.zeros_like(t0), jnp.ones_like(t1), jnp.linspace(0.0, 1.0, ts.shape[-1], dtype=ts.dtype), 1e-4 * jnp.ones_like(dt0)
-    chosen = tuple(jnp.where(fits, own, other) for own, other in zip((t0, t1, ts, dt0), others, strict=True))
-    return eqx.tree_at(lambda s: (s.t0, s.t1, s.ts, s.options.dt0), setup, chosen)
+    """The setup with times that serve any loop, also where its own do not go together."""
+    times = fitting_times(setup.ts, setup.t0, setup.t1, setup.options.dt0)
+    return eqx.tree_at(lambda s: (s.ts, s.t0, s.t1, s.options.dt0), setup, times)
 
 
 def _solved(setup: Setup, begun: Begun) -> Solved:
@@ -153,7 +149,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     moving = form.projects_positions or form.projects_speeds
     stored_first = form.stored(scene, t0, start.q, inputs(t0))
     before_end = (solved.ts - t0) * jnp.sign(t1 - t0) <= (end.t - t0) * jnp.sign(t1 - t0)
-    valid = solved.reached & before_end
+    valid = solved.reached & before_end & begun.timely
 
     def saved_state(t, y, valid):
         # what was never reached holds anything: compute at the end state instead, then mark
@@ -164,7 +160,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (q, u, work)), form.pivot(scene, fixed, t, y, inputs(t))
 
     # the end state as one more saved one, so that all this is compiled once
-    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), (end.t, end.y, jnp.array(True)))
+    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), (end.t, end.y, begun.timely))
     (q, u, work), pivots = jax.vmap(saved_state)(*with_end)
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
@@ -203,11 +199,11 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     )
 
 
-def _without_faults(scene: Scene, t0, start: State, timely):
-    """Whether all parameters are right, and the bodies they make; and the start: NaN where they are not, or times are not, so that such a lane ends at once."""
+def _without_faults(scene: Scene, t0, start: State):
+    """Whether all parameters are right, and the bodies they make; and the start: NaN where they are not, so that such a lane ends at once."""
     faults = *parameter_faults(scene).values(), *body_faults(scene, t0, start.q).values()
     right = ~jnp.any(jnp.stack([jnp.array(False), *faults]))
-    return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right & timely, x, jnp.nan) for x in (start.q, start.u)))
+    return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 
 def _by_lean_loop(setup: Setup, begun: Begun) -> Solved:

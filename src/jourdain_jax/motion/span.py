@@ -14,6 +14,7 @@ from jourdain_jax.scene.numbers import checked_unless_traced, is_traced
 from jourdain_jax.scene.scene import Scene
 
 DEFAULT_SAMPLES = 201
+_SHORT = 1e-9  # s, a span for motions that are not asked for
 _ROUND_OFF = 4  # units in the last place by which a time at an end of the span may lie beyond it
 
 
@@ -62,6 +63,14 @@ def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
     slack = _ROUND_OFF * np.finfo(ts.dtype).eps * xp.maximum(xp.abs(t0), xp.abs(t1))
     from_start, to_end = (ts[0] - t0) * direction, (t1 - ts[-1]) * direction
     return (direction != 0) & xp.isfinite(t1 - t0) & xp.all((ts[1:] - ts[:-1]) * direction > 0) & (from_start >= -slack) & (to_end >= -slack)
+
+
+def fitting_times(ts, t0, t1, dt0):
+    """`ts`, `t0`, `t1` and the first step, where they go together, without the round-off by which a time lies beyond an end; otherwise others, of a short span."""
+    fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
+    inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
+    short = _SHORT * jnp.linspace(0.0, 1.0, ts.shape[-1], dtype=ts.dtype), jnp.zeros_like(t0), _SHORT * jnp.ones_like(t1), 0.1 * _SHORT * jnp.ones_like(dt0)
+    return tuple(jnp.where(fits, own, other) for own, other in zip((inside, t0, t1, dt0), short, strict=True))
 
 
 def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":

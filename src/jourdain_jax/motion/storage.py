@@ -240,7 +240,9 @@ def _read(path, kind: str) -> tuple[dict, dict]:
     arrays = _later(arrays) | arrays
     missing = [name for name in (*_ARRAYS, "inputs", *(["continued"] if kind == "rollout" else [])) if name not in arrays]
     missing += [name for name in _HEADER if name not in header]
-    missing += [name for name in (header["arrays"] if isinstance(header.get("arrays"), list) else ()) if name not in arrays and not str(name).startswith("parameter:")]
+    missing += [
+        name for name in (header["arrays"] if isinstance(header.get("arrays"), list) else ()) if name not in arrays and not str(name).startswith("parameter:")
+    ]
     if missing:
         raise refused(path, f"lacks `{missing[0]}`")
     check_header(path, header)

@@ -29,7 +29,7 @@ def refused(path, sentence: str) -> ValueError:
 
 def check_header(path, header: dict) -> None:
     """ValueError for an entry of the header that is of another kind than `save` writes."""
-    wanted = {name: (str, "a text") for name in _TEXTS} | {name: (list, "a list of names") for name in _LISTS}
+    wanted = dict.fromkeys(_TEXTS, (str, "a text")) | dict.fromkeys(_LISTS, (list, "a list of names"))
     wanted |= {"static": (dict, "a dictionary"), "projected": (bool, "true or false"), "ways": (list, "a list")}
     for name, (kind, text) in wanted.items():
         value = header.get(name, kind())
@@ -52,7 +52,7 @@ def check_arrays(path, header: dict, arrays: dict) -> None:
         if arrays[name].ndim and arrays[name].shape[-1] != counts[what]:
             raise refused(path, f"has {arrays[name].shape[-1]} columns for {counts[what]} {what.replace('_', ' ')}")
     shapes = {"ts": (times,), **{name: (times, counts[what]) for name, what in _STATES.items()}, **{name: (counts[what],) for name, what in _ENDS.items()}}
-    shapes |= {name: () for name in (*_NUMBERS, *COUNTS)} | ({"work": (times,)} if "work" in arrays else {})
+    shapes |= dict.fromkeys((*_NUMBERS, *COUNTS), ()) | ({"work": (times,)} if "work" in arrays else {})
     for name, shape in shapes.items():
         array, expected = arrays[name], (*lead, *shape)
         if array.shape != expected or not times or 0 in lead:
@@ -101,8 +101,8 @@ def check_fields(path, scene: Scene, found: set[str], expected: set[str]) -> Non
     missing = sorted(expected - found)
     if missing:
         raise ValueError(
-            f"`{path}` lacks the parameter `{missing[0]}` of `{type(scene).__name__}`; it is damaged, or was written when the class had none: pass the class as "
-            "it was when the file was written"
+            f"`{path}` lacks the parameter `{missing[0]}` of `{type(scene).__name__}`; it is damaged, or was written when the class had none: "
+            "pass the class as it was when the file was written"
         )
 
 
@@ -122,4 +122,6 @@ def check_scenes(path, scene: Scene, result, *, many: bool) -> None:
         jax.eval_shape(quantities, one)
     except (ValueError, TypeError, IndexError) as error:
         said = str(error).splitlines()[0]
-        raise ValueError(f"`{path}` holds parameters that do not make a `{type(scene).__name__}` ({said}); pass the class as it was when it was written") from None
+        raise ValueError(
+            f"`{path}` holds parameters that do not make a `{type(scene).__name__}` ({said}); pass the class as it was when it was written"
+        ) from None

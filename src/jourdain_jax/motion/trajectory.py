@@ -69,7 +69,7 @@ class Trajectory(eqx.Module):
         return name == "t" or name in self.scene.coordinate_names or name in self.scene.speed_names
 
     @property
-    def succeeded(self) -> Bool[Array, ""]:
+    def succeeded(self) -> Bool[Array, "*lanes"]:
         """Whether the motion reached the end of its span, or an event; also under jit and vmap."""
         return results.is_success(self.result)
 

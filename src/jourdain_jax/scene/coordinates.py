@@ -142,6 +142,6 @@ def _check_names(names: Sequence[str], kind: str) -> None:
         if names.count(name) > 1:
             raise ValueError(f"{kind} name `{name}` is used twice; every {kind} needs a name of its own")
         if name == "t" and kind != "input":
-            raise ValueError(f"{kind} name `t` is taken by the time, so that `motion[\"t\"]` would be two things; choose another")
+            raise ValueError(f'{kind} name `t` is taken by the time, so that `motion["t"]` would be two things; choose another')
         if name in ("array", "slots", "keys"):
             raise ValueError(f"{kind} name `{name}` is taken by the container itself; choose another")

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Vector
 from jourdain_jax.scene.bodies import Body, RigidBody
 from jourdain_jax.scene.names import Named, UnknownNameError, nearest
 from jourdain_jax.scene.numbers import checked_real
