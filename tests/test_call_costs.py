@@ -59,7 +59,7 @@ def test_a_new_function_with_other_numbers_compiles_nothing(compilations):
     }
     options = {"start": jj.start(Pushed(), x=0.1), "projection": False}
     for make in kinds.values():
-        moved(make(1.0), **options)
+        np.testing.assert_allclose(moved(make(1.0), **options)["x"][-1], pulled(1.0), atol=1e-7)
         before = len(compilations)
         for k in (2.0, 3.5):
             np.testing.assert_allclose(moved(make(k), **options)["x"][-1], pulled(k), atol=1e-7)
@@ -187,7 +187,7 @@ def test_inputs_of_any_kind_are_what_they_were_given_as():
 def test_motions_go_on_after_the_precision_is_switched():
     def run():
         found = []
-        for scene in (jj.models.Skate(), jj.models.DoublePendulumRods()):
+        for scene in (jj.models.DoublePendulumRods(),):
             motion = jj.simulate(scene, t1=0.1, rtol=1e-5, atol=1e-5)
             assert str(motion)
             assert int(motion.result) == 0

@@ -4,6 +4,7 @@ Both give states at the saved times, which of those were reached, and where and 
 located (the lean loop does so itself), speeds worked out, and all is put into a `Trajectory`.
 """
 
+from operator import attrgetter
 from typing import Literal
 
 import diffrax
@@ -83,6 +84,11 @@ class Setup(eqx.Module):
     form: StateForm
     options: Options
 
+    def fitting(self) -> "Setup":
+        """The setup with times that serve any loop, also where its own do not go together."""
+        of = attrgetter("ts", "t0", "t1", "options.dt0")
+        return eqx.tree_at(of, self, fitting_times(*of(self)))
+
 
 class Begun(eqx.Module):
     """The start of the integration, marked for the adjoint."""
@@ -96,12 +102,11 @@ class Begun(eqx.Module):
 
 def integrate(setup: Setup) -> Trajectory:
     """The motion of one setup."""
-    compiled = _integrate_dense if setup.form.lowered is None else _integrate_lowered
-    return compiled(setup.inputs.programs)(setup)
+    return (_integrate_dense if setup.form.lowered is None else _integrate_lowered)(setup.inputs.programs)(setup)
 
 
 def _one_motion(setup: Setup) -> Trajectory:
-    begun, fitting = _begin(setup), _fitting(setup)
+    begun, fitting = _begin(setup), setup.fitting()
     return _finish(setup, fitting, begun, _solved(fitting, begun))
 
 
@@ -110,7 +115,7 @@ _integrate_dense, _integrate_lowered = (for_programs(_one_motion, compiled_by) f
 
 def integrate_lanes(setups: Setup) -> Trajectory:
     """The motions of all lanes: `lockstep.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
-    begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(_fitting)(setups)
+    begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
     program = setups.form.lowered
     if setups.options.lean and program is not None:
         solved = in_blocks(_lanes_by_lean_loop, width(program), fitting, begun)
@@ -128,12 +133,6 @@ def _begin(setup: Setup) -> Begun:
     scene, start, inputs = _mark_inputs(setup.options.adjoint, (setup.scene, start, setup.inputs))
     form = setup.form
     return Begun(right, timely, start, (form, scene, inputs, form.fixed(scene)), form.pack(start.q, start.u))
-
-
-def _fitting(setup: Setup) -> Setup:
-    """The setup with times that serve any loop, also where its own do not go together."""
-    times = fitting_times(setup.ts, setup.t0, setup.t1, setup.options.dt0)
-    return eqx.tree_at(lambda s: (s.ts, s.t0, s.t1, s.options.dt0), setup, times)
 
 
 def _solved(setup: Setup, begun: Begun) -> Solved:
@@ -201,8 +200,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
 
 def _without_faults(scene: Scene, t0, start: State):
     """Whether all parameters are right, and the bodies they make; and the start: NaN where they are not, so that such a lane ends at once."""
-    faults = *parameter_faults(scene).values(), *body_faults(scene, t0, start.q).values()
-    right = ~jnp.any(jnp.stack([jnp.array(False), *faults]))
+    right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *body_faults(scene, t0, start.q).values()]))
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 

@@ -66,7 +66,7 @@ def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
 
 
 def fitting_times(ts, t0, t1, dt0):
-    """`ts`, `t0`, `t1` and the first step, where they go together, without the round-off by which a time lies beyond an end; otherwise others, of a short span."""
+    """`ts`, `t0`, `t1` and the first step where they go together, none beyond an end by round-off; otherwise those of a short span."""
     fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
     inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
     short = _SHORT * jnp.linspace(0.0, 1.0, ts.shape[-1], dtype=ts.dtype), jnp.zeros_like(t0), _SHORT * jnp.ones_like(t1), 0.1 * _SHORT * jnp.ones_like(dt0)
