@@ -56,8 +56,8 @@ def test_lanes_whose_bodies_cannot_be_end_with_a_code_and_their_neighbours_move(
         else:
             assert np.isnan(found.lanes.q[i]).all()
     named = {name: found.lane(i).message for i, name in enumerate(LANES)}
-    assert "(body `pebble`)" in named["negative mass"]
-    assert "(body `top`)" in named["products beyond the moments"]
+    assert "(a negative mass or moment of inertia of body `pebble`)" in named["negative mass"]
+    assert "of body `top`)" in named["products beyond the moments"]
     assert "(`radius`)" in named["wrong radius"]
     assert "(`moment`)" in named["no number"]
     assert "body `pebble`" in str(found)

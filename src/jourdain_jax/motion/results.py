@@ -16,7 +16,7 @@ MESSAGES = {
     "`accelerations` and `verify`",
     INCONSISTENT_START: "the start does not meet the constraints and could not be projected onto them",
     SINGULAR_PARTITION: "the privileged speeds came near a configuration where they do not determine the others; use state='full'",
-    BAD_PARAMETER: "a parameter is not finite or has the wrong sign, or makes a mass or an inertia that cannot be",
+    BAD_PARAMETER: "a parameter is not finite or has the wrong sign",
     BAD_START: "the start is not finite; check where its values were computed",
     SHRANK: "ran out of steps, which had shrunk to less than a hundredth of their average: a singularity, a discontinuity or a stiff force near the last time",
     STIFF: "stiff: ran out of steps that stability, not accuracy, keeps short, and an implicit solver did not reach the end either; "

@@ -159,7 +159,10 @@ class Trajectory(eqx.Module):
         """Parameters that are not finite or have the wrong sign, otherwise bodies whose mass or inertia cannot be, as they stand in messages."""
         reference = jnp.asarray(self.scene.coordinates.reference(), self.q.dtype)
         bodies = () if self.wrong_parameters else body_faults(self.scene, self.t_end, reference).items()
-        return (*(f"`{name}`" for name in self.wrong_parameters), *(f"body `{name}`" for name, wrong in bodies if bool(wrong)))
+        return (
+            *(f"`{name}`" for name in self.wrong_parameters),
+            *(f"a negative mass or moment of inertia of body `{name}`" for name, wrong in bodies if bool(wrong)),
+        )
 
     def nan_if_failed(self) -> "Trajectory":
         """The trajectory itself, with NaN in place of its states where it reached neither its end nor an event: under `jit`, `vmap` and `grad`, lane by lane.
