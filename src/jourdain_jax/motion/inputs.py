@@ -118,7 +118,7 @@ def as_inputs(scene: Scene, given) -> Inputs:
     for name in given:
         if name not in scene.inputs.entries:
             raise ValueError(f"`{type(scene).__name__}` has no input `{name}`; {nearest(name, scene.inputs.entries)}")
-    channels = []
+    channels: list[Callable] = []
     for name in scene.inputs.entries:
         value = given.get(name, 0.0)
         advice = "give a number, a function of time, or `jj.Sampled(ts, values)`"

@@ -29,7 +29,7 @@ def refused(path, sentence: str) -> ValueError:
 
 def check_header(path, header: dict) -> None:
     """ValueError for an entry of the header that is of another kind than `save` writes."""
-    wanted = dict.fromkeys(_TEXTS, (str, "a text")) | dict.fromkeys(_LISTS, (list, "a list of names"))
+    wanted: dict[str, tuple[type, str]] = dict.fromkeys(_TEXTS, (str, "a text")) | dict.fromkeys(_LISTS, (list, "a list of names"))
     wanted |= {"static": (dict, "a dictionary"), "projected": (bool, "true or false"), "ways": (list, "a list")}
     for name, (kind, text) in wanted.items():
         value = header.get(name, kind())
