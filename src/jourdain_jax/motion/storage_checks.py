@@ -33,7 +33,7 @@ def check_header(path, header: dict) -> None:
     wanted |= {"static": (dict, "a dictionary"), "projected": (bool, "true or false"), "ways": (list, "a list")}
     for name, (kind, text) in wanted.items():
         value = header.get(name, kind())
-        if not isinstance(value, kind) or (name in _LISTS and not all(isinstance(x, str) for x in value)):
+        if not isinstance(value, kind) or (isinstance(value, list) and name in _LISTS and not all(isinstance(x, str) for x in value)):
             raise refused(path, f"has {described(value)} as `{name}` of its header, expected {text}")
     if header["state_form"] not in ("minimal", "full"):
         raise refused(path, f"has the state form {header['state_form']!r}, expected 'minimal' or 'full'")
