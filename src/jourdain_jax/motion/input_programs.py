@@ -17,6 +17,8 @@ from jax.extend.core import ClosedJaxpr, Literal, Primitive, Var, jaxpr_as_fun
 from jaxtyping import Array, Float
 
 from jourdain_jax.program.calls import description
+from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.what_is_read import WhatIsRead, is_function, is_read_by
 
 MOST_PROGRAMS = 64  # kept, so that equal ones are one object
 MOST_COMPILED = 16  # sets of them for which compiled motions are kept
@@ -84,7 +86,39 @@ class FunctionOfTime(eqx.Module):
 
 
 def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
-    """A function of one time as it is now, and the shape of what it returns; no `FunctionOfTime` where that is not one number."""
+    """A function of one time as it is now, and the shape of what it returns; no `FunctionOfTime` where that is not one number.
+
+    It is traced again where it is another function, or what it reads (`scene/what_is_read.py`) has changed.
+    """
+    if not is_function(function):
+        return _traced_now(function, real)
+    kept = _trace(function)
+    if kept.read is not None and kept.now == (kept.read.now(), real):
+        return kept.found
+    found = _traced_now(function, real)
+    if kept.again and found[0] is not None and not is_traced(found[0].held):
+        kept.read, kept.found = is_read_by(function), found
+        kept.now = kept.read.now(), real
+    kept.again = True
+    return found
+
+
+class _Trace:
+    """The last trace of a function that is given again, and what it read then; of one that is given once, as most in loops are, nothing is kept."""
+
+    def __init__(self) -> None:
+        self.again = False
+        self.read: WhatIsRead | None = None
+        self.now: Hashable = None
+        self.found: tuple[FunctionOfTime | None, object] = (None, None)
+
+
+@lru_cache(maxsize=MOST_PROGRAMS)
+def _trace(function: Callable) -> _Trace:
+    return _Trace()
+
+
+def _traced_now(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
     closed, shape = jax.make_jaxpr(lambda t: function(t), return_shape=True)(jax.ShapeDtypeStruct((), real))  # of a new function JAX keeps no trace
     if getattr(shape, "shape", None) != ():
         return None, shape
