@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -14,9 +15,10 @@ Vector = Real[Array | np.ndarray, "3"] | Sequence[ArrayLike]  # three numbers
 
 def as_real(x) -> Float[Array, "*shape"]:
     """`x` as a floating-point array: integers become the default float, floats keep their type; never weakly typed, so that one trace serves all."""
-    array = jnp.asarray(x)
-    dtype = array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else jnp.result_type(float)
-    return jnp.asarray(array, dtype)
+    array = x if isinstance(x, jax.Array) else jnp.asarray(np.asarray(x, jnp.result_type(float)) if type(x) in (int, float) else x)
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return jnp.asarray(array, array.dtype) if array.weak_type else array
+    return jnp.asarray(array, jnp.result_type(float))
 
 
 def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is put together") -> Array:
@@ -31,15 +33,31 @@ def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advi
     **Raises** ValueError: no real numbers, or another shape.
     """
     try:
-        array = jnp.asarray(value)
+        array = value if isinstance(value, jax.Array) else jnp.asarray(np.asarray(value, jnp.result_type(float)) if type(value) is float else value)
     except (TypeError, ValueError):
         raise ValueError(f"{what} is {described(value)}, expected real numbers; {advice}") from None
+    _check(array, what, shape, advice)
+    return as_real(array)
+
+
+def checked_known(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str = "check how it is put together") -> np.ndarray:
+    """`value`, which is not traced, as a NumPy array of the default float, also inside `jit`. Arguments and errors: as of `checked_real`."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):
+        array = np.array(None)
+    if array.dtype.kind in "OUSMm":
+        raise ValueError(f"{what} is {described(value)}, expected real numbers; {advice}")
+    _check(array, what, shape, advice)
+    return array.astype(jnp.result_type(float))
+
+
+def _check(array, what: str, shape: tuple[int, ...] | None, advice: str) -> None:
     if not jnp.issubdtype(array.dtype, jnp.integer) and not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(f"{what} is of type {array.dtype}, expected real numbers; {advice}")
     if shape is not None and array.shape != shape:
         expected = "one number" if shape == () else str(shape)
         raise ValueError(f"{what} has shape {array.shape}, expected {expected}; {advice}")
-    return as_real(array)
 
 
 def described(value) -> str:

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.scene.answers import contacts_of
@@ -77,6 +77,22 @@ def _normal_velocities(scene: Scene, pose: Pose, contacts: dict[str, Contact]) -
         lengths = [jnp.sum(jnp.abs(x)) for x in (origin_rate, plane.velocity, arm, normal_rate, plane.angular_velocity)]
         found[name] = jnp.stack([by_pose, by_velocity, lengths[0] + lengths[1] + lengths[2] * (lengths[3] + lengths[4])])
     return found
+
+
+def body_faults(scene: Scene, t, q) -> dict[str, Bool[Array, ""]]:
+    """Body name -> whether its mass is negative, or its inertia has a negative principal moment; also under jit and vmap. What is NaN is no fault of a body."""
+    bodies = {name: body.body for name, body in pose_at(scene, t, q).bodies.items()}
+    return {name: (body.mass < 0) | (_is_negative(body.inertia) if isinstance(body, RigidBody) else False) for name, body in bodies.items()}
+
+
+def _is_negative(I) -> Bool[Array, ""]:
+    """Whether a symmetric matrix has an eigenvalue below zero: by its principal minors."""
+    I = jax.lax.stop_gradient(I)
+    size = jnp.max(jnp.abs(I))
+    I = I / jnp.where(size > 0, size, 1.0) + _TOLERANCE * jnp.eye(3, dtype=I.dtype)
+    minors = [I[i, i] for i in range(3)] + [I[i, i] * I[j, j] - I[i, j] * I[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
+    whole = sum(I[0, i] * (I[1, (i + 1) % 3] * I[2, (i + 2) % 3] - I[1, (i + 2) % 3] * I[2, (i + 1) % 3]) for i in range(3))
+    return jnp.any(jnp.stack([*minors, whole]) < 0)
 
 
 def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:

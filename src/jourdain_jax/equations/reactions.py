@@ -30,28 +30,28 @@ from jourdain_jax.scene.scene import Scene
 
 
 class RowReactions(eqx.Module):
-    """The constraint force of every row on every body, and what it does directly on the speeds."""
+    """The constraint force of every row on every body, and what it does directly on the speeds; along a motion with a first axis of times."""
 
-    multipliers: Float[Array, "rows"]
-    force: Float[Array, "rows bodies 3"]  # N
-    torque: Float[Array, "rows bodies 3"]  # N m, about the mass centre; zero for particles
-    direct: Float[Array, "rows speeds"]  # on speeds, from rows written in coordinates, rates or speeds
-    determined: Bool[Array, "rows"]  # whether the multiplier is unique; False where rows are dependent and it is of minimum norm
+    multipliers: Float[Array, "*times rows"]
+    force: Float[Array, "*times rows bodies 3"]  # N
+    torque: Float[Array, "*times rows bodies 3"]  # N m, about the mass centre; zero for particles
+    direct: Float[Array, "*times rows speeds"]  # on speeds, from rows written in coordinates, rates or speeds
+    determined: Bool[Array, "*times rows"]  # whether the multiplier is unique; False where rows are dependent and it is of minimum norm
     row_names: tuple[str, ...] = eqx.field(static=True)
     body_names: tuple[str, ...] = eqx.field(static=True)
 
-    def forces_on(self, body: str) -> dict[str, Float[Array, "3"]]:
+    def forces_on(self, body: str) -> dict[str, Float[Array, "*times 3"]]:
         """Force on one body (N), by row."""
         return self._by_row(self.force, body)
 
-    def torques_on(self, body: str) -> dict[str, Float[Array, "3"]]:
+    def torques_on(self, body: str) -> dict[str, Float[Array, "*times 3"]]:
         """Torque on one body about its mass centre (N m), by row."""
         return self._by_row(self.torque, body)
 
     def _by_row(self, values, body):
         if body not in self.body_names:
             raise UnknownNameError(f"no body `{body}` in this scene; {nearest(body, self.body_names)}")
-        return {row: values[s, self.body_names.index(body)] for s, row in enumerate(self.row_names)}
+        return {row: values[..., s, self.body_names.index(body), :] for s, row in enumerate(self.row_names)}
 
 
 class ContactForce(eqx.Module):

@@ -169,7 +169,7 @@ def structure_of(scene: Scene) -> Structure:
     ValueError where no admissible state is found, where bodies do not move smoothly, where a motion that the rows leave free has no inertia, or
     `privileged` names unknown or too few speeds; for known parameters also where numbers of its bodies or planes cannot be.
     """
-    with without_collecting():
+    with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
         structure = _probed_structure(as_scene(scene))
     if structure.faults and not is_traced(scene):  # numbers that stand in for traced parameters prove nothing
         raise ValueError(structure.faults[0])
@@ -229,7 +229,7 @@ def _probed_structure(scene: Scene) -> Structure:
     if independent is None:
         independent, by_user = _choose(candidates, count, rank), False
     pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
-    full_everywhere, eps, hidden = all(r == rank for r in ranks), np.finfo(found.A.dtype).eps, found.hidden
+    full_everywhere, eps, hidden = all(r == rank for r in ranks), float(np.finfo(found.A.dtype).eps), found.hidden
     redundant = _redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
     return Structure(
         row_names=names,

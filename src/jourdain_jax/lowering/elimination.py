@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.pivots import FEW, Pivot, Pivots, products
@@ -24,7 +24,15 @@ class Eliminated:
 def serves(pivots: list[int], probes: Probes | FormalProbes) -> Bool[np.ndarray, "probes"]:
     """At which probes what was divided by these pivots is more than round-off: none of them is small beside its usual size."""
     sizes = np.abs(probes(pivots))
-    return np.all(sizes > SMALLEST_PIVOT * np.nanmedian(sizes, axis=1, keepdims=True), axis=0)
+    return np.all(sizes > SMALLEST_PIVOT * usual(sizes)[:, None], axis=0)
+
+
+def usual(sizes: Float[np.ndarray, "nodes probes"]) -> Float[np.ndarray, "nodes"]:
+    """The median of each over the probes at which it is a number; NaN where it is none at any."""
+    known = np.any(~np.isnan(sizes), axis=1)
+    found = np.full(len(sizes), np.nan)
+    found[known] = np.nanmedian(sizes[known], axis=1)
+    return found
 
 
 def eliminate(graph: Graph, A: list[list[int]], right: list[list[int]], probes: Probes, far: Callable[[], Probes] | None = None) -> Eliminated:

@@ -22,7 +22,7 @@ from jourdain_jax.equations.structure import Structure, structure_of
 from jourdain_jax.equations.trace import event_values, named_values, traced_scene
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.blame import blamed
-from jourdain_jax.lowering.elimination import serves
+from jourdain_jax.lowering.elimination import serves, usual
 from jourdain_jax.lowering.far import full_turns, on_velocity_rows
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
@@ -98,7 +98,7 @@ class _Key:
 @lru_cache(maxsize=256)
 def _lowered(key: _Key) -> Lowered | NotLowered:
     try:
-        with without_collecting():
+        with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
             return _built(key)
     except NotLowered as reason:
         return NotLowered(str(reason))  # kept without its traceback
@@ -203,7 +203,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         ydot=ydot,
         z=z,
         pivots=pivots,
-        typical=tuple(np.nanmedian(np.abs(probes(pivots)), axis=1).tolist()),
+        typical=tuple(usual(np.abs(probes(pivots))).tolist()),
         guards=guards,
         power=None if structure.driven else power[0],
         events=events,
@@ -255,7 +255,7 @@ def _dense_rates(independent: tuple[int, ...], eliminates: bool, one_by_one: boo
 
     `one_by_one`: what JAX traces serves one state at a time, which halves the time that tracing takes.
     """
-    columns = np.array(independent, int)
+    columns = np.array(independent, np.int32)  # also for a precision that is switched afterwards
 
     def one(scene, t, q, y, inputs):
         if eliminates:

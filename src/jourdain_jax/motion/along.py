@@ -14,6 +14,7 @@ from jourdain_jax.equations.reactions import ContactForce, RowReactions, contact
 from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.structure import structure_of, usual_rows
 from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy
+from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.scene.answers import invariants_of
 from jourdain_jax.scene.motion_state import Motion
@@ -49,12 +50,17 @@ class Record(Protocol):
     recovered: tuple[str, ...]
 
 
-@eqx.filter_jit
 def along(f, record: Record, by_inputs: bool = False):
     """`f(scene, t, q, u, inputs)` at all times; NaN at times that were not reached. f must be a named function or a module (it is a cache key).
 
-    `by_inputs`: f needs the rates of the inputs.
+    `by_inputs`: f needs the rates of the inputs, where rows depend on some that change. Of a batch of motions: with its axes of lanes first.
     """
+    return _compiled(record.inputs.programs)(f, record, by_inputs and _needs_rates(record))
+
+
+def _along(f, record: Record, by_inputs: bool):
+    if record.q.ndim > 2:
+        return eqx.filter_vmap(lambda record: _along(f, record, by_inputs))(record)
 
     def one(t, q, u):
         reached = jnp.all(jnp.isfinite(q))
@@ -65,50 +71,54 @@ def along(f, record: Record, by_inputs: bool = False):
     return jax.vmap(one)(record.ts, record.q, record.u)
 
 
+_compiled = for_programs(_along, by_itself)
+
+
 def motions(record: Record) -> Motion:
     """Poses and velocities of all bodies (leading axis: times)."""
     return along(motion_at, record)
 
 
-def path(record: Record, body: str, local) -> Float[Array, "times 3"]:
+def path(record: Record, body: str, local) -> Float[Array, "*lanes times 3"]:
     """Path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m, from the mass centre)."""
     local = checked_real(local, f"point of body `{body}`", (3,), advice="give three components in its body frame, m")
     return along(_Point(body, local.astype(record.q.dtype)), record)
 
 
-def energies(record: Record) -> tuple[Float[Array, "times"], Float[Array, "times"]]:
+def energies(record: Record) -> tuple[Float[Array, "*lanes times"], Float[Array, "*lanes times"]]:
     """Kinetic and potential energy, J."""
     return along(_energies, record)
 
 
 def accelerations_along(record: Record, usual: UsualRows | None = None) -> Accelerations:
     """Accelerations, multipliers, rank and smallest singular value; `usual`: from `usual_rows`, for a record whose parameters are traced."""
-    return along(_Accelerations(jax.tree.map(jnp.asarray, usual_rows(record.scene) if usual is None else usual)), record, _needs_rates(record))
+    return along(_Accelerations(jax.tree.map(jnp.asarray, usual_rows(record.scene) if usual is None else usual)), record, by_inputs=True)
 
 
 def reactions_along(record: Record) -> RowReactions:
     """Constraint forces per row and per body."""
-    return along(_reactions, record, _needs_rates(record))
+    return along(_reactions, record, by_inputs=True)
 
 
 def contact_forces_along(record: Record) -> dict[str, ContactForce]:
     """Normal and tangential force and the friction coefficient needed, of every rolling contact."""
-    return along(_contacts, record, _needs_rates(record))
+    return along(_contacts, record, by_inputs=True)
 
 
-def residuals(record: Record) -> tuple[Float[Array, "times closures"], Float[Array, "times rows"]]:
+def residuals(record: Record) -> tuple[Float[Array, "*lanes times closures"], Float[Array, "*lanes times rows"]]:
     """Residuals of the geometric rows and quaternion norms, and of the velocity rows."""
     return along(_residuals, record)
 
 
-def invariants(record: Record) -> dict[str, Float[Array, "times"]]:
+def invariants(record: Record) -> dict[str, Float[Array, "*lanes times"]]:
     """The quantities that the scene is known to conserve."""
     return along(_invariants, record)
 
 
 def _needs_rates(record: Record) -> bool:
     """Whether accelerations depend on the rates of the inputs."""
-    return not record.inputs.constant and structure_of(record.scene).rows_of_inputs
+    scene = jax.tree.map(lambda x: x[(0,) * (record.q.ndim - 2)], record.scene)  # of a batch, the first
+    return not record.inputs.constant and structure_of(scene).rows_of_inputs
 
 
 class _Point(eqx.Module):

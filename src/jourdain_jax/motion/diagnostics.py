@@ -21,12 +21,12 @@ from jourdain_jax.motion.results import FALLBACKS
 class Energies(eqx.Module):
     """Energies along a motion, in J. `balance` is constant for a right motion: T + V, less the work done where some is tracked."""
 
-    kinetic: Float[Array, "times"]
-    potential: Float[Array, "times"]
-    work: Float[Array, "times"] | None
+    kinetic: Float[Array, "*lanes times"]
+    potential: Float[Array, "*lanes times"]
+    work: Float[Array, "*lanes times"] | None
 
     @property
-    def balance(self) -> Float[Array, "times"]:
+    def balance(self) -> Float[Array, "*lanes times"]:
         """T + V - W; W is the work of forces without potential and of rows that do work."""
         total = self.kinetic + self.potential
         return total if self.work is None else total - self.work

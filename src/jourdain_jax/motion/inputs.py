@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import as_real
+from jourdain_jax.motion.input_programs import FunctionOfTime, by_itself, for_programs, traced
 from jourdain_jax.scene.arguments import ChangingInputs
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.what_is_read import WhatIsRead, is_function, is_read_by
 
 
 class Sampled(eqx.Module):
@@ -51,21 +51,6 @@ class Constant(eqx.Module):
         return self.value
 
 
-class FunctionOfTime(eqx.Module):
-    """An input as a given function of time: no numbers of its own, so that motions with it can be batched."""
-
-    function: Callable = eqx.field(static=True)
-    read: WhatIsRead  # globals and closures: a change of them makes another input
-
-    def __init__(self, function: Callable):
-        self.function = function
-        self.read = is_read_by(function) if is_function(function) else is_read_by()
-
-    def __call__(self, t):
-        """Value at time t."""
-        return self.function(t)
-
-
 class Inputs(eqx.Module):
     """All inputs of a scene, in order; `inputs(t)` is their vector."""
 
@@ -75,10 +60,19 @@ class Inputs(eqx.Module):
         """The vector of inputs at time t."""
         return jnp.stack([jnp.asarray(channel(t), jnp.result_type(float)) for channel in self.channels]) if self.channels else jnp.zeros(0)
 
+    def at(self, t) -> Float[Array, "inputs"]:
+        """The same; compiled where all is known, instead of one operation after another."""
+        return self(t) if self.constant or is_traced(self, t) else _compiled_inputs(self.programs)(self, jnp.asarray(t, jnp.result_type(float)))
+
     @property
     def constant(self) -> bool:
         """Whether all are numbers."""
         return all(isinstance(channel, Constant) for channel in self.channels)
+
+    @property
+    def programs(self) -> tuple:
+        """What is done with time, of the channels that are functions."""
+        return tuple(channel.program for channel in self.channels if isinstance(channel, FunctionOfTime))
 
     def near(self, t) -> ChangingInputs:
         """Values and rates at time t; a ValueError for functions that JAX cannot differentiate."""
@@ -93,17 +87,23 @@ class Inputs(eqx.Module):
         return ChangingInputs(t, values, rates)
 
 
-def _check_function(f: Callable, where: str) -> None:
-    """ValueError unless `f` of one time is one number; nothing is computed."""
+_compiled_inputs = for_programs(lambda inputs, t: inputs(t), by_itself)
+
+
+def _as_channel(f: Callable, where: str) -> Callable:
+    """A function of time as a channel, or a ValueError unless `f` of one time is one number; nothing is computed."""
     advice = "give a function of one time that returns one number, such as `lambda t: jnp.sin(t)`"
     try:
-        found = jax.eval_shape(f, jax.ShapeDtypeStruct((), jnp.result_type(float)))
+        channel, found = traced(f, jnp.result_type(float))
     except TypeError as error:
         raise ValueError(f"{where} cannot be called with a time ({str(error).splitlines()[0]}); {advice}") from None
     if not hasattr(found, "shape"):
         raise ValueError(f"{where} returned {described(found)}, expected one number; {advice}")
     if found.shape != ():
         raise ValueError(f"{where} returned an array of shape {found.shape}, expected one number; {advice}")
+    leaves = jax.tree.leaves(f)
+    plain = len(leaves) == 1 and leaves[0] is f  # a module may hold arrays to be differentiated, and is kept as it is
+    return channel if plain and channel is not None else f
 
 
 def as_inputs(scene: Scene, given) -> Inputs:
@@ -118,16 +118,15 @@ def as_inputs(scene: Scene, given) -> Inputs:
     for name in given:
         if name not in scene.inputs.entries:
             raise ValueError(f"`{type(scene).__name__}` has no input `{name}`; {nearest(name, scene.inputs.entries)}")
-    channels = []
+    channels: list[Callable] = []
     for name in scene.inputs.entries:
         value = given.get(name, 0.0)
         advice = "give a number, a function of time, or `jj.Sampled(ts, values)`"
         where = f"input `{name}` of `{type(scene).__name__}`"
-        if callable(value):
-            _check_function(value, where)
-            leaves = jax.tree.leaves(value)
-            plain = len(leaves) == 1 and leaves[0] is value  # a module may hold arrays to be differentiated, and is kept as it is
-            channels.append(FunctionOfTime(value) if plain else value)
-            continue
-        channels.append(Constant(checked_real(value, where, (), advice=advice)))
+        if isinstance(value, Sampled):  # its own numbers are checked where it is made
+            channels.append(value)
+        elif callable(value):
+            channels.append(_as_channel(value, where))
+        else:
+            channels.append(Constant(checked_real(value, where, (), advice=advice)))
     return Inputs(tuple(channels))

@@ -4,6 +4,7 @@ Both give states at the saved times, which of those were reached, and where and 
 located (the lean loop does so itself), speeds worked out, and all is put into a `Trajectory`.
 """
 
+from operator import attrgetter
 from typing import Literal
 
 import diffrax
@@ -13,16 +14,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.calculus.guards import forward_only, reverse_only
+from jourdain_jax.equations.plausibility import body_faults
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion import lean_loop, results
 from jourdain_jax.motion.event_location import Located, locate
 from jourdain_jax.motion.finite_derivatives import Flat
 from jourdain_jax.motion.guarded_solver import GuardedSolver, for_adjoint
+from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.land_on import land_on
 from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.recovery import LargestError, is_among
 from jourdain_jax.motion.solver_choice import controller_of
+from jourdain_jax.motion.span import fitting_times, times_fit
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
 from jourdain_jax.motion.trajectory import Trajectory
@@ -81,11 +85,17 @@ class Setup(eqx.Module):
     form: StateForm
     options: Options
 
+    def fitting(self) -> "Setup":
+        """The setup with times that serve any loop, also where its own do not go together."""
+        of = attrgetter("ts", "t0", "t1", "options.dt0")
+        return eqx.tree_at(of, self, fitting_times(*of(self)))
+
 
 class Begun(eqx.Module):
     """The start of the integration, marked for the adjoint."""
 
-    right: Bool[Array, ""]  # whether all parameters are
+    right: Bool[Array, ""]  # whether all parameters are, and the masses and inertias that they make
+    timely: Bool[Array, ""]  # whether the times go together
     start: State
     args: tuple  # form, scene, inputs, what the rates need of the scene
     y0: Integrated
@@ -93,44 +103,44 @@ class Begun(eqx.Module):
 
 def integrate(setup: Setup) -> Trajectory:
     """The motion of one setup."""
-    return (_integrate_dense if setup.form.lowered is None else _integrate_lowered)(setup)
+    return (_integrate_dense if setup.form.lowered is None else _integrate_lowered)(setup.inputs.programs)(setup)
 
 
 def _one_motion(setup: Setup) -> Trajectory:
-    begun = _begin(setup)
-    return _finish(setup, begun, _solved(setup, begun))
+    begun, fitting = _begin(setup), setup.fitting()
+    return _finish(setup, fitting, begun, _solved(fitting, begun))
 
 
-_integrate_dense, _integrate_lowered = eqx.filter_jit(_one_motion), quickly_compiled(_one_motion)
+_integrate_dense, _integrate_lowered = (for_programs(_one_motion, compiled_by) for compiled_by in (by_itself, quickly_compiled))
 
 
-@eqx.filter_jit
 def integrate_lanes(setups: Setup) -> Trajectory:
     """The motions of all lanes: `lockstep.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
-    begun = eqx.filter_vmap(_begin)(setups)
+    begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
     program = setups.form.lowered
     if setups.options.lean and program is not None:
-        solved = in_blocks(_lanes_by_lean_loop, width(program), setups, begun)
+        solved = in_blocks(_lanes_by_lean_loop, width(program), fitting, begun)
     else:
         # lanes often share their times: what XLA knows to be the same in all of them it moves through diffrax's `nextafter`, one operation per pass
-        times = jax.lax.optimization_barrier((setups.t0, setups.t1, setups.options.dt0))
-        timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.options.dt0), setups, times)
+        times = jax.lax.optimization_barrier((fitting.t0, fitting.t1, fitting.options.dt0))
+        timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.options.dt0), fitting, times)
         solved = eqx.filter_vmap(_solved)(timed, begun)
-    return eqx.filter_vmap(_finish)(setups, begun, solved)
+    return eqx.filter_vmap(_finish)(setups, fitting, begun, solved)
 
 
 def _begin(setup: Setup) -> Begun:
-    right, start = _without_faults(setup.scene, setup.start)
+    timely = times_fit(setup.ts, setup.t0, setup.t1)
+    right, start = _without_faults(setup.scene, setup.t0, setup.start)
     scene, start, inputs = _mark_inputs(setup.options.adjoint, (setup.scene, start, setup.inputs))
     form = setup.form
-    return Begun(right, start, (form, scene, inputs, form.fixed(scene)), form.pack(start.q, start.u))
+    return Begun(right, timely, start, (form, scene, inputs, form.fixed(scene)), form.pack(start.q, start.u))
 
 
 def _solved(setup: Setup, begun: Begun) -> Solved:
     return (_by_lean_loop if setup.options.lean else _by_diffrax)(setup, begun)
 
 
-def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
+def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
     t0, t1, form, options, adjoint = setup.t0, setup.t1, setup.form, setup.options, setup.options.adjoint
     start, args = begun.start, begun.args
     _, scene, inputs, fixed = args
@@ -139,7 +149,7 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
     moving = form.projects_positions or form.projects_speeds
     stored_first = form.stored(scene, t0, start.q, inputs(t0))
     before_end = (solved.ts - t0) * jnp.sign(t1 - t0) <= (end.t - t0) * jnp.sign(t1 - t0)
-    valid = solved.reached & before_end
+    valid = solved.reached & before_end & begun.timely
 
     def saved_state(t, y, valid):
         # what was never reached holds anything: compute at the end state instead, then mark
@@ -150,23 +160,24 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
         return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (q, u, work)), form.pivot(scene, fixed, t, y, inputs(t))
 
     # the end state as one more saved one, so that all this is compiled once
-    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), (end.t, end.y, jnp.array(True)))
+    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), (end.t, end.y, begun.timely))
     (q, u, work), pivots = jax.vmap(saved_state)(*with_end)
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
     return Trajectory(
         scene=setup.scene,
-        ts=solved.ts,
+        ts=jnp.where(begun.timely, solved.ts, given.ts) if options.saveat is None else solved.ts,
         q=q[:-1],
         u=u[:-1],
         work=None if work is None else work[:-1],
-        t_end=end.t,
+        t_end=jnp.where(begun.timely, end.t, given.t0),
         q_end=q[-1],
         u_end=u[-1],
         result=results.with_causes(
             _result(solved.code, end.y, start, pivot if form.needs_pivot else jnp.inf),
             parameters=begun.right,
+            times=begun.timely,
             start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
             moved=solved.accepted > 0,
         ),
@@ -189,9 +200,9 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
     )
 
 
-def _without_faults(scene: Scene, start: State):
-    """Whether all parameters are right, and the start: NaN where they are not, so that such a lane ends at once."""
-    right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values()]))
+def _without_faults(scene: Scene, t0, start: State):
+    """Whether all parameters are right, and the bodies they make; and the start: NaN where they are not, so that such a lane ends at once."""
+    right = ~jnp.any(jnp.stack([jnp.array(False), *parameter_faults(scene).values(), *body_faults(scene, t0, start.q).values()]))
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 

@@ -16,11 +16,9 @@ from jourdain_jax.scene.numbers import is_traced
 _OPTIONS: dict[str, Any] = {"compiler_options": {"xla_cpu_use_fusion_emitters": False}}
 
 
-def quickly_compiled(f: Callable) -> Callable:
-    """`f`, compiled as by `equinox.filter_jit`; on a CPU with the quick options, but for calls inside another transformation: JAX takes options of whole
-    programs only.
-    """
-    plain, quick = eqx.filter_jit(f), eqx.filter_jit(f, **_OPTIONS)
+def quickly_compiled(f: Callable, compiler: Callable = eqx.filter_jit) -> Callable:
+    """`f`, compiled by `compiler`; on a CPU with the quick options, but for calls inside another transformation: JAX takes options of whole programs only."""
+    plain, quick = compiler(f), compiler(f, **_OPTIONS)
 
     def run(*arguments):
         return (quick if jax.default_backend() == "cpu" and _outermost(arguments) else plain)(*arguments)

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START, UNSOLVED_STEP = range(10)
-SHRANK, STIFF, OFF_CONSTRAINTS = 10, 11, 12
+SHRANK, STIFF, OFF_CONSTRAINTS, BAD_TIMES = 10, 11, 12, 13
 MOST_PROJECTED = 0.5  # of the change by a step
 
 MESSAGES = {
@@ -25,6 +25,7 @@ MESSAGES = {
     "put a row in the place of a stiff spring or damper, or loosen the tolerances",
     OFF_CONSTRAINTS: "a step of constant length ended so far from the constraints that the projection moved it by more than half of its change: take shorter "
     "steps, step-size control (`stepsize_controller`), or look for rows that lose rank",
+    BAD_TIMES: "the times to save at leave the span or are not in order, or the span is empty or not finite; give increasing `ts` between `t0` and `t1`",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step (`dt0`), or look for a singularity there",
 }
 
@@ -40,11 +41,19 @@ FALLBACKS = {
 }
 
 
-def with_causes(code, *, parameters: Bool[Array, ""], start: Bool[Array, ""], moved: Bool[Array, ""]) -> Int[Array, ""]:
-    """The code with the cause where one is known: whether the `parameters` are right, the `start` is finite, and any step was accepted (`moved`)."""
+def is_success(code: Int[Array, "*lanes"]) -> Bool[Array, "*lanes"]:
+    """Whether a motion reached the end of its span, or an event."""
+    return (jnp.asarray(code) == SUCCESS) | (jnp.asarray(code) == EVENT)
+
+
+def with_causes(code, *, parameters: Bool[Array, ""], times: Bool[Array, ""], start: Bool[Array, ""], moved: Bool[Array, ""]) -> Int[Array, ""]:
+    """The code with the cause where one is known: whether the `parameters` are right, the `times` go together, the `start` is finite, and any step was
+    accepted (`moved`).
+    """
     # no step, however short: the accelerations themselves are at fault
     code = jnp.where((code == STEP_TOO_SMALL) & ~moved, NOT_FINITE, code)
     code = jnp.where(start, code, BAD_START)
+    code = jnp.where(times, code, BAD_TIMES)
     return jnp.where(parameters, code, BAD_PARAMETER).astype(jnp.int32)
 
 

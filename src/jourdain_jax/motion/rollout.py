@@ -18,9 +18,11 @@ from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.motion import results
 from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.fallbacks import changed_options, fallen_back, lost_codes, next_way
+from jourdain_jax.motion.input_programs import by_itself, for_programs
+from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.simulate import MOST_STEPS, TOLERANCE, default_solver, set_up, state_form, warn_float32
-from jourdain_jax.motion.span import check_span, saved_times
+from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import StateForm
 from jourdain_jax.motion.stiff import OUT_OF_STEPS
@@ -50,6 +52,9 @@ class Rollout(Printed, eqx.Module):
     def __getitem__(self, name: str) -> Float[Array, "lanes times *shape"]:
         """A coordinate or speed by name, of all lanes at all times."""
         return jax.vmap(lambda lane: lane[name])(self.lanes)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.lanes
 
     def lane(self, index: int) -> Trajectory:
         """The motion of the lane with number `index`, as a `Trajectory`; IndexError where there is none."""
@@ -106,8 +111,7 @@ class Rollout(Printed, eqx.Module):
         return "\n".join(lines)
 
     def _wrong_parameters(self, lanes: np.ndarray) -> str:
-        names = dict.fromkeys(name for i in lanes for name in self.lane(int(i)).wrong_parameters)
-        return f" ({', '.join(f'`{name}`' for name in names)})"
+        return f" ({', '.join(dict.fromkeys(name for i in lanes for name in self.lane(int(i)).faults))})"
 
 
 def rollout(
@@ -136,10 +140,9 @@ def rollout(
     parameters = {} if parameters is None else {name: checked_real(value, f"parameter `{name}`") for name, value in parameters.items()}
     fixed, varied, count = _lanes(scene, starts, parameters)
     chunk = _chunk(scene, count, chunk, options)
-    if options.get("ts") is not None:
-        options["ts"] = saved_times(options["ts"])
-    _check_span_of_lanes(starts, options)
-    if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, fixed, varied, parameters))):
+    _check_times_of_lanes(scene, starts, options)
+    options["inputs"] = as_inputs(scene, options.get("inputs"))
+    if is_traced((scene, fixed, varied, parameters, options)):
         return Rollout(_together(scene, fixed, _with_arrays(options), varied, parameters))  # being differentiated or batched: one piece, no host loop
     pieces = []
     sound = _sound_lane(scene, parameters)
@@ -167,14 +170,19 @@ def rollout(
     return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(continued.tolist()), tuple(sorted(ways.items())))
 
 
-def _check_span_of_lanes(starts, options: dict) -> None:
-    """Where both ends are given and known: inside the lanes they are traced, and nothing is refused."""
-    t1, t0 = options.get("t1"), options.get("t0")
-    if t1 is None or (t0 is None and isinstance(starts, State)):
+def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:
+    """Where all lanes have one span and it is known. Inside the lanes it is traced: a lane whose own time does not fit gets a result code."""
+    ts = None if options.get("ts") is None else saved_times(options["ts"])
+    t0, t1 = (as_end(name, options.get(name)) for name in ("t0", "t1"))
+    if t0 is None and isinstance(starts, State):
         return
-    t0, t1 = (checked_real(x, f"`{name}`", (), advice="give one time in s") for name, x in (("t0", 0.0 if t0 is None else t0), ("t1", t1)))
-    if not is_traced(t0, t1):
-        check_span(t0, t1)
+    t0 = as_end("t0", 0.0) if t0 is None else t0
+    t1 = (t0 + scene.example_span if ts is None else ts[-1]) if t1 is None else t1
+    if is_traced(t0, t1, ts):
+        return
+    check_span(t0, t1)
+    if ts is not None:
+        check_times(ts, t0, t1)
 
 
 def _sound_lane(scene: Scene, parameters: dict) -> Scene:
@@ -218,9 +226,12 @@ def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajec
     return jax.tree.unflatten(treedef, new)
 
 
-@eqx.filter_jit
 def _together(scene, fixed, options, varied, parameters) -> Trajectory:
     """All given lanes in lockstep; compiled once for scenes and lanes of one shape."""
+    return _compiled(options["inputs"].programs)(scene, fixed, options, varied, parameters)
+
+
+def _lanes_in_lockstep(scene, fixed, options, varied, parameters) -> Trajectory:
 
     def lane(varied, parameters):
         own = scene.replace(**parameters) if parameters else scene
@@ -229,16 +240,19 @@ def _together(scene, fixed, options, varied, parameters) -> Trajectory:
     return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
 
 
+_compiled = for_programs(_lanes_in_lockstep, by_itself)
+
+
 def _with_arrays(options: dict) -> dict:
     """Options with their numbers as arrays: another tolerance, first step or end is no other program."""
     options = {"rtol": TOLERANCE, "atol": TOLERANCE} | options
-    numbers = {name: options[name] for name in ("rtol", "atol", "dt0", "t1") if options.get(name) is not None}
-    check_options(**{name: value for name, value in numbers.items() if name != "t1"})
+    numbers = {name: options[name] for name in ("rtol", "atol", "dt0", "t0", "t1", "ts") if options.get(name) is not None}
+    check_options(**{name: value for name, value in numbers.items() if name in ("rtol", "atol", "dt0")})
     if options.get("solver") is None:
         options["solver"] = default_solver(options["rtol"])
     real = jnp.result_type(float)
     warn_float32(real, options["rtol"])
-    return options | {name: checked_real(value, f"`{name}`", ()).astype(real) for name, value in numbers.items()}
+    return options | {name: checked_real(value, f"`{name}`", None if name == "ts" else ()).astype(real) for name, value in numbers.items()}
 
 
 def _first_time(options: dict):

@@ -25,7 +25,7 @@ from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.fallbacks import changed_options, fallen_back, next_way
 from jourdain_jax.motion.fixed_step import FixedStepSolver
-from jourdain_jax.motion.inputs import as_inputs
+from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integration import Options, Setup, integrate
 from jourdain_jax.motion.recovery import recovering
 from jourdain_jax.motion.sensitivity import watched
@@ -150,7 +150,7 @@ def _set_up(
         event_names=names_of_events(scene) if events else (),
     )
     form = recovering(form, recover, options)
-    start = _on_constraints(scene, t0, start, inputs(t0), made_here) if projection else start
+    start = _on_constraints(scene, t0, start, inputs, made_here) if projection else start
     return Setup(scene, start, inputs, t0, t1, ts, form, options)
 
 
@@ -174,16 +174,16 @@ def _check_adjoint(adjoint) -> None:
         )
 
 
-def _on_constraints(scene: Scene, t0, start: State, inputs, made_here: bool) -> State:
+def _on_constraints(scene: Scene, t0, start: State, inputs: Inputs, made_here: bool) -> State:
     """The start on the constraints, with how far it has moved from what was given; one made here is there already, unless what was given kept it off."""
 
     def moved_again(start: State) -> State:
-        state = consistent(scene, t0, start.q, start.u, inputs)
+        state = consistent(scene, t0, start.q, start.u, inputs.at(t0))
         moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
         return eqx.tree_at(lambda s: (s.moved_q, s.moved_u), state, tuple(moved))
 
     if not made_here:
-        return consistent(scene, t0, start.q, start.u, inputs)
+        return consistent(scene, t0, start.q, start.u, inputs.at(t0))
     off = start.residual > _OFF * jnp.finfo(start.q.dtype).eps
     if is_traced(off):
         return jax.lax.cond(eqxi.unvmap_any(off), moved_again, lambda start: start, start)

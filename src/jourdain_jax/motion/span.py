@@ -1,42 +1,47 @@
-"""The span of a motion and the times to save at, checked where they are known."""
+"""The span of a motion and the times to save at, checked where they are known; and whether they go together where they are traced.
 
-import jax
+t0 <= ts_1 < ts_2 < ... <= t1,   or the other way round in reversed time
+"""
+
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.motion.start import State
-from jourdain_jax.scene.numbers import checked_real
+from jourdain_jax.scene.numbers import checked_unless_traced, is_traced
 from jourdain_jax.scene.scene import Scene
 
 DEFAULT_SAMPLES = 201
+_SHORT = 1e-9  # s, a span for motions that are not asked for
+_ROUND_OFF = 4  # units in the last place by which a time at an end of the span may lie beyond it
 
 
 def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs):
-    """The start as a state (with the inputs at t0), t0, the times to save at, t1; a ValueError where they do not go together."""
+    """The start as a state (with the inputs at t0), t0, the times to save at, t1; a ValueError where they are known and do not go together."""
     real = jnp.result_type(float)
+    if isinstance(start, State) and start.q.ndim != 1:
+        raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
     ts = None if ts is None else saved_times(ts)
-    for name, value in (("t0", t0), ("t1", t1)):
-        if value is not None:
-            checked_real(value, f"`{name}`", (), advice="give one time in s")
+    t0, t1 = (as_end(name, value) for name, value in (("t0", t0), ("t1", t1)))
     if t0 is None:
-        t0 = start.t if isinstance(start, State) else 0.0
+        t0 = as_end("t", start.t if isinstance(start, State) else 0.0)
     if t1 is None:
         t1 = t0 + scene.example_span if ts is None else ts[-1]
-    start = as_state(scene, start, t0=t0, inputs=None if isinstance(start, State) else inputs(jnp.asarray(t0, real)))
-    if start.q.ndim != 1:
-        raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
-    t0, t1 = jnp.asarray(t0, real), jnp.asarray(t1, real)
-    known = not isinstance(t0, jax.core.Tracer) and not isinstance(t1, jax.core.Tracer)
-    if known:
+    start = as_state(scene, start, t0=t0, inputs=None if isinstance(start, State) else inputs.at(t0))
+    if not is_traced(t0, t1):
         check_span(t0, t1)
     if ts is None:
-        first, last = (np.asarray(t0), np.asarray(t1)) if known else (t0, t1)  # known numbers: nothing to compile
-        return start, t0, jnp.asarray(first + (last - first) * np.linspace(0.0, 1.0, DEFAULT_SAMPLES), real), t1
-    _check_inside(ts, t0, t1)
-    return start, t0, ts, t1
+        ts = t0 + (t1 - t0) * np.linspace(0.0, 1.0, DEFAULT_SAMPLES)  # of known ends: nothing to compile
+    elif not is_traced(ts, t0, t1):
+        check_times(ts, t0, t1)
+    return start, *(jnp.asarray(x, real) for x in (t0, ts, t1))
+
+
+def as_end(name: str, value):
+    """One end of the span; None stays. A ValueError where it is no number."""
+    return None if value is None else checked_unless_traced(value, f"`{name}`", (), advice="give one time in s")
 
 
 def check_span(t0, t1) -> None:
@@ -45,22 +50,36 @@ def check_span(t0, t1) -> None:
         raise ValueError(f"the span from t0 = {t0} to t1 = {t1} s is empty or not finite; give a finite `t1` different from `t0`")
 
 
-def _check_inside(ts, t0, t1) -> None:
-    if any(isinstance(x, jax.core.Tracer) for x in (ts, t0, t1)):
-        return
-    first, last = (float(ts[0]), float(ts[-1])) if t1 > t0 else (float(ts[-1]), float(ts[0]))
-    backwards = ts.shape[0] > 1 and bool((ts[-1] > ts[0]) != (t1 > t0))
-    if backwards or first < min(t0, t1) or last > max(t0, t1):
+def check_times(ts, t0, t1) -> None:
+    """ValueError for known times to save at that leave the span, or go against it."""
+    if not times_fit(ts, t0, t1):
         raise ValueError(f"`ts` runs from {ts[0]} to {ts[-1]} s, outside of the span from t0 = {t0} to t1 = {t1} s or against it; give `t0` and `t1` around it")
 
 
-def saved_times(ts) -> Float[Array, "times"]:
-    """Times to save at, as an array; a ValueError where they are no monotonic vector of finite numbers."""
-    ts = checked_real(ts, "`ts`", advice="give a vector of times in s").astype(jnp.result_type(float))
+def times_fit(ts, t0, t1) -> "Bool[Array, ''] | np.bool_":
+    """Whether the span is finite and not empty, and the times to save at lie in it, one after another; also of traced times."""
+    xp = jnp if is_traced(ts, t0, t1) else np
+    direction = xp.sign(t1 - t0)
+    slack = _ROUND_OFF * np.finfo(ts.dtype).eps * xp.maximum(xp.abs(t0), xp.abs(t1))
+    from_start, to_end = (ts[0] - t0) * direction, (t1 - ts[-1]) * direction
+    return (direction != 0) & xp.isfinite(t1 - t0) & xp.all((ts[1:] - ts[:-1]) * direction > 0) & (from_start >= -slack) & (to_end >= -slack)
+
+
+def fitting_times(ts, t0, t1, dt0):
+    """`ts`, `t0`, `t1` and the first step where they go together, none beyond an end by round-off; otherwise those of a short span."""
+    fits, direction = times_fit(ts, t0, t1), jnp.sign(t1 - t0)
+    inside = jnp.where((t1 - ts) * direction < 0, t1, jnp.where((ts - t0) * direction < 0, t0, ts))
+    short = _SHORT * jnp.linspace(0.0, 1.0, ts.shape[-1], dtype=ts.dtype), jnp.zeros_like(t0), _SHORT * jnp.ones_like(t1), 0.1 * _SHORT * jnp.ones_like(dt0)
+    return tuple(jnp.where(fits, own, other) for own, other in zip((inside, t0, t1, dt0), short, strict=True))
+
+
+def saved_times(ts) -> "Float[Array, 'times'] | Float[np.ndarray, 'times']":
+    """Times to save at, on NumPy where they are known; a ValueError where they are no monotonic vector of finite numbers."""
+    ts = checked_unless_traced(ts, "`ts`", advice="give a vector of times in s")
     if ts.ndim != 1 or ts.shape[0] == 0:
         raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
-    if not isinstance(ts, jax.core.Tracer):
-        steps = np.diff(np.asarray(ts))
-        if not np.all(np.isfinite(np.asarray(ts))) or not (np.all(steps > 0) or np.all(steps < 0)):
+    if not is_traced(ts):
+        steps = np.diff(ts)
+        if not np.all(np.isfinite(ts)) or not (np.all(steps > 0) or np.all(steps < 0)):
             raise ValueError("`ts` must be finite and strictly increasing (or decreasing, for reversed time); sort it and drop repeated times")
     return ts

@@ -54,6 +54,9 @@ class State(Printed, eqx.Module):
         coordinates, speeds = (names.view(x) for names, x in zip(self.names, (self.q, self.u), strict=True))
         return coordinates[name] if name in coordinates else speeds[name]
 
+    def __contains__(self, name: str) -> bool:
+        return any(name in names for names in self.names)
+
     def _text(self) -> str:
         if self.q.ndim > 1:
             return f"States of shape {self.q.shape[:-1]}: {', '.join((*self.names[0].entries, *self.names[1].entries))}"
@@ -197,7 +200,7 @@ def start(scene: Scene, *, t0: Number = 0.0, inputs=None, **values) -> State:
     `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; what they are at `t0` counts where velocity rows depend on them.
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
     """
-    return named_start(scene, values, t0, as_inputs(as_scene(scene), inputs)(as_time(t0)))
+    return named_start(scene, values, t0, as_inputs(as_scene(scene), inputs).at(as_time(t0)))
 
 
 def named_start(scene: Scene, values: Mapping, t0, inputs: Float[Array, "inputs"]) -> State:

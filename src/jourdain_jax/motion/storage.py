@@ -4,16 +4,19 @@ Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `
 `result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `fallback`, `quadrature_error`, `inputs` (times, inputs;
 sampled at `ts`), and `parameter:NAME` for every field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
 `speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
-`state_form`, `reduction`, `solver`, `projected`, `event_names`, `recovered`, `versions`.
+`state_form`, `reduction`, `solver`, `projected`, `event_names`, `recovered`, `arrays` (names of all arrays), `versions`.
 `kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `continued` holds
 the numbers of the lanes that were run again with the full state; `ways` in its header says how lanes with a `fallback` were run.
 
 What came after the first files of format 1 may be absent: `kind` is then "trajectory", `last_step` NaN, `fallback` 0 (or 1 in lanes that were
-continued), `quadrature_error` 0, `ways` and `recovered` empty.
+continued), `quadrature_error` 0, `ways`, `recovered` and `arrays` empty. What else is absent, or is not what the names and the number of times ask for, is an
+error, and so is a parameter of the scene's class that the file lacks.
 """
 
+import contextlib
 import json
 import os
+import secrets
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -26,6 +29,7 @@ import numpy as np
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.results import AS_ASKED, BAD_PARAMETER, FULL_STATE
 from jourdain_jax.motion.rollout import Rollout
+from jourdain_jax.motion.storage_checks import COUNTS, check_arrays, check_fields, check_header, check_scenes, refused
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.motion.versions import version_of
 from jourdain_jax.scene.names import nearest
@@ -33,8 +37,7 @@ from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
-_COUNTS = ("result", "event", "accepted", "rejected", "fallback")
-_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", *_COUNTS, "last_step", "quadrature_error", "moved_q", "moved_u", "smallest_pivot")
+_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", *COUNTS, "last_step", "quadrature_error", "moved_q", "moved_u", "smallest_pivot")
 _TEXTS = ("state_form", "reduction", "solver", "projected")
 _HEADER = ("scene", "coordinates", "speeds", "input_names", "static", "event_names", *_TEXTS)
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
@@ -43,6 +46,7 @@ _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load
 def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
     """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of `motion/storage.py`).
 
+    A file that is there already is replaced at once, when the new one is whole: an interruption leaves the old one.
     Inputs are stored as samples at the saved times. ValueError where the path is a folder, or the scene has a field that is no array, number or text.
     Read it with `load_trajectory` or `load_rollout`.
     """
@@ -69,10 +73,25 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
         "static": dict(_static_fields(scene)),
         "event_names": trajectory.event_names,
         "recovered": trajectory.recovered,
+        "arrays": sorted(arrays),
         "versions": {name: version_of(name) for name in ("jourdain-jax", "jax", "diffrax", "numpy")},
     }
-    with open(path, "wb") as file:  # a handle, so that numpy does not append a suffix to the name
-        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+    _write(os.path.realpath(path), {"header": np.array(json.dumps(header)), **arrays})
+
+
+def _write(path: str, arrays: dict) -> None:
+    """The whole file or, where writing is interrupted, what was there before: written beside it under another name, which then takes its place."""
+    beside = os.path.join(os.path.dirname(path), f".{os.path.basename(path)}.{secrets.token_hex(8)}")
+    try:
+        with open(beside, "xb") as file:  # a handle, so that numpy does not append a suffix to the name
+            np.savez_compressed(file, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(beside)
+        raise
 
 
 def _sampled(inputs: Inputs, ts):
@@ -118,8 +137,11 @@ def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Traj
     kind = _checked_class(path, scene, header, arrays)
     arrays["input_ts"], arrays["inputs"] = _samples(arrays["ts"], arrays["inputs"])
     if int(arrays["result"]) == BAD_PARAMETER:  # what cannot be built by itself: as a lane, where parameters are not looked at
-        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), _lanes(kind, header, {name: x[None] for name, x in arrays.items()}))
-    return _trajectory(kind, header, arrays)
+        lanes = _lanes(path, kind, header, {name: x[None] for name, x in arrays.items()})
+        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), lanes)
+    motion = _trajectory(path, kind, header, arrays)
+    check_scenes(path, motion.scene, motion.result, many=False)
+    return motion
 
 
 def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout:
@@ -136,17 +158,23 @@ def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout
     arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in lanes])
     arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in lanes])
     ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header.get("ways", ()))
-    return Rollout(_lanes(kind, header, arrays), continued, ways)
+    return Rollout(_lanes(path, kind, header, arrays), continued, ways)
 
 
-def _lanes(kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
+def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
     """Trajectories from arrays with a leading axis of lanes, which may be failed ones: built under `vmap`, where no value is refused."""
-    return jax.vmap(lambda arrays: _trajectory(kind, header, arrays))(arrays)
+    lanes = jax.vmap(lambda arrays: _trajectory(path, kind, header, arrays))(arrays)
+    check_scenes(path, lanes.scene, lanes.result, many=True)
+    return lanes
 
 
-def _trajectory(kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
+def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
     values = {name.removeprefix("parameter:"): value for name, value in arrays.items() if name.startswith("parameter:")}
-    scene = kind(**values, **header["static"])
+    try:
+        scene = kind(**values, **header["static"])
+    except TypeError as error:
+        raise refused(path, f"does not hold what makes a `{kind.__name__}` ({str(error).splitlines()[0]})") from None
+    check_fields(path, scene, {*values, *header["static"]}, {*_array_fields(scene), *(name for name, _ in _static_fields(scene))})
     for name, now in (("coordinates", scene.coordinate_names), ("speeds", scene.speed_names), ("input_names", scene.inputs)):
         if tuple(header[name]) != now.entries:
             raise ValueError(
@@ -182,10 +210,11 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
     for name in (*(name.removeprefix("parameter:") for name in arrays if name.startswith("parameter:")), *header["static"]):
         if name not in known:
             raise ValueError(f"`{path}` has a parameter `{name}` that `{kind.__name__}` has not; {nearest(name, known)}")
-    counts = {"coordinates": arrays["q"].shape[-1], "speeds": arrays["u"].shape[-1], "input_names": arrays["inputs"].shape[-1]}
-    for name, count in counts.items():
-        if len(header[name]) != count:
-            raise ValueError(f"`{path}` has {count} columns for {len(header[name])} {name.replace('_', ' ')}; it is damaged or was not written by `save`")
+    for name, value in arrays.items():
+        if name.startswith("parameter:") and value.dtype.kind not in "fiub":
+            raise refused(path, f"has `{name.removeprefix('parameter:')}` of type {value.dtype}, expected numbers")
+        if name.startswith("parameter:") and header["kind"] == "rollout" and value.shape[:1] != arrays["result"].shape:
+            raise refused(path, f"has `{name.removeprefix('parameter:')}` of shape {value.shape}, expected one value for each of {len(arrays['result'])} lanes")
     return kind
 
 
@@ -203,16 +232,21 @@ def _read(path, kind: str) -> tuple[dict, dict]:
         raise ValueError(f"there is no file `{path}`; check the path") from None
     except (OSError, ValueError, TypeError, AttributeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"`{path}` is no {kind} file, or is damaged ({error}); expected an .npz written by `save`") from None
-    if header.get("format") != 1:
+    if header.get("format") != 1 or isinstance(header["format"], bool):
         raise ValueError(f"`{path}` has format {header.get('format')}, expected 1; read it with the version of jourdain-jax that wrote it")
     found = header.setdefault("kind", "trajectory")
     if found != kind:
-        raise ValueError(f"`{path}` holds a {found}, expected a {kind}; read it with `{_READERS.get(found, 'the version of jourdain-jax that wrote it')}`")
+        raise ValueError(f"`{path}` holds a {found}, expected a {kind}; read it with `{_READERS.get(str(found), 'the version of jourdain-jax that wrote it')}`")
     arrays = _later(arrays) | arrays
     missing = [name for name in (*_ARRAYS, "inputs", *(["continued"] if kind == "rollout" else [])) if name not in arrays]
     missing += [name for name in _HEADER if name not in header]
+    missing += [
+        name for name in (header["arrays"] if isinstance(header.get("arrays"), list) else ()) if name not in arrays and not str(name).startswith("parameter:")
+    ]
     if missing:
-        raise ValueError(f"`{path}` lacks `{missing[0]}`; it is damaged or was not written by `save`")
+        raise refused(path, f"lacks `{missing[0]}`")
+    check_header(path, header)
+    check_arrays(path, header, arrays)
     return header, arrays
 
 
@@ -223,7 +257,8 @@ def _later(arrays: dict) -> dict:
     like = arrays["t_end"]
     lanes = np.arange(np.size(arrays["result"])).reshape(np.shape(arrays["result"]))
     fallback = np.where(np.isin(lanes, arrays.get("continued", ())), FULL_STATE, AS_ASKED).astype(arrays["result"].dtype)
-    return {"last_step": np.full_like(like, np.nan), "quadrature_error": np.zeros_like(like), "fallback": fallback}
+    real = like.dtype if like.dtype.kind == "f" else float
+    return {"last_step": np.full(like.shape, np.nan, real), "quadrature_error": np.zeros(like.shape, real), "fallback": fallback}
 
 
 def _array_fields(scene: Scene) -> list[str]:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.equations.accelerations import Accelerations
+from jourdain_jax.equations.plausibility import body_faults
 from jourdain_jax.equations.reactions import ContactForce, RowReactions
 from jourdain_jax.motion import along, results
 from jourdain_jax.motion.diagnostics import Energies, diagnose, energies_of, summary, summary_html, warnings_of
@@ -18,7 +19,11 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Trajectory(eqx.Module):
-    """The motion of a scene. Times after an early end (event, failure) hold NaN; `t_end`, `q_end`, `u_end` are the last state."""
+    """The motion of a scene. Times after an early end (event, failure) hold NaN.
+
+    `t_end`, `q_end`, `u_end` are the last state that was reached, of a failed motion the one at which it failed. What is made of them by itself, such as a
+    loss to be minimised, takes `motion.nan_if_failed()`, or looks at `motion.succeeded`.
+    """
 
     scene: Scene
     ts: Float[Array, "times"]  # s
@@ -60,8 +65,16 @@ class Trajectory(eqx.Module):
         valid = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries, "t")
         raise UnknownNameError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}")
 
+    def __contains__(self, name: str) -> bool:
+        return name == "t" or name in self.scene.coordinate_names or name in self.scene.speed_names
+
     @property
-    def valid(self) -> Bool[Array, "times"]:
+    def succeeded(self) -> Bool[Array, "*lanes"]:
+        """Whether the motion reached the end of its span, or an event; also under jit and vmap."""
+        return results.is_success(self.result)
+
+    @property
+    def valid(self) -> Bool[Array, "*lanes times"]:
         """Which times were reached."""
         return jnp.all(jnp.isfinite(self.q), axis=-1)
 
@@ -71,7 +84,7 @@ class Trajectory(eqx.Module):
         """Poses and velocities (inertial frame) of all bodies at all times (leading axis: times)."""
         return along.motions(self)
 
-    def point(self, body: str, local=(0.0, 0.0, 0.0)) -> Float[Array, "times 3"]:
+    def point(self, body: str, local=(0.0, 0.0, 0.0)) -> Float[Array, "*lanes times 3"]:
         """Path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m, from the mass centre)."""
         return along.path(self, body, local)
 
@@ -91,11 +104,11 @@ class Trajectory(eqx.Module):
         """Normal and tangential force (N) on the body and friction coefficient needed, of every rolling contact at all times."""
         return along.contact_forces_along(self)
 
-    def residuals(self) -> tuple[Float[Array, "times closures"], Float[Array, "times rows"]]:
+    def residuals(self) -> tuple[Float[Array, "*lanes times closures"], Float[Array, "*lanes times rows"]]:
         """Residuals of the geometric rows (and quaternion norms), and of the velocity rows, at all times."""
         return along.residuals(self)
 
-    def invariants(self) -> dict[str, Float[Array, "times"]]:
+    def invariants(self) -> dict[str, Float[Array, "*lanes times"]]:
         """The quantities that the scene states to be conserved, by name at all times; without the energy."""
         return along.invariants(self)
 
@@ -122,7 +135,7 @@ class Trajectory(eqx.Module):
         code = int(self.result)
         text = results.MESSAGES[code]
         if code == results.BAD_PARAMETER:
-            return f"{text} ({', '.join(f'`{name}`' for name in self.wrong_parameters)}); check where it was computed"
+            return f"{text} ({', '.join(self.faults)}); check where it was computed"
         return f"{text} `{self.event_names[int(self.event)]}`" if code == results.EVENT else text
 
     @property
@@ -140,6 +153,27 @@ class Trajectory(eqx.Module):
     def wrong_parameters(self) -> tuple[str, ...]:
         """Names of the scene's parameters that are not finite or have the wrong sign."""
         return tuple(name for name, wrong in parameter_faults(self.scene).items() if bool(wrong))
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Parameters that are not finite or have the wrong sign, otherwise bodies whose mass or inertia cannot be, as they stand in messages."""
+        reference = jnp.asarray(self.scene.coordinates.reference(), self.q.dtype)
+        bodies = () if self.wrong_parameters else body_faults(self.scene, self.t_end, reference).items()
+        return (
+            *(f"`{name}`" for name in self.wrong_parameters),
+            *(f"a negative mass or moment of inertia of body `{name}`" for name, wrong in bodies if bool(wrong)),
+        )
+
+    def nan_if_failed(self) -> "Trajectory":
+        """The trajectory itself, with NaN in place of its states where it reached neither its end nor an event: under `jit`, `vmap` and `grad`, lane by lane.
+
+            loss = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0).nan_if_failed().q_end[0]
+
+        Lanes that are left out of a loss by `jnp.where(motion.succeeded, ..., 0.0)` do not disturb its derivatives by what all lanes share.
+        """
+        parts = [x for x in (self.q, self.u, self.q_end, self.u_end, self.work) if x is not None]
+        marked = [jnp.where(jnp.expand_dims(self.succeeded, tuple(range(jnp.ndim(self.result), x.ndim))), x, jnp.nan) for x in parts]
+        return eqx.tree_at(lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None], self, marked)
 
     def raise_if_failed(self) -> "Trajectory":
         """The trajectory itself; a SimulationError with reason and time where it did not reach its end or an event."""

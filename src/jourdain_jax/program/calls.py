@@ -22,7 +22,7 @@ class Call:
 
     def __init__(self, closed, reasons: tuple[str, ...]):
         self.closed, self.reasons = closed, reasons
-        self._described = _described(closed)
+        self._described = description(closed)
         self._hash = hash(self._described)
 
     def __hash__(self):
@@ -107,22 +107,22 @@ AT_PROBES: dict[str, Callable] = {
 }
 
 
-def _described(x) -> Hashable:
+def description(x) -> Hashable:
     """What tells a jaxpr, or a parameter of an operation, from another; two traces of one function have the same, unless they hold new functions."""
     if hasattr(x, "consts") and hasattr(x, "jaxpr"):
-        return "closed", _described(x.jaxpr), tuple(map(_described, x.consts))
+        return "closed", description(x.jaxpr), tuple(map(description, x.consts))
     if hasattr(x, "eqns"):
         number = {v: k for k, v in enumerate([*x.constvars, *x.invars])}
         lines: list = [tuple(str(v.aval) for v in number)]
         for equation in x.eqns:
-            inputs = tuple(_described(v.val) if isinstance(v, Literal) else number[v] for v in equation.invars)
+            inputs = tuple(description(v.val) if isinstance(v, Literal) else number[v] for v in equation.invars)
             number |= {v: len(number) + k for k, v in enumerate(equation.outvars)}
-            lines.append((equation.primitive, inputs, _described(equation.params), tuple(str(v.aval) for v in equation.outvars)))
-        return *lines, tuple(_described(v.val) if isinstance(v, Literal) else number[v] for v in x.outvars)
+            lines.append((equation.primitive, inputs, description(equation.params), tuple(str(v.aval) for v in equation.outvars)))
+        return *lines, tuple(description(v.val) if isinstance(v, Literal) else number[v] for v in x.outvars)
     if isinstance(x, dict):
-        return tuple((key, _described(value)) for key, value in sorted(x.items()))
+        return tuple((key, description(value)) for key, value in sorted(x.items()))
     if isinstance(x, tuple | list):
-        return tuple(map(_described, x))
+        return tuple(map(description, x))
     if isinstance(x, np.ndarray | np.generic | jax.Array | float):
         return str(np.asarray(x).dtype), np.shape(x), np.asarray(x).tobytes()
     try:

@@ -5,7 +5,7 @@ angular velocity, `attitude_omega_x`, `..._y`, `..._z`, with `d attitude/dt = 1/
 """
 
 import keyword
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -43,6 +43,12 @@ class Names:
 
     def __len__(self) -> int:
         return len(self.entries)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.entries)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.entries or any(name == group for group, _, _ in self.groups)
 
 
 @dataclass(frozen=True)
@@ -135,5 +141,7 @@ def _check_names(names: Sequence[str], kind: str) -> None:
             raise ValueError(f"{kind} name `{name}` is a word of Python's own, so that `q.{name}` cannot be written; choose another")
         if names.count(name) > 1:
             raise ValueError(f"{kind} name `{name}` is used twice; every {kind} needs a name of its own")
+        if name == "t" and kind != "input":
+            raise ValueError(f'{kind} name `t` is taken by the time, so that `motion["t"]` would be two things; choose another')
         if name in ("array", "slots", "keys"):
             raise ValueError(f"{kind} name `{name}` is taken by the container itself; choose another")

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Vector
 from jourdain_jax.scene.bodies import Body, RigidBody
 from jourdain_jax.scene.names import Named, UnknownNameError, nearest
 from jourdain_jax.scene.numbers import checked_real
@@ -17,9 +16,9 @@ from jourdain_jax.scene.numbers import checked_real
 class Point(eqx.Module):
     """A point of a body (or of the inertial frame, `body` None): where it is and how fast it moves."""
 
-    position: Float[Array, "3"]  # m, inertial frame
-    velocity: Float[Array, "3"]  # m/s, inertial frame
-    arm: Float[Array, "3"]  # m, from the mass centre of the body to the point, inertial frame
+    position: Float[Array, "*times 3"]  # m, inertial frame
+    velocity: Float[Array, "*times 3"]  # m/s, inertial frame
+    arm: Float[Array, "*times 3"]  # m, from the mass centre of the body to the point, inertial frame
     body: str | None = eqx.field(static=True, default=None)
 
 
@@ -48,7 +47,9 @@ class BodyPose(eqx.Module):
     @property
     def orientation(self) -> Float[Array, "*times 3 3"]:
         """Rotation matrix, body to space; the identity for a particle."""
-        return self.body.orientation if isinstance(self.body, RigidBody) else jnp.eye(3, dtype=self.body.position.dtype)
+        if isinstance(self.body, RigidBody):
+            return self.body.orientation
+        return jnp.broadcast_to(jnp.eye(3, dtype=self.position.dtype), (*self.position.shape, 3))
 
     def place(self, local) -> Float[Array, "*times 3"]:
         """Position (inertial frame) of the point with body-frame coordinates `local` (m, relative to the mass centre)."""
@@ -61,8 +62,8 @@ class BodyMotion(eqx.Module):
 
     name: str = eqx.field(static=True)
     body: Body
-    velocity: Float[Array, "3"]  # m/s, mass centre, inertial frame
-    angular_velocity: Float[Array, "3"]  # rad/s, inertial frame; zero for a particle
+    velocity: Float[Array, "*times 3"]  # m/s, mass centre, inertial frame
+    angular_velocity: Float[Array, "*times 3"]  # rad/s, inertial frame; zero for a particle
 
     mass = BodyPose.mass
     position = BodyPose.position
@@ -74,9 +75,14 @@ class BodyMotion(eqx.Module):
         """Angular velocity in body components, rad/s."""
         return jnp.einsum("...ji,...j->...i", self.orientation, self.angular_velocity)
 
-    def velocity_at(self, position: Vector) -> Float[Array, "3"]:
-        """Velocity (m/s, inertial frame) of the material point at `position` (m, inertial frame): `v + omega x (position - r)`."""
-        position = checked_real(position, f"point of body `{self.name}`", (3,), advice="give three components in the inertial frame, m")
+    def velocity_at(self, position) -> Float[Array, "*times 3"]:
+        """Velocity (m/s, inertial frame) of the material point at `position` (m, inertial frame): `v + omega x (position - r)`.
+
+        `position`: three components, or along a motion three at each time.
+        """
+        where, advice = f"point of body `{self.name}`", "give three components in the inertial frame, m"
+        position = checked_real(position, where, advice=advice)
+        position = checked_real(position, where, self.position.shape if position.ndim > 1 else (3,), advice=advice)
         return self.velocity + jnp.cross(self.angular_velocity, position - self.position)
 
     def point(self, local=(0.0, 0.0, 0.0)) -> Point:
@@ -95,6 +101,9 @@ class Pose(eqx.Module):
     def __getitem__(self, name: str) -> BodyPose:
         return _lookup(self.bodies, name)
 
+    def __contains__(self, name: str) -> bool:
+        return name in self.bodies
+
 
 class Motion(eqx.Module):
     """Time, coordinates, speeds, inputs and the motion of all bodies; `motion["disc"].velocity`, `motion.u.yaw_rate`."""
@@ -108,6 +117,9 @@ class Motion(eqx.Module):
 
     def __getitem__(self, name: str) -> BodyMotion:
         return _lookup(self.bodies, name)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.bodies
 
     def pose(self) -> Pose:
         """The same without velocities."""

@@ -1,0 +1,208 @@
+"""What a call of `simulate` with functions of time costs: nothing is compiled twice, what is compiled is dropped again, and numbers stay numbers."""
+
+import functools
+import gc
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.motion import input_programs
+from jourdain_jax.motion.inputs import as_inputs
+
+K = 2.0
+
+
+class Pushed(jj.Scene):
+    """A mass that two inputs push, on a spring."""
+
+    stiffness: jnp.ndarray = jj.parameter(4.0, unit="N/m")
+    coordinates = jj.coordinates("x y")
+    inputs = jj.inputs("f g")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.f - self.stiffness * motion.q.x, y_rate=motion.inputs.g),)
+
+
+TS = np.array([0.0, 0.5, 1.0])
+
+
+def moved(f, start=None, **options):
+    return jj.simulate(Pushed(), {"x": 0.1} if start is None else start, ts=TS, inputs={"f": f}, **options)
+
+
+def pulled(k):
+    """x of the oscillator that k sin(t) pushes from rest at 0.1, at the end."""
+    return 0.1 * np.cos(2.0) + k * (2.0 * np.sin(1.0) - np.sin(2.0)) / 6.0
+
+
+@pytest.fixture
+def compilations():
+    """How many programs were compiled so far."""
+    count = []
+    jax.monitoring.register_event_duration_secs_listener(lambda name, *_, **__: count.append(name) if name.endswith("backend_compile_duration") else None)
+    return count
+
+
+def test_a_new_function_with_other_numbers_compiles_nothing(compilations):
+    table = np.array([0.0, 1.0, 3.0])
+    kinds = {
+        "number": lambda k: lambda t: k * jnp.sin(t),
+        "array": lambda k: functools.partial(lambda a, t: a * jnp.sin(t), jnp.asarray(k)),
+        "table": lambda k: lambda t: k * jnp.sin(t) + 0.0 * jnp.interp(t, table, k * table),
+    }
+    options = {"start": jj.start(Pushed(), x=0.1), "projection": False}
+    for make in kinds.values():
+        np.testing.assert_allclose(moved(make(1.0), **options)["x"][-1], pulled(1.0), atol=1e-7)
+        before = len(compilations)
+        for k in (2.0, 3.5):
+            np.testing.assert_allclose(moved(make(k), **options)["x"][-1], pulled(k), atol=1e-7)
+        assert len(compilations) == before
+
+
+def test_the_same_function_with_a_rule_of_its_own_compiles_once(compilations):
+    @jax.custom_jvp
+    def sine(t):
+        return jnp.sin(t)
+
+    sine.defjvp(lambda primals, tangents: (jnp.sin(primals[0]), jnp.cos(primals[0]) * tangents[0]))
+
+    def force(t):
+        return 2.0 * sine(t)
+
+    moved(force)
+    before = len(compilations)
+    np.testing.assert_allclose(moved(force)["x"][-1], pulled(2.0), atol=1e-7)
+    assert len(compilations) == before
+
+
+def test_a_function_whose_global_or_closure_has_changed_is_another_function():
+    global K
+    box = [1.0]
+
+    def by_global(t):
+        return K * jnp.sin(t)
+
+    def by_box(t):
+        return box[0] * jnp.sin(t)
+
+    def by_helper(t):
+        return jnp.where(t < 5.0 * K, K, 0.0) * jnp.sin(t)
+
+    for k in (2.0, 4.0, -1.0):
+        K, box[0] = k, k
+        wanted = {by_global: k, by_box: k, by_helper: k if k > 0 else 0.0}
+        for f, amplitude in wanted.items():
+            np.testing.assert_allclose(moved(f)["x"][-1], pulled(amplitude), atol=1e-7)
+    K = 2.0
+
+
+def test_programs_that_differ_are_told_apart():
+    real = jnp.result_type(float)
+    functions = [
+        lambda t: t**2,
+        lambda t: t**3,
+        lambda t: jnp.where(t < 1.0, 1.0, 0.0),
+        lambda t: jnp.where(t < 1.0, 2.0, 0.0),
+        lambda t: 3.0,
+        lambda t: t - 1.0,
+    ]
+    functions += [lambda t: 1.0 - t, lambda t: -t, lambda t: jnp.maximum(t, 0.5), lambda t: jnp.maximum(t, 0.25), lambda t: t / 4.0, lambda t: 4.0 / (t + 1.0)]
+    for f in functions:
+        traced, shape = input_programs.traced(f, real)
+        assert shape.shape == ()
+        for t in (0.0, 0.4, 1.7):
+            np.testing.assert_allclose(traced(t), f(t), rtol=1e-15)
+    programs = {input_programs.traced(f, real)[0].program for f in functions}
+    assert len(programs) == len(functions)
+
+
+def test_what_is_compiled_for_functions_is_dropped_when_others_are_used():
+    client, most, x = jax.devices()[0].client, input_programs.MOST_COMPILED, jnp.ones(3)
+    compiled = input_programs.for_programs(lambda x: jnp.sin(x) + jnp.sum(x), input_programs.by_itself)
+
+    def alive(programs):
+        for n in programs:
+            compiled((n,))(x)
+        gc.collect()
+        return len(client.live_executables())
+
+    none, full = alive(()), alive(range(most))
+    assert full >= none + most
+    assert alive(range(most, 3 * most)) <= full
+    kept = input_programs.traced(lambda t: t**2, jnp.result_type(float))[0].program
+    for n in range(3, 4 + input_programs.MOST_PROGRAMS):
+        input_programs.traced(lambda t, n=n: t**n, jnp.result_type(float))
+    assert input_programs.traced(lambda t: t**2, jnp.result_type(float))[0].program == kept
+
+
+LOSSES = {
+    "default": {},
+    "dense": {"lowering": False},
+    "Kvaerno5": {"solver": diffrax.Kvaerno5()},
+}
+
+
+@pytest.mark.parametrize("options", LOSSES.values(), ids=LOSSES)
+def test_gradients_reach_what_an_input_function_closes_over_without_jit(options):
+    slope = jax.grad(lambda k: moved(lambda t: k * jnp.sin(t), **options)["x"][-1])(1.5)
+    np.testing.assert_allclose(slope, pulled(1.0) - pulled(0.0), rtol=1e-5)
+
+
+def test_gradients_reach_what_an_input_function_closes_over_in_every_mode():
+    expected = pulled(1.0) - pulled(0.0)
+
+    def end(k, **options):
+        return moved(lambda t: jax.jit(lambda t: k * jnp.sin(t))(t), **options)["x"][-1]
+
+    _, slope = jax.jvp(lambda k: end(k, adjoint=diffrax.ForwardMode()), (1.5,), (1.0,))
+    np.testing.assert_allclose(slope, expected, rtol=1e-6)
+    np.testing.assert_allclose(jax.vmap(end)(jnp.array([0.0, 1.5])), [pulled(0.0), pulled(1.5)], atol=1e-7)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(1.5), expected, rtol=1e-6)
+
+    def lanes(k):
+        found = jj.rollout(Pushed(), {"x": np.array([0.1, 0.2])}, ts=TS, inputs={"f": lambda t: k * jnp.sin(t)}, progress=False)
+        return jnp.sum(found["x"][:, -1])
+
+    np.testing.assert_allclose(jax.grad(lanes)(1.5), 2 * expected, rtol=1e-6)
+
+
+def test_inputs_of_any_kind_are_what_they_were_given_as():
+    ts = np.linspace(0.0, 1.0, 5)
+    given = {"f": jj.Sampled(ts, ts**2), "g": lambda t: jnp.interp(t, ts, ts**2)}
+    inputs = as_inputs(Pushed(), given)
+    for t in (0.1, 0.6, 1.4):
+        np.testing.assert_allclose(inputs(t), [np.interp(t, ts, ts**2)] * 2, rtol=1e-14)
+    assert inputs.programs
+    assert not inputs.constant
+    assert as_inputs(Pushed(), inputs) is inputs
+
+
+def test_motions_go_on_after_the_precision_is_switched():
+    def run():
+        found = []
+        for scene in (jj.models.DoublePendulumRods(),):
+            motion = jj.simulate(scene, t1=0.1, rtol=1e-5, atol=1e-5)
+            assert str(motion)
+            assert int(motion.result) == 0
+            found.append(np.asarray(motion.q_end))
+        found.append(np.asarray(moved(lambda t: jnp.sin(t), rtol=1e-5, atol=1e-5).q_end))
+        return found
+
+    double = run()
+    assert jax.config.jax_enable_x64
+    try:
+        jax.config.update("jax_enable_x64", False)
+        single = run()
+    finally:
+        jax.config.update("jax_enable_x64", True)
+    for a, b, again in zip(double, single, run(), strict=True):
+        assert (a.dtype, b.dtype) == (np.float64, np.float32)
+        np.testing.assert_allclose(b, a, atol=1e-3)
+        np.testing.assert_array_equal(again, a)

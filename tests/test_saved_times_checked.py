@@ -1,0 +1,90 @@
+"""Times to save at that no motion can serve are refused where they are known, and end in a result code of their own, lane by lane, where they are traced."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_along_batches import Oscillator
+
+import jourdain_jax as jj
+from jourdain_jax.motion import results
+
+START = {"x": 1.0}
+WRONG = {
+    "before the start": {"ts": [-0.5, 0.5, 1.0]},
+    "before a later start": {"ts": [0.5, 0.7, 1.0], "t0": 0.8},
+    "backwards": {"ts": [1.0, 0.7, 0.5]},
+    "beyond the end": {"ts": [0.0, 0.5, 0.7], "t1": 0.6},
+    "against reversed time": {"ts": [0.2, 0.3, 0.4], "t0": 1.0, "t1": 0.0},
+    "an empty span": {"ts": [0.5, 0.6, 0.7], "t0": 0.7},
+}
+SHUFFLED = {"out of order": {"ts": [0.0, 0.7, 0.5]}, "twice": {"ts": [0.0, 0.5, 0.5]}, "no number": {"ts": [0.0, np.nan, 0.5]}}
+RIGHT = {"plain": {"ts": [0.0, 0.5, 1.0]}, "reversed": {"ts": [1.0, 0.5, 0.1], "t0": 1.2}, "inside": {"ts": [0.3, 0.5, 0.6], "t0": 0.1, "t1": 0.8}}
+
+
+@pytest.mark.parametrize("times", [*WRONG.values(), *SHUFFLED.values()], ids=[*WRONG, *SHUFFLED])
+def test_known_times_are_refused_alike_alone_in_lanes_and_inside_jit(times):
+    sentences = []
+    for run in (
+        lambda: jj.simulate(Oscillator(), START, **times),
+        lambda: jj.rollout(Oscillator(), {"x": np.array([1.0, 2.0])}, progress=False, **times),
+        lambda: jax.jit(lambda x: jj.simulate(Oscillator(), {"x": x}, **times).q)(1.0),
+    ):
+        with pytest.raises(ValueError, match=r"`ts` (runs from|must be finite and strictly)|the span from") as refused:
+            run()
+        sentences.append(str(refused.value))
+    assert len(set(sentences)) == 1
+
+
+def moved(x, times):
+    return jj.simulate(Oscillator(), {"x": x}, rtol=1e-7, atol=1e-7, **times)
+
+
+@pytest.mark.parametrize("solver", [None, diffrax.Kvaerno5()], ids=["lean", "diffrax"])
+def test_traced_times_that_do_not_go_together_end_in_a_code_of_their_own_and_no_state(solver):
+    every = [{"t0": 0.0, "t1": times["ts"][-1]} | times for times in (WRONG | SHUFFLED | RIGHT).values()]
+    stacked = {name: jnp.array([times[name] for times in every]) for name in ("ts", "t0", "t1")}
+    lanes = jax.jit(jax.vmap(lambda times: jj.simulate(Oscillator(), START, rtol=1e-7, atol=1e-7, solver=solver, **times)))(stacked)
+    wrong = len(WRONG) + len(SHUFFLED)
+    assert lanes.result.tolist() == [results.BAD_TIMES] * wrong + [results.SUCCESS] * len(RIGHT)
+    assert np.isnan(lanes.q[:wrong]).all()
+    assert np.isnan(lanes.u[:wrong]).all()
+    np.testing.assert_array_equal(lanes.ts, stacked["ts"])
+    np.testing.assert_allclose(lanes.q[wrong:, :, 0], np.cos(2.0 * (stacked["ts"] - stacked["t0"][:, None]))[wrong:], atol=1e-5)
+    np.testing.assert_allclose(lanes.t_end[wrong:], stacked["t1"][wrong:], rtol=1e-14)
+
+
+def test_lanes_with_times_of_their_own_are_judged_one_by_one():
+    begun = np.array([0.0, 0.5, 0.6, 1.2])
+    states = jax.vmap(lambda x, t: jj.start(Oscillator(), x=x, t0=t))(jnp.ones(4), jnp.asarray(begun))
+    lanes = jj.rollout(Oscillator(), states, ts=[0.5, 1.0], progress=False)
+    assert lanes.result.tolist() == [results.SUCCESS, results.SUCCESS, results.BAD_TIMES, results.BAD_TIMES]
+    assert np.isnan(lanes.lanes.q[2:]).all()
+    np.testing.assert_allclose(lanes["x"][:2, -1], np.cos(2.0 * (1.0 - begun[:2])), atol=1e-6)
+    assert "the times to save at leave the span or are not in order" in str(lanes)
+    assert "lanes 2, 3" in str(lanes)
+    with pytest.raises(jj.SimulationError, match="the times to save at"):
+        lanes.lane(2).raise_if_failed()
+
+
+def test_a_lane_with_wrong_times_takes_no_part_in_derivatives():
+    def loss(stiffness, begun):
+        states = jax.vmap(lambda t: jj.start(Oscillator(), x=1.0, t0=t))(begun)
+        lanes = jj.rollout(Oscillator(stiffness=stiffness), states, ts=[0.5, 1.0], progress=False).lanes
+        return jnp.sum(jnp.where(lanes.succeeded, lanes.q_end[:, 0], 0.0))
+
+    slope = jax.grad(loss)(4.0, jnp.array([0.0, 0.7]))
+    np.testing.assert_allclose(slope, -np.sin(2.0) / 4.0, rtol=1e-6)
+
+
+def test_even_times_of_any_span_go_together():
+    generator = np.random.default_rng(0)
+    ends = generator.normal(size=(200, 2)) * 10.0 ** generator.uniform(-3, 9, size=(200, 1))
+
+    @jax.jit
+    @jax.vmap
+    def code(t0, t1):
+        return jj.simulate(Oscillator(stiffness=0.0), {"x": 1.0}, t0=t0, t1=t1, rtol=1e-5, atol=1e-5, max_steps=1000).result
+
+    assert not np.any(np.asarray(code(*jnp.asarray(ends.T))) == results.BAD_TIMES)
