@@ -14,7 +14,7 @@ from hunting.asking import Failed, ask_for
 from hunting.family import Ask, Family, Truth, together
 from hunting.record import BY_CODE, BY_WARNING, RIGHT, UNDECIDED, WRONG, Record
 
-NUDGE = 1e-6  # relative change of numbers
+NUDGE, NUDGES = 1e-6, 2  # relative change of numbers, and how often they are changed
 MOST = 0.05  # of the size of a quantity: wrong in any case
 SUCCESS, EVENT = 0, 1
 
@@ -43,16 +43,16 @@ def search(family: Family, seeds: list[int]) -> list[Record]:
 def _truth(family: Family, numbers: list[dict], ts) -> tuple[Truth, np.ndarray]:
     """The truth, and how much its values (cases, times + 1, names + 1: the end, and the time, too) grow from a relative change of 1."""
     draw = np.random.default_rng(5)
-    rows = together(numbers)
-    truth = family.truth(rows, ts)
-    growth = np.zeros_like(_whole(truth, ts))
-    for _ in range(2):
-        nudged = {}
+    rows, count = together(numbers), len(numbers)
+    every = {name: [value] for name, value in rows.items()}
+    for _ in range(NUDGES):
         for name, value in rows.items():
-            off = NUDGE * np.where(draw.uniform(size=value.shape) < 0.5, -1.0, 1.0)
-            nudged[name] = value if name in family.fixed else value * (1 + off) + (off if family.size is None and value.dtype == float else 0.0)
-        off = np.abs(_whole(family.truth(nudged, ts), ts) - _whole(truth, ts)) / NUDGE
-        growth = np.maximum(growth, np.where(np.isnan(off), 0.0, off))
+            off = NUDGE * np.where(draw.uniform(size=count) < 0.5, -1.0, 1.0)
+            absolute = off if family.size is None else 0.0
+            every[name].append(value if name in family.fixed else value * (1 + off) + absolute)
+    truth = family.truth({name: np.concatenate(values) for name, values in every.items()}, np.tile(ts, (1 + NUDGES, 1)))
+    whole = _whole(truth, np.tile(ts, (1 + NUDGES, 1))).reshape(1 + NUDGES, count, ts.shape[1] + 1, -1)
+    growth = np.nan_to_num(np.max(np.abs(whole[1:] - whole[0]), axis=0) / NUDGE)
     return truth, growth
 
 
