@@ -1,8 +1,8 @@
 """All families of generated cases, in one list."""
 
-from hunting import bodies, events, linkages, oscillators, pendulums, sliders
+from hunting import bodies, events, gradients, linkages, oscillators, pendulums, sliders, uses
 
-FAMILIES = (*linkages.FAMILIES, *sliders.FAMILIES, *pendulums.FAMILIES, *events.FAMILIES, *oscillators.FAMILIES, *bodies.FAMILIES)
+FAMILIES = (*linkages.FAMILIES, *sliders.FAMILIES, *pendulums.FAMILIES, *events.FAMILIES, *oscillators.FAMILIES, *bodies.FAMILIES, *uses.FAMILIES, *gradients.families())
 
 
 def family(name: str):
