@@ -4,9 +4,9 @@
     python bench/hunt.py --only NAME [--seed N]             # one family; with a seed, that case alone
     python bench/hunt.py --list
 
-Every case is drawn by a seed. Outcomes: right; flagged by its result code; flagged by `motion.warnings`; refused with an error of the engine's own; wrong in
-silence; crashed with a raw error. Wrong and crashed ones are printed with what repeats them alone. The JSON is a list of {"figure", "model", "value", "required", "met"};
-`--records FILE` writes every case. float32 runs in processes of its own: JAX chooses once.
+Every case is drawn by a seed. Outcomes: right; flagged by its result code; flagged by `motion.warnings`; refused with an error of the engine's own; wrong
+in silence; crashed with a raw error. Wrong and crashed ones are printed with what repeats them alone. The JSON is a list of {"figure", "model", "value",
+"required", "met"}; `--records FILE` writes every case. float32 runs in processes of its own: JAX chooses once.
 """
 
 import argparse
@@ -87,7 +87,13 @@ def run_all(work, jobs: int, cache: str | None) -> list[dict]:
                     found += _said(waiting[done], done.result())
                 except Exception as error:  # the process died, or the family itself is broken
                     text = f"{type(error).__name__}: {error}"
-                    found += _said(waiting[done], [{"family": name, "seed": s, "dtype": dtype, "asked": "", "outcome": CRASHED, "error": None, "said": text, "seconds": 0.0} for s in seeds])
+                    found += _said(
+                        waiting[done],
+                        [
+                            {"family": name, "seed": s, "dtype": dtype, "asked": "", "outcome": CRASHED, "error": None, "said": text, "seconds": 0.0}
+                            for s in seeds
+                        ],
+                    )
     return found
 
 

@@ -43,7 +43,10 @@ def ask_for(family: Family, ask: Ask, numbers: list[dict], ts: np.ndarray) -> li
         return [_caught(lambda one=one, row=row: motion(one, row)) for one, row in zip(numbers, ts, strict=True)]
     if ask.way == "jit":
         compiled = jax.jit(motion)
-        return [_caught(lambda one=one, row=row: compiled({k: jnp.asarray(v) for k, v in one.items()}, jnp.asarray(row))) for one, row in zip(numbers, ts, strict=True)]
+        return [
+            _caught(lambda one=one, row=row: compiled({k: jnp.asarray(v) for k, v in one.items()}, jnp.asarray(row)))
+            for one, row in zip(numbers, ts, strict=True)
+        ]
     many = {name: jnp.asarray(value) for name, value in together(numbers).items()}
     if ask.way == "vmap":
         found = _caught(lambda: jax.jit(jax.vmap(motion))(many, jnp.asarray(ts)))

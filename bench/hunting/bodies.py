@@ -51,13 +51,17 @@ def _top_truth(n, ts):
         torque = -n["weight"][:, None] * np.cross(np.array([0.0, 0.0, 1.0]), up)
         return np.concatenate([attitude_rates(p, w), (torque - np.cross(w, moments * w)) / moments], axis=1)
 
-    start = np.concatenate([np.stack([np.cos(n["tilt"] / 2), np.sin(n["tilt"] / 2), 0 * n["tilt"], 0 * n["tilt"]], axis=1), np.stack([n["wx"], n["wy"], n["wz"]], axis=1)], axis=1)
+    start = np.concatenate(
+        [np.stack([np.cos(n["tilt"] / 2), np.sin(n["tilt"] / 2), 0 * n["tilt"], 0 * n["tilt"]], axis=1), np.stack([n["wx"], n["wy"], n["wz"]], axis=1)], axis=1
+    )
     return Truth(integrate(rates, start, ts, width=0.05))
 
 
 def _top_start(n):
     half, o = n["tilt"] / 2, 0.0 * n["tilt"]
-    return {"attitude_w": jnp.cos(half), "attitude_x": jnp.sin(half), "attitude_y": o, "attitude_z": o} | {name: n[k] for name, k in zip(OMEGA, ("wx", "wy", "wz"), strict=True)}
+    return {"attitude_w": jnp.cos(half), "attitude_x": jnp.sin(half), "attitude_y": o, "attitude_z": o} | {
+        name: n[k] for name, k in zip(OMEGA, ("wx", "wy", "wz"), strict=True)
+    }
 
 
 def _top(name, what, weight):
@@ -66,7 +70,11 @@ def _top(name, what, weight):
         c = min(c, 0.95 * (a + b))
         moments = r.permutation([a, b, c])
         spins = {"wx": r.uniform(-2, 2), "wy": r.uniform(-2, 2), "wz": r.uniform(-6, 6)}
-        return dict(zip(("i1", "i2", "i3"), map(float, moments), strict=True)) | spins | {"tilt": r.uniform(0, 3.1), "weight": weight * r.uniform(0.5, 4), "span": r.uniform(1, 5)}
+        return (
+            dict(zip(("i1", "i2", "i3"), map(float, moments), strict=True))
+            | spins
+            | {"tilt": r.uniform(0, 3.1), "weight": weight * r.uniform(0.5, 4), "span": r.uniform(1, 5)}
+        )
 
     return Family(
         name=name, what=what, scene=Top, draw=draw, start=_top_start, truth=_top_truth, names=(*QUATERNION, *OMEGA),
@@ -135,7 +143,13 @@ def _robot_start(n):
 
 def _robot(name, what, scene):
     def draw(r):
-        drawn = {"m": r.uniform(1, 5), "inertia": r.uniform(0.05, 0.4), "ahead": r.choice([0.0, r.uniform(-0.1, 0.1)]), "wheel": r.uniform(0.1, 1), "R": r.uniform(0.05, 0.2)}
+        drawn = {
+            "m": r.uniform(1, 5),
+            "inertia": r.uniform(0.05, 0.4),
+            "ahead": r.choice([0.0, r.uniform(-0.1, 0.1)]),
+            "wheel": r.uniform(0.1, 1),
+            "R": r.uniform(0.05, 0.2),
+        }
         drawn |= {"b": r.uniform(0.1, 0.3), "th": r.uniform(-0.3, 0.3), "v": r.uniform(-1, 1), "w": r.choice([-1, 1]) * r.uniform(0.5, 4)}
         return drawn | {"tl": r.uniform(-0.02, 0.02), "tr": r.uniform(-0.02, 0.02), "span": r.uniform(1, 6)}
 
@@ -256,14 +270,21 @@ def _wagon_truth(n, ts):
 def _wagon(name, what, scene, cases, slack=1.0, **more):
     return Family(
         name=name, what=what, scene=scene, truth=_wagon_truth, names=("angle", "angle_rate"), cases=cases, slack=slack,
-        draw=lambda r: {"size": r.uniform(0.1, 0.5), "rate": r.uniform(1, 4), "l": r.uniform(0.5, 1.5), "angle": r.uniform(-0.5, 0.5), "w": 0.0, "span": r.uniform(1, 5)},
+        draw=lambda r: {"size": r.uniform(0.1, 0.5), "rate": r.uniform(1, 4), "l": r.uniform(0.5, 1.5), "angle": r.uniform(-0.5, 0.5), "w": 0.0,
+                        "span": r.uniform(1, 5)},
         start=lambda n: {"angle": n["angle"], "angle_rate": n["w"]}, parameters=lambda n: {"size": n["size"], "rate": n["rate"], "length": n["l"]}, **more,
     )  # fmt: skip
 
 
+def _circles(n, ts):
+    w, circle = n["w"][:, None], (n["R"] * n["p"] / n["w"])[:, None]
+    return Truth(np.stack([circle * np.sin(w * ts), circle * (1 - np.cos(w * ts)), w * ts, n["p"][:, None] * ts], axis=-1))
+
+
 FEW = (Ask("simulate"), Ask("jit", 33), Ask("rollout", 33, 1e-6), Ask("vmap"))
 SLEIGH = {
-    "draw": lambda r: {"m": r.uniform(0.5, 2), "inertia": r.uniform(0.2, 1), "a": r.uniform(-0.3, 0.3), "v": r.uniform(-1, 1), "w": r.choice([-1, 1]) * r.uniform(0.5, 4), "span": r.uniform(1, 6)},
+    "draw": lambda r: {"m": r.uniform(0.5, 2), "inertia": r.uniform(0.2, 1), "a": r.uniform(-0.3, 0.3), "v": r.uniform(-1, 1),
+                       "w": r.choice([-1, 1]) * r.uniform(0.5, 4), "span": r.uniform(1, 6)},
     "start": lambda n: {"x": 0.0 * n["a"], "y": 0.0 * n["a"], "heading": 0.0 * n["a"], "x_rate": n["v"], "y_rate": n["a"] * n["w"], "heading_rate": n["w"]},
     "truth": _sleigh_truth, "names": ("x", "y", "heading", "heading_rate"), "parameters": lambda n: {"mass": n["m"], "inertia": n["inertia"], "offset": n["a"]},
 }  # fmt: skip
@@ -284,8 +305,7 @@ FAMILIES = (
         name="upright-disc", what="an upright disc on circles, saved seldom and often", scene=VerticalDisc, names=("x", "y", "heading", "roll"),
         draw=lambda r: {"R": r.uniform(0.3, 1), "w": r.choice([-1, 1]) * r.uniform(0.5, 6), "p": r.uniform(-5, 5), "span": r.uniform(1, 8)},
         start=lambda n: {"heading_rate": n["w"], "roll_rate": n["p"]}, parameters=lambda n: {"radius": n["R"]},
-        truth=lambda n, ts: Truth(np.stack([(n["R"] * n["p"] / n["w"])[:, None] * np.sin(n["w"][:, None] * ts), (n["R"] * n["p"] / n["w"])[:, None] * (1 - np.cos(n["w"][:, None] * ts)),
-                                            n["w"][:, None] * ts, n["p"][:, None] * ts], axis=-1)),
+        truth=_circles,
     ),
     _wagon("wagon", "a pendulum on a cart whose place is prescribed", Wagon, 28, asks=FEW),
     _wagon("carried-pendulum", "the same as a pose of time", CarriedPendulum, 28, asks=FEW),

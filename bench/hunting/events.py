@@ -70,7 +70,14 @@ def _room_truth(n, ts):
 
 
 def _room_drawn(r):
-    return {"z": r.uniform(0.5, 2.5), "vx": r.choice([-1.0, 1.0]) * r.uniform(0.5, 8.0), "vz": r.uniform(-4.0, 4.0), "width": r.uniform(0.5, 3.0), "height": 3.0, "span": 3.0}
+    return {
+        "z": r.uniform(0.5, 2.5),
+        "vx": r.choice([-1.0, 1.0]) * r.uniform(0.5, 8.0),
+        "vz": r.uniform(-4.0, 4.0),
+        "width": r.uniform(0.5, 3.0),
+        "height": 3.0,
+        "span": 3.0,
+    }
 
 
 def _grazing_drawn(r):
@@ -188,7 +195,12 @@ def _stiff_truth(n, ts):
 
 
 ASKS = (Ask("simulate"), Ask("jit", 9), Ask("rollout", 9, 1e-6), Ask("vmap", 33), Ask("simulate", 33, 1e-6), Ask("rollout", 1), Ask("jit rollout", 2, 1e-6))
-IMPLICIT = (Ask("simulate", 1, 1e-6), Ask("simulate", 9, 1e-6, {"solver": jj.RadauIIA()}), Ask("rollout", 1, 1e-6), Ask("jit", 9, 1e-6, {"solver": jj.RadauIIA()}))
+IMPLICIT = (
+    Ask("simulate", 1, 1e-6),
+    Ask("simulate", 9, 1e-6, {"solver": jj.RadauIIA()}),
+    Ask("rollout", 1, 1e-6),
+    Ask("jit", 9, 1e-6, {"solver": jj.RadauIIA()}),
+)
 ROOM = {
     "scene": Room, "truth": _room_truth, "names": ("x", "z", "x_rate", "z_rate"), "asks": ASKS,
     "start": lambda n: {"x": 0.0 * n["z"], "z": n["z"], "x_rate": n["vx"], "z_rate": n["vz"]},

@@ -2,7 +2,16 @@
 
 from hunting import bodies, events, gradients, linkages, oscillators, pendulums, sliders, uses
 
-FAMILIES = (*linkages.FAMILIES, *sliders.FAMILIES, *pendulums.FAMILIES, *events.FAMILIES, *oscillators.FAMILIES, *bodies.FAMILIES, *uses.FAMILIES, *gradients.families())
+FAMILIES = (
+    *linkages.FAMILIES,
+    *sliders.FAMILIES,
+    *pendulums.FAMILIES,
+    *events.FAMILIES,
+    *oscillators.FAMILIES,
+    *bodies.FAMILIES,
+    *uses.FAMILIES,
+    *gradients.families(),
+)
 
 
 def family(name: str):

@@ -143,7 +143,9 @@ def families() -> tuple[Slopes, ...]:
     sleigh = next(f for f in BODIES if f.name == "sleigh")
     flat = next(f for f in LINKAGES if f.name == "parallelogram")
     bar = replace(flat, draw=lambda r: flat.draw(r) | {"g": 9.81}, fixed=("span", "r1", "r2", "r3", "d", "m1", "m2", "m3", "g"), parameters=lambda n: FIXED)
-    bar = replace(bar, draw=lambda r: {"s": r.uniform(0.5, 2.0), "s_rate": r.uniform(3.0, 6.0), "span": r.uniform(0.3, 1.0)}, start=lambda n: flat.start({**FIXED, **n}))
+    bar = replace(
+        bar, draw=lambda r: {"s": r.uniform(0.5, 2.0), "s_rate": r.uniform(3.0, 6.0), "span": r.uniform(0.3, 1.0)}, start=lambda n: flat.start({**FIXED, **n})
+    )
     return (
         Slopes("gradient-rod", "gradients of the pendulum with a rod and a narrow domain", rod, _rod_end),
         Slopes("gradient-sleigh", "gradients of Chaplygin's sleigh", sleigh, _sleigh_end),

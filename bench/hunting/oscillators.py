@@ -82,7 +82,15 @@ BASE = {
 
 def _blow_drawn(r):
     span, length = float(r.choice([2.0, 10.0])), 10 ** r.uniform(-3.5, -1.0)
-    return {"k": r.uniform(0.2, 4.0), "x": r.uniform(0, 0.3), "v": 0.0, "when": r.uniform(0.1, 0.8) * span, "length": length, "force": r.uniform(0.5, 3.0) / length, "span": span}
+    return {
+        "k": r.uniform(0.2, 4.0),
+        "x": r.uniform(0, 0.3),
+        "v": 0.0,
+        "when": r.uniform(0.1, 0.8) * span,
+        "length": length,
+        "force": r.uniform(0.5, 3.0) / length,
+        "span": span,
+    }
 
 
 def _record_drawn(r):
@@ -91,8 +99,13 @@ def _record_drawn(r):
 
 def _far_drawn(r):
     k = 10 ** r.uniform(0.0, 6.0)
-    return {"k": k, "x": r.uniform(-1, 1), "v": r.uniform(-1, 1) * np.sqrt(k), "t0": float(r.choice([1.7e9, 1e6, -3e4, 1e12])), "span": 10 ** r.uniform(1.0, 2.5) / np.sqrt(k)}
-
+    return {
+        "k": k,
+        "x": r.uniform(-1, 1),
+        "v": r.uniform(-1, 1) * np.sqrt(k),
+        "t0": float(r.choice([1.7e9, 1e6, -3e4, 1e12])),
+        "span": 10 ** r.uniform(1.0, 2.5) / np.sqrt(k),
+    }
 
 
 def _stiff_drawn(r):
@@ -121,11 +134,16 @@ FAMILIES = (
     ),
     Family(
         name="far-times-single", what="an oscillator at t0 of 1e3 to 1e5 s, for float32", truth=truth_with(_no_push), asks=WAYS, cases=72,
-        draw=lambda r: {"k": r.uniform(1, 100), "x": r.uniform(0, 1), "v": r.uniform(0, 1), "t0": float(r.choice([1e3, 1e4, 1e5])), "span": r.uniform(1, 10)}, **BASE,
+        draw=lambda r: {"k": r.uniform(1, 100), "x": r.uniform(0, 1), "v": r.uniform(0, 1), "t0": float(r.choice([1e3, 1e4, 1e5])), "span": r.uniform(1, 10)},
+        **BASE,
     ),
-    Family(name="stiff", what="overdamped oscillators, rates apart by up to 1e12", draw=_stiff_drawn, truth=truth_with(_no_push), asks=WAYS, fixed=("span", "k", "c"), cases=48, single=False, **BASE),
     Family(
-        name="units", what="masses of 1e-20 to 1e20 kg, lengths of 1e-12 to 1e12 m, 1e-6 to 1e6 rad/s", draw=_units_drawn, truth=truth_with(_no_push), single=False,
+        name="stiff", what="overdamped oscillators, rates apart by up to 1e12", draw=_stiff_drawn, truth=truth_with(_no_push), asks=WAYS,
+        fixed=("span", "k", "c"), cases=48, single=False, **BASE,
+    ),
+    Family(
+        name="units", what="masses of 1e-20 to 1e20 kg, lengths of 1e-12 to 1e12 m, 1e-6 to 1e6 rad/s", draw=_units_drawn, truth=truth_with(_no_push),
+        single=False,
         asks=tuple(a for a in WAYS if "rollout" not in a.way), fixed=("span", "atol"), cases=48,
         size=lambda n: np.stack([n["x"], n["x"] * np.sqrt(n["k"] / n["m"])], axis=1), **BASE,
     ),

@@ -123,7 +123,8 @@ def _bead_truth(n, ts):
 
 
 BEAD = {
-    "draw": lambda r: {"s": r.uniform(-0.3, 0.3), "w": r.choice([-1.0, 1.0]) * r.uniform(2.0, 6.0), "weight": float(r.choice([0.0, 2.0])), "span": r.uniform(0.5, 4.0)},
+    "draw": lambda r: {"s": r.uniform(-0.3, 0.3), "w": r.choice([-1.0, 1.0]) * r.uniform(2.0, 6.0), "weight": float(r.choice([0.0, 2.0])),
+                       "span": r.uniform(0.5, 4.0)},
     "start": lambda n: {
         "x": jnp.cos(n["s"]), "y": jnp.sin(n["s"]), "s": n["s"],
         "x_rate": -jnp.sin(n["s"]) * n["w"], "y_rate": jnp.cos(n["s"]) * n["w"], "s_rate": n["w"],
@@ -194,7 +195,7 @@ def _chain_truth(n, ts):
         return np.stack([da, db, (f1 - m * c * f2) / det, ((1 + m) * f2 - c * f1) / det], axis=1)
 
     o = 0.0 * m
-    a, b, da, db = np.moveaxis(integrate(rates, np.stack([o, o, n["w1"], n["w2"]], axis=1), ts, width=0.02), -1, 0)
+    a, b = np.moveaxis(integrate(rates, np.stack([o, o, n["w1"], n["w2"]], axis=1), ts, width=0.02)[..., :2], -1, 0)
     x1, z1 = np.sin(a), -np.cos(a)
     return Truth(np.stack([x1, z1, x1 + np.sin(b), z1 - np.cos(b)], axis=-1))
 

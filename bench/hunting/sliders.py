@@ -154,7 +154,12 @@ def _crank_rocker(r):
     order = r.permutation(3)
     drawn = {"r1": short} | {name: (*middle, long)[k] for name, k in zip(("r2", "r3", "d"), order, strict=True)}
     drawn |= {f"m{k}": r.uniform(0.3, 3.0) for k in (1, 2, 3)}
-    drawn |= {"g": float(r.choice([0.0, 9.81])), "s": r.uniform(-3.0, 3.0), "s_rate": float(r.choice([-1.0, 1.0])) * r.uniform(4.0, 12.0), "span": r.uniform(0.3, 1.2)}
+    drawn |= {
+        "g": float(r.choice([0.0, 9.81])),
+        "s": r.uniform(-3.0, 3.0),
+        "s_rate": float(r.choice([-1.0, 1.0])) * r.uniform(4.0, 12.0),
+        "span": r.uniform(0.3, 1.2),
+    }
     return drawn
 
 

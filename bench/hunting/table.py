@@ -45,7 +45,8 @@ def losses(records: list[dict]) -> Iterator[str]:
     """Every case that is wrong or crashed, with what repeats it alone."""
     for r in records:
         if r["outcome"] in LOST:
-            yield f"{r['outcome'].upper()}: python bench/hunt.py --only {r['family']} --seed {r['seed']} --dtype {r['dtype']}\n    {r['said']}\n    {r['asked']}"
+            again = f"python bench/hunt.py --only {r['family']} --seed {r['seed']} --dtype {r['dtype']}"
+            yield f"{r['outcome'].upper()}: {again}\n    {r['said']}\n    {r['asked']}"
 
 
 def figures(records: list[dict], wall: float) -> list[dict]:

@@ -19,7 +19,7 @@ from hunting.reference import integrate
 
 @dataclass(frozen=True)
 class Single:
-    """A family whose cases are asked one by one: `ask(seed)` gives words, error over its bound, result code and what is said against the motion (empty: nothing)."""
+    """A family whose cases are asked one by one: `ask(seed)` gives words, error over its bound, result code and what is said against it."""
 
     name: str
     what: str
@@ -118,14 +118,19 @@ def _changed(seed: int):
     if kind == "replaced method":
         type(scene).loads = lambda self, motion: (jj.generalized_force(motion, x_rate=-k * motion.q.x),)
     motion = run()
-    return f"{way}, {kind}, k={k!r}", abs(float(motion.q_end[0]) - np.cos(np.sqrt(k))) / 1e-5, int(motion.result), "; ".join(jax.tree.map(jnp.asarray, motion).warnings)
+    return (
+        f"{way}, {kind}, k={k!r}",
+        abs(float(motion.q_end[0]) - np.cos(np.sqrt(k))) / 1e-5,
+        int(motion.result),
+        "; ".join(jax.tree.map(jnp.asarray, motion).warnings),
+    )
 
 
 # Rows that set in later. -------------------------------------------------------------------------------------------
 
 
 class LateRow(jj.Scene):
-    """Two rows of which the second says, until `late` s, no more than the first; then it holds the speed along y at `speed`, against a force that sets in with it."""
+    """Until `late` s the second row says no more than the first; then it holds the speed along y, against a force that sets in with it."""
 
     coordinates = jj.coordinates("x y")
     late: object = jj.parameter(1.0, unit="s")
@@ -206,14 +211,19 @@ def _pushed(push):
 
 
 def _wheels(seed: int):
-    """The normal forces of a robot's wheels add up to its weight less what its middle carries (`ahead` = 0: nothing), and those of a rod pendulum are its tension."""
+    """The normal forces of a robot's wheels add up to its weight."""
     r = np.random.default_rng([seed, 82])
     n = {"mass": r.uniform(1, 5), "ahead": 0.0, "wheel": r.uniform(0.1, 1)}
     motion = jj.simulate(Robot(**n), {"heading": r.uniform(-3, 3), "left_rate": 2.0, "right_rate": r.uniform(-4, 4)}, ts=[0.5, 1.0])
     normal = sum(np.asarray(force.normal) for force in motion.contact_forces().values())
     weight = (n["mass"] + 2 * n["wheel"]) * G
     undetermined = all(not np.any(np.asarray(force.determined)) for force in motion.contact_forces().values())
-    return f"contact_forces of a robot, {n}", float(np.max(np.abs(normal / weight - 1)) / 1e-8), int(motion.result), "`determined` is False" if undetermined else ""
+    return (
+        f"contact_forces of a robot, {n}",
+        float(np.max(np.abs(normal / weight - 1)) / 1e-8),
+        int(motion.result),
+        "`determined` is False" if undetermined else "",
+    )
 
 
 def _tension(seed: int):
@@ -243,7 +253,8 @@ FAMILIES = (
         fixed=("span",), cases=20, single=False, asks=FEW,
     ),
     Family(
-        name="beside-huge-force", what="a pendulum beside a block that 1e16 N push", scene=BesideHugeForce, truth=_pushed(lambda x: -G * np.sin(x)), names=("x", "x_rate"),
+        name="beside-huge-force", what="a pendulum beside a block that 1e16 N push", scene=BesideHugeForce,
+        truth=_pushed(lambda x: -G * np.sin(x)), names=("x", "x_rate"),
         draw=lambda r: {"x": r.uniform(-2.0, 2.0), "v": r.uniform(-3, 3), "span": r.uniform(0.5, 2)}, start=lambda n: {"x": n["x"], "x_rate": n["v"]},
         cases=20, single=False, asks=FEW,
     ),
