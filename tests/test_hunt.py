@@ -14,20 +14,18 @@ from hunting.table import as_markdown, figures, losses
 import jourdain_jax as jj
 from jourdain_jax.motion import results
 
-# Family and seeds: seeds that differ by the number of a family's ways ask alike, and share a program.
+# Family and seeds, each wrong or flagged at some time; seeds that differ by the number of a family's ways ask alike, and share a program.
 SHORT = (
     ("antiparallelogram", (0, 7, 14)),
-    ("rod-pendulum", (1, 8, 15, 22)),
-    ("sleigh-ahead", (3, 10, 17)),
+    ("rod-pendulum", (3, 10, 17, 24)),
     ("room", (5, 12, 19)),
     ("grazing", (0, 7, 14)),
     ("stop-arcsine", (0, 7)),
     ("stiff-drop", (0,)),
     ("hammer", (1, 7)),
-    ("far-times", (1, 7, 13, 19)),
+    ("far-times", (13, 19)),
     ("tiny-force", (0, 4)),
-    ("late-row", (3,)),
-    ("times", (1, 5, 9, 13)),
+    ("times", (5,)),
     ("changed", (0, 1)),
 )
 
