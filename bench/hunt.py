@@ -22,7 +22,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 # Hundreds of small programs: compiling them is most of the time. The first flag belongs to jaxlib 0.10.
 FLAGS = "--xla_backend_optimization_level=0" + (" --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else "")
-QUICK = 1 / 7  # of the cases
+CASES, QUICK = 2000, 300  # in all
 
 
 def prepare(dtype: str) -> None:
@@ -56,7 +56,7 @@ def planned(arguments) -> list[tuple[str, str, list[int]]]:
     if arguments.only and arguments.seed is not None and arguments.cases is None:
         return [(f.name, arguments.dtype, [arguments.seed]) for f in chosen]
     whole = sum(f.cases for f in FAMILIES)
-    share = QUICK if arguments.quick else 1.0 if arguments.cases is None else arguments.cases / whole
+    share = (arguments.cases or (QUICK if arguments.quick else CASES)) / whole
     first, work = arguments.seed or 0, []
     for f in chosen:
         count = max(1, round(share * f.cases))
@@ -106,10 +106,10 @@ def _said(work, records: list[dict]) -> list[dict]:
 def main() -> int:
     """Search, print, write; exit code 1 where something is wrong or crashed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a seventh of the cases, float64")
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK} cases, float64")
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--records", type=Path, help="file for the records of all cases")
-    parser.add_argument("--cases", type=int, help="about how many cases in all")
+    parser.add_argument("--cases", type=int, help=f"about how many cases all families together have (default: {CASES})")
     parser.add_argument("--seed", type=int, help="first seed (default 0); with --only and without --cases, the only one")
     parser.add_argument("--only", nargs="*", metavar="NAME", help="only these families")
     parser.add_argument("--dtype", choices=("float64", "float32"), default="float64", help="of a case that is run alone")

@@ -58,7 +58,7 @@ class Family:
     inputs: Callable[[dict], dict] | None = None
     times: Callable[[dict, int], np.ndarray] | None = None  # numbers of one case, count -> ts; default: even ones
     asks: tuple[Ask, ...] = SOME
-    cases: int = 70  # of a full search
+    cases: int = 70  # of a full search, in proportion
     shared: tuple[str, ...] = ("span", "t0")  # numbers that the lanes of a rollout have in common
     fixed: tuple[str, ...] = ("span", "t0")  # numbers that are not varied to see how much a motion amplifies errors
     slack: float = 1.0

@@ -5,7 +5,7 @@ import numpy as np
 
 import jourdain_jax as jj
 from hunting.family import Family, Truth
-from hunting.linkages import ASKS, FourBarInAngles, FourBarWithPins, _along, _rod, starting
+from hunting.linkages import ASKS, FEW, FourBarInAngles, FourBarWithPins, _along, _rod, starting
 from hunting.reference import integrate
 
 
@@ -178,7 +178,7 @@ def _four_bar(name, what, pins):
         truth=_four_bar_truth,
         names=("a", "b", "c", "a_rate", "b_rate", "c_rate"),
         parameters=_parameters,
-        asks=ASKS,
+        asks=FEW if pins else ASKS,
         slack=10.0,
         single=not pins,
     )
