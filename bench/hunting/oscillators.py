@@ -129,11 +129,13 @@ FAMILIES = (
         asks=WAYS, shared=("span", "when", "force"), fixed=("span", "when"), cases=72, slack=10.0, **BASE,
     ),
     Family(
-        name="far-times", what="an oscillator at t0 from -3e4 to 1e12 s", draw=_far_drawn, truth=truth_with(_no_push), cases=72, single=False, fixed=("span", "t0", "k"),
+        name="far-times", what="an oscillator at t0 from -3e4 to 1e12 s", draw=_far_drawn, truth=truth_with(_no_push), cases=72,
+        single=False, fixed=("span", "t0", "k"),
         size=lambda n: np.stack([np.hypot(n["x"], n["v"] / np.sqrt(n["k"])), np.hypot(n["x"] * np.sqrt(n["k"]), n["v"])], axis=1), asks=WAYS, **BASE,
     ),
     Family(
-        name="far-times-single", what="an oscillator at t0 of 1e3 to 1e5 s, for float32", truth=truth_with(_no_push), asks=WAYS, cases=72, fixed=("span", "t0", "k"),
+        name="far-times-single", what="an oscillator at t0 of 1e3 to 1e5 s, for float32", truth=truth_with(_no_push), asks=WAYS, cases=72,
+        fixed=("span", "t0", "k"),
         draw=lambda r: {"k": r.uniform(1, 100), "x": r.uniform(0, 1), "v": r.uniform(0, 1), "t0": float(r.choice([1e3, 1e4, 1e5])), "span": r.uniform(1, 10)},
         **BASE,
     ),
