@@ -66,8 +66,8 @@ def planned(arguments) -> list[tuple[str, str, list[int]]]:
     return sorted(work, key=lambda w: -len(w[2]))
 
 
-def run_all(work, jobs: int, cache: str | None) -> list[dict]:
-    """Records of all; each kind of floats has processes of its own."""
+def run_all(work, jobs: int, cache: str | None, report) -> list[dict]:
+    """Records of all; each kind of floats has processes of its own. `report(records so far, new ones)` after every family."""
     from hunting.record import CRASHED
 
     found: list[dict] = []
@@ -78,22 +78,20 @@ def run_all(work, jobs: int, cache: str | None) -> list[dict]:
         if jobs == 1 and len({w[1] for w in work}) == 1 and dtype == "float64":
             for w in own:
                 found += _said(w, run_family(*w, cache))
+                report(found, found[-len(w[2]) :])
             continue
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
             waiting = {pool.submit(run_family, *w, cache): w for w in own}
             for done in as_completed(waiting):
                 name, _, seeds = waiting[done]
                 try:
-                    found += _said(waiting[done], done.result())
+                    new = done.result()
                 except Exception as error:  # the process died, or the family itself is broken
-                    text = f"{type(error).__name__}: {error}"
-                    found += _said(
-                        waiting[done],
-                        [
-                            {"family": name, "seed": s, "dtype": dtype, "asked": "", "outcome": CRASHED, "error": None, "said": text, "seconds": 0.0}
-                            for s in seeds
-                        ],
-                    )
+                    said = f"{type(error).__name__}: {error}"
+                    lost = {"family": name, "dtype": dtype, "asked": "", "outcome": CRASHED, "error": None, "said": said, "seconds": 0.0}
+                    new = [lost | {"seed": seed} for seed in seeds]
+                found += _said(waiting[done], new)
+                report(found, new)
     return found
 
 
@@ -127,14 +125,16 @@ def main() -> int:
         print("\n".join(f"{f.name:26s} {f.cases:4d}  {f.what}" for f in FAMILIES))
         return 0
     print(f"seeds from {arguments.seed or 0}; {sum(len(w[2]) for w in work)} cases", file=sys.stderr)
-    records = run_all(work, arguments.jobs, arguments.cache)
+
+    def report(records: list[dict], new: list[dict]) -> None:
+        print("".join(f"{line}\n" for line in losses(new)), end="", flush=True)
+        if arguments.records:
+            arguments.records.write_text(json.dumps(records, indent=1) + "\n")
+
+    records = run_all(work, arguments.jobs, arguments.cache, report)
     wall = time.perf_counter() - begin
-    if arguments.records:
-        arguments.records.write_text(json.dumps(records, indent=1) + "\n")
     if arguments.json:
         arguments.json.write_text(json.dumps(figures(records, wall), indent=1) + "\n")
-    for line in losses(records):
-        print(line)
     print("\n".join((as_markdown if arguments.markdown else as_text)(records)))
     print(f"{len(records)} cases in {wall:.0f} s")
     return int(any(r["outcome"] in ("wrong", "crashed") for r in records))

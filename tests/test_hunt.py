@@ -24,7 +24,6 @@ SHORT = (
     ("stiff-drop", (0,)),
     ("hammer", (1, 7)),
     ("far-times", (13, 19)),
-    ("tiny-force", (0, 4)),
     ("times", (5,)),
     ("changed", (0, 1)),
 )
