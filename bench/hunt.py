@@ -1,0 +1,144 @@
+"""A search for motions that are wrong and do not say so: generated scenes and uses against references that share nothing with the engine.
+
+    python bench/hunt.py [--quick] [--json FILE] [--cases N] [--seed S] [--jobs N] [--markdown]
+    python bench/hunt.py --only NAME [--seed N]             # one family; with a seed, that case alone
+    python bench/hunt.py --list
+
+Every case is drawn by a seed. Outcomes: right; flagged by its result code; flagged by `motion.warnings`; refused with an error of the engine's own; wrong
+in silence; crashed with a raw error. Wrong and crashed ones are printed with what repeats them alone. The JSON is a list of {"figure", "model", "value",
+"required", "met"}; `--records FILE` writes every case. float32 runs in processes of its own: JAX chooses once.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+# Hundreds of small programs: compiling them is most of the time. The first flag belongs to jaxlib 0.10.
+FLAGS = "--xla_backend_optimization_level=0" + (" --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else "")
+CASES, QUICK = 2000, 300  # in all
+
+
+def prepare(dtype: str) -> None:
+    """The floats of this process, before JAX is imported."""
+    os.environ.setdefault("XLA_FLAGS", FLAGS)
+    os.environ["JAX_ENABLE_X64"] = "1" if dtype == "float64" else "0"
+    sys.path[:0] = [str(HERE), str(HERE.parent / "tests")]
+
+
+def run_family(name: str, dtype: str, seeds: list[int], cache: str | None = None) -> list[dict]:
+    """Records of one family's cases, in this process."""
+    prepare(dtype)
+    import jax
+
+    if cache:
+        jax.config.update("jax_compilation_cache_dir", cache)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    from hunting.families import family
+
+    found = [record.as_dict() for record in family(name).run(seeds)]
+    jax.clear_caches()
+    return found
+
+
+def planned(arguments) -> list[tuple[str, str, list[int]]]:
+    """Family, floats and seeds of every piece of work, longest first."""
+    prepare("float64")
+    from hunting.families import FAMILIES
+
+    chosen = [f for f in FAMILIES if not arguments.only or f.name in arguments.only]
+    if arguments.only and arguments.seed is not None and arguments.cases is None:
+        return [(f.name, arguments.dtype, [arguments.seed]) for f in chosen]
+    whole = sum(f.cases for f in FAMILIES)
+    share = (arguments.cases or (QUICK if arguments.quick else CASES)) / whole
+    first, work = arguments.seed or 0, []
+    for f in chosen:
+        count = max(1, round(share * f.cases))
+        narrow = [first + k for k in range(count) if f.single and k % 5 == 4] if not arguments.quick else []
+        wide = [first + k for k in range(count) if first + k not in narrow]
+        work += [(f.name, "float64", wide)] + ([(f.name, "float32", narrow)] if narrow else [])
+    return sorted(work, key=lambda w: -len(w[2]))
+
+
+def run_all(work, jobs: int, cache: str | None, report) -> list[dict]:
+    """Records of all; each kind of floats has processes of its own. `report(records so far, new ones)` after every family."""
+    from hunting.record import CRASHED
+
+    found: list[dict] = []
+    for dtype in ("float64", "float32"):
+        own = [w for w in work if w[1] == dtype]
+        if not own:
+            continue
+        if jobs == 1 and len({w[1] for w in work}) == 1 and dtype == "float64":
+            for w in own:
+                found += _said(w, run_family(*w, cache))
+                report(found, found[-len(w[2]) :])
+            continue
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            waiting = {pool.submit(run_family, *w, cache): w for w in own}
+            for done in as_completed(waiting):
+                name, _, seeds = waiting[done]
+                try:
+                    new = done.result()
+                except Exception as error:  # the process died, or the family itself is broken
+                    said = f"{type(error).__name__}: {error}"
+                    lost = {"family": name, "dtype": dtype, "asked": "", "outcome": CRASHED, "error": None, "said": said, "seconds": 0.0}
+                    new = [lost | {"seed": seed} for seed in seeds]
+                found += _said(waiting[done], new)
+                report(found, new)
+    return found
+
+
+def _said(work, records: list[dict]) -> list[dict]:
+    counts = {outcome: sum(r["outcome"] == outcome for r in records) for outcome in dict.fromkeys(r["outcome"] for r in records)}
+    print(f"{work[0]} ({work[1]}): {counts}, {sum(r['seconds'] for r in records):.0f} s", file=sys.stderr, flush=True)
+    return records
+
+
+def main() -> int:
+    """Search, print, write; exit code 1 where something is wrong or crashed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK} cases, float64")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--records", type=Path, help="file for the records of all cases")
+    parser.add_argument("--cases", type=int, help=f"about how many cases all families together have (default: {CASES})")
+    parser.add_argument("--seed", type=int, help="first seed (default 0); with --only and without --cases, the only one")
+    parser.add_argument("--only", nargs="*", metavar="NAME", help="only these families")
+    parser.add_argument("--dtype", choices=("float64", "float32"), default="float64", help="of a case that is run alone")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--cache", help="folder for compiled programs, which makes a second run shorter")
+    parser.add_argument("--markdown", action="store_true", help="print the table as Markdown")
+    parser.add_argument("--list", action="store_true", help="print the families and end")
+    arguments = parser.parse_args()
+    begin = time.perf_counter()
+    work = planned(arguments)
+    from hunting.families import FAMILIES
+    from hunting.table import as_markdown, as_text, figures, losses
+
+    if arguments.list:
+        print("\n".join(f"{f.name:26s} {f.cases:4d}  {f.what}" for f in FAMILIES))
+        return 0
+    print(f"seeds from {arguments.seed or 0}; {sum(len(w[2]) for w in work)} cases", file=sys.stderr)
+
+    def report(records: list[dict], new: list[dict]) -> None:
+        print("".join(f"{line}\n" for line in losses(new)), end="", flush=True)
+        if arguments.records:
+            arguments.records.write_text(json.dumps(records, indent=1) + "\n")
+
+    records = run_all(work, arguments.jobs, arguments.cache, report)
+    wall = time.perf_counter() - begin
+    if arguments.json:
+        arguments.json.write_text(json.dumps(figures(records, wall), indent=1) + "\n")
+    print("\n".join((as_markdown if arguments.markdown else as_text)(records)))
+    print(f"{len(records)} cases in {wall:.0f} s")
+    return int(any(r["outcome"] in ("wrong", "crashed") for r in records))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

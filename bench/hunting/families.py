@@ -1,0 +1,22 @@
+"""All families of generated cases, in one list."""
+
+from hunting import bodies, events, gradients, linkages, oscillators, pendulums, sliders, uses
+
+FAMILIES = (
+    *linkages.FAMILIES,
+    *sliders.FAMILIES,
+    *pendulums.FAMILIES,
+    *events.FAMILIES,
+    *oscillators.FAMILIES,
+    *bodies.FAMILIES,
+    *uses.FAMILIES,
+    *gradients.families(),
+)
+
+
+def family(name: str):
+    """The family with this name; ValueError where there is none."""
+    for found in FAMILIES:
+        if found.name == name:
+            return found
+    raise ValueError(f"there is no family `{name}`; known: {', '.join(f.name for f in FAMILIES)}")
