@@ -63,7 +63,5 @@ class Kinked(jj.Scene):
 
 def test_no_scene_is_said_to_have_derivatives_of_its_own_that_has_none():
     for scene in (Kinked(), jj.models.TwoWheelAxleRedundant()):
-        try:
-            jj.lower(scene, every_speed=True)
-        except jj.NotLowered as reason:
-            assert "derivative of its own" not in str(reason)
+        said = jj.report(scene).lowering if isinstance(scene, Kinked) else jj.lower(scene, every_speed=True).summary()
+        assert "derivative of its own" not in said
