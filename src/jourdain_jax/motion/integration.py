@@ -1,7 +1,10 @@
 """One motion from start to end as one compiled program: the lean loop for the default options, diffrax for all others.
 
-Both give states at the saved times, which of those were reached, and where and why the motion ended; events that diffrax stepped over are then
-located (the lean loop does so itself), speeds worked out, and all is put into a `Trajectory`.
+Both give states at the saved times, which of those were reached, and where and why the motion ended; then speeds are worked out, and all is put into a
+`Trajectory`.
+
+Time counts from the start, tau = t - t0: far from zero a clock has few digits, and what does not depend on it is to be as right there as at t0 = 0.
+Rates, projection and events are given tau, and the scene and its inputs t0 + tau.
 """
 
 from typing import Literal
@@ -15,9 +18,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion import lean_loop, results
-from jourdain_jax.motion.event_location import Located, locate
+from jourdain_jax.motion.event_location import Remembering, locate, with_tolerances
+from jourdain_jax.motion.event_search import no_event
 from jourdain_jax.motion.finite_derivatives import Flat
-from jourdain_jax.motion.land_on import land_on
+from jourdain_jax.motion.knots import knots_between
+from jourdain_jax.motion.land_on import land_on, merged
 from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
 from jourdain_jax.motion.quick_compilation import quickly_compiled
@@ -30,6 +35,7 @@ from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
 LEAN_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
+_WITHOUT_TIMES = (diffrax.PIDController, diffrax.ConstantStepSize)
 
 
 class Options(eqx.Module):
@@ -55,7 +61,7 @@ class Options(eqx.Module):
 class Solved(eqx.Module):
     """What either loop finds."""
 
-    ts: Float[Array, "times *lanes"]
+    ts: Float[Array, "times *lanes"]  # as t_end, since the start
     ys: PyTree
     reached: Bool[Array, "times *lanes"]
     t_end: Float[Array, "*lanes"]
@@ -86,7 +92,7 @@ class Begun(eqx.Module):
 
     right: Bool[Array, ""]  # whether all parameters are
     start: State
-    args: tuple  # form, scene, inputs, what the rates need of the scene
+    args: tuple  # form, scene, inputs, what the rates need of the scene, the time from which times count
     y0: Integrated
 
 
@@ -122,7 +128,7 @@ def _begin(setup: Setup) -> Begun:
     right, start = _without_faults(setup.scene, setup.start)
     scene, start, inputs = _mark_inputs(setup.options.adjoint, (setup.scene, start, setup.inputs))
     form = setup.form
-    return Begun(right, start, (form, scene, inputs, form.fixed(scene)), form.pack(start.q, start.u))
+    return Begun(right, start, (form, scene, inputs, form.fixed(scene), _origin(setup)), form.pack(start.q, start.u))
 
 
 def _solved(setup: Setup, begun: Begun) -> Solved:
@@ -130,40 +136,40 @@ def _solved(setup: Setup, begun: Begun) -> Solved:
 
 
 def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
-    t0, t1, form, options, adjoint = setup.t0, setup.t1, setup.form, setup.options, setup.options.adjoint
+    t0, form, options, adjoint = setup.t0, setup.form, setup.options, setup.options.adjoint
     start, args = begun.start, begun.args
-    _, scene, inputs, fixed = args
+    _, scene, inputs, fixed, origin = args
     solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, _mark_outputs(adjoint, (solved.ys, solved.y_end)))
-    end = Located(solved.t_end, solved.y_end) if options.lean else _located_end(solved, args, t0, options.event_names)
     moving = form.projects_positions or form.projects_speeds
     stored_first = form.stored(scene, t0, start.q, inputs(t0))
-    before_end = (solved.ts - t0) * jnp.sign(t1 - t0) <= (end.t - t0) * jnp.sign(t1 - t0)
-    valid = solved.reached & before_end
+    direction = jnp.sign(setup.t1 - t0)
+    valid = solved.reached & (solved.ts * direction <= solved.t_end * direction)
 
-    def saved_state(t, y, valid):
+    def saved_state(tau, y, valid):
         # what was never reached holds anything: compute at the end state instead, then mark
-        t, y = jnp.where(valid, t, end.t), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, end.y)
-        y = _project(t, y, args) if moving and not options.lean else y
+        tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
+        y = _project(tau, y, args) if moving and not options.lean else y
+        t = origin + tau
         q, u = form.unpack(scene, fixed, t, y, inputs(t))
         work = None if y.work is None else y.work + form.stored(scene, t, q, inputs(t)) - stored_first
         return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (q, u, work)), form.pivot(scene, fixed, t, y, inputs(t))
 
     # the end state as one more saved one, so that all this is compiled once
-    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), (end.t, end.y, jnp.array(True)))
+    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), (solved.t_end, solved.y_end, jnp.array(True)))
     (q, u, work), pivots = jax.vmap(saved_state)(*with_end)
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
     return Trajectory(
         scene=setup.scene,
-        ts=solved.ts,
+        ts=setup.ts if options.saveat is None else origin + solved.ts,
         q=q[:-1],
         u=u[:-1],
         work=None if work is None else work[:-1],
-        t_end=end.t,
+        t_end=jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end),
         q_end=q[-1],
         u_end=u[-1],
         result=results.with_causes(
-            _result(solved.code, end.y, start, pivot if form.needs_pivot else jnp.inf),
+            _result(solved.code, solved.y_end, start, pivot if form.needs_pivot else jnp.inf),
             parameters=begun.right,
             start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
             moved=solved.accepted > 0,
@@ -196,7 +202,7 @@ def _without_faults(scene: Scene, start: State):
 def _by_lean_loop(setup: Setup, begun: Begun) -> Solved:
     form, options = setup.form, setup.options
     moving = form.projects_positions or form.projects_speeds
-    return _lean(setup, begun.y0, begun.args, setup.ts, _rates, _project if moving else None, _events if options.event_names else None)
+    return _lean(setup, begun.y0, begun.args, setup.ts, _knots(setup), _rates, _project if moving else None, _events if options.event_names else None)
 
 
 def _lanes_by_lean_loop(setups: Setup, begun: Begun) -> Solved:
@@ -204,13 +210,14 @@ def _lanes_by_lean_loop(setups: Setup, begun: Begun) -> Solved:
     form, options = setups.form, setups.options
     moving = form.projects_positions or form.projects_speeds
     events = _events_of_lanes if options.event_names else None
-    y0, ts = _lanes_last((begun.y0, setups.ts))
-    solved = _lean(setups, y0, begun.args, ts, _rates_of_lanes, _project_of_lanes if moving else None, events)
+    y0, ts, knots = _lanes_last((begun.y0, setups.ts, eqx.filter_vmap(_knots)(setups)))
+    solved = _lean(setups, y0, begun.args, ts, knots, _rates_of_lanes, _project_of_lanes if moving else None, events)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solved)
 
 
-def _lean(setup: Setup, y0, args, ts, rates, project, events) -> Solved:
+def _lean(setup: Setup, y0, args, ts, knots, rates, project, events) -> Solved:
     options = setup.options
+    goals = jnp.concatenate([ts, setup.t1[None]]) - setup.t0
     problem = lean_loop.Problem(
         rates=rates,
         args=args,
@@ -219,15 +226,29 @@ def _lean(setup: Setup, y0, args, ts, rates, project, events) -> Solved:
         norm=_StateNorm(setup.form.recovered),
         rtol=jnp.broadcast_to(options.tolerances[0], setup.t0.shape),
         atol=jnp.broadcast_to(options.tolerances[1], setup.t0.shape),
-        shortest=_shortest(setup.t0, setup.t1),
-        max_steps=options.max_steps,
+        shortest=_shortest(setup.t1 - setup.t0),
+        max_steps=options.max_steps + (0 if knots is None else len(knots)),
+        knots=knots,
         unseen=LargestError(setup.form.recovered) if setup.form.recovered else None,
     )
     kind: Literal["forward", "reverse"] = "forward" if isinstance(options.adjoint, diffrax.ForwardMode) else "reverse"
-    goals = jnp.concatenate([ts, setup.t1[None]])
-    ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, setup.t0, goals, options.dt0, kind)
+    since = jnp.zeros_like(setup.t0)
+    ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, since, goals, options.dt0, kind)
     unseen = jnp.zeros_like(end.h) if end.unseen is None else end.unseen
-    return Solved(ts, jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, unseen)
+    return Solved(goals[:-1], jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, unseen)
+
+
+def _origin(setup: Setup) -> Float[Array, ""]:
+    """The time from which times count: the start, but zero where a controller of the user's may hold times of its own."""
+    plain = setup.options.controller is None or type(setup.options.controller) in _WITHOUT_TIMES
+    return setup.t0 if plain else jnp.zeros_like(setup.t0)
+
+
+def _knots(setup: Setup) -> Float[Array, "knots"] | None:
+    """Times since the start at which steps must end for the inputs' sake."""
+    if isinstance(setup.options.controller, diffrax.StepTo):  # whose steps are the user's
+        return None
+    return knots_between((setup.inputs, setup.scene), setup.options.tolerances[0], setup.t0, setup.t1, setup.ts)
 
 
 def _lanes_last(tree):
@@ -239,8 +260,9 @@ def _lane_by_lane(function):
     return lambda t, y, args: eqx.filter_vmap(function, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(t, y, args)
 
 
-def _rates_of_lanes(t, y, args):
-    form, scene, inputs, fixed = args
+def _rates_of_lanes(tau, y, args):
+    form, scene, inputs, fixed, origin = args
+    t = origin + tau
     return form.rates(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
 
 
@@ -249,47 +271,60 @@ def _inputs_of_lanes(inputs, t) -> Float[Array, "inputs lanes"]:
 
 
 def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
-    t0, t1, ts, form, options, args, y0 = setup.t0, setup.t1, setup.ts, setup.form, setup.options, begun.args, begun.y0
+    form, options, args, y0 = setup.form, setup.options, begun.args, begun.y0
+    origin = args[4]
+    t0, t1, ts, knots = setup.t0 - origin, setup.t1 - origin, setup.ts - origin, _knots(setup)
     names, (rtol, atol) = options.event_names, options.tolerances
-    controller = controller_of(options.solver, options.controller, ts, t1)
-    land = options.land and controller is None
+    landings = jnp.append(ts if options.land else ts[:0], t1)
+    landings = landings if knots is None else merged(landings, knots + t0, jnp.sign(t1 - t0))
+    controller = controller_of(options.solver, options.controller, landings)
+    land = (options.land or knots is not None) and controller is None
     controller = options.controller if controller is None else controller
     if controller is None:
-        controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=_StateNorm(), dtmin=_shortest(t0, t1), force_dtmin=False)
-    saveat = diffrax.SaveAt(ts=ts) if options.saveat is None else options.saveat
+        controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=_StateNorm(), dtmin=_shortest(t1 - t0), force_dtmin=False)
+    saveat = diffrax.SaveAt(ts=ts) if options.saveat is None else _shifted(options.saveat, -origin)
     moving = form.projects_positions or form.projects_speeds
     solver = for_adjoint(options.solver, options.adjoint)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
     rates, project = (Flat(f, t0, y0) if implicit else f for f in (_rates, _project))
+    solver = with_tolerances(ProjectedSolver(solver, project) if moving else solver, controller)
+    term = diffrax.ODETerm(rates)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(rates),
-        ProjectedSolver(solver, project) if moving else solver,
+        term,
+        Remembering(solver, _events) if names else solver,
         t0,
         t1,
         options.dt0,
         y0,
         args,
-        saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)]),
-        stepsize_controller=land_on(ts, controller) if land else controller,
+        saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)], solver_state=bool(names)),
+        stepsize_controller=land_on(landings, controller) if land else controller,
         adjoint=options.adjoint,
-        event=diffrax.Event({name: _EventValue(i) for i, name in enumerate(names)}, direction=False) if names else None,
-        max_steps=options.max_steps,
+        event=diffrax.Event(_an_event) if names else None,
+        max_steps=options.max_steps + (0 if knots is None else len(knots)),
         throw=False,
     )
-    happened = jnp.stack([solution.event_mask[name] for name in names]) if names else jnp.zeros(1, bool)
+    t_end, y_end = solution.ts[1][0], jax.tree.map(lambda x: x[0], solution.ys[1])
     code = jnp.where(solution.result == diffrax.RESULTS.max_steps_reached, results.MAX_STEPS, results.STEP_TOO_SMALL)
     code = jnp.where(solution.result == diffrax.RESULTS.successful, results.SUCCESS, code)
     unsolved = (solution.result == diffrax.RESULTS.nonlinear_divergence) | (solution.result == diffrax.RESULTS.nonlinear_max_steps_reached)
-    t_end = solution.ts[1][0]
+    # a step that was not solved is no step: the times at its end were not reached
+    reached = jnp.isfinite(solution.ts[0]) & ~(unsolved & ((solution.ts[0] - t_end) * jnp.sign(t1 - t0) >= 0))
+    code, event = jnp.where(unsolved, results.UNSOLVED_STEP, code), jnp.full_like(code, -1, jnp.int32)
+    if names:
+        happened = solution.event_mask
+        t_last, y_last, _ = solution.solver_state
+        located = locate(solver, term, _events, (t_last * jnp.sign(t1 - t0), y_last), t_end, y_end, args, happened)
+        t_end, y_end, event = located.t, located.y, located.event
+        code = jnp.where(happened, results.EVENT, code)
     return Solved(
         ts=solution.ts[0],
         ys=solution.ys[0],
-        # a step that was not solved is no step: the times at its end were not reached
-        reached=jnp.isfinite(solution.ts[0]) & ~(unsolved & ((solution.ts[0] - t_end) * jnp.sign(t1 - t0) >= 0)),
+        reached=reached,
         t_end=t_end,
-        y_end=jax.tree.map(lambda x: x[0], solution.ys[1]),
-        code=jnp.where(jnp.any(happened), results.EVENT, jnp.where(unsolved, results.UNSOLVED_STEP, code)),
-        event=jnp.where(jnp.any(happened), jnp.argmax(happened), -1).astype(jnp.int32),
+        y_end=y_end,
+        code=code,
+        event=event,
         accepted=solution.stats["num_accepted_steps"],
         rejected=solution.stats["num_rejected_steps"],
         last_step=jnp.full_like(t_end, jnp.nan),
@@ -297,21 +332,20 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
     )
 
 
-def _shortest(t0, t1) -> Float[Array, "*lanes"]:
-    return 1e-14 * jnp.maximum(jnp.abs(t1 - t0), jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
+def _shifted(saveat: diffrax.SaveAt, by) -> diffrax.SaveAt:
+    """With other times to save at."""
+    return saveat if saveat.subs.ts is None else eqx.tree_at(lambda saveat: saveat.subs.ts, saveat, saveat.subs.ts + by)
 
 
-def _located_end(solved: Solved, args, t0, names) -> Located:
-    """Time and state at the end of the motion: at the event, where one ended it."""
-    if not names:
-        return Located(solved.t_end, solved.y_end)
-    happened = solved.event >= 0
+def _an_event(t, y, args, *, terms, **kwargs) -> Bool[Array, ""]:
+    """Whether any event has happened, in the signature of diffrax; a state that is lost is none."""
+    direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
+    known = jnp.all(jnp.stack([jnp.all(jnp.isfinite(part)) for part in jax.tree.leaves((y.q, y.v))]))
+    return known & ~no_event(_events(t * direction, y, args))
 
-    def value(t, y, args):
-        return _events(t, y, args)[solved.event]
 
-    # a motion that starts beyond an event has no motion at all
-    return locate(_rates, value, solved.t_end, solved.y_end, args, happened & (solved.t_end != t0), solved.t_end - t0)
+def _shortest(span) -> Float[Array, "*lanes"]:
+    return 1e-14 * jnp.abs(span)
 
 
 def _result(code, y_end: Integrated, start: State, pivot):
@@ -340,43 +374,38 @@ class _StateNorm(eqx.Module):
 
 
 @eqx.filter_jit  # traced once, not once per stage and derivative
-def _rates(t, y, args):
-    form, scene, inputs, fixed = args
+def _rates(tau, y, args):
+    form, scene, inputs, fixed, origin = args
+    t = origin + tau
     return form.rates(scene, fixed, t, y, form.now(inputs, t))
 
 
 @eqx.filter_jit  # traced once, not once per stage and derivative
-def _project(t, y, args):
-    form, scene, inputs, fixed = args
+def _project(tau, y, args):
+    form, scene, inputs, fixed, origin = args
+    t = origin + tau
     return form.project(scene, fixed, t, y, inputs(t))
 
 
-def _project_of_lanes(t, y, args):
-    form, scene, inputs, fixed = args
+def _project_of_lanes(tau, y, args):
+    form, scene, inputs, fixed, origin = args
+    t = origin + tau
     return form.project(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
 
 
 @eqx.filter_jit
-def _events(t, y, args) -> Float[Array, "events *lanes"]:
-    form, scene, inputs, fixed = args
+def _events(tau, y, args) -> Float[Array, "events *lanes"]:
+    form, scene, inputs, fixed, origin = args
+    t = origin + tau
     return form.events(scene, fixed, t, y, inputs(t))
 
 
-def _events_of_lanes(t, y, args):
-    form, scene, inputs, fixed = args
+def _events_of_lanes(tau, y, args):
+    form, scene, inputs, fixed, origin = args
     if form.lowers_events:
+        t = origin + tau
         return form.events(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
-    return _lane_by_lane(_events)(t, y, args)
-
-
-class _EventValue(eqx.Module):
-    """Value of one named event of the scene, in the signature of diffrax."""
-
-    index: int = eqx.field(static=True)
-
-    def __call__(self, t, y, args, *, terms, **kwargs):
-        direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
-        return _events(t * direction, y, args)[self.index]
+    return _lane_by_lane(_events)(tau, y, args)
 
 
 def _mark_inputs(adjoint, tree):

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.motion import lean_adjoint, results
-from jourdain_jax.motion.event_search import MOST_STEPS
-from jourdain_jax.motion.lean_step import LOCATING, RUNNING, Method, Problem, Progress, advanced, begun, chosen, running
+from jourdain_jax.motion.event_search import MOST_STEPS, chosen
+from jourdain_jax.motion.lean_step import LOCATING, Method, Problem, Progress, advanced, begun, running, standing
 
 STEPS_ALONE, STEPS_TOGETHER = 2048, 512  # of a window: for one motion, for lanes in lockstep
 SPARE = 4  # this part of a window is left free, for the steps that it takes when it is integrated again
@@ -84,7 +84,7 @@ def motion(forward: Callable, problem: Problem, method: Method, y0: PyTree, t0, 
     """`forward` of the other arguments, with derivatives in reverse mode by `y0`, `t0`, `goals` and whatever the functions of `problem` depend on."""
     like = (t0, y0, problem.args)
     rates, project, events = (f if f is None else eqx.filter_closure_convert(f, *like) for f in (problem.rates, problem.project, problem.events))
-    control = problem.norm, *jax.lax.stop_gradient((problem.rtol, problem.atol, problem.shortest)), problem.max_steps, problem.unseen
+    control = problem.norm, *jax.lax.stop_gradient((problem.rtol, problem.atol, problem.shortest)), problem.max_steps, jax.lax.stop_gradient(problem.knots), problem.unseen
     return _motion(((rates, project, problem.args), events, y0, t0, goals), (control, jax.lax.stop_gradient(jnp.asarray(dt0))), forward, method)
 
 
@@ -104,8 +104,8 @@ def _motion(moving, control, forward, method):
 def _recorded(perturbed, moving, control, forward, method):
     *_, y0, t0, goals = moving
     problem = _problem(moving, control)
-    start = begun(problem, y0, t0, control[1])
     direction = jnp.sign(goals[-1] - t0)
+    start = begun(problem, y0, t0, control[1], direction)
     empty = _empty(start, problem.max_steps)
     full = len(empty.window.t) - 1 - len(empty.window.t) // SPARE
     places = len(empty.beginnings.t)
@@ -207,8 +207,7 @@ def _again(problem: Problem, method: Method, beginnings: _Beginnings, number, wi
     """The window with this number, integrated to where the next one begins, and which lanes arrived there; nothing where the number is negative."""
     first = _at(beginnings, jnp.maximum(number, 0))
     target, last_goal = _at((beginnings.t, beginnings.goal), number + 1)
-    zero = jnp.zeros(jnp.shape(first.t), jnp.int32)
-    start = Progress(first.t, first.y, first.h, zero + RUNNING, zero, zero, zero - 1, None, problem.nothing_unseen(first.t))
+    start = standing(problem, first.y, first.t, first.h, direction)
     room = len(window.t) - 1
 
     def to_goal(carry):

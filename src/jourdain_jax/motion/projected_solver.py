@@ -11,11 +11,10 @@ import equinox as eqx
 import jax.numpy as jnp
 
 
-class ProjectedSolver(diffrax.AbstractWrappedSolver):
-    """`solver`, followed by `project(t, y, args)` after every step."""
+class Wrapping(diffrax.AbstractWrappedSolver):
+    """What solvers have in common that do something about the steps of another one, `solver`."""
 
-    solver: diffrax.AbstractSolver
-    project: Callable = eqx.field(static=False)
+    solver: eqx.AbstractVar[diffrax.AbstractSolver]
 
     @property
     def scan_kind(self):
@@ -59,6 +58,17 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         """As the wrapped solver."""
         return self.solver.error_order(terms)
 
+    def func(self, terms, t0, y0, args):
+        """As the wrapped solver."""
+        return self.solver.func(terms, t0, y0, args)
+
+
+class ProjectedSolver(Wrapping):
+    """`solver`, followed by `project(t, y, args)` after every step."""
+
+    solver: diffrax.AbstractSolver
+    project: Callable = eqx.field(static=False)
+
     def init(self, terms, t0, t1, y0, args):
         """As the wrapped solver."""
         return self.solver.init(terms, t0, t1, y0, args)
@@ -68,10 +78,6 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         y1, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, True)
         t = t1 * jnp.sign(terms.contr(t0, t1))  # diffrax counts time along the direction of the motion
         return self.project(t, y1, args), error, dense, solver_state, result
-
-    def func(self, terms, t0, y0, args):
-        """As the wrapped solver."""
-        return self.solver.func(terms, t0, y0, args)
 
 
 def for_adjoint(solver: diffrax.AbstractSolver, adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractSolver:

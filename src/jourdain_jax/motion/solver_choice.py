@@ -1,7 +1,6 @@
 """What a solver asks for besides its rates: a form of the state, constant steps, states saved at ends of steps only."""
 
 import diffrax
-import jax.numpy as jnp
 
 from jourdain_jax.motion.discrete_gradient import DiscreteGradient
 from jourdain_jax.motion.even_steps import EvenSteps
@@ -39,8 +38,8 @@ def check_solver(solver, controller, dt0, land: bool, saveat) -> None:
         raise ValueError(f"`{name}` takes steps of one length; give `dt0`, the step in s")
 
 
-def controller_of(solver, controller, ts, t1):
-    """Even steps between the saved times for a structure-preserving solver, unless the steps are given otherwise; None: no such choice."""
+def controller_of(solver, controller, ts):
+    """Even steps between the times at which steps end for a structure-preserving solver, unless the steps are given otherwise; None: no such choice."""
     if isinstance(solver, FixedStepSolver) and (controller is None or type(controller) is diffrax.ConstantStepSize):
-        return EvenSteps(jnp.append(ts, t1))
+        return EvenSteps(ts)
     return None

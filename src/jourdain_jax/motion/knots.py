@@ -1,0 +1,62 @@
+"""At which times steps must end, so that nothing of an input that is given by samples is passed over.
+
+A step sees an input at a few times only, so that a short feature between them would be lost at any tolerance. `Sampled` inputs are straight lines between
+knots: where steps end at the knots, each step has a smooth input, and nothing is lost. A knot at which the input hardly bends may be passed over: those
+at which steps end are chosen so that the straight lines between them are nowhere off by more than
+
+    max(0.1 min(rtol, 1e-4) (max v - min v), round-off)
+
+at the knots in between. They are found one after the other: from the last one, lines to later knots must pass all knots in between within that distance.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jourdain_jax.motion.inputs import Sampled
+
+_SHARE, _LOOSEST = 0.1, 1e-4
+_ONE_TIME = 1e-12  # of the span: times nearer to each other than this are one
+
+
+def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
+    """Times since `t0`, in the order of the motion to `t1`, of the knots of all samples in `holders` at which steps must end, but for the saved times `ts`.
+
+    Then infinite times, with the sign of the motion, at least one. None where there are no samples.
+    """
+    samples = [x for x in jax.tree.leaves(holders, is_leaf=lambda x: isinstance(x, Sampled)) if isinstance(x, Sampled) and len(x.ts) > 1]
+    if not samples:
+        return None
+    rtol, t0, t1, ts, samples = jax.lax.stop_gradient((rtol, t0, t1, ts, samples))
+    direction, span = jnp.sign(t1 - t0), jnp.abs(t1 - t0)
+    since = jnp.concatenate([jnp.where(bends(x, _SHARE * jnp.minimum(rtol, _LOOSEST)), (x.ts - t0) * direction, jnp.inf) for x in samples])
+    near = _ONE_TIME * span
+    ends = jnp.sort(jnp.concatenate([(ts - t0) * direction, jnp.stack([jnp.zeros_like(span), span])]))
+    after = jnp.clip(jnp.searchsorted(ends, since), 1, len(ends) - 1)
+    is_end = jnp.minimum(jnp.abs(since - ends[after - 1]), jnp.abs(ends[after] - since)) <= near
+    since = jnp.sort(jnp.where(is_end | (since < 0) | (since > span), jnp.inf, since))
+    repeated = jnp.concatenate([jnp.zeros(1, bool), since[1:] - since[:-1] <= near])
+    return direction * jnp.append(jnp.sort(jnp.where(repeated, jnp.inf, since)), jnp.inf)
+
+
+def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
+    """At which knots steps must end: the straight lines between them are off by `share` of the range of values at most, at the other knots."""
+    t, v = sampled.ts, sampled.values
+    allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * jnp.max(jnp.abs(v)))
+
+    def next_knot(carry, here):
+        # lines from the anchor: to the knot before, and the slopes between which a line passes all knots since
+        t_a, v_a, t_b, v_b, low, high = carry
+        t_k, v_k = here
+        slope = (v_k - v_a) / (t_k - t_a)
+        straight = (slope >= low) & (slope <= high)
+        t_a, v_a = jnp.where(straight, t_a, t_b), jnp.where(straight, v_a, v_b)
+        least, most = (v_k - allowed - v_a) / (t_k - t_a), (v_k + allowed - v_a) / (t_k - t_a)
+        low, high = jnp.where(straight, jnp.maximum(low, least), least), jnp.where(straight, jnp.minimum(high, most), most)
+        return (t_a, v_a, t_k, v_k, low, high), ~straight
+
+    start = (t[0], v[0], t[0], v[0], jnp.asarray(-jnp.inf, v.dtype), jnp.asarray(jnp.inf, v.dtype))
+    _, bent = jax.lax.scan(next_knot, start, (t[1:], v[1:]))
+    # `bent` tells at a knot that steps end at the one before
+    ends = jnp.concatenate([bent[1:], jnp.zeros(1, bool)])
+    return jnp.concatenate([(v[1] != v[0])[None], ends[:-1], (v[-1] != v[-2])[None]]) if len(t) > 2 else jnp.full(2, True)
