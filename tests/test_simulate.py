@@ -84,8 +84,9 @@ def test_an_event_is_located_with_derivatives_up_to_the_third(derivative):
 
     def fall_time(height):
         y_f = jnp.stack([height - 0.5 * g * t_f**2, jnp.asarray(-g * t_f)])  # dropped at t = 0, seen at t_f, below the ground
-        rates = lambda t, y, args: jnp.stack([y[1], jnp.asarray(-g)])  # noqa: E731
-        return locate(rates, lambda t, y, args: y[0], jnp.asarray(t_f), y_f, None, jnp.asarray(True), jnp.asarray(t_f)).t
+        term = diffrax.ODETerm(lambda t, y, args: jnp.stack([y[1], jnp.asarray(-g)]))
+        dropped = jnp.asarray(0.0), jnp.stack([height, jnp.asarray(0.0)])
+        return locate(diffrax.Dopri8(), term, lambda t, y, args: y[:1], dropped, jnp.asarray(t_f), y_f, None, jnp.asarray(True)).t
 
     height, exact = 2.0, np.sqrt(2 * 2.0 / g)
     for expected in (exact, exact / (2 * height), -exact / (4 * height**2), 3 * exact / (8 * height**3)):

@@ -4,10 +4,10 @@ For motions by diffrax, which stops at the end of the step in which an event hap
 step began, (t_0, y_0); the event is found by shorter steps Y(h) of the same solver from there, so that a motion that the solver follows, stiff or not,
 is followed to the event:
 
-    h* with c(t_0 + h*, Y(h*)) = 0 (held constant in differentiation),   then twice   h <- h - c / (dc/dh),   t_e = t_0 + h,   y_e = Y(h)
+    h* with c(t_0 + h*, Y(h*)) = 0 (held constant in differentiation),   then   h <- h - c / (dc/dh) thrice,   t_e = t_0 + h,   y_e = Y(h)
 
 The last corrections are zero in value, and carry the derivatives of the event time and of the state at the event (the saltation term). Newton's
-method doubles the order at which it is right: one correction gives first derivatives, two give the second and third ones too.
+method doubles the order at which it is right: one correction at h* gives first derivatives, two give the second and third ones too.
 """
 
 from collections.abc import Callable
@@ -19,10 +19,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.motion import event_search
-from jourdain_jax.motion.event_search import Bracket, bracket, chosen, next_trial, no_event
+from jourdain_jax.motion.event_search import Bracket, bracket, chosen, next_trial
 from jourdain_jax.motion.projected_solver import Wrapping
 
-_CORRECTIONS = 2  # differentiable ones
+_CORRECTIONS = 3  # the first makes h* exact
 _TRIALS = 72
 _INSIDE = (0.25, 0.5, 0.75)  # of a step: where events are looked for besides its end
 
@@ -36,7 +36,7 @@ class Located(eqx.Module):
 
 
 class Remembering(Wrapping):
-    """`solver`, which remembers where its last step began, and refuses a step in which an event happened but not at its end, by the dense output.
+    """`solver`, which remembers where its last step began, and refuses a step inside of which an event happened that is over at its end, by the dense output.
 
     `values(t, y, args)`: of the events. The error estimate of a step that is refused is infinite; a solver without one takes all its steps.
     """
@@ -55,11 +55,11 @@ class Remembering(Wrapping):
             direction = jnp.sign(terms.contr(t0, t1))  # diffrax counts time along the direction of the motion
 
             def free(t, y):
-                return no_event(self.values(t * direction, y, args))
+                return self.values(t * direction, y, args) > 0
 
             between = self.interpolation_cls(t0=t0, t1=t1, **dense)
             times = t0 + jnp.asarray(_INSIDE, jnp.result_type(t0)) * (t1 - t0)
-            hidden = free(t1, y1) & ~jnp.all(jax.vmap(lambda t: free(t, between.evaluate(t)))(times))
+            hidden = jnp.any(free(t1, y1) & ~jnp.all(jax.vmap(lambda t: free(t, between.evaluate(t)))(times), axis=0))
             error = jax.tree.map(lambda e: jnp.where(hidden, jnp.inf, e), error)
         return y1, error, dense, (t0, y0, inner), result
 
@@ -148,7 +148,7 @@ def _differentiable_in_time(solver: diffrax.AbstractSolver) -> diffrax.AbstractS
     if isinstance(solver, diffrax.AbstractWrappedSolver):
         return eqx.tree_at(lambda s: s.solver, solver, _differentiable_in_time(solver.solver))
     if isinstance(solver, diffrax.AbstractRungeKutta):
-        return eqx.tree_at(lambda s: s.scan_kind, solver, "lax", is_leaf=lambda x: x is None)
+        return eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)
     return solver
 
 

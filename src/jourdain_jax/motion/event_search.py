@@ -146,14 +146,14 @@ def newton_shift(known: Bracket, step, c, c_dot, searching) -> Float[Array, "*la
 
 
 class Dip(eqx.Module):
-    """Whether a value falls below zero and rises again inside of a step, and after which part of it the first one is lowest."""
+    """Whether a value that is positive at both ends of a step falls below zero in between, and after which part of the step the first one is lowest."""
 
     happens: Bool[Array, "*lanes"]
     share: Float[Array, "*lanes"]
 
 
 def dip(h: Float[Array, "*lanes"], c_0, c_dot_0, c_1, c_dot_1) -> Dip:
-    """By the cubics through values (positive) and rates (events, *lanes) at the ends of a step `h`.
+    """By the cubics through values (those at the start positive) and rates (events, *lanes) at the ends of a step `h`.
 
     p(s) = c_0 + m_0 s + A s^2 + B s^3,   lowest at s = -m_0/(A + sqrt(A^2 - 3 B m_0))
     """
@@ -162,7 +162,7 @@ def dip(h: Float[Array, "*lanes"], c_0, c_dot_0, c_1, c_dot_1) -> Dip:
     A, B = 3 * rise - 2 * m_0 - m_1, m_0 + m_1 - 2 * rise
     s = -m_0 / (A + jnp.sqrt(jnp.maximum(A**2 - 3 * B * m_0, 0.0)))
     lowest = c_0 + s * (m_0 + s * (A + s * B))
-    dips = (m_0 < 0) & (m_1 > 0) & (s < _LATE) & (lowest < -1e-12 * (c_0 + c_1))
+    dips = (c_1 > 0) & (m_0 < 0) & (m_1 > 0) & (s < _LATE) & (lowest < -1e-12 * (c_0 + c_1))
     share = jnp.min(jnp.where(dips, s, 1.0), axis=0)
     return Dip(share < 1, share)
 

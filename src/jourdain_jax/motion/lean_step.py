@@ -42,12 +42,12 @@ class Method:
     @property
     def needed(self) -> int:
         """How many stages a step takes: without a last one that nothing else needs."""
-        return len(self.c) - (self.last_is_next_first and self.b_error[-1] == 0)
+        return len(self.c) - int(self.last_is_next_first and self.b_error[-1] == 0)
 
     @property
     def at_the_end(self) -> int:
         """The last stage that a step takes, of those at its end (of those at all, where none is)."""
-        return max(np.flatnonzero(self.c[: self.needed] == 1.0), default=self.needed - 1)
+        return int(max(np.flatnonzero(self.c[: self.needed] == 1.0), default=self.needed - 1))
 
 
 class Progress(eqx.Module):
@@ -202,9 +202,9 @@ def _watched(problem: Problem, p: Progress, moved: Progress, h, slopes, accept) 
     one, locating, (first_slope, last_slope) = jnp.ones_like(p.t), p.code == LOCATING, slopes
     first_values, first_rates = jax.jvp(events, (p.t, p.y), (one, first_slope))
     values, last_rates = jax.jvp(events, (moved.t, moved.y), (one, jax.lax.stop_gradient(last_slope)))
-    happened = accept & ~event_search.no_event(values)
     dip = event_search.dip(h, first_values, first_rates, values, last_rates)
-    dips = accept & ~happened & dip.happens
+    dips = accept & dip.happens
+    happened = accept & ~dips & ~event_search.no_event(values)
     search = event_search.advanced(p.search, happened, p.t, first_values, first_rates, moved.t, values)
     search = jax.tree.map(lambda new, old: jnp.where(happened | locating, new, old), search, p.search)
     # trials start at the last state before the event; a step that passes over a dip is tried again to its bottom
