@@ -89,7 +89,7 @@ def test_straight_lines_between_the_knots_that_are_kept_are_as_near_as_stated(sh
     random = np.random.default_rng(3)
     ts = np.sort(random.uniform(0.0, 10.0, 400))
     for values in (np.sin(ts), 1e3 + random.standard_normal(400), np.sign(np.sin(3 * ts)), 5.0 - 3.0 * ts, np.maximum(0.0, 1 - 50 * abs(ts - 4.0))):
-        kept = np.asarray(bends(jj.Sampled(ts, values), share))
+        kept = np.array(bends(jj.Sampled(ts, values), share))
         kept[[0, -1]] = True
         off = np.max(np.abs(np.interp(ts, ts[kept], values[kept]) - values))
         assert off <= share * np.ptp(values) * (1 + 1e-9) + 1e-12 * np.max(np.abs(values))

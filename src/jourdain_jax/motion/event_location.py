@@ -16,6 +16,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.motion import event_search
@@ -28,11 +29,12 @@ _INSIDE = (0.25, 0.5, 0.75)  # of a step: where events are looked for besides it
 
 
 class Located(eqx.Module):
-    """Time and state of an event, and its index."""
+    """Time and state of an event, its index, and whether the steps to it were solved."""
 
     t: Float[Array, ""]
     y: PyTree
     event: Int[Array, ""]
+    solved: Bool[Array, ""]
 
 
 class Remembering(Wrapping):
@@ -91,46 +93,50 @@ def locate(
     (t_f, y_f) itself where nothing happened. `term`: what is integrated; `values(t, y, args)`: of the events, (events,).
     """
     (t_0, y_0), direction = begun, jnp.sign(t_f - begun[0])
-    solver = _differentiable_in_time(solver)
+    solver = _for_trials(solver)
     moving = happened & (t_f != t_0)
     longest = jnp.where(moving, jnp.abs(t_f - t_0), jnp.ones_like(t_0))
 
     def stepped(h, t_0, y_0, args, direction):
-        """The state after a step by |h|, NaN where the solver failed."""
+        """The state after a step by |h|, NaN where the solver failed, and whether it did not."""
         along, first = Along(term, direction), t_0 * direction
         y, error, _, _, result = solver.step(along, first, first + h, y_0, args, solver.init(along, first, first + h, y_0, args), True)
         solved = diffrax.is_successful(result)
         for part in jax.tree.leaves(error):
             solved &= jnp.all(jnp.isfinite(part))
-        return jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), y)
+        return jax.tree.map(lambda x: jnp.where(solved, x, jnp.nan), y), solved
 
     def numbers(tree):
         return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
     fixed = numbers((t_0, y_0, args, jnp.where(moving, direction, 1.0)))
 
-    def tried(h) -> Float[Array, "events"]:
+    def tried(h) -> tuple[Float[Array, "events"], Bool[Array, ""]]:
         t_0, y_0, args, direction = fixed
-        return values(t_0 + direction * h, stepped(h, t_0, y_0, args, direction), args)
+        y, solved = stepped(h, t_0, y_0, args, direction)
+        return values(t_0 + direction * h, y, args), solved
 
     last = numbers(longest)
     known = bracket(jnp.zeros_like(last), values(fixed[0], fixed[1], fixed[2]), last, values(*numbers((t_f, y_f, args))))
 
     def not_found(carry):
-        known, k = carry
+        known, k, _ = carry
         return moving & ~next_trial(known, last, k >= _TRIALS).near
 
-    def search(carry) -> tuple[Bracket, Int[Array, ""]]:
-        known, k = carry
+    def search(carry) -> tuple[Bracket, Int[Array, ""], Bool[Array, ""]]:
+        known, k, right = carry
         h = next_trial(known, last, k >= _TRIALS).t
-        return known.narrowed(h, tried(h)), k + 1
+        c, solved = tried(h)
+        known = known.narrowed(h, c)
+        return known, k + 1, jnp.where(known.before, right, solved)
 
-    known, _ = jax.lax.while_loop(not_found, search, (known, jnp.zeros((), jnp.int32)))
+    # a step that is not solved says nothing of events: an event found where such steps begin is none
+    known, _, right = jax.lax.while_loop(not_found, search, (known, jnp.zeros((), jnp.int32), jnp.array(True)))
     event = known.first
 
     def corrected(h, _):
         def at(h):
-            t, y = t_0 + direction * h, stepped(h, t_0, y_0, args, direction)
+            t, (y, _) = t_0 + direction * h, stepped(h, t_0, y_0, args, direction)
             return chosen(event, values(t, y, args)), y
 
         (c, y), (c_dot, f) = jax.jvp(at, (h,), (jnp.ones_like(h),))
@@ -140,13 +146,16 @@ def locate(
     h, ys = jax.lax.scan(corrected, jnp.where(moving, known.t[0], longest), None, length=_CORRECTIONS)
     t = jnp.where(moving, t_0 + direction * h, t_f)
     y = jax.tree.map(lambda y, end: jnp.where(moving, y[-1], end), ys, y_f)
-    return Located(t, y, jnp.where(happened, event, -1).astype(jnp.int32))
+    return Located(t, y, jnp.where(happened, event, -1).astype(jnp.int32), right)
 
 
-def _differentiable_in_time(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
-    """The solver with a loop over its stages that can be differentiated in both modes."""
+def _for_trials(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
+    """The solver with a loop over its stages that can be differentiated in both modes, and with Newton's method in place of a chord, which fails in more steps."""
     if isinstance(solver, diffrax.AbstractWrappedSolver):
-        return eqx.tree_at(lambda s: s.solver, solver, _differentiable_in_time(solver.solver))
+        return eqx.tree_at(lambda s: s.solver, solver, _for_trials(solver.solver))
+    if isinstance(solver, diffrax.AbstractImplicitSolver) and isinstance(solver.root_finder, diffrax.VeryChord):
+        chord = solver.root_finder
+        solver = eqx.tree_at(lambda s: s.root_finder, solver, optx.Newton(rtol=chord.rtol, atol=chord.atol, norm=chord.norm))
     if isinstance(solver, diffrax.AbstractRungeKutta):
         return eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)
     return solver

@@ -316,7 +316,7 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
         t_last, y_last, _ = solution.solver_state
         located = locate(solver, term, _events, (t_last * jnp.sign(t1 - t0), y_last), t_end, y_end, args, happened)
         t_end, y_end, event = located.t, located.y, located.event
-        code = jnp.where(happened, results.EVENT, code)
+        code = jnp.where(happened, jnp.where(located.solved, results.EVENT, results.UNSOLVED_STEP), code)
     return Solved(
         ts=solution.ts[0],
         ys=solution.ys[0],

@@ -27,21 +27,24 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
     samples = [x for x in jax.tree.leaves(holders, is_leaf=lambda x: isinstance(x, Sampled)) if isinstance(x, Sampled) and len(x.ts) > 1]
     if not samples:
         return None
-    rtol, t0, t1, ts, samples = jax.lax.stop_gradient((rtol, t0, t1, ts, samples))
-    direction, span = jnp.sign(t1 - t0), jnp.abs(t1 - t0)
-    since = jnp.concatenate([jnp.where(bends(x, _SHARE * jnp.minimum(rtol, _LOOSEST)), (x.ts - t0) * direction, jnp.inf) for x in samples])
-    near = _ONE_TIME * span
-    ends = jnp.sort(jnp.concatenate([(ts - t0) * direction, jnp.stack([jnp.zeros_like(span), span])]))
-    after = jnp.clip(jnp.searchsorted(ends, since), 1, len(ends) - 1)
-    is_end = jnp.minimum(jnp.abs(since - ends[after - 1]), jnp.abs(ends[after] - since)) <= near
-    since = jnp.sort(jnp.where(is_end | (since < 0) | (since > span), jnp.inf, since))
-    repeated = jnp.concatenate([jnp.zeros(1, bool), since[1:] - since[:-1] <= near])
+    t1, ts = jax.lax.stop_gradient((t1, ts))
+    direction, span = jax.lax.stop_gradient((jnp.sign(t1 - t0), jnp.abs(t1 - t0)))
+    share, near = _SHARE * jnp.minimum(rtol, _LOOSEST), _ONE_TIME * span
+    # which times these are is a number to differentiation, the times are not: steps end where a knot is moved to
+    since = jnp.concatenate([jnp.where(bends(x, share), (x.ts - t0) * direction, jnp.inf) for x in samples])
+    ends = jnp.sort(jnp.concatenate([(ts - jax.lax.stop_gradient(t0)) * direction, jnp.stack([jnp.zeros_like(span), span])]))
+    number = jax.lax.stop_gradient(since)
+    after = jnp.clip(jnp.searchsorted(ends, number), 1, len(ends) - 1)
+    is_end = jnp.minimum(jnp.abs(number - ends[after - 1]), jnp.abs(ends[after] - number)) <= near
+    since = jnp.sort(jnp.where(is_end | (number < 0) | (number > span), jnp.inf, since))
+    number = jax.lax.stop_gradient(since)
+    repeated = jnp.concatenate([jnp.zeros(1, bool), number[1:] - number[:-1] <= near])
     return direction * jnp.append(jnp.sort(jnp.where(repeated, jnp.inf, since)), jnp.inf)
 
 
 def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
     """At which knots steps must end: the straight lines between them are off by `share` of the range of values at most, at the other knots."""
-    t, v = sampled.ts, sampled.values
+    t, v, share = jax.lax.stop_gradient((sampled.ts, sampled.values, share))
     allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * jnp.max(jnp.abs(v)))
 
     def next_knot(carry, here):
@@ -58,5 +61,4 @@ def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
     start = (t[0], v[0], t[0], v[0], jnp.asarray(-jnp.inf, v.dtype), jnp.asarray(jnp.inf, v.dtype))
     _, bent = jax.lax.scan(next_knot, start, (t[1:], v[1:]))
     # `bent` tells at a knot that steps end at the one before
-    ends = jnp.concatenate([bent[1:], jnp.zeros(1, bool)])
-    return jnp.concatenate([(v[1] != v[0])[None], ends[:-1], (v[-1] != v[-2])[None]]) if len(t) > 2 else jnp.full(2, True)
+    return jnp.concatenate([(v[1] != v[0])[None], bent[1:], (v[-1] != v[-2])[None]])
