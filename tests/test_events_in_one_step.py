@@ -150,3 +150,17 @@ def test_a_value_that_falls_below_zero_and_rises_again_within_a_step_is_an_event
     seen = slice(None) if not options else slice(2, None)  # the dense output of diffrax is looked at in three places
     np.testing.assert_array_equal(lanes.event[seen], np.full(3, 2)[seen])
     np.testing.assert_allclose(lanes.t_end[seen], expected[seen], rtol=1e-9)
+
+
+def test_an_event_is_no_mistake_to_a_search_for_nan_and_a_mistake_still_is():
+    class Wrong(Thrown):
+        def loads(self, motion):
+            return (jj.gravity(motion, GRAVITY * jnp.sqrt(motion.q.z - 0.9)),)
+
+    with jax.debug_nans(True):
+        motion = jj.simulate(Thrown(), t1=5.0)
+        assert int(motion.result) == results.EVENT
+        assert np.isnan(motion["x"][-1])
+        assert "stopped at an event" in str(motion)
+        with pytest.raises(FloatingPointError):
+            jj.simulate(Wrong(), t1=5.0)

@@ -150,7 +150,7 @@ def locate(
 
 
 def _for_trials(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
-    """The solver with a loop over its stages that can be differentiated in both modes, and with Newton's method in place of a chord, which fails in more steps."""
+    """The solver with a loop over its stages that can be differentiated in both modes, and Newton's method in place of a chord, which fails more often."""
     if isinstance(solver, diffrax.AbstractWrappedSolver):
         return eqx.tree_at(lambda s: s.solver, solver, _for_trials(solver.solver))
     if isinstance(solver, diffrax.AbstractImplicitSolver) and isinstance(solver.root_finder, diffrax.VeryChord):

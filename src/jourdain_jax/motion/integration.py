@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion import lean_loop, results
 from jourdain_jax.motion.event_location import Remembering, locate, with_tolerances
@@ -27,7 +26,7 @@ from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.projected_solver import ProjectedSolver, for_adjoint
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.recovery import LargestError, is_among
-from jourdain_jax.motion.solver_choice import controller_of
+from jourdain_jax.motion.solver_choice import controller_of, marked_inputs, marked_outputs, since, steps_are_given, time_origin
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
 from jourdain_jax.motion.trajectory import Trajectory
@@ -35,7 +34,6 @@ from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
 LEAN_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
-_WITHOUT_TIMES = (diffrax.PIDController, diffrax.ConstantStepSize)
 
 
 class Options(eqx.Module):
@@ -126,9 +124,9 @@ def integrate_lanes(setups: Setup) -> Trajectory:
 
 def _begin(setup: Setup) -> Begun:
     right, start = _without_faults(setup.scene, setup.start)
-    scene, start, inputs = _mark_inputs(setup.options.adjoint, (setup.scene, start, setup.inputs))
+    scene, start, inputs = marked_inputs(setup.options.adjoint, (setup.scene, start, setup.inputs))
     form = setup.form
-    return Begun(right, start, (form, scene, inputs, form.fixed(scene), _origin(setup)), form.pack(start.q, start.u))
+    return Begun(right, start, (form, scene, inputs, form.fixed(scene), time_origin(setup.options.controller, setup.t0)), form.pack(start.q, start.u))
 
 
 def _solved(setup: Setup, begun: Begun) -> Solved:
@@ -139,7 +137,7 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
     t0, form, options, adjoint = setup.t0, setup.form, setup.options, setup.options.adjoint
     start, args = begun.start, begun.args
     _, scene, inputs, fixed, origin = args
-    solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, _mark_outputs(adjoint, (solved.ys, solved.y_end)))
+    solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, marked_outputs(adjoint, (solved.ys, solved.y_end)))
     moving = form.projects_positions or form.projects_speeds
     stored_first = form.stored(scene, t0, start.q, inputs(t0))
     direction = jnp.sign(setup.t1 - t0)
@@ -155,7 +153,8 @@ def _finish(setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
         return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (q, u, work)), form.pivot(scene, fixed, t, y, inputs(t))
 
     # the end state as one more saved one, so that all this is compiled once
-    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), (solved.t_end, solved.y_end, jnp.array(True)))
+    end = solved.t_end, solved.y_end, jnp.array(True)
+    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), end)
     (q, u, work), pivots = jax.vmap(saved_state)(*with_end)
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
@@ -232,21 +231,14 @@ def _lean(setup: Setup, y0, args, ts, knots, rates, project, events) -> Solved:
         unseen=LargestError(setup.form.recovered) if setup.form.recovered else None,
     )
     kind: Literal["forward", "reverse"] = "forward" if isinstance(options.adjoint, diffrax.ForwardMode) else "reverse"
-    since = jnp.zeros_like(setup.t0)
-    ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, since, goals, options.dt0, kind)
+    ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, options.dt0, kind)
     unseen = jnp.zeros_like(end.h) if end.unseen is None else end.unseen
     return Solved(goals[:-1], jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, unseen)
 
 
-def _origin(setup: Setup) -> Float[Array, ""]:
-    """The time from which times count: the start, but zero where a controller of the user's may hold times of its own."""
-    plain = setup.options.controller is None or type(setup.options.controller) in _WITHOUT_TIMES
-    return setup.t0 if plain else jnp.zeros_like(setup.t0)
-
-
 def _knots(setup: Setup) -> Float[Array, "knots"] | None:
     """Times since the start at which steps must end for the inputs' sake."""
-    if isinstance(setup.options.controller, diffrax.StepTo):  # whose steps are the user's
+    if steps_are_given(setup.options.controller):
         return None
     return knots_between((setup.inputs, setup.scene), setup.options.tolerances[0], setup.t0, setup.t1, setup.ts)
 
@@ -282,7 +274,7 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
     controller = options.controller if controller is None else controller
     if controller is None:
         controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=_StateNorm(), dtmin=_shortest(t1 - t0), force_dtmin=False)
-    saveat = diffrax.SaveAt(ts=ts) if options.saveat is None else _shifted(options.saveat, -origin)
+    saveat = diffrax.SaveAt(ts=ts) if options.saveat is None else since(options.saveat, origin)
     moving = form.projects_positions or form.projects_speeds
     solver = for_adjoint(options.solver, options.adjoint)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
@@ -330,11 +322,6 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
         last_step=jnp.full_like(t_end, jnp.nan),
         quadrature_error=jnp.zeros_like(t_end),
     )
-
-
-def _shifted(saveat: diffrax.SaveAt, by) -> diffrax.SaveAt:
-    """With other times to save at."""
-    return saveat if saveat.subs.ts is None else eqx.tree_at(lambda saveat: saveat.subs.ts, saveat, saveat.subs.ts + by)
 
 
 def _an_event(t, y, args, *, terms, **kwargs) -> Bool[Array, ""]:
@@ -406,13 +393,3 @@ def _events_of_lanes(tau, y, args):
         t = origin + tau
         return form.events(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
     return _lane_by_lane(_events)(tau, y, args)
-
-
-def _mark_inputs(adjoint, tree):
-    """Inputs of the integration: forward mode through a reverse-only adjoint raises our own error."""
-    return reverse_only(tree) if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) else tree
-
-
-def _mark_outputs(adjoint, tree):
-    """Outputs of the integration: reverse mode, which comes to them first, through a forward-only adjoint raises our own error."""
-    return forward_only(tree) if isinstance(adjoint, diffrax.ForwardMode) else tree

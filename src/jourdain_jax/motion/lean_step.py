@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -205,8 +206,15 @@ def _watched(problem: Problem, p: Progress, moved: Progress, h, slopes, accept) 
     dip = event_search.dip(h, first_values, first_rates, values, last_rates)
     dips = accept & dip.happens
     happened = accept & ~dips & ~event_search.no_event(values)
-    search = event_search.advanced(p.search, happened, p.t, first_values, first_rates, moved.t, values)
-    search = jax.tree.map(lambda new, old: jnp.where(happened | locating, new, old), search, p.search)
+    search = jax.lax.cond(
+        eqxi.unvmap_any(happened | locating),
+        lambda: jax.tree.map(
+            lambda new, old: jnp.where(happened | locating, new, old),
+            event_search.advanced(p.search, happened, p.t, first_values, first_rates, moved.t, values),
+            p.search,
+        ),
+        lambda: p.search,
+    )
     # trials start at the last state before the event; a step that passes over a dip is tried again to its bottom
     found, back = locating & (search.left == 0), (happened | locating) & search.trying
     t = jnp.where(found, moved.t + search.shift, jnp.where(back | dips, p.t, moved.t))
