@@ -160,7 +160,7 @@ def test_an_event_is_no_mistake_to_a_search_for_nan_and_a_mistake_still_is():
     with jax.debug_nans(True):
         motion = jj.simulate(Thrown(), t1=5.0)
         assert int(motion.result) == results.EVENT
-        assert np.isnan(motion["x"][-1])
+        assert np.isnan(np.asarray(motion["x"])[-1])
         assert "stopped at an event" in str(motion)
         with pytest.raises(FloatingPointError):
             jj.simulate(Wrong(), t1=5.0)
