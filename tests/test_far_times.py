@@ -78,6 +78,13 @@ def test_a_driven_oscillator_gets_the_time_of_the_clock():
     np.testing.assert_allclose(motion.u_end[0], (np.sin(2 * (t0 + 1.0)) - np.sin(2 * t0)) / 2, rtol=0, atol=1e-8)
 
 
+def test_a_clock_that_is_coarse_beside_the_steps_is_warned_of():
+    near, far = (jj.simulate(Oscillator(stiffness=1e8, driven=1.0), t0=t0, ts=[t0, t0 + 2.0**-7]) for t0 in (0.0, 1.7e9))
+    assert near.warnings == ()
+    (text,) = far.warnings
+    assert text.startswith("the clock resolves 2e-07 s at these times, and steps are of ")
+
+
 def test_lanes_far_in_time_are_the_ones_at_zero():
     starts = {"x": np.array([1.0, 0.5])}
     near, far = (jj.rollout(Oscillator(), starts, t0=t0, ts=[t0 + 0.5, t0 + 1.0], progress=False) for t0 in (0.0, 1.7e9))

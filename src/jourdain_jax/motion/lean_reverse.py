@@ -91,8 +91,8 @@ def motion(forward: Callable, problem: Problem, method: Method, y0: PyTree, t0, 
 
 def _problem(moving, control) -> Problem:
     (rates, project, args), events, knots, *_ = moving
-    *given, unseen = control[0]
-    return Problem(rates, args, project, events, *given, knots, unseen)
+    norm, rtol, atol, shortest, max_steps, unseen = control[0]
+    return Problem(rates, args, project, events, norm, rtol, atol, shortest, max_steps, knots, unseen)
 
 
 @eqx.filter_custom_vjp

@@ -200,6 +200,8 @@ def _watched(problem: Problem, p: Progress, moved: Progress, h, slopes, accept) 
     def events(t, y):
         return problem.events(t, y, problem.args)
 
+    so_far = p.search
+    assert so_far is not None  # where there are events
     one, locating, (first_slope, last_slope) = jnp.ones_like(p.t), p.code == LOCATING, slopes
     first_values, first_rates = jax.jvp(events, (p.t, p.y), (one, first_slope))
     values, last_rates = jax.jvp(events, (moved.t, moved.y), (one, jax.lax.stop_gradient(last_slope)))
@@ -210,16 +212,16 @@ def _watched(problem: Problem, p: Progress, moved: Progress, h, slopes, accept) 
         eqxi.unvmap_any(happened | locating),
         lambda: jax.tree.map(
             lambda new, old: jnp.where(happened | locating, new, old),
-            event_search.advanced(p.search, happened, p.t, first_values, first_rates, moved.t, values),
-            p.search,
+            event_search.advanced(so_far, happened, p.t, first_values, first_rates, moved.t, values),
+            so_far,
         ),
-        lambda: p.search,
+        lambda: so_far,
     )
     # trials start at the last state before the event; a step that passes over a dip is tried again to its bottom
     found, back = locating & (search.left == 0), (happened | locating) & search.trying
     t = jnp.where(found, moved.t + search.shift, jnp.where(back | dips, p.t, moved.t))
     y = jax.tree.map(lambda y, y_0, f: jnp.where(found, y + as_in(search.shift, y) * f, jnp.where(back | dips, y_0, y)), moved.y, p.y, first_slope)
-    event = jnp.where(happened | (locating & p.search.trying), search.known.first, p.event)
+    event = jnp.where(happened | (locating & so_far.trying), search.known.first, p.event)
     next_h = jnp.where(dips, dip.share * jnp.abs(h), jnp.where(locating, p.h, moved.h))
     code = jnp.where(happened, LOCATING, jnp.where(found, results.EVENT, jnp.where(locating, LOCATING, moved.code))).astype(jnp.int32)
     tried = dips.astype(jnp.int32)
