@@ -88,7 +88,9 @@ def as_stabilisation(stabilisation) -> Baumgarte | None:
     return stabilisation
 
 
-def accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None, usual: UsualRows | None = None) -> Accelerations:
+def accelerations(
+    scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None, usual: UsualRows | None = None
+) -> Accelerations:
     """Accelerations, multipliers and diagnostics of a scene at (t, q, u).
 
         M udot + h = Q + A' lambda,   A udot = -drift

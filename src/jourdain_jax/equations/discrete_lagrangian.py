@@ -43,13 +43,13 @@ class Interval(eqx.Module):
     """The span of one step, and the rule by which it is seen."""
 
     t0: Float[Array, ""]
-    t1: Float[Array, ""]
+    h: Float[Array, ""]  # its length, s
     rule: str = eqx.field(static=True)
 
     @property
-    def h(self) -> Float[Array, ""]:
-        """Its length, s."""
-        return self.t1 - self.t0
+    def t1(self) -> Float[Array, ""]:
+        """Its end."""
+        return self.t0 + self.h
 
     def mean(self, f: Callable, q0, q1):
         """The mean of `f(t, q, v)` over the interval, by the rule."""

@@ -113,7 +113,10 @@ def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
 
 
 def _spare_multipliers(A: Float[Array, "rows speeds"], typical: Float[Array, "rows"] | None = None) -> Float[Array, "rows rows"]:
-    """Columns: multipliers that change no motion, `A' lambda = 0`; all zero where the rows are independent; `typical`: lengths of the rows, as in `row_scale`."""
+    """Columns: multipliers that change no motion, `A' lambda = 0`; all zero where the rows are independent.
+
+    `typical`: lengths of the rows, as in `row_scale`.
+    """
     scale = row_scale(A, typical)
     A = jax.lax.stop_gradient(scale[:, None] * A)
     spare = jnp.eye(A.shape[0], dtype=A.dtype) - A @ pseudo_inverse(A)

@@ -12,7 +12,7 @@ from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.equations.probing import Seldom, on_numbers
 from jourdain_jax.equations.reactions import ContactForce
 from jourdain_jax.equations.rows import UsualRows
-from jourdain_jax.equations.structure import usual_rows
+from jourdain_jax.equations.structure import structure_of, usual_rows
 from jourdain_jax.motion.along import Record, accelerations_along, contact_forces_along, energies, invariants, residuals
 from jourdain_jax.motion.recovery import TOO_LONG
 from jourdain_jax.motion.results import FALLBACKS
@@ -82,6 +82,7 @@ def diagnose(trajectory: Record) -> Diagnostics:
 
 
 FEW_TIMES = 1000
+COARSE = 1e-3  # of a step: a clock that resolves less rounds times visibly
 VIOLATED = 1e-4  # residual of a row, relative to the state
 DRIFTED = 1e-2  # of the energy that moves
 _ROUND_OFF = 1e-6  # of the whole energy: where less than that moves, as at rest, nothing is said of its drift
@@ -144,6 +145,14 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
         warned.append(
             f"the privileged speeds of the reduction hardly determine the others, pivot {pivot:.1e}: no digit of the accelerations is sure in "
             f"{trajectory.q.dtype}; leave `reduction` at its default, or take float64"
+        )
+    ts, steps = np.asarray(trajectory.ts), max(int(trajectory.accepted), 1)
+    resolved, step = float(np.spacing(np.max(np.abs(ts)))), abs(float(trajectory.t_end) - float(ts[0])) / steps
+    by_clock = not trajectory.inputs.constant or bool(structure_of(trajectory.scene).timed)
+    if by_clock and resolved > COARSE * step > 0:
+        warned.append(
+            f"the clock resolves {resolved:.0e} s at these times, and steps are of {step:.0e} s: loads, poses and inputs that depend on time are given "
+            "rounded times; count time from zero, or take float64"
         )
     if float(trajectory.quadrature_error) > TOO_LONG:
         warned.append(

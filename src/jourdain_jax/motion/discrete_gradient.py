@@ -58,7 +58,7 @@ class DiscreteGradient(FixedStepSolver):
 
     def stepped(self, step: Step, y: Integrated) -> Stepped:
         """The state `y` after one `step`."""
-        return _stepped(step.args, step.t + step.h / 2, jnp.asarray(step.h, y.q.dtype), y)
+        return _stepped(step.args, step.args[4] + step.t + step.h / 2, jnp.asarray(step.h, y.q.dtype), y)
 
 
 @eqx.filter_jit  # traced once, not wherever diffrax looks at a step
@@ -105,7 +105,7 @@ def _skew_times(args, t, q, v, gbar) -> Float[Array, "state"]:
 
 @eqx.filter_jit
 def _rates(args, t, q, v):
-    form, scene, inputs, fixed = args
+    form, scene, inputs, fixed, _ = args
     found = form.rates(scene, fixed, t, Integrated(q, v, None), form.now(inputs, t))
     return found.q, found.v
 
@@ -113,7 +113,7 @@ def _rates(args, t, q, v):
 @eqx.filter_jit
 def _energy(args, t, z, n: int) -> Float[Array, ""]:
     """H = T + V in J."""
-    form, scene, inputs, fixed = args
+    form, scene, inputs, fixed, _ = args
     q, u = form.unpack(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t))
     return kinetic_energy(scene, t, q, u) + potential_energy(scene, motion_at(scene, t, q, u, inputs(t)))
 

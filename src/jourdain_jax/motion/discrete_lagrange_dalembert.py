@@ -65,12 +65,12 @@ class DiscreteLagrangeDAlembert(FixedStepSolver):
 
     def stepped(self, step: Step, y: Integrated) -> Stepped:
         """The state `y` after one `step`."""
-        return _stepped(step.args, Interval(step.t, step.t + step.h, self.rule), y)
+        return _stepped(step.args, Interval(step.args[4] + step.t, step.h, self.rule), y)
 
 
 @eqx.filter_jit  # traced once, not wherever diffrax looks at a step
 def _stepped(args, over: Interval, y: Integrated) -> Stepped:
-    _, scene, inputs, _ = args
+    _, scene, inputs, *_ = args
     q0, u0, h = y.q, y.v, over.h
     n = q0.shape[0]
     A0 = jax.jacfwd(lambda u: _kept(scene, velocity_residual(scene, over.t0, q0, u, inputs(over.t0))))(u0)
@@ -88,7 +88,7 @@ def _stepped(args, over: Interval, y: Integrated) -> Stepped:
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
 def _residual(args, over: Interval, q0, p0, A0, x) -> Float[Array, "unknowns"]:
     """`p^+ - p_0 - A_0' lambda` and the discrete rows, of x = (q_1 - q_0, lambda)."""
-    _, scene, inputs, _ = args
+    _, scene, inputs, *_ = args
     n = q0.shape[0]
     q1, impulse = q0 + x[:n], x[n:]
     p, _ = discrete_momenta(scene, over, q0, q1, inputs)
@@ -98,7 +98,7 @@ def _residual(args, over: Interval, q0, p0, A0, x) -> Float[Array, "unknowns"]:
 
 def _projected(args, over: Interval, q0, q1) -> Float[Array, "speeds"]:
     """Speeds on the rows with the momentum at the end of the interval, but for a constraint impulse: linear in both."""
-    _, scene, inputs, _ = args
+    _, scene, inputs, *_ = args
     t1, rest = over.t1, jnp.zeros_like(q1)
     _, p1 = discrete_momenta(scene, over, q0, q1, inputs)
 
@@ -134,6 +134,6 @@ def _work(args, over: Interval, y: Integrated, q1, u1):
     """The work so far, by the midpoint rule."""
     if y.work is None:
         return None
-    form, scene, inputs, fixed = args
+    form, scene, inputs, fixed, _ = args
     t = (over.t0 + over.t1) / 2
     return y.work + over.h * form.rates(scene, fixed, t, Integrated((y.q + q1) / 2, (y.v + u1) / 2, y.work), form.now(inputs, t)).work

@@ -1,63 +1,175 @@
-"""Going back to a stop event inside the loop over steps: which shift of time brings the event value c to zero.
+"""Which stop event of a step came first, and when: trials of shorter steps from the last state before it.
 
-Every step of the search starts at (t_0, y_0), where its first slope gives the rate of c, and ends at t_1 = t_0 + h. The next shift is
+All event values are positive at t_b, and one of them is not at t_a. What is not a number is not positive: such a value lies beyond its boundary. Of
+the values that are not positive at t_a, the one whose secant from t_b falls to zero first is followed; the next trial, between t_b and t_a, is by
+Chandrupatla's method (inverse quadratic interpolation where it is safe, otherwise the middle). Where a trial finds another event, all that
+is after it no longer counts: so the event that is found has no other before it, as far as values were seen.
 
-    -c_1/s,   s = 2 (c_1 - c_0)/h - cdot_0     slope at t_1 of the parabola through c_0, cdot_0, c_1; cdot_0 itself where h is tiny
+The times tried are numbers to differentiation. Near the event, shifts of Newton's method follow,
 
-between times at which c is known to be positive and not to be; to their middle where that does not help. Shifts are numbers to differentiation,
-but for the last ones, which are zero in value and carry the derivatives of the event time and of the state at the event (the saltation term): each is
-an honest step, and Newton's method doubles the order at which it is right, so that they give derivatives up to the third.
+    t <- t - c/cdot,   y <- y + (shift of t) f
+
+whose last ones are zero in value and carry the derivatives of the event time and of the state at the event (the saltation term): each is
+an honest step, and Newton's method doubles the order at which it is right, so that they give derivatives up to the third. Where c is not a number beyond
+the event, only values before it are known: then cdot, which may be infinite there, is a number too, and first derivatives are right.
+
+Source: T. R. Chandrupatla, Advances in Engineering Software 28 (1997) 145-149.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-MOST_STEPS = 30
+MOST_STEPS = 72
 _DIFFERENTIABLE = 2
+_LATE = 0.98  # of a step: a dip that is later is left to the next one
+
+
+class Bracket(eqx.Module):
+    """Three times with the values of all events there: the last one tried, one on the other side of the event, and one that was either before."""
+
+    t: Float[Array, "3 *lanes"]
+    c: Float[Array, "3 events *lanes"]
+
+    @property
+    def before(self) -> Bool[Array, "*lanes"]:
+        """Whether the last time tried is before the event."""
+        return no_event(self.c[0])
+
+    @property
+    def ends(self) -> tuple[Float[Array, "events *lanes"], Float[Array, "events *lanes"]]:
+        """Values before and after the event."""
+        return jnp.where(self.before, self.c[0], self.c[1]), jnp.where(self.before, self.c[1], self.c[0])
+
+    @property
+    def first(self) -> Int[Array, "*lanes"]:
+        """Index of the event that is the first to happen, by its secant."""
+        before, after = self.ends
+        share = before / (before - after)
+        share = jnp.where(jnp.isfinite(share), share, 1.0)
+        return jnp.argmin(jnp.where(after > 0, jnp.inf, share), axis=0).astype(jnp.int32)
+
+    def narrowed(self, t: Float[Array, "*lanes"], c: Float[Array, "events *lanes"]) -> "Bracket":
+        """With the values at a time in between."""
+        same = no_event(c) == self.before
+        older = (jnp.where(same, self.t[1], self.t[0]), jnp.where(same, self.t[0], self.t[1]))
+        older_c = (jnp.where(same, self.c[1], self.c[0]), jnp.where(same, self.c[0], self.c[1]))
+        return Bracket(jnp.stack([t, *older]), jnp.stack([c, *older_c]))
+
+
+def no_event(values: Float[Array, "events *lanes"]) -> Bool[Array, "*lanes"]:
+    """Whether all values are positive, which NaN is not."""
+    return jnp.all(values > 0, axis=0)
+
+
+def bracket(t_0: Float[Array, "*lanes"], c_0, t_1: Float[Array, "*lanes"], c_1) -> Bracket:
+    """What is known after a step from `t_0`, before the event, to `t_1`, after it."""
+    t_0, c_0, t_1, c_1 = jax.lax.stop_gradient((t_0, c_0, t_1, c_1))
+    return Bracket(jnp.stack([t_1, t_0, jnp.full_like(t_0, jnp.inf)]), jnp.stack([c_1, c_0, jnp.full_like(c_0, jnp.nan)]))
+
+
+class Trial(eqx.Module):
+    """Where to look next, or that the last time tried is near enough."""
+
+    t: Float[Array, "*lanes"]
+    near: Bool[Array, "*lanes"]
+
+
+def next_trial(known: Bracket, step: Float[Array, "*lanes"], last: Bool[Array, "*lanes"]) -> Trial:
+    """The next time to try in a step of length `step`; with `last` the search ends, at a time where the value is a number."""
+    c_1, c_2, c_3 = (chosen(known.first, known.c[i]) for i in range(3))
+    t_1, t_2, t_3 = known.t
+    width, tiny = t_2 - t_1, 2 * jnp.finfo(t_1.dtype).eps * (jnp.abs(t_1) + jnp.abs(t_2))
+    xi, phi = (t_1 - t_2) / (t_3 - t_2), (c_1 - c_2) / (c_3 - c_2)
+    safe = (phi**2 < xi) & ((1 - phi) ** 2 < 1 - xi)
+    inverse = c_1 / (c_2 - c_1) * c_3 / (c_2 - c_3) - (t_3 - t_1) / width * c_1 / (c_3 - c_1) * c_2 / (c_2 - c_3)
+    share = jnp.where(jnp.isinf(t_3), c_1 / (c_1 - c_2), jnp.where(safe, inverse, 0.5))
+    share = jnp.where(jnp.isfinite(share), share, 0.5)
+    least = jnp.minimum(tiny / jnp.abs(width), 0.5)
+    # near in time by the slope, and small beside the value at the other end: neither says enough of a value that is flat, or that jumps
+    slope = (c_1 - c_3) / (t_1 - t_3)
+    slope = jnp.where(jnp.isfinite(slope) & jnp.isfinite(t_3), slope, (c_1 - c_2) / (t_1 - t_2))
+    small = jnp.sqrt(jnp.finfo(t_1.dtype).eps)
+    near = (c_1 == 0) | ((jnp.abs(c_1) <= small * step * jnp.abs(slope)) & (jnp.abs(c_1) <= 1e-3 * jnp.abs(c_2)))
+    closed = (jnp.abs(width) <= 2 * tiny) | last
+    known_there = jnp.isfinite(c_1)
+    t = jnp.where(closed, t_2, t_1 + jnp.clip(share, least, 1 - least) * width)
+    return Trial(t, near | (closed & known_there))
 
 
 class Search(eqx.Module):
     """What is known of the event's time, for each lane."""
 
-    before: Float[Array, "*lanes"]  # a time with c > 0
-    after: Float[Array, "*lanes"]  # a time with c <= 0
+    known: Bracket
+    step: Float[Array, "*lanes"]  # length of the step in which the event lies
     left: Int[Array, "*lanes"]  # steps; 0: found
     shift: Float[Array, "*lanes"]  # the next step, with its sign
 
+    @property
+    def trying(self) -> Bool[Array, "*lanes"]:
+        """Whether trials start at the last state before the event; then Newton's shifts do, each where the last one ended."""
+        return self.left > _DIFFERENTIABLE + 1
 
-def none(t: Float[Array, "*lanes"]) -> Search:
+
+def none(t: Float[Array, "*lanes"], values: Float[Array, "events *lanes"]) -> Search:
     """Nothing to search for."""
-    t = jax.lax.stop_gradient(t)
-    return Search(t, t, jnp.zeros(jnp.shape(t), jnp.int32), jnp.zeros_like(t))
+    t, c = jax.lax.stop_gradient((t, values))
+    return Search(bracket(t, c, t, c), jnp.zeros_like(t), jnp.zeros(jnp.shape(t), jnp.int32), jnp.zeros_like(t))
 
 
-def begun(t_0: Float[Array, "*lanes"], t_1: Float[Array, "*lanes"]) -> Search:
-    """The search after a step from `t_0`, before the event, to `t_1`, beyond it."""
-    t_0, t_1 = jax.lax.stop_gradient((t_0, t_1))
-    return Search(t_0, t_1, jnp.full(jnp.shape(t_0), MOST_STEPS + 1, jnp.int32), jnp.zeros_like(t_0))
+def advanced(search: Search, begins: Bool[Array, "*lanes"], t_0, c_0, c_dot_0, t_1, c_1) -> Search:
+    """The search after a step from `t_0` to `t_1`, with the values of all events there and the rates of the first; `begins`: it is the step of the event."""
+    now, c = jax.lax.stop_gradient((t_1, c_1))
+    fresh, narrowed = bracket(t_0, c_0, now, c), search.known.narrowed(now, c)
+    trying = begins | search.trying
+    known = jax.tree.map(lambda new, old, kept: jnp.where(begins, new, jnp.where(trying, old, kept)), fresh, narrowed, search.known)
+    step = jnp.where(begins, jnp.abs(now - jax.lax.stop_gradient(t_0)), search.step)
+    left = jnp.where(begins, MOST_STEPS, jnp.maximum(search.left - 1, 0))
+    trial = next_trial(known, step, left <= _DIFFERENTIABLE + 3)
+    left = jnp.where(trying & trial.near, _DIFFERENTIABLE + 1, left).astype(jnp.int32)
+    shift = jnp.where(trial.near, 0.0, trial.t - jax.lax.stop_gradient(t_0))
+    first = known.first
+    newton = newton_shift(known, step, chosen(first, c_1), chosen(first, c_dot_0), search.left > 0)
+    return Search(known, step, left, jnp.where(trying, shift, newton))
 
 
-def advanced(search: Search, h, c_0, c_dot_0, t_1, c_1) -> Search:
-    """The search after a step by `h` to the time `t_1`; `c_0`, `c_1`: values of the event at its ends (any unit), `c_dot_0`: the rate of the first."""
-    left = jnp.maximum(search.left - 1, 0)
-    now, c, h, c_0, rate = jax.lax.stop_gradient((t_1, c_1, h, c_0, c_dot_0))  # numbers to differentiation
-    before, after = jnp.where(c > 0, now, search.before), jnp.where(c > 0, search.after, now)
-    width = jnp.abs(after - before)
-    small = jnp.sqrt(jnp.finfo(now.dtype).eps) * (jnp.abs(now) + width)
-    large = jnp.abs(h) > small
-    chord = jnp.where(large, (c - c_0) / jnp.where(large, h, 1.0), rate)
-    slope = jnp.where(large, 2 * chord - rate, rate)
-    # to the middle where the parabola bends back, leads far beyond, or the last step did little
-    steep = slope * chord > 0
-    shift = jnp.where(c == 0, 0.0, -c / jnp.where(steep, slope, 1.0))
-    low, high = jnp.minimum(before, after) - now, jnp.maximum(before, after) - now
-    sensible = (steep | (c == 0)) & (shift >= low - 0.1 * width) & (shift <= high + 0.1 * width)
-    helped = ~large | (jnp.abs(c) <= 0.5 * jnp.abs(c_0)) | (left == MOST_STEPS)
-    shift = jnp.where(sensible & helped, jnp.clip(shift, low, high), 0.5 * (low + high))
-    # near enough: one more step to the event, then the differentiable ones
-    left = jnp.where((left > _DIFFERENTIABLE) & (jnp.abs(c) <= small * jnp.abs(chord)), _DIFFERENTIABLE + 1, left)
-    usable = (search.left > 0) & (jnp.abs(c) < (width + small) * jnp.abs(rate)) & jnp.isfinite(rate)
-    newton = jnp.where(usable, -c_1 / jnp.where(usable, c_dot_0, 1.0), 0.0)
-    return Search(before, after, left, jnp.where(left > _DIFFERENTIABLE, shift, newton))
+def newton_shift(known: Bracket, step, c, c_dot, searching) -> Float[Array, "*lanes"]:
+    """Newton's shift to c = 0, and zero where it says nothing; `step`: length of the step in which the event lies."""
+    _, after = known.ends
+    beyond = jnp.isnan(chosen(known.first, after))
+    c_dot = jnp.where(beyond, jax.lax.stop_gradient(c_dot), c_dot)
+    far = jnp.abs(known.t[0] - known.t[1]) + jnp.sqrt(jnp.finfo(known.t.dtype).eps) * step
+    usable = searching & (jnp.abs(c) < far * jnp.abs(c_dot)) & jnp.isfinite(c_dot)
+    shift = jnp.where(usable, -c / jnp.where(usable, c_dot, 1.0), 0.0)
+    return jnp.where(beyond, shift - jax.lax.stop_gradient(shift), shift)
+
+
+class Dip(eqx.Module):
+    """Whether a value that is positive at both ends of a step falls below zero in between, and after which part of the step the first one is lowest."""
+
+    happens: Bool[Array, "*lanes"]
+    share: Float[Array, "*lanes"]
+
+
+def dip(h: Float[Array, "*lanes"], c_0, c_dot_0, c_1, c_dot_1) -> Dip:
+    """By the cubics through values (those at the start positive) and rates (events, *lanes) at the ends of a step `h`.
+
+    p(s) = c_0 + m_0 s + A s^2 + B s^3,   lowest at s = -m_0/(A + sqrt(A^2 - 3 B m_0))
+    """
+    c_0, m_0, c_1, m_1 = jax.lax.stop_gradient((c_0, h * c_dot_0, c_1, h * c_dot_1))
+    rise = c_1 - c_0
+    A, B = 3 * rise - 2 * m_0 - m_1, m_0 + m_1 - 2 * rise
+    s = -m_0 / (A + jnp.sqrt(jnp.maximum(A**2 - 3 * B * m_0, 0.0)))
+    lowest = c_0 + s * (m_0 + s * (A + s * B))
+    dips = (c_1 > 0) & (m_0 < 0) & (m_1 > 0) & (s < _LATE) & (lowest < -1e-12 * (c_0 + c_1))
+    share = jnp.min(jnp.where(dips, s, 1.0), axis=0)
+    return Dip(share < 1, share)
+
+
+def chosen(index, values: Float[Array, "events *lanes"]) -> Float[Array, "*lanes"]:
+    """The value with this index, of the first one where there is none."""
+    chosen = values[0]
+    for i in range(1, len(values)):
+        chosen = jnp.where(index == i, values[i], chosen)
+    return chosen

@@ -19,7 +19,10 @@ from jourdain_jax.scene.scene import Scene
 
 
 class Step(eqx.Module):
-    """One step: from t (s) over h (s, negative backwards), of `rates(t, y)`; `args` as `integrate` hands them to the rates."""
+    """One step: from t (s) over h (s, negative backwards), of `rates(t, y)`; `args` as `integrate` hands them to the rates.
+
+    Times are those of the rates, which count from `args[4]`.
+    """
 
     t: Float[Array, ""]
     h: Float[Array, ""]

@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from jourdain_jax.motion.wrapping_solver import WrappingSolver
+
 _REST = 1e-6  # of the size of the state: a step that changes less counts as one that changes so much
 
 
@@ -31,54 +33,12 @@ class Seen(eqx.Module):
         return jnp.min(jnp.where(self.lowest * self.highest < 0, -smallest, smallest), initial=jnp.inf)
 
 
-class GuardedSolver(diffrax.AbstractWrappedSolver):
+class GuardedSolver(WrappingSolver):
     """`solver`, followed by `project(t, y, args)` after every step, while `pivots(t, y, args)` must keep their signs; None: there is no such function."""
 
     solver: diffrax.AbstractSolver
     project: Callable | None
     pivots: Callable | None
-
-    @property
-    def scan_kind(self):
-        """As the wrapped solver. diffrax sets it on a Runge-Kutta solver itself, but not through a wrapper: see `for_adjoint`."""
-        return self.solver.scan_kind
-
-    @property
-    def term_structure(self):
-        """As the wrapped solver."""
-        return self.solver.term_structure
-
-    @property
-    def interpolation_cls(self):
-        """As the wrapped solver."""
-        return self.solver.interpolation_cls
-
-    @property
-    def term_compatible_contr_kwargs(self):
-        """As the wrapped solver."""
-        return self.solver.term_compatible_contr_kwargs
-
-    @property
-    def root_finder(self):
-        """As the wrapped solver, where it is implicit."""
-        return self.solver.root_finder
-
-    @property
-    def root_find_max_steps(self):
-        """As the wrapped solver, where it is implicit."""
-        return self.solver.root_find_max_steps
-
-    def order(self, terms):
-        """As the wrapped solver."""
-        return self.solver.order(terms)
-
-    def strong_order(self, terms):
-        """As the wrapped solver."""
-        return self.solver.strong_order(terms)
-
-    def error_order(self, terms):
-        """As the wrapped solver."""
-        return self.solver.error_order(terms)
 
     def init(self, terms, t0, t1, y0, args):
         """The state of the wrapped solver, and what is seen at the start."""
@@ -106,20 +66,6 @@ class GuardedSolver(diffrax.AbstractWrappedSolver):
 
     def _pivots_at(self, t, y, args) -> Float[Array, "pivots"]:
         return jnp.zeros(0) if self.pivots is None else jax.lax.stop_gradient(self.pivots(t, y, args))
-
-    def func(self, terms, t0, y0, args):
-        """As the wrapped solver."""
-        return self.solver.func(terms, t0, y0, args)
-
-
-def for_adjoint(solver: diffrax.AbstractSolver, adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractSolver:
-    """The solver with the loop over its stages that the adjoint can differentiate."""
-    if isinstance(vars(solver).get("solver"), diffrax.AbstractSolver):
-        return eqx.tree_at(lambda s: s.solver, solver, for_adjoint(solver.solver, adjoint))
-    kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
-    if type(adjoint) in kinds and getattr(solver, "scan_kind", "none of its own") is None:
-        return eqx.tree_at(lambda s: s.scan_kind, solver, kinds[type(adjoint)], is_leaf=lambda x: x is None)
-    return solver
 
 
 def _time(terms, t0, t1, t) -> Float[Array, ""]:

@@ -1,7 +1,10 @@
 """One motion from start to end as one compiled program: the lean loop for the default options, diffrax for all others.
 
-Both give states at the saved times, which of those were reached, and where and why the motion ended; events that diffrax stepped over are then
-located (the lean loop does so itself), speeds worked out, and all is put into a `Trajectory`.
+Both give states at the saved times, which of those were reached, and where and why the motion ended; then speeds are worked out, and all is put into a
+`Trajectory`.
+
+Time counts from the start, tau = t - t0: far from zero a clock has few digits, and what does not depend on it is to be as right there as at t0 = 0.
+Rates, projection and events are given tau, and the scene and its inputs t0 + tau.
 """
 
 from operator import attrgetter
@@ -13,23 +16,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.equations.plausibility import body_faults
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.motion import lean_loop, results
-from jourdain_jax.motion.event_location import Located, locate
+from jourdain_jax.motion import integrands, lean_loop, results
+from jourdain_jax.motion.event_location import Remembering, locate, with_tolerances
+from jourdain_jax.motion.event_search import no_event
 from jourdain_jax.motion.finite_derivatives import Flat
-from jourdain_jax.motion.guarded_solver import GuardedSolver, for_adjoint
+from jourdain_jax.motion.guarded_solver import GuardedSolver
 from jourdain_jax.motion.input_programs import by_itself, for_programs
-from jourdain_jax.motion.land_on import land_on
+from jourdain_jax.motion.knots import knots_between
+from jourdain_jax.motion.land_on import land_on, merged
 from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.quick_compilation import quickly_compiled
-from jourdain_jax.motion.recovery import LargestError, is_among
-from jourdain_jax.motion.solver_choice import controller_of
+from jourdain_jax.motion.recovery import LargestError
+from jourdain_jax.motion.solver_choice import controller_of, marked_inputs, marked_outputs, since, steps_are_given, time_origin
 from jourdain_jax.motion.span import fitting_times, times_fit
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
 from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.motion.wrapping_solver import for_adjoint
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
@@ -59,7 +64,7 @@ class Options(eqx.Module):
 class Solved(eqx.Module):
     """What either loop finds."""
 
-    ts: Float[Array, "times *lanes"]
+    ts: Float[Array, "times *lanes"]  # as t_end, since the start
     ys: PyTree
     reached: Bool[Array, "times *lanes"]
     t_end: Float[Array, "*lanes"]
@@ -97,7 +102,7 @@ class Begun(eqx.Module):
     right: Bool[Array, ""]  # whether all parameters are, and the masses and inertias that they make
     timely: Bool[Array, ""]  # whether the times go together
     start: State
-    args: tuple  # form, scene, inputs, what the rates need of the scene
+    args: tuple  # form, scene, inputs, what the rates need of the scene, the time from which times count
     y0: Integrated
 
 
@@ -131,9 +136,10 @@ def integrate_lanes(setups: Setup) -> Trajectory:
 def _begin(setup: Setup) -> Begun:
     timely = times_fit(setup.ts, setup.t0, setup.t1)
     right, start = _without_faults(setup.scene, setup.t0, setup.start)
-    scene, start, inputs = _mark_inputs(setup.options.adjoint, (setup.scene, start, setup.inputs))
+    scene, start, inputs = marked_inputs(setup.options.adjoint, (setup.scene, start, setup.inputs))
     form = setup.form
-    return Begun(right, timely, start, (form, scene, inputs, form.fixed(scene)), form.pack(start.q, start.u))
+    args = form, scene, inputs, form.fixed(scene), time_origin(setup.options.controller, setup.t0)
+    return Begun(right, timely, start, args, form.pack(start.q, start.u))
 
 
 def _solved(setup: Setup, begun: Begun) -> Solved:
@@ -141,41 +147,42 @@ def _solved(setup: Setup, begun: Begun) -> Solved:
 
 
 def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
-    t0, t1, form, options, adjoint = setup.t0, setup.t1, setup.form, setup.options, setup.options.adjoint
+    t0, form, options, adjoint = setup.t0, setup.form, setup.options, setup.options.adjoint
     start, args = begun.start, begun.args
-    _, scene, inputs, fixed = args
-    solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, _mark_outputs(adjoint, (solved.ys, solved.y_end)))
-    end = Located(solved.t_end, solved.y_end) if options.lean else _located_end(solved, args, t0, options.event_names)
+    _, scene, inputs, fixed, origin = args
+    solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, marked_outputs(adjoint, (solved.ys, solved.y_end)))
     moving = form.projects_positions or form.projects_speeds
     stored_first = form.stored(scene, t0, start.q, inputs(t0))
-    before_end = (solved.ts - t0) * jnp.sign(t1 - t0) <= (end.t - t0) * jnp.sign(t1 - t0)
-    valid = solved.reached & before_end & begun.timely
+    direction = jnp.sign(setup.t1 - t0)
+    valid = solved.reached & (solved.ts * direction <= solved.t_end * direction) & begun.timely
 
-    def saved_state(t, y, valid):
+    def saved_state(tau, y, valid):
         # what was never reached holds anything: compute at the end state instead, then mark
-        t, y = jnp.where(valid, t, end.t), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, end.y)
-        y = _project(t, y, args) if moving and not options.lean else y
+        tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
+        y = integrands.project(tau, y, args) if moving and not options.lean else y
+        t = origin + tau
         q, u = form.unpack(scene, fixed, t, y, inputs(t))
         work = None if y.work is None else y.work + form.stored(scene, t, q, inputs(t)) - stored_first
         return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (q, u, work)), form.pivot(scene, fixed, t, y, inputs(t))
 
     # the end state as one more saved one, so that all this is compiled once
-    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), (end.t, end.y, begun.timely))
+    end = solved.t_end, solved.y_end, begun.timely
+    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), end)
     (q, u, work), pivots = jax.vmap(saved_state)(*with_end)
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
     return Trajectory(
         scene=setup.scene,
-        ts=jnp.where(begun.timely, solved.ts, given.ts) if options.saveat is None else solved.ts,
+        ts=given.ts if options.saveat is None else origin + solved.ts,
         q=q[:-1],
         u=u[:-1],
         work=None if work is None else work[:-1],
-        t_end=jnp.where(begun.timely, end.t, given.t0),
+        t_end=jnp.where(begun.timely, jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end), given.t0),
         q_end=q[-1],
         u_end=u[-1],
         result=results.with_causes(
-            _result(solved.code, end.y, start, pivot if form.needs_pivot else jnp.inf),
+            _result(solved.code, solved.y_end, start, pivot if form.needs_pivot else jnp.inf),
             parameters=begun.right,
             times=begun.timely,
             start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),
@@ -209,109 +216,115 @@ def _without_faults(scene: Scene, t0, start: State):
 def _by_lean_loop(setup: Setup, begun: Begun) -> Solved:
     form, options = setup.form, setup.options
     moving = form.projects_positions or form.projects_speeds
-    return _lean(setup, begun.y0, begun.args, setup.ts, _rates, _rates_and_pivots, _project if moving else None, _events if options.event_names else None)
+    events = integrands.events if options.event_names else None
+    functions = integrands.rates, integrands.rates_and_pivots, integrands.project if moving else None, events
+    return _lean(setup, begun.y0, begun.args, setup.ts, _knots(setup), *functions)
 
 
 def _lanes_by_lean_loop(setups: Setup, begun: Begun) -> Solved:
     """Lanes in lockstep: their axis comes first outside and last inside."""
     form, options = setups.form, setups.options
     moving = form.projects_positions or form.projects_speeds
-    events = _events_of_lanes if options.event_names else None
-    y0, ts = _lanes_last((begun.y0, setups.ts))
-    solved = _lean(setups, y0, begun.args, ts, _rates_of_lanes, _rates_and_pivots_of_lanes, _project_of_lanes if moving else None, events)
+    events = integrands.events_of_lanes if options.event_names else None
+    y0, ts, knots = _lanes_last((begun.y0, setups.ts, eqx.filter_vmap(_knots)(setups)))
+    functions = integrands.rates_of_lanes, integrands.rates_and_pivots_of_lanes, integrands.project_of_lanes if moving else None, events
+    solved = _lean(setups, y0, begun.args, ts, knots, *functions)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solved)
 
 
-def _lean(setup: Setup, y0, args, ts, rates, rates_and_pivots, project, events) -> Solved:
+def _lean(setup: Setup, y0, args, ts, knots, rates, rates_and_pivots, project, events) -> Solved:
     options = setup.options
+    goals = jnp.concatenate([ts, setup.t1[None]]) - setup.t0
     problem = lean_loop.Problem(
         rates=rates,
         args=args,
         project=project,
         events=events,
-        norm=_StateNorm(setup.form.recovered),
+        norm=integrands.StateNorm(setup.form.recovered),
         rtol=jnp.broadcast_to(options.tolerances[0], setup.t0.shape),
         atol=jnp.broadcast_to(options.tolerances[1], setup.t0.shape),
-        shortest=_shortest(setup.t0, setup.t1),
-        max_steps=options.max_steps,
+        shortest=_shortest(setup.t1 - setup.t0),
+        max_steps=options.max_steps + (0 if knots is None else len(knots)),
+        knots=knots,
         unseen=LargestError(setup.form.recovered) if setup.form.recovered else None,
         rates_and_pivots=rates_and_pivots if setup.form.has_pivots else None,
     )
     kind: Literal["forward", "reverse"] = "forward" if isinstance(options.adjoint, diffrax.ForwardMode) else "reverse"
-    goals = jnp.concatenate([ts, setup.t1[None]])
-    ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, setup.t0, goals, options.dt0, kind)
+    ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, options.dt0, kind)
     unseen = jnp.zeros_like(end.h) if end.unseen is None else end.unseen
-    return Solved(ts, jax.tree.map(lambda x: x[:-1], ys), reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, unseen, end.pivot)
+    ys = jax.tree.map(lambda x: x[:-1], ys)
+    return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, unseen, end.pivot)
+
+
+def _knots(setup: Setup) -> Float[Array, "knots"] | None:
+    """Times since the start at which steps must end for the inputs' sake."""
+    if steps_are_given(setup.options.controller):
+        return None
+    return knots_between((setup.inputs, setup.scene), setup.options.tolerances[0], setup.t0, setup.t1, setup.ts)
 
 
 def _lanes_last(tree):
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
 
 
-def _lane_by_lane(function):
-    """A function `(t, y, args)` of one lane for states with lanes last and `args` with lanes first."""
-    return lambda t, y, args: eqx.filter_vmap(function, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(t, y, args)
-
-
-def _rates_of_lanes(t, y, args):
-    form, scene, inputs, fixed = args
-    return form.rates(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
-
-
-def _rates_and_pivots_of_lanes(t, y, args):
-    form, scene, inputs, fixed = args
-    return form.rates_and_pivots(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
-
-
-def _inputs_of_lanes(inputs, t) -> Float[Array, "inputs lanes"]:
-    return eqx.filter_vmap(lambda inputs, t: inputs(t), out_axes=-1)(inputs, t)
-
-
 def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
-    t0, t1, ts, form, options, args, y0 = setup.t0, setup.t1, setup.ts, setup.form, setup.options, begun.args, begun.y0
+    form, options, args, y0 = setup.form, setup.options, begun.args, begun.y0
+    origin = args[4]
+    t0, t1, ts, knots = setup.t0 - origin, setup.t1 - origin, setup.ts - origin, _knots(setup)
     names, (rtol, atol) = options.event_names, options.tolerances
-    controller = controller_of(options.solver, options.controller, ts, t1)
-    land = options.land and controller is None
+    landings = jnp.append(ts if options.land else ts[:0], t1)
+    landings = landings if knots is None else merged(landings, knots + t0, jnp.sign(t1 - t0))
+    controller = controller_of(options.solver, options.controller, landings)
+    land = (options.land or knots is not None) and controller is None
     controller = options.controller if controller is None else controller
     if controller is None:
-        controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=_StateNorm(), dtmin=_shortest(t0, t1), force_dtmin=False)
-    saveat = diffrax.SaveAt(ts=ts) if options.saveat is None else options.saveat
+        controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.StateNorm(), dtmin=_shortest(t1 - t0), force_dtmin=False)
+    saveat = diffrax.SaveAt(ts=ts) if options.saveat is None else since(options.saveat, origin)
     moving = form.projects_positions or form.projects_speeds
     solver = for_adjoint(options.solver, options.adjoint)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    rates, project = (Flat(f, t0, y0) if implicit else f for f in (_rates, _project))
-    guarded = GuardedSolver(solver, project if moving else None, _pivots if form.has_pivots else None)
+    rates, project = (Flat(f, t0, y0) if implicit else f for f in (integrands.rates, integrands.project))
+    solver = GuardedSolver(with_tolerances(solver, controller), project if moving else None, integrands.pivots if form.has_pivots else None)
+    term = diffrax.ODETerm(rates)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(rates),
-        guarded,
+        term,
+        Remembering(solver, integrands.events) if names else solver,
         t0,
         t1,
         options.dt0,
         y0,
         args,
         saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)], solver_state=True),
-        stepsize_controller=land_on(ts, controller) if land else controller,
+        stepsize_controller=land_on(landings, controller) if land else controller,
         adjoint=options.adjoint,
-        event=diffrax.Event({name: _EventValue(i) for i, name in enumerate(names)}, direction=False) if names else None,
-        max_steps=options.max_steps,
+        event=diffrax.Event(_an_event) if names else None,
+        max_steps=options.max_steps + (0 if knots is None else len(knots)),
         throw=False,
     )
-    happened = jnp.stack([solution.event_mask[name] for name in names]) if names else jnp.zeros(1, bool)
+    t_end, y_end = solution.ts[1][0], jax.tree.map(lambda x: x[0], solution.ys[1])
     code = jnp.where(solution.result == diffrax.RESULTS.max_steps_reached, results.MAX_STEPS, results.STEP_TOO_SMALL)
     code = jnp.where(solution.result == diffrax.RESULTS.successful, results.SUCCESS, code)
     unsolved = (solution.result == diffrax.RESULTS.nonlinear_divergence) | (solution.result == diffrax.RESULTS.nonlinear_max_steps_reached)
-    t_end, seen = solution.ts[1][0], solution.solver_state[1]
+    # a step that was not solved is no step: the times at its end were not reached
+    reached = jnp.isfinite(solution.ts[0]) & ~(unsolved & ((solution.ts[0] - t_end) * jnp.sign(t1 - t0) >= 0))
+    seen = (solution.solver_state[2] if names else solution.solver_state)[1]
     if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):  # others cannot reject a step
         code = jnp.where((seen.projected > results.MOST_PROJECTED) & (code == results.SUCCESS), results.OFF_CONSTRAINTS, code)
+    code, event = jnp.where(unsolved, results.UNSOLVED_STEP, code), jnp.full_like(code, -1, jnp.int32)
+    if names:
+        happened = solution.event_mask
+        t_last, y_last, _ = solution.solver_state
+        located = locate(solver, term, integrands.events, (t_last * jnp.sign(t1 - t0), y_last), t_end, y_end, args, happened)
+        t_end, y_end, event = located.t, located.y, located.event
+        code = jnp.where(happened, jnp.where(located.solved, results.EVENT, results.UNSOLVED_STEP), code)
     return Solved(
         ts=solution.ts[0],
         ys=solution.ys[0],
-        # a step that was not solved is no step: the times at its end were not reached
-        reached=jnp.isfinite(solution.ts[0]) & ~(unsolved & ((solution.ts[0] - t_end) * jnp.sign(t1 - t0) >= 0)),
+        reached=reached,
         t_end=t_end,
-        y_end=jax.tree.map(lambda x: x[0], solution.ys[1]),
-        code=jnp.where(jnp.any(happened), results.EVENT, jnp.where(unsolved, results.UNSOLVED_STEP, code)),
-        event=jnp.where(jnp.any(happened), jnp.argmax(happened), -1).astype(jnp.int32),
+        y_end=y_end,
+        code=code,
+        event=event,
         accepted=solution.stats["num_accepted_steps"],
         rejected=solution.stats["num_rejected_steps"],
         last_step=jnp.full_like(t_end, jnp.nan),
@@ -320,21 +333,15 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
     )
 
 
-def _shortest(t0, t1) -> Float[Array, "*lanes"]:
-    return 1e-14 * jnp.maximum(jnp.abs(t1 - t0), jnp.maximum(jnp.abs(t0), jnp.abs(t1)))
+def _an_event(t, y, args, *, terms, **kwargs) -> Bool[Array, ""]:
+    """Whether any event has happened, in the signature of diffrax; a state that is lost is none."""
+    direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
+    known = jnp.all(jnp.stack([jnp.all(jnp.isfinite(part)) for part in jax.tree.leaves((y.q, y.v))]))
+    return known & ~no_event(integrands.events(t * direction, y, args))
 
 
-def _located_end(solved: Solved, args, t0, names) -> Located:
-    """Time and state at the end of the motion: at the event, where one ended it."""
-    if not names:
-        return Located(solved.t_end, solved.y_end)
-    happened = solved.event >= 0
-
-    def value(t, y, args):
-        return _events(t, y, args)[solved.event]
-
-    # a motion that starts beyond an event has no motion at all
-    return locate(_rates, value, solved.t_end, solved.y_end, args, happened & (solved.t_end != t0), solved.t_end - t0)
+def _shortest(span) -> Float[Array, "*lanes"]:
+    return 1e-14 * jnp.abs(span)
 
 
 def _result(code, y_end: Integrated, start: State, pivot):
@@ -345,79 +352,3 @@ def _result(code, y_end: Integrated, start: State, pivot):
     code = jnp.where(pivot < SMALLEST_PIVOT, results.SINGULAR_PARTITION, code)
     tolerance = 1e3 * jnp.sqrt(jnp.finfo(start.q.dtype).eps)
     return jnp.where(start.residual <= tolerance, code, results.INCONSISTENT_START).astype(jnp.int32)
-
-
-class _StateNorm(eqx.Module):
-    """Root mean square over coordinates and speeds; the work that rides along and recovered coordinates do not decide the step size.
-
-    What is not a number counts as infinite: the step shrinks and the motion ends, where NaN would be tried until the last allowed step.
-    """
-
-    recovered: tuple[int, ...] = eqx.field(static=True, default=())
-
-    def __call__(self, y: Integrated) -> Float[Array, "*lanes"]:
-        q = jnp.where(is_among(self.recovered, y.q), 0.0, y.q) if self.recovered else y.q
-        squared = sum(jnp.sum(part**2, axis=0) for part in (q, y.v)) / (len(q) + len(y.v) - len(self.recovered))
-        squared = jnp.where(jnp.isnan(squared), jnp.inf, squared)
-        return jnp.where(squared == 0, 0.0, jnp.sqrt(jnp.where(squared == 0, 1.0, squared)))
-
-
-@eqx.filter_jit  # traced once, not once per stage and derivative
-def _rates(t, y, args):
-    form, scene, inputs, fixed = args
-    return form.rates(scene, fixed, t, y, form.now(inputs, t))
-
-
-@eqx.filter_jit
-def _rates_and_pivots(t, y, args):
-    form, scene, inputs, fixed = args
-    return form.rates_and_pivots(scene, fixed, t, y, form.now(inputs, t))
-
-
-@eqx.filter_jit
-def _pivots(t, y, args):
-    return _rates_and_pivots(t, y, args)[1]
-
-
-@eqx.filter_jit  # traced once, not once per stage and derivative
-def _project(t, y, args):
-    form, scene, inputs, fixed = args
-    return form.project(scene, fixed, t, y, inputs(t))
-
-
-def _project_of_lanes(t, y, args):
-    form, scene, inputs, fixed = args
-    return form.project(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
-
-
-@eqx.filter_jit
-def _events(t, y, args) -> Float[Array, "events *lanes"]:
-    form, scene, inputs, fixed = args
-    return form.events(scene, fixed, t, y, inputs(t))
-
-
-def _events_of_lanes(t, y, args):
-    form, scene, inputs, fixed = args
-    if form.lowers_events:
-        return form.events(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
-    return _lane_by_lane(_events)(t, y, args)
-
-
-class _EventValue(eqx.Module):
-    """Value of one named event of the scene, in the signature of diffrax."""
-
-    index: int = eqx.field(static=True)
-
-    def __call__(self, t, y, args, *, terms, **kwargs):
-        direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
-        return _events(t * direction, y, args)[self.index]
-
-
-def _mark_inputs(adjoint, tree):
-    """Inputs of the integration: forward mode through a reverse-only adjoint raises our own error."""
-    return reverse_only(tree) if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) else tree
-
-
-def _mark_outputs(adjoint, tree):
-    """Outputs of the integration: reverse mode, which comes to them first, through a forward-only adjoint raises our own error."""
-    return forward_only(tree) if isinstance(adjoint, diffrax.ForwardMode) else tree

@@ -18,6 +18,11 @@ def land_on(ts: Float[Array, "times"], controller: diffrax.AbstractStepSizeContr
     return kind(controller, ts)
 
 
+def merged(ts: Float[Array, "times"], more: Float[Array, "more"], direction) -> Float[Array, "all"]:
+    """Both, in the order of the motion."""
+    return jnp.sort(jnp.concatenate([ts, more]) * direction) * direction
+
+
 def time_ahead(ts: Float[Array, "times"], index: Int[Array, ""]) -> Float[Array, ""]:
     """The time with this `index` among `ts`; infinity beyond the last."""
     count = ts.shape[0]

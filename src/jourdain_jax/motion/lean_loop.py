@@ -59,5 +59,5 @@ def _motion(problem: Problem, method: Method, y0: PyTree, t0, goals, dt0) -> tup
         end = eqxi.while_loop(lambda p: jnp.any(running(p, goal)), step, progress, kind="lax")
         return end, (end.y, end.t == goal)
 
-    end, (ys, reached) = jax.lax.scan(to_goal, begun(problem, y0, t0, dt0), goals)
+    end, (ys, reached) = jax.lax.scan(to_goal, begun(problem, y0, t0, dt0, direction), goals)
     return ys, reached, end

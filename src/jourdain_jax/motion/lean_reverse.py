@@ -2,8 +2,8 @@
 
     y_(i+1) = step(t_i, t_(i+1), y_i, args)       g_i = (dstep/dy_i)' g_(i+1),   g_args += (dstep/dargs)' g_(i+1)
 
-The times t_i are data: step-size control, rejected steps and error estimates are no part of it. Only times that were asked for, the first time, and the
-time of an event have cotangents. The search for an event is no part of it either: from the last state before the event one step leads to it, and what lies
+The times t_i are data: step-size control, rejected steps and error estimates are no part of it. Only times that were asked for, knots, the first time, and
+the time of an event have cotangents. The search for an event is no part of it either: from the last state before the event one step leads to it, and what lies
 beyond, where derivatives may not exist, is never met.
 
 Memory holds a window of steps with their states; when it is full, the state and step size there are kept and the next window begins. Going back, the
@@ -22,8 +22,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.motion import lean_adjoint, results
-from jourdain_jax.motion.event_search import MOST_STEPS
-from jourdain_jax.motion.lean_step import LOCATING, RUNNING, Method, Problem, Progress, advanced, begun, chosen, no_pivot, running
+from jourdain_jax.motion.event_search import MOST_STEPS, chosen
+from jourdain_jax.motion.lean_step import LOCATING, Method, Problem, Progress, advanced, begun, running, standing
 
 STEPS_ALONE, STEPS_TOGETHER = 2048, 512  # of a window: for one motion, for lanes in lockstep
 SPARE = 4  # this part of a window is left free, for the steps that it takes when it is integrated again
@@ -78,19 +78,22 @@ class _Cotangents(eqx.Module):
     y: PyTree
     shared: PyTree  # rates, projection, args
     goals: Float[Array, "times *lanes"]
+    knots: Float[Array, "knots *lanes"] | None
 
 
 def motion(forward: Callable, problem: Problem, method: Method, y0: PyTree, t0, goals, dt0):
     """`forward` of the other arguments, with derivatives in reverse mode by `y0`, `t0`, `goals` and whatever the functions of `problem` depend on."""
     like = (t0, y0, problem.args)
     rates, project, events = (f if f is None else eqx.filter_closure_convert(f, *like) for f in (problem.rates, problem.project, problem.events))
-    control = problem.norm, *jax.lax.stop_gradient((problem.rtol, problem.atol, problem.shortest)), problem.max_steps, problem.unseen, problem.rates_and_pivots
-    return _motion(((rates, project, problem.args), events, y0, t0, goals), (control, jax.lax.stop_gradient(jnp.asarray(dt0))), forward, method)
+    control = problem.norm, *jax.lax.stop_gradient((problem.rtol, problem.atol, problem.shortest)), problem.max_steps
+    control += problem.unseen, problem.rates_and_pivots
+    return _motion(((rates, project, problem.args), events, problem.knots, y0, t0, goals), (control, jax.lax.stop_gradient(jnp.asarray(dt0))), forward, method)
 
 
 def _problem(moving, control) -> Problem:
-    (rates, project, args), events, *_ = moving
-    return Problem(rates, args, project, events, *control[0])
+    (rates, project, args), events, knots, *_ = moving
+    norm, rtol, atol, shortest, max_steps, *watched = control[0]
+    return Problem(rates, args, project, events, norm, rtol, atol, shortest, max_steps, knots, *watched)
 
 
 @eqx.filter_custom_vjp
@@ -104,8 +107,8 @@ def _motion(moving, control, forward, method):
 def _recorded(perturbed, moving, control, forward, method):
     *_, y0, t0, goals = moving
     problem = _problem(moving, control)
-    start = begun(problem, y0, t0, control[1])
     direction = jnp.sign(goals[-1] - t0)
+    start = begun(problem, y0, t0, control[1], direction)
     empty = _empty(start, problem.max_steps)
     full = len(empty.window.t) - 1 - len(empty.window.t) // SPARE
     places = len(empty.beginnings.t)
@@ -145,14 +148,14 @@ def _before_event(p: Progress, kept: Progress) -> Progress:
 @_motion.def_bwd
 def _gone_back(residuals, cotangents, perturbed, moving, control, forward, method):
     record, reached, end = residuals
-    shared, events, y0, t0, goals = moving
-    problem = _problem(moving, control)
+    shared, events, knots, y0, t0, goals = moving
+    problem, direction = _problem(moving, control), jnp.sign(goals[-1] - t0)
     g_ys, _, g_end = cotangents
     g_ys, g_t, g_y = (_filled(g, x) for g, x in ((g_ys, _stacked(y0, len(goals))), (g_end.t, end.t), (g_end.y, end.y)))
     differentiable, fixed = eqx.partition(shared, perturbed[0])
     by_events, fixed_events = eqx.partition(events, perturbed[1])
     g_events = jax.tree.map(jnp.zeros_like, by_events)
-    g = _Cotangents(g_t, g_y, jax.tree.map(jnp.zeros_like, differentiable), jnp.zeros_like(goals))
+    g = _Cotangents(g_t, g_y, jax.tree.map(jnp.zeros_like, differentiable), jnp.zeros_like(goals), None if knots is None else jnp.zeros_like(knots))
     located = (end.code == results.EVENT) & (end.accepted > 0)
     if events is not None:
         # what was not reached repeats the state at the event
@@ -183,32 +186,36 @@ def _gone_back(residuals, cotangents, perturbed, moving, control, forward, metho
         moving = _where(idle, jax.tree.map(jnp.zeros_like, g.y), g.y)
         gone = lean_adjoint.back(problem_of, differentiable, method, t_0, t_1, y, moving)
         at_end = jnp.where(idle, g.t, g.t + gone.t_1)
-        # the end of a step is a number, but where it is a time that was asked for
-        asked = (t_1 == goals[k]) & ~(located & (t_1 == end.t))
+        # the end of a step is a number, but where it is a time that was asked for, or a knot
+        not_event = ~(located & (t_1 == end.t))
+        asked = (t_1 == goals[k]) & not_event
         by_goals = g.goals.at[k].add(jnp.where(asked, at_end, 0))
-        t = jnp.where(idle, jnp.where(asked, 0, at_end), gone.t_0)
-        return i - 1, window, _Cotangents(t, _where(idle, g.y, gone.y), jax.tree.map(jnp.add, g.shared, gone.shared), by_goals)
+        t, by_knots = jnp.where(idle, jnp.where(asked, 0, at_end), gone.t_0), g.knots
+        if by_knots is not None:
+            last = (jnp.maximum(problem.knots_passed(t_1, direction) - 1, 0), *jnp.indices(t_1.shape))
+            at_knot = (knots[last] == t_1) & not_event & ~asked & ~idle
+            by_knots = by_knots.at[last].add(jnp.where(at_knot, at_end, 0))
+        return i - 1, window, _Cotangents(t, _where(idle, g.y, gone.y), jax.tree.map(jnp.add, g.shared, gone.shared), by_goals, by_knots)
 
     def window_back(carry):
         number, window, g = carry
         _, _, g = jax.lax.while_loop(lambda carry: carry[0] > 0, step_back, (window.last, window, g))
         g = past_goals(g, record.beginnings.goal[number], window.goal[0])
-        window, arrived = _again(replace(problem, events=None), method, record.beginnings, number - 1, window, goals, jnp.sign(goals[-1] - t0))
+        window, arrived = _again(replace(problem, events=None), method, record.beginnings, number - 1, window, goals, direction)
         return number - 1, window, replace(g, y=_where(arrived, g.y, jax.tree.map(lambda y: jnp.full_like(y, jnp.nan), g.y)))
 
     lost = record.number == len(record.beginnings.t) - 1
     g = replace(g, y=_where(lost, jax.tree.map(lambda y: jnp.full_like(y, jnp.nan), g.y), g.y))
     number = jnp.where(lost, 0, record.number)
     _, _, g = jax.lax.while_loop(lambda carry: carry[0] >= 0, window_back, (number, record.window, g))
-    return g.shared, g_events, g.y, g.t, g.goals
+    return g.shared, g_events, g.knots, g.y, g.t, g.goals
 
 
 def _again(problem: Problem, method: Method, beginnings: _Beginnings, number, window: _Window, goals, direction) -> tuple[_Window, Bool[Array, "*lanes"]]:
     """The window with this number, integrated to where the next one begins, and which lanes arrived there; nothing where the number is negative."""
     first = _at(beginnings, jnp.maximum(number, 0))
     target, last_goal = _at((beginnings.t, beginnings.goal), number + 1)
-    zero = jnp.zeros(jnp.shape(first.t), jnp.int32)
-    start = Progress(first.t, first.y, first.h, zero + RUNNING, zero, zero, zero - 1, None, problem.nothing_unseen(first.t), no_pivot(first.t))
+    start = standing(problem, first.y, first.t, first.h, direction)
     room = len(window.t) - 1
 
     def to_goal(carry):

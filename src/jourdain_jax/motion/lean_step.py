@@ -4,7 +4,8 @@
     |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts;   h <- h clip(0.9 |e|^(-1/order), 0.2, 10)
 
 The state is any tree of arrays; in a batch all arrays, times and step sizes among them, have a last axis of lanes, which keeps neighbours in memory
-neighbours. A step ends at every time asked for; the step size found before such a shortened step is remembered.
+neighbours. A step ends at every time asked for and at every knot of the inputs; the step size found before such a shortened step is remembered. The state
+advances by the difference of the times at the ends of a step, as they are after rounding.
 """
 
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,6 +42,16 @@ class Method:
         """Whether the last stage is taken at y_1."""
         return bool(np.array_equal(self.A[-1], self.b) and self.c[-1] == 1.0)
 
+    @property
+    def needed(self) -> int:
+        """How many stages a step takes: without a last one that nothing else needs."""
+        return len(self.c) - int(self.last_is_next_first and self.b_error[-1] == 0)
+
+    @property
+    def at_the_end(self) -> int:
+        """The last stage that a step takes, of those at its end (of those at all, where none is)."""
+        return int(max(np.flatnonzero(self.c[: self.needed] == 1.0), default=self.needed - 1))
+
 
 class Progress(eqx.Module):
     """Where a motion is, or each of several lanes."""
@@ -48,6 +60,7 @@ class Progress(eqx.Module):
     y: PyTree
     h: Float[Array, "*lanes"]  # the next step, positive
     code: Int[Array, "*lanes"]  # RUNNING, LOCATING, or the result
+    knot: Int[Array, "*lanes"]  # index of the knot ahead
     accepted: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
     event: Int[Array, "*lanes"]  # index of the event that ended the motion, or -1
@@ -68,6 +81,7 @@ class Problem(eqx.Module):
     atol: Float[Array, "*lanes"]
     shortest: Float[Array, "*lanes"]
     max_steps: int = eqx.field(static=True)
+    knots: Float[Array, "knots *lanes"] | None = None  # times at which a step must end, in the order of the motion; the last are infinite, with its sign
     unseen: Callable | None = None  # of an error, relative to what step-size control lets pass: how large the part is that it does not see
     # as `rates`, and pivots (pivots, *lanes) that must keep their signs; None: the rates have none
     rates_and_pivots: Callable | None = None
@@ -76,19 +90,35 @@ class Problem(eqx.Module):
         """What `Progress.unseen` begins with."""
         return None if self.unseen is None else jnp.zeros_like(t)
 
+    def knot_ahead(self, p: "Progress", direction) -> Float[Array, "*lanes"]:
+        """The time of the knot ahead, infinity with the sign of the motion where there is none."""
+        if self.knots is None:
+            return direction * jnp.full_like(p.t, jnp.inf)
+        return jnp.take_along_axis(self.knots, p.knot[None], axis=0)[0]
 
-def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0) -> Progress:
+    def knots_passed(self, t: Float[Array, "*lanes"], direction) -> Int[Array, "*lanes"]:
+        """How many knots lie at `t` or before it."""
+        zero = jnp.zeros(jnp.shape(t), jnp.int32)
+        return zero if self.knots is None else zero + jnp.sum((self.knots - t) * direction <= 0, axis=0, dtype=jnp.int32)
+
+
+def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0, direction) -> Progress:
     """The start of a motion; one that starts beyond an event has no motion at all."""
-    zero = jnp.zeros(jnp.shape(t0), jnp.int32)
-    h = jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0))
-    start = Progress(t0, y0, h, zero + RUNNING, zero, zero, zero - 1, None, problem.nothing_unseen(t0), no_pivot(t0))
+    start = standing(problem, y0, t0, jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0)), direction)
     if problem.events is None:
         return start
-    beyond = problem.events(t0, y0, problem.args) <= 0
+    values = problem.events(t0, y0, problem.args)
+    beyond = ~(values > 0)
     happened = jnp.any(beyond, axis=0)
     code = jnp.where(happened, results.EVENT, start.code).astype(jnp.int32)
     event = jnp.where(happened, jnp.argmax(beyond, axis=0), start.event).astype(jnp.int32)
-    return replace(start, code=code, event=event, search=event_search.none(t0))
+    return replace(start, code=code, event=event, search=event_search.none(t0, values))
+
+
+def standing(problem: Problem, y: PyTree, t: Float[Array, "*lanes"], h: Float[Array, "*lanes"], direction) -> Progress:
+    """On the way, with no step behind and no event to search for."""
+    zero = jnp.zeros(jnp.shape(t), jnp.int32)
+    return Progress(t, y, h, zero + RUNNING, problem.knots_passed(t, direction), zero, zero, zero - 1, None, problem.nothing_unseen(t), no_pivot(t))
 
 
 def running(p: Progress, goal: Float[Array, "*lanes"]) -> Bool[Array, "*lanes"]:
@@ -104,15 +134,17 @@ def advanced(problem: Problem, method: Method, p: Progress, goal, last_goal, dir
 
 def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direction) -> Progress:
     locating = jnp.array(False) if p.search is None else p.code == LOCATING
-    rest = jnp.abs(goal - p.t)
+    knot = problem.knot_ahead(p, direction)
+    target = jnp.where((knot - goal) * direction < 0, knot, goal)
+    rest = jnp.abs(target - p.t)
     lands = ~locating & (p.h >= 0.999 * rest)
     size = jnp.where(lands, rest, jnp.where(2 * p.h > rest, 0.5 * rest, p.h))
     shortened = size < p.h
     h = direction * size if p.search is None else jnp.where(locating, p.search.shift, direction * size)
-    t1 = jnp.where(lands, goal, p.t + h)
+    t1 = jnp.where(lands, target, p.t + h)
+    h = t1 - p.t  # as rounded: the state and the time advance together
     y1, slopes, _, pivots = stages(problem, method, p.t, p.y, h, watched=True)
     error = jax.tree.map(lambda k: as_in(h, k) * weighted(method.b_error, k), slopes)
-    first_slope = jax.tree.map(lambda k: k[0], slopes)
     if problem.project is not None:
         free, y1 = y1, problem.project(t1, y1, problem.args)
         # the projection removes what the error estimate does not see; it must be no larger than an error
@@ -129,16 +161,22 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     proposed = size * factor
     next_h = jnp.where(accept & shortened, jnp.maximum(proposed, p.h), proposed)
     accepted, rejected = p.accepted + (accept & ~locating).astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
-    code = jnp.where(next_h < problem.shortest, results.STEP_TOO_SMALL, RUNNING)
+    too_short = (next_h < problem.shortest) | (t1 + direction * next_h == t1)  # the second: no time would pass
+    code = jnp.where(too_short, results.STEP_TOO_SMALL, RUNNING)
     code = jnp.where((code == RUNNING) & (accepted + rejected >= problem.max_steps) & ~(accept & (t1 == last_goal)), results.MAX_STEPS, code).astype(jnp.int32)
-    pivot = p.pivot
-    if pivots is not None:
-        pivot = jnp.where(accept & ~locating, jnp.minimum(pivot, pivots.smallest), pivot)
-        code = jnp.where(pivot < SMALLEST_PIVOT, results.SINGULAR_PARTITION, code).astype(jnp.int32)
     y = jax.tree.map(lambda new, old: jnp.where(accept, as_in(new, old), old), y1, p.y)
     unseen = None if problem.unseen is None else jnp.where(accept & ~locating, jnp.maximum(p.unseen, problem.unseen(relative)), p.unseen)
-    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, accepted, rejected, p.event, p.search, unseen, pivot)
-    return moved if problem.events is None else _watched(problem, p, moved, h, first_slope, accept)
+    passed = p.knot + (accept & ~locating & (t1 == knot)).astype(jnp.int32)
+    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, passed, accepted, rejected, p.event, p.search, unseen, p.pivot)
+    if problem.events is not None:
+        slopes = [jax.tree.map(lambda k, i=i: k[i], slopes) for i in (0, method.at_the_end)]  # first and last
+        moved = _watched(problem, p, moved, h, slopes, accept & ~locating & (code == RUNNING))
+    if pivots is None:
+        return moved
+    # what lies beyond an event does not count
+    counts = accept & ~locating & (moved.code == RUNNING) & (moved.t == t1)
+    pivot = jnp.where(counts, jnp.minimum(p.pivot, pivots.smallest), p.pivot)
+    return replace(moved, pivot=pivot, code=jnp.where(counts & (pivot < SMALLEST_PIVOT), results.SINGULAR_PARTITION, moved.code).astype(jnp.int32))
 
 
 class Pivots(eqx.Module):
@@ -176,7 +214,7 @@ def stages(problem: Problem, method: Method, t, y: PyTree, h, watched: bool = Fa
         slopes = [jax.lax.dynamic_update_index_in_dim(k, as_in(f, k), i, 0) for k, f in zip(slopes, found, strict=True)]
         return ([y + as_in(h, y) * weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes, extremes), at
 
-    count = len(method.c) - (method.last_is_next_first and method.b_error[-1] == 0)  # a last stage that nothing else needs
+    count = method.needed
     rows = (jnp.asarray(method.c[:count]), jnp.arange(count), jnp.asarray([*method.A[1:count], method.b]))
     slopes = [jnp.zeros((len(method.c), *y.shape), y.dtype) for y in leaves]
     (y_1, slopes, extremes), at = jax.lax.scan(stage, (leaves, slopes, _no_extremes(problem, t, y) if watched else None), rows)
@@ -210,31 +248,36 @@ def as_in(x, like) -> Array:
     return jnp.asarray(x, like.dtype)
 
 
-def _watched(problem: Problem, p: Progress, moved: Progress, h, first_slope, accept) -> Progress:
-    """The step from `p` by `h` to `moved`, in which an event may have happened or is being located."""
+def _watched(problem: Problem, p: Progress, moved: Progress, h, slopes, accept) -> Progress:
+    """The step from `p` by `h` to `moved`, in which an event may have happened or is being located; `slopes`: at its ends, `accept`: a step of the motion."""
 
     def events(t, y):
         return problem.events(t, y, problem.args)
 
-    locating = p.code == LOCATING
-    values = events(moved.t, moved.y)
-    happened = accept & ~locating & (moved.code == RUNNING) & jnp.any(values <= 0, axis=0)
-    event = jnp.where(happened, jnp.argmax(values <= 0, axis=0), p.event).astype(jnp.int32)
-    first_values, first_rates = jax.jvp(events, (p.t, p.y), (jnp.ones_like(p.t), first_slope))
-    c_0, c_dot_0, c_1 = (chosen(event, x) for x in (first_values, first_rates, values))
-    search = jax.tree.map(lambda new, old: jnp.where(happened, new, old), event_search.begun(p.t, moved.t), p.search)
-    search = event_search.advanced(search, h, c_0, c_dot_0, moved.t, c_1)
-    # the last, vanishing, shift is along the slope
-    found = locating & (search.left == 0)
-    t = jnp.where(found, moved.t + search.shift, moved.t)
-    y = jax.tree.map(lambda y, f: jnp.where(found, y + as_in(search.shift, y) * f, y), moved.y, first_slope)
+    so_far = p.search
+    assert so_far is not None  # where there are events
+    one, locating, (first_slope, last_slope) = jnp.ones_like(p.t), p.code == LOCATING, slopes
+    first_values, first_rates = jax.jvp(events, (p.t, p.y), (one, first_slope))
+    values, last_rates = jax.jvp(events, (moved.t, moved.y), (one, jax.lax.stop_gradient(last_slope)))
+    dip = event_search.dip(h, first_values, first_rates, values, last_rates)
+    dips = accept & dip.happens
+    happened = accept & ~dips & ~event_search.no_event(values)
+    search = jax.lax.cond(
+        eqxi.unvmap_any(happened | locating),
+        lambda: jax.tree.map(
+            lambda new, old: jnp.where(happened | locating, new, old),
+            event_search.advanced(so_far, happened, p.t, first_values, first_rates, moved.t, values),
+            so_far,
+        ),
+        lambda: so_far,
+    )
+    # trials start at the last state before the event; a step that passes over a dip is tried again to its bottom
+    found, back = locating & (search.left == 0), (happened | locating) & search.trying
+    t = jnp.where(found, moved.t + search.shift, jnp.where(back | dips, p.t, moved.t))
+    y = jax.tree.map(lambda y, y_0, f: jnp.where(found, y + as_in(search.shift, y) * f, jnp.where(back | dips, y_0, y)), moved.y, p.y, first_slope)
+    event = jnp.where(happened | (locating & so_far.trying), search.known.first, p.event)
+    next_h = jnp.where(dips, dip.share * jnp.abs(h), jnp.where(locating, p.h, moved.h))
     code = jnp.where(happened, LOCATING, jnp.where(found, results.EVENT, jnp.where(locating, LOCATING, moved.code))).astype(jnp.int32)
-    return Progress(t, y, jnp.where(locating, p.h, moved.h), code, moved.accepted, moved.rejected, event, search, moved.unseen, moved.pivot)
-
-
-def chosen(index, values: Float[Array, "events *lanes"]) -> Float[Array, "*lanes"]:
-    """The value with this index, of the first one where there is none."""
-    chosen = values[0]
-    for i in range(1, len(values)):
-        chosen = jnp.where(index == i, values[i], chosen)
-    return chosen
+    tried = dips.astype(jnp.int32)
+    knot = jnp.where(dips, p.knot, moved.knot)
+    return Progress(t, y, jax.lax.stop_gradient(next_h), code, knot, moved.accepted - tried, moved.rejected + tried, event, search, moved.unseen, moved.pivot)

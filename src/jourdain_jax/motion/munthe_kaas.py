@@ -57,7 +57,7 @@ class MuntheKaas(diffrax.AbstractWrappedSolver):
 
     @property
     def scan_kind(self):
-        """As the wrapped solver: see `guarded_solver.for_adjoint`."""
+        """As the wrapped solver: see `wrapping_solver.for_adjoint`."""
         return self.solver.scan_kind
 
     def order(self, terms):

@@ -27,6 +27,7 @@ from jourdain_jax.motion.fallbacks import changed_options, fallen_back, next_way
 from jourdain_jax.motion.fixed_step import FixedStepSolver
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integration import Options, Setup, integrate
+from jourdain_jax.motion.marks import looked_after
 from jourdain_jax.motion.recovery import recovering
 from jourdain_jax.motion.sensitivity import watched
 from jourdain_jax.motion.solver_choice import check_solver, fitted
@@ -106,13 +107,17 @@ def simulate(
     """
     given = dict(locals())
     setup = _set_up(**given)
-    motion = watched(setup, integrate)
+    motion = watched(setup, _integrated)
     if isinstance(motion.result, jax.core.Tracer):
         return motion
     while ways := next_way(setup.form, motion, setup.t0, given):
         setup = _set_up(**(given | changed_options(ways, max_steps)))
-        motion = fallen_back(watched(setup, integrate), ways)
+        motion = fallen_back(watched(setup, _integrated), ways)
     return motion
+
+
+def _integrated(setup: Setup) -> Trajectory:
+    return looked_after(integrate, setup)
 
 
 def set_up(scene: Scene, start=None, **options) -> Setup:

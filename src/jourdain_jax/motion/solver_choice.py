@@ -1,8 +1,10 @@
-"""What a solver asks for besides its rates: a form of the state, constant steps, states saved at ends of steps only."""
+"""What a solver and its control of steps ask for besides rates: a form of the state, constant steps, states saved at ends of steps only, a clock."""
 
 import diffrax
+import equinox as eqx
 import jax.numpy as jnp
 
+from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.motion.discrete_gradient import DiscreteGradient
 from jourdain_jax.motion.even_steps import EvenSteps
 from jourdain_jax.motion.fixed_step import FixedStepSolver
@@ -39,8 +41,36 @@ def check_solver(solver, controller, dt0, land: bool, saveat) -> None:
         raise ValueError(f"`{name}` takes steps of one length; give `dt0`, the step in s")
 
 
-def controller_of(solver, controller, ts, t1):
-    """Even steps between the saved times for a structure-preserving solver, unless the steps are given otherwise; None: no such choice."""
+def controller_of(solver, controller, ts):
+    """Even steps between the times at which steps end for a structure-preserving solver, unless the steps are given otherwise; None: no such choice."""
     if isinstance(solver, FixedStepSolver) and (controller is None or type(controller) is diffrax.ConstantStepSize):
-        return EvenSteps(jnp.append(ts, t1))
+        return EvenSteps(ts)
     return None
+
+
+_WITHOUT_TIMES = (diffrax.PIDController, diffrax.ConstantStepSize)
+
+
+def time_origin(controller, t0):
+    """The time from which times count in the loops: the start, but zero where a `controller` of the user's may hold times of its own."""
+    return t0 if controller is None or type(controller) in _WITHOUT_TIMES else jnp.zeros_like(t0)
+
+
+def since(saveat: diffrax.SaveAt, origin) -> diffrax.SaveAt:
+    """With times to save at that count from `origin`."""
+    return saveat if saveat.subs.ts is None else eqx.tree_at(lambda saveat: saveat.subs.ts, saveat, saveat.subs.ts - origin)
+
+
+def steps_are_given(controller) -> bool:
+    """Whether the user says where each step ends."""
+    return isinstance(controller, diffrax.StepTo)
+
+
+def marked_inputs(adjoint, tree):
+    """Inputs of the integration: forward mode through a reverse-only `adjoint` raises our own error."""
+    return reverse_only(tree) if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) else tree
+
+
+def marked_outputs(adjoint, tree):
+    """Outputs of the integration: reverse mode, which comes to them first, through a forward-only `adjoint` raises our own error."""
+    return forward_only(tree) if isinstance(adjoint, diffrax.ForwardMode) else tree

@@ -10,6 +10,7 @@ from jourdain_jax.equations.reactions import ContactForce, RowReactions
 from jourdain_jax.motion import along, results
 from jourdain_jax.motion.diagnostics import Energies, diagnose, energies_of, summary, summary_html, warnings_of
 from jourdain_jax.motion.inputs import Inputs
+from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.numbers import is_traced
@@ -60,8 +61,9 @@ class Trajectory(eqx.Module):
         if name == "t":
             return self.ts
         for names, array in ((self.scene.coordinate_names, self.q), (self.scene.speed_names, self.u)):
-            if name in names.view(array):
-                return names.view(array)[name]
+            with nan_is_a_mark():
+                if name in names.view(array):
+                    return names.view(array)[name]
         valid = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries, "t")
         raise UnknownNameError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}")
 
@@ -113,7 +115,8 @@ class Trajectory(eqx.Module):
         return along.invariants(self)
 
     def __str__(self) -> str:
-        return summary(self, self.message) if self._is_known_motion else self._outline
+        with nan_is_a_mark():
+            return summary(self, self.message) if self._is_known_motion else self._outline
 
     def _repr_html_(self) -> str:
         return summary_html(self, self.message) if self._is_known_motion else preformatted(self._outline)

@@ -1,0 +1,64 @@
+"""At which times steps must end, so that nothing of an input that is given by samples is passed over.
+
+A step sees an input at a few times only, so that a short feature between them would be lost at any tolerance. `Sampled` inputs are straight lines between
+knots: where steps end at the knots, each step has a smooth input, and nothing is lost. A knot at which the input hardly bends may be passed over: those
+at which steps end are chosen so that the straight lines between them are nowhere off by more than
+
+    max(0.1 min(rtol, 1e-4) (max v - min v), round-off)
+
+at the knots in between. They are found one after the other: from the last one, lines to later knots must pass all knots in between within that distance.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jourdain_jax.motion.inputs import Sampled
+
+_SHARE, _LOOSEST = 0.1, 1e-4
+_ONE_TIME = 1e-12  # of the span: times nearer to each other than this are one
+
+
+def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> Float[Array, "knots"] | None:
+    """Times since `t0`, in the order of the motion to `t1`, of the knots of all samples in `holders` at which steps must end, but for the saved times `ts`.
+
+    Then infinite times, with the sign of the motion, at least one. None where there are no samples.
+    """
+    samples = [x for x in jax.tree.leaves(holders, is_leaf=lambda x: isinstance(x, Sampled)) if isinstance(x, Sampled) and len(x.ts) > 1]
+    if not samples:
+        return None
+    t1, ts = jax.lax.stop_gradient((t1, ts))
+    direction, span = jax.lax.stop_gradient((jnp.sign(t1 - t0), jnp.abs(t1 - t0)))
+    share, near = _SHARE * jnp.minimum(rtol, _LOOSEST), _ONE_TIME * span
+    # which times these are is a number to differentiation, the times are not: steps end where a knot is moved to
+    since = jnp.concatenate([jnp.where(bends(x, share), (x.ts - t0) * direction, jnp.inf) for x in samples])
+    ends = jnp.sort(jnp.concatenate([(ts - jax.lax.stop_gradient(t0)) * direction, jnp.stack([jnp.zeros_like(span), span])]))
+    number = jax.lax.stop_gradient(since)
+    after = jnp.clip(jnp.searchsorted(ends, number), 1, len(ends) - 1)
+    is_end = jnp.minimum(jnp.abs(number - ends[after - 1]), jnp.abs(ends[after] - number)) <= near
+    since = jnp.sort(jnp.where(is_end | (number < 0) | (number > span), jnp.inf, since))
+    number = jax.lax.stop_gradient(since)
+    repeated = jnp.concatenate([jnp.zeros(1, bool), number[1:] - number[:-1] <= near])
+    return direction * jnp.append(jnp.sort(jnp.where(repeated, jnp.inf, since)), jnp.inf)
+
+
+def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
+    """At which knots steps must end: the straight lines between them are off by `share` of the range of values at most, at the other knots."""
+    t, v, share = jax.lax.stop_gradient((sampled.ts, sampled.values, share))
+    allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * jnp.max(jnp.abs(v)))
+
+    def next_knot(carry, here):
+        # lines from the anchor: to the knot before, and the slopes between which a line passes all knots since
+        t_a, v_a, t_b, v_b, low, high = carry
+        t_k, v_k = here
+        slope = (v_k - v_a) / (t_k - t_a)
+        straight = (slope >= low) & (slope <= high)
+        t_a, v_a = jnp.where(straight, t_a, t_b), jnp.where(straight, v_a, v_b)
+        least, most = (v_k - allowed - v_a) / (t_k - t_a), (v_k + allowed - v_a) / (t_k - t_a)
+        low, high = jnp.where(straight, jnp.maximum(low, least), least), jnp.where(straight, jnp.minimum(high, most), most)
+        return (t_a, v_a, t_k, v_k, low, high), ~straight
+
+    start = (t[0], v[0], t[0], v[0], jnp.asarray(-jnp.inf, v.dtype), jnp.asarray(jnp.inf, v.dtype))
+    _, bent = jax.lax.scan(next_knot, start, (t[1:], v[1:]))
+    # `bent` tells at a knot that steps end at the one before
+    return jnp.concatenate([(v[1] != v[0])[None], bent[1:], (v[-1] != v[-2])[None]])

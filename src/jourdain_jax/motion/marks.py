@@ -1,0 +1,20 @@
+"""NaN as a mark: what a motion did not reach is NaN on purpose, which `jax_debug_nans` is not to take for a mistake."""
+
+import jax
+
+from jourdain_jax.motion import results
+from jourdain_jax.scene.numbers import is_traced
+
+
+def nan_is_a_mark():
+    """A context in which JAX does not look for NaN."""
+    return jax.debug_nans(False)
+
+
+def looked_after(integrate, setup):
+    """`integrate(setup)` under `jax_debug_nans`: NaN after an event is a mark; where the motion failed, it is integrated again for JAX to find the NaN."""
+    if not jax.config.jax_debug_nans or is_traced(setup):
+        return integrate(setup)
+    with nan_is_a_mark():
+        motion = integrate(setup)
+    return motion if int(motion.result) in (results.SUCCESS, results.EVENT) else integrate(setup)

@@ -1,0 +1,166 @@
+"""Of several stop events in one step the first in time ends the motion, whatever its name; one whose value ends at its boundary is found there."""
+
+import itertools
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.motion import results
+
+DIFFRAX = {"solver": diffrax.Dopri5(), "stepsize_controller": diffrax.PIDController(rtol=1e-9, atol=1e-9)}
+LOOPS = {"lean": {}, "diffrax": DIFFRAX}
+GRAVITY = 9.81
+
+
+class Thrown(jj.Scene):
+    """A particle under gravity between a floor, a wall and two more planes: all its coordinates are polynomials in time, which steps follow at any length."""
+
+    floor: object = jj.parameter(0.0)
+    wall: object = jj.parameter(2.0)
+    roof: object = jj.parameter(9.0)
+    slope: object = jj.parameter(9.0)
+    coordinates = jj.coordinates("x z")
+    example = {"z": 1.0, "x_rate": 4.5}
+
+    def bodies(self, t, q):
+        return {"stone": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, q.z]))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, GRAVITY),)
+
+    def events(self, motion):
+        q = motion.q
+        return {"a floor": q.z - self.floor, "b wall": self.wall - q.x, "c roof": self.roof - q.z, "d slope": self.slope - q.x - q.z}
+
+
+def first_crossing(x_rate, z_rate, floor, wall, roof, slope):
+    """Index and time of the first event from x = 0, z = 1."""
+
+    def least(*coefficients):
+        roots = np.roots(coefficients)
+        return min((r.real for r in roots if abs(r.imag) < 1e-12 and r.real > 0), default=np.inf)
+
+    fall = [-GRAVITY / 2, z_rate, 1.0]
+    times = least(*np.subtract(fall, [0, 0, floor])), wall / x_rate, least(*np.subtract(fall, [0, 0, roof])), least(*np.subtract(fall, [0, -x_rate, slope]))
+    return int(np.argmin(times)), min(times)
+
+
+def generated_throws(count=48):
+    random = np.random.default_rng(13)
+    throws = [
+        (random.uniform(2, 6), random.uniform(-2, 3), random.uniform(-1, 0.9), random.uniform(0.3, 3), random.uniform(1.05, 3), random.uniform(1.3, 6))
+        for _ in range(count)
+    ]
+    # one shortly after the other, in every order
+    for floor, wall, slope in itertools.permutations([0.20, 0.21, 0.22]):
+        throws.append((4.0, 0.0, 1 - GRAVITY * floor**2 / 2, 4.0 * wall, 9.0, 1 + 4.0 * slope - GRAVITY * slope**2 / 2))
+    return np.array(throws)
+
+
+@pytest.mark.parametrize("options", LOOPS.values(), ids=LOOPS)
+def test_the_first_of_several_events_in_one_long_step_ends_the_motion(options):
+    throws = generated_throws()
+    if options:
+        throws[:, 4] = 100.0  # a hump over the roof is found by the lean loop; of diffrax only where it lasts a quarter of a step
+    starts = {"x": np.zeros(len(throws)), "z": np.ones(len(throws)), "x_rate": throws[:, 0], "z_rate": throws[:, 1]}
+    walls = dict(zip(("floor", "wall", "roof", "slope"), throws[:, 2:].T, strict=True))
+    lanes = jj.rollout(Thrown(), starts, parameters=walls, ts=[5.0], dt0=1.0, progress=False, **options).lanes  # the first step is beyond all of them
+    expected = [first_crossing(*throw) for throw in throws]
+    np.testing.assert_array_equal(lanes.event, [event for event, _ in expected])
+    np.testing.assert_allclose(lanes.t_end, [t for _, t in expected], rtol=1e-12)
+    assert set(np.asarray(lanes.event)) >= {0, 1, 3}
+    assert np.all(np.asarray(lanes.result) == results.EVENT)
+    np.testing.assert_allclose(lanes.q_end[:, 0], throws[:, 0] * lanes.t_end, rtol=1e-12)
+
+
+def test_the_derivative_of_the_first_event_is_its_own():
+    def end(wall, adjoint):
+        motion = jj.simulate(Thrown(wall=wall), ts=[5.0], dt0=1.0, adjoint=adjoint)
+        return jnp.stack([motion.t_end, motion.q_end[1]])
+
+    t, dt = 2.0 / 4.5, 1 / 4.5
+    expected = [dt, -GRAVITY * t * dt]
+    np.testing.assert_allclose(jax.jacrev(lambda wall: end(wall, None))(2.0), expected, rtol=1e-10)
+    np.testing.assert_allclose(jax.jacfwd(lambda wall: end(wall, diffrax.ForwardMode()))(2.0), expected, rtol=1e-10)
+
+
+class Bounded(jj.Scene):
+    """A particle without forces; event values that are no numbers beyond edges of their own."""
+
+    arc: object = jj.parameter(1.0)
+    root: object = jj.parameter(1e3)
+    jump: object = jj.parameter(1e3)
+    positive: object = jj.parameter(1e3)
+    coordinates = jj.coordinates("x")
+    example = {"x_rate": 1.0}
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def events(self, motion):
+        x = motion.q.x
+        return {
+            "arc": 1 - jnp.arcsin(x / self.arc) / (jnp.pi / 2),
+            "root": jnp.sqrt(1 - x / self.root),
+            "jump": 1 + jnp.sqrt(1 - x / self.jump),
+            "positive": jnp.arccosh(2 - x / self.positive) + 1e-3,
+        }
+
+
+@pytest.mark.parametrize("options", LOOPS.values(), ids=LOOPS)
+def test_an_event_that_is_no_number_beyond_its_boundary_stops_the_motion_there(options):
+    edges, kinds = (x.ravel() for x in np.meshgrid([0.3, 1.0, 1.7], [0, 1, 2, 3]))
+    own = {name: np.where(kinds == k, edges, 1e3) for k, name in enumerate(("arc", "root", "jump", "positive"))}
+    lanes = jj.rollout(Bounded(), {"x_rate": np.full(12, 1.3)}, parameters=own, ts=[5.0], progress=False, **options).lanes
+    assert np.all(np.asarray(lanes.result) == results.EVENT)
+    np.testing.assert_array_equal(lanes.event, np.array([0, 3, 1, 2])[kinds])  # in the order of the alphabet
+    np.testing.assert_allclose(lanes.q_end[:, 0], edges, rtol=1e-13)
+    np.testing.assert_allclose(lanes.t_end, edges / 1.3, rtol=1e-13)
+
+
+def test_the_time_at_which_a_value_ends_has_the_derivative_of_its_boundary():
+    def end(edge, adjoint):
+        return jj.simulate(Bounded(arc=edge), {"x_rate": 1.3}, ts=[5.0], adjoint=adjoint).t_end
+
+    np.testing.assert_allclose(jax.grad(lambda edge: end(edge, None))(0.7), 1 / 1.3, rtol=1e-6)
+    np.testing.assert_allclose(jax.jacfwd(lambda edge: end(edge, diffrax.ForwardMode()))(0.7), 1 / 1.3, rtol=1e-6)
+
+
+def test_a_start_whose_event_is_no_number_is_beyond_it_and_a_state_that_is_none_is_a_failure():
+    beyond = jj.simulate(Bounded(), {"x": 1.5, "x_rate": 1.0}, ts=[5.0])
+    assert (int(beyond.result), float(beyond.t_end)) == (results.EVENT, 0.0)
+    lost = eqx.tree_at(lambda s: s.q, jj.start(Bounded(), x_rate=1.0), jnp.array([jnp.nan]))
+    assert int(jj.simulate(Bounded(), lost, t1=5.0).result) == results.BAD_START
+
+
+@pytest.mark.parametrize("options", LOOPS.values(), ids=LOOPS)
+def test_a_value_that_falls_below_zero_and_rises_again_within_a_step_is_an_event(options):
+    """A stone thrown up against a roof that it passes by little: the first step would take it there and back."""
+    passes, longest = np.array([1e-4, 1e-2, 0.3]), 2.5
+    top = 1.0 + 5.0**2 / (2 * GRAVITY)
+    starts = {"z": np.ones(3), "z_rate": np.full(3, 5.0)}
+    scene = Thrown(floor=-100.0, wall=100.0, slope=100.0)
+    lanes = jj.rollout(scene, starts, parameters={"roof": top - passes}, ts=[longest], dt0=0.8, progress=False, **options).lanes
+    expected = 5.0 / GRAVITY - np.sqrt(2 * passes / GRAVITY)
+    seen = slice(None) if not options else slice(2, None)  # the dense output of diffrax is looked at in three places
+    np.testing.assert_array_equal(lanes.event[seen], np.full(3, 2)[seen])
+    np.testing.assert_allclose(lanes.t_end[seen], expected[seen], rtol=1e-9)
+
+
+def test_an_event_is_no_mistake_to_a_search_for_nan_and_a_mistake_still_is():
+    class Wrong(Thrown):
+        def loads(self, motion):
+            return (jj.gravity(motion, GRAVITY * jnp.sqrt(motion.q.z - 0.9)),)
+
+    with jax.debug_nans(True):
+        motion = jj.simulate(Thrown(), t1=5.0)
+        assert int(motion.result) == results.EVENT
+        assert np.isnan(np.asarray(motion["x"])[-1])
+        assert "stopped at an event" in str(motion)
+        with pytest.raises(FloatingPointError):
+            jj.simulate(Wrong(), t1=5.0)

@@ -1,0 +1,113 @@
+"""What does not depend on time is as right far from t = 0 as near it, in both loops and both precisions."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+LOOPS = {
+    "lean": {},
+    "diffrax": {"solver": diffrax.Dopri5(), "stepsize_controller": diffrax.PIDController(rtol=1e-8, atol=1e-8)},
+    "equal steps": {"solver": jj.ImplicitMidpoint(), "dt0": 1e-3},
+}
+FAR = (1.7e9, -3.0e8, 86400.0)
+
+
+class Oscillator(jj.Scene):
+    """An oscillator that a force of the clock drives, and that stops where it passes x = -0.999."""
+
+    stiffness: object = jj.parameter(1e4)
+    driven: object = jj.parameter(0.0)
+    stops: object = jj.parameter(2.0)
+    coordinates = jj.coordinates("x")
+    example = {"x": 1.0}
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=self.driven * jnp.cos(2.0 * motion.t) - self.stiffness * motion.q.x),)
+
+    def events(self, motion):
+        return {"passed": motion.q.x + self.stops}
+
+
+@pytest.mark.parametrize("options", LOOPS.values(), ids=LOOPS)
+def test_an_oscillator_far_in_time_is_the_one_at_zero(options):
+    since = np.array([0.25, 0.5, 1.0])  # exact in binary
+    near = jj.simulate(Oscillator(), ts=since, t0=0.0, **options).raise_if_failed()
+    for t0 in FAR:
+        far = jj.simulate(Oscillator(), ts=t0 + since, t0=t0, **options).raise_if_failed()
+        np.testing.assert_array_equal(far.q, near.q)
+        np.testing.assert_array_equal(far.ts, t0 + since)
+        assert int(far.accepted) == int(near.accepted)
+        assert float(far.t_end) == t0 + 1.0
+
+
+def test_an_event_far_in_time_is_the_one_at_zero_and_so_is_its_derivative():
+    def passed(stops, t0, options):
+        motion = jj.simulate(Oscillator(stiffness=100.0, stops=stops), t0=t0, ts=[t0 + 1.0], **options)
+        return motion.t_end - t0, motion.u_end[0]
+
+    for options in ({}, {"solver": diffrax.Dopri5()}):
+        t, speed = passed(0.5, 2.0**31, options)
+        np.testing.assert_allclose(t, np.arccos(-0.5) / 10.0, rtol=0, atol=2.0**-21)  # of the clock
+        np.testing.assert_allclose(speed, -10 * np.sqrt(0.75), rtol=1e-7)
+    slope = jax.grad(lambda stops: passed(stops, 2.0**31, {})[1])(0.5)
+    np.testing.assert_allclose(slope, 10 * 0.5 / np.sqrt(0.75), rtol=1e-6)
+
+
+def test_the_state_and_the_time_advance_together():
+    """xdot = 1 in steps that do not divide the span: x is the time, to the last digit of the clock."""
+    motion = jj.simulate(Oscillator(stiffness=0.0), {"x": 0.0, "x_rate": 1.0}, t0=1e9, ts=1e9 + np.linspace(0.0, 3.0, 7), t1=1e9 + 3.0)
+    np.testing.assert_allclose(motion["x"], np.asarray(motion.ts) - 1e9, rtol=1e-14, atol=1e-14)
+
+
+def test_a_driven_oscillator_gets_the_time_of_the_clock():
+    t0 = 1e6
+    motion = jj.simulate(Oscillator(stiffness=0.0, driven=1.0), {"x": 0.0}, t0=t0, ts=[t0 + 1.0])
+    np.testing.assert_allclose(motion.u_end[0], (np.sin(2 * (t0 + 1.0)) - np.sin(2 * t0)) / 2, rtol=0, atol=1e-8)
+
+
+def test_a_clock_that_is_coarse_beside_the_steps_is_warned_of():
+    near, far = (jj.simulate(Oscillator(stiffness=1e8, driven=1.0), t0=t0, ts=[t0, t0 + 2.0**-7]) for t0 in (0.0, 1.7e9))
+    assert near.warnings == ()
+    (text,) = far.warnings
+    assert text.startswith("the clock resolves 2e-07 s at these times, and steps are of ")
+
+
+def test_lanes_far_in_time_are_the_ones_at_zero():
+    starts = {"x": np.array([1.0, 0.5])}
+    near, far = (jj.rollout(Oscillator(), starts, t0=t0, ts=[t0 + 0.5, t0 + 1.0], progress=False) for t0 in (0.0, 1.7e9))
+    np.testing.assert_array_equal(far.lanes.q, near.lanes.q)
+
+
+PROGRAM = """
+import json, sys
+sys.path[:0] = {path!r}
+import jax, test_far_times as here
+assert not jax.config.jax_enable_x64
+print(json.dumps(here.in_single_precision()))
+"""
+
+
+def in_single_precision():
+    options = {"rtol": 1e-5, "atol": 1e-5}
+    return [jj.simulate(Oscillator(stiffness=100.0), t0=t0, ts=[t0 + 0.5, t0 + 1.0], **options).q[:, 0].tolist() for t0 in (0.0, 1e4)]
+
+
+def test_single_precision_far_in_time_is_as_right_as_at_zero():
+    program = PROGRAM.format(path=[str(pathlib.Path(__file__).parent), *sys.path])
+    environment = {**os.environ, "JAX_ENABLE_X64": "0"}
+    near, far = json.loads(subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True).stdout)
+    assert far == near
+    np.testing.assert_allclose(far, np.cos([5.0, 10.0]), rtol=0, atol=1e-3)

@@ -1,0 +1,96 @@
+"""Inputs given by samples: steps end at their knots, so that no feature is passed over, however short it is and at whatever tolerance."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.motion.knots import bends
+
+
+class Struck(jj.Scene):
+    """A mass without other forces that an input strikes."""
+
+    mass: object = jj.parameter(2.0, positive=True)
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("force push")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.force + motion.inputs.push),)
+
+
+BLOW = jj.Sampled([0.0, 2.0137, 2.0142, 2.0147, 10.0], [0.0, 0.0, 2000.0, 0.0, 0.0])  # 1 N s about 2.0142 s
+LOOPS = {
+    "lean": {},
+    "diffrax": {"solver": diffrax.Dopri5(), "stepsize_controller": diffrax.PIDController(rtol=1e-6, atol=1e-6)},
+    "dense output": {"land_on_ts": False},
+    "implicit": {"solver": jj.RadauIIA()},
+    "equal steps": {"solver": jj.ImplicitMidpoint(), "dt0": 1.0},
+    "dense matrices": {"lowering": False},
+}
+
+
+@pytest.mark.parametrize("options", LOOPS.values(), ids=LOOPS)
+def test_a_hammer_blow_of_a_millisecond_is_felt_in_every_loop(options):
+    motion = jj.simulate(Struck(), ts=[10.0], inputs={"force": BLOW}, work=False, **options).raise_if_failed()
+    if "dt0" not in options:
+        np.testing.assert_allclose(motion.q_end[0], 0.5 * (10 - 2.0142), rtol=1e-9)
+    np.testing.assert_allclose(motion.u_end[0], 0.5, rtol=1e-9)
+
+
+def test_a_hammer_blow_is_felt_at_every_tolerance_and_whenever_it_comes():
+    random = np.random.default_rng(7)
+    for tolerance in (0.3, 1e-2, 1e-5, 1e-11):
+        at, long, high = random.uniform(0.1, 9.0), 10 ** random.uniform(-6, -1), 10 ** random.uniform(-3, 4)
+        ts, values = at + long * np.array([-1.0, -0.5, 0.0, 0.2, 0.7]), high * np.array([0.0, 1.0, -1.0, 0.5, 0.0])  # to and fro
+        inputs = {"force": jj.Sampled([0.0, *ts], [0.0, *values]), "push": jj.Sampled([0.0, 10.0], [-1.0, 1.0])}
+        motion = jj.simulate(Struck(), ts=[10.0], inputs=inputs, rtol=tolerance, atol=tolerance, work=False)
+        grid = np.concatenate([[0.0], ts, [10.0]])
+        impulse = np.trapezoid(np.concatenate([[0.0], values, [0.0]]), grid)  # that of the push is zero
+        np.testing.assert_allclose(motion.u_end[0], impulse / 2, rtol=0, atol=1e-9 + 1e-9 * abs(impulse))
+
+
+def test_a_blow_within_thousands_of_samples_is_felt():
+    ts = np.linspace(0.0, 10.0, 10_001)
+    values = np.where((ts > 2.0135) & (ts < 2.0165), 1000.0, 0.0)
+    motion = jj.simulate(Struck(), ts=[10.0], inputs={"force": jj.Sampled(ts, values)}, rtol=1e-3, atol=1e-3, work=False)
+    np.testing.assert_allclose(motion.u_end[0], np.trapezoid(values, ts) / 2, rtol=1e-9)
+    assert int(motion.accepted) < 100  # the straight parts have no knots
+
+
+def test_lanes_feel_blows_of_their_own_and_forwards_and_backwards():
+    at = jnp.array([0.7, 3.0, 8.5])
+
+    def end(at, t0, t1, adjoint=None):
+        ts = jnp.stack([jnp.zeros(()), at - 5e-4, at, at + 5e-4])
+        inputs = {"force": jj.Sampled(ts, jnp.array([0.0, 0.0, 2000.0, 0.0]))}
+        motion = jj.simulate(Struck(), {}, t0=t0, ts=jnp.stack([t1]), inputs=inputs, work=False, adjoint=adjoint)
+        return motion.q_end[0]
+
+    np.testing.assert_allclose(jax.vmap(lambda at: end(at, 0.0, jnp.asarray(10.0)))(at), 0.5 * (10 - at), rtol=1e-9)
+    np.testing.assert_allclose(jax.vmap(lambda at: end(at, 10.0, jnp.asarray(0.0)))(at), 0.5 * at, rtol=1e-9)
+    np.testing.assert_allclose(jax.grad(lambda at: end(at, 0.0, jnp.asarray(10.0)))(3.0), -0.5, rtol=1e-6)
+    forward = jax.jacfwd(lambda at: end(at, 0.0, jnp.asarray(10.0), diffrax.ForwardMode()))
+    np.testing.assert_allclose(forward(3.0), -0.5, rtol=1e-6)
+
+
+def test_lanes_of_a_rollout_feel_a_blow_that_they_share():
+    lanes = jj.rollout(Struck(), parameters={"mass": np.array([1.0, 2.0, 4.0])}, ts=[10.0], inputs={"force": BLOW}, work=False, progress=False).lanes
+    np.testing.assert_allclose(lanes.u_end[:, 0], [1.0, 0.5, 0.25], rtol=1e-9)
+
+
+@pytest.mark.parametrize("share", [1e-9, 1e-4, 1e-2])
+def test_straight_lines_between_the_knots_that_are_kept_are_as_near_as_stated(share):
+    random = np.random.default_rng(3)
+    ts = np.sort(random.uniform(0.0, 10.0, 400))
+    for values in (np.sin(ts), 1e3 + random.standard_normal(400), np.sign(np.sin(3 * ts)), 5.0 - 3.0 * ts, np.maximum(0.0, 1 - 50 * abs(ts - 4.0))):
+        kept = np.array(bends(jj.Sampled(ts, values), share))
+        kept[[0, -1]] = True
+        off = np.max(np.abs(np.interp(ts, ts[kept], values[kept]) - values))
+        assert off <= share * np.ptp(values) * (1 + 1e-9) + 1e-12 * np.max(np.abs(values))
+    assert np.sum(bends(jj.Sampled(ts, 5.0 - 3.0 * ts), share)) == 2
