@@ -76,7 +76,7 @@ class AppellOnGraph:
     def __init__(self, traced: TracedScene, structure: Structure, kept: KeptRows | None, probes: Probes, far, reference, quaternions: tuple[int, ...]):
         self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
         every, rows = range(len(traced.u)), [s for s, name in enumerate(structure.row_names) if name not in structure.redundant_rows]
-        self.independent = list(every) if kept else list(structure.independent)
+        self.independent = list(every) if kept or not rows else list(structure.independent)
         self.dependent = [k for k in every if k not in self.independent]
         self.kept, self.rows, self.multiplied = kept, *(([], rows) if kept else (rows, []))
         self.reference, self.quaternions, self.far = reference, quaternions, far

@@ -134,7 +134,7 @@ def _with_calls_or_without(key: _Key, begin: float) -> Lowered:
             probes = on_velocity_rows(probes, traced, structure.affine)
         quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
         far = full_turns(probes, traced, quaternions)
-        kept = KeptRows(traced.graph, structure, key.massless, probes, far) if key.every_speed else None
+        kept = KeptRows(traced.graph, structure, key.massless, probes, far) if key.every_speed and structure.row_names else None
         builder = AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference(), quaternions)
         return _best(scene, structure, builder, begin)
 
