@@ -170,9 +170,9 @@ def _probed_structure(scene: Scene) -> Structure:
     symmetric = symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
     found = _look(scene, t, q, u, -u[::-1])
-    check_smoothness(scene, found.q[:RANDOM_PROBES], u)
     generic = np.arange(len(t)) < RANDOM_PROBES
     on_rows = assembled(scene, found.miss, generic)
+    check_smoothness(scene, found.q[on_rows & generic], u)
     faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
     scaled = _scaled(found)
     usable = np.all(np.isfinite(scaled.A), axis=(1, 2)) & on_rows
