@@ -25,7 +25,7 @@ from jourdain_jax.scene.what_is_read import WhatIsRead, is_read_by
 
 
 class _SceneClass(type(eqx.Module)):  # type: ignore[misc]
-    """Every scene carries what its methods read, as a part of its structure; but its fields, as `dataclasses.fields` lists them, are those that its author wrote."""
+    """Every scene carries what its methods read as a part of its structure; the fields that `dataclasses.fields` lists are those that its author wrote."""
 
     hidden: ClassVar[dict] = {}
 
