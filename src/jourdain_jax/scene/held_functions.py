@@ -33,9 +33,9 @@ def hold_functions(scene) -> None:
         return HeldFunction(leaf) if callable(leaf) else leaf
 
     static = tuple(value for field in fields(scene) if field.metadata.get("static") and is_function(value := getattr(scene, field.name)))
-    object.__setattr__(scene, "read_by_methods", is_read_by(type(scene), *static))
+    object.__setattr__(scene, "_read", is_read_by(type(scene), *static))
     for field in fields(scene):
-        if field.metadata.get("static") or field.metadata.get("parameter") or not field.init:
+        if field.metadata.get("static") or field.metadata.get("parameter"):
             continue
         value = getattr(scene, field.name)
         leaves = jax.tree.leaves(value)

@@ -24,7 +24,26 @@ from jourdain_jax.scene.parameters import check_parameters, parameters_of
 from jourdain_jax.scene.what_is_read import WhatIsRead, is_read_by
 
 
-class Scene(eqx.Module):
+class _SceneClass(type(eqx.Module)):  # type: ignore[misc]
+    """Every scene carries what its methods read as a part of its structure; the fields that `dataclasses.fields` lists are those that its author wrote."""
+
+    hidden: ClassVar[dict] = {}
+
+    def __new__(mcs, name, bases, namespace, **options):
+        """The class, built with that field and shown without it."""
+        scenes = {kind for base in bases for kind in base.__mro__ if isinstance(kind, mcs)}
+        for kind in scenes:
+            kind.__dataclass_fields__.update(mcs.hidden)
+        try:
+            new = super().__new__(mcs, name, bases, namespace, **options)
+        finally:
+            for kind in scenes:
+                kind.__dataclass_fields__.pop("_read", None)
+        mcs.hidden["_read"] = new.__dataclass_fields__.pop("_read")
+        return new
+
+
+class Scene(eqx.Module, metaclass=_SceneClass):
     """Base class of all scenes. Subclass it, state `coordinates` and `bodies`, and what else the scene needs.
 
     Class attributes (or properties, where they depend on a static field such as a number of bodies)
@@ -49,13 +68,13 @@ class Scene(eqx.Module):
     conventions: ClassVar[str] = "SI units, radians; right-handed inertial frame, z up."
     example: ClassVar[dict[str, float]] = {}
     example_span: ClassVar[float] = 5.0
-    read_by_methods: WhatIsRead = eqx.field(init=False, repr=False)  # globals, closures, attributes of the class: a change of them makes another scene
+    _read: WhatIsRead = eqx.field(init=False, repr=False)  # globals, closures, attributes of the class: a change of them makes another scene
 
     def __new__(cls, *args, **kwargs):
         """Before any field is set: the arguments are parameters of the scene."""
         checked_arguments(cls, kwargs)
         scene = super().__new__(cls)
-        object.__setattr__(scene, "read_by_methods", is_read_by(cls))  # functions in fields come to it when they are known
+        object.__setattr__(scene, "_read", is_read_by(cls))  # functions in fields come to it when they are known
         return scene
 
     def __check_init__(self):
