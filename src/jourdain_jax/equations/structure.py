@@ -200,7 +200,6 @@ def usual_rows(scene: Scene) -> UsualRows:
 def _probed_structure(scene: Scene) -> Structure:
     names = names_of_rows(scene)
     count = len(scene.speed_names)
-<<<<<<< HEAD
     generator = np.random.default_rng(0)
     drawn = random_states(scene, RANDOM_PROBES, generator)
     t, u, generic, found = _at_probes(scene, *drawn)
@@ -208,17 +207,8 @@ def _probed_structure(scene: Scene) -> Structure:
     if near is not None:
         drawn = near
         t, u, generic, found = _at_probes(scene, *near)
-    check_smoothness(scene, found.q[:RANDOM_PROBES], u)
     on_rows = usable_states(scene, found, generic)
-=======
-    t, q, u = random_states(scene, RANDOM_PROBES, np.random.default_rng(0))
-    symmetric = symmetric_configurations(scene)
-    t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
-    found = _look(scene, t, q, u, -u[::-1])
-    generic = np.arange(len(t)) < RANDOM_PROBES
-    on_rows = assembled(scene, found.miss, generic)
     check_smoothness(scene, found.q[on_rows & generic], u)
->>>>>>> truths
     faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
     A = found.A * speed_scales(found.M)[:, None]
     usable = np.all(np.isfinite(A), axis=(1, 2)) & on_rows
