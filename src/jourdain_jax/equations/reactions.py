@@ -11,6 +11,7 @@ Everything is in the inertial frame. Source: Wang and Pao (2003), eqs. (1)-(3), 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
@@ -112,7 +113,7 @@ def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
     return Motion(motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies)
 
 
-def _spare_multipliers(A: Float[Array, "rows speeds"], typical: Float[Array, "rows"] | None = None) -> Float[Array, "rows rows"]:
+def _spare_multipliers(A: Float[Array, "rows speeds"], typical: Float[np.ndarray, "rows"]) -> Float[Array, "rows rows"]:
     """Columns: multipliers that change no motion, `A' lambda = 0`; all zero where the rows are independent.
 
     `typical`: lengths of the rows, as in `row_scale`.
