@@ -56,7 +56,9 @@ def damped_root(rows: Callable, guess: Float[Array, "unknowns"], size: Float[Arr
         return _Search(best + size * step, best, f, J, damping, search.steps + 1, going)
 
     f, J = jax.eval_shape(look, guess)
-    start = _Search(guess, guess, jnp.full(f.shape, jnp.inf, f.dtype), jnp.zeros(J.shape, J.dtype), jnp.full((), 6e-2, f.dtype), jnp.zeros((), jnp.int32), jnp.array(True))
+    start = _Search(
+        guess, guess, jnp.full(f.shape, jnp.inf, f.dtype), jnp.zeros(J.shape, J.dtype), jnp.full((), 6e-2, f.dtype), jnp.zeros((), jnp.int32), jnp.array(True)
+    )
     found = jax.lax.while_loop(lambda search: search.going, once, start)
     left = jnp.max(jnp.abs(found.f), initial=0.0)
     return Nearest(found.best, jnp.where(jnp.isfinite(left), left, jnp.inf))

@@ -23,7 +23,7 @@ from jourdain_jax.equations.reductions import (
     reduce,
 )
 from jourdain_jax.equations.rows import ConstraintRows, UsualRows, position_residual
-from jourdain_jax.equations.structure import usual_rows, structure_of
+from jourdain_jax.equations.structure import structure_of, usual_rows
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
 from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.names import nearest
@@ -88,7 +88,9 @@ def as_stabilisation(stabilisation) -> Baumgarte | None:
     return stabilisation
 
 
-def accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None, usual: UsualRows | None = None) -> Accelerations:
+def accelerations(
+    scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None, usual: UsualRows | None = None
+) -> Accelerations:
     """Accelerations, multipliers and diagnostics of a scene at (t, q, u).
 
         M udot + h = Q + A' lambda,   A udot = -drift

@@ -63,8 +63,16 @@ def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "c
 
 
 def project_speeds(
-    scene: Scene, t, q, u: Float[Array, "speeds"], inputs=None, *, free: Bool[Array, "speeds"] | None = None, iterations: int = 8, cutoff: float | None = None,
-    typical=None
+    scene: Scene,
+    t,
+    q,
+    u: Float[Array, "speeds"],
+    inputs=None,
+    *,
+    free: Bool[Array, "speeds"] | None = None,
+    iterations: int = 8,
+    cutoff: float | None = None,
+    typical=None,
 ) -> Float[Array, "speeds"]:
     """Speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are `free` move.
 
