@@ -82,8 +82,8 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
     good = np.isfinite(found.error)
     if not good[generic].any():
         raise NoStateFoundError(
-            f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by {np.min(found.miss[generic]):.1e} "
-            "or more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, "
+            f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by "
+            f"{np.min(found.miss[generic]):.1e} or more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each other (where parameters are traced, "
             "numbers near their defaults stood in for them, or near one where they have none: give defaults near the values in use)"
         )
     outside = np.sort(found.outside[good & generic])
@@ -94,8 +94,13 @@ def _projected(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled
     try:
         return sampled_on_graph(scene, t, q, u)
     except Unsupported:
-        found = assembled_by_jax(scene, t, q, np.ones(len(q), bool))
-        return found.q, _speeds_by_jax(scene, t, found.q, u), found
+        return sampled_by_jax(scene, t, q, u)
+
+
+def sampled_by_jax(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
+    """The same by JAX, for scenes without a scalar form."""
+    found = assembled_by_jax(scene, t, q, np.ones(len(q), bool))
+    return found.q, _speeds_by_jax(scene, t, found.q, u), found
 
 
 @on_numbers

@@ -2,7 +2,8 @@
 
     M^ = c M c,  f^ = c (Q - h),  A^ = d A c,  b^ = -d drift,   udot = c w,   c_i = M_ii^(-1/2),  d_s = 1/max(|A_s c|, l_s)
 
-l_s: the typical length of the row (`structure_of`), so that a row that vanishes at a configuration is not blown up to a direction of round-off. The scales are constants to differentiation: the accelerations do not depend on them.
+l_s: the typical length of the row (`structure_of`), so that a row that vanishes at a configuration is not blown up to a direction of round-off.
+The scales are constants to differentiation: the accelerations do not depend on them.
 """
 
 import equinox as eqx

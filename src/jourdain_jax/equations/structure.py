@@ -185,10 +185,10 @@ def _probed_structure(scene: Scene) -> Structure:
     names = names_of_rows(scene)
     count = len(scene.speed_names)
     generator = np.random.default_rng(0)
-    t, u, generic, found = _at_probes(scene, *random_states(scene, RANDOM_PROBES, generator))
+    t, generic, found = _at_probes(scene, *random_states(scene, RANDOM_PROBES, generator))
     near = None if np.isfinite(found.error[generic]).any() else states_near_what_was_seen(scene, RANDOM_PROBES, generator)
     if near is not None:
-        t, u, generic, found = _at_probes(scene, *near)
+        t, generic, found = _at_probes(scene, *near)
     on_rows = usable_states(scene, found, generic)
     faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
     A = found.A * speed_scales(found.M)[:, None]
@@ -238,12 +238,12 @@ def _probed_structure(scene: Scene) -> Structure:
     )
 
 
-def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
-    """What is found at the given random states and at the symmetric ones; their times and speeds, and which are random."""
+def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Probed]:
+    """Times, which states are random, and what is found: at the given random states and at the symmetric ones."""
     symmetric = symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
     generic = np.arange(len(t)) < RANDOM_PROBES
-    return t, u, generic, _look(scene, t, q, u, -u[::-1], generic)
+    return t, generic, _look(scene, t, q, u, -u[::-1], generic)
 
 
 def _rank(A: np.ndarray, error: float) -> int:
