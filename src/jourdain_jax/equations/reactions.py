@@ -11,6 +11,7 @@ Everything is in the inertial frame. Source: Wang and Pao (2003), eqs. (1)-(3), 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
@@ -96,7 +97,7 @@ def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
     return Motion(motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies)
 
 
-def determined_rows(A: Float[Array, "rows speeds"], typical: Float[Array, "rows"] | None = None) -> Bool[Array, "rows"]:
+def determined_rows(A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray, "rows"] | None = None) -> Bool[Array, "rows"]:
     """Which multipliers are unique: those whose row is no combination of the others, `(A A+)_ss = 1`; `typical`: lengths of the rows, as in `row_scale`."""
     A = jax.lax.stop_gradient(row_scale(A, typical)[:, None] * A)
     alone = jnp.diagonal(A @ pseudo_inverse(A))
