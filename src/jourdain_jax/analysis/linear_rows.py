@@ -37,7 +37,7 @@ class RowsOverStates:
     def __init__(self, scene: Scene):
         self.scene = scene
         try:
-            self._look = _OnGraph(scene)
+            self._look: _OnGraph | _ByJax = _OnGraph(scene)
         except Unsupported:
             self._look = _ByJax(scene)
 

@@ -127,8 +127,9 @@ def _looked_at_from_afar(scene: Scene, t, q, u, u_other, generic) -> Probed:
     for first, _ in scene.coordinates.quaternions:
         far_q[:, first : first + 4] = q[:FAR_PROBES, first : first + 4]
     far = FAR * generator.uniform(size=FAR_PROBES), far_q, *(FAR * generator.uniform(-1, 1, (2, *u[:FAR_PROBES].shape)))
-    found = probed(scene, *(np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True)), np.pad(generic, (0, FAR_PROBES)))
-    near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[: len(t)], np.s_[len(t) :]))
+    t, q, u, u_other = (np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True))
+    found = probed(scene, t, q, u, u_other, np.append(generic, np.zeros(FAR_PROBES, bool)), far=FAR_PROBES)
+    near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[:-FAR_PROBES], np.s_[-FAR_PROBES:]))
     return replace(near, hidden=_seen(beyond))
 
 
