@@ -61,6 +61,14 @@ def test_the_report_names_the_configuration(name):
     assert all("1.571" in loss for loss in losses)
 
 
+def test_the_report_warns_where_a_start_has_another_rank():
+    scene = Parallelogram()
+    singular, regular = (jj.report(scene, start={"a": a, "b": 0.0, "c": a}) for a in (np.pi / 2, 0.4))
+    assert (singular.rank_at_start, regular.rank_at_start) == (1, 2)
+    assert "WARNING" in str(singular)
+    assert "WARNING" not in str(regular)
+
+
 def test_verifying_at_a_loss_of_rank_raises_no_false_alarm():
     scene, q, _ = _near("parallelogram", 0.0)
     found = jj.verify(scene, jj.consistent(scene, 0.0, q, jnp.array([1.0, 0.0, 1.0])))
