@@ -154,16 +154,20 @@ def structure_of(scene: Scene) -> Structure:
     ValueError where no admissible state is found, where a motion that the rows leave free has no inertia, or `privileged` names unknown or too few
     speeds; for known parameters also where numbers of its bodies or planes cannot be.
     """
-    with without_collecting():
-        structure = _probed_structure(as_scene(scene))
+    structure = _whatever_its_faults(scene)
     if structure.faults and not is_traced(scene):  # numbers that stand in for traced parameters prove nothing
         raise ValueError(structure.faults[0])
     return structure
 
 
+def _whatever_its_faults(scene: Scene) -> Structure:
+    with without_collecting():
+        return _probed_structure(as_scene(scene))
+
+
 def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
     """Typical lengths of the rows of `A` in the units of the speeds; of a scene whose parameters are traced, as in `usual_rows`."""
-    return structure_of(scene).plain_row_lengths * (TRACED if is_traced(scene) else 1.0)
+    return _whatever_its_faults(scene).plain_row_lengths * (TRACED if is_traced(scene) else 1.0)
 
 
 def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
@@ -177,7 +181,7 @@ def usual_rows(scene: Scene) -> UsualRows:
 
     Of a scene whose parameters are traced, numbers stand in that may be of another order: only what is shorter than a thousandth of those lengths counts less.
     """
-    known = structure_of(scene)
+    known = _whatever_its_faults(scene)
     return UsualRows(known.row_lengths * (TRACED if is_traced(scene) else 1.0), np.asarray(known.rank, np.int32))
 
 

@@ -47,7 +47,8 @@ class State(Printed, eqx.Module):
     moved_u: Float[Array, ""]  # largest change of a speed by the projection
     residual: Float[Array, ""]  # what is left of rows and quaternion norms
     names: tuple[Names, Names] = eqx.field(static=True)
-    guess: Int[Array, ""] = eqx.field(default=0, converter=lambda k: jnp.asarray(k, jnp.int32))  # that led here: 0, what was given; then others (`start`)
+    # that led here: 0, what was given; then others (`start`). A floating-point number, so that a loss can be differentiated with respect to a whole state
+    guess: Float[Array, ""] = eqx.field(default=0, converter=lambda k: jnp.asarray(k, jnp.result_type(float)))
 
     def __getitem__(self, name: str):
         """A coordinate, speed, quaternion or angular velocity by name."""
@@ -93,7 +94,9 @@ def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable
         if not found.arrived and _can_search(scene):
             found = _uncompiled_projection(*arguments, guesses())
     found = jax.tree.map(jnp.asarray, found)
-    return State(t, found.q, found.u, found.moved_q, found.moved_u, found.residual, (scene.coordinate_names, scene.speed_names), found.guess)
+    return State(
+        t, found.q, found.u, found.moved_q, found.moved_u, found.residual, (scene.coordinate_names, scene.speed_names), found.guess.astype(found.q.dtype)
+    )
 
 
 _seldom = Seldom(often=8)
