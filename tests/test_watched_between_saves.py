@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from linkages import NarrowPendulum, Parallelogram, SliderCrank, pendulum_angles, slider_crank_motion
+from moving_linkages import NarrowPendulum, Parallelogram, SliderCrank, pendulum_angles, slider_crank_motion
 
 import jourdain_jax as jj
 from jourdain_jax.motion import results

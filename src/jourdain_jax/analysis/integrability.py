@@ -7,25 +7,18 @@ Rows together: with `qdot = X y + X_0` the admissible velocities, the spaces `D_
 a last dimension; the motion stays on a manifold of that dimension. Time counts as one more coordinate with the field `(1, X_0)`
 where the rows or rates depend on time or are not homogeneous; its dimension is left out of the growth vector.
 
-`[X, Y] = DY X - DX Y` by jvp. A bracket of brackets needs the derivative of such a jvp: taken by eighth-order central differences
-(to about 1e-11), because every further nesting of jvp doubles the program to be compiled.
+`[X, Y] = DY X - DX Y` along the fields. A bracket of brackets needs the derivative of such a derivative: taken by eighth-order central differences
+(to about 1e-11), because every further derivative doubles what is evaluated.
 Source: Wang and Pao (2003), section II; for the growth vector A. M. Vershik and V. Ya. Gershkovich, Dynamical Systems VII (1994).
 """
 
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
-from jourdain_jax.equations.kinematics import coordinate_rates
-from jourdain_jax.equations.probing import on_numbers
-from jourdain_jax.equations.reductions import Partition
-from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.analysis.linear_rows import RowsOverStates
 from jourdain_jax.equations.sampling import sample_states
-from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.scene.scene import Scene
 
@@ -63,9 +56,9 @@ def row_integrability(scene: Scene, *, points: int = 6, seed: int = 0) -> RowInt
     names = structure_of(scene).row_names
     if not names:
         return RowIntegrability((), (), {})
-    states = [jnp.asarray(x) for x in sample_states(scene, points, seed)]
-    forms, derivatives, frames, nonlinear = (np.asarray(x) for x in _forms_at(scene, *states))
-    limit = INTEGRABLE if forms.dtype == np.float64 else 1e-4
+    t, q, u = (np.asarray(x, float) for x in sample_states(scene, points, seed))
+    forms, derivatives, frames, nonlinear = _forms_at(RowsOverStates(scene), np.concatenate([t[:, None], q], axis=1), u)
+    limit = INTEGRABLE if jnp.result_type(float) == jnp.float64 else 1e-4
     violations = {}
     for s, name in enumerate(names):
         at_states = zip(forms[:, s], derivatives[:, s], frames, strict=True)
@@ -87,38 +80,33 @@ def _frobenius_violation(w: np.ndarray, derivative: np.ndarray, frame: np.ndarra
     return float(np.max(np.abs(two_form), initial=0.0) / (size + np.max(np.abs(derivative))))
 
 
-@on_numbers
-def _forms_at(scene: Scene, t, q, u):
+def _forms_at(rows: RowsOverStates, x: np.ndarray, u: np.ndarray):
     """Forms over (t, q), derivatives (component, direction), a frame of the possible velocities, and which rows are nonlinear."""
-
-    def one(t, q, u):
-        def forms(x):
-            t, q = x[0], x[1:]
-            N, nu = _rates(scene, t, q, u)
-            A, d = _linear_rows(scene, t, q, u)
-            alpha = A @ pseudo_inverse(N)
-            return jnp.concatenate([(d - alpha @ nu)[:, None], alpha], axis=1)
-
-        x = jnp.concatenate([t[None], q])
-        N, nu = _rates(scene, t, q, u)
-        frame = jnp.concatenate([jnp.concatenate([jnp.ones(1), nu])[:, None], jnp.pad(N, ((1, 0), (0, 0)))], axis=1)
-        (A, _), (A_other, _) = _linear_rows(scene, t, q, u), _linear_rows(scene, t, q, -0.7 * u[::-1])
-        curved = jnp.max(jnp.abs(A - A_other), axis=1) > jnp.sqrt(jnp.finfo(A.dtype).eps) * (1 + jnp.max(jnp.abs(A), axis=1))
-        return forms(x), jax.jacfwd(forms)(x), frame, curved
-
-    return jax.vmap(one)(t, q, u)
+    here, along = rows(x, u, [np.tile(e, (len(x), 1)) for e in np.eye(x.shape[1])])
+    other, _ = rows(x, -0.7 * u[:, ::-1], [])
+    inverse = np.linalg.pinv(here.N, rcond=1e-12)
+    alpha = here.A @ inverse
+    forms = np.concatenate([(here.d - _times(alpha, here.nu))[:, :, None], alpha], axis=2)
+    derivatives = np.empty((*forms.shape, x.shape[1]))
+    for k, change in enumerate(along):
+        dalpha = change.A @ inverse + here.A @ _derivative_of_inverse(here.N, inverse, change.N)
+        derivatives[:, :, 0, k] = change.d - _times(dalpha, here.nu) - _times(alpha, change.nu)
+        derivatives[:, :, 1:, k] = dalpha
+    frame = np.zeros((len(x), x.shape[1], 1 + u.shape[1]))
+    frame[:, 0, 0], frame[:, 1:, 0], frame[:, 1:, 1:] = 1.0, here.nu, here.N
+    curved = np.max(np.abs(here.A - other.A), axis=2, initial=0.0) > np.sqrt(np.finfo(float).eps) * (1 + np.max(np.abs(here.A), axis=2, initial=0.0))
+    return forms, derivatives, frame, curved
 
 
-def _rates(scene: Scene, t, q, u) -> tuple[Float[Array, "coordinates speeds"], Float[Array, "coordinates"]]:
-    """N and nu of `qdot = N u + nu`."""
-    N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
-    return N, coordinate_rates(scene, t, q, jnp.zeros_like(u))
+def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    return np.einsum("pij,pj->pi", matrices, vectors)
 
 
-def _linear_rows(scene: Scene, t, q, u) -> tuple[Float[Array, "rows speeds"], Float[Array, "rows"]]:
-    """A and d of `A u + d`, taken at u."""
-    A = jax.jacfwd(lambda u: velocity_residual(scene, t, q, u))(u)
-    return A, velocity_residual(scene, t, q, u) - A @ u
+def _derivative_of_inverse(N: np.ndarray, inverse: np.ndarray, dN: np.ndarray) -> np.ndarray:
+    """Of the pseudo-inverse: `-N+ dN N+ + N+ N+' dN' (1 - N N+) + (1 - N+ N) dN' N+' N+` (Golub and Pereyra)."""
+    down, across = np.swapaxes(dN, 1, 2), np.swapaxes(inverse, 1, 2)
+    outside, unseen = np.eye(N.shape[1]) - N @ inverse, np.eye(N.shape[2]) - inverse @ N
+    return -inverse @ dN @ inverse + inverse @ across @ down @ outside + unseen @ down @ across @ inverse
 
 
 def growth_vector(scene: Scene, *, depth: int = 4, points: int = 2, seed: int = 0) -> Growth:
@@ -214,31 +202,41 @@ class _Fields:
     """The generators `X` (and `(1, X_0)` first, where time counts) as columns over (t, q) or q, and their derivatives."""
 
     def __init__(self, scene: Scene, with_time: bool, u):
-        self.scene, self.with_time, self.u = scene, with_time, jnp.asarray(u)
+        self.scene, self.with_time, self.u, self.rows = scene, with_time, np.asarray(u, float), RowsOverStates(scene)
+        independent = structure_of(scene).independent
+        self.independent = list(independent)
+        self.dependent = [i for i in range(len(scene.speed_names)) if i not in independent]
 
     def __call__(self, x: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values and derivatives along `direction` at many points, in batches of one size, so that one program serves all."""
-        count = len(x)
-        padded = -count % BATCH
-        x, direction = (np.pad(a, ((0, padded), (0, 0)), mode="edge") for a in (x, direction))
-        batches = [_fields_along(self.scene, self.with_time, self.u, x[i : i + BATCH], direction[i : i + BATCH]) for i in range(0, len(x), BATCH)]
-        values, derivatives = (np.concatenate([np.asarray(batch[k]) for batch in batches]) for k in (0, 1))
-        return values[:count], derivatives[:count]
+        """Values and derivatives along `direction` at many points."""
+        if not self.with_time:
+            x, direction = (np.pad(a, ((0, 0), (1, 0))) for a in (x, direction))
+        parts = [self._some(x[i : i + BATCH], direction[i : i + BATCH]) for i in range(0, len(x), BATCH)]
+        return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
+    def _some(self, x, direction) -> tuple[np.ndarray, np.ndarray]:
+        here, (change,) = self.rows(x, np.tile(self.u, (len(x), 1)), [direction])
+        length = np.linalg.norm(here.A, axis=2, keepdims=True)
+        scale = 1 / np.where(length > 0, length, 1.0)
+        A, d, dA, dd = scale * here.A, scale[..., 0] * here.d, scale * change.A, scale[..., 0] * change.d
+        # A (C, c) = (0, -d);  A dC = -dA C,  A dc = -dA c - dd, in the dependent speeds only
+        C, dC = (np.zeros((len(x), A.shape[2], 1 + len(self.independent))) for _ in range(2))
+        C[:, self.independent, np.arange(1, 1 + len(self.independent))] = 1.0
+        right = -A @ C
+        right[:, :, 0] -= d
+        C[:, self.dependent] = self._solved(A, right)
+        right = -dA @ C
+        right[:, :, 0] -= dd
+        dC[:, self.dependent] = self._solved(A, right)
+        X, dX = here.N @ C, change.N @ C + here.N @ dC
+        if not self.with_time:
+            return X[:, :, 1:], dX[:, :, 1:]
+        X[:, :, 0], dX[:, :, 0] = X[:, :, 0] + here.nu, dX[:, :, 0] + change.nu
+        X, dX = (np.pad(a, ((0, 0), (1, 0), (0, 0))) for a in (X, dX))
+        X[:, 0, 0] = 1.0
+        return X, dX
 
-@on_numbers
-def _fields_along(scene: Scene, with_time, u, x, direction):
-    return jax.vmap(lambda x, direction: jax.jvp(lambda x: _fields_at(scene, with_time, u, x), (x,), (direction,)))(x, direction)
-
-
-def _fields_at(scene: Scene, with_time: bool, u, x) -> Float[Array, "directions generators"]:
-    t, q = (x[0], x[1:]) if with_time else (jnp.zeros((), x.dtype), x)
-    A, d = _linear_rows(scene, t, q, u)
-    scale = row_scale(A)
-    split = Partition(scale[:, None] * A, structure_of(scene).independent)
-    C, c = split.C, split.particular(-scale * d)
-    N, nu = _rates(scene, t, q, u)
-    if not with_time:
-        return N @ C
-    drift = jnp.concatenate([jnp.ones(1, x.dtype), N @ c + nu])
-    return jnp.concatenate([drift[:, None], jnp.pad(N @ C, ((1, 0), (0, 0)))], axis=1)
+    def _solved(self, A, right) -> np.ndarray:
+        """`A_z^-1 right`."""
+        A_z = A[:, :, self.dependent]
+        return np.linalg.solve(A_z, right) if A_z.shape[1] == A_z.shape[2] else np.linalg.pinv(A_z, rcond=1e-12) @ right

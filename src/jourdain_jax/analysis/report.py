@@ -3,12 +3,15 @@
 from dataclasses import asdict, dataclass
 
 from jourdain_jax.analysis.integrability import growth_vector, row_integrability
+from jourdain_jax.equations.accelerations import accelerations
 from jourdain_jax.equations.cyclic import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.equations.domain import COORDINATE_DOMAIN, SPEED_DOMAIN
 from jourdain_jax.equations.event_names import names_of_events
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.motion.arguments import as_state
+from jourdain_jax.motion.start import State
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
@@ -49,6 +52,7 @@ class Report(Printed):
     worst_pivot: float  # smallest singular value of the scaled A_z over all probed states; zero: singular somewhere
     typical_pivot: float
     rank_losses: tuple[str, ...]  # probed configurations where the rows lose rank
+    rank_at_start: int | None  # at the given start; None where none was given
     events: tuple[str, ...]  # names of the stop events
     domain: dict[str, tuple[float, float]]  # where states were probed, as the scene states it
     conventions: str
@@ -78,6 +82,7 @@ class Report(Printed):
             "lowered to": self.lowering,
             "their conditioning": self._conditioning(),
             "rank is lost at": "none of the probed configurations" if not self.rank_losses else "; ".join(self.rank_losses[:4]),
+            **({} if self.rank_at_start is None else {"at the given start": self._at_start()}),
             "stops at": _listed(self.events),
             "probed in": self._probed(),
             "conventions": self.conventions,
@@ -91,6 +96,15 @@ class Report(Printed):
         if self.rank < len(self.rows):
             return f"none may be left out, though {len(self.rows)} rows have rank {self.rank}: each is needed at some configuration"
         return "none"
+
+    def _at_start(self) -> str:
+        if self.rank_at_start == self.rank:
+            return f"rank {self.rank}, as at generic states"
+        freedoms = len(self.speeds) - (self.rank_at_start or 0)
+        return (
+            f"WARNING: rank {self.rank_at_start}, not {self.rank} as at generic states, and {freedoms} freedoms: a singular configuration, "
+            "or another way to assemble the scene; state a `domain` around the start to have it judged there"
+        )
 
     def _growth(self) -> str:
         if not self.growth_vector:
@@ -116,10 +130,11 @@ class Report(Printed):
         return f"{worst}, typically {self.typical_pivot:.2g} (1 is best)"
 
 
-def report(scene: Scene, *, depth: int = 4) -> Report:
+def report(scene: Scene, *, depth: int = 4, start: State | dict | None = None) -> Report:
     """Degrees of freedom, rows, rank, redundancy, integrability, growth vector, cyclic and ignorable coordinates of a scene.
 
-    `depth` bounds the number of fields in a bracket for the growth vector. `print(report(scene))` shows a table; `as_dict()` is
+    `depth` bounds the number of fields in a bracket for the growth vector. `start`: a state, or named values as for `jj.start`, at which the rank is
+    compared with that at generic states. `print(report(scene))` shows a table; `as_dict()` is
     for machines. Found numerically at random states of the scene's `domain` and at symmetric configurations (zero and right
     angles): what holds at all of them is taken to hold everywhere.
     """
@@ -151,10 +166,15 @@ def report(scene: Scene, *, depth: int = 4) -> Report:
         worst_pivot=structure.worst_pivot,
         typical_pivot=structure.typical_pivot,
         rank_losses=structure.rank_losses,
+        rank_at_start=None if start is None else _rank_at(scene, as_state(scene, start)),
         events=names_of_events(scene),
         domain={name: (float(low), float(high)) for name, (low, high) in scene.domain.items()},
         conventions=scene.conventions,
     )
+
+
+def _rank_at(scene: Scene, state: State) -> int:
+    return int(accelerations(scene, state.t, state.q, state.u, reduction="svd").rank)
 
 
 def _span(bounds: tuple[float, float]) -> str:

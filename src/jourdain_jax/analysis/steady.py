@@ -18,8 +18,13 @@ from jourdain_jax.analysis.tangent import flow_of, privileged_speeds
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.calculus.reals import Number, Numbers
 from jourdain_jax.equations.cyclic import ignorable_coordinates
+from jourdain_jax.equations.domain import coordinate_bounds
 from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.equations.rows import names_of_position_rows
+from jourdain_jax.equations.trace import traced_scene
 from jourdain_jax.motion.start import State
+from jourdain_jax.program.derivative import jacobian
+from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.numbers import described
@@ -27,6 +32,7 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 _FINAL_STEPS = 3
+_FARTHEST = 0.5  # of the width of the domain: how far a coordinate moves in one step of the search
 
 
 class SteadyMotion(Printed, eqx.Module):
@@ -84,13 +90,30 @@ def steady(
     held = as_names(held)
     names = scene.coordinate_names.entries + scene.speed_names.entries
     _check_names(scene, held, names)
-    moving = ignorable_coordinates(scene) if moving is None else as_names(moving)
+    ignorable = ignorable_coordinates(scene) if moving is None else ()
+    moving = ignorable if moving is None else as_names(moving)
     groups = {group: scene.coordinate_names.entries[first : first + length] for group, first, length in scene.coordinate_names.groups}
     _check_names(scene, moving, (*scene.coordinate_names.entries, *groups))
     carried = {entry for name in moving for entry in groups.get(name, (name,))}
     resting = tuple(i for i, name in enumerate(scene.coordinate_names.entries) if name not in carried)
-    free = jnp.array([name not in held for name in names], bool)
+    # nothing that vanishes changes with them: they keep the guess's value, and no step runs away along them
+    idle = {entry for name in ignorable for entry in groups.get(name, (name,))} - _on_geometric_rows(scene)
+    free = jnp.array([name not in held and name not in idle for name in names], bool)
     return _solve(_Problem(scene, t, f, privileged_speeds(scene, privileged), resting), q, u, free, max_steps)
+
+
+def _on_geometric_rows(scene: Scene) -> set[str]:
+    """Coordinates on which geometric rows or unit norms may depend."""
+    names = scene.coordinate_names.entries
+    in_quaternions = {names[first + k] for first, _ in scene.coordinates.quaternions for k in range(4)}
+    if not names_of_position_rows(scene):
+        return in_quaternions
+    try:
+        traced = traced_scene(scene)
+    except Unsupported:
+        return set(names)
+    found = {n for row in jacobian(traced.graph, traced.at.closure.tolist(), traced.q.tolist()) for n in row}
+    return in_quaternions | {name for name, n in zip(names, traced.q.tolist(), strict=True) if n in found}
 
 
 def _guessed(scene: Scene, guess, t0) -> tuple[Array, Array, Array]:
@@ -173,7 +196,12 @@ def _search(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "u
         damping = jnp.clip(jnp.where(better, search.damping / 5, search.damping * 3), 1e-8, 1e8)
         system = jnp.concatenate([J, damping * jnp.eye(z.shape[0], dtype=z.dtype)])
         d = -pseudo_inverse(system, _round_off_root(z.dtype)) @ jnp.concatenate([R, jnp.zeros_like(z)])
-        return _Search(best + jnp.where(free, d, 0.0), best, R, J, damping), None
+        d = jnp.where(free, d, 0.0)
+        farthest = jnp.max(jnp.abs(d[: width.shape[0]]) / width, initial=0.0)
+        return _Search(best + d * jnp.minimum(1.0, _FARTHEST / jnp.maximum(farthest, jnp.finfo(z.dtype).tiny)), best, R, J, damping), None
+
+    low, high = coordinate_bounds(problem.scene)
+    width = jnp.asarray(np.where(high > low, high - low, 1.0), z.dtype)
 
     size = jax.eval_shape(problem, z).shape[0]
     start = _Search(z, z, jnp.full(size, jnp.inf, z.dtype), jnp.zeros((size, z.shape[0]), z.dtype), jnp.full((), 1e-3, z.dtype))

@@ -45,16 +45,16 @@ def without_rows(q: np.ndarray) -> Assembled:
     return Assembled(q, *np.zeros((3, len(q))))
 
 
-def assemble(look: Look, q: np.ndarray, low: np.ndarray, high: np.ndarray, generic: np.ndarray) -> Assembled:
+def assemble(look: Look, q: np.ndarray, low: np.ndarray, high: np.ndarray, generic: np.ndarray, far: int = 0) -> Assembled:
     """Configurations near q on the rows: `look(q[k], k)` gives residuals and slopes of the rows at the states numbered k.
 
-    Of the `generic` ones those that find no place inside the domain begin anew elsewhere, until half of them have one.
+    Of the `generic` ones those that find no place inside the domain begin anew elsewhere, until half of them have one. The last `far` ones need none.
     """
     rows = _Rows(look, typical_lengths(_lengths(look(q, np.arange(len(q)))[1])[generic]), low, high)
     found = _judged(rows, *_newton(rows, q, np.arange(len(q))))
     generator = np.random.default_rng(2)
     for attempt in range(_ATTEMPTS):
-        lost = ~(found.on_rows & (found.outside <= _INSIDE))
+        lost = ~(found.on_rows & (found.outside <= _INSIDE)) & (np.arange(len(q)) < len(q) - far)
         if attempt:
             lost &= generic
         if not lost.any() or (attempt and lost.sum() <= generic.sum() / 2):

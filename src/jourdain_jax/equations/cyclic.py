@@ -15,28 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at
+from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics
 from jourdain_jax.equations.probing import on_numbers, probed_once
-from jourdain_jax.equations.reductions import Partition, Privileged, reduce
-from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.sampling import sample_states
-from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.equations.structure import structure_of, usual_rows
-from jourdain_jax.equations.virtual_power import equations_and_rows, potential_resultants, resultants
+from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.equations.virtual_power import potential_resultants, resultants
 from jourdain_jax.scene.scene import Scene
 
 PROBES = 8
 DISPLACEMENT = 0.1
 DEPENDS = 1e-9  # change relative to the size of the quantity; larger means that the quantity depends on the coordinate
-
-
-class AdmissibleRates(eqx.Module):
-    """Speeds `u = C y + c` and coordinate rates `qdot = B y + b` in the privileged velocities y."""
-
-    C: Float[Array, "speeds freedoms"]
-    c: Float[Array, "speeds"]
-    B: Float[Array, "coordinates freedoms"]
-    b: Float[Array, "coordinates"]
 
 
 class Dependence(eqx.Module):
@@ -46,17 +35,6 @@ class Dependence(eqx.Module):
     rates: Bool[np.ndarray, "coordinates coordinates"]  # B y + b, row by row
     accelerations: Bool[np.ndarray, "coordinates"]  # the privileged accelerations
     privileged: Bool[np.ndarray, "coordinates"]  # whether the coordinate's own rate is a privileged velocity
-
-
-def admissible_rates(scene: Scene, t, q, u) -> AdmissibleRates:
-    """C, c, B and b at one state; u matters for rows nonlinear in the speeds only, which are linearised there."""
-    A = jax.jacfwd(lambda u: velocity_residual(scene, t, q, u))(u)
-    scale = row_scale(A)
-    split = Partition(scale[:, None] * A, structure_of(scene).independent)
-    C, c = split.C, split.particular(scale * (A @ u - velocity_residual(scene, t, q, u)))
-    nu = coordinate_rates(scene, t, q, jnp.zeros_like(u))
-    N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
-    return AdmissibleRates(C, c, N @ C, N @ c + nu)
 
 
 def cyclic_coordinates(scene: Scene) -> tuple[str, ...]:
@@ -124,36 +102,39 @@ def _probe(scene: Scene, t, q, u, shifts):
 
     def one(t, q, u, shifts):
         displaced = q + jnp.concatenate([jnp.zeros((1, q.shape[0])), jnp.diag(shifts)])
-        rates = admissible_rates(scene, t, q, u)
-        one_speed = (jnp.max(rates.B, axis=1, initial=0.0) == 1) & (jnp.sum(jnp.abs(rates.B), axis=1) == 1) & (rates.b == 0)
-        return jax.vmap(lambda q: _quantities(scene, t, q, u))(displaced), one_speed
+        values = jax.vmap(lambda q: _quantities(scene, t, q, u))(displaced)
+        B = values["B and b"][0, : q.shape[0] * len(independent)].reshape(q.shape[0], -1)
+        b = values["B and b"][0, B.size : B.size + q.shape[0]]
+        one_speed = (jnp.max(B, axis=1, initial=0.0) == 1) & (jnp.sum(jnp.abs(B), axis=1) == 1) & (b == 0)
+        return values, one_speed
 
+    independent = structure_of(scene).independent
     return jax.vmap(one)(t, q, u, shifts)
 
 
 def _quantities(scene: Scene, t, q, u) -> dict[str, Float[Array, "entries"]]:
     """The rates `B y + b`, the privileged accelerations, and what a cyclic coordinate must not appear in (inertial frame)."""
-    independent = structure_of(scene).independent
-    chosen = jnp.array(independent, jnp.int32)
-    y, rates = u[chosen], admissible_rates(scene, t, q, u)
-    u = rates.C @ y + rates.c
-
-    def space_velocities(u):
-        bodies = motion_at(scene, t, q, u).bodies.values()
-        return jnp.concatenate([jnp.concatenate([body.velocity, body.angular_velocity]) for body in bodies])
-
-    motion = motion_at(scene, t, q, u)
-    turned = jnp.stack([body.orientation for body in motion.bodies.values()])
-    inertia = jnp.einsum("bij,bjk,blk->bil", turned, inertias(scene, t, q).inertia, turned)
+    chosen = np.array(structure_of(scene).independent, int)
+    y = u[chosen]
+    known = minimal_kinematics(scene, tuple(chosen.tolist()), t, q, y)
+    motion, found = accelerations_of(scene, known, t, q)
+    C = known.c[:, None] * known.split.C / known.c[chosen]
+    N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
+    B = N @ C
+    # what is left of speeds and rates at y = 0
+    c, b = known.u - C @ y, motion.qdot.array - B @ y
+    bodies = motion.bodies.values()
+    velocities = jnp.concatenate([jnp.concatenate([body.velocity, body.angular_velocity]) for body in bodies])
+    turned = jnp.stack([body.orientation for body in bodies])
+    inertia = jnp.einsum("bij,bjk,blk->bil", turned, known.weights.inertia, turned)
+    beta, gamma = known.partial.bodies.linear @ C, jnp.einsum("bij,bjk->bik", turned, known.partial.bodies.angular @ C)
     loads, potential = resultants(scene, motion), potential_resultants(scene, motion)
-    forces = [loads.force, loads.torque, loads.direct @ rates.C, potential.force, potential.torque, potential.direct @ rates.C]
-    equations, rows = equations_and_rows(scene, t, q, u)
-    udot = reduce(Privileged(independent), equations, rows.judged_by(usual_rows(scene))).udot
+    forces = [loads.force, loads.torque, loads.direct @ C, potential.force, potential.torque, potential.direct @ C]
     return {
-        "rates": rates.B @ y + rates.b,
-        "accelerations": jnp.concatenate([udot[chosen], y]),  # y, which depends on nothing, gives free motion a size
-        "B and b": jnp.concatenate([rates.B.ravel(), rates.b, rates.C.ravel(), rates.c]),
-        "beta and gamma": jnp.concatenate([space_velocities(u), (jax.jacfwd(space_velocities)(u) @ rates.C).ravel()]),
+        "rates": motion.qdot.array,
+        "accelerations": jnp.concatenate([found.udot[chosen], y]),  # y, which depends on nothing, gives free motion a size
+        "B and b": jnp.concatenate([B.ravel(), b, C.ravel(), c]),
+        "beta and gamma": jnp.concatenate([velocities, beta.ravel(), gamma.ravel()]),
         "inertia": inertia.ravel(),
         "forces": jnp.concatenate([part.ravel() for part in forces]),
     }

@@ -56,15 +56,19 @@ def speeds_and_pivot(scene: Scene, independent: tuple[int, ...], t, q, y, inputs
     return found.u, Partition(jax.lax.stop_gradient(found.split.A), independent).signed_pivot()
 
 
-def minimal_accelerations(
-    scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None, *, known: MinimalKinematics | None = None
-) -> tuple[Float[Array, "speeds"], Motion, Reduced]:
-    """All speeds, the motion they make, and the accelerations with the constraint force; `known`: the kinematics, where they are at hand."""
-    known = minimal_kinematics(scene, independent, t, q, y, inputs) if known is None else known
+def minimal_accelerations(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> tuple[Float[Array, "speeds"], Motion, Reduced]:
+    """All speeds, the motion they make, and the accelerations with the constraint force."""
+    known = minimal_kinematics(scene, independent, t, q, y, inputs)
+    motion, found = accelerations_of(scene, known, t, q, inputs)
+    return known.u, motion, found
+
+
+def accelerations_of(scene: Scene, known: MinimalKinematics, t, q, inputs=None) -> tuple[Motion, Reduced]:
+    """The motion and the accelerations that go with known speeds."""
     value, rate, motion = rates_along_motion(scene, t, q, known.u, inputs)
     equations = equations_of(scene, Instant(motion, known.weights, value, known.partial, rate))
     c = known.c
     # in scaled speeds, where definiteness has no units
     M, f = c[:, None] * equations.M * c, c * (equations.Q - equations.h)
     w, pivot, applicable = appell(M, f, known.split.C, known.split.particular(-known.d * rate.rows), known.split.pivot())
-    return known.u, motion, reduced(c * w, pivot, applicable, equations)
+    return motion, reduced(c * w, pivot, applicable, equations)

@@ -46,13 +46,16 @@ def generic_inputs(scene: Scene) -> np.ndarray:
     return np.linspace(0.5, 1.0, len(scene.inputs))
 
 
-def probed(scene: Scene, t, q, u, u_other, generic) -> Probed:
-    """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`. `generic`: which states are random ones."""
-    found = assembled_by_jax(scene, t, q, generic)
+def probed(scene: Scene, t, q, u, u_other, generic, far: int = 0) -> Probed:
+    """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`. `generic`: which states are random ones.
+
+    The last `far` states are meant to be far from the domain.
+    """
+    found = assembled_by_jax(scene, t, q, generic, far)
     return _probed(scene, t, found.q, np.asarray(q, found.q.dtype), u, u_other, found.miss, found.error, found.outside)
 
 
-def assembled_by_jax(scene: Scene, t, q, generic) -> Assembled:
+def assembled_by_jax(scene: Scene, t, q, generic, far: int = 0) -> Assembled:
     """Coordinates on geometric rows and unit norms, inside the domain where that can be."""
     q = np.array(q, float)
     for first, _ in scene.coordinates.quaternions:
@@ -66,7 +69,7 @@ def assembled_by_jax(scene: Scene, t, q, generic) -> Assembled:
         every[which] = some
         return tuple(np.asarray(x, float)[which] for x in _closures(scene, t, every))
 
-    return assemble(look, q, *coordinate_bounds(scene), generic)
+    return assemble(look, q, *coordinate_bounds(scene), generic, far)
 
 
 @on_numbers

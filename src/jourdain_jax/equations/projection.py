@@ -42,7 +42,7 @@ def project_positions(
         residual, G = closure_residual(scene, t, q), jax.jacfwd(lambda q: closure_residual(scene, t, q))(q)
         G = jnp.where(free, G, 0.0)
         d = row_scale(G, typical)
-        return q - pseudo_inverse(d[:, None] * G) @ (d * residual)
+        return q - jnp.where(free, pseudo_inverse(d[:, None] * G) @ (d * residual), 0.0)  # what is held does not move by round-off either
 
     return settled(step, q, iterations)
 

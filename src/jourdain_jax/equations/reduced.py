@@ -13,16 +13,29 @@ Source: Wang and Pao (2003), eq. (42).
 
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.equations.accelerations import bare_accelerations
-from jourdain_jax.equations.cyclic import admissible_rates, dependence
-from jourdain_jax.equations.reductions import Privileged
+from jourdain_jax.equations.cyclic import dependence
+from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.reductions import Partition, Privileged
+from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.scene.scene import Scene
+
+
+class AdmissibleRates(eqx.Module):
+    """Speeds `u = C y + c` and coordinate rates `qdot = B y + b` in the privileged velocities y."""
+
+    C: Float[Array, "speeds freedoms"]
+    c: Float[Array, "speeds"]
+    B: Float[Array, "coordinates freedoms"]
+    b: Float[Array, "coordinates"]
 
 
 @dataclass(frozen=True)
@@ -37,6 +50,17 @@ class ReducedCoordinates:
     def recovered(self) -> tuple[str, ...]:
         """All dropped coordinates in the order of their recovery."""
         return tuple(name for group in self.dropped for name in group)
+
+
+def admissible_rates(scene: Scene, t, q, u) -> AdmissibleRates:
+    """C, c, B and b at one state; u matters for rows nonlinear in the speeds only, which are linearised there."""
+    A = jax.jacfwd(lambda u: velocity_residual(scene, t, q, u))(u)
+    scale = row_scale(A)
+    split = Partition(scale[:, None] * A, structure_of(scene).independent)
+    C, c = split.C, split.particular(scale * (A @ u - velocity_residual(scene, t, q, u)))
+    nu = coordinate_rates(scene, t, q, jnp.zeros_like(u))
+    N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
+    return AdmissibleRates(C, c, N @ C, N @ c + nu)
 
 
 def reduced_coordinates(scene: Scene) -> ReducedCoordinates:

@@ -266,7 +266,9 @@ class UdwadiaKalaba(Reduction):
         L, definite = cholesky(problem.M)
         free = jax.scipy.linalg.solve_triangular(L, problem.f, lower=True)  # L' a
         weighted = jax.scipy.linalg.solve_triangular(L, problem.A.T, lower=True).T  # A L'^-1
-        d = jax.lax.stop_gradient(1 / jnp.maximum(jnp.sqrt(jnp.sum(weighted**2, axis=1)), jnp.finfo(L.dtype).tiny))
+        # to their lengths in A, so that a row that vanishes stays as small as it is
+        lengths, by_mass = (jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2, axis=1)) for rows in (problem.A, weighted))
+        d = jnp.where(by_mass > 0, lengths / jnp.where(by_mass > 0, by_mass, 1.0), 1.0)
         weighted = d[:, None] * weighted
         x = free + _refined(pseudo_inverse(weighted), weighted, d * problem.b - weighted @ free)
         return jnp.where(definite, jax.scipy.linalg.solve_triangular(L.T, x, lower=False), jnp.nan), jnp.ones((), L.dtype), definite

@@ -18,7 +18,6 @@ from jourdain_jax.scene.scene import Scene
 
 SYMMETRIC_PROBES = 200
 FEW_INSIDE = 8  # random states inside the domain: with fewer, those nearest to it are used as well
-NEAR = 0.1  # of the domain: where states are looked for about one that was given
 NEARLY_INSIDE = 0.05  # of the width of the domain
 
 
@@ -40,7 +39,8 @@ def states_near_what_was_seen(scene: Scene, count: int, generator: np.random.Gen
         return None
     t, q, u = random_states(scene, count, generator)
     low, high = coordinate_bounds(scene)
-    return t, _seen[type(scene)] + NEAR * (q - (low + high) / 2), u
+    near = 10.0 ** -(1.0 + np.arange(count) % 6)  # of the domain: rows may be met, or be numbers, in a small part of it only
+    return t, _seen[type(scene)] + near[:, None] * (q - (low + high) / 2), u
 
 
 def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -103,8 +103,13 @@ def _projected(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled
     try:
         return sampled_on_graph(scene, t, q, u)
     except Unsupported:
-        found = assembled_by_jax(scene, t, q, np.ones(len(q), bool))
-        return found.q, _speeds_by_jax(scene, t, found.q, u), found
+        return sampled_by_jax(scene, t, q, u)
+
+
+def sampled_by_jax(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
+    """The same by JAX, for scenes without a scalar form."""
+    found = assembled_by_jax(scene, t, q, np.ones(len(q), bool))
+    return found.q, _speeds_by_jax(scene, t, found.q, u), found
 
 
 @on_numbers

@@ -51,7 +51,7 @@ def row_scale(A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray,
     return jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1), 1)
 
 
-def typical_row_lengths(A: Float[np.ndarray, "states rows speeds"], elsewhere: Float[np.ndarray, "states rows speeds"]) -> Float[np.ndarray, "rows"]:
+def typical_row_lengths(A: Float[np.ndarray, "states rows speeds"], elsewhere: Float[np.ndarray, "others rows speeds"]) -> Float[np.ndarray, "rows"]:
     """The length of each row at most states: the median, or the largest for a row that vanishes at half of them.
 
     A row that is round-off at all `A` of what it is `elsewhere`, off the geometric rows, keeps that length, and so counts as zero.

@@ -142,9 +142,10 @@ def _looked_at_from_afar(scene: Scene, t, q, u, u_other, generic) -> Probed:
     for first, _ in scene.coordinates.quaternions:
         far_q[:, first : first + 4] = q[:FAR_PROBES, first : first + 4]
     far = FAR * generator.uniform(size=FAR_PROBES), far_q, *(FAR * generator.uniform(-1, 1, (2, *u[:FAR_PROBES].shape)))
-    found = probed(scene, *(np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True)), np.pad(generic, (0, FAR_PROBES)))
-    near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[: len(t)], np.s_[len(t) :]))
-    return replace(near, hidden=_seen(beyond, far[2]) | {"rank"})  # which nothing proves
+    t, q, u, u_other = (np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True))
+    found = probed(scene, t, q, u, u_other, np.append(generic, np.zeros(FAR_PROBES, bool)), far=FAR_PROBES)
+    near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[:-FAR_PROBES], np.s_[-FAR_PROBES:]))
+    return replace(near, hidden=_seen(beyond, u[-FAR_PROBES:]) | {"rank"})  # which nothing proves
 
 
 def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
@@ -169,16 +170,20 @@ def structure_of(scene: Scene) -> Structure:
     ValueError where no admissible state is found, where bodies do not move smoothly, where a motion that the rows leave free has no inertia, or
     `privileged` names unknown or too few speeds; for known parameters also where numbers of its bodies or planes cannot be.
     """
-    with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
-        structure = _probed_structure(as_scene(scene))
+    structure = _whatever_its_faults(scene)
     if structure.faults and not is_traced(scene):  # numbers that stand in for traced parameters prove nothing
         raise ValueError(structure.faults[0])
     return structure
 
 
+def _whatever_its_faults(scene: Scene) -> Structure:
+    with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
+        return _probed_structure(as_scene(scene))
+
+
 def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
     """Typical lengths of the rows of `A` in the units of the speeds; of a scene whose parameters are traced, as in `usual_rows`."""
-    return structure_of(scene).plain_row_lengths * (TRACED if is_traced(scene) else 1.0)
+    return _whatever_its_faults(scene).plain_row_lengths * (TRACED if is_traced(scene) else 1.0)
 
 
 def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
@@ -192,7 +197,7 @@ def usual_rows(scene: Scene) -> UsualRows:
 
     Of a scene whose parameters are traced, numbers stand in that may be of another order: only what is shorter than a thousandth of those lengths counts less.
     """
-    known = structure_of(scene)
+    known = _whatever_its_faults(scene)
     return UsualRows(known.row_lengths * (TRACED if is_traced(scene) else 1.0), np.asarray(known.rank, np.int32))
 
 
@@ -261,7 +266,7 @@ def _probed_structure(scene: Scene) -> Structure:
 
 
 def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
-    """What is found at the given random states and at the symmetric ones; their times and speeds, and which are random."""
+    """Times, speeds, which states are random, and what is found: at the given random states and at the symmetric ones."""
     symmetric = symmetric_configurations(scene)
     t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
     generic = np.arange(len(t)) < RANDOM_PROBES

@@ -3,7 +3,7 @@
 g(t, q) = 0,  phi(t, q, u) = 0
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -47,7 +47,8 @@ class State(Printed, eqx.Module):
     moved_u: Float[Array, ""]  # largest change of a speed by the projection
     residual: Float[Array, ""]  # what is left of rows and quaternion norms
     names: tuple[Names, Names] = eqx.field(static=True)
-    guess: Int[Array, ""] = eqx.field(default=0, converter=lambda k: jnp.asarray(k, jnp.int32))  # that led here: 0, what was given; then others (`start`)
+    # that led here: 0, what was given; then others (`start`). A floating-point number, so that a loss can be differentiated with respect to a whole state
+    guess: Float[Array, ""] = eqx.field(default=0, converter=lambda k: jnp.asarray(k, jnp.result_type(float)))
 
     def __getitem__(self, name: str):
         """A coordinate, speed, quaternion or angular velocity by name."""
@@ -82,21 +83,23 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
         if name not in known:
             raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, known)}")
     free_q, free_u = (np.array([name not in held for name in names.entries], bool) for names in (scene.coordinate_names, scene.speed_names))
-    return _consistent(scene, t, q, u, inputs, free_q, free_u, jnp.zeros((0, q.shape[0]), q.dtype))
+    return _consistent(scene, t, q, u, inputs, free_q, free_u, lambda: np.zeros((0, q.shape[0]), q.dtype))
 
 
-def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Float[Array, "guesses coordinates"]) -> State:
-    """The nearest state; where Newton's method does not arrive, the nearest that a damped search finds, from q and then from the other `guesses`."""
+def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable) -> State:
+    """The nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`."""
     arguments = (scene, t, q, u, inputs, free_q, free_u, _usual(scene))
     if is_traced(arguments):
-        found = _put_onto_constraints(*arguments, guesses)
+        found = _put_onto_constraints(*arguments, guesses())
     else:
         project = _uncompiled_projection if _seldom(jax.tree.structure(scene), ()) else _compiled_projection
         found = project(*arguments, None)
         if not found.arrived and _can_search(scene):
-            found = _uncompiled_projection(*arguments, guesses)
+            found = _uncompiled_projection(*arguments, guesses())
     found = jax.tree.map(jnp.asarray, found)
-    return State(t, found.q, found.u, found.moved_q, found.moved_u, found.residual, (scene.coordinate_names, scene.speed_names), found.guess)
+    return State(
+        t, found.q, found.u, found.moved_q, found.moved_u, found.residual, (scene.coordinate_names, scene.speed_names), found.guess.astype(found.q.dtype)
+    )
 
 
 _seldom = Seldom(often=8)
@@ -211,7 +214,7 @@ def named_start(scene: Scene, values: Mapping, t0, inputs: Float[Array, "inputs"
     known = _structure(scene, t, q, free_q)
     free_u = np.array([name not in (*given, *_resting(scene, known, given)) for name in scene.speed_names.entries], bool)
     q, u = as_coordinates(scene, q), as_speeds(scene, u)
-    state = _consistent(scene, t, q, u, as_input_vector(scene, inputs, q.dtype), free_q, free_u, _guesses(scene, known, q, free_q))
+    state = _consistent(scene, t, q, u, as_input_vector(scene, inputs, q.dtype), free_q, free_u, lambda: _guesses(scene, known, q, free_q))
     _check_residual(scene, state, inputs, given)
     return state
 
@@ -230,15 +233,17 @@ def _structure(scene: Scene, t, q, free_q) -> Structure:
         return structure_of(scene)
 
 
-def _guesses(scene: Scene, known: Structure, q, free_q) -> Float[Array, "guesses coordinates"]:
+def _guesses(scene: Scene, known: Structure, q, free_q) -> Float[Array | np.ndarray, "guesses coordinates"]:
     """Configurations near q, on the rows (those first whose given coordinates are nearest), and elsewhere in the domain."""
+    on = jnp if is_traced(q) else np
+    q = jax.lax.stop_gradient(q) if is_traced(q) else np.asarray(q)
     low, high = coordinate_bounds(scene)
-    on_rows = jnp.asarray(known.coordinates[: known.random], q.dtype)
-    apart = jnp.where(free_q, 0.0, (on_rows - jax.lax.stop_gradient(q)) / np.where(high > low, high - low, 1.0))
-    nearest_first = jnp.argsort(jnp.sum(apart**2, axis=1))[:GUESSES]
+    on_rows = on.asarray(known.coordinates[: known.random], q.dtype)
+    apart = on.where(free_q, 0.0, (on_rows - q) / np.where(high > low, high - low, 1.0))
+    nearest_first = on.argsort(on.sum(apart**2, axis=1))[:GUESSES]
     elsewhere = np.random.default_rng(3).uniform(low, high, (2 * GUESSES, len(low)))
-    near = jax.lax.stop_gradient(q) + NEAR * jnp.asarray(elsewhere[:GUESSES] - (low + high) / 2, q.dtype)
-    return jnp.concatenate([near, on_rows[nearest_first], jnp.asarray(elsewhere[GUESSES:], q.dtype)])
+    near = q + NEAR * (elsewhere[:GUESSES] - (low + high) / 2)
+    return on.concatenate([near, on_rows[nearest_first], elsewhere[GUESSES:]]).astype(q.dtype)
 
 
 def _resting(scene: Scene, known: Structure, given: tuple[str, ...]) -> tuple[str, ...]:

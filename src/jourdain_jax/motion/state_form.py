@@ -16,7 +16,7 @@ from jourdain_jax.equations.accelerations import Baumgarte, bare_accelerations
 from jourdain_jax.equations.explicit_power import stored_by_inputs
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.equations.minimal import minimal_accelerations, minimal_kinematics, speeds_and_pivot, speeds_from_privileged
+from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics, speeds_and_pivot, speeds_from_privileged
 from jourdain_jax.equations.power import rate_of_work
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
@@ -140,7 +140,7 @@ class StateForm(eqx.Module):
             return Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power_now), jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
         known = None if self.independent is None else minimal_kinematics(scene, self.independent, t, y.q, y.v, inputs)
         if known is not None and self._by_appell:
-            _, motion, found = minimal_accelerations(scene, self.independent, t, y.q, y.v, inputs, known=known)
+            motion, found = accelerations_of(scene, known, t, y.q, inputs)
         else:
             u = y.v if known is None else known.u
             motion = motion_at(scene, t, y.q, u, inputs)

@@ -1,0 +1,114 @@
+"""Rows and coordinate rates as linear functions of the speeds, and how they change with time and coordinates; at many points, on NumPy.
+
+    A u + d = 0,   qdot = N u + nu,          and their derivatives in x = (t, q)
+
+From the scene's scalar graph, where it has one: nothing is then traced or compiled for it.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.equations.trace import named_values, traced_scene
+from jourdain_jax.program.derivative import jacobian
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Unsupported
+from jourdain_jax.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class LinearRows:
+    """At many points; or, of these, the derivatives along one direction for each point."""
+
+    A: np.ndarray  # (points, rows, speeds)
+    d: np.ndarray  # (points, rows)
+    N: np.ndarray  # (points, coordinates, speeds)
+    nu: np.ndarray  # (points, coordinates)
+
+
+class RowsOverStates:
+    """The rows and rates of a scene as functions of points x = (t, q)."""
+
+    def __init__(self, scene: Scene):
+        self.scene = scene
+        try:
+            self._look: _OnGraph | _ByJax = _OnGraph(scene)
+        except Unsupported:
+            self._look = _ByJax(scene)
+
+    def __call__(self, x: np.ndarray, u: np.ndarray, directions: list[np.ndarray]) -> tuple[LinearRows, list[LinearRows]]:
+        """Values at the points, taken at the speeds u (which matter where rows are nonlinear in them), and derivatives along each of the directions.
+
+        `x`, `u` and each direction have a leading axis of points.
+        """
+        return self._look(x, u, directions)
+
+
+class _OnGraph:
+    """On the graph: derivatives are sparse there."""
+
+    def __init__(self, scene: Scene):
+        self.scene, self.traced = scene, traced_scene(scene)
+        if self.traced.own_derivatives:
+            raise Unsupported("a function with derivatives of its own")
+        g, at, u = self.traced.graph, self.traced.at, self.traced.u.tolist()
+        flat = [*at.phi.tolist(), *at.qdot.tolist()]
+        slopes = jacobian(g, flat, u)
+        self.shape = len(flat), len(u)
+        self.places = [(i, u.index(n)) for i, row in enumerate(slopes) for n in row]
+        self.values = [*flat, *g.substituted(at.qdot.tolist(), dict.fromkeys(u, g.zero)), *(node for row in slopes for node in row.values())]
+        variables = [self.traced.t, *self.traced.q.tolist()]
+        changes = jacobian(g, self.values, variables)
+        self.changes = [(i, variables.index(n), node) for i, row in enumerate(changes) for n, node in row.items()]
+
+    def __call__(self, x, u, directions):
+        named = named_values(self.scene, x[:, 0], x[:, 1:], u, np.zeros((len(x), len(self.scene.inputs))))
+        probes = Probes(self.traced.graph, {name: np.asarray(value, float) for name, value in named.items()})
+        found = probes([*self.values, *(node for _, _, node in self.changes)])
+        value, change = found[: len(self.values)], found[len(self.values) :]
+        here, along = self._arranged(value, u), []
+        place, variable = (np.array([c[k] for c in self.changes], int) for k in (0, 1))
+        for direction in directions:
+            rate = np.zeros_like(value)
+            np.add.at(rate, place, change * direction.T[variable])
+            along.append(self._arranged(rate, u))
+        return here, along
+
+    def _arranged(self, flat: np.ndarray, u: np.ndarray) -> LinearRows:
+        """Of values with a last axis of points."""
+        count, rows = self.shape[0], len(self.traced.at.phi)
+        slopes = np.zeros((flat.shape[-1], *self.shape))
+        if self.places:
+            i, j = zip(*self.places, strict=True)
+            slopes[:, i, j] = flat[count + len(self.traced.q) :].T
+        A, N = slopes[:, :rows], slopes[:, rows:]
+        return LinearRows(A, flat[:rows].T - np.einsum("pij,pj->pi", A, u), N, flat[count : count + len(self.traced.q)].T)
+
+
+class _ByJax:
+    """By JAX, for scenes without a scalar form."""
+
+    def __init__(self, scene: Scene):
+        self.scene = scene
+
+    def __call__(self, x, u, directions):
+        here, change = _linear_rows(self.scene, x, u)
+        pieces = [np.asarray(piece) for piece in here]
+        along = [LinearRows(*(np.einsum("p...x,px->p...", np.asarray(piece), direction) for piece in change)) for direction in directions]
+        return LinearRows(*pieces), along
+
+
+@on_numbers
+def _linear_rows(scene: Scene, x, u):
+    def pieces(x, u):
+        t, q = x[0], x[1:]
+        A = jax.jacfwd(lambda u: velocity_residual(scene, t, q, u))(u)
+        N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
+        return A, velocity_residual(scene, t, q, u) - A @ u, N, coordinate_rates(scene, t, q, jnp.zeros_like(u))
+
+    return jax.vmap(lambda x, u: (pieces(x, u), jax.jacfwd(pieces)(x, u)))(x, u)

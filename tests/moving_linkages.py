@@ -1,0 +1,115 @@
+"""Planar linkages of rods, in angles and in Cartesian coordinates, that pass through configurations at which their rows lose rank."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+import jourdain_jax as jj
+
+
+def rod_body(x, z, angle, length, mass) -> jj.RigidBody:
+    """A uniform thin rod in the plane y = 0, centred at (x, z) m and turned by `angle` (rad) from the x axis."""
+    return jj.RigidBody(mass, mass * length**2 / 12 * jnp.ones(3), jnp.stack([x, 0 * x, z]), jj.rot_y(-angle))
+
+
+def end_of(body, distance) -> Float[Array, "3"]:
+    """The point of a rod at `distance` (m) from its centre."""
+    return body.place(jnp.stack([distance, 0 * distance, 0 * distance]))
+
+
+def pinned(name: str, first: Float[Array, "3"], second: Float[Array, "3"]) -> dict:
+    """Two rows that hold two points of the plane together."""
+    return {f"{name} x": first[0] - second[0], f"{name} z": first[2] - second[2]}
+
+
+class Parallelogram(jj.Scene):
+    """Two cranks a, c of equal length and a coupler b as long as the ground: flat at a = 0 and a = pi, where both rows have no independent gradient.
+
+    Without loads the parallelogram's branch is a = c = a_0 + w t, b = 0.
+    """
+
+    crank: Float[Array, ""] = jj.parameter(1.0, unit="m", positive=True)
+    coupler: Float[Array, ""] = jj.parameter(2.0, unit="m", positive=True)
+    mass: Float[Array, ""] = jj.parameter(1.0, unit="kg", positive=True)
+    coordinates = jj.coordinates("a b c")
+    example = {"a": 0.7, "b": 0.0, "c": 0.7, "a_rate": 1.0}
+
+    def bodies(self, t, q):
+        r, d, m = self.crank, self.coupler, self.mass
+        x, z = r * jnp.cos(q.a), r * jnp.sin(q.a)
+        return {
+            "first": rod_body(0.5 * x, 0.5 * z, q.a, r, m),
+            "coupler": rod_body(x + 0.5 * d * jnp.cos(q.b), z + 0.5 * d * jnp.sin(q.b), q.b, d, m),
+            "second": rod_body(d + 0.5 * r * jnp.cos(q.c), 0.5 * r * jnp.sin(q.c), q.c, r, m),
+        }
+
+    def geometric_constraints(self, pose):
+        return pinned("loop", end_of(pose["coupler"], 0.5 * self.coupler), end_of(pose["second"], 0.5 * self.crank))
+
+
+class SliderCrank(jj.Scene):
+    """A crank a and a rod b of the same length 1 m that moves a slider x along the x axis; at a = pi/2 the slider passes the crank's axis.
+
+    The branch b = -a, x = 2 cos a crosses there the branch on which rod and crank turn as one and the slider rests.
+    """
+
+    slider: Float[Array, ""] = jj.parameter(0.5, unit="kg", positive=True)
+    coordinates = jj.coordinates("a b x")
+    example = {"a": 0.5, "b": -0.5, "x": 2 * np.cos(0.5), "a_rate": 1.0}
+
+    def bodies(self, t, q):
+        one = jnp.ones_like(q.a)
+        x, z = jnp.cos(q.a), jnp.sin(q.a)
+        return {
+            "crank": rod_body(0.5 * x, 0.5 * z, q.a, one, 1.0),
+            "rod": rod_body(x + 0.5 * jnp.cos(q.b), z + 0.5 * jnp.sin(q.b), q.b, one, 1.0),
+            "slider": jj.Particle(self.slider, jnp.stack([q.x, 0 * q.x, 0 * q.x])),
+        }
+
+    def geometric_constraints(self, pose):
+        return pinned("pin", end_of(pose["rod"], jnp.asarray(0.5)), pose["slider"].position)
+
+
+def slider_crank_motion(a_0: float, rate: float, ts, slider: float = 0.5) -> np.ndarray:
+    """Angle a (rad) of `SliderCrank` at times `ts` on its branch b = -a, by quadrature of the energy.
+
+    T = I(a) a'^2/2 with I = 2/12 + 1/4 (crank) + |d centre of rod/da|^2 + 4 slider sin^2 a; centre of the rod: (3/2 cos a, 1/2 sin a).
+    """
+    from scipy.integrate import solve_ivp
+
+    def inertia(a):
+        return 1 / 12 + 1 / 4 + 1 / 12 + (1.5 * np.sin(a)) ** 2 + (0.5 * np.cos(a)) ** 2 + 4 * slider * np.sin(a) ** 2
+
+    momentum = np.sqrt(inertia(a_0)) * rate  # sqrt(I) a' is constant
+    found = solve_ivp(lambda t, a: momentum / np.sqrt(inertia(a)), (0.0, ts[-1]), [a_0], method="DOP853", rtol=1e-12, atol=1e-12, t_eval=ts)
+    return found.y[0]
+
+
+class NarrowPendulum(jj.Scene):
+    """A pendulum in Cartesian coordinates whose domain says that it hangs: the speed of z follows from that of x, but for a motion that reaches z = 0."""
+
+    length: Float[Array, ""] = jj.parameter(1.0, unit="m", positive=True)
+    coordinates = jj.coordinates("x z")
+    domain = {"x": (-0.6, 0.6), "z": (-1.0, -0.8)}
+    example = {"x": 0.3, "z": -np.sqrt(0.91), "x_rate": 1.0}
+
+    def bodies(self, t, q):
+        return {"bob": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, q.z]))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81),)
+
+    def geometric_constraints(self, pose):
+        return {"rod": jj.rod(jnp.zeros(3), pose["bob"].position, self.length)}
+
+
+def pendulum_angles(speeds, ts) -> np.ndarray:
+    """Angles (rad, from hanging) of `NarrowPendulum` from its example's place with the given rates of x, shape (lanes, times), by SciPy."""
+    from scipy.integrate import solve_ivp
+
+    a_0 = np.arcsin(0.3)
+    lanes = [
+        solve_ivp(lambda t, y: [y[1], -9.81 * np.sin(y[0])], (0.0, ts[-1]), [a_0, v / np.cos(a_0)], method="DOP853", rtol=1e-12, atol=1e-12, t_eval=ts).y[0]
+        for v in speeds
+    ]
+    return np.array(lanes)

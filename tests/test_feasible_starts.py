@@ -1,0 +1,110 @@
+"""Values that some state on the rows has are a start: what was not given is found, and where it was not found near the reference, the state says so."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from linkages import Parallelogram, SliderCrank, Windows, bennett, bricard
+from small_scenes import DiscWithHeightRow
+
+import jourdain_jax as jj
+from jourdain_jax.equations.sampling import NoStateFoundError
+from jourdain_jax.equations.structure import structure_of
+
+SCENES = {
+    "disc with quaternion": jj.models.TiltingDiscQuaternion(),
+    "disc in angles": DiscWithHeightRow(),
+    "pendulum of rods": jj.models.DoublePendulumRods(),
+    "parallelogram": Parallelogram(),
+    "slider-crank": SliderCrank(rod=2.0),
+    "Bennett": bennett(0.7, 1.2),
+    "Bricard": bricard(1.0, 1.2, 0.8, 0.9, 1.1),
+    "windows": Windows(2),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_any_part_of_a_state_on_the_rows_is_a_start(name):
+    scene, generator = SCENES[name], np.random.default_rng(0)
+    _, states, _ = jj.sample_states(scene, 8, seed=5)
+    names = scene.coordinate_names.entries
+    for q in states:
+        given = generator.choice(len(names), generator.integers(1, len(names)), replace=False)
+        found = jj.start(scene, **{names[i]: q[i] for i in given})
+        assert float(found.residual) < 1e-9
+        np.testing.assert_array_equal(np.asarray(found.q)[given], q[given])
+
+
+@pytest.mark.parametrize("given", [{"z": 0.4}, {"z": 0.4, "attitude_x": 0.1}, {"z": 0.1}, {"attitude_x": 0.2}])
+def test_a_disc_leans_as_its_height_wants(given):
+    found = jj.start(SCENES["disc with quaternion"], **given)
+    assert float(found.residual) < 1e-12
+    assert float(jnp.max(jnp.abs(found.q))) <= 1.0
+    w, x, y, z = found.q[3:]
+    assert float(0.5 * jnp.sqrt(1 - (2 * (y * z + w * x)) ** 2)) == pytest.approx(float(found["z"]), abs=1e-9)
+    assert (int(found.guess) > 0) == ("guess" in str(found))
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "row"),
+    [
+        ("disc with quaternion", {"z": 0.6}, "rim height"),
+        ("slider-crank", {"x": 3.4}, "along|across"),
+        ("windows", {"x0": 0.9, "z0": 0.9}, "left 0"),
+        ("disc with quaternion", {"attitude_x": 1.2}, "norm of quaternion"),
+    ],
+)
+def test_values_that_no_state_has_are_refused_with_the_row(name, given, row):
+    with pytest.raises(ValueError, match=f"contradicts row `({row})"):
+        jj.start(SCENES[name], **given)
+
+
+def test_starts_in_lanes_find_what_single_ones_find_and_have_derivatives():
+    scene, places = SCENES["slider-crank"], jnp.array([-1.5, -1.2, 1.4, 2.5])
+
+    def crank(x):
+        state = jj.start(scene, x=x)
+        return state["a"], state.q
+
+    a, slope, q = jax.jit(jax.vmap(lambda x: jax.jvp(crank, (x,), (1.0,), has_aux=True)))(places)
+    single = [jj.start(scene, x=x) for x in places.tolist()]
+    np.testing.assert_allclose(q, np.stack([np.asarray(state.q) for state in single]), atol=1e-8)
+    assert max(int(state.guess) for state in single) > 0
+    # r^2 + x^2 - 2 r x cos(a) = l^2
+    np.testing.assert_allclose(slope, (np.cos(a) - places) / (places * np.sin(a)), rtol=1e-7)
+
+
+def test_a_start_found_elsewhere_has_a_derivative_in_reverse_mode():
+    def crank(x):
+        return jj.start(SCENES["slider-crank"], x=x)["a"]
+
+    x = -1.5
+    a = float(crank(x))
+    assert jax.jit(jax.grad(crank))(x) == pytest.approx((np.cos(a) - x) / (x * np.sin(a)), rel=1e-9)
+
+
+class Hidden(jj.Scene):
+    """A particle held by a row that is a number in a small disc of its domain only."""
+
+    coordinates = jj.coordinates("x y z")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, q.array)}
+
+    def geometric_constraints(self, pose):
+        x, y = pose.q.x - 0.3, pose.q.y - 0.2
+        return {"hidden": x * jnp.sqrt(4e-4 - x**2 - y**2)}
+
+
+def test_a_start_on_the_rows_is_not_refused_because_no_state_was_found_at_random():
+    with pytest.raises(NoStateFoundError, match="no admissible state"):
+        structure_of(Hidden())
+    found = jj.start(Hidden(), x=0.3, y=0.2, y_rate=1.0)
+    assert float(found.residual) < 1e-12
+    assert structure_of(Hidden()).degrees_of_freedom == 2
+
+
+def test_steady_motions_keep_the_coordinates_on_which_nothing_depends():
+    found = jj.steady(jj.models.VerticalDisc(), {"x": 5.0, "heading": 0.7, "heading_rate": 0.2, "roll_rate": 3.0})
+    assert bool(found.converged)
+    assert (float(found["x"]), float(found["y"]), float(found["heading"])) == (5.0, 0.0, 0.7)

@@ -1,0 +1,76 @@
+"""A row that vanishes at a configuration is lost there, in whatever unit it is written; and the conditioning says so beforehand."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from linkages import Parallelogram, SliderCrank
+
+import jourdain_jax as jj
+from jourdain_jax.equations.reactions import determined_rows
+from jourdain_jax.equations.structure import plain_row_lengths, structure_of
+
+SINGULAR = {
+    "parallelogram": (Parallelogram, {"a": np.pi / 2, "b": 0.0, "c": np.pi / 2}, {"a": 1.0, "c": 1.0}),
+    "slider-crank": (SliderCrank, {"a": np.pi / 2, "b": -np.pi / 2, "x": 0.0}, {"a": 1.0, "b": -1.0}),
+}
+UNITS = (1.0, 1e6, 1e-6)
+
+
+def _near(name: str, distance: float, unit: float = 1.0):
+    """Accelerations at a distance from the singular configuration, along the linkage's motion."""
+    make, at, towards = SINGULAR[name]
+    scene = make(unit=unit)
+    at = {key: value - distance * towards.get(key, 0.0) for key, value in at.items()}
+    if name == "slider-crank":
+        at["x"] = 2.0 * np.cos(at["a"])
+    q, u, _ = scene.named(**at)
+    return scene, q, jj.accelerations(scene, 0.0, q, u)
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("name", SINGULAR)
+def test_rank_is_lost_where_a_row_is_round_off(name, unit):
+    scene, q, found = _near(name, 0.0, unit)
+    assert (structure_of(scene).rank, int(found.rank)) == (2, 1)
+    assert float(found.smallest_singular_value) < 1e-12
+    A = jj.constraint_rows(scene, 0.0, q, jnp.zeros(3)).A
+    assert sum(determined_rows(A, plain_row_lengths(scene)).tolist()) == 1
+
+
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("name", SINGULAR)
+def test_the_smallest_singular_value_goes_to_zero_with_the_distance(name, unit):
+    distances = np.array([1e-1, 1e-3, 1e-5, 1e-7, 1e-9])
+    values = np.array([float(_near(name, distance, unit)[2].smallest_singular_value) for distance in distances])
+    assert np.all(np.diff(values) < 0)
+    np.testing.assert_allclose(values[1:] / distances[1:], values[1] / distances[1], rtol=1e-2)
+
+
+@pytest.mark.parametrize("name", SINGULAR)
+def test_the_conditioning_does_not_depend_on_the_unit_of_a_row(name):
+    values = [float(_near(name, 0.2, unit)[2].smallest_singular_value) for unit in UNITS]
+    np.testing.assert_allclose(values, values[0], rtol=1e-6)
+    choices = [structure_of(SINGULAR[name][0](unit=unit)) for unit in UNITS]
+    assert len({(found.independent, found.ranks, found.rank_losses) for found in choices}) == 1
+
+
+@pytest.mark.parametrize("name", SINGULAR)
+def test_the_report_names_the_configuration(name):
+    losses = structure_of(SINGULAR[name][0]()).rank_losses
+    assert losses
+    assert all("1.571" in loss for loss in losses)
+
+
+def test_the_report_warns_where_a_start_has_another_rank():
+    scene = Parallelogram()
+    singular, regular = (jj.report(scene, start={"a": a, "b": 0.0, "c": a}) for a in (np.pi / 2, 0.4))
+    assert (singular.rank_at_start, regular.rank_at_start) == (1, 2)
+    assert "WARNING" in str(singular)
+    assert "WARNING" not in str(regular)
+
+
+def test_verifying_at_a_loss_of_rank_raises_no_false_alarm():
+    scene, q, _ = _near("parallelogram", 0.0)
+    found = jj.verify(scene, jj.consistent(scene, 0.0, q, jnp.array([1.0, 0.0, 1.0])))
+    assert found.passed, str(found)
+    assert any("lose rank" in check.note for check in found.checks)
