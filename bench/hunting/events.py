@@ -107,7 +107,7 @@ class ArcsineStop(Spring):
     """The angle of a crank that a ratio gives, which has none beyond a right angle."""
 
     def events(self, motion):
-        return {"stop": 1.0 - jnp.arcsin(motion.q.x / self.stop) / (jnp.pi / 2)}
+        return {"stop": 1.0 - jnp.arcsin(jnp.maximum(motion.q.x / self.stop, -0.9)) / (jnp.pi / 2)}
 
 
 class RootStop(Spring):

@@ -6,19 +6,18 @@ parameters are traced (numbers near the class's defaults stand in), so that the 
 """
 
 import itertools
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.equations.plausibility import implausible
 from jourdain_jax.equations.probed import TIMED, Probed, probed
 from jourdain_jax.equations.probed_on_graph import follow_from_others, probed_on_graph
 from jourdain_jax.equations.probing import probed_once, without_collecting
+from jourdain_jax.equations.rank import Scaled, rank_of, redundant_rows, scaled_states
 from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, names_of_rows
 from jourdain_jax.equations.sampling import random_states, states_near_what_was_seen, symmetric_configurations, usable_states
 from jourdain_jax.equations.scaling import speed_scales, typical_row_lengths
@@ -32,9 +31,7 @@ from jourdain_jax.scene.scene import Scene
 RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
 LONG = 24  # dependent speeds: of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
-LARGE_COEFFICIENT, TAIL = 20.0, 3.0  # of the rows that stay, in a row that is left out: at any probe; with both signs, beside the median
 FAR, FAR_PROBES = 100.0, 16  # where no graph is: further states, at times (s), coordinates and speeds up to this
-ERRORS = 100.0  # of a configuration: singular values below are of the error, not of the rows
 TRACED = 1e-3  # of the typical lengths of rows, where parameters are traced
 _EXHAUSTIVE = 3000
 _SHORTLIST = 40
@@ -93,23 +90,6 @@ class Structure:
     def well_conditioned(self) -> bool:
         """Whether the privileged velocities serve everywhere in the domain."""
         return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, LONG / max(self.rank, 1))
-
-
-class _Scaled(eqx.Module):
-    """What decides ranks and pivots, at every probed state."""
-
-    A: Float[np.ndarray, "states rows speeds"]  # scaled rows in scaled speeds
-    lengths: Float[np.ndarray, "states rows"]  # of the rows before
-    M: Float[np.ndarray, "states speeds speeds"]  # in scaled speeds
-    c: Float[np.ndarray, "states speeds"]  # scales of the speeds
-
-
-def _scaled(found: Probed, typical: np.ndarray) -> _Scaled:
-    """`d A c` with the scales that the accelerations use (`scaling.row_scale`)."""
-    c = speed_scales(found.M)
-    A = found.A * c[:, None]
-    length = np.maximum(np.sqrt(np.sum(A**2, axis=2, keepdims=True)), typical[:, None])
-    return _Scaled(A / np.where(length > 0, length, 1), length[..., 0], c[:, :, None] * found.M * c[:, None], c)
 
 
 def _moves(rates) -> bool:
@@ -224,8 +204,8 @@ def _probed_structure(scene: Scene) -> Structure:
     typical = typical_row_lengths(A[usable & generic], (found.A_beyond * speed_scales(found.M)[:, None])[generic])
     beyond = found.A_beyond[generic]
     t, u, generic, found = jax.tree.map(lambda x: x[usable], (t, u, generic, found))
-    scaled = _scaled(found, typical)
-    ranks = [_rank(A, error) for A, error in zip(scaled.A, found.error, strict=True)]
+    scaled = scaled_states(found, typical)
+    ranks = [rank_of(A, error) for A, error in zip(scaled.A, found.error, strict=True)]
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     if not faults:  # a negative mass is named as such
         _check_inertia(scene, jax.tree.map(lambda x: x[generic & (np.array(ranks) == rank)], scaled), rank)
@@ -235,7 +215,7 @@ def _probed_structure(scene: Scene) -> Structure:
         independent, by_user = _choose(candidates, count, rank), False
     pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
     full_everywhere, eps, hidden = all(r == rank for r in ranks), float(np.finfo(found.A.dtype).eps), found.hidden
-    redundant = _redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
+    redundant = redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
     return Structure(
         row_names=names,
         rank=rank,
@@ -273,20 +253,12 @@ def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return t, u, generic, _look(scene, t, q, u, -u[::-1], generic)
 
 
-def _rank(A: np.ndarray, error: float) -> int:
-    """Rank of scaled rows, by the cut-off that the accelerations use, or by the `error` of the configuration they belong to."""
-    if not A.size:
-        return 0
-    sigma = np.linalg.svd(A, compute_uv=False)
-    return int(np.sum(sigma > max(rank_cutoff(A.dtype), ERRORS * error) * sigma[0]))
-
-
 def _is_singular(M: np.ndarray) -> bool:
     """Whether scaled inertias are singular at all of some states."""
     return bool(M.size) and bool(np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * np.finfo(M.dtype).eps))
 
 
-def _check_inertia(scene: Scene, found: _Scaled, rank: int) -> None:
+def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
     """Raise a ValueError that names the speeds along which the rows leave a motion free that no body's inertia resists, at every generic state."""
     moved = []
     for A, M, c in zip(found.A, found.M, found.c, strict=True):
@@ -305,29 +277,6 @@ def _check_inertia(scene: Scene, found: _Scaled, rank: int) -> None:
     )
 
 
-def _redundant_rows(
-    found: _Scaled, errors: np.ndarray, ranks: list[int], generic: np.ndarray, names: tuple[str, ...], far: Callable[[], _Scaled]
-) -> tuple[str, ...]:
-    """Rows that may be left out, later ones first, so that the rest keeps its rank at every probed state, and does not come near to losing it.
-
-    A row that is left out is a combination of the others. Where its coefficients are large somewhere, they have no bounds: so those of one wheel's row
-    along y, by its row along x and the rows of the wheel beside it, are tangents of the heading. `generic`: which of the states `found` are random;
-    `far`: rows at full turns of all angles.
-    """
-    kept, everywhere = list(range(len(names))), None
-    for s in reversed(range(len(names))):
-        if len(kept) in ranks:
-            break  # somewhere those that are left are independent
-        rest = [i for i in kept if i != s]
-        if not all(_rank(A[rest], error) == r for A, error, r in zip(found.A, errors, ranks, strict=True)):
-            continue
-        if everywhere is None:
-            everywhere = jax.tree.map(lambda *x: np.concatenate(x), jax.tree.map(lambda x: x[generic], found), far())
-        if _are_bounded(_coefficients(everywhere, rest, s, max(ranks))):
-            kept = rest
-    return tuple(name for s, name in enumerate(names) if s not in kept)
-
-
 def _follow(scene: Scene, *state_and_rows) -> bool:
     """Whether rows that follow from the others at the probes do so by an identity."""
     try:
@@ -336,27 +285,7 @@ def _follow(scene: Scene, *state_and_rows) -> bool:
         return False
 
 
-def _coefficients(found: _Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
-    """Of the rows `rest` in row s, each in its usual length, at states where all rows have their rank; infinite where they do not give it."""
-    tiny, made = np.finfo(found.A.dtype).tiny, []
-    lengths = np.maximum(found.lengths, tiny)
-    usual = np.median(lengths, axis=0)
-    for A, length in zip(found.A, lengths, strict=True):
-        if _rank(A, 0.0) == rank:
-            c = A[s] @ np.linalg.pinv(A[rest], rcond=rank_cutoff(A.dtype))
-            given = np.linalg.norm(A[s] - c @ A[rest]) < np.sqrt(np.finfo(A.dtype).eps)
-            made.append(c * (length[s] / usual[s]) / (length[rest] / usual[rest]) if given else np.full(len(rest), np.inf))
-    return np.array(made).reshape(-1, len(rest))
-
-
-def _are_bounded(c: np.ndarray) -> bool:
-    """Whether coefficients at many states are: none is large, nor far beyond its usual size with both signs, as tangents are."""
-    usual = TAIL * np.median(np.abs(c), axis=0) + np.sqrt(np.finfo(c.dtype).eps)
-    poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)
-    return bool(np.all(np.abs(c) < LARGE_COEFFICIENT) and not np.any(poles & (np.max(np.abs(c), axis=0, initial=0.0) > 2)))
-
-
-def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> _Scaled:
+def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
     """Scaled rows with coordinates up to half a turn away from those given, where they are on the geometric rows."""
     generator = np.random.default_rng(4)
     t, q, u = (x[:RANDOM_PROBES].repeat(2, 0) for x in (t, q, u))
@@ -365,7 +294,7 @@ def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> _Scaled:
         turned[:, first : first + 4] = q[:, first : first + 4]
     found = _look(scene, t, turned, u, -u, np.zeros(len(t), bool))
     good = np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2))
-    return jax.tree.map(lambda x: x[good], _scaled(found, typical))
+    return jax.tree.map(lambda x: x[good], scaled_states(found, typical))
 
 
 def _describe(scene: Scene, q: np.ndarray) -> str:

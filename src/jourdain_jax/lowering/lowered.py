@@ -133,7 +133,10 @@ class Lowered:
         return self.rates_and_pivots(fixed, t, q, y, inputs, with_power)[:3]
 
     def rates_and_pivots(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Array | None, tuple]:
-        """As `rates`, and the pivots relative to their usual sizes, which must keep their signs; they are numbers to differentiation."""
+        """As `rates`, and the pivots relative to their usual sizes, which must keep their signs; they are numbers to differentiation.
+
+        `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
+        """
         found = list((self._with_power if with_power else self._without_power)(*self._known(fixed, t, q, y, inputs).values()))
         count = len(found) - len(self.pivots)
         pivots = tuple(value / size for value, size in zip(found[count:], self.typical, strict=True))

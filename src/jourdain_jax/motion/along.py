@@ -92,6 +92,8 @@ def energies(record: Record) -> tuple[Float[Array, "*lanes times"], Float[Array,
 
 def accelerations_along(record: Record, usual: UsualRows | None = None) -> Accelerations:
     """Accelerations, multipliers, rank and smallest singular value; `usual`: from `usual_rows`, for a record whose parameters are traced."""
+    if usual is None and record.q.ndim > 2:  # every lane has parameters of its own
+        return along(_accelerations, record, by_inputs=True)
     return along(_Accelerations(jax.tree.map(jnp.asarray, usual_rows(record.scene) if usual is None else usual)), record, by_inputs=True)
 
 
