@@ -389,7 +389,7 @@ MOTIONS: dict[str, Case] = {
         "input `push` of `Bead` returned `None`, expected one number; give a function of one",
     ),
     "jj.simulate(b, {}, t1=1.0, inputs={'push': lambda: 1.0})": ("ValueError", "input `push` of `Bead` cannot be called with a time"),
-    "ended(b, {}, inputs={'push': nan})": ("result 4", "the accelerations are not finite or not determined"),
+    "ended(b, {}, inputs={'push': nan})": ("result 4", "the accelerations are not finite near the last time"),
     "jj.simulate(described(events=lambda self, m: {'out': m.q.x < 1.0}), {}, t1=0.1)": (
         "ValueError",
         "event `out` of `Described` is of type bool, expected real",

@@ -20,7 +20,7 @@ for code in json.loads(CASES):
         answer = eval(code)
         answer = answer if isinstance(answer, tuple) and len(answer) == 2 and isinstance(answer[0], str) else ("accepted", repr(answer)[:200])
     except Exception as error:
-        answer = (type(error).__name__, str(error))
+        answer = ("/".join(kind.__name__ for kind in type(error).__mro__), str(error))  # a kind of ValueError is one
     print("ANSWER", json.dumps(answer))
 """
 
@@ -48,4 +48,4 @@ def test_malformed_input_is_named_with_what_is_expected(code, answers):
     kind, words = TABLE[code]
     found, text = answers[code]
     assert words in text, text
-    assert found == kind, text
+    assert kind in found.split("/"), text

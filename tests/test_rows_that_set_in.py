@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
+from jourdain_jax.motion import results
 
 
 class Slider(jj.Scene):
@@ -75,17 +76,20 @@ def test_a_row_that_follows_by_an_identity_is_left_out(name, monkeypatch):
 
 @pytest.mark.parametrize("use", ["simulate", "jit", "rollout"])
 def test_a_motion_meets_a_row_that_has_set_in(use, monkeypatch):
-    """The mass is stopped along x when the row sets in, in whatever way it is simulated."""
+    """The mass would be stopped along x when the row sets in: no motion without an impact, so it ends there with a result code, however it is simulated."""
     scene = slider(SETS_IN["in time"], monkeypatch)
 
     def speed(scene):
-        return jj.simulate(scene, {}, ts=[1.5, 3.0]).u[:, 0]
+        motion = jj.simulate(scene, {}, ts=[1.5, 3.0])
+        return motion.u[:, 0], motion.result
 
     if use == "rollout":
-        found = jj.rollout(scene, {"x": jnp.zeros(2)}, ts=[1.5, 3.0]).lanes.u[0, :, 0]
+        lanes = jj.rollout(scene, {"x": jnp.zeros(2)}, ts=[1.5, 3.0]).lanes
+        found, result = lanes.u[0, :, 0], lanes.result[0]
     else:
-        found = (jax.jit(speed) if use == "jit" else speed)(scene)
-    assert np.allclose(found, [1.5, 0.0], atol=1e-6)
+        found, result = (jax.jit(speed) if use == "jit" else speed)(scene)
+    assert np.allclose(found, [1.5, np.nan], atol=1e-6, equal_nan=True)
+    assert int(result) == results.STEP_TOO_SMALL
 
 
 def test_a_linkage_that_is_overconstrained_keeps_its_program():

@@ -292,8 +292,8 @@ def test_rows_that_a_motion_leaves_are_warned_of():
     rods = jj.models.DoublePendulumRods()
     options = {"t1": 2.0, "solver": diffrax.Euler(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": 5e-3}
     kept, left = (jj.simulate(rods, rods.example, projection=projection, **options).warnings for projection in (True, False))
-    assert kept == ()
-    assert [text.split(" are violated")[0] for text in left] == ["geometric rows", "velocity rows"]
+    assert [text.split(", ")[0] for text in kept] == ["T + V"]  # Euler's method adds energy
+    assert [text.split(" are violated")[0] for text in left[:2]] == ["geometric rows", "velocity rows"]
 
 
 def test_a_reduction_by_privileged_speeds_too_light_for_the_precision_is_warned_of():

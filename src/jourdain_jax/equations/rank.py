@@ -78,7 +78,7 @@ def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarr
             c = A[s] @ np.linalg.pinv(A[rest], rcond=rank_cutoff(A.dtype))
             given = np.linalg.norm(A[s] - c @ A[rest]) < np.sqrt(np.finfo(A.dtype).eps)
             made.append(c * (length[s] / usual[s]) / (length[rest] / usual[rest]) if given else np.full(len(rest), np.inf))
-    return np.array(made).reshape(-1, len(rest))
+    return np.array(made).reshape(len(made), len(rest))
 
 
 def _are_bounded(c: np.ndarray) -> bool:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from jourdain_jax.motion.lean_step import removed
 from jourdain_jax.motion.wrapping_solver import WrappingSolver
 
 _REST = 1e-6  # of the size of the state: a step that changes less counts as one that changes so much
@@ -53,7 +54,7 @@ class GuardedSolver(WrappingSolver):
             free, y1 = y1, self.project(_time(terms, t0, t1, t1), y1, args)
             moved = jax.tree.map(lambda a, b: jax.lax.stop_gradient(jnp.abs(a - b)), y1, free)
             seen = eqx.tree_at(lambda s: s.projected, seen, jnp.maximum(seen.projected, _relative(moved, y0, y1)))
-            error = None if error is None else jax.tree.map(lambda e, m: jnp.maximum(jnp.abs(e), m), error, moved)
+            error = None if error is None else jax.tree.map(lambda e, m: jnp.maximum(jnp.abs(e), m), error, removed(y1, free, 0))
         if self.pivots is not None:
             middle = self.interpolation_cls(t0=t0, t1=t1, **dense).evaluate(t0 + 0.5 * (t1 - t0))
             inside = jnp.stack([self._pivots_at(_time(terms, t0, t1, t), y, args) for t, y in ((t0 + 0.5 * (t1 - t0), middle), (t1, y1))])
