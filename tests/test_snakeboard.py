@@ -46,7 +46,8 @@ def test_a_step_that_ends_where_the_rows_are_parallel_is_right_or_says_so(reduct
     heading = oracle.motion(times, **oracle.RUN)["th"]
     if int(motion.result) != results.SUCCESS:
         assert int(motion.result) == results.STEP_TOO_SMALL
-        assert abs(float(motion.t_end) - times[4]) <= 1e-9
+        # where round-off of the speeds, over the sine of the angle between rows, is more than what a projection may remove
+        assert abs(float(motion.t_end) - times[4]) <= 1e-7
     valid = np.asarray(motion.valid)
     assert relative_error(motion["heading"][valid], heading[valid]) <= tolerance("closed_form")
 
