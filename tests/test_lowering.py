@@ -55,15 +55,15 @@ class Rough(jj.Scene):
     mass: jnp.ndarray = jj.parameter(1.3, unit="kg", positive=True)
     k1: jnp.ndarray = jj.parameter(2.0, unit="N/m")
     double: jnp.ndarray = jj.parameter(0.7, unit="N")
-    coordinates = jj.coordinates("s0 t")  # a length, and an angle
+    coordinates = jj.coordinates("s0 rates")  # a length, and an angle
 
     def bodies(self, t, q):
-        return {"bead": jj.RigidBody(self.mass, jnp.ones(3), jnp.stack([q.s0, 0.0 * q.s0, 0.0 * q.s0]), jj.rot_x(q.t))}
+        return {"bead": jj.RigidBody(self.mass, jnp.ones(3), jnp.stack([q.s0, 0.0 * q.s0, 0.0 * q.s0]), jj.rot_x(q.rates))}
 
     def loads(self, motion):
         x, v = motion.q.s0, motion.u.s0_rate
         push = jnp.where((jnp.abs(v) < 0.5) | ~(x < 1.0), jnp.maximum(x, 0.1), 0.0)
-        return (jj.generalized_force(motion, s0_rate=push - self.k1 * x - self.double * jnp.sign(v), t_rate=-self.double * jnp.sin(motion.t)),)
+        return (jj.generalized_force(motion, s0_rate=push - self.k1 * x - self.double * jnp.sign(v), rates_rate=-self.double * jnp.sin(motion.t)),)
 
 
 PRINTED = {name: MODELS[name]() for name in ("skate", "tilting-disc", "two-wheel-axle-coordinates", "whipple-bicycle")} | {"rough": Rough()}
