@@ -235,3 +235,14 @@ def test_scenes_are_copied_and_stored():
     for other in (copy.deepcopy(SCENE), pickle.loads(pickle.dumps(SCENE))):
         assert jax.tree.structure(other) == jax.tree.structure(SCENE)
     assert jax.tree.structure(SCENE.replace(mass=2.0)) == jax.tree.structure(SCENE)
+
+
+def test_a_method_replaced_on_a_class_that_was_made_by_type_counts():
+    made = type("Made", (Spring,), {})()  # its module is the one of the metaclass
+
+    def acceleration():
+        return float(jj.accelerations(made, 0.0, jnp.ones(1), jnp.zeros(1)).udot[0])
+
+    before = acceleration()
+    type(made).loads = lambda self, motion: jj.Load(generalized={"x_rate": -4.0 * motion.q.x})
+    assert [before, acceleration()] == pytest.approx([-1.0, -4.0])

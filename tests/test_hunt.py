@@ -25,7 +25,8 @@ SHORT = (
     ("hammer", (1, 7)),
     ("far-times", (13, 19)),
     ("times", (5,)),
-    ("changed", (0, 1)),
+    ("kite", (1, 26)),
+    ("changed", (0, 1, 3)),
 )
 
 

@@ -98,3 +98,16 @@ def test_a_loss_of_energy_is_warned_of():
     crude = jj.simulate(pendulum, dict(zip(["x", "z", "x_rate"], (0.3, -np.sqrt(0.91), 1.0), strict=True)), **crude)
     assert any("which is constant for a right motion, drifts" in text for text in crude.warnings)
     assert not jj.simulate(pendulum, pendulum.example, t1=1.0).warnings
+
+
+@pytest.mark.parametrize("lowering", [True, False], ids=["lowered", "dense"])
+def test_a_row_is_compared_with_its_usual_length_for_the_parameters_of_the_motion(lowering):
+    def motion(scene):
+        start = {"a": 0.7, "b": 0.0, "c": 0.7, "a_rate": 1.0, "b_rate": 0.0, "c_rate": 1.0}
+        return jj.simulate(scene, start, ts=jnp.array([1.0]), rtol=1e-6, atol=1e-6, state="full", lowering=lowering)
+
+    motion(Parallelogram())  # of ordinary size, first
+    for size in (1e-5, 1e5):
+        found = jax.jit(lambda size: motion(Parallelogram(crank=size, coupler=2 * size, mass=size**3)))(size)
+        assert int(found.result) == results.SUCCESS
+        np.testing.assert_allclose(found.q_end, [1.7, 0.0, 1.7], atol=1e-5)

@@ -29,6 +29,14 @@ def null_space_qr(A: Float[Array, "rows columns"], cutoff: float | None = None) 
     return _null_space(A, "qr", cutoff)
 
 
+def pivots_qr(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
+    """Magnitudes of the pivots of that decomposition, largest first, as a diagnostic: no derivative passes through them."""
+    if 0 in A.shape:
+        return jnp.ones((0,), A.dtype)
+    _, R, _ = jax.lax.linalg.qr(jax.lax.stop_gradient(A).T, full_matrices=True, pivoting=True)
+    return jnp.abs(jnp.diagonal(R))
+
+
 def present(Z: Float[Array, "columns columns"]) -> Bool[Array, "columns"]:
     """Which columns of a basis belong to the null space."""
     return jnp.any(jax.lax.stop_gradient(Z) != 0, axis=0)

@@ -26,6 +26,14 @@ def passing_cutoff(dtype: jnp.dtype) -> float:
     return max(rank_cutoff(dtype), float(jnp.finfo(dtype).eps) ** 0.5)
 
 
+def undecided(dtype: jnp.dtype) -> float:
+    """Beside its usual size, the size of a row below which round-off decides on which branch a motion goes on: 8 roots of the round-off of `dtype`.
+
+    Where two branches of g = 0 cross, g = e is a hyperbola that turns from one into the other, as near as the root of e to their crossing.
+    """
+    return 8 * float(jnp.finfo(dtype).eps) ** 0.5
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def pseudo_inverse(A: Float[Array, "rows columns"], cutoff: float | None = None) -> Float[Array, "columns rows"]:
     """Moore-Penrose inverse of `A`; singular values below `cutoff` times the largest are dropped.

@@ -114,9 +114,11 @@ def _accelerations(scene: Scene, t, q, u, inputs, reduction, stabilisation, usua
     return diagnosed(*_reduced(scene, t, q, u, inputs, reduction, stabilisation, usual))
 
 
-def bare_accelerations(scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None) -> Reduced:
+def bare_accelerations(
+    scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None, usual: UsualRows | None = None
+) -> Reduced:
     """Accelerations and constraint force alone, as `accelerations` but without multipliers and diagnostics: for use inside integration."""
-    return _reduced(scene, t, q, u, inputs, reduction, stabilisation, usual_rows(scene))[0]
+    return _reduced(scene, t, q, u, inputs, reduction, stabilisation, usual_rows(scene) if usual is None else usual)[0]
 
 
 def _reduced(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:

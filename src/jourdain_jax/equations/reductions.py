@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, present
+from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, pivots_qr, present
 from jourdain_jax.calculus.pseudo_inverse import numerical_rank, pseudo_inverse, rank_cutoff, singular_values
 from jourdain_jax.equations.rows import ConstraintRows, UsualRows
 from jourdain_jax.equations.scaling import ScaledProblem, scaled
@@ -205,7 +205,7 @@ def _by_null_space(problem: ScaledProblem, Z, cutoff: float | None = None):
     particular = pseudo_inverse(problem.A, cutoff) @ problem.b
     S = Z.T @ problem.M @ Z + jnp.diag(jnp.where(present(Z), 0.0, 1.0).astype(Z.dtype))
     zeta, definite = solve_definite(S, Z.T @ (problem.f - problem.M @ particular))
-    return particular + Z @ zeta, jnp.ones((), Z.dtype), definite
+    return particular + Z @ zeta, definite
 
 
 class NullSpaceQR(Reduction):
@@ -219,7 +219,8 @@ class NullSpaceQR(Reduction):
     name = "null space (QR)"
 
     def solve(self, problem):
-        return _by_null_space(problem, null_space_qr(problem.A, self.cutoff), self.cutoff)
+        w, definite = _by_null_space(problem, null_space_qr(problem.A, self.cutoff), self.cutoff)
+        return w, smallest_that_counts(pivots_qr(problem.A), problem.usual), definite
 
 
 class NullSpaceSVD(Reduction):
@@ -228,7 +229,8 @@ class NullSpaceSVD(Reduction):
     name = "null space (SVD)"
 
     def solve(self, problem):
-        return _by_null_space(problem, null_space_svd(problem.A))
+        w, definite = _by_null_space(problem, null_space_svd(problem.A))
+        return w, jnp.ones((), w.dtype), definite
 
 
 def _refined(inverse, A, b):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.equations.rows import ConstraintRows
+from jourdain_jax.equations.rows import ConstraintRows, UsualRows
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations
 
 
@@ -25,6 +25,7 @@ class ScaledProblem(eqx.Module):
     b: Float[Array, "rows"]
     c: Float[Array, "speeds"]
     d: Float[Array, "rows"]
+    usual: UsualRows | None
 
 
 def speed_scale(M: Float[Array, "speeds speeds"]) -> Float[Array, "speeds"]:
@@ -72,4 +73,4 @@ def scaled(equations: UnconstrainedEquations, rows: ConstraintRows) -> ScaledPro
     """The scaled problem of one state."""
     c = speed_scale(equations.M)
     d = row_scale(rows.A * c, None if rows.usual is None else rows.usual.lengths)
-    return ScaledProblem(c[:, None] * equations.M * c, c * (equations.Q - equations.h), d[:, None] * rows.A * c, -d * rows.drift, c, d)
+    return ScaledProblem(c[:, None] * equations.M * c, c * (equations.Q - equations.h), d[:, None] * rows.A * c, -d * rows.drift, c, d, rows.usual)

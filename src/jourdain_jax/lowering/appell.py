@@ -24,7 +24,6 @@ from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.formal import FormalProbes, equal, formal, on_rows, unaffected
 from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
 
-SMALL_SINE = 0.02  # of the angle between rows: where it is smaller at some probe, the program watches it at every evaluation
 
 
 @dataclass(frozen=True)
@@ -60,6 +59,7 @@ class Equations:
     guards: list[int] = field(default_factory=list)  # must stay positive
     power: int = 0  # `rate_of_work`; for scenes that no prescribed pose drives
     events: list[int] = field(default_factory=list)  # values of the stop events
+    usual: dict[int, int] = field(default_factory=dict)  # inputs that stand for what a node usually is, with that node
 
 
 @dataclass
@@ -97,12 +97,13 @@ class AppellOnGraph:
         forms_of_equations = self._forms(strategy.keep_sines, strategy.most_terms_of_equations)
         M, f = self._equations(kinematics, forms_of_equations)
         if self.kept and self.multiplied:
-            ydot, sines, margins = self.kept.accelerations(M, f, *kinematics.rows_along_motion(self.multiplied), forms)
+            ydot, sines, margins, usual = self.kept.accelerations(M, f, *kinematics.rows_along_motion(self.multiplied), forms)
         else:
             ydot, sines, margins = self._solved(M, f, forms_of_equations if strategy.by_determinants else None), [], []
+            usual = {}
         z, qdot, pivots = self._true_rates(kinematics, forms) if held else (kinematics.z, kinematics.qdot, [])
         guards = {node for made in (forms, forms_of_equations) if made is not None for node in made.guards}
-        guards |= {margin for sine, margin in zip(sines, margins, strict=False) if self._may_vanish(sine)}
+        guards |= set(margins)
         power = self._power(kinematics, ydot)
         if strategy.free_z:
             *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
@@ -114,7 +115,7 @@ class AppellOnGraph:
         elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
             power = power if equal(self.formal([power]), self.formal([true_power])).all() else true_power
-        return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots, *sines])), sorted(guards), power, events)
+        return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots, *sines])), sorted(guards), power, events, usual)
 
     def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}
@@ -138,11 +139,6 @@ class AppellOnGraph:
         M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
         phi = [int(at.phi[s]) for s in self.multiplied]
         return Projection(moved, self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms))
-
-    def _may_vanish(self, pivot: int) -> bool:
-        """Whether a pivot is small or not a number at some probe."""
-        values = self.probes([pivot])[0]
-        return not bool(np.min(values) > SMALL_SINE)
 
     def _power(self, k: "_Kinematics", ydot: list[int]) -> int:
         """Power of loads without a potential and of potentials in time, and `(A' lambda).u` where rows are not homogeneous.

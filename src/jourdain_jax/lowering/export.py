@@ -63,6 +63,7 @@ def identifiers(lowered) -> dict[int, str]:
         named += [(n, name if len(flat) == 1 else f"{name}_{i}") for i, n in enumerate(flat)]
     for nodes, given in ((traced.q, lowered.coordinates), (traced.u, lowered.speeds), (traced.inputs, lowered.inputs)):
         named += zip(nodes.tolist(), given, strict=True)
+    named += [(n, str(lowered.graph.value[n])) for n in lowered.usual]
     names: dict[int, str] = {}
     taken = {"fixed", "math", "sign"}
     for n, name in named:
@@ -94,8 +95,9 @@ def python_source(lowered) -> str:
     names, rates = identifiers(lowered), results(lowered)
     c, k, s = (_prefix(letter, names.values()) for letter in "cks")
     parameters = [names[int(n)] for nodes in lowered.traced.parameters for n in np.ravel(nodes)]
-    first, fixed = statements(lowered.graph, lowered.fixed, names, PYTHON, c)
-    known = names | {n: f"{k}{i}" for i, n in enumerate(lowered.fixed)}
+    used = lowered.graph.fixed(rates.values())
+    first, fixed = statements(lowered.graph, used, names, PYTHON, c)
+    known = names | {n: f"{k}{i}" for i, n in enumerate(used)}
     second, outputs = statements(lowered.graph, list(rates.values()), known, PYTHON, s)
     given = [lowered.traced.t, *lowered.traced.q, *(lowered.traced.u[i] for i in lowered.independent), *lowered.traced.inputs]
     state = ", ".join(names[int(n)] for n in given)

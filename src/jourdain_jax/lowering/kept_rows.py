@@ -29,7 +29,7 @@ class KeptRows:
         """The accelerations under all rows, and what must not vanish on the way."""
         if self.by_partition:
             return self._partition.accelerations(M, f, A, drift, forms)
-        return accelerations_by_multipliers(self.graph, self._inertia(M, A), f, A, drift, forms)
+        return accelerations_by_multipliers(self.graph, self._inertia(M, A), f, A, drift, self.probes, forms)
 
     def projected_speeds(self, M: Columns, u: list[int], phi: list[int], forms=None) -> list[int]:
         """The speeds on `phi = 0`."""

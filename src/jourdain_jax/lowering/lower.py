@@ -25,7 +25,7 @@ from jourdain_jax.lowering.blame import blamed
 from jourdain_jax.lowering.elimination import serves, usual
 from jourdain_jax.lowering.far import full_turns, on_velocity_rows
 from jourdain_jax.lowering.kept_rows import KeptRows
-from jourdain_jax.lowering.lowered import Lowered, Stage, fixed_nodes
+from jourdain_jax.lowering.lowered import Lowered, Stage
 from jourdain_jax.lowering.massless import may_be_massless
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.formal import FormalProbes, equal
@@ -215,7 +215,9 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         stages=tuple(stages),
         way=builder.kept.description if builder.kept else way.description,
         seconds=time.perf_counter() - begin,
-        fixed=fixed_nodes(graph, outputs),
+        fixed=graph.fixed(outputs),
+        usual=best.usual,
+        states={n: probes.inputs[str(graph.value[n])] for n in graph.reachable(best.usual.values()) if graph.op[n] == "input" and graph.varies[n]},
     )
 
 

@@ -60,6 +60,8 @@ class Lowered:
     way: str  # which way of building it took fewest operations
     seconds: float  # that lowering took
     fixed: tuple[int, ...]  # nodes that depend on parameters alone, computed once per motion
+    usual: dict[int, int]  # inputs that stand for what a node usually is, with that node
+    states: dict[int, Float[np.ndarray, "probes"]]  # time, coordinates and speeds at which that is found
 
     @property
     def graph(self) -> Graph:
@@ -119,11 +121,18 @@ class Lowered:
             owners = {place[a][0] for a in args if a in place} if self.graph.op[n] == "array" and all(a in place for a in args) else ()
             if len(owners) == 1:  # entries of one parameter: taken together
                 known[n] = leaves[owners.pop()][np.array([place[a][1] for a in args])].reshape(self.graph.value[n][0])
-        for n in self.graph.needed(self.fixed, known):
+        for n in self.graph.needed([*self.fixed, *self.usual.values()], known):
             if n in place:
                 leaf, i = place[n]
                 known[n] = leaves[leaf][i]
-        return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known))
+        return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known | self._usual_values(known)))
+
+    def _usual_values(self, parameters: dict) -> dict[int, Float[Array, ""]]:
+        """What stands for usual values: medians over `states`, for these parameters."""
+        if not self.usual:
+            return {}
+        found = run(self.graph, list(self.usual.values()), parameters | {n: jnp.asarray(x) for n, x in self.states.items()})
+        return {n: jax.lax.stop_gradient(jnp.nanmedian(jnp.asarray(x))) for n, x in zip(self.usual, found, strict=True)}
 
     def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Float[Array, "*lanes"] | None]:
         """`qdot` and `ydot`, tuples of scalars, and the power (W) where `with_power` asks for it; NaN where a guard is not positive.
@@ -220,12 +229,3 @@ class Lowered:
     def calls(self) -> tuple[str, ...]:
         """Why each call of JAX in the rates and stop events is one: a part of a load or event that has no scalar form."""
         return tuple(self.graph.value[n].reason for n in self.graph.calls([*self.qdot, *self.ydot, *self.events]))
-
-
-def fixed_nodes(graph: Graph, outputs) -> tuple[int, ...]:
-    """Nodes that depend on parameters alone and are used by varying ones."""
-    found: set[int] = set()
-    for node in graph.reachable(outputs):
-        if graph.varies[node]:
-            found.update(a for a in graph.args[node] if not graph.varies[a] and graph.op[a] != "const")
-    return tuple(sorted(found | {n for n in outputs if not graph.varies[n] and graph.op[n] != "const"}))

@@ -6,21 +6,27 @@
 
 S is symmetric and positive definite where the rows are independent, and as sparse as the rows are local: tridiagonal for a chain. What is
 left of a diagonal entry of S after elimination, relative to the entry, is the squared sine of the angle between that row and those before it.
-Accelerations lose as many digits as that square is small.
+Accelerations lose as many digits as that square is small. A row that vanishes at some configuration makes no small angle, but a small entry: entries
+are therefore compared with what they usually are, at the states where the scene was probed, for the parameters of the motion.
 
 Where M is singular, though no admissible velocity is without inertia, M + A' W A stands in its place: A udot is known, so only the multipliers change.
 """
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.calculus.pseudo_inverse import undecided
 from jourdain_jax.lowering.elimination import quotient, solve_symmetric
 from jourdain_jax.program.derivative import columns
+from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 
 Columns = list[list[int]]
 
 
-LEAST_SQUARE = 1e-8  # of a sine: below it rows count as dependent, and the program does not serve
+LEAST = 1e-4  # sine, or length of a row beside its usual one: below it rows count as dependent, and the program does not serve
 
 
 class Accelerations(NamedTuple):
@@ -28,11 +34,12 @@ class Accelerations(NamedTuple):
 
     udot: list[int]
     sines: list[int]  # one per row, between that row and those before it; or the pivots of privileged speeds
-    margins: list[int]  # of the former: must stay positive: squared sines above their least, times the diagonal entry
+    margins: list[int]  # must stay positive: what is left of each entry, above its least
+    usual: dict[int, int]  # inputs for the usual value of an entry, with the node of that entry
 
 
-def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], forms=None) -> Accelerations:
-    """The accelerations under all rows."""
+def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], probes: Probes, forms=None) -> Accelerations:
+    """The accelerations under all rows; at `probes` usual entries are found."""
     *impulses, free = (list(column) for column in solve_symmetric(graph, M, [*A, f]).solution)  # M^-1 A' column by column, M^-1 f
     S = _products(graph, A, impulses, forms)
     for r in range(len(A)):
@@ -44,9 +51,16 @@ def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Colu
     solved = solve_symmetric(graph, S, [right])
     multipliers = solved.solution[0]
     udot = [graph.add(w, graph.total(graph.mul(x[k], m) for x, m in zip(impulses, multipliers, strict=True))) for k, w in enumerate(free)]
-    left = [(pivot, S[r][r]) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
-    sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, diagonal))) for pivot, diagonal in left]
-    return Accelerations(udot, sines, [graph.sub(pivot, graph.mul(graph.const(LEAST_SQUARE), diagonal)) for pivot, diagonal in left])
+    left = [(r, pivot) for r, pivot in enumerate(solved.pivots) if graph.varies[pivot]]
+    sines = [graph.call("sqrt", graph.call("max", graph.zero, graph.div(pivot, S[r][r]))) for r, pivot in left]
+    least = max(LEAST, undecided(jnp.result_type(float))) ** 2
+    usual = {graph.input(f"usual_{r}", False): S[r][r] for r, _ in left}
+    margins = []
+    for (r, pivot), (size, entry) in zip(left, usual.items(), strict=True):
+        values = np.abs(probes([entry])[0])
+        probes.inputs[f"usual_{r}"] = np.full(probes.count, np.median(values[np.isfinite(values)]) if np.isfinite(values).any() else np.nan)
+        margins.append(graph.sub(pivot, graph.mul(graph.const(least), graph.call("max", entry, size))))
+    return Accelerations(udot, sines, margins, usual)
 
 
 def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, weights: list[float]) -> Columns:

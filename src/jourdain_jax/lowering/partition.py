@@ -38,7 +38,7 @@ class Partition:
             for j in range(i + 1):
                 inertia[i][j] = inertia[j][i] = simple(graph.dot(C[i], moved[j]))
         ydot = solve_symmetric(graph, inertia, [[simple(graph.dot(column, rest)) for column in C]]).solution[0]
-        return Accelerations([graph.add(graph.dot([column[k] for column in C], ydot), c[k]) for k in speeds], found.pivots, [])
+        return Accelerations([graph.add(graph.dot([column[k] for column in C], ydot), c[k]) for k in speeds], found.pivots, [], {})
 
     def projected_speeds(self, u: list[int], phi: list[int]) -> list[int]:
         """The speeds on `phi = 0`, the independent ones as they are."""

@@ -20,6 +20,7 @@ from jourdain_jax.equations.power import needs_work
 from jourdain_jax.equations.probing import described_once
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.structure import Structure, structure_of
+from jourdain_jax.equations.usual_lengths import usual_lengths
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.arguments import check_options
@@ -241,6 +242,7 @@ def state_form(
         of_inputs=structure.potentials_of_inputs,
         affine=structure.affine,
         inputs_in_rows=inputs_in_rows,
+        usual=usual_lengths(scene) if program is None else None,
         cutoff=cutoff,
     )
 

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
+from jourdain_jax.calculus.pseudo_inverse import passing_cutoff, undecided
 from jourdain_jax.equations.accelerations import Baumgarte, bare_accelerations
 from jourdain_jax.equations.explicit_power import stored_by_inputs
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -20,8 +20,9 @@ from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics,
 from jourdain_jax.equations.power import rate_of_work
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
-from jourdain_jax.equations.structure import WELL_CONDITIONED, Structure, closure_lengths, usual_rows
+from jourdain_jax.equations.structure import WELL_CONDITIONED, Structure
 from jourdain_jax.equations.trace import event_values
+from jourdain_jax.equations.usual_lengths import UsualLengths
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.scene.scene import Scene
 
@@ -49,6 +50,7 @@ class StateForm(eqx.Module):
     recovered: tuple[int, ...] = eqx.field(static=True, default=())  # numbers of the coordinates that do not decide the step size
     own_equations: str = eqx.field(static=True, default="")  # of a solver that takes no accelerations: what it solves instead
     inputs_in_rows: bool = eqx.field(static=True, default=False)  # some change in time, and rows depend on them: their rates are needed
+    usual: UsualLengths | None = None  # of the rows, for dense matrices
     cutoff: float | None = eqx.field(static=True, default=None)  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     @property
@@ -128,13 +130,27 @@ class StateForm(eqx.Module):
 
     @property
     def has_pivots(self) -> bool:
-        """Whether a change of sign of some pivot loses the state: the minimal one, where rows leave any speed dependent."""
+        """Whether steps in which some pivot changes its sign are tried again: in them the state, or a row that it is kept on, is lost."""
         if self.lowered is not None:
             return self.independent is not None and bool(self.lowered.pivots)
-        return self.independent is not None
+        return self.independent is not None or self._passes_losses_of_rank
+
+    @property
+    def _passes_losses_of_rank(self) -> bool:
+        """Whether rows below a cut-off are left out for as long as they are."""
+        return self.independent is None and isinstance(self.reduction, NullSpaceQR) and self.reduction.cutoff is not None
+
+    @staticmethod
+    def _decided(pivot: Float[Array, ""]) -> Float[Array, ""]:
+        """1 where the rows say on which branch the motion goes on, -1 where round-off does."""
+        return jnp.where(pivot > undecided(pivot.dtype), 1.0, -1.0).astype(pivot.dtype)
 
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots *lanes"]]:
-        """As `rates`, and what must keep its sign: the pivots of a lowered elimination relative to their usual sizes, otherwise the sign of det A_z."""
+        """As `rates`, and what must keep its sign.
+
+        These are the pivots of a lowered elimination relative to their usual sizes, the sign of det A_z, or, for the full state by the null space, 1 where all
+        rows count and -1 where one is round-off.
+        """
         if self.lowered is not None:
             qdot, vdot, power_now, pivots = self.lowered.rates_and_pivots(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
             return Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power_now), jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
@@ -144,20 +160,23 @@ class StateForm(eqx.Module):
         else:
             u = y.v if known is None else known.u
             motion = motion_at(scene, t, y.q, u, inputs)
-            found = bare_accelerations(scene, t, y.q, u, inputs, reduction=self.reduction, stabilisation=self.stabilisation)
+            usual = None if self.usual is None else self.usual.rows
+            found = bare_accelerations(scene, t, y.q, u, inputs, reduction=self.reduction, stabilisation=self.stabilisation, usual=usual)
         v = found.udot if self.independent is None else found.udot[jnp.array(self.independent, jnp.int32)]
         rates = Integrated(motion.qdot.array, v, rate_of_work(scene, motion, found, self.of_inputs) if self.with_work else None)
-        return rates, jnp.zeros(0, y.q.dtype) if known is None else known.split.orientation()[None]
+        if known is not None:
+            return rates, known.split.orientation()[None]
+        return rates, self._decided(found.pivot)[None] if self._passes_losses_of_rank else jnp.zeros(0, y.q.dtype)
 
     def project(self, scene: Scene, fixed, t, y: Integrated, inputs, iterations: int = 2) -> Integrated:
         """The state put back onto geometric rows, quaternion norms and (full state) velocity rows; lanes only where it is lowered."""
         if self.lowered is not None:
             q, v = self.lowered.projected(fixed, t, tuple(y.q), tuple(y.v), inputs, self.affine)
             return Integrated(jnp.stack(q), jnp.stack(v) if v else y.v, y.work)
-        q = project_positions(scene, t, y.q, iterations=iterations, typical=closure_lengths(scene)) if self.projects_positions else y.q
+        q = project_positions(scene, t, y.q, iterations=iterations, typical=self.usual.closures) if self.projects_positions else y.q
         v = y.v
         if self.projects_speeds:
-            v = project_speeds(scene, t, q, v, inputs, iterations=iterations, cutoff=self.cutoff, typical=usual_rows(scene).lengths)
+            v = project_speeds(scene, t, q, v, inputs, iterations=iterations, cutoff=self.cutoff, typical=self.usual.rows.lengths)
         return Integrated(q, v, y.work)
 
 

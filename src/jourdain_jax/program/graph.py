@@ -301,6 +301,12 @@ class Graph:
                 stack.extend(a for a in self.args[node] if a not in known)
         return sorted(seen)  # arguments are older than what uses them
 
+    def fixed(self, outputs: Iterable[int]) -> tuple[int, ...]:
+        """What depends on parameters alone and is used by varying nodes."""
+        outputs = list(outputs)
+        found = {a for n in self.reachable(outputs) if self.varies[n] for a in self.args[n]} | set(outputs)
+        return tuple(sorted(n for n in found if not self.varies[n] and not self.is_const(n)))
+
     def looked_at(self, outputs: Iterable[int]) -> list[int]:
         """What decides between branches on the way to the outputs: arguments of comparisons, magnitudes and signs."""
         return [a for node in self.reachable(outputs) if self.op[node] in BRANCHES for a in self.args[node]]

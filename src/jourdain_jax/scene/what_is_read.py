@@ -203,9 +203,9 @@ class _Reader:
 
     def _class(self, kind: type, depth: int) -> Hashable:
         own: list[Hashable] = [self._identity(kind)]
-        # a scene of this package counts too: someone may replace its methods
+        # of a scene all its classes count: someone may replace methods of this package's too, and a class made by `type(...)` bears another module's name
         for owner in kind.__mro__[: next((k for k, owner in enumerate(kind.__mro__) if owner.__module__ == _BASE), None)]:
-            if not _is_package(owner.__module__) or (depth == 0 and owner.__module__.startswith(_PACKAGE)):
+            if depth == 0 or not _is_package(owner.__module__):
                 self.members.append(vars(owner))
                 own += [(name, self.key(member, depth + 1)) for name, member in vars(owner).items() if not _is_bookkeeping(name)]
         return tuple(own)
