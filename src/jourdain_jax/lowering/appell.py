@@ -25,7 +25,6 @@ from jourdain_jax.program.formal import FormalProbes, equal, formal, on_rows, un
 from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
 
 
-
 @dataclass(frozen=True)
 class Strategy:
     """How the equations are built; all give the same values."""
