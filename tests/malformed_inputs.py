@@ -447,37 +447,37 @@ FILES: dict[str, Case] = {
     "jj.load_trajectory('empty.npz', Bead)": ("ValueError", "`empty.npz` is no trajectory file, or is damaged (No data left in file)"),
     "jj.load_trajectory('text.npz', Bead)": ("ValueError", "`text.npz` is no trajectory file, or is damaged"),
     "jj.load_trajectory('.', Bead)": ("ValueError", "`.` is no trajectory file, or is damaged ([Errno 21] Is a directory: '.')"),
-    "jj.load(3.5, Bead)": ("ValueError", "`path` is a float, expected the name of a file"),
+    "jj.load_trajectory(3.5, Bead)": ("ValueError", "`path` is a float, expected the name of a file"),
     "jj.load_trajectory('run.npz', 3)": ("ValueError", "`scene` is an int, expected the class of the scene that moved, or any scene of that class"),
     "jj.load_trajectory('run.npz', ChaplyginSleigh)": (
         "ValueError",
         "`run.npz` holds a trajectory of `Bead`, expected `ChaplyginSleigh`; pass the class it was made with",
     ),
-    "jj.load(rewritten('noq.npz', q=None), Bead)": ("ValueError", "`noq.npz` lacks `q`; it is damaged or was not written by `save`"),
-    "jj.load(rewritten('shape.npz', q=ARRAYS['q'][:, :1]), Bead)": (
+    "jj.load_trajectory(rewritten('noq.npz', q=None), Bead)": ("ValueError", "`noq.npz` lacks `q`; it is damaged or was not written by `save`"),
+    "jj.load_trajectory(rewritten('shape.npz', q=ARRAYS['q'][:, :1]), Bead)": (
         "ValueError",
         "`shape.npz` has 1 columns for 2 coordinates; it is damaged or was not written by `save`",
     ),
-    "jj.load(rewritten('later.npz', format=9), Bead)": (
+    "jj.load_trajectory(rewritten('later.npz', format=9), Bead)": (
         "ValueError",
         "`later.npz` has format 9, expected 1; read it with the version of jourdain-jax that wrote it",
     ),
-    "jj.load(rewritten('bare.npz', solver=None), Bead)": ("ValueError", "`bare.npz` lacks `solver`; it is damaged or was not written by `save`"),
-    "jj.load(rewritten('headless.npz', header=None), Bead)": ("ValueError", "`headless.npz` is no trajectory file, or is damaged ('header')"),
-    "jj.load(rewritten('broken.npz', header=np.array('{')), Bead)": (
+    "jj.load_trajectory(rewritten('bare.npz', solver=None), Bead)": ("ValueError", "`bare.npz` lacks `solver`; it is damaged or was not written by `save`"),
+    "jj.load_trajectory(rewritten('headless.npz', header=None), Bead)": ("ValueError", "`headless.npz` is no trajectory file, or is damaged ('header')"),
+    "jj.load_trajectory(rewritten('broken.npz', header=np.array('{')), Bead)": (
         "ValueError",
         "`broken.npz` is no trajectory file, or is damaged (Expecting property name",
     ),
-    "jj.load(rewritten('listed.npz', header=np.array('[1]')), Bead)": (
+    "jj.load_trajectory(rewritten('listed.npz', header=np.array('[1]')), Bead)": (
         "ValueError",
         "`listed.npz` is no trajectory file, or is damaged (its header is no dictionary)",
     ),
-    "jj.load(rewritten('other.npz', coordinates=['r', 'phi']), Bead)": ("ValueError", "the file holds the coordinates r, phi, but `Bead` has x, y"),
-    "jj.load(rewritten('minus.npz', parameter_mass=np.array(-1.0)), Bead)": (
+    "jj.load_trajectory(rewritten('other.npz', coordinates=['r', 'phi']), Bead)": ("ValueError", "the file holds the coordinates r, phi, but `Bead` has x, y"),
+    "jj.load_trajectory(rewritten('minus.npz', parameter_mass=np.array(-1.0)), Bead)": (
         "ValueError",
         "parameter `mass` of `Bead` is -1.0, expected a positive number in kg",
     ),
-    "jj.load(rewritten('more.npz', parameter_load=np.array(1.0)), Bead)": ("ValueError", "`more.npz` has a parameter `load` that `Bead` has not"),
+    "jj.load_trajectory(rewritten('more.npz', parameter_load=np.array(1.0)), Bead)": ("ValueError", "`more.npz` has a parameter `load` that `Bead` has not"),
     "jj.save(run, 'nowhere/run.npz')": ("ValueError", "cannot write `nowhere/run.npz`: there is no folder `nowhere`; make it first"),
     "jj.save(run, '.')": ("ValueError", "cannot write `.`: it is a folder; give the name of a file in it, such as motion.npz"),
     "jj.save(run, 3.5)": ("ValueError", "`path` is a float, expected the name of a file"),

@@ -305,7 +305,7 @@ class FarWall(Effective):
 def test_what_a_call_depends_on_is_not_left_out_though_no_probe_shows_it():
     scene = FarWall()
     program = jj.lower(scene)
-    assert program.held == program.recoverable() == ()
+    assert program.held == ()
     fixed = program.fixed_values(scene)
     _, ydot, _ = jax.jit(lambda x: program.rates(fixed, 0.0, (x,), (0.0 * x,), jnp.zeros(0)))(15.0)
     np.testing.assert_allclose(ydot, [-25.0])

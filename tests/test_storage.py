@@ -132,26 +132,6 @@ def test_damaged_and_foreign_files_are_refused_with_the_reason(files, tmp_path):
         jj.load_rollout(tmp_path / "none.npz", TiltingDisc)
 
 
-def test_files_written_before_later_fields_existed_are_read_with_what_was_true_then(discs, files, tmp_path):
-    later = ("last_step", "fallback", "quadrature_error")
-    first = lambda header: {name: value for name, value in header.items() if name not in ("ways", "recovered", "kind")}  # noqa: E731
-    rewritten(files / "trajectory.npz", tmp_path / "trajectory.npz", first, later)
-    loaded = jj.load_trajectory(tmp_path / "trajectory.npz", TiltingDisc)
-    np.testing.assert_array_equal(loaded.q, discs.lane(0).q)
-    assert (int(loaded.fallback), float(loaded.quadrature_error), loaded.recovered) == (results.AS_ASKED, 0.0, ())
-    assert np.isnan(float(loaded.last_step))
-    assert "recovered" not in str(loaded)
-    rewritten(files / "rollout.npz", tmp_path / "rollout.npz", lambda h: first(h) | {"kind": "rollout"}, later, continued=np.array([2]))
-    lanes = jj.load_rollout(tmp_path / "rollout.npz", TiltingDisc)
-    assert lanes.lanes.fallback.tolist() == [results.AS_ASKED, results.AS_ASKED, results.FULL_STATE]
-    assert lanes.ways == ()
-    assert jax.tree.map(lambda x: x.dtype, lanes.lanes) == jax.tree.map(lambda x: x.dtype, discs.lanes)
-
-
-def test_the_first_name_of_reading_a_trajectory_still_serves(files):
-    assert_equal_to_the_bit(jj.load(files / "trajectory.npz", TiltingDisc), jj.load_trajectory(files / "trajectory.npz", TiltingDisc))
-
-
 def test_a_field_that_cannot_be_stored_is_named(tmp_path):
     class Labelled(ChaplyginSleigh):
         labels: tuple = eqx.field(static=True, default=("a",))

@@ -69,7 +69,7 @@ from jourdain_jax.motion.rollout import Rollout, rollout
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import State, consistent, start
-from jourdain_jax.motion.storage import load, load_rollout, load_trajectory, save
+from jourdain_jax.motion.storage import load_rollout, load_trajectory, save
 from jourdain_jax.motion.trajectory import Trajectory
 from jourdain_jax.motion.versions import version_of as _version_of
 from jourdain_jax.plotting.animation import animate
@@ -157,7 +157,6 @@ __all__ = [
     "knife_edge",
     "lagrange_equations",
     "linearize",
-    "load",
     "load_rollout",
     "load_trajectory",
     "log_likelihood",

@@ -7,7 +7,6 @@ were probed with numbers near the class's defaults.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.equations.probed import generic_inputs
@@ -25,13 +24,13 @@ class UsualLengths(eqx.Module):
     """Of the rows in scaled speeds, with their rank; and of geometric rows and quaternion norms in the coordinates."""
 
     rows: UsualRows
-    closures: Float[Array | np.ndarray, "closures"]
+    closures: Float[Array, "closures"]
 
 
 def usual_lengths(scene: Scene) -> UsualLengths:
     """The usual lengths for the parameters of `scene`; no derivative passes through them."""
     if not is_traced(scene):
-        return UsualLengths(usual_rows(scene), closure_lengths(scene))
+        return UsualLengths(jax.tree.map(jnp.asarray, usual_rows(scene)), jnp.asarray(closure_lengths(scene)))
     known = structure_of(scene)
     count = min(STATES, known.random)
     t, q, inputs = jnp.asarray(known.times[:count]), jnp.asarray(known.coordinates[:count]), jnp.asarray(generic_inputs(scene))
@@ -45,7 +44,7 @@ def usual_lengths(scene: Scene) -> UsualLengths:
     scaled, plain = (_usual(x) for x in jax.vmap(lengths)(t, q))
     norms = jnp.ones(len(scene.coordinates.quaternions), plain.dtype)
     closures = jnp.concatenate([plain[: len(names_of_position_rows(scene))], norms])
-    return UsualLengths(UsualRows(scaled, np.asarray(known.rank, np.int32)), closures)
+    return UsualLengths(UsualRows(scaled, jnp.asarray(known.rank, jnp.int32)), closures)
 
 
 def _usual(lengths: Float[Array, "states rows"]) -> Float[Array, "rows"]:

@@ -19,7 +19,6 @@ def summary(lowered) -> str:
         *(f"  {stage.operations:6d} operations: {stage.name}" for stage in lowered.stages),
         *_speeds(lowered),
         f"  left out of the accelerations, which do not depend on them: {', '.join(lowered.held) or 'nothing'}",
-        f"  recoverable by quadrature, as nothing else depends on them: {', '.join(lowered.coordinates[i] for i in lowered.recoverable()) or 'none'}",
         *(f"  kept as a call of JAX, as it has no scalar form: {reason}" for reason in lowered.calls),
         *([f"  rows left out, as the others imply them: {', '.join(lowered.left_out)}"] if lowered.left_out else []),
         f"  parameters, which stay inputs (SI units and radians): {_parameters(lowered) or 'none'}",

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, Num
 from jourdain_jax.equations.trace import TracedScene
 from jourdain_jax.lowering import export
 from jourdain_jax.lowering.jacobian import differentiable
-from jourdain_jax.lowering.recoverable import recoverable
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import ARRAYS, Graph
 from jourdain_jax.scene.scene import Scene
@@ -72,21 +71,6 @@ class Lowered:
     def operations(self) -> int:
         """Operations per evaluation of all rates."""
         return self.graph.operations([*self.qdot, *self.ydot])
-
-    def recoverable(self, events: bool = True, projected: bool = True) -> tuple[int, ...]:
-        """Numbers of the coordinates that a quadrature recovers: no acceleration, no rate of the others, no stop event and no projection depends on them.
-
-        `events`, `projected`: whether the motion stops at events, and whether its states are put back onto the rows.
-        """
-        q = self.traced.q.tolist()
-        wanted = self._coordinates_in([*self.ydot, *self.guards, *(self.events if events else ()), *(self.projected_u if projected else ())])
-        for i, n in enumerate(self.projected_q if projected else ()):
-            wanted |= {i} | self._coordinates_in([n]) if n != q[i] else set()
-        return recoverable({i: self._coordinates_in([n]) for i, n in enumerate(self.qdot)}, wanted)
-
-    def _coordinates_in(self, nodes) -> frozenset[int]:
-        numbers = {int(n): i for i, n in enumerate(self.traced.q)}
-        return frozenset(numbers[n] for n in self.graph.reachable(nodes) if n in numbers)
 
     def summary(self) -> str:
         """Operations after each step, what was dropped and why, the chosen privileged speeds."""

@@ -39,7 +39,6 @@ class Record(Protocol):
     rejected: Int[Array, ""]
     last_step: Float[Array, ""]
     fallback: Int[Array, ""]
-    quadrature_error: Float[Array, ""]
     moved_q: Float[Array, ""]
     moved_u: Float[Array, ""]
     smallest_pivot: Float[Array, ""]
@@ -47,7 +46,6 @@ class Record(Protocol):
     reduction: str
     solver: str
     projected: bool
-    recovered: tuple[str, ...]
 
 
 def along(f, record: Record, by_inputs: bool = False):

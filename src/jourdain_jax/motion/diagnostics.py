@@ -14,7 +14,6 @@ from jourdain_jax.equations.reactions import ContactForce
 from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.equations.structure import structure_of, usual_rows
 from jourdain_jax.motion.along import Record, accelerations_along, contact_forces_along, energies, invariants, residuals
-from jourdain_jax.motion.recovery import TOO_LONG
 from jourdain_jax.motion.results import FALLBACKS
 
 
@@ -154,11 +153,6 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
             f"the clock resolves {resolved:.0e} s at these times, and steps are of {step:.0e} s: loads, poses and inputs that depend on time are given "
             "rounded times; count time from zero, or take float64"
         )
-    if float(trajectory.quadrature_error) > TOO_LONG:
-        warned.append(
-            f"steps were too long for the recovered coordinates {', '.join(trajectory.recovered)}: in one step {float(trajectory.quadrature_error):.0e} times "
-            "the error that the tolerances let pass; give more times to save at, or leave `recover`"
-        )
     pulled = [name for name, contact in found.contacts.items() if not contact.honest]
     return (*warned, *(f"contact `{name}` would have to pull: a real one lifts off" for name in pulled))
 
@@ -175,7 +169,6 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
         ("solver", f"{trajectory.solver}, {int(trajectory.accepted)} steps accepted, {int(trajectory.rejected)} rejected"),
         *([("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again "))] if int(trajectory.fallback) else []),
         ("state", f"{trajectory.state_form}, reduction: {trajectory.reduction}" + (", projected after each step" if trajectory.projected else "") + pivot),
-        *([("recovered", _recovered_text(trajectory))] if trajectory.recovered else []),
         ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}"),
         ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
         ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),
@@ -184,11 +177,6 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
     rows += [(f"invariant {name}", f"drift {float(drift):.2e}") for name, drift in found.invariant_drifts.items()]
     rows += [(f"contact {name}", _contact_text(contact)) for name, contact in found.contacts.items()]
     return rows + [("warning", text) for text in warnings_of(found, trajectory) if not text.startswith("contact")]
-
-
-def _recovered_text(trajectory: Record) -> str:
-    error = float(trajectory.quadrature_error)
-    return f"{', '.join(trajectory.recovered)} by quadrature; error in one step at most {error:.1e} of what the tolerances let pass"
 
 
 def _contact_text(contact: ContactExtremes) -> str:

@@ -38,8 +38,8 @@ def next_way(form: StateForm, motion: Trajectory, t0, options: dict) -> int:
 
 def changed_options(ways: int, max_steps: int) -> dict:
     """Which options of `simulate` make the ways; `max_steps`: as was asked for."""
-    full = {"state": "full", "lowering": False, "recover": None} if ways & results.FULL_STATE else {}
-    implicit = {"solver": RadauIIA(), "max_steps": implicit_steps(max_steps), "recover": None} if ways & results.IMPLICIT else {}
+    full = {"state": "full", "lowering": False} if ways & results.FULL_STATE else {}
+    implicit = {"solver": RadauIIA(), "max_steps": implicit_steps(max_steps)} if ways & results.IMPLICIT else {}
     return full | implicit
 
 

@@ -7,23 +7,17 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.motion.recovery import is_among
 from jourdain_jax.motion.state_form import Integrated
 
 
-class StateNorm(eqx.Module):
-    """Root mean square over coordinates and speeds; the work that rides along and recovered coordinates do not decide the step size.
+def state_norm(y: Integrated) -> Float[Array, "*lanes"]:
+    """Root mean square over coordinates and speeds; the work that rides along does not decide the step size.
 
     What is not a number counts as infinite: the step shrinks and the motion ends, where NaN would be tried until the last allowed step.
     """
-
-    recovered: tuple[int, ...] = eqx.field(static=True, default=())
-
-    def __call__(self, y: Integrated) -> Float[Array, "*lanes"]:
-        q = jnp.where(is_among(self.recovered, y.q), 0.0, y.q) if self.recovered else y.q
-        squared = sum(jnp.sum(part**2, axis=0) for part in (q, y.v)) / (len(q) + len(y.v) - len(self.recovered))
-        squared = jnp.where(jnp.isnan(squared), jnp.inf, squared)
-        return jnp.where(squared == 0, 0.0, jnp.sqrt(jnp.where(squared == 0, 1.0, squared)))
+    squared = sum(jnp.sum(part**2, axis=0) for part in (y.q, y.v)) / (len(y.q) + len(y.v))
+    squared = jnp.where(jnp.isnan(squared), jnp.inf, squared)
+    return jnp.where(squared == 0, 0.0, jnp.sqrt(jnp.where(squared == 0, 1.0, squared)))
 
 
 @eqx.filter_jit  # traced once, not once per stage and derivative

@@ -28,7 +28,6 @@ from jourdain_jax.motion.knots import knots_between
 from jourdain_jax.motion.land_on import land_on, merged
 from jourdain_jax.motion.lockstep import in_blocks, width
 from jourdain_jax.motion.quick_compilation import quickly_compiled
-from jourdain_jax.motion.recovery import LargestError
 from jourdain_jax.motion.solver_choice import controller_of, marked_inputs, marked_outputs, since, steps_are_given, time_origin
 from jourdain_jax.motion.span import fitting_times, times_fit
 from jourdain_jax.motion.start import State
@@ -74,7 +73,6 @@ class Solved(eqx.Module):
     accepted: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
     last_step: Float[Array, "*lanes"]  # s, that the step-size control would take next; NaN where it keeps that to itself
-    quadrature_error: Float[Array, "*lanes"]  # largest, in one step, of the recovered coordinates, relative to what the step-size control lets pass
     pivot: Float[Array, "*lanes"]  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was watched
 
 
@@ -192,7 +190,6 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         accepted=solved.accepted,
         rejected=solved.rejected,
         last_step=solved.last_step,
-        quadrature_error=solved.quadrature_error,
         fallback=jnp.zeros((), jnp.int32) + results.AS_ASKED,
         moved_q=start.moved_q,
         moved_u=start.moved_u,
@@ -202,7 +199,6 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         reduction=form.reduction_name,
         solver=type(options.solver).__name__,
         projected=moving,
-        recovered=tuple(scene.coordinate_names.entries[i] for i in form.recovered),
         event_names=options.event_names,
     )
 
@@ -240,20 +236,18 @@ def _lean(setup: Setup, y0, args, ts, knots, rates, rates_and_pivots, project, e
         args=args,
         project=project,
         events=events,
-        norm=integrands.StateNorm(setup.form.recovered),
+        norm=integrands.state_norm,
         rtol=jnp.broadcast_to(options.tolerances[0], setup.t0.shape),
         atol=jnp.broadcast_to(options.tolerances[1], setup.t0.shape),
         shortest=_shortest(setup.t1 - setup.t0),
         max_steps=options.max_steps + (0 if knots is None else len(knots)),
         knots=knots,
-        unseen=LargestError(setup.form.recovered) if setup.form.recovered else None,
         rates_and_pivots=rates_and_pivots if setup.form.has_pivots else None,
     )
     kind: Literal["forward", "reverse"] = "forward" if isinstance(options.adjoint, diffrax.ForwardMode) else "reverse"
     ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, options.dt0, kind)
-    unseen = jnp.zeros_like(end.h) if end.unseen is None else end.unseen
     ys = jax.tree.map(lambda x: x[:-1], ys)
-    return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, unseen, end.pivot)
+    return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, end.pivot)
 
 
 def _knots(setup: Setup) -> Float[Array, "knots"] | None:
@@ -278,7 +272,7 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
     land = (options.land or knots is not None) and controller is None
     controller = options.controller if controller is None else controller
     if controller is None:
-        controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.StateNorm(), dtmin=_shortest(t1 - t0), force_dtmin=False)
+        controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=_shortest(t1 - t0), force_dtmin=False)
     saveat = diffrax.SaveAt(ts=ts) if options.saveat is None else since(options.saveat, origin)
     moving = form.projects_positions or form.projects_speeds
     solver = for_adjoint(options.solver, options.adjoint)
@@ -328,7 +322,6 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
         accepted=solution.stats["num_accepted_steps"],
         rejected=solution.stats["num_rejected_steps"],
         last_step=jnp.full_like(t_end, jnp.nan),
-        quadrature_error=jnp.zeros_like(t_end),
         pivot=seen.pivot,
     )
 

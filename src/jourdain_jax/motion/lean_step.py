@@ -66,7 +66,6 @@ class Progress(eqx.Module):
     rejected: Int[Array, "*lanes"]
     event: Int[Array, "*lanes"]  # index of the event that ended the motion, or -1
     search: Search | None  # for that event
-    unseen: Float[Array, "*lanes"] | None  # largest error so far of what does not decide the step size, 1: as much as it lets pass
     pivot: Float[Array, "*lanes"]  # smallest magnitude so far of a pivot, at any stage of an accepted step
 
 
@@ -83,13 +82,8 @@ class Problem(eqx.Module):
     shortest: Float[Array, "*lanes"]
     max_steps: int = eqx.field(static=True)
     knots: Float[Array, "knots *lanes"] | None = None  # times at which a step must end, in the order of the motion; the last are infinite, with its sign
-    unseen: Callable | None = None  # of an error, relative to what step-size control lets pass: how large the part is that it does not see
     # as `rates`, and pivots (pivots, *lanes) that must keep their signs; None: the rates have none
     rates_and_pivots: Callable | None = None
-
-    def nothing_unseen(self, t: Float[Array, "*lanes"]) -> Float[Array, "*lanes"] | None:
-        """What `Progress.unseen` begins with."""
-        return None if self.unseen is None else jnp.zeros_like(t)
 
     def knot_ahead(self, p: "Progress", direction) -> Float[Array, "*lanes"]:
         """The time of the knot ahead, infinity with the sign of the motion where there is none."""
@@ -120,7 +114,7 @@ def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0, directi
 def standing(problem: Problem, y: PyTree, t: Float[Array, "*lanes"], h: Float[Array, "*lanes"], direction) -> Progress:
     """On the way, with no step behind and no event to search for."""
     zero = jnp.zeros(jnp.shape(t), jnp.int32)
-    return Progress(t, y, h, zero + RUNNING, problem.knots_passed(t, direction), zero, zero, zero - 1, None, problem.nothing_unseen(t), no_pivot(t))
+    return Progress(t, y, h, zero + RUNNING, problem.knots_passed(t, direction), zero, zero, zero - 1, None, no_pivot(t))
 
 
 def running(p: Progress, goal: Float[Array, "*lanes"]) -> Bool[Array, "*lanes"]:
@@ -167,9 +161,8 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     code = jnp.where(too_short, results.STEP_TOO_SMALL, RUNNING)
     code = jnp.where((code == RUNNING) & (accepted + rejected >= problem.max_steps) & ~(accept & (t1 == last_goal)), results.MAX_STEPS, code).astype(jnp.int32)
     y = jax.tree.map(lambda new, old: jnp.where(accept, as_in(new, old), old), y1, p.y)
-    unseen = None if problem.unseen is None else jnp.where(accept & ~locating, jnp.maximum(p.unseen, problem.unseen(relative)), p.unseen)
     passed = p.knot + (accept & ~locating & (t1 == knot)).astype(jnp.int32)
-    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, passed, accepted, rejected, p.event, p.search, unseen, p.pivot)
+    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, passed, accepted, rejected, p.event, p.search, p.pivot)
     if problem.events is not None:
         slopes = [jax.tree.map(lambda k, i=i: k[i], slopes) for i in (0, method.at_the_end)]  # first and last
         moved = _watched(problem, p, moved, h, slopes, accept & ~locating & (code == RUNNING))
@@ -292,4 +285,4 @@ def _watched(problem: Problem, p: Progress, moved: Progress, h, slopes, accept) 
     code = jnp.where(happened, LOCATING, jnp.where(found, results.EVENT, jnp.where(locating, LOCATING, moved.code))).astype(jnp.int32)
     tried = dips.astype(jnp.int32)
     knot = jnp.where(dips, p.knot, moved.knot)
-    return Progress(t, y, jax.lax.stop_gradient(next_h), code, knot, moved.accepted - tried, moved.rejected + tried, event, search, moved.unseen, moved.pivot)
+    return Progress(t, y, jax.lax.stop_gradient(next_h), code, knot, moved.accepted - tried, moved.rejected + tried, event, search, moved.pivot)

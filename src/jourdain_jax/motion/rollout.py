@@ -35,7 +35,7 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 CHUNK = 512  # lanes whose stages fit the cache of a core
-WAYS = ("state_form", "reduction", "solver", "projected", "recovered")  # static, of a trajectory
+WAYS = ("state_form", "reduction", "solver", "projected")  # static, of a trajectory
 MEMORY = 2**30  # bytes of saved states per chunk, at most
 
 

@@ -29,7 +29,6 @@ from jourdain_jax.motion.fixed_step import FixedStepSolver
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integration import Options, Setup, integrate
 from jourdain_jax.motion.marks import looked_after
-from jourdain_jax.motion.recovery import recovering
 from jourdain_jax.motion.sensitivity import watched
 from jourdain_jax.motion.solver_choice import check_solver, fitted
 from jourdain_jax.motion.span import span_and_start
@@ -70,7 +69,6 @@ def simulate(
     work: bool = True,
     land_on_ts: bool = True,
     lowering: bool = True,
-    recover: str | None = None,
 ) -> Trajectory:
     """Integrate a scene's equations of motion from `start` over [t0, t1].
 
@@ -93,9 +91,6 @@ def simulate(
       its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
     - `lowering`: integrate the scene's scalar program (`jj.lower`) where it has one and neither `reduction` nor `stabilisation` is given; with False,
       the dense matrices.
-    - `recover`: "quadrature" leaves coordinates on which nothing else depends (`jj.lower(scene)` names them: x, y, yaw and spin of a rolling disc) out of
-      the control of step sizes; they are integrated by the same steps and of the same order. With the scalar program and the default solvers only.
-      `trajectory.quadrature_error` says whether the steps were short enough for them, and a warning where they were not.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
 
     Where nothing is traced, a motion that leaves the domain of its privileged speeds is run again with the full state, and a stiff one by an implicit
@@ -130,7 +125,7 @@ def set_up(scene: Scene, start=None, **options) -> Setup:
 
 def _set_up(
     *, scene, start, t0, t1, ts, saveat, rtol, atol, solver, stepsize_controller, dt0, adjoint, max_steps, state, reduction, stabilisation,
-    projection, inputs, events, work, land_on_ts, lowering, recover,
+    projection, inputs, events, work, land_on_ts, lowering,
 ) -> Setup:  # fmt: skip
     scene = as_scene(scene)
     switches = {"projection": projection, "events": events, "work": work, "land_on_ts": land_on_ts, "lowering": lowering}
@@ -155,7 +150,6 @@ def _set_up(
         saveat=None if saveat is None else _checked_saveat(saveat),
         event_names=names_of_events(scene) if events else (),
     )
-    form = recovering(form, recover, options)
     start = _on_constraints(scene, t0, start, inputs, made_here) if projection else start
     return Setup(scene, start, inputs, t0, t1, ts, form, options)
 

@@ -47,7 +47,6 @@ class StateForm(eqx.Module):
     lowered: Lowered | None = eqx.field(static=True, default=None)  # the scalar program of the rates; None: dense matrices
     of_inputs: tuple[int, ...] = eqx.field(static=True, default=())  # numbers of the loads whose potential depends on inputs
     affine: bool = eqx.field(static=True, default=True)  # rows are, in the speeds
-    recovered: tuple[int, ...] = eqx.field(static=True, default=())  # numbers of the coordinates that do not decide the step size
     own_equations: str = eqx.field(static=True, default="")  # of a solver that takes no accelerations: what it solves instead
     inputs_in_rows: bool = eqx.field(static=True, default=False)  # some change in time, and rows depend on them: their rates are needed
     usual: UsualLengths | None = None  # of the rows, for dense matrices

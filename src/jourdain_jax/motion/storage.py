@@ -1,16 +1,14 @@
 """Saving and loading motions: NumPy's `.npz`, readable by anything that reads `.npz`.
 
 Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent where not tracked), `t_end`, `q_end`, `u_end`,
-`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `fallback`, `quadrature_error`, `inputs` (times, inputs;
+`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `fallback`, `inputs` (times, inputs;
 sampled at `ts`), and `parameter:NAME` for every field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
 `speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
-`state_form`, `reduction`, `solver`, `projected`, `event_names`, `recovered`, `arrays` (names of all arrays), `versions`.
+`state_form`, `reduction`, `solver`, `projected`, `event_names`, `arrays` (names of all arrays), `versions`.
 `kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `continued` holds
 the numbers of the lanes that were run again with the full state; `ways` in its header says how lanes with a `fallback` were run.
 
-What came after the first files of format 1 may be absent: `kind` is then "trajectory", `last_step` NaN, `fallback` 0 (or 1 in lanes that were
-continued), `quadrature_error` 0, `ways`, `recovered` and `arrays` empty. What else is absent, or is not what the names and the number of times ask for, is an
-error, and so is a parameter of the scene's class that the file lacks.
+What is absent, or is not what the names and the number of times ask for, is an error, and so is a parameter of the scene's class that the file lacks.
 """
 
 import contextlib
@@ -27,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.motion.inputs import Inputs, Sampled
-from jourdain_jax.motion.results import AS_ASKED, BAD_PARAMETER, FULL_STATE
+from jourdain_jax.motion.results import BAD_PARAMETER
 from jourdain_jax.motion.rollout import Rollout
 from jourdain_jax.motion.storage_checks import COUNTS, check_arrays, check_fields, check_header, check_scenes, refused
 from jourdain_jax.motion.trajectory import Trajectory
@@ -37,9 +35,9 @@ from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
-_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", *COUNTS, "last_step", "quadrature_error", "moved_q", "moved_u", "smallest_pivot")
+_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", *COUNTS, "last_step", "moved_q", "moved_u", "smallest_pivot")
 _TEXTS = ("state_form", "reduction", "solver", "projected")
-_HEADER = ("scene", "coordinates", "speeds", "input_names", "static", "event_names", *_TEXTS)
+_HEADER = ("scene", "coordinates", "speeds", "input_names", "static", "event_names", *_TEXTS, "kind", "arrays", "ways")
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
 
 
@@ -72,7 +70,6 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
         "units": {name: metadata["unit"] for name, _, metadata in parameters_of(scene)},
         "static": dict(_static_fields(scene)),
         "event_names": trajectory.event_names,
-        "recovered": trajectory.recovered,
         "arrays": sorted(arrays),
         "versions": {name: version_of(name) for name in ("jourdain-jax", "jax", "diffrax", "numpy")},
     }
@@ -123,11 +120,6 @@ def _check_saved(motion, path) -> None:
         raise ValueError(f"cannot write `{os.fspath(path)}`: it is a folder; give the name of a file in it, such as motion.npz")
 
 
-def load(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
-    """The same as `load_trajectory`, under its first name; `jj.Load` is something else, a force. `path`, `scene`: as there."""
-    return load_trajectory(path, scene)
-
-
 def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
     """Read a trajectory written by `save` from `path`. `scene`: the scene's class, or any scene of that class; parameters come from the file.
 
@@ -157,7 +149,7 @@ def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout
     longest = max(len(times) for times, _ in lanes)  # lanes with fewer are filled up with their last sample
     arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in lanes])
     arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in lanes])
-    ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header.get("ways", ()))
+    ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header["ways"])
     return Rollout(_lanes(path, kind, header, arrays), continued, ways)
 
 
@@ -186,7 +178,6 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
         work=jnp.asarray(arrays["work"]) if "work" in arrays else None,
         inputs=Inputs(tuple(Sampled(arrays["input_ts"], column) for column in arrays["inputs"].T)),
         event_names=tuple(header["event_names"]),
-        recovered=tuple(header.get("recovered", ())),
         **{name: jnp.asarray(arrays[name]) for name in _ARRAYS},
         **{name: header[name] for name in _TEXTS},
     )
@@ -234,10 +225,9 @@ def _read(path, kind: str) -> tuple[dict, dict]:
         raise ValueError(f"`{path}` is no {kind} file, or is damaged ({error}); expected an .npz written by `save`") from None
     if header.get("format") != 1 or isinstance(header["format"], bool):
         raise ValueError(f"`{path}` has format {header.get('format')}, expected 1; read it with the version of jourdain-jax that wrote it")
-    found = header.setdefault("kind", "trajectory")
+    found = header.get("kind")
     if found != kind:
         raise ValueError(f"`{path}` holds a {found}, expected a {kind}; read it with `{_READERS.get(str(found), 'the version of jourdain-jax that wrote it')}`")
-    arrays = _later(arrays) | arrays
     missing = [name for name in (*_ARRAYS, "inputs", *(["continued"] if kind == "rollout" else [])) if name not in arrays]
     missing += [name for name in _HEADER if name not in header]
     missing += [
@@ -248,17 +238,6 @@ def _read(path, kind: str) -> tuple[dict, dict]:
     check_header(path, header)
     check_arrays(path, header, arrays)
     return header, arrays
-
-
-def _later(arrays: dict) -> dict:
-    """What came after the first files of format 1, as it is where a file has none of it."""
-    if not {"result", "t_end"} <= arrays.keys():
-        return {}
-    like = arrays["t_end"]
-    lanes = np.arange(np.size(arrays["result"])).reshape(np.shape(arrays["result"]))
-    fallback = np.where(np.isin(lanes, arrays.get("continued", ())), FULL_STATE, AS_ASKED).astype(arrays["result"].dtype)
-    real = like.dtype if like.dtype.kind == "f" else float
-    return {"last_step": np.full(like.shape, np.nan, real), "quadrature_error": np.zeros(like.shape, real), "fallback": fallback}
 
 
 def _array_fields(scene: Scene) -> list[str]:

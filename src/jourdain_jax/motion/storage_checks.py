@@ -17,9 +17,9 @@ from jourdain_jax.scene.scene import Scene
 COUNTS = ("result", "event", "accepted", "rejected", "fallback")
 _STATES = {"q": "coordinates", "u": "speeds", "inputs": "input_names"}  # at all times, and what their last axis counts
 _ENDS = {"q_end": "coordinates", "u_end": "speeds"}
-_NUMBERS = ("t_end", "last_step", "quadrature_error", "moved_q", "moved_u", "smallest_pivot")
+_NUMBERS = ("t_end", "last_step", "moved_q", "moved_u", "smallest_pivot")
 _TEXTS = ("scene", "state_form", "reduction", "solver")
-_LISTS = ("coordinates", "speeds", "input_names", "event_names", "recovered", "arrays")
+_LISTS = ("coordinates", "speeds", "input_names", "event_names", "arrays")
 
 
 def refused(path, sentence: str) -> ValueError:
@@ -71,7 +71,6 @@ def _check_codes(path, header: dict, arrays: dict) -> None:
     ranges = {"result": np.isin(arrays["result"], list(MESSAGES)), "fallback": np.isin(arrays["fallback"], list(FALLBACKS))}
     ranges["event"] = (arrays["event"] <= events) & (arrays["event"] >= np.where(arrays["result"] == EVENT, 0, -1))
     ranges |= {name: arrays[name] >= 0 for name in ("accepted", "rejected")}
-    ranges["recovered"] = np.isin(header.get("recovered", []), header["coordinates"])
     for name, right in ranges.items():
         if not np.all(right):
             raise refused(path, f"has {arrays.get(name, header.get(name))} as `{name}`, which no motion has")

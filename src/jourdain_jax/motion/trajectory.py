@@ -40,7 +40,6 @@ class Trajectory(eqx.Module):
     rejected: Int[Array, ""]
     last_step: Float[Array, ""]  # s, that the step-size control would take next; NaN where it keeps that to itself
     fallback: Int[Array, ""]  # in what other way the motion was run again, see `results.FALLBACKS`; 0: as asked
-    quadrature_error: Float[Array, ""]  # largest, in one step, of `recovered` coordinates, over what the step-size control lets pass; 0: there are none
     moved_q: Float[Array, ""]  # how far the start was moved onto the constraints
     moved_u: Float[Array, ""]
     # of the privileged speeds, along the whole motion (lowered: of the elimination, relative to its usual size); negative if it changed sign;
@@ -52,7 +51,6 @@ class Trajectory(eqx.Module):
     solver: str = eqx.field(static=True)
     projected: bool = eqx.field(static=True)
     event_names: tuple[str, ...] = eqx.field(static=True)
-    recovered: tuple[str, ...] = eqx.field(static=True, default=())  # coordinates integrated outside of the step-size control
 
     # Named access. -------------------------------------------------------------------------------------------------
 
@@ -146,7 +144,7 @@ class Trajectory(eqx.Module):
         """What speaks against a motion, in words, most serious first; empty where nothing does. The printed summary shows them.
 
         A failure; rows that gain or lose rank, or come near it, so that constraint forces and what follows may not be unique; privileged speeds of a
-        reduction that do not determine the others in this precision; steps too long for recovered coordinates; contacts that would have to pull.
+        reduction that do not determine the others in this precision; contacts that would have to pull.
         Computed where it is asked for; needs numbers: not under jit or vmap.
         """
         failure = () if int(self.result) in (results.SUCCESS, results.EVENT) else (self.message,)
