@@ -29,7 +29,7 @@ from baselines.timing import fastest, seconds_per_evaluation
 
 import jourdain_jax as jj
 from jourdain_jax.models import PendulumChain, TiltingDisc, TrailerChain
-from jourdain_jax.motion import lockstep
+from jourdain_jax.motion.batches import lockstep
 from jourdain_jax.motion.simulate import state_form
 
 Figure = dict

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 import jourdain_jax as jj
-from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.eager.eager import eval_numpy
 
 
 def admissible_states(scene: jj.Scene, count: int, seed: int = 0) -> list[tuple]:
@@ -20,7 +20,7 @@ def disagreement(scene: jj.Scene, count: int = 20, seed: int = 0) -> dict[str, f
     """
     by_name = jj.reductions(scene)
 
-    @on_numbers
+    @eval_numpy
     @jax.vmap
     def all_of_them(t, q, u):
         found = {name: jj.accelerations(scene, t, q, u, reduction=reduction) for name, reduction in by_name.items()}

@@ -12,19 +12,19 @@ from generated_scenes import LENGTHS, Recipe, body_name, coordinate_list, genera
 from seen_differently import Seen, other_names, views
 
 import jourdain_jax as jj
+from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, present
+from jourdain_jax.dynamics.power import power
+from jourdain_jax.dynamics.reactions import row_reactions
+from jourdain_jax.eager.numpy_backend import uncompiled
 from jourdain_jax.equations import virtual_power as equations_module
 from jourdain_jax.equations.explicit_power import power_of_loads
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
-from jourdain_jax.equations.power import power
-from jourdain_jax.equations.probing import standing_in
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
-from jourdain_jax.equations.reactions import row_reactions
 from jourdain_jax.equations.reductions import Partition, _by_null_space, diagnosed, reduce
 from jourdain_jax.equations.rows import ConstraintRows, velocity_residual
 from jourdain_jax.equations.scaling import scaled
-from jourdain_jax.equations.structure import structure_of
-from jourdain_jax.program.uncompiled import uncompiled
 
 PUSH = 0.7  # value of the input, where a scene has one
 NEAR = 0.03  # smallest singular values of the rows, and of M, below which an instance counts as near a loss of rank and is left out
@@ -67,7 +67,7 @@ def evaluated(recipe: Recipe, *, parameters: int, states: int, seed: int = 0, co
     def seen(leaves, ways, *state):
         return jax.vmap(lambda leaves, *view_and_state: _seen(recipe, jax.tree.unflatten(treedef, leaves), *view_and_state))(leaves, ways, *state)
 
-    with standing_in(scene):
+    with reference_parameters(scene):
         both = [np.concatenate([x, x]) for x in (*leaves, t, q, u)]
         found = jax.tree.map(np.asarray, run(plain)(both[:-3], *both[-3:], np.repeat([1.0, -1.0], len(t))))
         forwards, backwards = (jax.tree.map(lambda x, half=half: x[half], found) for half in (slice(len(t)), slice(len(t), None)))

@@ -4,15 +4,15 @@ import jax
 import jax.numpy as jnp
 
 import jourdain_jax as jj
-from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.eager.eager import eval_numpy
 
 
-@on_numbers
+@eval_numpy
 def _solve(scene, t, q, u):
     return jax.vmap(lambda t, q, u: jj.accelerations(scene, t, q, u))(t, q, u)
 
 
-@on_numbers
+@eval_numpy
 def _solve_by_every_reduction(scene, reductions, q, u):
     return {name: jj.accelerations(scene, 0.0, q, u, reduction=reduction) for name, reduction in reductions.items()}
 

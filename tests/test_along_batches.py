@@ -32,16 +32,16 @@ def lanes(request):
 
 
 def test_forces_on_a_body_along_a_motion_are_those_of_each_time_and_row(moved):
-    along = moved.constraint_forces()
-    for b, body in enumerate(along.body_names):
-        forces, torques = along.forces_on(body), along.torques_on(body)
-        assert tuple(forces) == tuple(torques) == along.row_names
-        for s, row in enumerate(along.row_names):
+    map_over_times = moved.constraint_forces()
+    for b, body in enumerate(map_over_times.body_names):
+        forces, torques = map_over_times.forces_on(body), map_over_times.torques_on(body)
+        assert tuple(forces) == tuple(torques) == map_over_times.row_names
+        for s, row in enumerate(map_over_times.row_names):
             for i in range(len(TS)):
-                at_once = jax.tree.map(lambda x, i=i: x[i], along)
-                np.testing.assert_array_equal(forces[row][i], at_once.force[s, b])
-                np.testing.assert_array_equal(at_once.forces_on(body)[row], at_once.force[s, b])
-                np.testing.assert_array_equal(at_once.torques_on(body)[row], at_once.torque[s, b])
+                eager_if_concrete = jax.tree.map(lambda x, i=i: x[i], map_over_times)
+                np.testing.assert_array_equal(forces[row][i], eager_if_concrete.force[s, b])
+                np.testing.assert_array_equal(eager_if_concrete.forces_on(body)[row], eager_if_concrete.force[s, b])
+                np.testing.assert_array_equal(eager_if_concrete.torques_on(body)[row], eager_if_concrete.torque[s, b])
             assert forces[row].shape == torques[row].shape == (len(TS), 3)
 
 

@@ -9,7 +9,7 @@ import pytest
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.scene.parameters import parameters_of
 
 hand_derived = pytest.importorskip("baselines.hand_derived", reason="the scripts of `bench/` are not here")
@@ -33,7 +33,7 @@ def _with_random_parameters(name: str) -> jj.Scene:
     return scene.replace(**{key: (float(value) or 0.2) * generator.uniform(0.8, 1.2) for key, value, _ in parameters_of(scene)})
 
 
-@on_numbers
+@eval_numpy
 def _engine(scene, t, q, u):
     return jax.vmap(lambda t, q, u: (jj.coordinate_rates(scene, t, q, u), jj.accelerations(scene, t, q, u).udot))(t, q, u)
 

@@ -8,8 +8,8 @@ from rolling_scenes import GRAVITY, GROUNDS, BallInBowl, BallInDrum, DiscOnHill,
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.equations.probing import on_numbers
-from jourdain_jax.equations.reactions import contact_forces
+from jourdain_jax.dynamics.reactions import contact_forces
+from jourdain_jax.eager.eager import eval_numpy
 
 UP = np.array([0.0, 0.0, 1.0])
 SHAPES = ("ball", "ellipsoid", "disc", "wheel")
@@ -108,7 +108,7 @@ def test_one_force_at_the_contact_moves_and_turns_a_body_that_rolls(ground, shap
         motion = jj.motion_at(scene, 0.0, q, u)
         return motion["body"].velocity_at(scene.contacts(motion.pose())["touch"].point)
 
-    @on_numbers
+    @eval_numpy
     @jax.vmap
     def look(q, turning):
         contact = scene.contacts(jj.pose_at(scene, 0.0, q))["touch"]

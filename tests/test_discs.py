@@ -11,7 +11,7 @@ from solved_states import solved_at_random_states, solved_by_every_reduction
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.models.tilting_disc import TiltingDisc
 from jourdain_jax.models.tilting_disc_quaternion import TiltingDiscQuaternion
 from jourdain_jax.models.vertical_disc import VerticalDisc
@@ -155,7 +155,7 @@ def test_the_free_disc_has_the_accelerations_of_the_disc_in_angles():
     angles, free = TiltingDisc(mass=1.3, radius=0.4), TiltingDiscQuaternion(mass=1.3, radius=0.4)
     _, q, u = (jnp.asarray(x) for x in jj.sample_states(angles, 20))
 
-    @on_numbers
+    @eval_numpy
     @jax.vmap
     def both(q, u):
         values = _free_body(*q[2:], *u[2:], 0.4)

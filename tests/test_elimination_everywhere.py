@@ -7,27 +7,27 @@ import pytest
 from generated_robots import BeadOnCurve, PlanarRobot, drawn
 
 import jourdain_jax as jj
-from jourdain_jax.equations.accelerations import bare_accelerations
+from jourdain_jax.build.structure import structure_of
+from jourdain_jax.build.trace import named_values
+from jourdain_jax.dynamics.accelerations import bare_accelerations
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.minimal import minimal_accelerations
-from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT, NullSpaceQR
-from jourdain_jax.equations.structure import structure_of
-from jourdain_jax.equations.trace import named_values
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.models.trailer_chain import TrailerChain
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 from jourdain_jax.program.evaluate import Probes
 
 WEIGHTLESS = {"trailer_mass": 0.0, "trailer_inertia": 0.0}
 ROBOT = {"left_rate": 3.0, "right_rate": 20.0}
 
 
-@on_numbers
+@eval_numpy
 def dense_accelerations(scene, t, q, u):
     return jax.vmap(lambda t, q, u: bare_accelerations(scene, t, q, u, jnp.zeros(0), reduction=NullSpaceQR()).udot)(t, q, u)
 
 
-@on_numbers
+@eval_numpy
 def privileged_accelerations(scene, t, q, y):
     independent = structure_of(PlanarRobot(turned=0.4)).independent
     return minimal_accelerations(scene, independent, t, q, y)[2].udot[jnp.array(independent)]

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jourdain_jax.motion import lean_loop, results
+from jourdain_jax.motion.integrators import erk_loop
+from jourdain_jax.motion.trajectories import results
 
 GRAVITY = 9.81
 
@@ -14,7 +15,7 @@ GRAVITY = 9.81
 def stopped(y0, value, *, rates, longest=2.0, solver=None, kind="forward", lanes=(), max_steps=500):
     """Where a motion from `y0` at t = 0 stopped; `value(t, y)` of the one event."""
     real = lambda x: jnp.full(lanes, x)  # noqa: E731
-    problem = lean_loop.Problem(
+    problem = erk_loop.Problem(
         rates=lambda t, y, args: rates(t, y),
         args=None,
         project=None,
@@ -26,8 +27,8 @@ def stopped(y0, value, *, rates, longest=2.0, solver=None, kind="forward", lanes
         max_steps=max_steps,
     )
     goals = jnp.stack([real(0.5 * longest), real(longest)])
-    method = lean_loop.method_of(diffrax.Dopri8() if solver is None else solver)
-    return lean_loop.integrate(problem, method, y0, real(0.0), goals, 1e-2, kind)[2]
+    method = erk_loop.method_of(diffrax.Dopri8() if solver is None else solver)
+    return erk_loop.integrate(problem, method, y0, real(0.0), goals, 1e-2, kind)[2]
 
 
 def falling(t, y):

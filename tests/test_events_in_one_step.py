@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 
 DIFFRAX = {"solver": diffrax.Dopri5(), "stepsize_controller": diffrax.PIDController(rtol=1e-9, atol=1e-9)}
 LOOPS = {"lean": {}, "diffrax": DIFFRAX}
@@ -66,7 +66,7 @@ def generated_throws(count=48):
 def test_the_first_of_several_events_in_one_long_step_ends_the_motion(options):
     throws = generated_throws()
     if options:
-        throws[:, 4] = 100.0  # a hump over the roof is found by the lean loop; of diffrax only where it lasts a quarter of a step
+        throws[:, 4] = 100.0  # a hump over the roof is found by our explicit Runge-Kutta loop; of diffrax only where it lasts a quarter of a step
     starts = {"x": np.zeros(len(throws)), "z": np.ones(len(throws)), "x_rate": throws[:, 0], "z_rate": throws[:, 1]}
     walls = dict(zip(("floor", "wall", "roof", "slope"), throws[:, 2:].T, strict=True))
     lanes = jj.rollout(Thrown(), starts, parameters=walls, ts=[5.0], dt0=1.0, progress=False, **options).lanes  # the first step is beyond all of them

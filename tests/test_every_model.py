@@ -13,8 +13,8 @@ from jax.flatten_util import ravel_pytree
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.equations.probing import on_numbers
-from jourdain_jax.equations.trace import named_values
+from jourdain_jax.build.trace import named_values
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.models import MODELS
@@ -33,7 +33,7 @@ def other_parameters(name: str, seed: int) -> jj.Scene:
     return scene.replace(**{key: value + shift(value) for key, value, metadata in parameters_of(scene) if not metadata["non_negative"] or np.all(value > 0)})
 
 
-@on_numbers  # each program runs once, so that compiling it would take longer than running it
+@eval_numpy  # each program runs once, so that compiling it would take longer than running it
 @eqx.filter_vmap(in_axes=(eqx.if_array(0), 0, 0, 0))
 @eqx.filter_vmap(in_axes=(None, 0, 0, 0))
 def _solved(scene, t, q, u):

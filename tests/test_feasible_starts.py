@@ -8,8 +8,8 @@ from linkages import Parallelogram, SliderCrank, Windows, bennett, bricard
 from small_scenes import DiscWithHeightRow
 
 import jourdain_jax as jj
-from jourdain_jax.equations.sampling import NoStateFoundError
-from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.build.sampling import NoStateFoundError
+from jourdain_jax.build.structure import structure_of
 
 SCENES = {
     "disc with quaternion": jj.models.TiltingDiscQuaternion(),

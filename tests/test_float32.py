@@ -30,7 +30,7 @@ import gc, json, warnings
 import jax, jax.numpy as jnp, numpy as np
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 from jourdain_jax.scene.parameters import parameters_of
 
 gc.disable()  # a process of a minute

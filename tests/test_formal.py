@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.formal import equal, formal, on_rows, unaffected
 from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.identity_test import equal, identity_probes, on_rows, unaffected
 from jourdain_jax.program.interpret import Nodes, as_nodes
-from jourdain_jax.program.parts import interpret_in_parts
+from jourdain_jax.program.opaque_calls import interpret_with_calls
 
 COUNT = 40
 
 
 def traced(f):
-    """Nodes of f(x, y, p), and formal probes that know nothing but numbers below one."""
+    """Nodes of f(x, y, p), and generic probes that know nothing but numbers below one."""
     graph = Graph(most_multiplications=512)
     inputs = [graph.input(name, varies) for name, varies in (("q_0", True), ("q_1", True), ("p0_0", False))]
-    found = interpret_in_parts(graph, jax.make_jaxpr(f)(1.0, 1.0, 1.0), [Nodes(n) for n in inputs])
+    found = interpret_with_calls(graph, jax.make_jaxpr(f)(1.0, 1.0, 1.0), [Nodes(n) for n in inputs])
     values = {graph.value[n]: np.linspace(0.1, 0.9, COUNT) for n in inputs}
-    return [int(as_nodes(graph, x)[()]) for x in found], inputs, formal(Probes(graph, values), ())
+    return [int(as_nodes(graph, x)[()]) for x in found], inputs, identity_probes(Probes(graph, values), ())
 
 
 def ramp_beyond(x):

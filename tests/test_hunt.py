@@ -12,7 +12,7 @@ from hunting.reference import integrate
 from hunting.table import as_markdown, figures, losses
 
 import jourdain_jax as jj
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 
 # Family and seeds, each wrong or flagged at some time; seeds that differ by the number of a family's ways ask alike, and share a program.
 SHORT = (

@@ -20,7 +20,7 @@ from jourdain_jax.analysis.likelihood import log_likelihood
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
 from jourdain_jax.models.rattleback import Rattleback
-from jourdain_jax.motion.forward_mode import simulate_forward
+from jourdain_jax.motion.integrators.forward_mode import simulate_forward
 
 REPEATS = 200
 SIGMA = 0.02  # m, rad

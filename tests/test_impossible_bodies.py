@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.equations.plausibility import body_faults
-from jourdain_jax.motion import results
+from jourdain_jax.build.plausibility import body_faults
+from jourdain_jax.motion.trajectories import results
 
 
 class Spinning(jj.Scene):

@@ -7,7 +7,7 @@ import pytest
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 
 
 class Weightless(jj.Scene):

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
+from jourdain_jax.build.trace import event_values, traced_scene
 from jourdain_jax.equations.minimal import minimal_accelerations
-from jourdain_jax.equations.trace import event_values, traced_scene
 from jourdain_jax.models import ChaplyginSleigh, TiltingDisc
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes
-from jourdain_jax.program.parts import interpret_in_parts
+from jourdain_jax.program.opaque_calls import interpret_with_calls
 
 
 def by_table(force, numbers):
@@ -394,7 +394,7 @@ def test_calls_run_in_single_precision():
 def in_parts(f, *like):
     graph = Graph()
     inputs = [Nodes(np.array([graph.input(f"{k}_{i}", True) for i in range(np.size(x))]).reshape(np.shape(x))) for k, x in enumerate(like)]
-    return graph, [as_nodes(graph, x) for x in interpret_in_parts(graph, jax.make_jaxpr(f)(*like), inputs)]
+    return graph, [as_nodes(graph, x) for x in interpret_with_calls(graph, jax.make_jaxpr(f)(*like), inputs)]
 
 
 def test_parts_that_are_apart_are_calls_of_their_own_in_the_right_order():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.motion.knots import bends
+from jourdain_jax.motion.integrators.knots import bends
 
 
 class Struck(jj.Scene):

@@ -1,7 +1,7 @@
 """The layer table of the package, held by reading every import in `src` (no import is executed).
 
-Bottom to top: calculus < program < scene < equations < lowering < motion < analysis < models < bicycle < plotting < cli. A layer imports
-itself and what lies below it; only the package's `__init__` sees everything.
+Bottom to top: calculus < eager < program < scene < equations < build < dynamics < lowering < motion < analysis < models < bicycle < plotting < cli.
+A layer imports itself and what lies below it; only the package's `__init__` sees everything.
 """
 
 import ast
@@ -12,7 +12,7 @@ import pytest
 
 PACKAGE = "jourdain_jax"
 SOURCE = Path(__file__).parents[1] / "src" / PACKAGE
-LAYERS = ("calculus", "program", "scene", "equations", "lowering", "motion", "analysis", "models", "bicycle", "plotting", "cli")
+LAYERS = ("calculus", "eager", "program", "scene", "equations", "build", "dynamics", "lowering", "motion", "analysis", "models", "bicycle", "plotting", "cli")
 ENTRY_MODULES = ("__init__", "__main__")  # above every layer
 OWNERS = {"diffrax": ("motion",)}  # third-party packages that only the named layers know
 OPTIONAL = ("matplotlib", "IPython", "tqdm", "scipy", "sympy")  # may be imported inside a function

@@ -1,4 +1,4 @@
-"""Reverse mode of the lean loop goes back over the steps that the motion took: right in any number of steps, alone and in lanes, to events and times."""
+"""Reverse mode of our own loop goes back over the steps that the motion took: right in any number of steps, alone and in lanes, to events and times."""
 
 import diffrax
 import equinox as eqx
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.motion import lean_loop, lean_reverse, results
+from jourdain_jax.motion.integrators import erk_loop, recorded_adjoint
+from jourdain_jax.motion.trajectories import results
 
 LANES = 3
 AT_FOUR_SAVED_TIMES = jnp.array([0.0, 0.7, 1.5, 4.0, 4.0])  # the first is the start, the last comes twice
@@ -25,7 +26,7 @@ def pendulum(kind, *, rtol, solver=None, events=False, max_steps=100_000):
 
     def run(y0, t0, goals, gravity):
         same = jnp.full(jnp.shape(t0), 1.0)
-        problem = lean_loop.Problem(
+        problem = erk_loop.Problem(
             rates=rates,
             args=gravity,
             project=None,
@@ -36,8 +37,8 @@ def pendulum(kind, *, rtol, solver=None, events=False, max_steps=100_000):
             shortest=1e-14 * same,
             max_steps=max_steps,
         )
-        method = lean_loop.method_of(diffrax.Dopri8() if solver is None else solver)
-        ys, _, end = lean_loop.integrate(problem, method, y0, t0, goals, 1e-3, kind)
+        method = erk_loop.method_of(diffrax.Dopri8() if solver is None else solver)
+        ys, _, end = erk_loop.integrate(problem, method, y0, t0, goals, 1e-3, kind)
         return ys, end.t, end.y, end
 
     return run
@@ -71,8 +72,8 @@ def forward_mode(value, x):
 @pytest.mark.parametrize("events", [False, True], ids=["", "events"])
 @pytest.mark.parametrize("lanes", [False, True], ids=["alone", "lanes"])
 def test_reverse_mode_has_the_derivatives_of_forward_mode(lanes, events, steps, monkeypatch):
-    monkeypatch.setattr(lean_reverse, "STEPS_ALONE", steps)
-    monkeypatch.setattr(lean_reverse, "STEPS_TOGETHER", steps)
+    monkeypatch.setattr(recorded_adjoint, "STEPS_ALONE", steps)
+    monkeypatch.setattr(recorded_adjoint, "STEPS_TOGETHER", steps)
     x = arguments(lanes)
     options = {"rtol": 1e-11, "solver": diffrax.Tsit5(), "events": events}
     (_, end), found = jax.jit(jax.value_and_grad(lambda x: weighed(pendulum("reverse", **options))(*x), has_aux=True))(x)
@@ -84,7 +85,7 @@ def test_reverse_mode_has_the_derivatives_of_forward_mode(lanes, events, steps, 
 
 
 def test_lanes_of_vmap_keep_their_own_events_and_derivatives(monkeypatch):
-    monkeypatch.setattr(lean_reverse, "STEPS_ALONE", 24)
+    monkeypatch.setattr(recorded_adjoint, "STEPS_ALONE", 24)
     y0, t0, goals, gravity = arguments(lanes=True)
     options = {"rtol": 1e-11, "solver": diffrax.Tsit5(), "events": True}
 
@@ -99,12 +100,12 @@ def test_lanes_of_vmap_keep_their_own_events_and_derivatives(monkeypatch):
 
 
 def test_a_derivative_is_not_a_number_where_memory_does_not_hold_the_motion(monkeypatch):
-    monkeypatch.setattr(lean_reverse, "STEPS_ALONE", 24)
+    monkeypatch.setattr(recorded_adjoint, "STEPS_ALONE", 24)
     x = arguments(lanes=False)
 
     def derivative(windows):
-        monkeypatch.setattr(lean_reverse, "_MEMORY", (2**27, 0))
-        monkeypatch.setattr(lean_reverse, "_FEWEST", (16, windows))
+        monkeypatch.setattr(recorded_adjoint, "_MEMORY", (2**27, 0))
+        monkeypatch.setattr(recorded_adjoint, "_FEWEST", (16, windows))
         return jax.grad(lambda gravity: weighed(pendulum("reverse", rtol=1e-9))(*x[:3], gravity)[0])(x[3])
 
     assert np.isnan(derivative(2))
@@ -122,6 +123,6 @@ def test_the_derivative_of_a_long_motion_at_round_off_is_right():
         return jnp.sum(motion.q_end), motion.accepted
 
     found, steps = jax.grad(lambda x: turned(x, None), has_aux=True)(1.0)
-    assert steps > lean_reverse.STEPS_ALONE
+    assert steps > recorded_adjoint.STEPS_ALONE
     _, expected = jax.jvp(lambda x: turned(x, diffrax.ForwardMode())[0], (1.0,), (1.0,))
     np.testing.assert_allclose(found, expected, rtol=1e-9)

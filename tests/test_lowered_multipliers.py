@@ -11,12 +11,12 @@ import pytest
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.equations.probing import without_collecting
+from jourdain_jax.build.reference_parameters import without_collecting
+from jourdain_jax.build.structure import LONG, structure_of
 from jourdain_jax.equations.projection import project_positions, project_speeds
-from jourdain_jax.equations.structure import LONG, structure_of
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion import results
 from jourdain_jax.motion.simulate import state_form
+from jourdain_jax.motion.trajectories import results
 
 
 def ends(scene, start, t1, **options):

@@ -15,15 +15,16 @@ import pytest
 from baselines.hand_derived import HAND_DERIVED, operations
 
 import jourdain_jax as jj
+from jourdain_jax.build.trace import event_values
+from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.minimal import speeds_from_privileged
-from jourdain_jax.equations.power import needs_work
-from jourdain_jax.equations.trace import event_values
 from jourdain_jax.lowering import lower as module
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion import lockstep, results
+from jourdain_jax.motion.batches import lockstep
 from jourdain_jax.motion.simulate import state_form
+from jourdain_jax.motion.trajectories import results
 from jourdain_jax.program.emit import run
-from jourdain_jax.program.together import together
+from jourdain_jax.program.fused import fused
 
 
 @pytest.mark.parametrize("name", HAND_DERIVED)
@@ -322,7 +323,7 @@ def test_lanes_that_do_not_fill_a_block_move_as_they_do_alone_and_so_do_their_de
 
 
 def test_values_computed_together_are_the_same_and_have_the_same_derivatives():
-    both = lambda x: together((jnp.sin(x) * 2.0, jnp.sin(x) + x))  # noqa: E731
+    both = lambda x: fused((jnp.sin(x) * 2.0, jnp.sin(x) + x))  # noqa: E731
     x = jnp.linspace(-2.0, 2.0, 7)
     np.testing.assert_array_equal(jax.jit(both)(x)[1], jnp.sin(x) + x)
     np.testing.assert_array_equal(jax.vmap(both)(x)[0], jnp.sin(x) * 2.0)

@@ -6,7 +6,7 @@ import pytest
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.models.ball_on_turntable import BallOnTurntable
 from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
 from jourdain_jax.models.heisenberg_particle import HeisenbergParticle
@@ -61,7 +61,7 @@ def test_the_scene_has_its_degrees_of_freedom(scene, freedoms):
 def test_known_integrals_do_not_change_along_the_motion(scene):
     t, q, u = _states(scene, 20)
 
-    @on_numbers
+    @eval_numpy
     @jax.vmap
     def rates(t, q, u):
         udot = jj.accelerations(scene, t, q, u).udot

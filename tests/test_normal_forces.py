@@ -8,9 +8,9 @@ from rolling_scenes import GRAVITY, Cart, CartOnRows
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.equations.normal_forces import Wrenches, normal_forces
-from jourdain_jax.equations.probing import on_numbers
-from jourdain_jax.equations.reactions import contact_forces
+from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
+from jourdain_jax.dynamics.reactions import contact_forces
+from jourdain_jax.eager.eager import eval_numpy
 
 
 def forces(scene, q=None, u=None, **values):
@@ -34,7 +34,7 @@ def test_the_balls_of_a_cart_on_three_press_as_multipliers_of_height_rows_say():
     # the same cart with a free chassis: there the normal forces are multipliers
     random = np.random.default_rng(5)
 
-    @on_numbers
+    @eval_numpy
     @jax.vmap
     def both(load, push, slope, along, turn, angular):
         made = {"load": load, "push": push, "slope": slope}

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
+from jourdain_jax.eager.numpy_backend import uncompiled
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.program.polynomial import NormalForms
-from jourdain_jax.program.uncompiled import uncompiled
 
 
 def to_second_order(f, point):

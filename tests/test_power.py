@@ -8,9 +8,9 @@ from timed_scenes import TIMED
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
+from jourdain_jax.dynamics.power import power, power_of_nonconservative
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import coordinate_rates
-from jourdain_jax.equations.power import power, power_of_nonconservative
-from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.models import BallOnTurntable, ChaplyginSleigh, IsokineticParticle, TiltingDisc, TwoWheelAxleCoordinates
 
 
@@ -43,7 +43,7 @@ SCENES = [
 @pytest.mark.parametrize("scene", SCENES, ids=lambda s: type(s).__name__)
 def test_energy_changes_by_the_power_of_what_has_no_potential(scene):
     states = [jnp.asarray(x) for x in jj.sample_states(scene, 20)]
-    rate, supplied, size = on_numbers(jax.vmap(lambda t, q, u: energy_rate_and_power(scene, t, q, u)))(*states)
+    rate, supplied, size = eval_numpy(jax.vmap(lambda t, q, u: energy_rate_and_power(scene, t, q, u)))(*states)
     assert jnp.all(jnp.abs(rate - supplied) <= tolerance("round_off") * size)
 
 

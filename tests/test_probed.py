@@ -7,10 +7,10 @@ import pytest
 from jaxtyping import Array, Float
 
 import jourdain_jax as jj
-from jourdain_jax.equations.probed import TIMED, probed
-from jourdain_jax.equations.probed_on_graph import probed_on_graph, sampled_on_graph
-from jourdain_jax.equations.sampling import random_states, sampled_by_jax, symmetric_configurations
-from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.build.probed import TIMED, probed
+from jourdain_jax.build.probed_on_graph import probed_on_graph, sampled_on_graph
+from jourdain_jax.build.sampling import random_states, sampled_by_jax, symmetric_configurations
+from jourdain_jax.build.structure import structure_of
 from jourdain_jax.program.graph import Unsupported
 
 MODELS = ["skate", "tilting-disc-quaternion", "ball-on-turntable", "snakeboard", "rattleback", "double-pendulum-rods", "isokinetic-particle", "trailer-chain"]

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jourdain_jax.program.derivative import along, derivatives
+from jourdain_jax.eager.numpy_backend import uncompiled
+from jourdain_jax.program.derivative import derivatives, directional_derivative
 from jourdain_jax.program.emit import run, sine_and_cosine
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.program.polynomial import NormalForms, TooLarge
 from jourdain_jax.program.source import PYTHON, C, statements, sympy_expressions
-from jourdain_jax.program.uncompiled import uncompiled
 
 
 @pytest.fixture
@@ -313,7 +313,7 @@ def test_derivatives_along_many_directions_are_those_along_each():
     inner = graph.mul(x, graph.call("sin", y))
     outputs = [graph.add(inner, z), graph.div(inner, graph.add(graph.one, graph.mul(z, z))), graph.const(2.0)]
     directions = {0: {x: graph.one, inner: y}, 1: {z: x, inner: graph.zero}, 2: {y: graph.one, inner: z}}
-    together = along(graph, outputs, directions)
+    together = directional_derivative(graph, outputs, directions)
     for k, direction in directions.items():
         assert [row.get(k, graph.zero) for row in together] == derivatives(graph, outputs, direction)
 

@@ -6,8 +6,8 @@ import pytest
 from linkages import Parallelogram, SliderCrank
 
 import jourdain_jax as jj
-from jourdain_jax.equations.reactions import _spare_multipliers
-from jourdain_jax.equations.structure import plain_row_lengths, structure_of
+from jourdain_jax.build.structure import plain_row_lengths, structure_of
+from jourdain_jax.dynamics.reactions import _spare_multipliers
 
 SINGULAR = {
     "parallelogram": (Parallelogram, {"a": np.pi / 2, "b": 0.0, "c": np.pi / 2}, {"a": 1.0, "c": 1.0}),

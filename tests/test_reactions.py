@@ -8,8 +8,8 @@ import small_scenes as small
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.equations.probing import on_numbers
-from jourdain_jax.equations.reactions import contact_forces, row_reactions
+from jourdain_jax.dynamics.reactions import contact_forces, row_reactions
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.models import (
     BallOnTurntable,
     ChaplyginSleigh,
@@ -19,7 +19,7 @@ from jourdain_jax.models import (
     VerticalDisc,
     WhippleBicycle,
 )
-from jourdain_jax.motion.diagnostics import diagnose
+from jourdain_jax.motion.trajectories.diagnostics import diagnose
 
 SCENES = [
     TwoWheelAxleRedundant(),
@@ -33,7 +33,7 @@ SCENES = [
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda s: type(s).__name__)
 def test_forces_by_row_and_body_have_the_virtual_power_of_the_multipliers(scene):
-    @on_numbers
+    @eval_numpy
     @jax.vmap
     def compare(t, q, u):
         found = jj.accelerations(scene, t, q, u)
@@ -97,7 +97,7 @@ def test_a_vertical_disc_presses_with_its_weight_and_needs_the_friction_of_its_t
 def test_the_normal_force_is_the_same_from_newtons_equation_and_from_a_height_row():
     built_in, as_row = TiltingDisc(), small.DiscWithHeightRow()
 
-    @on_numbers
+    @eval_numpy
     @jax.vmap
     def both(t, q, u):
         # the tilting disc's x, y are those of the contact point, the other's those of the centre

@@ -9,15 +9,15 @@ from scipy.integrate import solve_ivp
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.equations.kinematics import coordinate_rates
-from jourdain_jax.equations.probing import on_numbers
-from jourdain_jax.equations.reduced import (
+from jourdain_jax.dynamics.reduced import (
     quadrature_times,
     recover_dropped,
     reduced_accelerations,
     reduced_coordinates,
     reduced_rates,
 )
+from jourdain_jax.eager.eager import eval_numpy
+from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.models import BallOnTurntable, ChaplyginSleigh, IsokineticParticle, TiltingDisc, TwoWheelAxleFree
 
 
@@ -73,7 +73,7 @@ def test_reduced_accelerations_are_those_of_the_whole_scene():
     scene = TiltingDisc()
     independent = list(jj.structure_of(scene).independent)
 
-    @on_numbers
+    @eval_numpy
     @jax.vmap
     def both(t, q, u):
         y = u[jnp.array(independent)]

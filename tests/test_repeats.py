@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jourdain_jax.program import emit, repeats
+from jourdain_jax.program import emit
 from jourdain_jax.program.graph import Graph
-from jourdain_jax.program.repeats import Before, Given, Loop, deepest_first, with_loops
+from jourdain_jax.program.loop_rerolling import Before, Given, Loop, deepest_first, with_loops
 
 LINKS = 120
 

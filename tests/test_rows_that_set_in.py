@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 
 
 class Slider(jj.Scene):

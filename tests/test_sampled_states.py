@@ -5,9 +5,9 @@ import pytest
 from linkages import Parallelogram, SliderCrank, Windows, bennett, bricard
 
 import jourdain_jax as jj
-from jourdain_jax.equations.domain import coordinate_bounds
+from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.structure import structure_of
 from jourdain_jax.equations.projection import closure_residual
-from jourdain_jax.equations.structure import structure_of
 
 LINKAGES = {
     "Bennett": (bennett(0.7, 1.2), 3),

@@ -8,7 +8,7 @@ import pytest
 from test_along_batches import Oscillator
 
 import jourdain_jax as jj
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 
 START = {"x": 1.0}
 WRONG = {

@@ -11,8 +11,9 @@ from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
 from jourdain_jax.models.double_pendulum_rods import DoublePendulumRods
 from jourdain_jax.models.skate import Skate
-from jourdain_jax.motion import integration, results
-from jourdain_jax.motion.event_location import locate
+from jourdain_jax.motion import integration
+from jourdain_jax.motion.integrators.event_location import locate
+from jourdain_jax.motion.trajectories import results
 
 
 class Falling(jj.Scene):

@@ -8,7 +8,7 @@ from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
 from jourdain_jax.models.snakeboard import Snakeboard
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 
 BOARD = Snakeboard()
 START = {

@@ -7,7 +7,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 
 
 class Falling(jj.Scene):

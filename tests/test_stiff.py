@@ -12,9 +12,9 @@ from oracles import skate
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.motion import results
-from jourdain_jax.motion.fallbacks import changed_options, next_way
+from jourdain_jax.motion.retries import next_retry, retry_options
 from jourdain_jax.motion.simulate import set_up
+from jourdain_jax.motion.trajectories import results
 
 TS = np.linspace(0.0, 2.0, 5)
 
@@ -142,12 +142,12 @@ def test_every_other_way_is_tried_once_and_ways_add_up(damped):
         lambda m: (m.result, m.fallback), damped, (jnp.array(code), jnp.array(ways))
     )
     both = results.FULL_STATE | results.IMPLICIT
-    assert next_way(form, lost(results.AS_ASKED), 0.0, {}) == results.FULL_STATE
-    assert next_way(form, lost(results.IMPLICIT), 0.0, {}) == both
-    assert next_way(form, lost(both), 0.0, {}) == results.AS_ASKED
-    assert next_way(form, lost(results.AS_ASKED, results.SUCCESS), 0.0, {}) == results.AS_ASKED
-    assert next_way(form, lost(results.AS_ASKED), 0.0, {"state": "minimal"}) == results.AS_ASKED
-    assert changed_options(both, 1000) == {"state": "full", "lowering": False, "solver": jj.RadauIIA(), "max_steps": 100}
+    assert next_retry(form, lost(results.AS_ASKED), 0.0, {}) == results.FULL_STATE
+    assert next_retry(form, lost(results.IMPLICIT), 0.0, {}) == both
+    assert next_retry(form, lost(both), 0.0, {}) == results.AS_ASKED
+    assert next_retry(form, lost(results.AS_ASKED, results.SUCCESS), 0.0, {}) == results.AS_ASKED
+    assert next_retry(form, lost(results.AS_ASKED), 0.0, {"state": "minimal"}) == results.AS_ASKED
+    assert retry_options(both, 1000) == {"state": "full", "lowering": False, "solver": jj.RadauIIA(), "max_steps": 100}
     assert "full state, dense matrices and an implicit solver" in results.FALLBACKS[both]
 
 

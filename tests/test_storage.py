@@ -12,7 +12,7 @@ from test_inputs import OnBelt
 
 import jourdain_jax as jj
 from jourdain_jax.models import ChaplyginSleigh, PendulumChain, TiltingDisc
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 
 TS = jnp.linspace(0.0, 0.5, 3)
 

@@ -13,7 +13,7 @@ from tolerances import tolerance
 import jourdain_jax as jj
 from jourdain_jax.calculus.newton import newton_root
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 
 MIDPOINT, DLA, TRAPEZOIDAL, GRADIENT = (
     jj.ImplicitMidpoint(),

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.equations.probing import concretised
+from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.models import ChaplyginSleigh
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 
 
 class TwoBlades(jj.Scene):
@@ -195,7 +195,7 @@ def test_stand_ins_of_parameters_with_equal_defaults_differ(kind):
     seen = {}
 
     def look(*values):
-        seen["scene"] = concretised(kind(**dict(zip(names, values, strict=True))))
+        seen["scene"] = with_reference_parameters(kind(**dict(zip(names, values, strict=True))))
         return 0.0
 
     jax.eval_shape(look, *np.ones(len(names)))

@@ -12,7 +12,7 @@ from solved_states import solved_at_random_states
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.equations.reactions import contact_forces
+from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.models.two_wheel_axle import (
     TwoWheelAxleCoordinates,
     TwoWheelAxleFree,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.equations import structure
+from jourdain_jax.build import structure
 from jourdain_jax.models import ChaplyginSleigh
 from jourdain_jax.program.graph import Unsupported
 

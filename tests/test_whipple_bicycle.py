@@ -10,9 +10,9 @@ from oracles import whipple_bicycle as oracle
 from tolerances import relative_error, tolerance
 
 import jourdain_jax as jj
+from jourdain_jax.dynamics.reactions import contact_forces
 from jourdain_jax.equations.minimal import speeds_from_privileged
 from jourdain_jax.equations.projection import project_positions
-from jourdain_jax.equations.reactions import contact_forces
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 
 BICYCLE = WhippleBicycle()

@@ -14,7 +14,7 @@ from atlas_cases import naive
 from atlas_cases.case import by_type
 from atlas_cases.methods import Method
 from atlas_cases.outcomes import Outcome, judged, not_applicable, worst
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 
 FEWER_STEPS = 2000  # for the reductions, of which reverse mode takes seconds per thousand steps: ten times what a right answer took
 IMPLICIT_STEPS = 5000  # for an implicit solver of diffrax, which comes to a singularity in ever shorter steps and goes back over all of them
@@ -85,7 +85,7 @@ class DerivativeOfMotion:
             return not_applicable("fixed steps find no event" if self.naive_value is None else "asked of motions")
         scene, start = self.begin(x)
         state = jj.start(scene, **start)
-        static = naive.settled(scene, state.q, state.u)
+        static = naive.fixed_point(scene, state.q, state.u)
 
         def value(x):
             scene, start = self.begin(x)

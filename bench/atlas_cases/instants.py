@@ -11,7 +11,7 @@ import jourdain_jax as jj
 from atlas_cases import naive
 from atlas_cases.methods import Method, reduction
 from atlas_cases.outcomes import Outcome, judged, not_applicable, worst
-from jourdain_jax.equations.probing import on_numbers
+from jourdain_jax.eager.eager import eval_numpy
 
 ONLY_MOTION = "no motion is asked"
 
@@ -34,7 +34,7 @@ class Instant:
             return not_applicable(self.skip.get(method.name, ONLY_MOTION))
         q, u = jnp.asarray(self.q, jnp.result_type(float)), jnp.asarray(self.u, jnp.result_type(float))
         if method.naive is not None:
-            udot = naive.accelerations(method.naive, self.scene, naive.settled(self.scene, q, u), 0.0, q, u)
+            udot = naive.accelerations(method.naive, self.scene, naive.fixed_point(self.scene, q, u), 0.0, q, u)
             return judged(worst(udot, self.udot, self.scale), tolerance)
         found = jj.accelerations(self.scene, 0.0, q, u, reduction=reduction(self.scene, method.reduction))
         error = worst(found.udot, self.udot, self.scale)
@@ -76,7 +76,7 @@ class DerivativeOfAccelerations:
             return not_applicable(ONLY_MOTION)
         weights = jnp.asarray(self.weights, jnp.result_type(float))
         scene, q, u = self.state(jnp.asarray(self.x))
-        static = naive.settled(scene, q, u) if method.naive else None
+        static = naive.fixed_point(scene, q, u) if method.naive else None
 
         def value(x, way):
             scene, q, u = self.state(x)
@@ -86,7 +86,7 @@ class DerivativeOfAccelerations:
 
         key = method.naive or ("default" if method.reduction is None else "reductions")
         if key not in self.traced:
-            self.traced[key] = on_numbers(jax.grad(value))  # looked at once: compiling would take longer
+            self.traced[key] = eval_numpy(jax.grad(value))  # looked at once: compiling would take longer
         try:
             slope = float(self.traced[key](jnp.asarray(self.x, jnp.result_type(float)), reduction(scene, method.reduction)))
         except NotImplementedError as refusal:

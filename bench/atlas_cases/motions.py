@@ -12,7 +12,7 @@ from atlas_cases import naive
 from atlas_cases.case import by_type, single
 from atlas_cases.methods import Method
 from atlas_cases.outcomes import NAN, Outcome, judged, not_applicable, worst
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 
 # Methods that take long and show something in some cases only.
 SELDOM = {
@@ -111,7 +111,7 @@ class Motion:
         rows = jj.constraint_rows(self.scene, 0.0, q, u)
         if method.naive in naive.REDUCED_STATE and (not jj.structure_of(self.scene).affine or rows.A.shape[0] == 0):
             return not_applicable("no rows that are linear in the speeds")
-        static = naive.settled(self.scene, q, u, independent=self.independent)
+        static = naive.fixed_point(self.scene, q, u, independent=self.independent)
         qs, us = naive.motion(method.naive, self.scene, static, q, u, self.ts, self.steps)
         qs, us = np.asarray(qs, float), np.asarray(us, float)
         if not (np.all(np.isfinite(qs)) and np.all(np.isfinite(us))):

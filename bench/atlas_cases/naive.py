@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
-from jourdain_jax.equations.probing import at_once
+from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.virtual_power import equations_and_rows
 
 
@@ -25,7 +25,7 @@ class Static:
     dependent: tuple[int, ...]
 
 
-def settled(scene, q, u, t=0.0, independent: tuple[str, ...] | None = None) -> Static:
+def fixed_point(scene, q, u, t=0.0, independent: tuple[str, ...] | None = None) -> Static:
     """Rank at the start, and the partition that is best there (or the one asked for)."""
     A = np.asarray(jj.constraint_rows(scene, t, q, u).A, float)
     cut = 4096 * float(jnp.finfo(q.dtype).eps) * np.linalg.norm(A) if A.size else 0.0
@@ -112,7 +112,7 @@ def accelerations(name: str, scene, static: Static, t, q, u):
     return _solved(name, static, equations.M, equations.Q - equations.h, rows.A, -rows.drift)
 
 
-@at_once
+@eager_if_concrete
 def _solved(name: str, static: Static, M, f, A, b):
     return jnp.linalg.solve(M, f) if A.shape[0] == 0 else ACCELERATIONS[name](M, f, A, b, static)
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
-from jourdain_jax.motion.lean_loop import method_of
+from jourdain_jax.motion.integrators.erk_loop import method_of
 from work_precision_cases.curve import TOLERANCES, Curve, NotApplicable, Prepared, Solved
 from work_precision_cases.problem import Problem
 

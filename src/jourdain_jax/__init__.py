@@ -36,17 +36,17 @@ from jourdain_jax.analysis.report import Report, report
 from jourdain_jax.analysis.steady import SteadyMotion, steady
 from jourdain_jax.analysis.verification import Verification
 from jourdain_jax.analysis.verify import verify
+from jourdain_jax.build.sampling import sample_states
+from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
-from jourdain_jax.equations.accelerations import Accelerations, Baumgarte, accelerations, reductions
+from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
 from jourdain_jax.equations.gibbs_appell import GibbsAppell, gibbs_equations, gibbs_function
 from jourdain_jax.equations.instant import constraint_rows
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.lagrange import lagrange_equations
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, NullSpaceSVD, Privileged, UdwadiaKalaba
 from jourdain_jax.equations.rows import position_residual, velocity_residual
-from jourdain_jax.equations.sampling import sample_states
-from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.equations.virtual_power import (
     generalized_forces,
     kinetic_energy,
@@ -57,21 +57,21 @@ from jourdain_jax.equations.virtual_power import (
 )
 from jourdain_jax.lowering.lower import NotLowered, lower
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.diagnostics import diagnose
-from jourdain_jax.motion.discrete_gradient import DiscreteGradient
-from jourdain_jax.motion.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
-from jourdain_jax.motion.implicit_midpoint import ImplicitMidpoint
+from jourdain_jax.motion.batches.rollout import Rollout, rollout
 from jourdain_jax.motion.inputs import Sampled
-from jourdain_jax.motion.munthe_kaas import MuntheKaas
-from jourdain_jax.motion.radau import RadauIIA
-from jourdain_jax.motion.results import SimulationError
-from jourdain_jax.motion.rollout import Rollout, rollout
+from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
+from jourdain_jax.motion.integrators.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
+from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
+from jourdain_jax.motion.integrators.munthe_kaas import MuntheKaas
+from jourdain_jax.motion.integrators.radau import RadauIIA
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import State, consistent, start
-from jourdain_jax.motion.storage import load_rollout, load_trajectory, save
-from jourdain_jax.motion.trajectory import Trajectory
-from jourdain_jax.motion.versions import version_of as _version_of
+from jourdain_jax.motion.trajectories.diagnostics import diagnose
+from jourdain_jax.motion.trajectories.results import SimulationError
+from jourdain_jax.motion.trajectories.storage import load_rollout, load_trajectory, save
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.motion.trajectories.versions import version_of as _version_of
 from jourdain_jax.plotting.animation import animate
 from jourdain_jax.plotting.quantities import plot
 from jourdain_jax.scene.bodies import Particle, RigidBody

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.equations.accelerations import bare_accelerations
+from jourdain_jax.build.sampling import sample_states
+from jourdain_jax.build.structure import structure_of
+from jourdain_jax.dynamics.accelerations import bare_accelerations
+from jourdain_jax.dynamics.power import power
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.equations.power import power
-from jourdain_jax.equations.sampling import sample_states
-from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy, unconstrained_equations
 from jourdain_jax.scene.scene import Scene
 

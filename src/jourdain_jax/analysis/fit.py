@@ -22,8 +22,8 @@ from jourdain_jax.analysis.least_squares import LeastSquaresSolution, least_squa
 from jourdain_jax.analysis.likelihood import as_runs, residuals
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.unknowns import Unknowns, check_starts, unknowns_of
-from jourdain_jax.equations.probing import standing_in
-from jourdain_jax.motion.forward_mode import simulate_forward
+from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.motion.integrators.forward_mode import simulate_forward
 from jourdain_jax.scene.scene import Scene
 
 _NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
@@ -62,7 +62,7 @@ def fit(
     constraints.
     """
     problem = _problem(scene, data, free, repeats=False)
-    with standing_in(scene):
+    with reference_parameters(scene):
         return _fit(problem, problem.measured(), simulation, cutoff, tolerance, max_iterations)
 
 
@@ -86,7 +86,7 @@ def fit_batch(
     counts = {values.shape[0] for run in problem.measured() for values in run.values()}
     if len(counts) != 1 or 0 in counts:
         raise ValueError(f"the channels hold {sorted(counts)} repeats; give every channel of every run the same leading axis, of one or more")
-    with standing_in(scene):
+    with reference_parameters(scene):
         return _fit_batch(problem, problem.measured(), simulation, cutoff, tolerance, max_iterations)
 
 

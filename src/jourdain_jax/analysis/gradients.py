@@ -7,16 +7,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.verification import DIFFERENCE_STEP, Check, central_difference, check
+from jourdain_jax.build.structure import plain_row_lengths, usual_rows
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
 from jourdain_jax.calculus.reals import as_real
-from jourdain_jax.equations.accelerations import reductions
+from jourdain_jax.dynamics.accelerations import reductions
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.instant import constraint_rows
 from jourdain_jax.equations.kinematics import coordinate_rates
-from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.reductions import reduce
 from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.equations.structure import plain_row_lengths, usual_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
@@ -43,7 +43,7 @@ def derivative_exists(scene: Scene, t, q, u, direction: Scene, dq, inputs=None) 
     return bool(np.max(np.abs(split)) <= 1e3 * rank_cutoff(A.dtype) * (size + np.max(np.abs(dA))))
 
 
-@on_numbers
+@eval_numpy
 def _row_change(scene, t, q, u, direction, dq, inputs, typical):
     moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
 
@@ -102,7 +102,7 @@ def _outcome(arguments, point) -> Float[Array, "reductions"]:
     return jnp.stack([weights @ jnp.concatenate([a.udot, a.constraint_force]) for a in found])
 
 
-_outcome_of_numbers = on_numbers(_outcome)
+_outcome_of_numbers = eval_numpy(_outcome)
 
 
 def by_reduction(way, scene, t, q, u, equations, rows):
@@ -110,13 +110,13 @@ def by_reduction(way, scene, t, q, u, equations, rows):
     return way.accelerations(scene, t, q, u, equations, rows) if isinstance(way, GibbsAppell) else reduce(way, equations, rows)
 
 
-@on_numbers
+@eval_numpy
 def _forward(arguments, point, direction):
     value, change = jax.jvp(lambda point: _outcome(arguments, point), (point,), (direction,))
     return change, jnp.abs(value) + jnp.abs(change) + jnp.sum(jnp.abs(arguments[1])) * 1e-3
 
 
-@on_numbers
+@eval_numpy
 def _reverse(arguments, point, direction):
     value, pull = jax.vjp(lambda point: _outcome(arguments, point), point)
     return jax.vmap(lambda way: _dot(pull(way)[0], direction))(jnp.eye(value.size, dtype=value.dtype))

@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.analysis.linear_rows import RowsOverStates
-from jourdain_jax.equations.sampling import sample_states
-from jourdain_jax.equations.structure import structure_of
+from jourdain_jax.build.sampling import sample_states
+from jourdain_jax.build.structure import structure_of
 from jourdain_jax.scene.scene import Scene
 
 INTEGRABLE = 1e-9  # size of dw on the velocities that w admits, relative to the derivatives of w

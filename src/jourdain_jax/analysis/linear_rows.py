@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.build.trace import named_values, traced_scene
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import coordinate_rates
-from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.rows import velocity_residual
-from jourdain_jax.equations.trace import named_values, traced_scene
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Unsupported
@@ -103,7 +103,7 @@ class _ByJax:
         return LinearRows(*pieces), along
 
 
-@on_numbers
+@eval_numpy
 def _linear_rows(scene: Scene, x, u):
     def pieces(x, u):
         t, q = x[0], x[1:]

@@ -3,11 +3,11 @@
 from dataclasses import asdict, dataclass
 
 from jourdain_jax.analysis.integrability import growth_vector, row_integrability
-from jourdain_jax.equations.accelerations import accelerations
-from jourdain_jax.equations.cyclic import cyclic_coordinates, ignorable_coordinates
-from jourdain_jax.equations.domain import COORDINATE_DOMAIN, SPEED_DOMAIN
+from jourdain_jax.build.domain import COORDINATE_DOMAIN, SPEED_DOMAIN
+from jourdain_jax.build.structure import structure_of
+from jourdain_jax.dynamics.accelerations import accelerations
+from jourdain_jax.dynamics.cyclic import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.equations.event_names import names_of_events
-from jourdain_jax.equations.structure import structure_of
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.arguments import as_state

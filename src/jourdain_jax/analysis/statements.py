@@ -12,14 +12,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.verification import DIFFERENCE_STEP, Check, central_difference, check
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import Velocities, coordinate_rates, motion_at, partial_velocities, pose_at
-from jourdain_jax.equations.probing import on_numbers
 from jourdain_jax.equations.rows import position_rows, velocity_rows
-from jourdain_jax.scene.answers import loads_of, potential_of
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import loads_of, potential_of
 
 _FLOOR = {"float64": 1e-4, "float32": 1e-2}  # SI units; what is smaller is not told from round-off in a difference
 _KINK = 1e-3  # a kink is a jump of order one, and its estimate is of lower order than the difference
@@ -35,7 +35,7 @@ def statement_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colu
     ]
 
 
-@on_numbers
+@eval_numpy
 def _evaluate(scene: Scene, t, q, u, inputs, Z) -> tuple[dict, dict]:
     motion = motion_at(scene, t, q, u, inputs)
     return _inertia(motion), _potentials(scene, motion, Z)
@@ -144,9 +144,9 @@ def _at(fixed, inputs, point) -> dict[str, Array]:
     return _pieces(eqx.combine(parameters, fixed), t, q, u, inputs)
 
 
-_at_numbers = on_numbers(_at)
+_at_numbers = eval_numpy(_at)
 
 
-@on_numbers
+@eval_numpy
 def _pushed(fixed, inputs, point, direction) -> tuple[dict[str, Array], dict[str, Array]]:
     return jax.jvp(lambda point: _at(fixed, inputs, point), (point,), (direction,))

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.analysis.tangent import flow_of, privileged_speeds
+from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.trace import traced_scene
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.calculus.reals import Number, Numbers
-from jourdain_jax.equations.cyclic import ignorable_coordinates
-from jourdain_jax.equations.domain import coordinate_bounds
+from jourdain_jax.dynamics.cyclic import ignorable_coordinates
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import names_of_position_rows
-from jourdain_jax.equations.trace import traced_scene
 from jourdain_jax.motion.start import State
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.graph import Unsupported

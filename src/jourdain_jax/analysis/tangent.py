@@ -12,15 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jourdain_jax.build.reference_parameters import with_reference_parameters
+from jourdain_jax.build.sampling import sample_states
+from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff, singular_values
 from jourdain_jax.calculus.rotations import quaternion_product
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import coordinate_rates
-from jourdain_jax.equations.probing import concretised, on_numbers
 from jourdain_jax.equations.reductions import Privileged
 from jourdain_jax.equations.rows import names_of_position_rows, position_residual
-from jourdain_jax.equations.sampling import sample_states
 from jourdain_jax.equations.scaling import row_scale, scaled
-from jourdain_jax.equations.structure import structure_of, usual_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.names import as_names, nearest
@@ -148,12 +149,12 @@ def dependent_coordinates(scene: Scene, state: State, named: tuple[str, ...], de
         return np.zeros(0, int)
     t, q = state.t[None], state.q[None]
     if any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves((scene, state))):
-        scene = concretised(scene)
+        scene = with_reference_parameters(scene)
         t, q, _ = sample_states(scene, 16)
     return _pivots(_geometric_rows(scene, t, q), [names.index(name) for name in named], type(scene).__name__)
 
 
-@on_numbers
+@eval_numpy
 def _geometric_rows(scene: Scene, t, q):
     """dg over the perturbations, at every state."""
     return jax.vmap(lambda t, q: jax.jacfwd(position_residual, 2)(scene, t, q) @ perturbations(scene, q).E)(t, q)

@@ -21,25 +21,25 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.gradients import by_reduction, gradient_checks
 from jourdain_jax.analysis.statements import statement_checks
 from jourdain_jax.analysis.verification import Check, Verification, check
+from jourdain_jax.build.structure import plain_row_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.null_space import null_space_svd
 from jourdain_jax.calculus.reals import Numbers
-from jourdain_jax.equations.accelerations import reductions
+from jourdain_jax.dynamics.accelerations import reductions
+from jourdain_jax.dynamics.power import power_of_nonconservative
+from jourdain_jax.dynamics.reactions import row_reactions
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import gibbs_equations
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, partial_velocities, velocities
 from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
-from jourdain_jax.equations.power import power_of_nonconservative
-from jourdain_jax.equations.probing import on_numbers
-from jourdain_jax.equations.reactions import row_reactions
 from jourdain_jax.equations.reductions import diagnosed
 from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
-from jourdain_jax.equations.structure import plain_row_lengths, structure_of, usual_rows
 from jourdain_jax.equations.virtual_power import equations_and_rows, kinetic_energy, newton_residual, potential_energy
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State
-from jourdain_jax.scene.answers import loads_of, potential_of
 from jourdain_jax.scene.arguments import as_input_vector, as_scene
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import loads_of, potential_of
 
 
 def verify(scene: Scene, state: State | dict | None = None, inputs: Numbers | dict | None = None, *, seed: int = 0) -> Verification:
@@ -75,7 +75,7 @@ def verify(scene: Scene, state: State | dict | None = None, inputs: Numbers | di
     return Verification(type(scene).__name__, tuple(checks), tuple(name for name in found["applicable"] if name not in applicable))
 
 
-@on_numbers
+@eval_numpy
 def _evaluate(scene, t, q, u, inputs, usual, plain) -> dict:
     equations, rows = equations_and_rows(scene, t, q, u, inputs)
     rows = rows.judged_by(usual)

@@ -19,7 +19,7 @@ from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 from jourdain_jax.bicycle.rides import Rides, ride, ride_speeds
 from jourdain_jax.bicycle.stability import eigenvalues, stability_speeds
 from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
-from jourdain_jax.motion.results import EVENT
+from jourdain_jax.motion.trajectories.results import EVENT
 
 SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")
 MAX_SPEED = 50.0  # m/s; a speed beyond it counts as none

@@ -7,7 +7,7 @@ import numpy as np
 
 from jourdain_jax.bicycle.linear import upright_running
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
-from jourdain_jax.motion.rollout import Rollout, rollout
+from jourdain_jax.motion.batches.rollout import Rollout, rollout
 from jourdain_jax.motion.start import State
 
 KICK = 0.1  # rad/s, in lean

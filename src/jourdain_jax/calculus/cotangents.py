@@ -61,11 +61,11 @@ ad.deflinear2(_tangents_p, lambda cotangents, *values, look: [ad.instantiate_zer
 ad.primitive_jvps[_tangents_p] = lambda primals, tangents, *, look: (_tangents_p.bind(*primals, look=look), list(tangents))
 
 
-def shown_forwards(values: tuple, look: Callable) -> tuple:
+def tap_tangents(values: tuple, look: Callable) -> tuple:
     """`values`, a tuple of arrays; `look` is called with the list of their tangents, with a first axis of directions, where these are numbers."""
     return tuple(_forwards_p.bind(*values, look=look))
 
 
-def shown_backwards(values: tuple, look: Callable) -> tuple:
+def tap_cotangents(values: tuple, look: Callable) -> tuple:
     """`values`, a tuple of arrays; `look` is called with the list of their cotangents where these are numbers."""
     return tuple(_shown_p.bind(*values, look=look))

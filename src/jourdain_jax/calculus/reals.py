@@ -72,3 +72,8 @@ def described(value) -> str:
         return f"an array of shape {tuple(value.shape)}"
     name = type(value).__name__
     return f"an {name}" if name[0] in "aeioAEIO" else f"a {name}"
+
+
+def is_traced(*trees) -> bool:
+    """Whether any leaf is being traced, so that its number is not known."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))

@@ -14,7 +14,7 @@ import jaxlib
 
 from jourdain_jax.cli.bicycle_verbs import add as add_bicycle_verbs
 from jourdain_jax.cli.model_verbs import add as add_model_verbs
-from jourdain_jax.motion.versions import version_of
+from jourdain_jax.motion.trajectories.versions import version_of
 from jourdain_jax.scene.names import nearest
 
 OK, FAILED, USAGE = 0, 1, 2

@@ -9,12 +9,12 @@ from jourdain_jax.analysis.report import report
 from jourdain_jax.analysis.verify import verify
 from jourdain_jax.equations.event_names import names_of_events
 from jourdain_jax.models.registry import MODELS, counts_of, known_model, model
-from jourdain_jax.motion.diagnostics import ContactExtremes, diagnose
-from jourdain_jax.motion.results import EVENT, FALLBACKS, SUCCESS
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import start
-from jourdain_jax.motion.storage import save
-from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.motion.trajectories.diagnostics import ContactExtremes, diagnose
+from jourdain_jax.motion.trajectories.results import EVENT, FALLBACKS, SUCCESS
+from jourdain_jax.motion.trajectories.storage import save
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.animation import animate, check_suffix
 from jourdain_jax.plotting.quantities import check_format, plot
 from jourdain_jax.scene.parameters import parameters_of

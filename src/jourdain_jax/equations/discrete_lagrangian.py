@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 from jourdain_jax.equations.kinematics import motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy, resultants
-from jourdain_jax.scene.answers import gauge_of, loads_of
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import gauge_of, loads_of
 
 RULES = ("midpoint", "trapezoidal")
 

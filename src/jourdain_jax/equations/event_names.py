@@ -3,12 +3,12 @@
 import jax
 
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.equations.probing import described_once
-from jourdain_jax.scene.answers import events_of
+from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import events_of
 
 
-@described_once
+@once_per_class
 def names_of_events(scene: Scene) -> tuple[str, ...]:
     """Names of the stop events, sorted, as JAX returns dictionaries."""
     q, u, _ = scene.named()

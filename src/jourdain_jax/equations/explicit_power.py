@@ -15,10 +15,10 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.virtual_power import potential_energy, resultants
-from jourdain_jax.scene.answers import loads_of
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import loads_of
 
 
 def stored_by_inputs(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]) -> Float[Array, ""]:

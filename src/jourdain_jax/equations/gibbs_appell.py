@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.kinematics import bias_accelerations, inertias, velocities
-from jourdain_jax.equations.probing import at_once
 from jourdain_jax.equations.reductions import APPLICABLE_PIVOT, Partition, Reduced, reduced, solve_definite
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.equations.scaling import scaled
@@ -45,7 +45,7 @@ def gibbs_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquation
     return _gibbs_equations(scene, as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f)
 
 
-@at_once
+@eager_if_concrete
 def _gibbs_equations(scene: Scene, t, q, u, inputs) -> UnconstrainedEquations:
     zero = jnp.zeros_like(u)
     h, M = _gradient_and_hessian(lambda a: gibbs_function(scene, t, q, u, a), zero)

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import as_real
+from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.kinematics import Inertias, Velocities, coordinate_rates, inertias_of, motion_at, velocities_of
-from jourdain_jax.equations.probing import at_once
 from jourdain_jax.equations.rows import ConstraintRows, flatten_rows, names_of_rows, velocity_rows
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.motion_state import Motion
@@ -51,7 +51,7 @@ def rows_of(scene: Scene, instant: Instant) -> ConstraintRows:
     return ConstraintRows(instant.value.rows, instant.by_speeds.rows, instant.rate.rows, names_of_rows(scene))
 
 
-@at_once
+@eager_if_concrete
 def constraint_rows(scene: Scene, t, q, u, inputs=None) -> ConstraintRows:
     """phi, `A = d phi/du` and the drift `d phi/dt` at `udot = 0` of all rows, with their names: `A udot = -drift`; eqs. (5)-(9), (25).
 

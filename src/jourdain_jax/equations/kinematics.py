@@ -14,12 +14,12 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Numbers, as_real
 from jourdain_jax.calculus.rotations import vee
-from jourdain_jax.equations.probing import at_once
-from jourdain_jax.scene.answers import bodies_of, coordinate_rates_of
+from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_speeds, as_time
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Pose
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import bodies_of, coordinate_rates_of
 
 
 class Velocities(eqx.Module):
@@ -82,7 +82,7 @@ def velocities_of(motion: Motion) -> Velocities:
     return Velocities(jnp.stack([b.velocity for b in bodies]), jnp.stack([b.angular_velocity_body for b in bodies]))
 
 
-@at_once
+@eager_if_concrete
 def partial_velocities(scene: Scene, t, q, u) -> Velocities:
     """`beta = dv/du` (inertial frame) and `gamma = d omega/du` (body axes), shape (bodies, 3, speeds), bodies sorted by name; eqs. (26)-(31), (49)."""
     return jax.jacfwd(lambda u: velocities(scene, t, q, u))(as_speeds(scene, u))

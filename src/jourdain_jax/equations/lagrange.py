@@ -9,7 +9,7 @@ Source: Wang and Pao (2003), eq. (11).
 import jax
 import jax.numpy as jnp
 
-from jourdain_jax.equations.probing import at_once
+from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces, kinetic_energy
 from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_speeds, as_time
 from jourdain_jax.scene.scene import Scene
@@ -28,7 +28,7 @@ def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquat
     return _lagrange_equations(scene, as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f)
 
 
-@at_once
+@eager_if_concrete
 def _lagrange_equations(scene: Scene, t, q, u, inputs) -> UnconstrainedEquations:
     def momentum(t, q, u):
         return jax.grad(kinetic_energy, argnums=3)(scene, t, q, u)

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.calculus.fixed_point import fixed_point
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
-from jourdain_jax.calculus.settling import settled
 from jourdain_jax.equations.reductions import cholesky
 from jourdain_jax.equations.rows import names_of_position_rows, position_residual, velocity_residual
 from jourdain_jax.equations.scaling import row_scale, speed_scale
@@ -44,13 +44,13 @@ def project_positions(
         d = row_scale(G, typical)
         return q - jnp.where(free, pseudo_inverse(d[:, None] * G) @ (d * residual), 0.0)  # what is held does not move by round-off either
 
-    return settled(step, q, iterations)
+    return fixed_point(step, q, iterations)
 
 
-def miss_of_rows(scene: Scene, t, q) -> Float[Array, ""]:
+def position_error_of_rows(scene: Scene, t, q) -> Float[Array, ""]:
     """Largest residual of the geometric rows; infinite where it is not a number."""
-    miss = jnp.max(jnp.abs(closure_residual(scene, t, q)), initial=0.0)
-    return jnp.where(jnp.isfinite(miss), miss, jnp.inf)
+    position_error = jnp.max(jnp.abs(closure_residual(scene, t, q)), initial=0.0)
+    return jnp.where(jnp.isfinite(position_error), position_error, jnp.inf)
 
 
 def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "coordinates"]:
@@ -94,4 +94,4 @@ def project_speeds(
         x = pseudo_inverse(d[:, None] * weighted, cutoff) @ (d * phi)
         return u - jnp.where(free, c * jax.scipy.linalg.solve_triangular(L.T, x, lower=False), 0.0)
 
-    return settled(step, u, iterations)
+    return fixed_point(step, u, iterations)

@@ -15,12 +15,12 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.equations.kinematics import motion_at, pose_at
-from jourdain_jax.equations.probing import described_once
-from jourdain_jax.scene.answers import contacts_of, geometric_constraints_of, prescribed_of, velocity_constraints_of
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
+from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import contacts_of, geometric_constraints_of, prescribed_of, velocity_constraints_of
 
 
 class UsualRows(eqx.Module):
@@ -126,14 +126,14 @@ def _velocity_residual(scene: Scene, t: Float[Array, ""], q, u, inputs):
     return flatten_rows(velocity_rows(scene, motion_at(scene, t, q, u, inputs)), q.dtype)
 
 
-@described_once
+@once_per_class
 def names_of_rows(scene: Scene) -> tuple[str, ...]:
     """Names of all rows, in order, without evaluating them."""
     q, u, _ = scene.named()
     return _names(lambda s: velocity_rows(s, motion_at(s, 0.0, q, u)), scene)
 
 
-@described_once
+@once_per_class
 def names_of_position_rows(scene: Scene) -> tuple[str, ...]:
     """Names of the geometric rows, in order; they come first among all rows."""
     q, _, _ = scene.named()

@@ -15,11 +15,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import skew
+from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import Inertias, Velocities, bias_accelerations, coordinate_rates, inertias, motion_at, partial_velocities, pose_at
-from jourdain_jax.equations.probing import at_once
 from jourdain_jax.equations.rows import ConstraintRows
-from jourdain_jax.scene.answers import loads_of, potential_of
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.loads import Load
@@ -27,6 +26,7 @@ from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import loads_of, potential_of
 
 
 class UnconstrainedEquations(eqx.Module):
@@ -93,7 +93,7 @@ def kinetic_energy(scene: Scene, t, q, u) -> Float[Array, ""]:
     return 0.5 * (jnp.sum(from_bodies.mass * jnp.sum(v * v, 1)) + jnp.einsum("bi,bij,bj->", w, from_bodies.inertia, w))
 
 
-@at_once
+@eager_if_concrete
 def unconstrained_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
     """M, h and Q of `M udot + h = Q`, the equations without constraint forces; eqs. (50), (56).
 
@@ -135,7 +135,7 @@ def _inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: V
     return weights.mass[:, None] * acceleration.linear, torque
 
 
-@at_once
+@eager_if_concrete
 def generalized_forces(scene: Scene, t, q, u, inputs=None) -> Float[Array, "speeds"]:
     """`Q = sum beta' F + gamma' L + Q_direct - N' dV/dq`, shape (speeds,), in N or N m; eq. (41).
 
@@ -192,7 +192,7 @@ def _displaced(pose: BodyPose, shift, turn) -> BodyPose:
     return moved
 
 
-@at_once
+@eager_if_concrete
 def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
     """The constraint force and torque on each body, `R = m a - F` (N) and `I alpha + omega x I omega - L` (N m, about the mass centre); (1)-(3).
 

@@ -14,14 +14,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jourdain_jax.equations.structure import Structure
-from jourdain_jax.equations.trace import TracedScene, VelocityQuantities
-from jourdain_jax.lowering.elimination import eliminate, serves, solve_symmetric
+from jourdain_jax.build.structure import Structure
+from jourdain_jax.build.trace import TracedScene, VelocityQuantities
+from jourdain_jax.lowering.elimination import eliminate, pivots_ok, solve_symmetric
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.multipliers import projected_coordinates
-from jourdain_jax.program.derivative import along, columns, derivatives
+from jourdain_jax.program.derivative import columns, derivatives, directional_derivative
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.formal import FormalProbes, equal, formal, on_rows, unaffected
+from jourdain_jax.program.identity_test import IdentityProbes, equal, identity_probes, on_rows, unaffected
 from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
 
 
@@ -79,14 +79,14 @@ class AppellOnGraph:
         self.dependent = [k for k in every if k not in self.independent]
         self.kept, self.rows, self.multiplied = kept, *(([], rows) if kept else (rows, []))
         self.reference, self.quaternions, self.far = reference, quaternions, far
-        self.formal = self._formal()
+        self.identity_probes = self._made_identity_probes()
 
-    def _formal(self) -> FormalProbes:
+    def _made_identity_probes(self) -> IdentityProbes:
         """Generic states on the geometric rows, at generic parameters."""
         g, q = self.graph, self.traced.q.tolist()
         attitudes = {f"q_{first + i}": q[first + i] for first in self.quaternions for i in range(4)}
         norms = [g.sub(g.total(g.mul(n, n) for n in q[first : first + 4]), g.one) for first in self.quaternions]
-        return on_rows(formal(self.probes, attitudes), self.probes, [*self.traced.at.closure.tolist(), *norms], {f"q_{i}": n for i, n in enumerate(q)})
+        return on_rows(identity_probes(self.probes, attitudes), self.probes, [*self.traced.at.closure.tolist(), *norms], {f"q_{i}": n for i, n in enumerate(q)})
 
     def build(self, strategy: Strategy) -> Equations:
         """The equations by one strategy."""
@@ -113,7 +113,7 @@ class AppellOnGraph:
             (power,) = self.graph.substituted([int(self.traced.at.power)], true_z)
         elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
-            power = power if equal(self.formal([power]), self.formal([true_power])).all() else true_power
+            power = power if equal(self.identity_probes([power]), self.identity_probes([true_power])).all() else true_power
         return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots, *sines])), sorted(guards), power, events, usual)
 
     def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
@@ -124,7 +124,7 @@ class AppellOnGraph:
         g, at, q = self.graph, self.traced.at, self.traced.q.tolist()
         redundant = {s for s in range(len(at.closure)) if s not in self.rows and s not in self.multiplied}
         closure = [int(n) for s, n in enumerate(at.closure) if s not in redundant]
-        closure = g.substituted(closure, unaffected(self.formal, closure, self._at_reference(ignorable)))
+        closure = g.substituted(closure, unaffected(self.identity_probes, closure, self._at_reference(ignorable)))
         norms = [g.total(g.mul(n, n) for n in q[first : first + 4]) for first in self.quaternions]
         moved = list(q)
         if closure:
@@ -177,7 +177,7 @@ class AppellOnGraph:
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
         simple = (lambda nodes: list(nodes)) if forms is None else (lambda nodes: [forms.simplified(n) for n in nodes])
         phi = [int(at.phi[s]) for s in self.rows]
-        phi = g.substituted(phi, unaffected(self.formal, [*phi, *at.qdot.tolist()], kinematics.held))
+        phi = g.substituted(phi, unaffected(self.identity_probes, [*phi, *at.qdot.tolist()], kinematics.held))
         A = [list(row) for row in zip(*columns(g, phi, u), strict=True)]
         phi_0 = g.substituted(phi, dict.fromkeys(u, g.zero))
         y = {k: u[k] for k in self.independent}
@@ -187,7 +187,8 @@ class AppellOnGraph:
             return eliminate(g, [[row[k] for k in columns] for row in A], right, self.probes, self.far)
 
         whole = solved(self.dependent, y)
-        same = equal(self.formal(kinematics.z), self.formal([row[0] for row in whole.solution]), serves(whole.pivots, self.formal))
+        generic = self.identity_probes
+        same = equal(generic(kinematics.z), generic([row[0] for row in whole.solution]), pivots_ok(whole.pivots, generic))
         known = y | {k: n for k, n, s in zip(self.dependent, kinematics.z, same, strict=True) if s}
         left = [k for k in self.dependent if k not in known]
         A, phi_0 = [simple(row) for row in A], simple(phi_0)
@@ -276,7 +277,7 @@ class _Kinematics:
             parts = self._parts(column)
             direction = self._cut([(at.v, parts[0]), (at.turning, turn(parts)), (at.orientation, None), (at.position, None)])
             directions[k] = direction | {self.u[k]: g.one}
-        A = [[row.get(k, g.zero) for k in directions] for row in along(g, self.phi, directions)]
+        A = [[row.get(k, g.zero) for k in directions] for row in directional_derivative(g, self.phi, directions)]
         A = np.reshape(self._at(g.substituted([n for row in A for n in row], put)), (len(A), len(self.u))).tolist()
         phi_0 = self._at(g.substituted(self.phi, dict.fromkeys(self.u, g.zero)))
         self._solve(A, phi_0)

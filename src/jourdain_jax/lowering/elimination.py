@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.pivots import FEW, Pivot, Pivots, products
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.formal import FormalProbes
 from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.identity_test import IdentityProbes
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Eliminated:
     pivots: list[int]
 
 
-def serves(pivots: list[int], probes: Probes | FormalProbes) -> Bool[np.ndarray, "probes"]:
+def pivots_ok(pivots: list[int], probes: Probes | IdentityProbes) -> Bool[np.ndarray, "probes"]:
     """At which probes what was divided by these pivots is more than round-off: none of them is small beside its usual size."""
     sizes = np.abs(probes(pivots))
     return np.all(sizes > SMALLEST_PIVOT * usual(sizes)[:, None], axis=0)

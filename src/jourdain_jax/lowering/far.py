@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from jourdain_jax.equations.trace import TracedScene
+from jourdain_jax.build.trace import TracedScene
 from jourdain_jax.lowering.pivots import turns
 from jourdain_jax.program.derivative import columns
 from jourdain_jax.program.evaluate import Probes

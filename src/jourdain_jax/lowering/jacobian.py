@@ -14,8 +14,8 @@ import jax.numpy as jnp
 
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.emit import run
+from jourdain_jax.program.fused import fused
 from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
-from jourdain_jax.program.together import together
 
 LARGEST_WORK = 100_000  # operations times variables: beyond, deriving takes longer than it can save
 LARGEST_GROWTH = 8  # operations of values and Jacobian over those of the values
@@ -50,7 +50,7 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
         used = [(i, j, node) for i, j, node in entries if moving[j]]
         varying = list(dict.fromkeys(node for *_, node in used if not graph.is_const(node)))
         found = values_of([*outputs, *watched, *varying], values)
-        found = together(found) if found[0].ndim == 0 else found  # measured: a quarter less time for one motion, a quarter more in batches
+        found = fused(found) if found[0].ndim == 0 else found  # measured: a quarter less time for one motion, a quarter more in batches
         J = dict(zip(varying, found[count + len(watched) :], strict=True))
         # d o_i = sum_j J_ij d x_j
         along = [jnp.zeros_like(x) for x in found[: count + len(watched)]]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jourdain_jax.equations.structure import Structure
+from jourdain_jax.build.structure import Structure
 from jourdain_jax.lowering.multipliers import Accelerations, Columns, accelerations_by_multipliers, projected_speeds, with_inertia_of_rows
 from jourdain_jax.lowering.partition import Partition
 from jourdain_jax.program.derivative import columns

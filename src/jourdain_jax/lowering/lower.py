@@ -12,24 +12,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.equations.accelerations import bare_accelerations
+from jourdain_jax.build.reference_parameters import with_reference_parameters, without_collecting
+from jourdain_jax.build.sampling import random_states
+from jourdain_jax.build.structure import Structure, structure_of
+from jourdain_jax.build.trace import event_values, named_values, traced_scene
+from jourdain_jax.dynamics.accelerations import bare_accelerations
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations
-from jourdain_jax.equations.probing import concretised, on_numbers, without_collecting
 from jourdain_jax.equations.reductions import NullSpaceQR
-from jourdain_jax.equations.sampling import random_states
-from jourdain_jax.equations.structure import Structure, structure_of
-from jourdain_jax.equations.trace import event_values, named_values, traced_scene
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
-from jourdain_jax.lowering.blame import blamed
-from jourdain_jax.lowering.elimination import serves, usual
+from jourdain_jax.lowering.elimination import pivots_ok, usual
 from jourdain_jax.lowering.far import full_turns, on_velocity_rows
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered import Lowered, Stage
 from jourdain_jax.lowering.massless import may_be_massless
+from jourdain_jax.lowering.mismatch import diagnose_mismatch
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.formal import FormalProbes, equal
 from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.identity_test import IdentityProbes, equal
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -59,7 +60,8 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
     structure = structure_of(scene)
     every_speed = not (structure.affine and structure.well_conditioned) if every_speed is None else every_speed
     every_speed = every_speed or not structure.row_names
-    return _lowered(_Key(concretised(scene), structure, every_speed, bool(every_speed and structure.row_names) and may_be_massless(scene, structure)))
+    massless = bool(every_speed and structure.row_names) and may_be_massless(scene, structure)
+    return _lowered(_Key(with_reference_parameters(scene), structure, every_speed, massless))
 
 
 def lower(scene: Scene, every_speed: bool | None = None) -> Lowered:
@@ -182,7 +184,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
     put_back = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
     groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power], best.events, put_back.q, put_back.u]
-    outputs = graph.with_quotients(_with_equal_calls_once(builder.formal, [n for group in groups for n in group]))
+    outputs = graph.with_quotients(_with_equal_calls_once(builder.identity_probes, [n for group in groups for n in group]))
     ends = np.cumsum([len(group) for group in groups])
     qdot, ydot, z, pivots, guards, power, events, put_q, put_u = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
     names = scene.coordinate_names.entries
@@ -245,7 +247,7 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
     limit = TO_DENSE[jnp.result_type(float).name]
     if np.max(error) > limit:
         worst = names[int(np.argmax(error))]
-        culprit = blamed(scene, builder.traced, probes, limit, parameters, t, q, u, inputs)
+        culprit = diagnose_mismatch(scene, builder.traced, probes, limit, parameters, t, q, u, inputs)
         raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: {culprit}")
     if found.events and not np.allclose(probes(found.events)[:, chosen][:, usable], dense_events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
         raise NotLowered("the value of a stop event differs from the dense path")
@@ -267,8 +269,8 @@ def _dense_rates(independent: tuple[int, ...], eliminates: bool, one_by_one: boo
         return motion.qdot.array, found.udot[columns], event_values(scene, motion)
 
     if not one_by_one:
-        return on_numbers(lambda scene, t, q, u, inputs: jax.vmap(one)(scene, t, q, u[:, columns], inputs))
-    single = on_numbers(one)
+        return eval_numpy(lambda scene, t, q, u, inputs: jax.vmap(one)(scene, t, q, u[:, columns], inputs))
+    single = eval_numpy(one)
 
     def each(scene, t, q, u, inputs):
         found = [single(jax.tree.map(lambda x, k=k: x[k], scene), t[k], q[k], u[k, columns], inputs[k]) for k in range(len(t))]
@@ -300,7 +302,7 @@ def _strategies(held: tuple[int, ...], small: bool, explicit_to_implicit: float 
 
 def _values(found: Equations, probes: Probes) -> np.ndarray:
     """Rates at all probes, NaN where a pivot is small: there the program does not serve."""
-    return np.where(serves(found.pivots, probes), probes(_rates(found)), np.nan)
+    return np.where(pivots_ok(found.pivots, probes), probes(_rates(found)), np.nan)
 
 
 def _agree(values: np.ndarray, expected: np.ndarray) -> bool:
@@ -322,16 +324,16 @@ def _enough(usable: np.ndarray) -> bool:
 
 def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:
     """Coordinates (quaternions as a whole) whose value the privileged accelerations do not depend on anywhere."""
-    probes, generic, q = builder.probes, builder.formal, builder.traced.q
+    probes, generic, q = builder.probes, builder.identity_probes, builder.traced.q
     attitudes = [tuple(range(first, first + 4)) for first, _ in scene.coordinates.quaternions]
     single = [(i,) for i in range(len(q)) if not any(i in attitude for attitude in attitudes)]
     at_probes, reference = expected[len(equations.qdot) :], scene.coordinates.reference()
     accelerations = replace(equations, qdot=[])
-    used, here, regular = set(builder.graph.reachable(equations.ydot)), generic(equations.ydot), serves(equations.pivots, generic)
+    used, here, regular = set(builder.graph.reachable(equations.ydot)), generic(equations.ydot), pivots_ok(equations.pivots, generic)
 
     def unchanged(group) -> bool:
         elsewhere = generic.exchanged([f"q_{i}" for i in group])
-        return bool(np.all(equal(elsewhere(equations.ydot), here, regular & serves(equations.pivots, elsewhere))))
+        return bool(np.all(equal(elsewhere(equations.ydot), here, regular & pivots_ok(equations.pivots, elsewhere))))
 
     def regular_at_reference(group) -> bool:
         values = _values(accelerations, probes.with_inputs({f"q_{i}": np.full(probes.count, reference[i]) for i in group}))
@@ -349,7 +351,7 @@ def _operands(graph: Graph, call: int) -> list[int]:
     return [n for a in graph.args[call] if graph.op[a] == "array" for n in graph.args[a]]
 
 
-def _with_equal_calls_once(generic: FormalProbes, outputs: list[int]) -> list[int]:
+def _with_equal_calls_once(generic: IdentityProbes, outputs: list[int]) -> list[int]:
     """The outputs, with one call in place of those that compute the same of what is equal, though it is not written in the same way."""
     graph = generic.graph
     calls = sorted(graph.calls(outputs), key=lambda call: (graph.operations(graph.args[call]), call))  # so none is replaced by one made from it

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
-from jourdain_jax.equations.trace import TracedScene
+from jourdain_jax.build.trace import TracedScene
 from jourdain_jax.lowering import export
 from jourdain_jax.lowering.jacobian import differentiable
 from jourdain_jax.program.emit import run

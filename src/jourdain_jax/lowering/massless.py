@@ -5,8 +5,8 @@ from dataclasses import fields
 import jax
 import numpy as np
 
-from jourdain_jax.equations.probing import concretised
-from jourdain_jax.equations.structure import Structure, structure_of
+from jourdain_jax.build.reference_parameters import with_reference_parameters
+from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 
@@ -33,7 +33,7 @@ def _with_zeros(scene: Scene, every: bool) -> Scene | None:
     may_vanish = {f.name for f in fields(scene) if (every and not f.metadata.get("positive")) or f.metadata.get("non_negative") or _is_zero(f.default)}
     given, treedef = jax.tree_util.tree_flatten_with_path(scene)
     zeros = [is_traced(x) and jax.tree_util.keystr(path[:1]).strip(".") in may_vanish for path, x in given]
-    leaves = [np.zeros_like(y) if zero else y for zero, y in zip(zeros, jax.tree.leaves(concretised(scene)), strict=True)]
+    leaves = [np.zeros_like(y) if zero else y for zero, y in zip(zeros, jax.tree.leaves(with_reference_parameters(scene)), strict=True)]
     return jax.tree.unflatten(treedef, leaves) if any(zeros) else None
 
 

@@ -1,4 +1,4 @@
-"""One motion from start to end as one compiled program: the lean loop for the default options, diffrax for all others.
+"""One motion from start to end as one compiled program: our explicit Runge-Kutta loop for the default options, diffrax for all others.
 
 Both give states at the saved times, which of those were reached, and where and why the motion ended; then speeds are worked out, and all is put into a
 `Trajectory`.
@@ -16,28 +16,29 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jourdain_jax.equations.plausibility import body_faults
+from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.motion import integrands, lean_loop, results
-from jourdain_jax.motion.event_location import Remembering, locate, with_tolerances
-from jourdain_jax.motion.event_search import no_event
-from jourdain_jax.motion.finite_derivatives import Flat
-from jourdain_jax.motion.guarded_solver import GuardedSolver
+from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.input_programs import by_itself, for_programs
-from jourdain_jax.motion.knots import knots_between
-from jourdain_jax.motion.land_on import land_on, merged
-from jourdain_jax.motion.lockstep import in_blocks, width
+from jourdain_jax.motion.integrators import erk_loop, integrands
+from jourdain_jax.motion.integrators.event_location import Remembering, locate, with_tolerances
+from jourdain_jax.motion.integrators.event_search import no_event
+from jourdain_jax.motion.integrators.guarded_solver import GuardedSolver
+from jourdain_jax.motion.integrators.knots import knots_between
+from jourdain_jax.motion.integrators.solver_choice import controller_of, marked_inputs, marked_outputs, since, steps_are_given, time_origin
+from jourdain_jax.motion.integrators.step_to_times import merged, step_to_times
+from jourdain_jax.motion.integrators.wrapping_solver import for_adjoint
+from jourdain_jax.motion.integrators.zero_tangents import ZeroTangentIfNonfinite
 from jourdain_jax.motion.quick_compilation import quickly_compiled
-from jourdain_jax.motion.solver_choice import controller_of, marked_inputs, marked_outputs, since, steps_are_given, time_origin
 from jourdain_jax.motion.span import fitting_times, times_fit
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import Integrated, StateForm
-from jourdain_jax.motion.trajectory import Trajectory
-from jourdain_jax.motion.wrapping_solver import for_adjoint
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
-LEAN_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
+OWN_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
 
 
 class Options(eqx.Module):
@@ -54,10 +55,10 @@ class Options(eqx.Module):
     event_names: tuple[str, ...] = eqx.field(static=True)
 
     @property
-    def lean(self) -> bool:
-        """Whether the lean loop serves."""
+    def by_erk_loop(self) -> bool:
+        """Whether our own explicit Runge-Kutta loop integrates it."""
         plain = self.controller is None and self.saveat is None and self.land
-        return plain and type(self.solver) in LEAN_SOLVERS and type(self.adjoint) in (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode)
+        return plain and type(self.solver) in OWN_SOLVERS and type(self.adjoint) in (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode)
 
 
 class Solved(eqx.Module):
@@ -121,8 +122,8 @@ def integrate_lanes(setups: Setup) -> Trajectory:
     """The motions of all lanes: `lockstep.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
     begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
     program = setups.form.lowered
-    if setups.options.lean and program is not None:
-        solved = in_blocks(_lanes_by_lean_loop, width(program), fitting, begun)
+    if setups.options.by_erk_loop and program is not None:
+        solved = in_blocks(_lanes_by_erk_loop, width(program), fitting, begun)
     else:
         # lanes often share their times: what XLA knows to be the same in all of them it moves through diffrax's `nextafter`, one operation per pass
         times = jax.lax.optimization_barrier((fitting.t0, fitting.t1, fitting.options.dt0))
@@ -141,7 +142,7 @@ def _begin(setup: Setup) -> Begun:
 
 
 def _solved(setup: Setup, begun: Begun) -> Solved:
-    return (_by_lean_loop if setup.options.lean else _by_diffrax)(setup, begun)
+    return (_by_erk_loop if setup.options.by_erk_loop else _by_diffrax)(setup, begun)
 
 
 def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
@@ -157,7 +158,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     def saved_state(tau, y, valid):
         # what was never reached holds anything: compute at the end state instead, then mark
         tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
-        y = integrands.project(tau, y, args) if moving and not options.lean else y
+        y = integrands.project(tau, y, args) if moving and not options.by_erk_loop else y
         t = origin + tau
         q, u = form.unpack(scene, fixed, t, y, inputs(t))
         work = None if y.work is None else y.work + form.stored(scene, t, q, inputs(t)) - stored_first
@@ -209,7 +210,7 @@ def _without_faults(scene: Scene, t0, start: State):
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
 
 
-def _by_lean_loop(setup: Setup, begun: Begun) -> Solved:
+def _by_erk_loop(setup: Setup, begun: Begun) -> Solved:
     form, options = setup.form, setup.options
     moving = form.projects_positions or form.projects_speeds
     events = integrands.events if options.event_names else None
@@ -217,7 +218,7 @@ def _by_lean_loop(setup: Setup, begun: Begun) -> Solved:
     return _lean(setup, begun.y0, begun.args, setup.ts, _knots(setup), *functions)
 
 
-def _lanes_by_lean_loop(setups: Setup, begun: Begun) -> Solved:
+def _lanes_by_erk_loop(setups: Setup, begun: Begun) -> Solved:
     """Lanes in lockstep: their axis comes first outside and last inside."""
     form, options = setups.form, setups.options
     moving = form.projects_positions or form.projects_speeds
@@ -231,7 +232,7 @@ def _lanes_by_lean_loop(setups: Setup, begun: Begun) -> Solved:
 def _lean(setup: Setup, y0, args, ts, knots, rates, rates_and_pivots, project, events) -> Solved:
     options = setup.options
     goals = jnp.concatenate([ts, setup.t1[None]]) - setup.t0
-    problem = lean_loop.Problem(
+    problem = erk_loop.Problem(
         rates=rates,
         args=args,
         project=project,
@@ -245,7 +246,7 @@ def _lean(setup: Setup, y0, args, ts, knots, rates, rates_and_pivots, project, e
         rates_and_pivots=rates_and_pivots if setup.form.has_pivots else None,
     )
     kind: Literal["forward", "reverse"] = "forward" if isinstance(options.adjoint, diffrax.ForwardMode) else "reverse"
-    ys, reached, end = lean_loop.integrate(problem, lean_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, options.dt0, kind)
+    ys, reached, end = erk_loop.integrate(problem, erk_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, options.dt0, kind)
     ys = jax.tree.map(lambda x: x[:-1], ys)
     return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, end.pivot)
 
@@ -277,7 +278,7 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
     moving = form.projects_positions or form.projects_speeds
     solver = for_adjoint(options.solver, options.adjoint)
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    rates, project = (Flat(f, t0, y0) if implicit else f for f in (integrands.rates, integrands.project))
+    rates, project = (ZeroTangentIfNonfinite(f, t0, y0) if implicit else f for f in (integrands.rates, integrands.project))
     solver = GuardedSolver(with_tolerances(solver, controller), project if moving else None, integrands.pivots if form.has_pivots else None)
     term = diffrax.ODETerm(rates)
     solution = diffrax.diffeqsolve(
@@ -289,7 +290,7 @@ def _by_diffrax(setup: Setup, begun: Begun) -> Solved:
         y0,
         args,
         saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)], solver_state=True),
-        stepsize_controller=land_on(landings, controller) if land else controller,
+        stepsize_controller=step_to_times(landings, controller) if land else controller,
         adjoint=options.adjoint,
         event=diffrax.Event(_an_event) if names else None,
         max_steps=options.max_steps + (0 if knots is None else len(knots)),

@@ -2,7 +2,7 @@
 
 import jax
 
-from jourdain_jax.motion import results
+from jourdain_jax.motion.trajectories import results
 from jourdain_jax.scene.numbers import is_traced
 
 
@@ -11,7 +11,7 @@ def nan_is_a_mark():
     return jax.debug_nans(False)
 
 
-def looked_after(integrate, setup):
+def marked(integrate, setup):
     """`integrate(setup)` under `jax_debug_nans`: NaN after an event is a mark; where the motion failed, it is integrated again for JAX to find the NaN."""
     if not jax.config.jax_debug_nans or is_traced(setup):
         return integrate(setup)

@@ -19,9 +19,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jourdain_jax.calculus.cotangents import shown_backwards, shown_forwards
+from jourdain_jax.calculus.cotangents import tap_cotangents, tap_tangents
 from jourdain_jax.motion.integration import Setup
-from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.numbers import is_traced
 
 LARGEST_ERROR = 0.05  # relative, of a derivative, beyond which a warning is given
@@ -108,7 +108,7 @@ def _judge(amplification: float, rtol: float, steps: int) -> None:
         warnings.warn(text, SensitivityWarning, stacklevel=3)
 
 
-def watched(setup: Setup, integrate) -> Trajectory:
+def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     """`integrate(setup)`; its derivative, taken outside of `jit`, warns where the motion amplifies errors too much."""
     if not is_traced(setup):
         return integrate(setup)
@@ -120,7 +120,7 @@ def watched(setup: Setup, integrate) -> Trajectory:
     only_start = not is_traced(eqx.tree_at(lambda s: s.start, setup, None))
     tolerances = float(known[2]), float(known[3])
     sizes = _Growth(*tolerances, only_start) if forward else _Sizes(*tolerances)
-    shown = shown_forwards if forward else shown_backwards
+    shown = tap_tangents if forward else tap_cotangents
     at_start = shown((start.q, start.u), sizes.start(known[:2]))
     motion = integrate(eqx.tree_at(lambda s: (s.start.q, s.start.u), setup, at_start))
     parts = (motion.q, motion.u, motion.q_end, motion.u_end)

@@ -13,31 +13,31 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 
+from jourdain_jax.build.structure import Structure, structure_of
+from jourdain_jax.build.usual_lengths import usual_lengths
 from jourdain_jax.calculus.reals import Number
-from jourdain_jax.equations.accelerations import Baumgarte, as_reduction, as_stabilisation
+from jourdain_jax.dynamics.accelerations import Baumgarte, as_reduction, as_stabilisation
+from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.event_names import names_of_events
-from jourdain_jax.equations.power import needs_work
-from jourdain_jax.equations.probing import described_once
 from jourdain_jax.equations.projection import closure_residual
-from jourdain_jax.equations.structure import Structure, structure_of
-from jourdain_jax.equations.usual_lengths import usual_lengths
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.arguments import check_options
-from jourdain_jax.motion.fallbacks import changed_options, fallen_back, next_way
-from jourdain_jax.motion.fixed_step import FixedStepSolver
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integration import Options, Setup, integrate
-from jourdain_jax.motion.marks import looked_after
-from jourdain_jax.motion.sensitivity import watched
-from jourdain_jax.motion.solver_choice import check_solver, fitted
+from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
+from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
+from jourdain_jax.motion.marks import marked
+from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
+from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.state_form import StateForm, cutoff_of, default_reduction
-from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
 _STATE_FORMS = ("auto", "minimal", "full")
@@ -103,17 +103,17 @@ def simulate(
     """
     given = dict(locals())
     setup = _set_up(**given)
-    motion = watched(setup, _integrated)
+    motion = warn_if_ill_conditioned(setup, _integrated)
     if isinstance(motion.result, jax.core.Tracer):
         return motion
-    while ways := next_way(setup.form, motion, setup.t0, given):
-        setup = _set_up(**(given | changed_options(ways, max_steps)))
-        motion = fallen_back(watched(setup, _integrated), ways)
+    while retries := next_retry(setup.form, motion, setup.t0, given):
+        setup = _set_up(**(given | retry_options(retries, max_steps)))
+        motion = mark_retried(warn_if_ill_conditioned(setup, _integrated), retries)
     return motion
 
 
 def _integrated(setup: Setup) -> Trajectory:
-    return looked_after(integrate, setup)
+    return marked(integrate, setup)
 
 
 def set_up(scene: Scene, start=None, **options) -> Setup:
@@ -241,7 +241,7 @@ def state_form(
     )
 
 
-@described_once
+@once_per_class
 def _is_closed(scene: Scene) -> bool:
     """Whether there are geometric rows or quaternion norms to keep."""
     return jax.eval_shape(lambda s: closure_residual(s, 0.0, s.named()[0]), scene).shape[0] > 0

@@ -12,15 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.sampling import NoStateFoundError, seen_on_rows
+from jourdain_jax.build.structure import Structure, closure_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.damped import damped_root
 from jourdain_jax.calculus.reals import Number, Numbers
-from jourdain_jax.equations.domain import coordinate_bounds
-from jourdain_jax.equations.probing import Seldom, on_numbers
-from jourdain_jax.equations.projection import closure_residual, miss_of_rows, project_positions, project_speeds
+from jourdain_jax.eager.eager import Seldom, eval_numpy
+from jourdain_jax.equations.projection import closure_residual, position_error_of_rows, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
-from jourdain_jax.equations.sampling import NoStateFoundError, seen_on_rows
 from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.equations.structure import Structure, closure_lengths, structure_of, usual_rows
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.coordinates import Names
@@ -158,7 +158,7 @@ def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: 
 
 def _left(scene: Scene, t, q) -> Float[Array, ""]:
     """Largest residual of the geometric rows that counts: what is no number is infinite, what is round-off is zero."""
-    left = jax.lax.stop_gradient(miss_of_rows(scene, t, q))
+    left = jax.lax.stop_gradient(position_error_of_rows(scene, t, q))
     return jnp.where(left < _tolerance(q.dtype), 0.0, left)
 
 
@@ -190,7 +190,7 @@ def _tolerance(dtype) -> float:
 
 
 _compiled_projection = eqx.filter_jit(_put_onto_constraints)  # one program for every choice of what is held
-_uncompiled_projection = on_numbers(_put_onto_constraints)
+_uncompiled_projection = eval_numpy(_put_onto_constraints)
 
 
 def start(scene: Scene, *, t0: Number = 0.0, inputs=None, **values) -> State:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.numbers import described

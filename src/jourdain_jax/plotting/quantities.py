@@ -4,9 +4,9 @@ import os
 
 import numpy as np
 
-from jourdain_jax.motion import results
-from jourdain_jax.motion.rollout import Rollout
-from jourdain_jax.motion.trajectory import Trajectory
+from jourdain_jax.motion.batches.rollout import Rollout
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.numbers import described

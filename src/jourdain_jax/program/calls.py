@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal, jaxpr_as_fun
 
-from jourdain_jax.program.uncompiled import uncompiled
+from jourdain_jax.eager.numpy_backend import uncompiled
 
 
 class Call:

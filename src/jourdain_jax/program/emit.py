@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from jourdain_jax.program.calls import EMITTED
+from jourdain_jax.program.fused import fused
 from jourdain_jax.program.graph import ARRAYS, COMPARISONS, Graph
-from jourdain_jax.program.repeats import Loop, deepest_first, sources, with_loops
-from jourdain_jax.program.rounds import Values, run_loop
-from jourdain_jax.program.together import together
+from jourdain_jax.program.loop_rerolling import Loop, deepest_first, sources, with_loops
+from jourdain_jax.program.scan_emission import Values, run_loop
 
 DEEP = 120  # operations one after the other; measured: chains of links and trailers gain from 100 to 250 on, the bicycle (102) loses a quarter
 PIECE = 128  # operations
@@ -86,7 +86,7 @@ def _together(nodes: list[int], values: Mapping[int, jax.Array]) -> dict[int, ja
     for n in nodes:
         if jnp.issubdtype(jnp.result_type(values[n]), jnp.floating) and isinstance(values[n], jax.Array):
             alike.setdefault((values[n].shape, values[n].dtype), []).append(n)
-    return {n: x for group in alike.values() for n, x in zip(group, together(tuple(values[n] for n in group)), strict=True)}
+    return {n: x for group in alike.values() for n, x in zip(group, fused(tuple(values[n] for n in group)), strict=True)}
 
 
 FUNCTIONS: dict[str, Callable] = {

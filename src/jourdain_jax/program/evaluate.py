@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
+from jourdain_jax.eager.entrywise import FUNCTIONS
 from jourdain_jax.program.calls import AT_PROBES
-from jourdain_jax.program.entrywise import FUNCTIONS
 from jourdain_jax.program.graph import ARRAYS, Graph
 
 

@@ -1,16 +1,10 @@
 """Numbers as users give them, and whether they are known: what the layers above need of `calculus.reals`."""
 
-import jax
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.reals import checked_known, checked_real, described
+from jourdain_jax.calculus.reals import checked_known, checked_real, described, is_traced
 
 __all__ = ["checked_known", "checked_real", "checked_unless_traced", "described", "is_traced"]
-
-
-def is_traced(*trees) -> bool:
-    """Whether any leaf is being traced, so that its number is not known."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def checked_unless_traced(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str):

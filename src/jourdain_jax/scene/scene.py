@@ -15,12 +15,12 @@ from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
 from jourdain_jax.scene.description import check_description, checked_arguments
-from jourdain_jax.scene.held_functions import hold_functions
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
 from jourdain_jax.scene.numbers import checked_real
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
+from jourdain_jax.scene.static_callables import hold_functions
 from jourdain_jax.scene.what_is_read import WhatIsRead, is_read_by
 
 

@@ -1,0 +1,187 @@
+"""Configurations put on the geometric rows, to round-off and within the domain; on NumPy, all at once.
+
+    q <- q - G+ g(q),   G = dg/dq                                  Gauss-Newton, which keeps what is near
+    min |d g(q)|^2  over  low <= q <= high                         Levenberg-Marquardt, for those that did not arrive, or not inside
+
+d: one over the typical lengths of the rows of G. Where rows are dependent on each other at all assembled configurations (overconstrained linkages),
+only a configuration on the rows to round-off shows their rank: directions whose singular value is small are left out of the last steps.
+Source: J. Nocedal and S. Wright, Numerical Optimization (2006), section 10.3.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+ITERATIONS = 25  # of Gauss-Newton, at most
+_DAMPED_ITERATIONS = 60
+_NEARLY_DEPENDENT = 1e-6  # of the triangular factor's diagonal: below, singular values decide
+_FARTHEST = 0.25  # of the width of the domain, in one damped step
+_ON_ROWS = 1e4  # units of round-off, of what a row changes by when a coordinate changes by its own size
+_AT_REST = 1e-7  # last correction of the coordinates, relative to their size: more is no configuration on the rows
+_INSIDE = 1e-6  # of the width of the domain
+_ATTEMPTS = 4
+
+Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]  # coordinates of some states, and their numbers -> residuals, slopes
+
+
+@dataclass(frozen=True)
+class Assembled:
+    """Configurations, and how good they are."""
+
+    q: np.ndarray  # (states, coordinates)
+    position_error: np.ndarray  # largest residual of the rows, (states,); infinite where it is no number
+    error: np.ndarray  # of the coordinates: the last correction, relative to their size; infinite for one that is not on the rows, (states,)
+    outside: np.ndarray  # how far outside the domain, in widths of it; zero inside, (states,)
+
+    @property
+    def on_rows(self) -> np.ndarray:
+        """Whether they are on the rows as well as round-off lets them, (states,)."""
+        return np.isfinite(self.error)
+
+
+def without_rows(q: np.ndarray) -> Assembled:
+    """Configurations of a scene that has no geometric rows."""
+    return Assembled(q, *np.zeros((3, len(q))))
+
+
+def assemble(look: Look, q: np.ndarray, low: np.ndarray, high: np.ndarray, generic: np.ndarray, far: int = 0) -> Assembled:
+    """Configurations near q on the rows: `look(q[k], k)` gives residuals and slopes of the rows at the states numbered k.
+
+    Of the `generic` ones those that find no place inside the domain begin anew elsewhere, until half of them have one. The last `far` ones need none.
+    """
+    rows = _Rows(look, typical_lengths(_lengths(look(q, np.arange(len(q)))[1])[generic]), low, high)
+    found = _judged(rows, *_newton(rows, q, np.arange(len(q))))
+    generator = np.random.default_rng(2)
+    for attempt in range(_ATTEMPTS):
+        lost = ~(found.on_rows & (found.outside <= _INSIDE)) & (np.arange(len(q)) < len(q) - far)
+        if attempt:
+            lost &= generic
+        if not lost.any() or (attempt and lost.sum() <= generic.sum() / 2):
+            break
+        begin = np.clip(q, low, high) if not attempt else generator.uniform(low, high, q.shape)
+        which = np.flatnonzero(lost)
+        again = _judged(rows, *_newton(rows, _damped(rows, begin, which), which))
+        better = lost & again.on_rows & (~found.on_rows | (again.outside < found.outside))
+        pairs = zip(_parts(found), _parts(again), strict=True)
+        found = Assembled(*(np.where(better if a.ndim == 1 else better[:, None], b, a) for a, b in pairs))
+    return found
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows with their typical lengths, where configurations lie anywhere in the domain: on the rows a row may be of no length at all."""
+
+    look: Look
+    typical: np.ndarray  # (rows,)
+    low: np.ndarray
+    high: np.ndarray
+
+    @property
+    def width(self) -> np.ndarray:
+        """Of the domain; 1 for a coordinate that has one value."""
+        return np.where(self.high > self.low, self.high - self.low, 1.0)
+
+
+def _parts(found: Assembled) -> tuple[np.ndarray, ...]:
+    return found.q, found.position_error, found.error, found.outside
+
+
+def _judged(rows: _Rows, q: np.ndarray, shift: np.ndarray) -> Assembled:
+    """Configurations with their last corrections, judged."""
+    residual, G = rows.look(q, np.arange(len(q)))
+    with np.errstate(invalid="ignore"):
+        position_error = np.max(np.abs(residual), axis=1, initial=0.0)
+        size = np.maximum(_lengths(G), rows.typical) * (1 + np.max(np.abs(q), axis=1, initial=0.0, keepdims=True))
+        arrived = np.all(np.abs(residual) <= _ON_ROWS * np.finfo(float).eps * size, axis=1) & (shift <= _AT_REST)
+        outside = np.max(np.maximum(np.maximum(rows.low - q, q - rows.high), 0.0) / rows.width, axis=1, initial=0.0)
+    nowhere = lambda x, good: np.where(good & np.isfinite(x), x, np.inf)  # noqa: E731
+    return Assembled(q, nowhere(position_error, True), nowhere(shift, arrived), nowhere(outside, True))
+
+
+def _lengths(G: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(G, axis=2)
+
+
+def typical_lengths(lengths: np.ndarray) -> np.ndarray:
+    """What a row's length is at most states: the median, or the largest for a row that vanishes at half of them; 1 for one that always does."""
+    lengths = lengths[np.all(np.isfinite(lengths), axis=1)]
+    if not len(lengths):
+        return np.ones(lengths.shape[1])
+    typical = np.median(lengths, axis=0)
+    typical = np.where(typical > 0, typical, lengths.max(axis=0))
+    return np.where(typical > 0, typical, 1.0)
+
+
+def _newton(rows: _Rows, q: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Newton at the states `which`, until nothing moves any more; and the last corrections, relative to the coordinates."""
+    q, last, moving = np.array(q, float), np.full(len(q), np.inf), which
+    for _ in range(ITERATIONS):
+        residual, G = rows.look(q[moving], moving)
+        shift = shortest(G, residual, rows.typical)
+        q[moving] -= shift
+        last[moving] = np.max(np.abs(shift), axis=1, initial=0.0) / (1 + np.max(np.abs(q[moving]), axis=1, initial=0.0))
+        moving = moving[~(last[moving] <= 4 * np.finfo(float).eps) & np.isfinite(last[moving])]
+        if not moving.size:
+            break
+    return q, last
+
+
+def _damped(rows: _Rows, q: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Levenberg-Marquardt within the bounds at the states `which`, in coordinates and rows without units."""
+    look, low, high, width = rows.look, rows.low, rows.high, rows.width
+    q, best = np.array(q, float), q[which]
+    residual, G = look(best, which)
+    d = 1 / typical_lengths(_lengths(G * width))
+    f, J = d * residual, d[:, None] * G * width
+    damping, moving = np.full(len(which), 1e-2), np.all(np.isfinite(f), axis=1) & np.all(np.isfinite(J), axis=(1, 2))
+    for _ in range(_DAMPED_ITERATIONS):
+        k = np.flatnonzero(moving)
+        if not k.size:
+            break
+        step = _damped_step(J[k], f[k], damping[k])
+        held = ((best[k] <= low) & (step < 0)) | ((best[k] >= high) & (step > 0))
+        if held.any():
+            step = _damped_step(np.where(held[:, None], 0.0, J[k]), f[k], damping[k])
+        step *= np.minimum(1.0, _FARTHEST / np.maximum(np.max(np.abs(step), axis=1, keepdims=True, initial=0.0), 1e-300))
+        trial = np.clip(best[k] + width * step, low, high)
+        residual, G = look(trial, which[k])
+        f_trial = d * residual
+        better = np.sum(f_trial**2, axis=1) < np.sum(f[k] ** 2, axis=1)  # never where it is not a number
+        better &= np.all(np.isfinite(G), axis=(1, 2))
+        at = k[better]
+        best[at], f[at], J[at] = trial[better], f_trial[better], d[:, None] * G[better] * width
+        damping[k] = np.clip(np.where(better, damping[k] / 6, damping[k] * 5), 1e-14, 1e8)
+        moving[k] = (np.max(np.abs(f[k]), axis=1) > 1e-9) & (damping[k] < 1e7)
+    q[which] = best
+    return q
+
+
+def _damped_step(J: np.ndarray, f: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """`-J' (J J' + damping)^-1 f` at every state."""
+    system = J @ np.swapaxes(J, 1, 2) + damping[:, None, None] * np.eye(J.shape[1])
+    return -np.einsum("smn,sm->sn", J, np.linalg.solve(system, f[..., None])[..., 0])
+
+
+def shortest(G: np.ndarray, residual: np.ndarray, typical: np.ndarray) -> np.ndarray:
+    """The shortest x with `G x = residual`, at every state; least squares where the rows are (nearly) dependent, or shorter than they typically are."""
+    d = 1 / np.maximum(np.linalg.norm(G, axis=2), typical)
+    G, residual = d[..., None] * G, d * residual
+    finite = np.all(np.isfinite(G), axis=(1, 2)) & np.all(np.isfinite(residual), axis=1)
+    x = np.full((len(G), G.shape[2]), np.nan)
+    Q, R = np.linalg.qr(np.swapaxes(G[finite], 1, 2))  # G = R' Q'
+    diagonal = np.abs(np.diagonal(R, axis1=1, axis2=2))
+    regular = np.min(diagonal, axis=1, initial=1.0) > _NEARLY_DEPENDENT if G.shape[1] <= G.shape[2] else np.zeros(len(R), bool)
+    places = np.flatnonzero(finite)
+    if regular.any():
+        x[places[regular]] = (Q[regular] @ np.linalg.solve(np.swapaxes(R[regular], 1, 2), residual[places[regular], :, None]))[..., 0]
+    for k in places[~regular]:
+        x[k] = _least_squares(G[k], residual[k])
+    return x
+
+
+def _least_squares(G: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    try:
+        return np.linalg.lstsq(G, residual, rcond=_NEARLY_DEPENDENT**1.5)[0]
+    except np.linalg.LinAlgError:  # numbers too far apart for a decomposition
+        return np.full(G.shape[1], np.nan)

@@ -1,0 +1,183 @@
+"""Whether the numbers that a scene gives for its bodies and contacts can be those of bodies and contacts; looked at while it is probed.
+
+m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
+n.n = 1,   gap = 0 where the coordinates keep a body on the ground
+d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's motion, stated twice: by o(t), n(t) and by v, w
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jourdain_jax.equations.kinematics import pose_at
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.contacts import Contact
+from jourdain_jax.scene.motion_state import Pose
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import contacts_of
+
+_TOLERANCE = 1e-4  # relative: constants may be typed with a few digits, mistakes are larger
+
+
+class PoseNumbers(eqx.Module):
+    """Numbers of all bodies and contacts at one state (or, with a leading axis, at many), by name."""
+
+    mass: dict[str, Float[Array, "*states"]]
+    position: dict[str, Float[Array, "*states 3"]]
+    inertia: dict[str, Float[Array, "*states 3 3"]]  # of rigid bodies only
+    orientation: dict[str, Float[Array, "*states 3 3"]]
+    planes: dict[str, Float[Array, "*states 3"]]  # normal velocity by origin and tilt, by velocity and angular velocity; size of both, m/s
+    normals: dict[str, Float[Array, "*states 2"]]  # squares of the lengths of the normals of contacts; and how far out the contact is, m
+    gaps: dict[str, Float[Array, "*states 2"]]  # where the coordinates keep them closed; and the distance of the contact from the mass centre, m
+
+
+def pose_numbers(scene: Scene, t, q) -> PoseNumbers:
+    """What the scene gives for its bodies and planes at (t, q)."""
+    return numbers_of(scene, pose_at(scene, t, q))
+
+
+def numbers_of(scene: Scene, pose: Pose) -> PoseNumbers:
+    """The same from known poses."""
+    rigid = {name: body.body for name, body in pose.bodies.items() if isinstance(body.body, RigidBody)}
+    contacts = contacts_of(scene, pose)
+    return PoseNumbers(
+        mass={name: body.mass for name, body in pose.bodies.items()},
+        position={name: body.position for name, body in pose.bodies.items()},
+        inertia={name: body.inertia for name, body in rigid.items()},
+        orientation={name: body.orientation for name, body in rigid.items()},
+        planes=_normal_velocities(scene, pose, contacts),
+        normals={name: _normal(contact) for name, contact in contacts.items()},
+        gaps={name: _gap(pose, contact) for name, contact in contacts.items() if contact.height == "coordinates"},
+    )
+
+
+def _normal(contact: Contact) -> Float[Array, "2"]:
+    return jnp.stack([contact.plane.normal @ contact.plane.normal, jnp.sum(jnp.abs(contact.point))])
+
+
+def _gap(pose: Pose, contact: Contact) -> Float[Array, "2"]:
+    return jnp.stack([contact.gap(), jnp.sum(jnp.abs(contact.point - pose[contact.body].position))])
+
+
+def _normal_velocities(scene: Scene, pose: Pose, contacts: dict[str, Contact]) -> dict[str, Float[Array, "3"]]:
+    """Velocity of every contact's plane along its normal at the contact point, twice; and how large either could be."""
+
+    def planes(t):
+        contacts = contacts_of(scene, Pose(t, pose.q, pose.bodies))
+        return {name: (contact.plane.normal, contact.plane.origin) for name, contact in contacts.items()}
+
+    found = {}
+    _, rates = jax.jvp(planes, (pose.t,), (jnp.ones_like(pose.t),))
+    for name, contact in contacts.items():
+        plane, arm, (normal_rate, origin_rate) = contact.plane, contact.point - contact.plane.origin, rates[name]
+        by_pose = plane.normal @ origin_rate - normal_rate @ arm
+        by_velocity = plane.normal @ plane.velocity_at(contact.point)
+        lengths = [jnp.sum(jnp.abs(x)) for x in (origin_rate, plane.velocity, arm, normal_rate, plane.angular_velocity)]
+        found[name] = jnp.stack([by_pose, by_velocity, lengths[0] + lengths[1] + lengths[2] * (lengths[3] + lengths[4])])
+    return found
+
+
+def body_faults(scene: Scene, t, q) -> dict[str, Bool[Array, ""]]:
+    """Body name -> whether its mass is negative, or its inertia has a negative principal moment; also under jit and vmap. What is NaN is no fault of a body."""
+    bodies = {name: body.body for name, body in pose_at(scene, t, q).bodies.items()}
+    return {name: (body.mass < 0) | (_is_negative(body.inertia) if isinstance(body, RigidBody) else False) for name, body in bodies.items()}
+
+
+def _is_negative(I) -> Bool[Array, ""]:
+    """Whether a symmetric matrix has an eigenvalue below zero: by its principal minors."""
+    I = jax.lax.stop_gradient(I)
+    size = jnp.max(jnp.abs(I))
+    I = I / jnp.where(size > 0, size, 1.0) + _TOLERANCE * jnp.eye(3, dtype=I.dtype)
+    minors = [I[i, i] for i in range(3)] + [I[i, i] * I[j, j] - I[i, j] * I[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
+    whole = sum(I[0, i] * (I[1, (i + 1) % 3] * I[2, (i + 2) % 3] - I[1, (i + 2) % 3] * I[2, (i + 1) % 3]) for i in range(3))
+    return jnp.any(jnp.stack([*minors, whole]) < 0)
+
+
+def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
+    """What cannot be, one sentence each; `numbers` at many states, those that are not finite are passed over."""
+    who = type(scene).__name__
+    pieces = {"mass": numbers.mass, "inertia": numbers.inertia, "position": numbers.position, "orientation": numbers.orientation}
+    sentences = [_of_nothing(f"body `{name}` of `{who}`", what, x) for what, part in pieces.items() for name, x in part.items()]
+    sentences += [_of_mass(f"body `{name}` of `{who}`", mass) for name, mass in numbers.mass.items()]
+    sentences += [_of_inertia(f"body `{name}` of `{who}`", I) for name, I in numbers.inertia.items()]
+    sentences += [_of_orientation(f"body `{name}` of `{who}`", R) for name, R in numbers.orientation.items()]
+    sentences += [_of_plane(f"the plane of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.planes.items()]
+    sentences += [_of_normal(f"contact `{name}` of `{who}`", squares) for name, squares in numbers.normals.items()]
+    sentences += [_of_gap(f"contact `{name}` of `{who}`", gaps) for name, gaps in numbers.gaps.items()]
+    return tuple(sentence for sentence in sentences if sentence)
+
+
+def _of_nothing(what: str, piece: str, values: np.ndarray) -> str:
+    if not len(values) or len(_finite(values)):
+        return ""
+    return f"{what} has no finite {piece} at any probed state, expected finite numbers; check what its {piece} is computed from"
+
+
+def _of_mass(what: str, mass: np.ndarray) -> str:
+    lowest = np.min(_finite(mass), initial=0.0)
+    return f"{what} has a mass of {lowest:.4g} kg, expected a number that is not negative; check what its mass is computed from" if lowest < 0 else ""
+
+
+def _of_inertia(what: str, I: np.ndarray) -> str:
+    I = _finite(I)
+    size = np.max(np.abs(I), axis=(1, 2), initial=np.finfo(float).tiny)
+    if np.any(np.max(np.abs(I - np.swapaxes(I, 1, 2)), axis=(1, 2), initial=0.0) > _TOLERANCE * size):
+        return f"{what} has an inertia that is not symmetric; give the same products of inertia above and below the diagonal"
+    least = np.linalg.eigvalsh(I)[:, 0]
+    if np.any(least < -_TOLERANCE * size):
+        return f"{what} has a principal moment of inertia of {least.min():.4g} kg m^2, expected none below zero; check signs and products of inertia"
+    return ""
+
+
+def _of_orientation(what: str, R: np.ndarray) -> str:
+    R = _finite(R)
+    off = np.max(np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)), initial=0.0)
+    if off > _TOLERANCE:
+        return (
+            f"{what} has an orientation R that is no rotation: R' R differs from the identity by {off:.2g}; build it from jj.rot_x, jj.rot_y, jj.rot_z "
+            "or jj.quaternion_to_matrix"
+        )
+    if np.any(np.linalg.det(R) < 0):
+        return f"{what} has an orientation of determinant -1, a reflection and no rotation; turn one of its axes round"
+    return ""
+
+
+def _of_plane(what: str, speeds: np.ndarray) -> str:
+    by_pose, by_velocity, size = _finite(speeds).T
+    off = np.abs(by_pose - by_velocity) - _TOLERANCE * size
+    if not np.any(off > 0):
+        return ""
+    k = int(np.argmax(off))
+    return (
+        f"{what} moves along its normal at {by_pose[k]:.4g} m/s by `origin` and `tilt`, but at {by_velocity[k]:.4g} m/s by `velocity` and "
+        "`angular_velocity`; state the motion in both: velocity = d origin/dt, angular_velocity = (0, d tilt/dt, 0)"
+    )
+
+
+def _of_normal(what: str, squares: np.ndarray) -> str:
+    if len(squares) and not len(_finite(squares)):
+        return (
+            f"{what} finds no point where body and ground touch at any probed state; a ball must be smaller than the cylinder or sphere that it rolls in, "
+            "a surface needs a gradient that does not vanish, coordinates a `domain` that lies near it"
+        )
+    off = np.max(np.abs(np.sqrt(_finite(squares)[:, 0]) - 1), initial=0.0)
+    return f"{what} has a normal whose length differs from 1 by {off:.2g}, expected a unit vector; divide it by its length" if off > _TOLERANCE else ""
+
+
+def _of_gap(what: str, gaps: np.ndarray) -> str:
+    gap, size = _finite(gaps).T
+    off = np.abs(gap) - _TOLERANCE * size
+    if not np.any(off > 0):
+        return ""
+    k = int(np.argmax(off))
+    return (
+        f'{what} has height="coordinates", but at a probed state its body is {gap[k]:.4g} m off the ground; let the coordinates keep it there, '
+        'or write height="row"'
+    )
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    """The states at which all entries are finite, with a leading axis of states."""
+    return values[np.all(np.isfinite(values.reshape(len(values), -1)), axis=1)]

@@ -1,0 +1,216 @@
+"""What is looked at of a scene at each probed state, on its scalar graph: derivatives are taken on the graph, everything is evaluated on NumPy.
+
+    A = d phi/du,   beta = dv/du,   gamma = d omega/du,   M = sum m beta' beta + gamma' I gamma
+    q <- q - G+ g(q),   G = dg/dq,           u <- u - M^-1 A' (A M^-1 A')+ phi(u)
+
+A scene is traced once for it, where JAX (`probed`) traces it a dozen times through nested transformations, which takes most of the time for large scenes.
+"""
+
+from collections.abc import Iterable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.build.assembling import ITERATIONS, Assembled, assemble, shortest, typical_lengths, without_rows
+from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.probed import Probed, generic_inputs
+from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
+from jourdain_jax.equations.scaling import speed_scales
+from jourdain_jax.program.analyticity import decided_by, depend_on, is_nonanalytic
+from jourdain_jax.program.derivative import columns, derivatives, jacobian
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Unsupported
+from jourdain_jax.program.identity_test import identity_probes, is_combination, on_rows
+from jourdain_jax.scene.scene import Scene
+
+
+def probed_on_graph(scene: Scene, t, q, u, u_other, generic) -> Probed:
+    """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`. `generic`: which states are random ones.
+
+    `Unsupported` where the scene has no scalar form, or derivatives of its own.
+    """
+    return _AtStates(_traced(scene), scene, t, q, u, generic_inputs(scene), generic).probed(u_other)
+
+
+def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
+    """Coordinates and speeds put on the rows, and how well that went for the coordinates; `Unsupported` as above."""
+    at = _AtStates(_traced(scene), scene, t, q, u, np.zeros(len(scene.inputs)), np.ones(len(q), bool))
+    return at.real(at.q), at.real(at.speeds_on_rows()), at.found
+
+
+def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
+    """Whether these velocity rows are combinations of the others wherever positions meet the geometric rows, at generic parameters; states as above.
+
+    `(A_s, phi_s(0)) = x' (A_k, phi_k(0))`, the residual of least squares being no more than the round-off of either side. `Unsupported` as above.
+    """
+    at = _AtStates(_traced(scene), scene, t, q, u, generic_inputs(scene), np.ones(len(t), bool))
+    graph, traced, speeds = at.graph, at.traced, at.traced.u.tolist()
+    attitudes = {f"q_{first + i}": int(traced.q[first + i]) for first, _ in scene.coordinates.quaternions for i in range(4)}
+    generic = on_rows(
+        identity_probes(at.values, attitudes), at.values, [*traced.at.closure.tolist(), *at.norms()], {f"q_{i}": n for i, n in enumerate(traced.q.tolist())}
+    )
+    at_rest = graph.substituted(traced.at.phi.tolist(), dict.fromkeys(speeds, graph.zero))
+    columns_of_rows = [*columns(graph, traced.at.phi.tolist(), speeds), at_rest]
+    found = generic([n for column in columns_of_rows for n in column])
+    shape = len(columns_of_rows), len(traced.at.phi), -1
+    A, E = (np.moveaxis(np.reshape(x, shape), (2, 1), (0, 1)) for x in (np.asarray(found), found.error))
+    kept = [s for s in range(len(traced.at.phi)) if s not in rows]
+    return all(is_combination(A[:, s], E[:, s], A[:, kept], E[:, kept]) for s in rows)
+
+
+def _traced(scene: Scene) -> TracedScene:
+    traced = traced_scene(scene)
+    if traced.own_derivatives:
+        raise Unsupported("a function with derivatives of its own")
+    return traced
+
+
+class _AtStates:
+    """Values on the graph at the probed states."""
+
+    def __init__(self, traced: TracedScene, scene: Scene, t, q, u, inputs, generic):
+        self.traced, self.graph, self.scene = traced, traced.graph, scene
+        self.inputs = np.tile(inputs, (len(t), 1))
+        self.t, self.u, self.generic = t, u, generic
+        self.q_beyond, self.found = np.array(q, float), self._assembled(q)
+        self.q = self.found.q
+        self.values = self._probes(self.q, u)
+
+    def _probes(self, q, u, which=slice(None)) -> Probes:
+        """The graph at coordinates and speeds of the states numbered `which`."""
+        named = named_values(self.scene, self.t[which], q, u, self.inputs[which])
+        return Probes(self.graph, {name: np.asarray(value, float) for name, value in named.items()})
+
+    def probed(self, u_other) -> Probed:
+        """All that is looked at."""
+        g, at, traced = self.graph, self.traced.at, self.traced
+        u = traced.u.tolist()
+        flat = [*at.phi.tolist(), *at.v.ravel().tolist(), *at.omega.ravel().tolist()]
+        by_speed, rows = jacobian(g, flat, u), len(at.phi)
+        still = dict.fromkeys(u, g.zero)
+        at_rest = np.split(g.substituted([*flat, *at.qdot.tolist()], still), [rows])
+        weights = [*at.mass.tolist(), *at.inertia.ravel().tolist()]
+        poses = [*at.position.ravel().tolist(), *at.orientation.ravel().tolist()]
+        by_time = {"rows": [*at.phi.tolist(), *at.closure.tolist()], "poses": poses, "inertias": weights, "coordinate rates": at.qdot.tolist()}
+        timed = {name: derivatives(g, nodes, {traced.t: g.one}) for name, nodes in by_time.items()} | traced.particulars.explicit
+        directional_derivative = {traced.t: g.one} | dict(zip(traced.q.tolist(), at.qdot.tolist(), strict=True))
+        changed = {n: g.mul(n, n) for n in traced.inputs.tolist()}
+        inertia_rates, potential_rates = derivatives(g, weights, directional_derivative), derivatives(g, traced.particulars.potentials.tolist(), changed)
+        row_rates = derivatives(g, at.phi.tolist(), changed)
+        vanishing = {"rows at rest": at_rest[0], "motion at rest": at_rest[1], "inertia": inertia_rates, "rows of inputs": row_rates}
+        vanishing |= {f"potential {k}": [rate] for k, rate in enumerate(potential_rates)} | timed
+        vanishing["rank"] = [*at_rest[0], *(node for row in by_speed[:rows] for node in row.values())]
+        return Probed(
+            q=self.real(self.q),
+            error=self.found.error,
+            position_error=self.found.position_error,
+            outside=self.found.outside,
+            A=self.real(self._matrices(self.values, by_speed[:rows], u)),
+            A_beyond=self.real(self._matrices(self._probes(self.q_beyond, self.u), by_speed[:rows], u)),
+            A_other=self.real(self._matrices(self._probes(self.q, u_other), by_speed[:rows], u)),
+            M=self.real(self._mass_matrix(by_speed[rows:])),
+            phi_at_rest=self.real(self._at(at_rest[0])),
+            motion_at_rest=self.real(self._at(at_rest[1])),
+            timed=jax.tree.map(self._at, timed, is_leaf=lambda x: isinstance(x, list)),
+            inertia_rates=self._at(inertia_rates),
+            potential_rates=self._at(potential_rates),
+            row_rates_of_inputs=self._at(row_rates),
+            numbers=jax.tree.map(lambda nodes: self.real(self._at(nodes)), traced.particulars.numbers),
+            unproved=frozenset(name for name, nodes in vanishing.items() if any(is_nonanalytic(g, _flat(nodes)))) | self._nonlinear(by_speed[:rows]),
+        )
+
+    def _nonlinear(self, by_speed: list[dict[int, int]]) -> set[str]:
+        """{"nonlinear"} where rows may be so at speeds beyond the probed ones."""
+        g, u = self.graph, self.traced.u.tolist()
+        entries = [node for row in by_speed for node in row.values()]
+        bent = any(a and b for a, b in zip(depend_on(g, entries, u), is_nonanalytic(g, entries), strict=True))
+        return {"nonlinear"} if bent or decided_by(g, self.traced.at.phi.tolist(), u) else set()
+
+    def _at(self, nodes) -> np.ndarray:
+        """Values of nodes, with a leading axis of states."""
+        return _values(self.values, nodes)
+
+    def real(self, x: np.ndarray) -> np.ndarray:
+        """In the precision that is in use; what is looked at is computed in double precision."""
+        return np.asarray(x, jnp.result_type(float))
+
+    def _matrices(self, probes: Probes, entries: list[dict[int, int]], columns: list[int]) -> np.ndarray:
+        """Matrices with these entries by row, with a leading axis of states."""
+        place = {n: k for k, n in enumerate(columns)}
+        found = np.zeros((probes.count, len(entries), len(columns)))
+        places = [(i, place[n], node) for i, row in enumerate(entries) for n, node in row.items()]
+        if places:
+            i, j, nodes = zip(*places, strict=True)
+            found[:, i, j] = _values(probes, nodes)
+        return found
+
+    def _mass_matrix(self, by_speed: list[dict[int, int]]) -> np.ndarray:
+        """`M = sum m beta' beta + gamma' I gamma`, from the entries of beta and gamma."""
+        partial = self._matrices(self.values, by_speed, self.traced.u.tolist())
+        beta, gamma = np.split(partial, 2, axis=1)
+        mass, inertia = self._at(self.traced.at.mass), self._at(self.traced.at.inertia)
+        turned = np.einsum("sbij,sbjk->sbik", inertia, gamma.reshape(*inertia.shape[:-1], -1)).reshape(gamma.shape)
+        return np.swapaxes(beta, 1, 2) @ (np.repeat(mass, 3, axis=1)[..., None] * beta) + np.swapaxes(gamma, 1, 2) @ turned
+
+    def speeds_on_rows(self) -> np.ndarray:
+        """`u <- u - M^-1 A' (A M^-1 A')+ phi`, in scaled speeds."""
+        at, columns, u = self.traced.at, self.traced.u.tolist(), np.array(self.u, float)
+        if not at.phi.size:
+            return u
+        M = self._mass_matrix(jacobian(self.graph, [*at.v.ravel().tolist(), *at.omega.ravel().tolist()], columns))
+        c = speed_scales(M)
+        metric = np.stack([_inverse_root(m) for m in c[:, :, None] * M * c[:, None]])  # L'^-1
+        entries, moving, typical = jacobian(self.graph, at.phi.tolist(), columns), np.arange(len(u)), None
+        for _ in range(ITERATIONS):
+            probes = self._probes(self.q[moving], u[moving], moving)
+            weighted = self._matrices(probes, entries, columns) * c[moving, None] @ metric[moving]
+            typical = typical_lengths(np.linalg.norm(weighted, axis=2)) if typical is None else typical
+            x = shortest(weighted, _values(probes, at.phi), typical)
+            shift = c[moving] * np.einsum("sij,sj->si", metric[moving], x)
+            u[moving] -= shift
+            moving = moving[np.max(np.abs(shift), axis=1) > 4 * np.finfo(float).eps * (1 + np.max(np.abs(u[moving]), axis=1))]
+            if not moving.size:
+                break
+        return u
+
+    def norms(self) -> list[int]:
+        """Of quaternions, as rows."""
+        g, quaternions = self.graph, [self.traced.q[first : first + 4].tolist() for first, _ in self.scene.coordinates.quaternions]
+        return [g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)) for wxyz in quaternions]
+
+    def _assembled(self, q) -> Assembled:
+        """Coordinates on geometric rows and unit norms, inside the domain where that can be."""
+        g, q, norms = self.graph, np.array(q, float), self.norms()
+        for first, _ in self.scene.coordinates.quaternions:
+            length = np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
+            q[:, first : first + 4] /= np.where(length == 0, 1.0, length)
+        if not self.traced.at.closure.size:
+            return without_rows(q)
+        rows, columns = [*self.traced.at.closure.tolist(), *norms], self.traced.q.tolist()
+        entries = jacobian(g, rows, columns)
+
+        def look(q, which):
+            probes = self._probes(q, self.u[which], which)
+            return _values(probes, rows), self._matrices(probes, entries, columns)
+
+        return assemble(look, q, *coordinate_bounds(self.scene), self.generic)
+
+
+def _flat(nodes) -> list[int]:
+    return [int(n) for part in jax.tree.leaves(nodes) for n in np.ravel(part)]
+
+
+def _values(probes: Probes, nodes: np.ndarray | Iterable[int]) -> np.ndarray:
+    nodes = np.asarray(nodes if isinstance(nodes, np.ndarray) else list(nodes), np.int64)
+    return np.moveaxis(probes(nodes.ravel().tolist()), -1, 0).reshape(probes.count, *nodes.shape)
+
+
+def _inverse_root(M: np.ndarray) -> np.ndarray:
+    """`L'^-1` with `M = L L'`; the identity where M is singular: then nearest in the scaled speeds."""
+    try:
+        root = np.linalg.cholesky(M)
+    except np.linalg.LinAlgError:
+        return np.eye(len(M))
+    definite = np.min(np.diagonal(root), initial=1.0) ** 2 > 16 * len(M) * np.finfo(float).eps
+    return np.linalg.inv(root).T if definite else np.eye(len(M))

@@ -1,0 +1,88 @@
+"""Rank of rows at probed states, and which of them may be left out.
+
+A^ = d A c,  M^ = c M c        rows and inertias in scaled speeds (`scaling.py`)
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jourdain_jax.build.probed import Probed
+from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
+from jourdain_jax.equations.scaling import speed_scales
+
+ERRORS = 100.0  # of a configuration: singular values below are of the error, not of the rows
+LARGE_COEFFICIENT, TAIL = 20.0, 3.0  # of the rows that stay, in a row that is left out: at any probe; with both signs, beside the median
+
+
+class Scaled(eqx.Module):
+    """What decides ranks and pivots, at every probed state."""
+
+    A: Float[np.ndarray, "states rows speeds"]  # scaled rows in scaled speeds
+    lengths: Float[np.ndarray, "states rows"]  # of the rows before
+    M: Float[np.ndarray, "states speeds speeds"]  # in scaled speeds
+    c: Float[np.ndarray, "states speeds"]  # scales of the speeds
+
+
+def scaled_states(found: Probed, typical: np.ndarray) -> Scaled:
+    """`d A c` with the scales that the accelerations use (`scaling.row_scale`)."""
+    c = speed_scales(found.M)
+    A = found.A * c[:, None]
+    length = np.maximum(np.sqrt(np.sum(A**2, axis=2, keepdims=True)), typical[:, None])
+    return Scaled(A / np.where(length > 0, length, 1), length[..., 0], c[:, :, None] * found.M * c[:, None], c)
+
+
+def rank_of(A: np.ndarray, error: float) -> int:
+    """Rank of scaled rows, by the cut-off that the accelerations use, or by the `error` of the configuration they belong to."""
+    if not A.size:
+        return 0
+    sigma = np.linalg.svd(A, compute_uv=False)
+    return int(np.sum(sigma > max(rank_cutoff(A.dtype), ERRORS * error) * sigma[0]))
+
+
+def redundant_rows(
+    found: Scaled, errors: np.ndarray, ranks: list[int], generic: np.ndarray, names: tuple[str, ...], far: Callable[[], Scaled]
+) -> tuple[str, ...]:
+    """Rows that may be left out, later ones first, so that the rest keeps its rank at every probed state, and does not come near to losing it.
+
+    A row that is left out is a combination of the others. Where its coefficients are large somewhere, they have no bounds: so those of one wheel's row
+    along y, by its row along x and the rows of the wheel beside it, are tangents of the heading. `generic`: which of the states `found` are random;
+    `far`: rows at full turns of all angles.
+    """
+    if not ranks:  # no state serves, which is a fault of its own
+        return ()
+    kept, everywhere = list(range(len(names))), None
+    for s in reversed(range(len(names))):
+        if len(kept) in ranks:
+            break  # somewhere those that are left are independent
+        rest = [i for i in kept if i != s]
+        if not all(rank_of(A[rest], error) == r for A, error, r in zip(found.A, errors, ranks, strict=True)):
+            continue
+        if everywhere is None:
+            everywhere = jax.tree.map(lambda *x: np.concatenate(x), jax.tree.map(lambda x: x[generic], found), far())
+        if _are_bounded(_coefficients(everywhere, rest, s, max(ranks))):
+            kept = rest
+    return tuple(name for s, name in enumerate(names) if s not in kept)
+
+
+def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
+    """Of the rows `rest` in row s, each in its usual length, at states where all rows have their rank; infinite where they do not give it."""
+    tiny, made = np.finfo(found.A.dtype).tiny, []
+    lengths = np.maximum(found.lengths, tiny)
+    usual = np.median(lengths, axis=0)
+    for A, length in zip(found.A, lengths, strict=True):
+        if rank_of(A, 0.0) == rank:
+            c = A[s] @ np.linalg.pinv(A[rest], rcond=rank_cutoff(A.dtype))
+            given = np.linalg.norm(A[s] - c @ A[rest]) < np.sqrt(np.finfo(A.dtype).eps)
+            made.append(c * (length[s] / usual[s]) / (length[rest] / usual[rest]) if given else np.full(len(rest), np.inf))
+    return np.array(made).reshape(len(made), len(rest))
+
+
+def _are_bounded(c: np.ndarray) -> bool:
+    """Whether coefficients at many states are: none is large, nor far beyond its usual size with both signs, as tangents are."""
+    usual = TAIL * np.median(np.abs(c), axis=0) + np.sqrt(np.finfo(c.dtype).eps)
+    poles = (np.max(c, axis=0, initial=0.0) > usual) & (np.min(c, axis=0, initial=0.0) < -usual)
+    return bool(np.all(np.abs(c) < LARGE_COEFFICIENT) and not np.any(poles & (np.max(np.abs(c), axis=0, initial=0.0) > 2)))

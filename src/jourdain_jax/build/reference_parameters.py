@@ -1,0 +1,124 @@
+"""Looking at a scene with numbers in it, also while its parameters are being traced.
+
+What holds of a scene at every state (the rank of its rows, which speeds are independent) is a static choice: it must be known before
+anything is compiled, and it is found by evaluating the scene at a few states.
+"""
+
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import fields
+from functools import lru_cache, wraps
+
+import jax
+import numpy as np
+
+from jourdain_jax.scene.scene import Scene
+
+MOST_CASES = 1024  # that are kept of one function
+
+
+@contextmanager
+def without_collecting() -> Iterator[None]:
+    """Garbage collection off: what is built meanwhile is many small objects, nearly all of which stay, and looking through them takes a tenth of the time."""
+    on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if on:
+            gc.enable()
+
+
+def once_per_values(probe):
+    """A function of a scene that runs on concrete parameters, also while they are traced, and once per class and values."""
+    cached = lru_cache(maxsize=512)(lambda wrapped: probe(wrapped.scene))
+
+    @wraps(probe)
+    def of(scene: Scene):
+        concrete = with_reference_parameters(scene)
+        leaves, treedef = jax.tree.flatten(concrete)
+        key = tuple((np.asarray(x).tobytes(), np.shape(x), str(np.asarray(x).dtype)) for x in leaves)
+        return cached(_Hashable(concrete, (treedef, key, type(scene))))
+
+    return of
+
+
+class _Hashable:
+    """A scene with the key it is cached by."""
+
+    def __init__(self, scene, key):
+        self.scene, self.key = scene, key
+
+    def __hash__(self):
+        return hash(self.key)
+
+    def __eq__(self, other):
+        return self.key == other.key
+
+
+_STAND_IN: ContextVar[Scene | None] = ContextVar("stand_in", default=None)
+
+
+@contextmanager
+def reference_parameters(scene: Scene) -> Iterator[None]:
+    """Inside, numbers near those of `scene` stand in for the parameters of scenes of its class that are traced (as far as it has numbers)."""
+    token = _STAND_IN.set(scene)
+    try:
+        yield
+    finally:
+        _STAND_IN.reset(token)
+
+
+def with_reference_parameters(scene: Scene) -> Scene:
+    """The scene with numbers in place of traced parameters: generic ones near those that stand in, the class's defaults, or one.
+
+    Generic, because a default of zero (a tilt, a rate) must not pass for a term that is absent, nor two equal defaults for one length.
+    """
+    leaves, treedef = jax.tree.flatten(scene)
+    if not any(_is_traced(x) for x in leaves):
+        return scene
+    near = _defaults(scene)
+    known = _STAND_IN.get()
+    if known is not None and jax.tree.structure(known) == treedef:
+        near = [y if _is_number(y) and np.shape(y) == np.shape(x) else d for x, y, d in zip(leaves, jax.tree.leaves(known), near, strict=True)]
+    numbers = [_generic(x, y, place) if _is_traced(x) else x for place, (x, y) in enumerate(zip(leaves, near, strict=True))]
+    return jax.tree.unflatten(treedef, numbers)
+
+
+def _defaults(scene: Scene) -> list:
+    """The class's default for every leaf of a scene, or None."""
+    found: list = []
+    for field in fields(scene):
+        if field.metadata.get("static", False):
+            continue
+        leaves = jax.tree.leaves(getattr(scene, field.name))
+        default = jax.tree.leaves(field.default)
+        if len(default) != len(leaves):
+            default = [field.default if len(leaves) == 1 else None] * len(leaves)
+        found += default
+    return found
+
+
+def _is_traced(x) -> bool:
+    return isinstance(x, jax.core.Tracer)
+
+
+def _is_number(x) -> bool:
+    return x is not None and not _is_traced(x)
+
+
+def _generic(x, near, place: int) -> np.ndarray:
+    """Numbers of the shape of x, near what is given (or one), unlike those at any other `place`."""
+    draws = np.random.default_rng(place).uniform(size=np.shape(x))
+    try:
+        near = np.broadcast_to(np.asarray(near, x.dtype), np.shape(x))
+    except (TypeError, ValueError):  # no numbers, or as many of them as do not fit
+        near = np.full(np.shape(x), np.nan)
+    if not np.all(np.isfinite(near)):
+        return np.asarray(1.0 + 0.1 * (np.sort(draws) if draws.ndim == 1 else draws), x.dtype)  # knots of a table increase
+    if near.ndim == 1 and near.size > 1 and np.all(np.diff(near) > 0):
+        steps = np.diff(near, append=2 * near[-1] - near[-2])
+        return np.asarray(near + 0.01 * draws * steps, x.dtype)
+    return np.asarray(np.where(near == 0, 0.1, near) * (1.0 + 0.01 * draws), x.dtype)

@@ -1,0 +1,134 @@
+"""States of a scene's domain, put on its rows: random ones, and the symmetric configurations (zero and right angles), where partitions that look well
+at random states are singular.
+"""
+
+import itertools
+
+import jax
+import numpy as np
+
+from jourdain_jax.build.assembling import Assembled
+from jourdain_jax.build.domain import coordinate_bounds, speed_bounds
+from jourdain_jax.build.probed import Probed, assembled_by_jax
+from jourdain_jax.build.probed_on_graph import sampled_on_graph
+from jourdain_jax.eager.eager import eval_numpy
+from jourdain_jax.equations.projection import project_speeds
+from jourdain_jax.program.graph import Unsupported
+from jourdain_jax.scene.scene import Scene
+
+SYMMETRIC_PROBES = 200
+FEW_INSIDE = 8  # random states inside the domain: with fewer, those nearest to it are used as well
+NEARLY_INSIDE = 0.05  # of the width of the domain
+
+
+class NoStateFoundError(ValueError):
+    """No state of a scene's domain was found on its geometric rows."""
+
+
+_seen: dict[type, np.ndarray] = {}  # configurations on the rows that were given for scenes of a class in whose domain none was found
+
+
+def seen_on_rows(scene: Scene, q: np.ndarray) -> None:
+    """A configuration on the geometric rows of a scene in whose domain none was found: where that is so, states are looked for near it."""
+    _seen.setdefault(type(scene), np.asarray(q, float))
+
+
+def states_near_what_was_seen(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """States near a configuration that was given for this class of scenes, not yet on the rows; None where there is none."""
+    if type(scene) not in _seen or len(_seen[type(scene)]) != len(scene.coordinate_names):
+        return None
+    t, q, u = random_states(scene, count, generator)
+    low, high = coordinate_bounds(scene)
+    near = 10.0 ** -(1.0 + np.arange(count) % 6)  # of the domain: rows may be met, or be numbers, in a small part of it only
+    return t, _seen[type(scene)] + near[:, None] * (q - (low + high) / 2), u
+
+
+def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """At most `count` random admissible states (t, q, u) from the scene's domain, on the rows, each with a leading axis of states.
+
+    `seed`: of the generator. Scene parameters must be concrete. ValueError where no state meets the geometric rows.
+    """
+    if not isinstance(count, int | np.integer) or count < 1:
+        raise ValueError(f"`count` is {count!r}, expected a whole number of states, at least 1")
+    if not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
+    drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
+    t, q, u = random_states(scene, drawn, np.random.default_rng(seed))
+    q, u, found = _projected(scene, t, q, u)
+    near = None if np.isfinite(found.error).any() else states_near_what_was_seen(scene, drawn, np.random.default_rng(seed))
+    if near is not None:
+        t, q, u = near
+        q, u, found = _projected(scene, t, q, u)
+    good = np.flatnonzero(usable_states(scene, found, np.ones(drawn, bool)))[:count]
+    return t[good], q[good], u[good]
+
+
+def random_states(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """States from the domain, not yet on the rows."""
+    q_low, q_high = coordinate_bounds(scene)
+    u_low, u_high = speed_bounds(scene)
+    q = generator.uniform(q_low, q_high, (count, len(q_low)))
+    for first, _ in scene.coordinates.quaternions:
+        wxyz = generator.normal(size=(count, 4))
+        q[:, first : first + 4] = wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
+    return generator.uniform(0, 1, count), q, generator.uniform(u_low, u_high, (count, len(u_low)))
+
+
+def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) -> np.ndarray:
+    """Which states serve: on the geometric rows to round-off, and inside the domain; where few random ones are inside, those nearest to it as well.
+
+    ValueError where no random state lies on the rows.
+    """
+    good = np.isfinite(found.error)
+    if not good[generic].any():
+        nowhere = (
+            ""
+            if np.isfinite(found.position_error[generic]).any()
+            else (
+                "; no row is a finite number anywhere: a contact finds no point where a ball is larger than the cylinder or sphere that it rolls in, "
+                "or where the gradient of a surface vanishes"
+            )
+        )
+        raise NoStateFoundError(
+            f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by "
+            f"{np.min(found.miss[generic]):.1e} or more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each "
+            "other (where parameters are traced, numbers near their defaults stood in for them, or near one where they have none: give defaults near the "
+            f"values in use){nowhere}"
+        )
+    outside = np.sort(found.outside[good & generic])
+    return good & (found.outside <= max(outside[min(FEW_INSIDE, len(outside)) - 1], NEARLY_INSIDE))
+
+
+def _projected(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
+    try:
+        return sampled_on_graph(scene, t, q, u)
+    except Unsupported:
+        return sampled_by_jax(scene, t, q, u)
+
+
+def sampled_by_jax(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
+    """The same by JAX, for scenes without a scalar form."""
+    found = assembled_by_jax(scene, t, q, np.ones(len(q), bool))
+    return found.q, _speeds_by_jax(scene, t, found.q, u), found
+
+
+@eval_numpy
+def _speeds_by_jax(scene, t, q, u):
+    return jax.vmap(lambda t, q, u: project_speeds(scene, t, q, u))(t, q, u)
+
+
+def symmetric_configurations(scene: Scene) -> np.ndarray:
+    """Zero, and right angles (within the domain) in one or two coordinates."""
+    low, high = coordinate_bounds(scene)
+    reference = scene.coordinates.reference()
+    attitude = {i + k for i, _ in scene.coordinates.quaternions for k in range(4)}
+    turns = [(i, a) for i in range(len(low)) if i not in attitude for a in (np.pi / 2, -np.pi / 2) if low[i] <= a <= high[i]]
+    pairs = sorted(itertools.combinations(turns, 2), key=lambda pair: pair[0][1] != pair[1][1])  # equal angles first: headings of one axle
+    chosen = [(), *((turn,) for turn in turns), *pairs]
+    configurations = []
+    for turned in chosen[:SYMMETRIC_PROBES]:
+        q = np.where([i in attitude for i in range(len(low))], reference, np.clip(reference, low, high))
+        for i, angle in turned:
+            q[i] = angle
+        configurations.append(q)
+    return np.array(configurations).reshape(-1, len(low))

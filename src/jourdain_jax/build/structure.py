@@ -1,0 +1,363 @@
+"""What holds of a scene at every state, found once by probing: rank, privileged velocities, which kind of rows.
+
+States are drawn from the scene's domain, together with the symmetric configurations (zero and right angles), where partitions that look
+well at random states are singular; all are projected onto the geometric rows. Probing runs on concrete numbers also while a scene's
+parameters are traced (numbers near the class's defaults stand in), so that the choice is static.
+"""
+
+import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jourdain_jax.build.plausibility import implausible
+from jourdain_jax.build.probed import TIMED, Probed, probed
+from jourdain_jax.build.probed_on_graph import follow_from_others, probed_on_graph
+from jourdain_jax.build.rank import Scaled, rank_of, redundant_rows, scaled_states
+from jourdain_jax.build.reference_parameters import once_per_values, without_collecting
+from jourdain_jax.build.sampling import random_states, states_near_what_was_seen, symmetric_configurations, usable_states
+from jourdain_jax.build.smoothness import check_smoothness
+from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, names_of_rows
+from jourdain_jax.equations.scaling import speed_scales, typical_row_lengths
+from jourdain_jax.program.graph import Unsupported
+from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.names import as_names
+from jourdain_jax.scene.numbers import described, is_traced
+from jourdain_jax.scene.scene import Scene
+
+RANDOM_PROBES = 24
+WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
+LONG = 24  # dependent speeds: of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
+FAR, FAR_PROBES = 100.0, 16  # where no graph is: further states, at times (s), coordinates and speeds up to this
+TRACED = 1e-3  # of the typical lengths of rows, where parameters are traced
+_EXHAUSTIVE = 3000
+_SHORTLIST = 40
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Static facts about a scene."""
+
+    row_names: tuple[str, ...]
+    rank: int  # of the rows at generic states
+    ranks: tuple[int, ...]  # at all probed states
+    redundant_rows: tuple[str, ...]  # may be left out together: the others keep the rank at every probed state
+    may_set_in: tuple[str, ...]  # those of them that no identity makes follow from the others: they may not, where no probe lies
+    rank_losses: tuple[str, ...]  # configurations among the probed ones with fewer independent rows, as text
+    independent: tuple[int, ...]  # privileged speeds, chosen by the user or by conditioning
+    worst_pivot: float  # smallest singular value of the scaled A_z over all probes
+    typical_pivot: float  # its median
+    affine: bool  # rows are linear or affine in the speeds
+    homogeneous: bool  # phi vanishes at u = 0
+    timed: tuple[str, ...]  # what depends on time by itself, out of `TIMED`
+    driven: bool  # bodies or coordinates move, or bodies turn, while all speeds are zero
+    massless: bool  # M is singular: nothing has inertia along some motion that the rows hold
+    varying_inertia: bool  # masses or central inertias change along the motion
+    potentials_of_inputs: tuple[int, ...]  # numbers of the loads whose potential depends on inputs
+    rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
+    chosen_by_user: bool
+    faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, as sentences
+    row_lengths: np.ndarray = field(compare=False, repr=False)  # typical ones, in scaled speeds: what the length of a row is judged by
+    plain_row_lengths: np.ndarray = field(compare=False, repr=False)  # in the speeds as they are
+    times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric rows
+    coordinates: np.ndarray = field(compare=False, repr=False)  # of the same; random ones first
+    random: int  # how many of them are random ones
+
+    @property
+    def rheonomic(self) -> bool:
+        """Whether anything depends on time by itself: rows, poses, inertias, coordinate rates, loads or potentials."""
+        return bool(self.timed)
+
+    @property
+    def timed_kinematics(self) -> bool:
+        """Whether rows, poses or coordinate rates do."""
+        return not {"rows", "poses", "coordinate rates"}.isdisjoint(self.timed)
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Number of independent speeds at generic states."""
+        return len(self.independent)
+
+    @property
+    def dependent_rows(self) -> bool:
+        """Whether rows depend on each other although none may be left out: each is needed somewhere."""
+        return len(self.row_names) - len(self.redundant_rows) > self.rank
+
+    @property
+    def well_conditioned(self) -> bool:
+        """Whether the privileged velocities serve everywhere in the domain."""
+        return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, LONG / max(self.rank, 1))
+
+
+def _moves(rates) -> bool:
+    """Whether any rate is a number other than zero."""
+    return any(bool(np.any(np.isfinite(x) & (x != 0))) for x in jax.tree.leaves(rates))
+
+
+def _exceeds(difference: np.ndarray, tolerance: float, size: np.ndarray) -> bool:
+    """Whether any entry exceeds `tolerance` times the size of its row, at its state or over all: rows may be stated in any unit."""
+    size = np.maximum(size, np.nanmedian(size, axis=0, keepdims=True)) if size.size else size
+    return bool(np.any(np.abs(difference) > tolerance * size))
+
+
+def _sizes(found: Probed) -> np.ndarray:
+    """The largest entry of every row, at every state."""
+    return np.max(np.abs(found.A), axis=2, initial=0.0)
+
+
+def _look(scene: Scene, *states_and_generic) -> Probed:
+    try:
+        return probed_on_graph(scene, *states_and_generic)
+    except Unsupported:
+        return _looked_at_from_afar(scene, *states_and_generic)
+
+
+def _looked_at_from_afar(scene: Scene, t, q, u, u_other, generic) -> Probed:
+    """By JAX, where no graph says what the probes do not show; so a few states far off are looked at too."""
+    generator = np.random.default_rng(1)
+    far_q = q[:FAR_PROBES] * FAR ** generator.uniform(size=(FAR_PROBES, 1))
+    for first, _ in scene.coordinates.quaternions:
+        far_q[:, first : first + 4] = q[:FAR_PROBES, first : first + 4]
+    far = FAR * generator.uniform(size=FAR_PROBES), far_q, *(FAR * generator.uniform(-1, 1, (2, *u[:FAR_PROBES].shape)))
+    t, q, u, u_other = (np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True))
+    found = probed(scene, t, q, u, u_other, np.append(generic, np.zeros(FAR_PROBES, bool)), far=FAR_PROBES)
+    near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[:-FAR_PROBES], np.s_[-FAR_PROBES:]))
+    return replace(near, unproved=_seen(beyond, u[-FAR_PROBES:]) | {"rank"})  # which nothing proves
+
+
+def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
+    """What is other than zero at states far off; rows, where it is more than round-off."""
+    some = np.sqrt(np.finfo(found.A.dtype).eps)
+    vanishing = {"motion at rest": found.motion_at_rest, "inertia": found.inertia_rates, "rows of inputs": found.row_rates_of_inputs, **found.timed}
+    vanishing |= {f"potential {k}": rate for k, rate in enumerate(found.potential_rates.T)}
+    rows = {"rows at rest"} if _exceeds(found.phi_at_rest, some, _speeds(found, u)) else set()
+    rows |= {"nonlinear"} if _exceeds(found.A - found.A_other, some, _sizes(found)[..., None]) else set()
+    return frozenset({name for name, rates in vanishing.items() if _moves(rates)} | rows)
+
+
+def _speeds(found: Probed, u: np.ndarray) -> np.ndarray:
+    """What the terms of every row amount to at the probed speeds."""
+    return np.einsum("srk,sk->sr", np.abs(found.A), np.abs(u))
+
+
+def structure_of(scene: Scene) -> Structure:
+    """Static facts about a scene: rank of its rows, privileged velocities and their conditioning, kinds of rows; eqs. (25)-(31).
+
+    Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers stand in for traced parameters.
+    ValueError where no admissible state is found, where bodies do not move smoothly, where a motion that the rows leave free has no inertia, or
+    `privileged` names unknown or too few speeds; for known parameters also where numbers of its bodies or planes cannot be.
+    """
+    structure = _whatever_its_faults(scene)
+    if structure.faults and not is_traced(scene):  # numbers that stand in for traced parameters prove nothing
+        raise ValueError(structure.faults[0])
+    return structure
+
+
+def _whatever_its_faults(scene: Scene) -> Structure:
+    with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
+        return _probed_structure(as_scene(scene))
+
+
+def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
+    """Typical lengths of the rows of `A` in the units of the speeds; of a scene whose parameters are traced, as in `usual_rows`."""
+    return _whatever_its_faults(scene).plain_row_lengths * (TRACED if is_traced(scene) else 1.0)
+
+
+def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
+    """Typical lengths of the geometric rows and of quaternion norms in the coordinates, for `project_positions`; of the former as rates."""
+    geometric = plain_row_lengths(scene)[: len(names_of_position_rows(scene))]
+    return np.concatenate([geometric, np.full(len(scene.coordinates.quaternions), 1.0, geometric.dtype)])
+
+
+def usual_rows(scene: Scene) -> UsualRows:
+    """Typical lengths of the rows in scaled speeds, and their rank at generic states.
+
+    Of a scene whose parameters are traced, numbers stand in that may be of another order: only what is shorter than a thousandth of those lengths counts less.
+    """
+    known = _whatever_its_faults(scene)
+    return UsualRows(known.row_lengths * (TRACED if is_traced(scene) else 1.0), np.asarray(known.rank, np.int32))
+
+
+@once_per_values
+def _probed_structure(scene: Scene) -> Structure:
+    names = names_of_rows(scene)
+    count = len(scene.speed_names)
+    generator = np.random.default_rng(0)
+    drawn = random_states(scene, RANDOM_PROBES, generator)
+    t, u, generic, found = _at_probes(scene, *drawn)
+    near = None if np.isfinite(found.error[generic]).any() else states_near_what_was_seen(scene, RANDOM_PROBES, generator)
+    if near is not None:
+        drawn = near
+        t, u, generic, found = _at_probes(scene, *near)
+    on_rows = usable_states(scene, found, generic)
+    check_smoothness(scene, found.q[on_rows & generic], u)
+    faults = implausible(scene, jax.tree.map(lambda x: x[on_rows], found.numbers))
+    A = found.A * speed_scales(found.M)[:, None]
+    usable = np.all(np.isfinite(A), axis=(1, 2)) & on_rows
+    if not faults and not usable.any():
+        finite = np.isfinite(A).all(axis=2)[on_rows].any(axis=0)
+        named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "the rows together"
+        faults = (f"rows {named} of `{type(scene).__name__}` are not finite at any probed state, expected numbers; check how they are computed",)
+    typical = typical_row_lengths(A[usable & generic], (found.A_beyond * speed_scales(found.M)[:, None])[generic])
+    beyond = found.A_beyond[generic]
+    t, u, generic, found = jax.tree.map(lambda x: x[usable], (t, u, generic, found))
+    scaled = scaled_states(found, typical)
+    ranks = [rank_of(A, error) for A, error in zip(scaled.A, found.error, strict=True)]
+    rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
+    if not faults:  # a negative mass is named as such
+        _check_inertia(scene, jax.tree.map(lambda x: x[generic & (np.array(ranks) == rank)], scaled), rank)
+    independent, by_user = _user_choice(scene, count - rank), True
+    candidates = scaled.A[[r == rank for r in ranks]]  # at isolated losses of rank no partition of generic size exists
+    if independent is None:
+        independent, by_user = _choose(candidates, count, rank), False
+    pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
+    full_everywhere, eps, unproved = all(r == rank for r in ranks), float(np.finfo(found.A.dtype).eps), found.unproved
+    redundant = redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
+    return Structure(
+        row_names=names,
+        rank=rank,
+        ranks=tuple(ranks),
+        redundant_rows=redundant,
+        may_set_in=redundant if redundant and "rank" in unproved and not _follow(scene, t, found.q, u, [names.index(name) for name in redundant]) else (),
+        rank_losses=tuple(_describe(scene, c) for c, r in zip(found.q, ranks, strict=True) if r < rank),
+        independent=independent,
+        worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
+        typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
+        affine="nonlinear" not in unproved and not _exceeds(found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None]),
+        # near round-off: work that turns out as zero does less harm than work left out
+        homogeneous="rows at rest" not in unproved and not _exceeds(found.phi_at_rest, 32 * eps, _speeds(found, u)),
+        timed=tuple(name for name in TIMED if name in unproved or _moves(found.timed[name])),
+        driven="motion at rest" in unproved or _moves(found.motion_at_rest),
+        massless=_is_singular(scaled.M[generic]),
+        varying_inertia="inertia" in unproved or _moves(found.inertia_rates),
+        potentials_of_inputs=tuple(k for k, rate in enumerate(found.potential_rates.T) if f"potential {k}" in unproved or _moves(rate)),
+        rows_of_inputs="rows of inputs" in unproved or _moves(found.row_rates_of_inputs),
+        chosen_by_user=by_user,
+        faults=faults,
+        row_lengths=typical,
+        plain_row_lengths=typical_row_lengths(found.A[generic], beyond),
+        times=t,
+        coordinates=found.q,
+        random=int(np.sum(generic)),
+    )
+
+
+def _at_probes(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, np.ndarray, Probed]:
+    """Times, speeds, which states are random, and what is found: at the given random states and at the symmetric ones."""
+    symmetric = symmetric_configurations(scene)
+    t, q, u = np.concatenate([t, np.zeros(len(symmetric))]), np.concatenate([q, symmetric]), np.concatenate([u, u[:1].repeat(len(symmetric), 0)])
+    generic = np.arange(len(t)) < RANDOM_PROBES
+    return t, u, generic, _look(scene, t, q, u, -u[::-1], generic)
+
+
+def _is_singular(M: np.ndarray) -> bool:
+    """Whether scaled inertias are singular at all of some states."""
+    return bool(M.size) and bool(np.all(np.linalg.eigvalsh(np.nan_to_num(M, nan=1.0))[:, 0] <= 16 * M.shape[1] * np.finfo(M.dtype).eps))
+
+
+def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
+    """Raise a ValueError that names the speeds along which the rows leave a motion free that no body's inertia resists, at every generic state."""
+    moved = []
+    for A, M, c in zip(found.A, found.M, found.c, strict=True):
+        free = np.linalg.svd(A)[2][rank:].T if A.size else np.eye(len(M))
+        sizes, directions = np.linalg.eigh(np.nan_to_num(free.T @ M @ free, nan=1.0))
+        if not sizes.size or sizes[0] > 16 * len(M) * np.finfo(M.dtype).eps:
+            return
+        moved.append(np.abs(c * (free @ directions[:, 0])))
+    if not moved:
+        return
+    share = np.median([x / x.max() for x in moved], axis=0)
+    names = ", ".join(f"`{name}`" for name, part in zip(scene.speed_names.entries, share, strict=True) if part > 1e-3)
+    raise ValueError(
+        f"nothing in `{type(scene).__name__}` has inertia along {names}: no mass moves with it and no row holds it, so that its acceleration is not "
+        "determined; give a body that moves with it a mass (or inertia), hold it by a row, or leave the coordinate out"
+    )
+
+
+def _follow(scene: Scene, *state_and_rows) -> bool:
+    """Whether rows that follow from the others at the probes do so by an identity."""
+    try:
+        return follow_from_others(scene, *state_and_rows)
+    except Unsupported:
+        return False
+
+
+def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
+    """Scaled rows with coordinates up to half a turn away from those given, where they are on the geometric rows."""
+    generator = np.random.default_rng(4)
+    t, q, u = (x[:RANDOM_PROBES].repeat(2, 0) for x in (t, q, u))
+    turned = q + generator.uniform(-np.pi, np.pi, q.shape)
+    for first, _ in scene.coordinates.quaternions:
+        turned[:, first : first + 4] = q[:, first : first + 4]
+    found = _look(scene, t, turned, u, -u, np.zeros(len(t), bool))
+    good = np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2))
+    return jax.tree.map(lambda x: x[good], scaled_states(found, typical))
+
+
+def _describe(scene: Scene, q: np.ndarray) -> str:
+    values = [f"{name} = {value:.4g}" for name, value in zip(scene.coordinate_names.entries, q, strict=True) if abs(value) > 1e-12]
+    return ", ".join(values) or "all coordinates zero"
+
+
+def _user_choice(scene: Scene, freedoms: int) -> tuple[int, ...] | None:
+    if scene.privileged is None:
+        return None
+    if not isinstance(scene.privileged, str | Iterable):
+        raise ValueError(f"`privileged` of `{type(scene).__name__}` is {described(scene.privileged)}, expected names of speeds")
+    chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(scene.privileged))
+    if len(set(chosen)) != len(chosen):
+        raise ValueError(f"`privileged` of `{type(scene).__name__}` names a speed twice ({', '.join(as_names(scene.privileged))}); name independent ones")
+    if len(chosen) != freedoms:
+        raise ValueError(
+            f"`privileged` of `{type(scene).__name__}` names {len(chosen)} speeds, but the scene has {freedoms} degrees of freedom; "
+            f"name {freedoms} independent speeds"
+        )
+    return chosen
+
+
+def _pivots(scaled: np.ndarray, dependent: list[int], rank: int) -> np.ndarray:
+    """Smallest singular value of A_z at every probe."""
+    if rank == 0:
+        return np.ones(len(scaled))
+    return np.linalg.svd(scaled[:, :, dependent], compute_uv=False)[:, rank - 1]
+
+
+def _worst(scaled: np.ndarray, dependent: list[int], rank: int) -> float:
+    """The smallest pivot over the domain: zero where the determinant of A_z changes sign between probes, for it vanishes in between."""
+    if rank and scaled.shape[1] == rank:
+        signs = np.linalg.slogdet(scaled[:, :, dependent])[0]
+        if signs.min(initial=0.0) < 0 < signs.max(initial=0.0):
+            return 0.0
+    return float(_pivots(scaled, dependent, rank).min(initial=1.0))
+
+
+def _choose(scaled: np.ndarray, count: int, rank: int) -> tuple[int, ...]:
+    """The independent speeds whose complement has the largest worst pivot over all probes (the largest typical one among equals)."""
+    if rank == 0:
+        return tuple(range(count))
+    subsets = list(itertools.islice(itertools.combinations(range(count), rank), _EXHAUSTIVE + 1))
+    if len(subsets) > _EXHAUSTIVE:
+        subsets = list({_greedy(A, rank) for A in scaled})
+
+    def merit(dependent, probes):
+        return round(_worst(probes, list(dependent), rank), 6), round(float(np.median(_pivots(probes, list(dependent), rank))), 6)
+
+    some = scaled[:: max(1, len(scaled) // 40)]
+    best = sorted(subsets, key=lambda dependent: merit(dependent, some), reverse=True)[:_SHORTLIST]
+    dependent = max(best, key=lambda dependent: merit(dependent, scaled))
+    return tuple(i for i in range(count) if i not in dependent)
+
+
+def _greedy(A: np.ndarray, rank: int) -> tuple[int, ...]:
+    """Columns chosen one after another by largest remaining length (pivoted QR)."""
+    remaining, chosen = A.copy(), []
+    for _ in range(rank):
+        lengths = np.linalg.norm(remaining, axis=0)
+        k = int(np.argmax(lengths))
+        chosen.append(k)
+        e = remaining[:, k] / lengths[k]
+        remaining = remaining - np.outer(e, e @ remaining)
+    return tuple(sorted(chosen))

@@ -1,0 +1,189 @@
+"""A scene at the level of velocities, traced to a graph of scalars: what Jourdain's principle needs, before any derivative is taken.
+
+v, omega (body axes), phi, qdot      of (t, q, u)
+g                                    geometric rows at the level of positions
+F, L (body axes), Q_direct, power    impressed forces
+m, I                                 inertias
+c                                    stop events
+
+The same graph serves probing (`probed_on_graph`) and lowering. What JAX traced is kept per class and shapes of the parameters.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Num, PyTree
+
+from jourdain_jax.build.plausibility import PoseNumbers, numbers_of
+from jourdain_jax.equations.explicit_power import explicit_power
+from jourdain_jax.equations.kinematics import inertias_of, motion_at, velocities_of
+from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
+from jourdain_jax.equations.virtual_power import impressed, potential_energy, resultants
+from jourdain_jax.program.graph import MOST_MULTIPLICATIONS, Graph, Unsupported
+from jourdain_jax.program.interpret import Nodes, as_nodes, has_own_derivatives, interpret
+from jourdain_jax.program.opaque_calls import interpret_with_calls
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.once_per_class import once_per_class
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import events_of, loads_of
+
+Entries: TypeAlias = Array | np.ndarray
+
+
+class VelocityQuantities(eqx.Module):
+    """What is traced; arrays of numbers, or of nodes."""
+
+    v: Num[Entries, "bodies 3"]
+    omega: Num[Entries, "bodies 3"]  # body axes
+    turning: Num[Entries, "bodies 3"]  # omega in space axes
+    position: Num[Entries, "bodies 3"]
+    orientation: Num[Entries, "bodies 3 3"]
+    mass: Num[Entries, "bodies"]
+    inertia: Num[Entries, "bodies 3 3"]
+    phi: Num[Entries, "rows"]
+    closure: Num[Entries, "geometric_rows"]
+    qdot: Num[Entries, "coordinates"]
+    force: Num[Entries, "bodies 3"]
+    torque: Num[Entries, "bodies 3"]  # body axes
+    direct: Num[Entries, "speeds"]
+    power: Num[Entries, ""]  # of loads without a potential, and of potentials that depend on time or on inputs
+    events: Num[Entries, "events"]  # sorted by name
+
+
+class Particulars(eqx.Module):
+    """What only probing looks at; arrays of numbers, or of nodes."""
+
+    numbers: PoseNumbers
+    potentials: Num[Entries, "loads"]  # of the loads; zero where a load has none
+    explicit: dict[str, PyTree]  # rates in time of loads and potentials while the motion is held
+
+
+def particulars_of(scene: Scene, motion: Motion) -> Particulars:
+    """The same on numbers."""
+    return Particulars(numbers_of(scene, motion.pose()), potentials_of(scene, motion), explicit_rates(scene, motion))
+
+
+def potentials_of(scene: Scene, motion: Motion) -> Float[Array, "loads"]:
+    """The potential of each load, zero where it has none."""
+    stored = [0.0 * motion.t if load.potential is None else load.potential for load in loads_of(scene, motion)]
+    return jnp.stack(stored) if stored else jnp.zeros(0, motion.q.array.dtype)
+
+
+def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
+    """Rates in time of loads and potentials while the motion, poses included, is held."""
+
+    def pieces(t):
+        held = eqx.tree_at(lambda m: m.t, motion, t)
+        return {"loads": resultants(scene, held), "potential": potential_energy(scene, held)}
+
+    return jax.jvp(pieces, (motion.t,), (jnp.ones_like(motion.t),))[1]
+
+
+def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...] = (), with_events: bool = True) -> VelocityQuantities:
+    """The same on numbers; `of_inputs`: numbers of the loads whose potential depends on inputs."""
+    stated = loads_of(scene, motion)  # once: a second time a callback would be another one
+    velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion, stated)
+    return VelocityQuantities(
+        velocities.linear,
+        velocities.angular,
+        jnp.stack([body.angular_velocity for body in motion.bodies.values()]),
+        jnp.stack([body.position for body in motion.bodies.values()]),
+        jnp.stack([body.orientation for body in motion.bodies.values()]),
+        weights.mass,
+        weights.inertia,
+        flatten_rows(velocity_rows(scene, motion), motion.t.dtype),
+        flatten_rows(position_rows(scene, motion.pose()), motion.t.dtype),
+        motion.qdot.array,
+        loads.force,
+        loads.torque,
+        loads.direct,
+        explicit_power(scene, motion, of_inputs, stated),
+        event_values(scene, motion) if with_events else jnp.zeros(0),
+    )
+
+
+def event_values(scene: Scene, motion: Motion) -> Float[Array, "events"]:
+    """Values of the stop events, sorted by name."""
+    events = events_of(scene, motion)
+    return jnp.stack([events[name] for name in sorted(events)]) if events else jnp.zeros(0)
+
+
+@dataclass
+class TracedScene:
+    """A graph with the scene's inputs and its quantities at the level of velocities, as arrays of nodes."""
+
+    graph: Graph
+    t: int
+    q: np.ndarray
+    u: np.ndarray
+    inputs: np.ndarray
+    parameters: list[np.ndarray]  # nodes, one array per leaf of the scene
+    at: VelocityQuantities
+    particulars: Particulars
+    own_derivatives: bool  # some function has a rule of differentiation of its own, which JAX believes and the graph does not know
+
+
+def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = (), calls: bool = True) -> TracedScene:
+    """The scene as a new graph, without its stop events where these alone cannot be; `Unsupported` where it cannot be.
+
+    `of_inputs`: numbers of the loads whose potential depends on inputs. `calls`: whether parts without scalar form, or with their own derivative, become calls.
+    """
+    interpretations = [(interpret, True), (interpret_with_calls, True), (interpret, False), (interpret_with_calls, False)]
+    for interpreted, with_events in interpretations if calls else interpretations[::2]:
+        try:
+            closed, shape = _traced(scene, of_inputs, with_events)
+            return _on_graph(scene, closed, shape, interpreted, Graph(MOST_MULTIPLICATIONS, keeps_rules=True) if calls else Graph())
+        except Unsupported as reason:
+            first = reason
+    raise first
+
+
+def jaxpr_of_scene(scene: Scene):
+    """A jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u and inputs, and their shapes; `Unsupported` as above."""
+    return _traced(scene, (), True)
+
+
+@once_per_class
+def _traced(scene: Scene, of_inputs: tuple[int, ...], with_events: bool):
+    """A jaxpr of the scene's quantities, and their shapes."""
+    leaves, treedef = jax.tree.flatten(scene)
+    real = jnp.result_type(float)
+    state = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),), (len(scene.inputs),))]
+    numbers = [jax.ShapeDtypeStruct(np.shape(x), real) for x in leaves]
+
+    def quantities(leaves, t, q, u, inputs):
+        scene = jax.tree.unflatten(treedef, leaves)
+        motion = motion_at(scene, t, q, u, inputs)
+        return velocity_quantities(scene, motion, of_inputs, with_events), particulars_of(scene, motion)
+
+    try:
+        return jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
+    except (ValueError, NotImplementedError) as error:  # the power of potentials takes a derivative of all loads, which nothing else may need
+        raise Unsupported(f"a function that JAX cannot differentiate ({str(error).split('.')[0]})") from None
+
+
+def _on_graph(scene: Scene, closed, shape, interpreted: Callable, graph: Graph) -> TracedScene:
+    parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(jax.tree.leaves(scene))]
+    sizes = {"t": (), "q": (len(scene.coordinate_names),), "u": (len(scene.speed_names),), "i": (len(scene.inputs),)}
+    t, q, u, inputs = (_inputs(graph, name, size, True) for name, size in sizes.items())
+    found = interpreted(graph, closed, [Nodes(x) for x in (*parameters, t, q, u, inputs)])
+    at, particulars = jax.tree.unflatten(jax.tree.structure(shape), [as_nodes(graph, x) for x in found])
+    return TracedScene(graph, int(t), q, u, inputs, parameters, at, particulars, has_own_derivatives(closed.jaxpr))
+
+
+def _inputs(graph: Graph, name: str, shape, varies: bool) -> np.ndarray:
+    return np.array([graph.input(f"{name}_{i}", varies) for i in range(int(np.prod(shape)))], np.int64).reshape(shape)
+
+
+def named_values(scene: Scene, t, q, u, inputs) -> dict[str, np.ndarray]:
+    """Values of the inputs of the scene's graph by name; states may have a leading axis."""
+    named = {f"p{k}_{i}": np.asarray(value) for k, leaf in enumerate(jax.tree.leaves(scene)) for i, value in enumerate(np.ravel(leaf))}
+    named["t_0"] = np.asarray(t)
+    for prefix, values in zip("qui", (q, u, inputs), strict=True):
+        named |= {f"{prefix}_{i}": column for i, column in enumerate(np.moveaxis(np.asarray(values), -1, 0))}
+    return named

@@ -1,0 +1,140 @@
+"""Accelerations of a scene at one state: the whole of the dynamics below time integration.
+
+kinematics -> virtual power (M, h, Q) -> rows (A, drift) -> reduction -> udot, lambda
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.build.structure import structure_of, usual_rows
+from jourdain_jax.eager.eager import eager_if_concrete
+from jourdain_jax.equations.gibbs_appell import GibbsAppell
+from jourdain_jax.equations.reductions import (
+    Accelerations,
+    Multipliers,
+    NullSpaceQR,
+    NullSpaceSVD,
+    Privileged,
+    Reduced,
+    Reduction,
+    UdwadiaKalaba,
+    diagnosed,
+    reduce,
+)
+from jourdain_jax.equations.rows import ConstraintRows, UsualRows, position_residual
+from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
+from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_scene, as_speeds, as_time
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import checked_real, described
+from jourdain_jax.scene.scene import Scene
+
+
+class Baumgarte(eqx.Module):
+    """Stabilisation terms: `A udot = -drift - 2 a phi - b^2 g` on geometric rows, `- a phi` on velocity rows.
+
+    `alpha` a, `beta` b in 1/s. Source: J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1. Projection (the default of `simulate`) is more
+    accurate.
+    """
+
+    alpha: Float[Array, ""] = eqx.field(converter=lambda x: checked_real(x, "`alpha` of `Baumgarte`", ()), default=5.0)
+    beta: Float[Array, ""] = eqx.field(converter=lambda x: checked_real(x, "`beta` of `Baumgarte`", ()), default=5.0)
+
+
+def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
+    """All reductions by short name, set up with the scene's privileged velocities.
+
+    Names: "privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
+    """
+    independent = structure_of(as_scene(scene)).independent
+    return {
+        "privileged": Privileged(independent),
+        "qr": NullSpaceQR(),
+        "svd": NullSpaceSVD(),
+        "kkt": Multipliers(),
+        "udwadia-kalaba": UdwadiaKalaba(),
+        "gibbs-appell": GibbsAppell(independent),
+    }
+
+
+def as_reduction(scene: Scene, reduction) -> "Reduction | GibbsAppell":
+    """A reduction from a short name, or the object itself; the null space by QR for None."""
+    if reduction is None:
+        return NullSpaceQR()
+    if isinstance(reduction, str):
+        known = reductions(scene)
+        if reduction not in known:
+            raise ValueError(f"unknown reduction `{reduction}`; {nearest(reduction, known)}")
+        return known[reduction]
+    if not isinstance(reduction, Reduction | GibbsAppell):
+        raise ValueError(f"`reduction` is {described(reduction)}, expected a name ({', '.join(reductions(scene))}) or an object such as `jj.NullSpaceQR()`")
+    if isinstance(reduction, Privileged | GibbsAppell):
+        _check_independent(scene, reduction.independent)
+    return reduction
+
+
+def _check_independent(scene: Scene, chosen) -> None:
+    count = len(scene.speed_names)
+    if any(not isinstance(i, int | np.integer) or not 0 <= i < count for i in chosen) or len(set(chosen)) != len(chosen):
+        where = f"speeds of `{type(scene).__name__}`, 0 to {count - 1}"
+        raise ValueError(f"`independent` is {chosen}, expected different indices of {where}; or give the reduction by its name")
+
+
+def as_stabilisation(stabilisation) -> Baumgarte | None:
+    """The Baumgarte terms, or None; a ValueError for anything else."""
+    if stabilisation is not None and not isinstance(stabilisation, Baumgarte):
+        raise ValueError(f"`stabilisation` is {described(stabilisation)}, expected `jj.Baumgarte(alpha, beta)` or None")
+    return stabilisation
+
+
+def accelerations(
+    scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None, usual: UsualRows | None = None
+) -> Accelerations:
+    """Accelerations, multipliers and diagnostics of a scene at (t, q, u).
+
+        M udot + h = Q + A' lambda,   A udot = -drift
+
+    - `inputs`: values of the scene's inputs (default: zero), which count as constant.
+    - `reduction`: a strategy object or one of the names "privileged", "qr" (default), "svd", "kkt", "udwadia-kalaba", "gibbs-appell".
+    - `stabilisation`: Baumgarte terms (default: none).
+    - `usual`: what the rows are at most states, by which is judged whether they lose rank at this one (default: as found for this scene).
+
+    Pure: works under any nesting of jit, vmap, jvp and vjp, with right derivatives wherever the rank of the rows is constant. Look at `applicable`
+    and `residual`: nothing is raised for a state that a reduction cannot serve. ValueError for an unknown reduction. Eqs. (41), (68)-(70).
+    """
+    f = inputs if inputs is None or isinstance(inputs, ChangingInputs) else as_input_vector(scene, inputs)
+    arguments = as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f
+    usual = usual_rows(scene) if usual is None else usual
+    return _accelerations(scene, *arguments, as_reduction(scene, reduction), as_stabilisation(stabilisation), usual)
+
+
+@eager_if_concrete
+def _accelerations(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> Accelerations:
+    return diagnosed(*_reduced(scene, t, q, u, inputs, reduction, stabilisation, usual))
+
+
+def bare_accelerations(
+    scene: Scene, t, q, u, inputs=None, *, reduction=None, stabilisation: Baumgarte | None = None, usual: UsualRows | None = None
+) -> Reduced:
+    """Accelerations and constraint force alone, as `accelerations` but without multipliers and diagnostics: for use inside integration."""
+    return _reduced(scene, t, q, u, inputs, reduction, stabilisation, usual_rows(scene) if usual is None else usual)[0]
+
+
+def _reduced(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> tuple[Reduced, UnconstrainedEquations, ConstraintRows]:
+    q, u = as_coordinates(scene, q), as_speeds(scene, u)
+    reduction = as_reduction(scene, reduction)
+    equations, rows = equations_and_rows(scene, t, q, u, inputs)
+    rows = rows.judged_by(usual)
+    if as_stabilisation(stabilisation) is not None:
+        rows = _stabilised(scene, t, q, rows, stabilisation)
+    if isinstance(reduction, GibbsAppell):
+        return reduction.accelerations(scene, t, q, u, equations, rows), equations, rows
+    return reduce(reduction, equations, rows), equations, rows
+
+
+def _stabilised(scene: Scene, t, q, rows: ConstraintRows, terms: Baumgarte) -> ConstraintRows:
+    g = position_residual(scene, t, q)
+    count = g.shape[0]
+    extra = jnp.concatenate([2 * terms.alpha * rows.phi[:count] + terms.beta**2 * g, terms.alpha * rows.phi[count:]])
+    return ConstraintRows(rows.phi, rows.A, rows.drift + extra, rows.names, rows.usual)

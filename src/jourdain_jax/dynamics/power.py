@@ -1,0 +1,112 @@
+"""The power that changes the energy T + V of a scene.
+
+    d(T + V)/dt = sum F.v + L.omega + Q_k u_k   loads without a potential
+                + (A' lambda).u                 rows that do real work: prescribed, nonhomogeneous or nonlinear in u
+                + sum R.v_0 + T.omega_0         what drives poses given as functions of time; v_0, omega_0: velocities at u = 0
+                + dV/dt at fixed poses          potentials that depend on time
+                + sum mdot v.v/2 + omega.(dI/dt omega)/2   masses and inertias that change: matter that joins a body at the body's own velocity
+
+A term that is zero at every state by the scene's structure is left out, not computed. Inputs count as constant here (their rates reach rows
+through the accelerations). Where the potential V_i of a load depends on inputs, these do the work dV_i/df . df/dt besides. It is found without a
+derivative of the inputs, which may jump:
+
+    W = integral of (power - dV_i/dt at fixed poses + F_i.v + L_i.omega + Q_i u) dt + V_i(t) - V_i(t0)        (`rate_of_work`, `stored_by_inputs`)
+
+Source: Wang and Pao (2003), eqs. (71)-(73).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.build.structure import Structure, structure_of
+from jourdain_jax.equations.explicit_power import explicit_rate, forces_for_potentials, power_of_loads
+from jourdain_jax.equations.kinematics import inertias, motion_at
+from jourdain_jax.equations.reductions import Accelerations, Reduced
+from jourdain_jax.equations.virtual_power import newton_residual, potential_energy
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.once_per_class import once_per_class
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import loads_of
+
+
+class Power(eqx.Module):
+    """Power in W by origin; positive where it adds to T + V."""
+
+    loads: Float[Array, ""]  # of loads without a potential
+    rows: Float[Array, ""]  # of constraint rows that do real work
+    driven: Float[Array, ""]  # of whatever moves poses that are given functions of time
+    potential: Float[Array, ""]  # explicit rate of potentials that depend on time
+    inertia: Float[Array, ""]  # of masses and inertias that change
+
+    @property
+    def total(self) -> Float[Array, ""]:
+        """`d(T + V)/dt`."""
+        return self.loads + self.rows + self.driven + self.potential + self.inertia
+
+
+def needs_work(scene: Scene, structure: Structure) -> bool:
+    """Whether anything changes T + V, so that the work done must be integrated beside the motion: any term above that is not zero by structure."""
+    by_structure = structure.driven or structure.varying_inertia or _rows_work(structure) or "potential" in structure.timed
+    return by_structure or bool(structure.potentials_of_inputs) or _some_load_has_no_potential(scene)
+
+
+def _rows_work(structure: Structure) -> bool:
+    return not (structure.affine and structure.homogeneous)
+
+
+@once_per_class
+def _some_load_has_no_potential(scene: Scene) -> bool:
+    flags: list[bool] = []
+
+    def look(scene):
+        q, u, _ = scene.named()
+        flags.extend(load.potential is None for load in loads_of(scene, motion_at(scene, 0.0, q, u)))
+
+    jax.eval_shape(look, scene)
+    return any(flags)
+
+
+def power_of_nonconservative(scene: Scene, t, q, u, inputs, accelerations: Accelerations | Reduced) -> Float[Array, ""]:
+    """`d(T + V)/dt` in W along the motion with the given accelerations, at constant inputs: zero where the energy T + V is conserved."""
+    return power(scene, motion_at(scene, t, q, u, inputs), accelerations).total
+
+
+def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) -> Power:
+    """The same by origin."""
+    structure = structure_of(scene)
+    zero = jnp.zeros_like(motion.t)
+    return Power(
+        loads=power_of_loads(scene, motion, conservative=False),
+        # lambda . (A u), which is lambda . phi = 0 for rows homogeneous and linear in u
+        rows=accelerations.constraint_force @ motion.u.array if _rows_work(structure) else zero,
+        driven=_power_of_drives(scene, motion, accelerations.udot) if structure.driven else zero,
+        potential=explicit_rate(scene, motion, potential_energy) if structure.driven or "potential" in structure.timed else zero,
+        inertia=_power_of_changing_inertia(scene, motion) if structure.varying_inertia else zero,
+    )
+
+
+def rate_of_work(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced, of_inputs: tuple[int, ...]) -> Float[Array, ""]:
+    """What is integrated for the work done, in W: the power, with the forces of the loads `of_inputs` in place of their potentials.
+
+    `of_inputs`: numbers of the loads whose potential depends on inputs; what they store (`stored_by_inputs`) is added to the integral.
+    """
+    return power(scene, motion, accelerations).total + forces_for_potentials(scene, motion, of_inputs)
+
+
+def _power_of_drives(scene: Scene, motion: Motion, udot) -> Float[Array, ""]:
+    """The constraint forces of bodies that move while all speeds are zero, times those velocities."""
+    t, q, u, inputs = motion.t, motion.q.array, motion.u.array, motion.inputs.array
+    total = newton_residual(scene, t, q, u, udot, inputs)
+    at_rest = motion_at(scene, t, q, jnp.zeros_like(u), inputs).bodies.values()
+    v, omega = jnp.stack([body.velocity for body in at_rest]), jnp.stack([body.angular_velocity for body in at_rest])
+    return jnp.sum(total.linear * v) + jnp.sum(total.angular * omega)
+
+
+def _power_of_changing_inertia(scene: Scene, motion: Motion) -> Float[Array, ""]:
+    """`sum mdot v.v/2 + omega.(dI/dt omega)/2`, with dI/dt in body axes."""
+    t, q, bodies = motion.t, motion.q.array, motion.bodies.values()
+    _, rate = jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), motion.qdot.array))
+    v, w = jnp.stack([body.velocity for body in bodies]), jnp.stack([body.angular_velocity_body for body in bodies])
+    return 0.5 * (rate.mass @ jnp.sum(v * v, axis=1) + jnp.einsum("bi,bij,bj->", w, rate.inertia, w))

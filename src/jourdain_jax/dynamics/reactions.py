@@ -1,0 +1,178 @@
+"""Constraint forces by row and by body, and the forces in rolling contacts (rows S1 and S4).
+
+    force    R_j^s = lambda_s d phi_s/d v_j          on body j
+    torque   T_j^s = lambda_s d phi_s/d omega_j      about its mass centre
+    direct   lambda_s d phi_s/d u at fixed v, omega  on the speeds themselves
+
+The rows are evaluated from the velocities that a `Motion` carries, so one reverse pass per row gives the force on every body.
+Everything is in the inertial frame. Source: Wang and Pao (2003), eqs. (1)-(3), (68)-(73).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jourdain_jax.build.structure import plain_row_lengths
+from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
+from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
+from jourdain_jax.eager.eager import eager_if_concrete
+from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
+from jourdain_jax.equations.reductions import Accelerations
+from jourdain_jax.equations.rows import flatten_rows, names_of_rows, velocity_residual, velocity_rows
+from jourdain_jax.equations.scaling import row_scale
+from jourdain_jax.equations.virtual_power import newton_residual, resultants
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.motion_state import BodyMotion, Motion
+from jourdain_jax.scene.names import Named, UnknownNameError, nearest
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import contacts_of
+
+
+class RowReactions(eqx.Module):
+    """The constraint force of every row on every body, and what it does directly on the speeds; along a motion with a first axis of times."""
+
+    multipliers: Float[Array, "*times rows"]
+    force: Float[Array, "*times rows bodies 3"]  # N
+    torque: Float[Array, "*times rows bodies 3"]  # N m, about the mass centre; zero for particles
+    direct: Float[Array, "*times rows speeds"]  # on speeds, from rows written in coordinates, rates or speeds
+    determined: Bool[Array, "*times rows"]  # whether the multiplier is unique; False where rows are dependent and it is of minimum norm
+    row_names: tuple[str, ...] = eqx.field(static=True)
+    body_names: tuple[str, ...] = eqx.field(static=True)
+
+    def forces_on(self, body: str) -> dict[str, Float[Array, "*times 3"]]:
+        """Force on one body (N), by row."""
+        return self._by_row(self.force, body)
+
+    def torques_on(self, body: str) -> dict[str, Float[Array, "*times 3"]]:
+        """Torque on one body about its mass centre (N m), by row."""
+        return self._by_row(self.torque, body)
+
+    def _by_row(self, values, body):
+        if body not in self.body_names:
+            raise UnknownNameError(f"no body `{body}` in this scene; {nearest(body, self.body_names)}")
+        return {row: values[..., s, self.body_names.index(body), :] for s, row in enumerate(self.row_names)}
+
+
+class ContactForce(eqx.Module):
+    """The force of the ground on the body at one rolling contact."""
+
+    normal: Float[Array, ""]  # N, along the plane's normal; negative where the contact would have to pull
+    tangential: Float[Array, "2"]  # N, along the plane's tangents
+    friction_needed: Float[Array, ""]  # |tangential| / normal; infinite where the contact would have to pull, zero where it bears nothing
+    pulls: Bool[Array, ""]  # whether the normal force is negative beyond round-off: the body would lift off
+    determined: Bool[Array, ""]  # whether the rows at hand determine these numbers
+
+
+class _PerMultiplier(eqx.Module):
+    """What the rows exert where their multipliers are one."""
+
+    on_bodies: Wrenches  # leading axis: rows
+    direct: Float[Array, "rows speeds"]
+    spare: Float[Array, "rows rows"]  # columns: multipliers that change no motion
+
+
+@eager_if_concrete
+def row_reactions(scene: Scene, t, q, u, accelerations: Accelerations, inputs=None) -> RowReactions:
+    """Constraint forces per row and per body at (t, q, u), from the multipliers of known `accelerations`.
+
+    Their generalized forces add up to `A' lambda`: `sum_s beta' R^s + gamma' T^s + direct^s`.
+    """
+    motion = motion_at(scene, t, q, u, inputs)
+    return _reactions(scene, motion, _per_multiplier(scene, motion, inputs), accelerations.multipliers)
+
+
+def _reactions(scene: Scene, motion: Motion, unit: _PerMultiplier, multipliers) -> RowReactions:
+    force, torque = (multipliers[:, None, None] * part for part in (unit.on_bodies.force, unit.on_bodies.torque))
+    determined = jnp.diagonal(unit.spare) == 0  # a multiplier is unique where its row is no combination of the others
+    return RowReactions(multipliers, force, torque, multipliers[:, None] * unit.direct, determined, names_of_rows(scene), tuple(motion.bodies))
+
+
+def _per_multiplier(scene: Scene, motion: Motion, inputs) -> _PerMultiplier:
+    bodies, q, u = motion.bodies.values(), motion.q.array, motion.u.array
+    if not names_of_rows(scene):
+        nothing = jnp.zeros((0, len(bodies), 3), q.dtype)
+        return _PerMultiplier(Wrenches(nothing, nothing), jnp.zeros((0, u.shape[0]), q.dtype), jnp.zeros((0, 0), q.dtype))
+
+    def rows(v, omega, u):
+        return flatten_rows(velocity_rows(scene, _moving(scene, motion, v, omega, u)), q.dtype)
+
+    v, omega = jnp.stack([body.velocity for body in bodies]), jnp.stack([body.angular_velocity for body in bodies])
+    force, torque, direct = jax.jacrev(rows, argnums=(0, 1, 2))(v, omega, u)
+    rigid = jnp.array([isinstance(body.body, RigidBody) for body in bodies])
+    torque = jnp.where(rigid[:, None], torque, 0.0)  # a particle takes no torque
+    A = jax.jacfwd(lambda u: velocity_residual(scene, motion.t, q, u, inputs))(u)
+    return _PerMultiplier(Wrenches(force, torque), direct, _spare_multipliers(A, plain_row_lengths(scene)))
+
+
+def _moving(scene: Scene, motion: Motion, v, omega, u) -> Motion:
+    """The motion with other velocities of the bodies, and other speeds, each on its own."""
+    bodies = {name: BodyMotion(name, body.body, v[j], omega[j]) for j, (name, body) in enumerate(motion.bodies.items())}
+    qdot = coordinate_rates(scene, motion.t, motion.q.array, u)
+    return Motion(motion.t, motion.q, Named(u, motion.u.slots), Named(qdot, motion.qdot.slots), motion.inputs, bodies)
+
+
+def _spare_multipliers(A: Float[Array, "rows speeds"], typical: Float[np.ndarray, "rows"]) -> Float[Array, "rows rows"]:
+    """Columns: multipliers that change no motion, `A' lambda = 0`; all zero where the rows are independent.
+
+    `typical`: lengths of the rows, as in `row_scale`.
+    """
+    scale = row_scale(A, typical)
+    A = jax.lax.stop_gradient(scale[:, None] * A)
+    spare = jnp.eye(A.shape[0], dtype=A.dtype) - A @ pseudo_inverse(A)
+    return scale[:, None] * jnp.where(jnp.abs(spare) > jnp.sqrt(jnp.finfo(A.dtype).eps), spare, 0.0)
+
+
+@eager_if_concrete
+def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=None) -> dict[str, ContactForce]:
+    """Normal and tangential force of every rolling contact, and the friction coefficient it needs to roll without slip.
+
+    The tangential force is the multiplier of the no-slip rows. With `height="row"` the normal force is the multiplier of the
+    height row; with `height="coordinates"` it comes from Newton's equations (row S1) of the bodies that the contact carries, forces and moments:
+    `sum N n = sum (m a - F - R_rows)` and its moment, over all contacts that touch these bodies; of minimum norm, and marked as not determined, where
+    they do not tell it (four wheels on a plane). Contacts share what the forces alone leave open according to the moments; where moments are left
+    that no contact can bear (a guide keeps a robot level), such a share is marked as not determined, too. Forces given directly on speeds
+    (`generalized_force`) are taken to have no resultant force or moment on these bodies.
+    """
+    motion = motion_at(scene, t, q, u, inputs)
+    contacts = contacts_of(scene, motion.pose())
+    if not contacts:
+        return {}
+    unit = _per_multiplier(scene, motion, inputs)
+    rows = _reactions(scene, motion, unit, accelerations.multipliers)
+    total = newton_residual(scene, t, q, u, accelerations.udot, inputs)
+    size = _size_of_forces(scene, motion, total.linear)
+    margin = rank_cutoff(size.dtype) * size
+    held = Wrenches(total.linear - jnp.sum(rows.force, axis=0), total.angular - jnp.sum(rows.torque, axis=0))  # by construction of the coordinates
+    spare = jax.tree.map(lambda part: jnp.einsum("sr,sbi->rbi", unit.spare, part), unit.on_bodies)
+    positions = jnp.stack([body.position for body in motion.bodies.values()])
+    built_in = normal_forces(contacts, rows.body_names, positions, held, spare, size)
+    forces = {}
+    for name, contact in contacts.items():
+        slip = jnp.array([rows.row_names.index(f"{name} slip[{i}]") for i in range(2)])
+        tangential, determined = rows.multipliers[slip], jnp.all(rows.determined[slip])
+        if contact.height == "row":
+            height = rows.row_names.index(f"{name} height")
+            normal, known = rows.multipliers[height], rows.determined[height]
+        else:
+            normal, known = built_in[name].normal, built_in[name].determined
+        forces[name] = _contact_force(normal, tangential, determined & known, margin)
+    return forces
+
+
+def _size_of_forces(scene: Scene, motion: Motion, total) -> Float[Array, ""]:
+    """Size of the forces at hand (N): of `m a - F`, of F and of `m |v| |omega|` on the bodies."""
+    size = jnp.max(jnp.abs(total)) + jnp.max(jnp.abs(resultants(scene, motion).force))
+    for body in motion.bodies.values():
+        size = size + body.mass * jnp.max(jnp.abs(body.velocity)) * jnp.max(jnp.abs(body.angular_velocity))
+    return jax.lax.stop_gradient(size)
+
+
+def _contact_force(normal, tangential, determined, margin) -> ContactForce:
+    squared = tangential @ tangential
+    sliding = squared > 0
+    size = jnp.where(sliding, jnp.sqrt(jnp.where(sliding, squared, 1.0)), 0.0)
+    pushes, idle = normal > margin, (jnp.abs(normal) <= margin) & (size <= margin)
+    friction = jnp.where(pushes, size / jnp.where(pushes, normal, 1.0), jnp.where(idle, 0.0, jnp.inf))
+    return ContactForce(normal, tangential, friction, normal < -margin, determined)

@@ -1,0 +1,67 @@
+"""Functions of numbers run at once on NumPy, uncompiled: a first call at a prompt takes a tenth of the time that compiling takes."""
+
+from collections import Counter
+from collections.abc import Callable, Hashable
+from functools import lru_cache, wraps
+from inspect import signature
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.eager.numpy_backend import uncompiled
+
+
+class Seldom:
+    """Counts calls: true for the first `often` ones of a kind, if their numbers are known. So long compiling does not pay (`eval_numpy` instead)."""
+
+    def __init__(self, often: int):
+        self.often = often
+        self._calls: Counter[Hashable] = Counter()
+
+    def __call__(self, kind: Hashable, numbers) -> bool:
+        """Whether this call of that kind is one of the first; `numbers`: anything with leaves."""
+        if is_traced(numbers):
+            return False
+        self._calls[kind] += 1
+        return self._calls[kind] <= self.often
+
+
+def eval_numpy(f: Callable) -> Callable:
+    """`f` run at once on concrete arguments, uncompiled: NumPy arrays out, also while something else is being traced."""
+
+    @lru_cache(maxsize=32)
+    def program(treedef, rest, x64):
+        return uncompiled(lambda numbers: f(*eqx.combine(numbers, jax.tree.unflatten(treedef, rest))))
+
+    @wraps(f)
+    def run(*arguments):
+        arguments = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array_like(x) else x, arguments)
+        numbers, others = eqx.partition(arguments, eqx.is_array)
+        rest, treedef = jax.tree.flatten(others, is_leaf=_is_none)
+        return program(treedef, tuple(rest), jax.config.jax_enable_x64)(numbers)
+
+    return run
+
+
+def eager_if_concrete(f: Callable) -> Callable:
+    """`f` of numbers run uncompiled, so that a first call at a prompt takes a tenth of the time; of traced values, as it stands.
+
+    What `f` finds out by the scene's own numbers (rank, privileged speeds) must be among its arguments: inside, the numbers are traced.
+    """
+    known, parameters = eval_numpy(f), signature(f)
+
+    @wraps(f)
+    def run(*given, **named):
+        bound = parameters.bind(*given, **named)
+        bound.apply_defaults()
+        arguments = bound.args
+        return f(*arguments) if is_traced(arguments) else jax.tree.map(jnp.asarray, known(*arguments))
+
+    return run
+
+
+def _is_none(x) -> bool:
+    return x is None

@@ -1,0 +1,352 @@
+"""A traced function run on NumPy arrays, one primitive after another: for what is looked at once, where compiling takes longer than running.
+
+Primitives without a rule here run one by one in JAX, which compiles each: tens of milliseconds.
+"""
+
+import os
+from collections.abc import Callable
+from functools import lru_cache, wraps
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Literal
+
+from jourdain_jax.eager.entrywise import FUNCTIONS
+from jourdain_jax.eager.indexing import gathered, scattered
+
+MOST_TURNS = 5000  # of a loop that states none: more of them are for ever
+_NOT_THE_USERS = (str(Path(__file__).parents[1]), f"{os.sep}site-packages{os.sep}")
+
+
+def uncompiled(f: Callable) -> Callable:
+    """`f` of trees of arrays, run on NumPy; also while something else is being traced."""
+
+    @lru_cache(maxsize=64)
+    def traced(treedef, shapes):
+        arguments = jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(*s) for s in shapes])
+        return jax.make_jaxpr(f, return_shape=True)(*arguments)
+
+    @wraps(f)
+    def run(*arguments):
+        leaves, treedef = jax.tree.flatten(arguments)
+        leaves = [np.asarray(x) for x in leaves]
+        closed, shape = traced(treedef, tuple((x.shape, x.dtype) for x in leaves))
+        with np.errstate(all="ignore"):
+            out = _run(closed.jaxpr, closed.consts, leaves)
+        return jax.tree.unflatten(jax.tree.structure(shape), out)
+
+    return run
+
+
+def _run(jaxpr, constants, arguments) -> list[np.ndarray]:
+    values = dict(zip(jaxpr.constvars, map(np.asarray, constants), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
+
+    def read(atom):
+        return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
+
+    for equation in jaxpr.eqns:
+        inputs = [read(x) for x in equation.invars]
+        results = _apply(equation, inputs)
+        for variable, result in zip(equation.outvars, results, strict=True):
+            values[variable] = result
+    return [read(x) for x in jaxpr.outvars]
+
+
+def _closed(inner, inputs):
+    return _run(inner.jaxpr, inner.consts, inputs) if hasattr(inner, "consts") else _run(inner, [], inputs)
+
+
+def _apply(equation, inputs) -> list[np.ndarray]:
+    name, params = equation.primitive.name, equation.params
+    if name == "while":
+        return _while(equation, inputs)
+    if name in _CONTROL:
+        return _CONTROL[name](params, inputs)
+    if name in _ENTRYWISE:
+        with_type = _ENTRYWISE[name](*inputs)
+        return [np.asarray(with_type, equation.outvars[0].aval.dtype)]
+    if name in _RULES and not any(params.get(flag) for flag in _WITHOUT_RULE):
+        result = _RULES[name](equation, *inputs)
+        if result is not None:
+            return result if isinstance(result, list) else [result]
+    with jax.ensure_compile_time_eval():
+        result = equation.primitive.bind(*(jnp.asarray(x) for x in inputs), **params)
+    return [np.asarray(x) for x in (result if equation.primitive.multiple_results else [result])]
+
+
+# Control flow: everything is known, so branches are taken and loops are run.
+
+
+def _scan(params, inputs) -> list[np.ndarray]:
+    fixed, carried = params["num_consts"], params["num_carry"]
+    constants, carry, xs = inputs[:fixed], inputs[fixed : fixed + carried], inputs[fixed + carried :]
+    outs: list[list] = [[] for _ in range(len(params["jaxpr"].jaxpr.outvars) - carried)]
+    order = range(params["length"])
+    before: list[np.ndarray] = []  # what was carried one turn ago
+    for done, i in enumerate(reversed(order) if params["reverse"] else order, 1):
+        result = _closed(params["jaxpr"], [*constants, *carry, *(x[i] for x in xs)])
+        before_last, before, carry = before, carry, result[:carried]
+        if not xs and not outs and (_equal(carry, before) or (_equal(carry, before_last) and (params["length"] - done) % 2 == 0)):
+            return carry  # an iteration that has converged, or goes to and fro: the rest changes nothing
+        for out, y in zip(outs, result[carried:], strict=True):
+            out.append(y)
+    avals = [v.aval for v in params["jaxpr"].jaxpr.outvars[carried:]]
+    stacked = [np.stack(out[::-1] if params["reverse"] else out) if out else np.zeros((0, *a.shape), a.dtype) for out, a in zip(outs, avals, strict=True)]
+    return [*carry, *stacked]
+
+
+def _equal(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
+    return len(a) == len(b) and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def _while(equation, inputs) -> list[np.ndarray]:
+    params = equation.params
+    a, b = params["cond_nconsts"], params["body_nconsts"]
+    of_condition, of_body, carry = inputs[:a], inputs[a : a + b], inputs[a + b :]
+    for _ in range(MOST_TURNS):
+        going = np.asarray(_closed(params["cond_jaxpr"], [*of_condition, *carry])[0])
+        if not np.any(going):
+            return carry
+        new = _closed(params["body_jaxpr"], [*of_body, *carry])
+        carry = new if going.ndim == 0 else [np.where(going.reshape(going.shape + (1,) * (n.ndim - going.ndim)), n, o) for n, o in zip(new, carry, strict=True)]
+    if np.all(going):
+        raise ValueError(
+            f"a `while_loop` in {_where(equation)} does not end: it still turned after {MOST_TURNS} times; give it a count of turns at most, "
+            "such as `lambda state: (state[0] < 50) & ...`, and check what it waits for"
+        )
+    # where some lanes have ended, what the others would have found is not known
+    return [np.where(going.reshape(going.shape + (1,) * (x.ndim - going.ndim)), np.nan, x).astype(x.dtype) if x.dtype.kind == "f" else x for x in carry]
+
+
+def _where(equation) -> str:
+    """The function of the user's that an equation comes from."""
+    traceback = equation.source_info.traceback
+    for frame in traceback.frames if traceback is not None else ():
+        if not any(part in frame.file_name for part in _NOT_THE_USERS):
+            return f"`{frame.function_name.rpartition('.')[2]}` (line {frame.line_num} of {os.path.basename(frame.file_name)})"
+    return "a function of the scene"
+
+
+def _cond(params, inputs) -> list[np.ndarray]:
+    return _closed(params["branches"][int(inputs[0])], inputs[1:])
+
+
+def _linear_solve(params, inputs) -> list[np.ndarray]:
+    lengths = params["const_lengths"]
+    constants, right = np.split(np.arange(len(inputs)), [sum(lengths)])
+    of_solve = constants[lengths.matvec + lengths.vecmat :][: lengths.solve]
+    return _closed(params["jaxprs"].solve, [inputs[i] for i in (*of_solve, *right)])
+
+
+def _call(key: str) -> Callable:
+    return lambda params, inputs: _closed(params[key], inputs)
+
+
+_CONTROL: dict[str, Callable] = {
+    "scan": _scan,
+    "cond": _cond,
+    "jit": _call("jaxpr"),
+    "pjit": _call("jaxpr"),
+    "closed_call": _call("call_jaxpr"),
+    "custom_jvp_call": _call("call_jaxpr"),
+    "custom_vjp_call": _call("call_jaxpr"),
+    "custom_lin": lambda params, inputs: inputs,
+    "custom_linear_solve": _linear_solve,
+}
+
+# Primitives.
+
+_ENTRYWISE: dict[str, Callable] = {
+    **FUNCTIONS,
+    "add_any": np.add,
+    "rem": np.fmod,
+    "square": np.square,
+    "rsqrt": lambda x: 1 / np.sqrt(x),
+    "pow": np.power,
+    "log1p": np.log1p,
+    "expm1": np.expm1,
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "xor": np.bitwise_xor,
+    "not": np.invert,
+    "copy": lambda x: x,
+    "copy_p": lambda x: x,
+    "stop_gradient": lambda x: x,
+    "unvmap_any": np.any,
+    "convert_element_type": lambda x: x,
+}
+del _ENTRYWISE["select"], _ENTRYWISE["round"]
+
+
+def _round(equation, x):
+    if equation.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+        return np.rint(x)
+    whole = np.trunc(x)
+    return whole + np.copysign(np.abs(x - whole) >= 0.5, x)  # half away from zero
+
+
+def _dot_general(equation, a, b):
+    (over_a, over_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
+    free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
+    free_b = [i for i in range(b.ndim) if i not in (*over_b, *batch_b)]
+    batch, contracted = [a.shape[i] for i in batch_a], int(np.prod([a.shape[i] for i in over_a]))
+    left = np.transpose(a, (*batch_a, *free_a, *over_a)).reshape(*batch, int(np.prod([a.shape[i] for i in free_a])), contracted)
+    right = np.transpose(b, (*batch_b, *over_b, *free_b)).reshape(*batch, contracted, int(np.prod([b.shape[i] for i in free_b])))
+    return (left @ right).reshape(equation.outvars[0].aval.shape)
+
+
+def _broadcast_in_dim(equation, x, *dynamic):
+    shape = [1] * len(equation.params["shape"])
+    for axis, place in enumerate(equation.params["broadcast_dimensions"]):
+        shape[place] = x.shape[axis]
+    return np.broadcast_to(x.reshape(shape), equation.params["shape"])
+
+
+def _slice(equation, x):
+    p = equation.params
+    return x[tuple(slice(*s) for s in zip(p["start_indices"], p["limit_indices"], p["strides"] or (1,) * x.ndim, strict=True))]
+
+
+def _dynamic_slice(equation, x, *starts):
+    sizes = equation.params["slice_sizes"]
+    begin = [min(max(int(s), 0), n - size) for s, n, size in zip(starts, x.shape, sizes, strict=True)]
+    return x[tuple(slice(s, s + size) for s, size in zip(begin, sizes, strict=True))]
+
+
+def _dynamic_update_slice(equation, x, update, *starts):
+    x = x.copy()
+    begin = [min(max(int(s), 0), n - size) for s, n, size in zip(starts, x.shape, update.shape, strict=True)]
+    x[tuple(slice(s, s + size) for s, size in zip(begin, update.shape, strict=True))] = update
+    return x
+
+
+def _pad(equation, x, fill):
+    out = np.full(equation.outvars[0].aval.shape, fill, equation.outvars[0].aval.dtype)
+    places, kept = [], []
+    for (low, _, interior), size, total in zip(equation.params["padding_config"], x.shape, out.shape, strict=True):
+        at = low + (interior + 1) * np.arange(size)
+        kept.append((at >= 0) & (at < total))
+        places.append(at[kept[-1]])
+    out[np.ix_(*places)] = x[np.ix_(*(np.flatnonzero(k) for k in kept))]
+    return out
+
+
+def _svd(equation, A):
+    p = equation.params
+    if A.size == 0 or not np.all(np.isfinite(A)):
+        good = np.all(np.isfinite(A), axis=(-2, -1), keepdims=True)
+        found = _svd_of(np.where(good, A, 0.0), p)
+        return [np.where(good if x.ndim == A.ndim else good[..., 0], x, np.nan) for x in found]
+    return _svd_of(A, p)
+
+
+def _svd_of(A, p):
+    if not p["compute_uv"]:
+        return [np.linalg.svd(A, compute_uv=False)]
+    U, s, V = np.linalg.svd(A, full_matrices=p["full_matrices"])
+    return [s, U, V]
+
+
+def _cholesky(equation, A):
+    try:
+        return np.linalg.cholesky(np.tril(A) + np.swapaxes(np.tril(A, -1), -1, -2))
+    except np.linalg.LinAlgError:
+        flat = A.reshape(-1, *A.shape[-2:])
+        return np.stack([_cholesky_or_nan(a) for a in flat]).reshape(A.shape)
+
+
+def _cholesky_or_nan(A):
+    try:
+        return np.linalg.cholesky(np.tril(A) + np.tril(A, -1).T)
+    except np.linalg.LinAlgError:
+        return np.full_like(A, np.nan)
+
+
+def _triangular_solve(equation, A, b):
+    p = equation.params
+    A = np.tril(A) if p["lower"] else np.triu(A)
+    A = np.swapaxes(A, -1, -2) if p["transpose_a"] else A
+    if p["unit_diagonal"]:
+        A = np.where(np.eye(A.shape[-1], dtype=bool), np.ones((), A.dtype), A)
+    singular = np.any(np.diagonal(A, axis1=-2, axis2=-1) == 0, axis=-1)[..., None, None]
+    safe = np.where(singular, np.eye(A.shape[-1]), A)
+    x = np.linalg.solve(safe, b) if p["left_side"] else np.swapaxes(np.linalg.solve(np.swapaxes(safe, -1, -2), np.swapaxes(b, -1, -2)), -1, -2)
+    return np.where(singular, np.nan, x)
+
+
+def _lu(equation, A):
+    """LU decomposition with partial pivoting, as LAPACK's getrf: factors, row exchanges and their permutation, for all matrices together."""
+    *lanes, rows, columns = A.shape
+    LU = np.array(A).reshape(-1, rows, columns)
+    every, swaps = np.arange(len(LU)), np.zeros((len(LU), min(rows, columns)), np.int32)
+    order = np.broadcast_to(np.arange(rows, dtype=np.int32), (len(LU), rows)).copy()
+    for k in range(swaps.shape[1]):
+        swaps[:, k] = best = k + np.argmax(np.abs(LU[:, k:, k]), axis=1)
+        for exchanged in (LU, order):
+            exchanged[every, k], exchanged[every, best] = exchanged[every, best].copy(), exchanged[every, k].copy()
+        pivot = LU[:, k, k, None]
+        LU[:, k + 1 :, k] /= np.where(pivot == 0, 1, pivot)
+        LU[:, k + 1 :, k + 1 :] -= LU[:, k + 1 :, k, None] * LU[:, k, None, k + 1 :]
+    return [LU.reshape(A.shape), swaps.reshape(*lanes, -1), order.reshape(*lanes, rows)]
+
+
+def _platform(equation):
+    """Which of several implementations: the one for CPUs, or the one for all platforms."""
+    return np.asarray(next(i for i, names in enumerate(equation.params["platforms"]) if names is None or "cpu" in names), np.int32)
+
+
+def _iota(equation, *dynamic):
+    shape, axis = equation.params["shape"], equation.params["dimension"]
+    along = [-1 if i == axis else 1 for i in range(len(shape))]
+    return np.broadcast_to(np.arange(shape[axis], dtype=equation.params["dtype"]).reshape(along), shape)
+
+
+def _reduced(function: Callable, of_nothing=None) -> Callable:
+    def reduced(equation, x):
+        start = {} if of_nothing is None or x.dtype.kind != "f" else {"initial": of_nothing}
+        return np.asarray(function(x, axis=tuple(equation.params["axes"]), **start), equation.outvars[0].aval.dtype)
+
+    return reduced
+
+
+_WITHOUT_RULE = ("conjugate_a",)  # variants of `triangular_solve` that are left to JAX
+_RULES: dict[str, Callable] = {
+    "dot_general": _dot_general,
+    "broadcast_in_dim": _broadcast_in_dim,
+    "reshape": lambda e, x, *_: x.reshape(e.outvars[0].aval.shape),
+    "squeeze": lambda e, x: x.reshape(e.outvars[0].aval.shape),
+    "expand_dims": lambda e, x: x.reshape(e.outvars[0].aval.shape),
+    "transpose": lambda e, x: np.transpose(x, e.params["permutation"]),
+    "rev": lambda e, x: np.flip(x, e.params["dimensions"]),
+    "concatenate": lambda e, *xs: np.concatenate(xs, axis=e.params["dimension"]),
+    "stack": lambda e, *xs: np.stack(xs, axis=e.params["axis"]),
+    "unstack": lambda e, x: list(np.moveaxis(x, e.params["axis"], 0)),
+    "split": lambda e, x: np.split(x, np.cumsum(e.params["sizes"])[:-1], axis=e.params["axis"]),
+    "slice": _slice,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "round": _round,
+    "select_n": lambda e, which, *cases: np.where(np.asarray(which, bool), cases[1], cases[0]) if len(cases) == 2 else np.choose(which, cases),
+    "integer_pow": lambda e, x: np.asarray(x ** e.params["y"] if e.params["y"] >= 0 else 1 / x ** -e.params["y"]),
+    "iota": _iota,
+    "pad": _pad,
+    "gather": gathered,
+    "scatter": scattered,
+    "platform_index": _platform,
+    "svd": _svd,
+    "lu": _lu,
+    "cholesky": _cholesky,
+    "triangular_solve": _triangular_solve,
+    "reduce_sum": _reduced(np.sum),
+    "reduce_max": _reduced(np.max, -np.inf),
+    "reduce_min": _reduced(np.min, np.inf),
+    "reduce_prod": _reduced(np.prod),
+    "reduce_and": _reduced(np.bitwise_and.reduce),
+    "reduce_or": _reduced(np.bitwise_or.reduce),
+    "argmax": lambda e, x: np.argmax(x, axis=e.params["axes"][0]).astype(e.params["index_dtype"]),
+    "optimization_barrier": lambda e, *xs: list(xs),
+}

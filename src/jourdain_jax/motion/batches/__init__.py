@@ -1,0 +1,1 @@
+"""Many motions at once: lanes in lockstep, rollouts."""

@@ -1,0 +1,298 @@
+"""Batches of motions: many starts, many parameters, or both; a result per lane, and one bad lane harms no other.
+
+Lanes of one chunk run in lockstep as one vmapped integration; chunks run one after another through the same compiled program.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from tqdm import tqdm
+
+from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.build.structure import structure_of
+from jourdain_jax.motion.arguments import check_options
+from jourdain_jax.motion.input_programs import by_itself, for_programs
+from jourdain_jax.motion.inputs import as_inputs
+from jourdain_jax.motion.integration import integrate_lanes
+from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS
+from jourdain_jax.motion.retries import lost_codes, mark_retried, next_retry, retry_options
+from jourdain_jax.motion.simulate import MOST_STEPS, TOLERANCE, default_solver, set_up, state_form, warn_float32
+from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
+from jourdain_jax.motion.start import State
+from jourdain_jax.motion.state_form import StateForm
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import checked_real, described, is_traced
+from jourdain_jax.scene.parameters import parameter_faults, parameters_of
+from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.scene import Scene
+
+CHUNK = 512  # lanes whose stages fit the cache of a core
+WAYS = ("state_form", "reduction", "solver", "projected")  # static, of a trajectory
+MEMORY = 2**30  # bytes of saved states per chunk, at most
+
+
+class Rollout(Printed, eqx.Module):
+    """Many motions of one scene: a `Trajectory` whose arrays have a leading axis of lanes."""
+
+    lanes: Trajectory
+    continued: tuple[int, ...] = eqx.field(static=True, default=())  # lanes that lost their privileged speeds and were run again with the full state
+    ways: tuple[tuple[int, tuple], ...] = eqx.field(static=True, default=())  # fallback -> how such lanes were run: `WAYS`
+
+    def __len__(self) -> int:
+        return self.lanes.q.shape[0]
+
+    def __getitem__(self, name: str) -> Float[Array, "lanes times *shape"]:
+        """A coordinate or speed by name, of all lanes at all times."""
+        return jax.vmap(lambda lane: lane[name])(self.lanes)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.lanes
+
+    def lane(self, index: int) -> Trajectory:
+        """The motion of the lane with number `index`, as a `Trajectory`; IndexError where there is none."""
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"lane {index} does not exist; this rollout has {len(self)} lanes, 0 to {len(self) - 1}")
+        lane = jax.tree.map(lambda x: x[index], self.lanes)
+        ways = {} if is_traced(lane.fallback) else dict(self.ways)
+        return dataclasses.replace(lane, **dict(zip(WAYS, ways.get(int(lane.fallback), ()), strict=False))) if ways else lane
+
+    @property
+    def result(self) -> np.ndarray:
+        """Result code of every lane, shape (lanes,); see `jourdain_jax.motion.trajectories.results`."""
+        return np.asarray(self.lanes.result)
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Numbers of the lanes that reached neither their end nor an event."""
+        return np.flatnonzero((self.result != results.SUCCESS) & (self.result != results.EVENT))
+
+    def quantiles(self, name: str, levels: Sequence[float] = (0.025, 0.5, 0.975)) -> np.ndarray:
+        """Quantiles over lanes of the coordinate or speed `name` at all times, for the given `levels` (0 to 1), shape (levels, times).
+
+        Lanes that ended are left out from then on; NaN where none is left.
+        """
+        values, quantiles = np.asarray(self[name]), np.asarray(checked_real(levels, "`levels`", advice="give numbers from 0 to 1"))
+        if quantiles.ndim != 1 or not np.all((quantiles >= 0) & (quantiles <= 1)):
+            raise ValueError(f"`levels` are {levels}, expected a list of numbers from 0 to 1")
+        out = np.full((len(levels), *values.shape[1:]), np.nan)
+        reached = np.isfinite(values).any(axis=0)
+        out[:, reached] = np.nanquantile(values[:, reached], levels, axis=0)
+        return out
+
+    def _text(self) -> str:
+        lines = [f"Rollout of {type(self.lanes.scene).__name__}: {len(self)} lanes"]
+        for code, message in results.MESSAGES.items():
+            lanes = np.flatnonzero(self.result == code)
+            if lanes.size == 0:
+                continue
+            named = ""
+            if code == results.EVENT:
+                events = np.asarray(self.lanes.event)[lanes]
+                named = " " + ", ".join(f"`{self.lanes.event_names[i]}` {int(np.sum(events == i))}" for i in np.unique(events))
+            elif code != results.SUCCESS:
+                named = self._wrong_parameters(lanes[:10]) if code == results.BAD_PARAMETER else ""
+                named += ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
+            lines.append(f"  {lanes.size} {message}{named}")
+        if self.continued:
+            lines.append(f"  {len(self.continued)} left the domain of their privileged speeds and were run with the full state")
+        stiff = int(np.count_nonzero(np.asarray(self.lanes.fallback) & results.IMPLICIT))
+        if stiff:
+            lines.append(f"  {stiff} are stiff and were run with an implicit solver")
+        steps = np.asarray(self.lanes.accepted)
+        lines.append(f"  steps accepted: {steps.min()} to {steps.max()}, median {int(np.median(steps))}")
+        return "\n".join(lines)
+
+    def _wrong_parameters(self, lanes: np.ndarray) -> str:
+        return f" ({', '.join(dict.fromkeys(name for i in lanes for name in self.lane(int(i)).faults))})"
+
+
+def rollout(
+    scene: Scene,
+    starts: "dict | State | None" = None,
+    *,
+    parameters: dict | None = None,
+    chunk: int | None = None,
+    progress: bool | None = None,
+    **options,
+) -> Rollout:
+    """Simulate many lanes.
+
+    - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a `State` with a leading axis of lanes.
+    - `parameters`: parameter name -> array with a leading axis of lanes, where lanes differ in parameters.
+    - `chunk`: lanes that run together (default: 512, less where saved states would pass 1 GiB); `progress`: a bar (default: with several chunks).
+    - `options`: further ones as in `simulate`.
+
+    Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`. In reverse mode a lane whose start
+    or parameters are NaN makes derivatives by what all lanes share NaN, even where its result is not used, as everywhere in JAX: leave it out first.
+    """
+    starts = dict(as_scene(scene).example) if starts is None else starts
+    for what, given in (("starts", starts), ("parameters", parameters)):
+        if given is not None and not isinstance(given, Mapping) and not (what == "starts" and isinstance(given, State)):
+            raise ValueError(f'`{what}` is {described(given)}, expected a dictionary by name, such as {{"x": jnp.linspace(0.0, 1.0, 8)}}')
+    parameters = {} if parameters is None else {name: checked_real(value, f"parameter `{name}`") for name, value in parameters.items()}
+    fixed, varied, count = _lanes(scene, starts, parameters)
+    chunk = _chunk(scene, count, chunk, options)
+    _check_times_of_lanes(scene, starts, options)
+    options["inputs"] = as_inputs(scene, options.get("inputs"))
+    if is_traced((scene, fixed, varied, parameters, options)):
+        return Rollout(_together(scene, fixed, _with_arrays(options), varied, parameters))  # being differentiated or batched: one piece, no host loop
+    pieces = []
+    sound = _sound_lane(scene, parameters)
+    bar = tqdm(total=count, unit="lane", disable=not (count > chunk if progress is None else progress))
+    for first in range(0, count, chunk):
+        index = np.minimum(np.arange(first, first + chunk), count - 1)  # the last chunk is filled up with copies of its last lane
+        with reference_parameters(sound):
+            piece = _together(scene, fixed, _with_arrays(options), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+        kept = min(chunk, count - first)
+        pieces.append(jax.tree.map(lambda x, kept=kept: np.asarray(x)[:kept], piece))
+        bar.update(kept)
+    bar.close()
+    lanes = jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
+
+    ways: dict[int, tuple] = {}
+    while (again := _next_retries(scene, lanes, varied, options)).any():
+        for way in np.unique(again[again > 0]).tolist():
+            chosen, changed = np.flatnonzero(again == way), options | retry_options(way, options.get("max_steps", MOST_STEPS))
+            for first in range(0, len(chosen), chunk):
+                index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
+                with reference_parameters(sound):
+                    new = _together(scene, fixed, _with_arrays(changed), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+                lanes, ways[way] = _replaced(lanes, mark_retried(new, way), index), tuple(getattr(new, name) for name in WAYS)
+    continued = np.flatnonzero(np.asarray(lanes.fallback) & results.FULL_STATE)
+    return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(continued.tolist()), tuple(sorted(ways.items())))
+
+
+def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:
+    """Where all lanes have one span and it is known. Inside the lanes it is traced: a lane whose own time does not fit gets a result code."""
+    ts = None if options.get("ts") is None else saved_times(options["ts"])
+    t0, t1 = (as_end(name, options.get(name)) for name in ("t0", "t1"))
+    if t0 is None and isinstance(starts, State):
+        return
+    t0 = as_end("t0", 0.0) if t0 is None else t0
+    t1 = (t0 + scene.example_span if ts is None else ts[-1]) if t1 is None else t1
+    if is_traced(t0, t1, ts):
+        return
+    check_span(t0, t1)
+    if ts is not None:
+        check_times(ts, t0, t1)
+
+
+def _sound_lane(scene: Scene, parameters: dict) -> Scene:
+    """The scene of the first lane whose parameters are right: what holds of its class is probed near its numbers."""
+    for lane in range(min(16, *(len(value) for value in parameters.values())) if parameters else 0):
+        own = scene.replace(**{name: value[lane] for name, value in parameters.items()})
+        if not any(bool(fault) for fault in parameter_faults(own).values()):
+            return own
+    return scene
+
+
+def _next_retries(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int[np.ndarray, "lanes"]:
+    """In which ways each lane is run again, those it was run in already included; AS_ASKED: it is not."""
+    own_times = isinstance(starts, State) and options.get("t0") is None
+    begun = np.broadcast_to(np.asarray(starts.t if own_times else _first_time(options)), lanes.result.shape)
+    found = np.full(lanes.result.shape, results.AS_ASKED)
+    for tried in np.unique(lanes.fallback).tolist():
+        form = _form(scene, options | retry_options(tried, options.get("max_steps", MOST_STEPS)))
+        for i in np.flatnonzero((np.asarray(lanes.fallback) == tried) & np.isin(lanes.result, (*lost_codes(form), *OUT_OF_STEPS))):
+            found[i] = next_retry(form, jax.tree.map(lambda x, i=i: x[i], lanes), begun[i], options)
+    return found
+
+
+def _form(scene: Scene, options: dict) -> StateForm:
+    """How the lanes' state is integrated."""
+    how = {name: options[name] for name in ("state", "reduction", "stabilisation", "projection", "work", "lowering", "inputs") if name in options}
+    return state_form(scene, structure_of(scene), **how)
+
+
+def _round_up(count: int) -> int:
+    """The next power of two, at least 8: few programs to compile."""
+    return max(8, 1 << (count - 1).bit_length())
+
+
+def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajectory:
+    """`lanes` with those at `index` from another run."""
+    leaves, treedef = jax.tree.flatten(lanes)
+    new = [np.array(x) for x in leaves]
+    for old, y in zip(new, jax.tree.leaves(again), strict=True):
+        old[index] = np.asarray(y)
+    return jax.tree.unflatten(treedef, new)
+
+
+def _together(scene, fixed, options, varied, parameters) -> Trajectory:
+    """All given lanes in lockstep; compiled once for scenes and lanes of one shape."""
+    return _compiled(options["inputs"].programs)(scene, fixed, options, varied, parameters)
+
+
+def _lanes_in_lockstep(scene, fixed, options, varied, parameters) -> Trajectory:
+
+    def lane(varied, parameters):
+        own = scene.replace(**parameters) if parameters else scene
+        return set_up(own, varied if isinstance(varied, State) else {**fixed, **varied}, **options)
+
+    return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
+
+
+_compiled = for_programs(_lanes_in_lockstep, by_itself)
+
+
+def _with_arrays(options: dict) -> dict:
+    """Options with their numbers as arrays: another tolerance, first step or end is no other program."""
+    options = {"rtol": TOLERANCE, "atol": TOLERANCE} | options
+    numbers = {name: options[name] for name in ("rtol", "atol", "dt0", "t0", "t1", "ts") if options.get(name) is not None}
+    check_options(**{name: value for name, value in numbers.items() if name in ("rtol", "atol", "dt0")})
+    if options.get("solver") is None:
+        options["solver"] = default_solver(options["rtol"])
+    real = jnp.result_type(float)
+    warn_float32(real, options["rtol"])
+    return options | {name: checked_real(value, f"`{name}`", None if name == "ts" else ()).astype(real) for name, value in numbers.items()}
+
+
+def _first_time(options: dict):
+    return 0.0 if options.get("t0") is None else options["t0"]
+
+
+def _lanes(scene: Scene, starts, parameters: dict):
+    """Start values common to all lanes, those that vary, and the number of lanes."""
+    known = [name for name, _, _ in parameters_of(scene)]
+    for name in parameters:
+        if name not in known:
+            raise ValueError(f"scene `{type(scene).__name__}` has no parameter `{name}`; {nearest(name, known)}")
+    lengths = {f"parameter `{name}`": value.shape[0] if value.ndim else None for name, value in parameters.items()}
+    if isinstance(starts, State):
+        fixed, varied = {}, starts
+        lengths["`starts`"] = starts.q.shape[0] if starts.q.ndim == 2 else None
+    else:
+        arrays = {name: checked_real(value, f"start `{name}`").astype(jnp.result_type(float)) for name, value in starts.items()}
+        groups = {group for names in (scene.coordinate_names, scene.speed_names) for group, _, _ in names.groups}  # quaternions and their rates
+        fixed = {name: value for name, value in arrays.items() if value.ndim == (1 if name in groups else 0)}
+        varied = {name: value for name, value in arrays.items() if name not in fixed}
+        lengths |= {f"start `{name}`": value.shape[0] for name, value in varied.items()}
+    return fixed, varied, _common_length(lengths)
+
+
+def _common_length(lengths: dict) -> int:
+    for what, length in lengths.items():
+        if length is None:
+            raise ValueError(f"{what} has no axis of lanes; give an array with one entry per lane, or set it on the scene itself")
+    counts = set(lengths.values())
+    if len(counts) > 1:
+        raise ValueError("lanes differ in number: " + ", ".join(f"{what} has {length}" for what, length in lengths.items()) + "; give arrays of one length")
+    if not counts or counts == {0}:
+        raise ValueError("no lanes: give at least one start value or parameter as an array with one entry per lane, or use `simulate` for one motion")
+    return counts.pop()
+
+
+def _chunk(scene: Scene, count: int, chunk: int | None, options: dict) -> int:
+    if chunk is not None and (not isinstance(chunk, int | np.integer) or chunk < 1):
+        raise ValueError(f"`chunk` is {chunk!r}, expected a whole number, at least one lane")
+    times = 201 if options.get("ts") is None else np.shape(options["ts"])[0]
+    per_lane = 8 * times * (len(scene.coordinate_names) + len(scene.speed_names) + 2)
+    return max(1, min(count, CHUNK if chunk is None else chunk, max(1, MEMORY // per_lane)))

@@ -1,0 +1,131 @@
+"""An energy-preserving integrator: a discrete gradient in the reduced, almost-Poisson form of a nonholonomic scene.
+
+Minimal state z = (q, y), y the privileged speeds; H(z) = T + V = y' m(q) y/2 + V(q); qdot = W(q) y. The rates are a skew matrix times grad H:
+
+    qdot =  W m^-1 H_y                                        m = H_yy
+    ydot = -m^-1 W' H_q + m^-1 G m^-1 H_y                     G(q, y) skew: G y = r,  r = m ydot + W' H_q
+
+r is quadratic in y and does no work, y.r = 0; so that G = (r_y - r_y')/3. One step puts S at the midpoint and Gonzalez's discrete gradient
+in the place of grad H:
+
+    z_1 - z_0 = h S(z_m) gbar,   gbar = grad H(z_m) + (H(z_1) - H(z_0) - grad H(z_m).(z_1 - z_0)) (z_1 - z_0)/|z_1 - z_0|^2
+
+whence H(z_1) - H(z_0) = gbar.(z_1 - z_0) = 0. S comes from the rates themselves by autodiff, whatever the reduction.
+Source: E. Celledoni, M. Farre Puiggali, E. H. Hoiseth and D. Martin de Diego, Energy-preserving integrators applied to nonholonomic systems,
+J. Nonlinear Sci. 29 (2019) 1523, arXiv 1605.02845; O. Gonzalez, Time integration and discrete Hamiltonian systems, J. Nonlinear Sci. 6 (1996) 449.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.build.structure import structure_of
+from jourdain_jax.calculus.newton import newton_root
+from jourdain_jax.dynamics.power import needs_work
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.rows import names_of_position_rows
+from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy
+from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step, Stepped
+from jourdain_jax.motion.state_form import Integrated, StateForm
+from jourdain_jax.scene.scene import Scene
+
+
+class DiscreteGradient(FixedStepSolver):
+    """The energy-preserving discrete-gradient method in reduced form, `simulate(..., solver=DiscreteGradient(), dt0=h)`; h in s.
+
+    With z = (q, y), y the privileged speeds, and the rates written as `zdot = S(z) grad H(z)`, S skew and H = T + V: `z_1 - z_0 = h S(z_m) gbar`,
+    z_m = (z_0 + z_1)/2, gbar Gonzalez's discrete gradient of H. Order 2, symmetric in time; T + V is kept to round-off, velocity rows hold exactly.
+    A discrete gradient rather than a projection onto the energy after each step: it is symmetric, and moves no other integral by a correction.
+
+    Needs a minimal state and a constant T + V: rows linear and homogeneous in the speeds, loads with potentials, nothing that depends on time, and
+    no geometric rows.
+
+    Worth it where an energy that drifts would decide the answer: long motions of conservative scenes, also of those where the other methods drift
+    because no symmetry helps them. Other integrals are kept to the order of the method only, and it is the dearest of these methods per step.
+
+    Source: Celledoni et al., J. Nonlinear Sci. 29 (2019) 1523 (arXiv 1605.02845); Gonzalez, J. Nonlinear Sci. 6 (1996) 449.
+    """
+
+    def fitted(self, scene: Scene, form: StateForm, asked: str) -> StateForm:
+        """The minimal `form` of the state. ValueError where the energy of the `scene` is not constant, or there is no minimal state; `asked`: the
+        state that was asked for.
+        """
+        fault = _fault(scene, form, asked)
+        if fault:
+            raise ValueError(f"`DiscreteGradient` does not apply to `{type(scene).__name__}`: {fault}; use solver=jj.ImplicitMidpoint()")
+        return form
+
+    def stepped(self, step: Step, y: Integrated) -> Stepped:
+        """The state `y` after one `step`."""
+        return _stepped(step.args, step.args[4] + step.t + step.h / 2, jnp.asarray(step.h, y.q.dtype), y)
+
+
+@eqx.filter_jit  # traced once, not wherever diffrax looks at a step
+def _stepped(args, t, h, y: Integrated) -> Stepped:
+    n, z0 = y.q.shape[0], jnp.concatenate([y.q, y.v])
+    H0 = _energy(args, t, z0, n)
+    guess = h * jnp.concatenate(_rates(args, t, y.q, y.v))
+    size = jnp.max(jnp.abs(z0)) + jnp.max(jnp.abs(guess))
+    scale = jnp.broadcast_to(jnp.where(size == 0, 1.0, size), z0.shape)
+    found = newton_root(lambda d: _residual(args, t, h, n, z0, H0, d), guess, jax.lax.stop_gradient(scale))
+    z1 = z0 + found.x
+    return Stepped(Integrated(z1[:n], z1[n:], y.work), found.converged)
+
+
+@eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
+def _residual(args, t, h, n: int, z0, H0, d) -> Float[Array, "state"]:
+    """`d - h S(z_m) gbar`, d = z_1 - z_0."""
+    z = z0 + d / 2
+    gradient, squared = jax.grad(lambda z: _energy(args, t, z, n))(z), d @ d
+    excess = _energy(args, t, z0 + d, n) - H0 - gradient @ d
+    gbar = gradient + jnp.where(squared > 0, excess / jnp.where(squared > 0, squared, 1.0), 0.0) * d
+    return d - h * _skew_times(args, t, z[:n], z[n:], gbar)
+
+
+def _skew_times(args, t, q, v, gbar) -> Float[Array, "state"]:
+    """`S(q, v) gbar`."""
+    n = q.shape[0]
+    W = jax.jacfwd(lambda v: _rates(args, t, q, v)[0])(v)
+
+    def H_v(v):
+        return jax.grad(lambda v: _energy(args, t, jnp.concatenate([q, v]), n))(v)
+
+    m = jax.jacfwd(H_v)(v)
+
+    def r(v):
+        # m ydot + W' H_q, of which the potential is no part
+        return m @ _rates(args, t, q, v)[1] + W.T @ jax.grad(lambda q: _energy(args, t, jnp.concatenate([q, v]), n))(q)
+
+    velocity = jnp.linalg.solve(m, gbar[n:])  # m^-1 gbar_y
+    J = jax.jacfwd(r)(v)
+    turning = (J - J.T) @ velocity / 3  # G m^-1 gbar_y
+    return jnp.concatenate([W @ velocity, jnp.linalg.solve(m, turning - W.T @ gbar[:n])])
+
+
+@eqx.filter_jit
+def _rates(args, t, q, v):
+    form, scene, inputs, fixed, _ = args
+    found = form.rates(scene, fixed, t, Integrated(q, v, None), form.now(inputs, t))
+    return found.q, found.v
+
+
+@eqx.filter_jit
+def _energy(args, t, z, n: int) -> Float[Array, ""]:
+    """H = T + V in J."""
+    form, scene, inputs, fixed, _ = args
+    q, u = form.unpack(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t))
+    return kinetic_energy(scene, t, q, u) + potential_energy(scene, motion_at(scene, t, q, u, inputs(t)))
+
+
+def _fault(scene: Scene, form: StateForm, asked: str) -> str:
+    """Why the method does not apply; empty where it does."""
+    structure = structure_of(scene)
+    if needs_work(scene, structure):
+        return "its T + V is not constant (loads without a potential, rows that do work, or something that depends on time)"
+    if names_of_position_rows(scene):
+        return "its geometric rows would have to be projected after each step, which moves the energy"
+    if form.independent is None:
+        way_out = "" if asked == "full" or not structure.affine else " (state='minimal' keeps to the privileged speeds, where the motion allows it)"
+        return f"it is integrated in all speeds, and the method needs the minimal state{way_out}"
+    return ""

@@ -1,0 +1,64 @@
+"""The loop over steps of an explicit Runge-Kutta method with an embedded error estimate, with little besides: for the default options.
+
+A batch of lanes runs in lockstep, from one time asked for to the next (`erk_step`). Every lane carries its own result code, and a lane that has ended
+stands still. A lane whose step ended beyond a stop event goes back to it in further steps of the same loop, so that there is one copy of the rates to
+compile (`event_search`). In reverse mode the loop keeps a record of its steps, which are then gone back over (`recorded_adjoint`). `diffrax` serves all
+other solvers, controllers and ways of saving.
+"""
+
+from typing import Literal
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jourdain_jax.motion.integrators import recorded_adjoint
+from jourdain_jax.motion.integrators.erk_step import RUNNING, Method, Problem, Progress, advanced, begun, running
+from jourdain_jax.motion.trajectories import results
+
+_SHRANK = 0.01  # of the average step: a singularity is near
+
+
+def method_of(solver: diffrax.AbstractERK) -> Method:
+    """The tableau of a diffrax solver."""
+    tableau = solver.tableau
+    stages = len(tableau.b_sol)
+    A = np.zeros((stages, stages))
+    for i, row in enumerate(tableau.a_lower):
+        A[i + 1, : i + 1] = row
+    return Method(A, np.asarray(tableau.b_sol), np.asarray(tableau.b_error), np.concatenate([[0.0], tableau.c]), solver.order(None))
+
+
+def integrate(
+    problem: Problem, method: Method, y0: PyTree, t0, goals: Float[Array, "times *lanes"], dt0, kind: Literal["forward", "reverse"]
+) -> tuple[PyTree, Bool[Array, "times *lanes"], Progress]:
+    """States at the goals (monotonic; what was not reached repeats the last state), which were reached, and where the lane ended.
+
+    `kind`: which mode of differentiation it is for; "forward" to any order, "reverse" to the first.
+    """
+    if kind == "forward":
+        ys, reached, end = _motion(problem, method, y0, t0, goals, dt0)
+    else:
+        ys, reached, end = recorded_adjoint.motion(_motion, problem, method, y0, t0, goals, dt0)
+    # the last steps against the average one
+    shrank = (end.code == results.MAX_STEPS) & (end.h * end.accepted < _SHRANK * jnp.abs(end.t - t0))
+    code = jnp.where(shrank, results.SHRANK, jnp.where(end.code == RUNNING, results.SUCCESS, end.code))
+    return ys, reached, eqx.tree_at(lambda p: p.code, end, code)
+
+
+def _motion(problem: Problem, method: Method, y0: PyTree, t0, goals, dt0) -> tuple[PyTree, Bool[Array, "times *lanes"], Progress]:
+    direction = jnp.sign(goals[-1] - t0)
+
+    def to_goal(progress: Progress, goal):
+        def step(p):
+            return advanced(problem, method, p, goal, goals[-1], direction)
+
+        end = eqxi.while_loop(lambda p: jnp.any(running(p, goal)), step, progress, kind="lax")
+        return end, (end.y, end.t == goal)
+
+    end, (ys, reached) = jax.lax.scan(to_goal, begun(problem, y0, t0, dt0, direction), goals)
+    return ys, reached, end

@@ -1,0 +1,289 @@
+"""One step of our explicit Runge-Kutta loop: an explicit Runge-Kutta method with an embedded error estimate, or a step of the search for a stop event.
+
+    k_i = f(t + c_i h, y + h sum_j a_ij k_j),   y_1 = y + h sum b_i k_i,   e = h sum b^err_i k_i
+    |e| = rms(e / (atol + rtol max(|y|, |y_1|))) <= 1 accepts;   h <- h clip(0.9 |e|^(-1/order), 0.2, 10)
+
+The state is any tree of arrays; in a batch all arrays, times and step sizes among them, have a last axis of lanes, which keeps neighbours in memory
+neighbours. A step ends at every time asked for and at every knot of the inputs; the step size found before such a shortened step is remembered. The state
+advances by the difference of the times at the ends of a step, as they are after rounding.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT
+from jourdain_jax.motion.integrators import event_search
+from jourdain_jax.motion.integrators.event_search import Search
+from jourdain_jax.motion.trajectories import results
+
+RUNNING, LOCATING = -1, -2
+NOISE = 0.6  # exponent of round-off: rows shrink to about its power 0.4 before a step passes
+SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """A tableau. Its stages run as a loop: one copy of the vector field to compile."""
+
+    A: np.ndarray
+    b: np.ndarray
+    b_error: np.ndarray
+    c: np.ndarray
+    order: int
+
+    @property
+    def last_is_next_first(self) -> bool:
+        """Whether the last stage is taken at y_1."""
+        return bool(np.array_equal(self.A[-1], self.b) and self.c[-1] == 1.0)
+
+    @property
+    def needed(self) -> int:
+        """How many stages a step takes: without a last one that nothing else needs."""
+        return len(self.c) - int(self.last_is_next_first and self.b_error[-1] == 0)
+
+    @property
+    def at_the_end(self) -> int:
+        """The last stage that a step takes, of those at its end (of those at all, where none is)."""
+        return int(max(np.flatnonzero(self.c[: self.needed] == 1.0), default=self.needed - 1))
+
+
+class Progress(eqx.Module):
+    """Where a motion is, or each of several lanes."""
+
+    t: Float[Array, "*lanes"]
+    y: PyTree
+    h: Float[Array, "*lanes"]  # the next step, positive
+    code: Int[Array, "*lanes"]  # RUNNING, LOCATING, or the result
+    knot: Int[Array, "*lanes"]  # index of the knot ahead
+    accepted: Int[Array, "*lanes"]
+    rejected: Int[Array, "*lanes"]
+    event: Int[Array, "*lanes"]  # index of the event that ended the motion, or -1
+    search: Search | None  # for that event
+    pivot: Float[Array, "*lanes"]  # smallest magnitude so far of a pivot, at any stage of an accepted step
+
+
+class Problem(eqx.Module):
+    """What is integrated and how well."""
+
+    rates: Callable  # (t, y, args) -> dy/dt
+    args: PyTree
+    project: Callable | None  # (t, y, args) -> y
+    events: Callable | None  # (t, y, args) -> values, (events, *lanes)
+    norm: Callable  # of a state, one number per lane
+    rtol: Float[Array, "*lanes"]
+    atol: Float[Array, "*lanes"]
+    shortest: Float[Array, "*lanes"]
+    max_steps: int = eqx.field(static=True)
+    knots: Float[Array, "knots *lanes"] | None = None  # times at which a step must end, in the order of the motion; the last are infinite, with its sign
+    # as `rates`, and pivots (pivots, *lanes) that must keep their signs; None: the rates have none
+    rates_and_pivots: Callable | None = None
+
+    def knot_ahead(self, p: "Progress", direction) -> Float[Array, "*lanes"]:
+        """The time of the knot ahead, infinity with the sign of the motion where there is none."""
+        if self.knots is None:
+            return direction * jnp.full_like(p.t, jnp.inf)
+        return jnp.take_along_axis(self.knots, p.knot[None], axis=0)[0]
+
+    def knots_passed(self, t: Float[Array, "*lanes"], direction) -> Int[Array, "*lanes"]:
+        """How many knots lie at `t` or before it."""
+        zero = jnp.zeros(jnp.shape(t), jnp.int32)
+        return zero if self.knots is None else zero + jnp.sum((self.knots - t) * direction <= 0, axis=0, dtype=jnp.int32)
+
+
+def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0, direction) -> Progress:
+    """The start of a motion; one that starts beyond an event has no motion at all."""
+    start = standing(problem, y0, t0, jnp.broadcast_to(jnp.abs(dt0), jnp.shape(t0)), direction)
+    if problem.events is None:
+        return start
+    values = problem.events(t0, y0, problem.args)
+    beyond = ~(values > 0)
+    known = [jnp.all(jnp.isfinite(x), axis=tuple(range(x.ndim - jnp.ndim(t0)))) for x in jax.tree.leaves(y0)]  # a state that is lost is no event
+    happened = jnp.any(beyond, axis=0) & jnp.all(jnp.stack(known), axis=0)
+    code = jnp.where(happened, results.EVENT, start.code).astype(jnp.int32)
+    event = jnp.where(happened, jnp.argmax(beyond, axis=0), start.event).astype(jnp.int32)
+    return replace(start, code=code, event=event, search=event_search.none(t0, values))
+
+
+def standing(problem: Problem, y: PyTree, t: Float[Array, "*lanes"], h: Float[Array, "*lanes"], direction) -> Progress:
+    """On the way, with no step behind and no event to search for."""
+    zero = jnp.zeros(jnp.shape(t), jnp.int32)
+    return Progress(t, y, h, zero + RUNNING, problem.knots_passed(t, direction), zero, zero, zero - 1, None, no_pivot(t))
+
+
+def running(p: Progress, goal: Float[Array, "*lanes"]) -> Bool[Array, "*lanes"]:
+    """Which lanes are on their way to this time."""
+    return (p.code == LOCATING) | ((p.code == RUNNING) & (p.t != goal))
+
+
+def advanced(problem: Problem, method: Method, p: Progress, goal, last_goal, direction) -> Progress:
+    """One step, tried by all lanes that are on their way to `goal`; the others stand still."""
+    moving = running(p, goal)
+    return jax.tree.map(lambda new, old: jnp.where(moving, new, old), _tried(problem, method, p, goal, last_goal, direction), p)
+
+
+def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direction) -> Progress:
+    locating = jnp.array(False) if p.search is None else p.code == LOCATING
+    knot = problem.knot_ahead(p, direction)
+    target = jnp.where((knot - goal) * direction < 0, knot, goal)
+    rest = jnp.abs(target - p.t)
+    lands = ~locating & (p.h >= 0.999 * rest)
+    size = jnp.where(lands, rest, jnp.where(2 * p.h > rest, 0.5 * rest, p.h))
+    shortened = size < p.h
+    h = direction * size if p.search is None else jnp.where(locating, p.search.shift, direction * size)
+    t1 = jnp.where(lands, target, p.t + h)
+    h = t1 - p.t  # as rounded: the state and the time advance together
+    y1, slopes, _, pivots = stages(problem, method, p.t, p.y, h, watched=True)
+    error = jax.tree.map(lambda k: as_in(h, k) * weighted(method.b_error, k), slopes)
+    if problem.project is not None:
+        free, y1 = y1, problem.project(t1, y1, problem.args)
+        # the projection removes what the error estimate does not see; it must be no larger than an error
+        error = jax.tree.map(lambda e, moved: jnp.maximum(jnp.abs(e), moved), error, removed(y1, free, p.t.ndim))
+    scale = jax.tree.map(lambda a, b: problem.atol + problem.rtol * jnp.maximum(jnp.abs(a), jnp.abs(b)), p.y, y1)
+    relative = jax.lax.stop_gradient(jax.tree.map(lambda e, s: e / s, error, scale))
+    size_of_error = problem.norm(relative)
+    if pivots is not None:
+        # a step in which a pivot changes its sign passes over a singularity, which no error estimate need notice
+        size_of_error = jnp.where(pivots.changed_sign & ~locating, jnp.inf, size_of_error)
+    accept = locating | (size_of_error <= 1)
+    factor = SAFETY * jnp.where(size_of_error > 0, size_of_error, 1e-30) ** (-1 / method.order)
+    factor = jnp.clip(jnp.where(jnp.isfinite(size_of_error), factor, 0.0), LEAST_FACTOR, jnp.where(accept, LARGEST_FACTOR, 1.0))
+    proposed = size * factor
+    next_h = jnp.where(accept & shortened, jnp.maximum(proposed, p.h), proposed)
+    accepted, rejected = p.accepted + (accept & ~locating).astype(jnp.int32), p.rejected + (~accept).astype(jnp.int32)
+    too_short = (next_h < problem.shortest) | (t1 + direction * next_h == t1)  # the second: no time would pass
+    code = jnp.where(too_short, results.STEP_TOO_SMALL, RUNNING)
+    code = jnp.where((code == RUNNING) & (accepted + rejected >= problem.max_steps) & ~(accept & (t1 == last_goal)), results.MAX_STEPS, code).astype(jnp.int32)
+    y = jax.tree.map(lambda new, old: jnp.where(accept, as_in(new, old), old), y1, p.y)
+    passed = p.knot + (accept & ~locating & (t1 == knot)).astype(jnp.int32)
+    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, passed, accepted, rejected, p.event, p.search, p.pivot)
+    if problem.events is not None:
+        slopes = [jax.tree.map(lambda k, i=i: k[i], slopes) for i in (0, method.at_the_end)]  # first and last
+        moved = _watched(problem, p, moved, h, slopes, accept & ~locating & (code == RUNNING))
+    if pivots is None:
+        return moved
+    # what lies beyond an event does not count
+    counts = accept & ~locating & (moved.code == RUNNING) & (moved.t == t1)
+    pivot = jnp.where(counts, jnp.minimum(p.pivot, pivots.smallest), p.pivot)
+    return replace(moved, pivot=pivot, code=jnp.where(counts & (pivot < SMALLEST_PIVOT), results.SINGULAR_PARTITION, moved.code).astype(jnp.int32))
+
+
+def removed(projected: PyTree, free: PyTree, lane_axes: int) -> PyTree:
+    """How far a projection moved a state, beyond what is noise near a loss of rank: round-off e at a row of size sigma is a velocity e/sigma."""
+
+    def moved(a, b):
+        size = jnp.max(jnp.abs(a), axis=tuple(range(a.ndim - lane_axes)), initial=0.0)
+        return jax.lax.stop_gradient(jnp.maximum(jnp.abs(a - b) - jnp.finfo(a.dtype).eps ** NOISE * size, 0.0))
+
+    return jax.tree.map(moved, projected, free)
+
+
+class Pivots(eqx.Module):
+    """What the pivots were at the stages of a step."""
+
+    smallest: Float[Array, "*lanes"]  # magnitude
+    changed_sign: Bool[Array, "*lanes"]  # whether any did
+
+
+class Stages(NamedTuple):
+    """The stages of one step; `slopes` and `states` have a leading axis of stages."""
+
+    y_1: PyTree
+    slopes: PyTree
+    states: PyTree
+    pivots: Pivots | None
+
+
+def stages(problem: Problem, method: Method, t, y: PyTree, h, watched: bool = False) -> Stages:
+    """y_1; the slopes of all stages, and the states at which they were taken; what the pivots were, where they are `watched`."""
+    leaves, treedef = jax.tree.flatten(y)
+    watched = watched and problem.rates_and_pivots is not None
+
+    def stage(carried, row):
+        # k_i = f(y_i), then the next y_i: what is carried from stage to stage is computed once, whatever uses it
+        at, slopes, extremes = carried
+        c, i, next_A = row
+        there = t + c * h, treedef.unflatten(at), problem.args
+        if watched:
+            found, pivots = problem.rates_and_pivots(*there)
+            extremes = jnp.minimum(extremes[0], pivots), jnp.maximum(extremes[1], pivots)
+        else:
+            found = problem.rates(*there)
+        found = jax.tree.leaves(found)
+        slopes = [jax.lax.dynamic_update_index_in_dim(k, as_in(f, k), i, 0) for k, f in zip(slopes, found, strict=True)]
+        return ([y + as_in(h, y) * weighted(next_A, k) for y, k in zip(leaves, slopes, strict=True)], slopes, extremes), at
+
+    count = method.needed
+    rows = (jnp.asarray(method.c[:count]), jnp.arange(count), jnp.asarray([*method.A[1:count], method.b]))
+    slopes = [jnp.zeros((len(method.c), *y.shape), y.dtype) for y in leaves]
+    (y_1, slopes, extremes), at = jax.lax.scan(stage, (leaves, slopes, _no_extremes(problem, t, y) if watched else None), rows)
+    return Stages(treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at), _pivots(extremes) if watched else None)
+
+
+def no_pivot(t: Float[Array, "*lanes"]) -> Float[Array, "*lanes"]:
+    """What `Progress.pivot` begins with."""
+    return jax.lax.stop_gradient(jnp.full_like(t, jnp.inf))
+
+
+def _no_extremes(problem: Problem, t, y: PyTree) -> tuple[Array, Array]:
+    """The lowest and the highest value of every pivot before any was seen."""
+    shape = jax.eval_shape(lambda: problem.rates_and_pivots(t, y, problem.args)[1])
+    return jnp.full(shape.shape, jnp.inf, shape.dtype), jnp.full(shape.shape, -jnp.inf, shape.dtype)
+
+
+def _pivots(extremes: tuple[Float[Array, "pivots *lanes"], Float[Array, "pivots *lanes"]]) -> Pivots:
+    lowest, highest = extremes
+    return Pivots(jnp.min(jnp.minimum(jnp.abs(lowest), jnp.abs(highest)), axis=0), jnp.any((lowest < 0) & (highest > 0), axis=0))
+
+
+def weighted(weights, slopes: Float[Array, "stages *shape"]) -> Float[Array, "*shape"]:
+    """sum_j w_j k_j, element by element."""
+    used = [j for j in range(len(slopes)) if isinstance(weights, jax.Array) or weights[j] != 0]
+    return sum((as_in(weights[j], slopes) * slopes[j] for j in used[1:]), start=as_in(weights[used[0]], slopes) * slopes[used[0]])
+
+
+def as_in(x, like) -> Array:
+    """In the precision of the state: time keeps its own."""
+    return jnp.asarray(x, like.dtype)
+
+
+def _watched(problem: Problem, p: Progress, moved: Progress, h, slopes, accept) -> Progress:
+    """The step from `p` by `h` to `moved`, in which an event may have happened or is being located; `slopes`: at its ends, `accept`: a step of the motion."""
+
+    def events(t, y):
+        return problem.events(t, y, problem.args)
+
+    so_far = p.search
+    assert so_far is not None  # where there are events
+    one, locating, (first_slope, last_slope) = jnp.ones_like(p.t), p.code == LOCATING, slopes
+    first_values, first_rates = jax.jvp(events, (p.t, p.y), (one, first_slope))
+    values, last_rates = jax.jvp(events, (moved.t, moved.y), (one, jax.lax.stop_gradient(last_slope)))
+    dip = event_search.dip(h, first_values, first_rates, values, last_rates)
+    dips = accept & dip.happens
+    happened = accept & ~dips & ~event_search.no_event(values)
+    search = jax.lax.cond(
+        eqxi.unvmap_any(happened | locating),
+        lambda: jax.tree.map(
+            lambda new, old: jnp.where(happened | locating, new, old),
+            event_search.advanced(so_far, happened, p.t, first_values, first_rates, moved.t, values),
+            so_far,
+        ),
+        lambda: so_far,
+    )
+    # trials start at the last state before the event; a step that passes over a dip is tried again to its bottom
+    found, back = locating & (search.left == 0), (happened | locating) & search.trying
+    t = jnp.where(found, moved.t + search.shift, jnp.where(back | dips, p.t, moved.t))
+    y = jax.tree.map(lambda y, y_0, f: jnp.where(found, y + as_in(search.shift, y) * f, jnp.where(back | dips, y_0, y)), moved.y, p.y, first_slope)
+    event = jnp.where(happened | (locating & so_far.trying), search.known.first, p.event)
+    next_h = jnp.where(dips, dip.share * jnp.abs(h), jnp.where(locating, p.h, moved.h))
+    code = jnp.where(happened, LOCATING, jnp.where(found, results.EVENT, jnp.where(locating, LOCATING, moved.code))).astype(jnp.int32)
+    tried = dips.astype(jnp.int32)
+    knot = jnp.where(dips, p.knot, moved.knot)
+    return Progress(t, y, jax.lax.stop_gradient(next_h), code, knot, moved.accepted - tried, moved.rejected + tried, event, search, moved.pivot)

@@ -1,0 +1,12 @@
+"""Simulation for forward-mode derivatives: the cheapest for up to about 30 parameters, and the one that least squares wants."""
+
+import diffrax
+
+from jourdain_jax.motion.simulate import simulate
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.scene.scene import Scene
+
+
+def simulate_forward(scene: Scene, start=None, **options) -> Trajectory:
+    """`simulate` with `adjoint=diffrax.ForwardMode()`: differentiable by jvp and jacfwd, to any order."""
+    return simulate(scene, start, adjoint=diffrax.ForwardMode(), **options)

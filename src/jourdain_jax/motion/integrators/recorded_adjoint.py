@@ -1,0 +1,302 @@
+"""Reverse mode of our explicit Runge-Kutta loop: the steps that a motion took are recorded, and gone back over.
+
+    y_(i+1) = step(t_i, t_(i+1), y_i, args)       g_i = (dstep/dy_i)' g_(i+1),   g_args += (dstep/dargs)' g_(i+1)
+
+The times t_i are data: step-size control, rejected steps and error estimates are no part of it. Only times that were asked for, knots, the first time, and
+the time of an event have cotangents. The search for an event is no part of it either: from the last state before the event one step leads to it, and what lies
+beyond, where derivatives may not exist, is never met.
+
+Memory holds a window of steps with their states; when it is full, the state and step size there are kept and the next window begins. Going back, the
+last window is there already. An earlier one is integrated again, from the state at its beginning to end exactly where the next begins: whatever steps
+round-off makes it take then, they are steps of the motion. Where that does not succeed, or there were more windows than memory allows, the derivative
+is NaN. What lanes in lockstep have in common, numbers of steps and windows, stays common under `vmap`.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jourdain_jax.motion.integrators import step_adjoint
+from jourdain_jax.motion.integrators.erk_step import LOCATING, Method, Problem, Progress, advanced, begun, running, standing
+from jourdain_jax.motion.integrators.event_search import MOST_STEPS, chosen
+from jourdain_jax.motion.trajectories import results
+
+STEPS_ALONE, STEPS_TOGETHER = 2048, 512  # of a window: for one motion, for lanes in lockstep
+SPARE = 4  # this part of a window is left free, for the steps that it takes when it is integrated again
+_MEMORY = 2**27, 2**30  # bytes of a window and of the beginnings of all, at most where lanes are many,
+_FEWEST = 16, 256  # but so many steps and windows
+
+
+class _Window(eqx.Module):
+    """States in a row, and how many goals were reached until each."""
+
+    t: Float[Array, "states *lanes"]
+    y: PyTree
+    goal: Int[Array, "states"]
+    last: Int[Array, ""]  # number of the last state
+
+    def added(self, p: Progress, goal, restart=False) -> "_Window":
+        """With the state after a try of a step, which is a new one where time has passed for any lane; the first one at a `restart`."""
+        i = jnp.where(restart, 0, self.last + self.passed(p)).astype(jnp.int32)
+        t, y, goals = _put((self.t, self.y, self.goal), i, (p.t, p.y, goal))
+        return _Window(t, y, goals, i)
+
+    def passed(self, p: Progress) -> Bool[Array, ""]:
+        """Whether time has passed since the last state."""
+        return eqxi.unvmap_any(p.t != _at(self.t, self.last))
+
+    def towards(self, goal) -> "_Window":
+        """The same, on the way to the goal with this number."""
+        return replace(self, goal=_put(self.goal, self.last, goal))
+
+
+class _Beginnings(eqx.Module):
+    """Where a window begins, or all do; then one more place than there are windows takes what is not kept."""
+
+    t: Float[Array, "..."]
+    y: PyTree
+    h: Float[Array, "..."]
+    goal: Int[Array, "..."]
+
+
+class _Record(eqx.Module):
+    """The last window, its number, and where all windows begin."""
+
+    window: _Window
+    beginnings: _Beginnings
+    number: Int[Array, ""]
+
+
+class _Cotangents(eqx.Module):
+    """Of a state, of its time, and of what all steps share."""
+
+    t: Float[Array, "*lanes"]
+    y: PyTree
+    shared: PyTree  # rates, projection, args
+    goals: Float[Array, "times *lanes"]
+    knots: Float[Array, "knots *lanes"] | None
+
+
+def motion(forward: Callable, problem: Problem, method: Method, y0: PyTree, t0, goals, dt0):
+    """`forward` of the other arguments, with derivatives in reverse mode by `y0`, `t0`, `goals` and whatever the functions of `problem` depend on."""
+    like = (t0, y0, problem.args)
+    rates, project, events = (f if f is None else eqx.filter_closure_convert(f, *like) for f in (problem.rates, problem.project, problem.events))
+    control = problem.norm, *jax.lax.stop_gradient((problem.rtol, problem.atol, problem.shortest)), problem.max_steps
+    control += (problem.rates_and_pivots,)
+    return _motion(((rates, project, problem.args), events, problem.knots, y0, t0, goals), (control, jax.lax.stop_gradient(jnp.asarray(dt0))), forward, method)
+
+
+def _problem(moving, control) -> Problem:
+    (rates, project, args), events, knots, *_ = moving
+    norm, rtol, atol, shortest, max_steps, *watched = control[0]
+    return Problem(rates, args, project, events, norm, rtol, atol, shortest, max_steps, knots, *watched)
+
+
+@eqx.filter_custom_vjp
+def _motion(moving, control, forward, method):
+    *_, y0, t0, goals = moving
+    ys, reached, end = forward(_problem(moving, control), method, y0, t0, goals, control[1])
+    return ys, reached, replace(end, search=None)
+
+
+@_motion.def_fwd
+def _recorded(perturbed, moving, control, forward, method):
+    *_, y0, t0, goals = moving
+    problem = _problem(moving, control)
+    direction = jnp.sign(goals[-1] - t0)
+    start = begun(problem, y0, t0, control[1], direction)
+    empty = _empty(start, problem.max_steps)
+    full = len(empty.window.t) - 1 - len(empty.window.t) // SPARE
+    places = len(empty.beginnings.t)
+
+    def to_goal(carry, k):
+        p, kept, record = carry
+        goal = goals[k]
+
+        def step(carry):
+            p, kept, record = carry
+            p = advanced(problem, method, p, goal, goals[-1], direction)
+            kept = _before_event(p, kept)
+            ended = record.window.last + record.window.passed(kept) == full
+            number = jnp.minimum(record.number + ended, places - 1)
+            place = jnp.where(ended, number, places - 1)
+            beginnings = _put(record.beginnings, place, _Beginnings(kept.t, kept.y, kept.h, k))
+            return p, kept, _Record(record.window.added(kept, k, restart=ended), beginnings, number)
+
+        record = replace(record, window=record.window.towards(k))
+        p, kept, record = jax.lax.while_loop(lambda carry: eqxi.unvmap_any(running(carry[0], goal)), step, (p, kept, record))
+        return (p, kept, record), (p.y, p.t == goal)
+
+    (end, _, record), (ys, reached) = jax.lax.scan(to_goal, (start, start, empty), jnp.arange(len(goals), dtype=jnp.int32))
+    record = replace(record, window=record.window.towards(jnp.asarray(len(goals), jnp.int32)))
+    end = replace(end, search=None)
+    return (ys, reached, end), (record, reached, end)
+
+
+def _before_event(p: Progress, kept: Progress) -> Progress:
+    """`p`, but lanes that are searching for an event still at the last state before it, which is `kept`."""
+    if p.search is None:
+        return p
+    t, y = _where(p.code == LOCATING, (kept.t, kept.y), (p.t, p.y))
+    return replace(p, t=t, y=y)
+
+
+@_motion.def_bwd
+def _vjp(residuals, cotangents, perturbed, moving, control, forward, method):
+    record, reached, end = residuals
+    shared, events, knots, y0, t0, goals = moving
+    problem, direction = _problem(moving, control), jnp.sign(goals[-1] - t0)
+    g_ys, _, g_end = cotangents
+    g_ys, g_t, g_y = (_filled(g, x) for g, x in ((g_ys, _stacked(y0, len(goals))), (g_end.t, end.t), (g_end.y, end.y)))
+    differentiable, fixed = eqx.partition(shared, perturbed[0])
+    by_events, fixed_events = eqx.partition(events, perturbed[1])
+    g_events = jax.tree.map(jnp.zeros_like, by_events)
+    g = _Cotangents(g_t, g_y, jax.tree.map(jnp.zeros_like, differentiable), jnp.zeros_like(goals), None if knots is None else jnp.zeros_like(knots))
+    located = (end.code == results.EVENT) & (end.accepted > 0)
+    if events is not None:
+        # what was not reached repeats the state at the event
+        repeats = located & ~reached
+        g = replace(g, y=jax.tree.map(lambda y, at: y + jnp.sum(_on_states(repeats, at), axis=0), g.y, g_ys))
+        g_ys = jax.tree.map(lambda at: _on_states(~repeats, at), g_ys)
+        g, g_events = _back_from_event(end, located, g, (differentiable, by_events), (fixed, fixed_events))
+
+    def problem_of(differentiable):
+        rates, project, args = eqx.combine(differentiable, fixed)
+        return replace(problem, rates=rates, project=project, args=args)
+
+    def past_goals(g: _Cotangents, first, count) -> _Cotangents:
+        """At a state where the goals number `first` to `count - 1` were reached."""
+
+        def add(carry):
+            y, k = carry
+            return jax.tree.map(lambda total, g: total + _at(g, k - 1), y, g_ys), k - 1
+
+        return replace(g, y=jax.lax.while_loop(lambda carry: carry[1] > first, add, (g.y, count))[0])
+
+    def step_back(carry):
+        i, window, g = carry
+        k = window.goal[i - 1]
+        g = past_goals(g, k, window.goal[i])
+        t_0, t_1, y = _at(window.t, i - 1), _at(window.t, i), _at(window.y, i - 1)
+        idle = t_0 == t_1
+        moving = _where(idle, jax.tree.map(jnp.zeros_like, g.y), g.y)
+        gone = step_adjoint.back(problem_of, differentiable, method, t_0, t_1, y, moving)
+        at_end = jnp.where(idle, g.t, g.t + gone.t_1)
+        # the end of a step is a number, but where it is a time that was asked for, or a knot
+        not_event = ~(located & (t_1 == end.t))
+        asked = (t_1 == goals[k]) & not_event
+        by_goals = g.goals.at[k].add(jnp.where(asked, at_end, 0))
+        t, by_knots = jnp.where(idle, jnp.where(asked, 0, at_end), gone.t_0), g.knots
+        if by_knots is not None:
+            last = (jnp.maximum(problem.knots_passed(t_1, direction) - 1, 0), *jnp.indices(t_1.shape))
+            at_knot = (knots[last] == t_1) & not_event & ~asked & ~idle
+            by_knots = by_knots.at[last].add(jnp.where(at_knot, at_end, 0))
+        return i - 1, window, _Cotangents(t, _where(idle, g.y, gone.y), jax.tree.map(jnp.add, g.shared, gone.shared), by_goals, by_knots)
+
+    def window_back(carry):
+        number, window, g = carry
+        _, _, g = jax.lax.while_loop(lambda carry: carry[0] > 0, step_back, (window.last, window, g))
+        g = past_goals(g, record.beginnings.goal[number], window.goal[0])
+        window, arrived = _again(replace(problem, events=None), method, record.beginnings, number - 1, window, goals, direction)
+        return number - 1, window, replace(g, y=_where(arrived, g.y, jax.tree.map(lambda y: jnp.full_like(y, jnp.nan), g.y)))
+
+    lost = record.number == len(record.beginnings.t) - 1
+    g = replace(g, y=_where(lost, jax.tree.map(lambda y: jnp.full_like(y, jnp.nan), g.y), g.y))
+    number = jnp.where(lost, 0, record.number)
+    _, _, g = jax.lax.while_loop(lambda carry: carry[0] >= 0, window_back, (number, record.window, g))
+    return g.shared, g_events, g.knots, g.y, g.t, g.goals
+
+
+def _again(problem: Problem, method: Method, beginnings: _Beginnings, number, window: _Window, goals, direction) -> tuple[_Window, Bool[Array, "*lanes"]]:
+    """The window with this number, integrated to where the next one begins, and which lanes arrived there; nothing where the number is negative."""
+    first = _at(beginnings, jnp.maximum(number, 0))
+    target, last_goal = _at((beginnings.t, beginnings.goal), number + 1)
+    start = standing(problem, first.y, first.t, first.h, direction)
+    room = len(window.t) - 1
+
+    def to_goal(carry):
+        p, window, k = carry
+        # a lane may have ended before the goal, and then went back to an event from beyond
+        goal = jnp.where((goals[k] - target) * direction > 0, target, goals[k])
+
+        def step(carry):
+            p, window = carry
+            p = advanced(problem, method, p, goal, target, jnp.sign(goal - p.t))
+            return p, window.added(p, k)
+
+        p, window = jax.lax.while_loop(lambda carry: eqxi.unvmap_any(running(carry[0], goal)) & (carry[1].last < room), step, (p, window.towards(k)))
+        return p, window, k + 1
+
+    exists = number >= 0
+    window = window.added(start, first.goal, restart=True)
+    p, window, _ = jax.lax.while_loop(lambda carry: exists & (carry[2] <= last_goal), to_goal, (start, window, first.goal))
+    return window, (p.t == target) | ~exists
+
+
+def _back_from_event(end: Progress, located, g: _Cotangents, differentiable, fixed) -> tuple[_Cotangents, PyTree]:
+    """Cotangents of the state at the event at a number for a time, and of the functions of events.
+
+    t = t_e - c(t_e, y)/cdot,   y_e = y - f c(t_e, y)/cdot      zero in value, t_e a number
+    """
+    (rates, _, args), events = eqx.combine(differentiable, fixed)
+    f = rates(end.t, end.y, args)
+    _, rate = jax.jvp(lambda t, y: chosen(end.event, events(t, y, args)), (end.t, end.y), (jnp.ones_like(end.t), f))
+    usable = located & (rate != 0) & jnp.isfinite(rate)
+    by_value = jnp.where(usable, -(g.t + step_adjoint.product(g.y, f, end.t.ndim)) / jnp.where(usable, rate, 1.0), 0.0)
+
+    def value(y, differentiable):
+        (_, _, args), events = eqx.combine(differentiable, fixed)
+        return chosen(end.event, events(end.t, y, args))
+
+    _, pull = jax.vjp(value, end.y, differentiable)
+    by_y, (by_shared, by_events) = pull(jnp.asarray(by_value, rate.dtype))
+    y = jax.tree.map(lambda y, more: y + jnp.where(located, more, 0), g.y, by_y)
+    return replace(g, t=jnp.where(located, 0, g.t), y=y, shared=jax.tree.map(jnp.add, g.shared, by_shared)), by_events
+
+
+def _empty(start: Progress, max_steps: int) -> _Record:
+    """A record with the start as its only state."""
+    state_bytes = sum(x.nbytes for x in jax.tree.leaves((start.t, start.y)))
+    length = max(_FEWEST[0], min(STEPS_TOGETHER if start.t.ndim else STEPS_ALONE, _MEMORY[0] // state_bytes, max_steps + MOST_STEPS + 2))
+    windows = -(-(max_steps + MOST_STEPS) // (length - length // SPARE)) + 1
+    windows = min(windows, max(_FEWEST[1], _MEMORY[1] // state_bytes))
+
+    def room(count: int, tree):
+        return jax.tree.map(lambda x: jnp.zeros((count, *jnp.shape(x)), jnp.result_type(x)), tree)
+
+    zero = jnp.zeros((), jnp.int32)
+    t, y, goal = room(length, (start.t, start.y, zero))
+    window = _Window(t, y, goal, zero).added(start, zero, restart=True)
+    beginning = _Beginnings(start.t, start.y, start.h, zero)
+    return _Record(window, _put(room(windows + 1, beginning), 0, beginning), zero)
+
+
+def _at(tree, i):
+    return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, i, keepdims=False), tree)
+
+
+def _put(tree, i, values):
+    return jax.tree.map(lambda x, value: jax.lax.dynamic_update_index_in_dim(x, jnp.asarray(value, x.dtype), i, 0), tree, values)
+
+
+def _on_states(chosen: Bool[Array, "times *lanes"], x: Float[Array, "times *shape"]):
+    """x of those that are chosen, zero elsewhere."""
+    return jnp.where(jnp.expand_dims(chosen, tuple(range(1, 1 + x.ndim - chosen.ndim))), x, 0)
+
+
+def _where(chosen, a, b):
+    return jax.tree.map(lambda a, b: jnp.where(chosen, a, b), a, b)
+
+
+def _stacked(tree, count: int):
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape), x.dtype), tree)
+
+
+def _filled(cotangents, like):
+    """Zeros in place of what is missing."""
+    return jax.tree.map(lambda x, g: jnp.zeros(x.shape, x.dtype) if g is None else g, like, cotangents)

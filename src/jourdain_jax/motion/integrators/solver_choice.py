@@ -1,0 +1,76 @@
+"""What a solver and its control of steps ask for besides rates: a form of the state, constant steps, states saved at ends of steps only, a clock."""
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+
+from jourdain_jax.calculus.guards import forward_only, reverse_only
+from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
+from jourdain_jax.motion.integrators.even_steps import EvenSteps
+from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
+from jourdain_jax.motion.integrators.munthe_kaas import MuntheKaas
+from jourdain_jax.motion.state_form import StateForm
+from jourdain_jax.scene.scene import Scene
+
+
+def fitted(solver, scene: Scene, form: StateForm, asked: str) -> StateForm:
+    """The form of the state that the solver integrates; a ValueError where it does not apply to the scene. `asked`: the `state` of `simulate`."""
+    return solver.fitted(scene, form, asked) if isinstance(solver, FixedStepSolver | MuntheKaas) else form
+
+
+def may_be_full(solver) -> bool:
+    """Whether a motion that lost its privileged speeds may go on with the full state."""
+    return not isinstance(solver, DiscreteGradient)
+
+
+def check_solver(solver, controller, dt0, land: bool, saveat) -> None:
+    """ValueError for options that do not go with a structure-preserving solver; others pass."""
+    if not isinstance(solver, FixedStepSolver | MuntheKaas):
+        return
+    name = type(solver).__name__
+    if not land or (saveat is not None and saveat.subs.ts is not None):
+        raise ValueError(f"`{name}` has states at ends of steps only: leave `land_on_ts` at True, and give times to save at as `ts`, not in `saveat`")
+    if not isinstance(solver, FixedStepSolver):
+        return
+    if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
+        raise ValueError(
+            f"`{name}` takes steps of one length and has no error estimate, which `stepsize_controller` = {type(controller).__name__} needs; leave it away "
+            "and give `dt0`, the step in s"
+        )
+    if dt0 is None and not isinstance(controller, diffrax.StepTo):
+        raise ValueError(f"`{name}` takes steps of one length; give `dt0`, the step in s")
+
+
+def controller_of(solver, controller, ts):
+    """Even steps between the times at which steps end for a structure-preserving solver, unless the steps are given otherwise; None: no such choice."""
+    if isinstance(solver, FixedStepSolver) and (controller is None or type(controller) is diffrax.ConstantStepSize):
+        return EvenSteps(ts)
+    return None
+
+
+_WITHOUT_TIMES = (diffrax.PIDController, diffrax.ConstantStepSize)
+
+
+def time_origin(controller, t0):
+    """The time from which times count in the loops: the start, but zero where a `controller` of the user's may hold times of its own."""
+    return t0 if controller is None or type(controller) in _WITHOUT_TIMES else jnp.zeros_like(t0)
+
+
+def since(saveat: diffrax.SaveAt, origin) -> diffrax.SaveAt:
+    """With times to save at that count from `origin`."""
+    return saveat if saveat.subs.ts is None else eqx.tree_at(lambda saveat: saveat.subs.ts, saveat, saveat.subs.ts - origin)
+
+
+def steps_are_given(controller) -> bool:
+    """Whether the user says where each step ends."""
+    return isinstance(controller, diffrax.StepTo)
+
+
+def marked_inputs(adjoint, tree):
+    """Inputs of the integration: forward mode through a reverse-only `adjoint` raises our own error."""
+    return reverse_only(tree) if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) else tree
+
+
+def marked_outputs(adjoint, tree):
+    """Outputs of the integration: reverse mode, which comes to them first, through a forward-only `adjoint` raises our own error."""
+    return forward_only(tree) if isinstance(adjoint, diffrax.ForwardMode) else tree

@@ -1,0 +1,62 @@
+"""What is tried again after a motion failed, and how: one rule for single motions and for the lanes of rollouts.
+
+FULL_STATE    it left the domain in which its privileged speeds, or its program, serve: the full state, dense matrices
+IMPLICIT      an explicit solver ran out of steps that stability kept short: Radau's method
+
+Retries add up, and each is made once: a stiff motion that left the domain runs with the full state by Radau's method.
+"""
+
+from typing import TypeVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from jourdain_jax.motion.integrators.radau import RadauIIA
+from jourdain_jax.motion.integrators.solver_choice import may_be_full
+from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS, implicit_steps, is_stiff
+from jourdain_jax.motion.state_form import StateForm
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+
+Motions = TypeVar("Motions", bound=Trajectory)
+
+
+def next_retry(form: StateForm, motion: Trajectory, t0, options: dict) -> int:
+    """The retries of a `motion` from `t0`: those already made and one more; AS_ASKED where none is left.
+
+    `form`: how it was integrated; `options`: those of `simulate` that were given.
+    """
+    tried, solver = int(motion.fallback), options.get("solver")
+    lost = options.get("state", "auto") in may_be_another_form(form) and may_be_full(solver) and int(motion.result) in lost_codes(form)
+    if lost and not tried & results.FULL_STATE:
+        return tried | results.FULL_STATE
+    free = solver is None and options.get("stepsize_controller") is None
+    if free and not tried & results.IMPLICIT and is_stiff(form, motion, t0):
+        return tried | results.IMPLICIT
+    return results.AS_ASKED
+
+
+def retry_options(retries: int, max_steps: int) -> dict:
+    """The options of `simulate` that make these retries; `max_steps`: as was asked for."""
+    full = {"state": "full", "lowering": False} if retries & results.FULL_STATE else {}
+    implicit = {"solver": RadauIIA(), "max_steps": implicit_steps(max_steps)} if retries & results.IMPLICIT else {}
+    return full | implicit
+
+
+def mark_retried(motion: Motions, retries: int) -> Motions:
+    """A motion, or several, marked as run again by these retries; where it is out of steps once more, it is called stiff."""
+    code = motion.result
+    if retries & results.IMPLICIT:
+        code = jnp.where(jnp.isin(code, jnp.array(OUT_OF_STEPS)), results.STIFF, code).astype(code.dtype)
+    return eqx.tree_at(lambda m: (m.result, m.fallback), motion, (code, jnp.full_like(motion.fallback, retries)))
+
+
+def may_be_another_form(form: StateForm) -> tuple[str, ...]:
+    """The values of `state` that let a motion that was lost in this form run again, with the full state and dense matrices."""
+    return ("auto", "full") if form.name == "full" and form.lowered is not None else ("auto",) if form.name == "minimal" else ()
+
+
+def lost_codes(form: StateForm) -> tuple[int, ...]:
+    """Result codes after which another form of the state may do better."""
+    guarded = form.lowered is not None and (form.lowered.guards or form.lowered.pivots)
+    return (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL, results.NOT_FINITE, results.UNSOLVED_STEP) if guarded else (results.SINGULAR_PARTITION,)

@@ -1,0 +1,1 @@
+"""What a motion leaves: states over time, result codes, diagnostics, files."""

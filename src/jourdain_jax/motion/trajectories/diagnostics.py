@@ -1,0 +1,202 @@
+"""Numbers that a motion carries to be trusted: drifts, residuals, conditioning, contact forces, and their printed summary."""
+
+import html
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jourdain_jax.build.structure import structure_of, usual_rows
+from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
+from jourdain_jax.dynamics.reactions import ContactForce
+from jourdain_jax.eager.eager import Seldom, eval_numpy
+from jourdain_jax.equations.rows import UsualRows
+from jourdain_jax.motion.trajectories.over_times import Record, accelerations_over_times, contact_forces_over_times, energies, invariants, residuals
+from jourdain_jax.motion.trajectories.results import FALLBACKS
+
+
+class Energies(eqx.Module):
+    """Energies along a motion, in J. `balance` is constant for a right motion: T + V, less the work done where some is tracked."""
+
+    kinetic: Float[Array, "*lanes times"]
+    potential: Float[Array, "*lanes times"]
+    work: Float[Array, "*lanes times"] | None
+
+    @property
+    def balance(self) -> Float[Array, "*lanes times"]:
+        """T + V - W; W is the work of forces without potential and of rows that do work."""
+        total = self.kinetic + self.potential
+        return total if self.work is None else total - self.work
+
+    @property
+    def kind(self) -> str:
+        """What `balance` is, in words."""
+        return "T + V" if self.work is None else "T + V less the work done"
+
+
+class Diagnostics(eqx.Module):
+    """Extremes of what can be checked along a motion."""
+
+    energy_drift: Float[Array, ""]  # J, max - min of T + V, less the work done where it is tracked
+    energy_kind: str = eqx.field(static=True)
+    energy_size: Float[Array, ""]  # J, largest kinetic energy, and max - min of the potential one: what a drift is judged against
+    position_residual: Float[Array, ""]  # largest residual of the geometric rows and quaternion norms
+    velocity_residual: Float[Array, ""]  # largest residual of the velocity rows
+    smallest_singular_value: Float[Array, ""]  # of the scaled rows, smallest along the motion
+    rank: tuple[Int[Array, ""], Int[Array, ""]]  # lowest and highest rank of the rows
+    invariant_drifts: dict[str, Float[Array, ""]]
+    contacts: dict[str, "ContactExtremes"]
+
+
+class ContactExtremes(eqx.Module):
+    """What a rolling contact had to bear."""
+
+    lowest_normal: Float[Array, ""]  # N; negative: it would have had to pull
+    highest_normal: Float[Array, ""]  # N
+    friction_needed: Float[Array, ""]  # largest |tangential| / normal
+    pulls: Array  # whether it would have had to pull at any time, beyond round-off
+    determined: Array  # whether the rows determine these forces all along
+
+    @property
+    def honest(self) -> bool:
+        """Whether the contact only ever pushed, or bore nothing."""
+        return not bool(self.pulls)
+
+
+def energies_of(record: Record, work) -> Energies:
+    """Kinetic and potential energy, and the work where it is tracked (`work` is None where it is not)."""
+    return Energies(*energies(record), work)
+
+
+def diagnose(trajectory: Record) -> Diagnostics:
+    """Drifts, residuals, conditioning and contact extremes of one `trajectory` (not of a batch: use `jax.vmap` or `rollout.lane(i)`).
+
+    Times that were not reached do not count.
+    """
+    if trajectory.ts.shape[0] <= FEW_TIMES and _seldom((jax.tree.structure(trajectory), trajectory.ts.shape), trajectory):
+        return jax.tree.map(jnp.asarray, _uncompiled(trajectory, usual_rows(trajectory.scene)))
+    return _diagnosed(trajectory, usual_rows(trajectory.scene))
+
+
+FEW_TIMES = 1000
+COARSE = 1e-3  # of a step: a clock that resolves less rounds times visibly
+VIOLATED = 1e-4  # residual of a row, relative to the state
+DRIFTED = 1e-2  # of the energy that moves
+_ROUND_OFF = 1e-6  # of the whole energy: where less than that moves, as at rest, nothing is said of its drift
+_seldom = Seldom(often=100)
+
+
+def _diagnosed(trajectory: Record, usual: UsualRows) -> Diagnostics:
+    energy = energies_of(trajectory, trajectory.work)
+    geometric, rows = residuals(trajectory)
+    motion = accelerations_over_times(trajectory, usual)
+    reached = jnp.all(jnp.isfinite(trajectory.q), axis=-1)
+    return Diagnostics(
+        energy_drift=_span(energy.balance),
+        energy_kind=energy.kind,
+        energy_size=jnp.nanmax(energy.kinetic) + _span(energy.potential) + _ROUND_OFF * jnp.nanmax(jnp.abs(energy.balance)),
+        position_residual=_largest(geometric),
+        velocity_residual=_largest(rows),
+        smallest_singular_value=jnp.nanmin(jnp.where(reached, motion.smallest_singular_value, jnp.nan)),
+        rank=(jnp.min(motion.rank), jnp.max(motion.rank)),
+        invariant_drifts={name: _span(values) for name, values in invariants(trajectory).items()},
+        contacts={name: _extremes(force) for name, force in contact_forces_over_times(trajectory).items()},
+    )
+
+
+_uncompiled = eval_numpy(_diagnosed)
+
+
+def _extremes(force: ContactForce) -> ContactExtremes:
+    friction = jnp.where(jnp.isnan(force.normal), 0.0, force.friction_needed)
+    return ContactExtremes(jnp.nanmin(force.normal), jnp.nanmax(force.normal), jnp.max(friction), jnp.any(force.pulls), jnp.all(force.determined))
+
+
+def _span(values) -> Float[Array, ""]:
+    return jnp.nanmax(values) - jnp.nanmin(values)
+
+
+def _largest(values) -> Float[Array, ""]:
+    return jnp.max(jnp.where(jnp.isnan(values), 0.0, jnp.abs(values)), initial=0.0)
+
+
+def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
+    """What the diagnostics of a motion speak against, in words."""
+    low, high = (int(rank) for rank in found.rank)
+    smallest = float(found.smallest_singular_value)
+    warned = []
+    if low != high:
+        warned.append(f"rows change their rank along the motion, {low} to {high}: constraint forces and the motion beyond may not be unique")
+    elif smallest < np.sqrt(jnp.finfo(trajectory.q.dtype).eps):
+        warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
+    for kind, residual, state in (("geometric", found.position_residual, trajectory.q), ("velocity", found.velocity_residual, trajectory.u)):
+        if float(residual) > VIOLATED * (1.0 + float(_largest(state))):
+            warned.append(f"{kind} rows are violated by up to {float(residual):.1e} in their own units: take projection, smaller tolerances or smaller steps")
+    drift, size = float(found.energy_drift), float(found.energy_size)
+    if drift > DRIFTED * size:
+        share = f"{drift:.1e} J, {drift / size:.0%} of the energy that moves"
+        warned.append(f"{found.energy_kind}, which is constant for a right motion, drifts by {share}: tighten `rtol`")
+    pivot, dense = float(trajectory.smallest_pivot), not trajectory.reduction.endswith("lowered")
+    # round-off over the square of the pivot is the error of an acceleration; other states than the full one end there
+    if trajectory.state_form == "full" and dense and pivot < passing_cutoff(trajectory.q.dtype):
+        warned.append(
+            f"the privileged speeds of the reduction hardly determine the others, pivot {pivot:.1e}: no digit of the accelerations is sure in "
+            f"{trajectory.q.dtype}; leave `reduction` at its default, or take float64"
+        )
+    ts, steps = np.asarray(trajectory.ts), max(int(trajectory.accepted), 1)
+    resolved, step = float(np.spacing(np.max(np.abs(ts)))), abs(float(trajectory.t_end) - float(ts[0])) / steps
+    by_clock = not trajectory.inputs.constant or bool(structure_of(trajectory.scene).timed)
+    if by_clock and resolved > COARSE * step > 0:
+        warned.append(
+            f"the clock resolves {resolved:.0e} s at these times, and steps are of {step:.0e} s: loads, poses and inputs that depend on time are given "
+            "rounded times; count time from zero, or take float64"
+        )
+    pulled = [name for name, contact in found.contacts.items() if not contact.honest]
+    return (*warned, *(f"contact `{name}` would have to pull: a real one lifts off" for name in pulled))
+
+
+def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
+    """The summary as pairs of heading and text."""
+    found = diagnose(trajectory)
+    ts = np.asarray(trajectory.ts)
+    saved = f"{int(np.sum(np.isfinite(np.asarray(trajectory.q)).all(axis=-1)))} of {len(ts)} times saved"
+    pivot = "" if trajectory.state_form == "full" else f"; pivot of the privileged speeds at least {float(trajectory.smallest_pivot):.1e}"
+    low, high = (int(r) for r in found.rank)
+    rows = [
+        ("motion", f"t {float(ts[0]):.6g} to {float(trajectory.t_end):.6g} s, {saved}; {message}"),
+        ("solver", f"{trajectory.solver}, {int(trajectory.accepted)} steps accepted, {int(trajectory.rejected)} rejected"),
+        *([("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again "))] if int(trajectory.fallback) else []),
+        ("state", f"{trajectory.state_form}, reduction: {trajectory.reduction}" + (", projected after each step" if trajectory.projected else "") + pivot),
+        ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}"),
+        ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
+        ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),
+        ("start", f"moved by {float(trajectory.moved_q):.1e} (coordinates), {float(trajectory.moved_u):.1e} (speeds) onto the constraints"),
+    ]
+    rows += [(f"invariant {name}", f"drift {float(drift):.2e}") for name, drift in found.invariant_drifts.items()]
+    rows += [(f"contact {name}", _contact_text(contact)) for name, contact in found.contacts.items()]
+    return rows + [("warning", text) for text in warnings_of(found, trajectory) if not text.startswith("contact")]
+
+
+def _contact_text(contact: ContactExtremes) -> str:
+    text = f"normal force {float(contact.lowest_normal):.5g} to {float(contact.highest_normal):.5g} N"
+    text += f", friction coefficient needed {float(contact.friction_needed):.3g}"
+    if not contact.honest:
+        text += "; WOULD HAVE TO PULL: a real contact lifts off"
+    return text if bool(contact.determined) else f"{text}; not determined by the rows (minimum norm)"
+
+
+def summary(trajectory: Record, message: str) -> str:
+    """A printed summary: steps, drift, residuals, contacts, result."""
+    rows = [(f"Trajectory of {type(trajectory.scene).__name__}", ""), *summary_rows(trajectory, message)]
+    width = max(len(name) for name, _ in rows[1:])
+    return "\n".join([rows[0][0], *(f"  {name:<{width}}  {text}" for name, text in rows[1:])])
+
+
+def summary_html(trajectory: Record, message: str) -> str:
+    """The summary as an HTML table, for notebooks."""
+    left = "style='text-align:left'"
+    rows = summary_rows(trajectory, message)
+    body = "".join(f"<tr><th {left}>{html.escape(a)}</th><td {left}>{html.escape(b)}</td></tr>" for a, b in rows)
+    return f"<table><caption>Trajectory of {html.escape(type(trajectory.scene).__name__)}</caption>{body}</table>"

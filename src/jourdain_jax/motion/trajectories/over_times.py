@@ -1,0 +1,160 @@
+"""Quantities along a recorded motion: a function of one state, mapped over all saved times."""
+
+from typing import Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jourdain_jax.build.structure import structure_of, usual_rows
+from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
+from jourdain_jax.dynamics.reactions import ContactForce, RowReactions, contact_forces, row_reactions
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.equations.rows import UsualRows, velocity_residual
+from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy
+from jourdain_jax.motion.input_programs import by_itself, for_programs
+from jourdain_jax.motion.inputs import Inputs
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.numbers import checked_real
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import invariants_of
+
+
+@runtime_checkable
+class Record(Protocol):
+    """What is needed of a recorded motion; NaN at times that were not reached."""
+
+    scene: Scene
+    ts: Float[Array, "times"]
+    q: Float[Array, "times coordinates"]
+    u: Float[Array, "times speeds"]
+    t_end: Float[Array, ""]
+    q_end: Float[Array, "coordinates"]
+    u_end: Float[Array, "speeds"]
+    inputs: Inputs
+    work: Float[Array, "times"] | None
+    accepted: Int[Array, ""]
+    rejected: Int[Array, ""]
+    last_step: Float[Array, ""]
+    fallback: Int[Array, ""]
+    moved_q: Float[Array, ""]
+    moved_u: Float[Array, ""]
+    smallest_pivot: Float[Array, ""]
+    state_form: str
+    reduction: str
+    solver: str
+    projected: bool
+
+
+def map_over_times(f, record: Record, by_inputs: bool = False):
+    """`f(scene, t, q, u, inputs)` at all times; NaN at times that were not reached. f must be a named function or a module (it is a cache key).
+
+    `by_inputs`: f needs the rates of the inputs, where rows depend on some that change. Of a batch of motions: with its axes of lanes first.
+    """
+    return _compiled(record.inputs.programs)(f, record, by_inputs and _needs_rates(record))
+
+
+def _along(f, record: Record, by_inputs: bool):
+    if record.q.ndim > 2:
+        return eqx.filter_vmap(lambda record: _along(f, record, by_inputs))(record)
+
+    def one(t, q, u):
+        reached = jnp.all(jnp.isfinite(q))
+        t, q, u = (jnp.where(reached, a, b) for a, b in ((t, record.t_end), (q, record.q_end), (u, record.u_end)))
+        values = f(record.scene, t, q, u, record.inputs.near(t) if by_inputs else record.inputs(t))
+        return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan) if eqx.is_inexact_array(x) else x, values)
+
+    return jax.vmap(one)(record.ts, record.q, record.u)
+
+
+_compiled = for_programs(_along, by_itself)
+
+
+def motions(record: Record) -> Motion:
+    """Poses and velocities of all bodies (leading axis: times)."""
+    return map_over_times(motion_at, record)
+
+
+def path(record: Record, body: str, local) -> Float[Array, "*lanes times 3"]:
+    """Path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m, from the mass centre)."""
+    local = checked_real(local, f"point of body `{body}`", (3,), advice="give three components in its body frame, m")
+    return map_over_times(_Point(body, local.astype(record.q.dtype)), record)
+
+
+def energies(record: Record) -> tuple[Float[Array, "*lanes times"], Float[Array, "*lanes times"]]:
+    """Kinetic and potential energy, J."""
+    return map_over_times(_energies, record)
+
+
+def accelerations_over_times(record: Record, usual: UsualRows | None = None) -> Accelerations:
+    """Accelerations, multipliers, rank and smallest singular value; `usual`: from `usual_rows`, for a record whose parameters are traced."""
+    if usual is None and record.q.ndim > 2:  # every lane has parameters of its own
+        return map_over_times(_accelerations, record, by_inputs=True)
+    return map_over_times(_Accelerations(jax.tree.map(jnp.asarray, usual_rows(record.scene) if usual is None else usual)), record, by_inputs=True)
+
+
+def reactions_over_times(record: Record) -> RowReactions:
+    """Constraint forces per row and per body."""
+    return map_over_times(_reactions, record, by_inputs=True)
+
+
+def contact_forces_over_times(record: Record) -> dict[str, ContactForce]:
+    """Normal and tangential force and the friction coefficient needed, of every rolling contact."""
+    return map_over_times(_contacts, record, by_inputs=True)
+
+
+def residuals(record: Record) -> tuple[Float[Array, "*lanes times closures"], Float[Array, "*lanes times rows"]]:
+    """Residuals of the geometric rows and quaternion norms, and of the velocity rows."""
+    return map_over_times(_residuals, record)
+
+
+def invariants(record: Record) -> dict[str, Float[Array, "*lanes times"]]:
+    """The quantities that the scene is known to conserve."""
+    return map_over_times(_invariants, record)
+
+
+def _needs_rates(record: Record) -> bool:
+    """Whether accelerations depend on the rates of the inputs."""
+    scene = jax.tree.map(lambda x: x[(0,) * (record.q.ndim - 2)], record.scene)  # of a batch, the first
+    return not record.inputs.constant and structure_of(scene).rows_of_inputs
+
+
+class _Point(eqx.Module):
+    body: str = eqx.field(static=True)
+    local: Float[Array, "3"]
+
+    def __call__(self, scene, t, q, u, inputs):
+        return motion_at(scene, t, q, u, inputs)[self.body].place(self.local)
+
+
+def _energies(scene, t, q, u, inputs):
+    return kinetic_energy(scene, t, q, u), potential_energy(scene, motion_at(scene, t, q, u, inputs))
+
+
+class _Accelerations(eqx.Module):
+    usual: UsualRows
+
+    def __call__(self, scene, t, q, u, inputs):
+        return accelerations(scene, t, q, u, inputs, reduction="svd", usual=self.usual)
+
+
+def _accelerations(scene, t, q, u, inputs):
+    return accelerations(scene, t, q, u, inputs, reduction="svd")
+
+
+def _reactions(scene, t, q, u, inputs):
+    return row_reactions(scene, t, q, u, _accelerations(scene, t, q, u, inputs), inputs)
+
+
+def _contacts(scene, t, q, u, inputs):
+    return contact_forces(scene, t, q, u, _accelerations(scene, t, q, u, inputs), inputs)
+
+
+def _residuals(scene, t, q, u, inputs):
+    return closure_residual(scene, t, q), velocity_residual(scene, t, q, u, inputs)
+
+
+def _invariants(scene, t, q, u, inputs):
+    return invariants_of(scene, motion_at(scene, t, q, u, inputs))

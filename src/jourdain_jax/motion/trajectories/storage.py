@@ -1,0 +1,253 @@
+"""Saving and loading motions: NumPy's `.npz`, readable by anything that reads `.npz`.
+
+Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `work` (times; absent where not tracked), `t_end`, `q_end`, `u_end`,
+`result`, `event`, `accepted`, `rejected`, `moved_q`, `moved_u`, `smallest_pivot`, `last_step`, `fallback`, `inputs` (times, inputs;
+sampled at `ts`), and `parameter:NAME` for every field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
+`speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
+`state_form`, `reduction`, `solver`, `projected`, `event_names`, `arrays` (names of all arrays), `versions`.
+`kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `continued` holds
+the numbers of the lanes that were run again with the full state; `ways` in its header says how lanes with a `fallback` were run.
+
+What is absent, or is not what the names and the number of times ask for, is an error, and so is a parameter of the scene's class that the file lacks.
+"""
+
+import contextlib
+import json
+import os
+import secrets
+import zipfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import fields
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.motion.batches.rollout import Rollout
+from jourdain_jax.motion.inputs import Inputs, Sampled
+from jourdain_jax.motion.trajectories.results import BAD_PARAMETER
+from jourdain_jax.motion.trajectories.storage_checks import COUNTS, check_arrays, check_fields, check_header, check_scenes, refused
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.motion.trajectories.versions import version_of
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import described
+from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.scene import Scene
+
+_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", *COUNTS, "last_step", "moved_q", "moved_u", "smallest_pivot")
+_TEXTS = ("state_form", "reduction", "solver", "projected")
+_HEADER = ("scene", "coordinates", "speeds", "input_names", "static", "event_names", *_TEXTS, "kind", "arrays", "ways")
+_READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
+
+
+def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
+    """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of `motion/storage.py`).
+
+    A file that is there already is replaced at once, when the new one is whole: an interruption leaves the old one.
+    Inputs are stored as samples at the saved times. ValueError where the path is a folder, or the scene has a field that is no array, number or text.
+    Read it with `load_trajectory` or `load_rollout`.
+    """
+    _check_saved(motion, path)
+    many = isinstance(motion, Rollout)
+    trajectory = motion.lanes if isinstance(motion, Rollout) else motion
+    scene = trajectory.scene
+    arrays = {name: np.asarray(getattr(trajectory, name)) for name in _ARRAYS}
+    if trajectory.work is not None:
+        arrays["work"] = np.asarray(trajectory.work)
+    arrays["inputs"] = np.asarray((jax.vmap(_sampled) if many else _sampled)(trajectory.inputs, trajectory.ts))
+    arrays |= {f"parameter:{name}": np.asarray(getattr(scene, name)) for name in _array_fields(scene)}
+    if isinstance(motion, Rollout):
+        arrays["continued"] = np.array(motion.continued, int)
+    header = {name: getattr(trajectory, name) for name in _TEXTS} | {
+        "format": 1,
+        "kind": "rollout" if many else "trajectory",
+        "ways": motion.ways if isinstance(motion, Rollout) else (),
+        "scene": type(scene).__name__,
+        "coordinates": scene.coordinate_names.entries,
+        "speeds": scene.speed_names.entries,
+        "input_names": scene.inputs.entries,
+        "units": {name: metadata["unit"] for name, _, metadata in parameters_of(scene)},
+        "static": dict(_static_fields(scene)),
+        "event_names": trajectory.event_names,
+        "arrays": sorted(arrays),
+        "versions": {name: version_of(name) for name in ("jourdain-jax", "jax", "diffrax", "numpy")},
+    }
+    _write(os.path.realpath(path), {"header": np.array(json.dumps(header)), **arrays})
+
+
+def _write(path: str, arrays: dict) -> None:
+    """The whole file or, where writing is interrupted, what was there before: written beside it under another name, which then takes its place."""
+    beside = os.path.join(os.path.dirname(path), f".{os.path.basename(path)}.{secrets.token_hex(8)}")
+    try:
+        with open(beside, "xb") as file:  # a handle, so that numpy does not append a suffix to the name
+            np.savez_compressed(file, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(beside)
+        raise
+
+
+def _sampled(inputs: Inputs, ts):
+    return jax.vmap(inputs)(ts).reshape(ts.shape[0], len(inputs.channels))
+
+
+def _check_saved(motion, path) -> None:
+    """One motion or a rollout, of a scene that can be stored, and a path that can be written."""
+    if not isinstance(motion, Trajectory | Rollout):
+        raise ValueError(f"`save` was given {described(motion)}, expected a `Trajectory` from `jj.simulate` or a `Rollout` from `jj.rollout`")
+    if isinstance(motion, Trajectory) and motion.q.ndim != 2:
+        raise ValueError(
+            f"`save` takes one motion and was given a batch of shape {motion.q.shape[:-2]}; save a `Rollout`, `jj.Rollout(batch)` for one axis of lanes"
+        )
+    scene = motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
+    stored = {*_array_fields(scene), *(name for name, _ in _static_fields(scene))}
+    for field in fields(scene):
+        if field.init and field.name not in stored and getattr(scene, field.name) is not field.default:
+            raise ValueError(
+                f"field `{field.name}` of `{type(scene).__name__}` is {described(getattr(scene, field.name))}, which `save` cannot store; "
+                "expected arrays, numbers or texts, or the class's default"
+            )
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"`path` is {described(path)}, expected the name of a file")
+    folder = os.path.dirname(path) or "."
+    if not os.path.isdir(folder):
+        raise ValueError(f"cannot write `{os.fspath(path)}`: there is no folder `{folder}`; make it first")
+    if os.path.isdir(path):
+        raise ValueError(f"cannot write `{os.fspath(path)}`: it is a folder; give the name of a file in it, such as motion.npz")
+
+
+def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
+    """Read a trajectory written by `save` from `path`. `scene`: the scene's class, or any scene of that class; parameters come from the file.
+
+    ValueError where the file cannot be read, is of another format, holds a rollout, or belongs to another scene.
+    """
+    header, arrays = _read(path, "trajectory")
+    kind = _checked_class(path, scene, header, arrays)
+    arrays["input_ts"], arrays["inputs"] = _samples(arrays["ts"], arrays["inputs"])
+    if int(arrays["result"]) == BAD_PARAMETER:  # what cannot be built by itself: as a lane, where parameters are not looked at
+        lanes = _lanes(path, kind, header, {name: x[None] for name, x in arrays.items()})
+        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), lanes)
+    motion = _trajectory(path, kind, header, arrays)
+    check_scenes(path, motion.scene, motion.result, many=False)
+    return motion
+
+
+def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout:
+    """Read a rollout written by `save` from `path`: all its lanes, failed ones too, each with its result code.
+
+    `scene`: the scene's class, or any scene of that class; parameters come from the file. ValueError where the file cannot be read, is of another
+    format, holds one trajectory, or belongs to another scene.
+    """
+    header, arrays = _read(path, "rollout")
+    kind = _checked_class(path, scene, header, arrays)
+    continued = tuple(arrays.pop("continued").tolist())
+    lanes = [_samples(ts, inputs) for ts, inputs in zip(arrays["ts"], arrays["inputs"], strict=True)]
+    longest = max(len(times) for times, _ in lanes)  # lanes with fewer are filled up with their last sample
+    arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in lanes])
+    arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in lanes])
+    ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header["ways"])
+    return Rollout(_lanes(path, kind, header, arrays), continued, ways)
+
+
+def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
+    """Trajectories from arrays with a leading axis of lanes, which may be failed ones: built under `vmap`, where no value is refused."""
+    lanes = jax.vmap(lambda arrays: _trajectory(path, kind, header, arrays))(arrays)
+    check_scenes(path, lanes.scene, lanes.result, many=True)
+    return lanes
+
+
+def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
+    values = {name.removeprefix("parameter:"): value for name, value in arrays.items() if name.startswith("parameter:")}
+    try:
+        scene = kind(**values, **header["static"])
+    except TypeError as error:
+        raise refused(path, f"does not hold what makes a `{kind.__name__}` ({str(error).splitlines()[0]})") from None
+    check_fields(path, scene, {*values, *header["static"]}, {*_array_fields(scene), *(name for name, _ in _static_fields(scene))})
+    for name, now in (("coordinates", scene.coordinate_names), ("speeds", scene.speed_names), ("input_names", scene.inputs)):
+        if tuple(header[name]) != now.entries:
+            raise ValueError(
+                f"the file holds the {name.replace('_', ' ')} {', '.join(header[name])}, but `{kind.__name__}` has {', '.join(now.entries) or 'none'}; "
+                "pass the class as it was when the file was written"
+            )
+    return Trajectory(
+        scene=scene,
+        work=jnp.asarray(arrays["work"]) if "work" in arrays else None,
+        inputs=Inputs(tuple(Sampled(arrays["input_ts"], column) for column in arrays["inputs"].T)),
+        event_names=tuple(header["event_names"]),
+        **{name: jnp.asarray(arrays[name]) for name in _ARRAYS},
+        **{name: header[name] for name in _TEXTS},
+    )
+
+
+def _samples(ts: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Samples of the inputs in increasing time, also of a motion in reversed time, without times that were not reached."""
+    reached = np.flatnonzero(np.isfinite(ts))
+    times, first = np.unique(ts[reached], return_index=True)
+    return (times, inputs[reached][first]) if times.size else (np.zeros(1), np.zeros((1, inputs.shape[1])))
+
+
+def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict) -> type[Scene]:
+    """The class of the scene; a ValueError where it is not the one in the file, or has other parameters or names than at that time."""
+    kind = scene if isinstance(scene, type) else type(scene)
+    if not issubclass(kind, Scene):
+        raise ValueError(f"`scene` is {described(scene)}, expected the class of the scene that moved, or any scene of that class")
+    if header["scene"] != kind.__name__:
+        raise ValueError(f"`{path}` holds a {header['kind']} of `{header['scene']}`, expected `{kind.__name__}`; pass the class it was made with")
+    known = [field.name for field in fields(kind)]
+    for name in (*(name.removeprefix("parameter:") for name in arrays if name.startswith("parameter:")), *header["static"]):
+        if name not in known:
+            raise ValueError(f"`{path}` has a parameter `{name}` that `{kind.__name__}` has not; {nearest(name, known)}")
+    for name, value in arrays.items():
+        if name.startswith("parameter:") and value.dtype.kind not in "fiub":
+            raise refused(path, f"has `{name.removeprefix('parameter:')}` of type {value.dtype}, expected numbers")
+        if name.startswith("parameter:") and header["kind"] == "rollout" and value.shape[:1] != arrays["result"].shape:
+            raise refused(path, f"has `{name.removeprefix('parameter:')}` of shape {value.shape}, expected one value for each of {len(arrays['result'])} lanes")
+    return kind
+
+
+def _read(path, kind: str) -> tuple[dict, dict]:
+    """Header and arrays of a file of this kind."""
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"`path` is {described(path)}, expected the name of a file")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(str(arrays.pop("header")))
+        if not isinstance(header, dict):
+            raise ValueError("its header is no dictionary")
+    except FileNotFoundError:
+        raise ValueError(f"there is no file `{path}`; check the path") from None
+    except (OSError, ValueError, TypeError, AttributeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise ValueError(f"`{path}` is no {kind} file, or is damaged ({error}); expected an .npz written by `save`") from None
+    if header.get("format") != 1 or isinstance(header["format"], bool):
+        raise ValueError(f"`{path}` has format {header.get('format')}, expected 1; read it with the version of jourdain-jax that wrote it")
+    found = header.get("kind")
+    if found != kind:
+        raise ValueError(f"`{path}` holds a {found}, expected a {kind}; read it with `{_READERS.get(str(found), 'the version of jourdain-jax that wrote it')}`")
+    missing = [name for name in (*_ARRAYS, "inputs", *(["continued"] if kind == "rollout" else [])) if name not in arrays]
+    missing += [name for name in _HEADER if name not in header]
+    missing += [
+        name for name in (header["arrays"] if isinstance(header.get("arrays"), list) else ()) if name not in arrays and not str(name).startswith("parameter:")
+    ]
+    if missing:
+        raise refused(path, f"lacks `{missing[0]}`")
+    check_header(path, header)
+    check_arrays(path, header, arrays)
+    return header, arrays
+
+
+def _array_fields(scene: Scene) -> list[str]:
+    """Parameters, and other fields that are arrays."""
+    kept = [field for field in fields(scene) if field.init and not field.metadata.get("static")]
+    return [field.name for field in kept if isinstance(getattr(scene, field.name), jax.Array | np.ndarray)]
+
+
+def _static_fields(scene: Scene) -> Iterator[tuple[str, object]]:
+    """Fields that are plain numbers or texts, such as a number of bodies."""
+    for field in fields(scene):
+        if field.init and isinstance(getattr(scene, field.name), int | float | str | bool):
+            yield field.name, getattr(scene, field.name)

@@ -1,0 +1,126 @@
+"""Whether what a file holds can be a motion: every entry there, of its kind, shape and type, and finite where a motion is.
+
+A file is believed in nothing: it may be of another version of a scene's class, written by another program, or damaged in a way that its format does not show.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.build.trace import velocity_quantities
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.motion.trajectories.results import BAD_PARAMETER, EVENT, FALLBACKS, MESSAGES, SUCCESS
+from jourdain_jax.scene.numbers import described
+from jourdain_jax.scene.parameters import parameter_faults
+from jourdain_jax.scene.scene import Scene
+
+COUNTS = ("result", "event", "accepted", "rejected", "fallback")
+_STATES = {"q": "coordinates", "u": "speeds", "inputs": "input_names"}  # at all times, and what their last axis counts
+_ENDS = {"q_end": "coordinates", "u_end": "speeds"}
+_NUMBERS = ("t_end", "last_step", "moved_q", "moved_u", "smallest_pivot")
+_TEXTS = ("scene", "state_form", "reduction", "solver")
+_LISTS = ("coordinates", "speeds", "input_names", "event_names", "arrays")
+
+
+def refused(path, sentence: str) -> ValueError:
+    """The error for a file that cannot be what it says."""
+    return ValueError(f"`{path}` {sentence}; it is damaged or was not written by `save`")
+
+
+def check_header(path, header: dict) -> None:
+    """ValueError for an entry of the header that is of another kind than `save` writes."""
+    wanted: dict[str, tuple[type, str]] = dict.fromkeys(_TEXTS, (str, "a text")) | dict.fromkeys(_LISTS, (list, "a list of names"))
+    wanted |= {"static": (dict, "a dictionary"), "projected": (bool, "true or false"), "ways": (list, "a list")}
+    for name, (kind, text) in wanted.items():
+        value = header.get(name, kind())
+        if not isinstance(value, kind) or (isinstance(value, list) and name in _LISTS and not all(isinstance(x, str) for x in value)):
+            raise refused(path, f"has {described(value)} as `{name}` of its header, expected {text}")
+    if header["state_form"] not in ("minimal", "full"):
+        raise refused(path, f"has the state form {header['state_form']!r}, expected 'minimal' or 'full'")
+    for way in header.get("ways", ()):
+        if not (isinstance(way, list) and len(way) == 2 and way[0] in FALLBACKS and isinstance(way[1], list) and len(way[1]) == 5):
+            raise refused(path, f"has {way!r} among the `ways` of its header, expected a code of a fallback and how such lanes were run")
+
+
+def check_arrays(path, header: dict, arrays: dict) -> None:
+    """ValueError for an array of another shape or type than the others ask for, or with numbers that no motion has."""
+    many = header["kind"] == "rollout"
+    lead = arrays["result"].shape[:1] if many else ()
+    times = arrays["ts"].shape[-1] if arrays["ts"].ndim else 0
+    counts = {name: len(header[name]) for name in ("coordinates", "speeds", "input_names")}
+    for name, what in (("q", "coordinates"), ("u", "speeds"), ("inputs", "input_names")):
+        if arrays[name].ndim and arrays[name].shape[-1] != counts[what]:
+            raise refused(path, f"has {arrays[name].shape[-1]} columns for {counts[what]} {what.replace('_', ' ')}")
+    shapes = {"ts": (times,), **{name: (times, counts[what]) for name, what in _STATES.items()}, **{name: (counts[what],) for name, what in _ENDS.items()}}
+    shapes |= dict.fromkeys((*_NUMBERS, *COUNTS), ()) | ({"work": (times,)} if "work" in arrays else {})
+    for name, shape in shapes.items():
+        array, expected = arrays[name], (*lead, *shape)
+        if array.shape != expected or not times or 0 in lead:
+            raise refused(path, f"has `{name}` of shape {array.shape}, expected {expected if times else 'at least one time'}")
+        kinds, text = ("iu", "whole numbers") if name in COUNTS else ("f", "floating-point numbers")
+        if array.dtype.kind not in kinds:
+            raise refused(path, f"has `{name}` of type {array.dtype}, expected {text}")
+    if many and (arrays["continued"].ndim != 1 or arrays["continued"].dtype.kind not in "iu" or not np.all(np.isin(arrays["continued"], np.arange(lead[0])))):
+        raise refused(path, f"names lanes that were continued, {arrays['continued']}, expected numbers from 0 to {lead[0] - 1}")
+    _check_codes(path, header, arrays)
+    _check_finite(path, arrays)
+
+
+def _check_codes(path, header: dict, arrays: dict) -> None:
+    events = np.where(arrays["result"] == EVENT, np.arange(len(header["event_names"]) + 1).max() - 1, -1)
+    ranges = {"result": np.isin(arrays["result"], list(MESSAGES)), "fallback": np.isin(arrays["fallback"], list(FALLBACKS))}
+    ranges["event"] = (arrays["event"] <= events) & (arrays["event"] >= np.where(arrays["result"] == EVENT, 0, -1))
+    ranges |= {name: arrays[name] >= 0 for name in ("accepted", "rejected")}
+    for name, right in ranges.items():
+        if not np.all(right):
+            raise refused(path, f"has {arrays.get(name, header.get(name))} as `{name}`, which no motion has")
+
+
+def _check_finite(path, arrays: dict) -> None:
+    """Motions that reached their end, or an event, are finite as far as they went; failed ones may hold anything."""
+    whole = np.isin(arrays["result"], (SUCCESS, EVENT))
+    for name in ("t_end", "q_end", "u_end", "moved_q", "moved_u"):
+        good = np.isfinite(arrays[name])
+        if not np.all(good.reshape(*whole.shape, -1)[whole]):
+            raise refused(path, f"has numbers in `{name}` that are not finite, in a motion that did not fail")
+    if np.any(np.isnan(arrays["ts"])):
+        raise refused(path, "has times in `ts` that are no numbers")
+    reached = np.all(np.isfinite(arrays["q"]), axis=-1)
+    due = np.isfinite(arrays["ts"]) & (np.asarray(arrays["result"]) == SUCCESS)[..., None]
+    for name in ("q", "u", "inputs", *(["work"] if "work" in arrays else [])):
+        values = arrays[name].reshape(*arrays["ts"].shape, -1)
+        finite = np.all(np.isfinite(values), axis=-1)
+        apart = (np.any(np.isfinite(values), axis=-1) if name in ("q", "u") else reached) & ~finite
+        if np.any((due | (apart & whole[..., None])) & ~finite):
+            raise refused(path, f"has numbers in `{name}` that are not finite at times that were reached")
+
+
+def check_fields(path, scene: Scene, found: set[str], expected: set[str]) -> None:
+    """ValueError where the file lacks a field that the scene has: its default would stand in for what moved."""
+    missing = sorted(expected - found)
+    if missing:
+        raise ValueError(
+            f"`{path}` lacks the parameter `{missing[0]}` of `{type(scene).__name__}`; it is damaged, or was written when the class had none: "
+            "pass the class as it was when the file was written"
+        )
+
+
+def check_scenes(path, scene: Scene, result, *, many: bool) -> None:
+    """ValueError where parameters are wrong in a motion that did not end for it, or of shapes that do not make the scene."""
+    wrong = {name: np.asarray(fault) for name, fault in (jax.vmap(parameter_faults) if many else parameter_faults)(scene).items()}
+    for name, fault in wrong.items():
+        if np.any(fault & (np.asarray(result) != BAD_PARAMETER)):
+            raise refused(path, f"has a value of the parameter `{name}` that is not finite or has the wrong sign, in a motion that did not fail for it")
+    one = jax.tree.map(lambda x: x[0], scene) if many else scene
+
+    def quantities(scene):
+        q, u, _ = scene.named()
+        return velocity_quantities(scene, motion_at(scene, jnp.zeros(()), q, u), with_events=False)
+
+    try:
+        jax.eval_shape(quantities, one)
+    except (ValueError, TypeError, IndexError) as error:
+        said = str(error).splitlines()[0]
+        raise ValueError(
+            f"`{path}` holds parameters that do not make a `{type(scene).__name__}` ({said}); pass the class as it was when it was written"
+        ) from None

@@ -1,0 +1,183 @@
+"""A motion in time, with named access and everything needed to trust it."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jourdain_jax.build.plausibility import body_faults
+from jourdain_jax.dynamics.accelerations import Accelerations
+from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
+from jourdain_jax.motion.inputs import Inputs
+from jourdain_jax.motion.marks import nan_is_a_mark
+from jourdain_jax.motion.trajectories import over_times, results
+from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, energies_of, summary, summary_html, warnings_of
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.names import UnknownNameError, nearest
+from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.parameters import parameter_faults
+from jourdain_jax.scene.printing import preformatted, shapes_of
+from jourdain_jax.scene.scene import Scene
+
+
+class Trajectory(eqx.Module):
+    """The motion of a scene. Times after an early end (event, failure) hold NaN.
+
+    `t_end`, `q_end`, `u_end` are the last state that was reached, of a failed motion the one at which it failed. What is made of them by itself, such as a
+    loss to be minimised, takes `motion.nan_if_failed()`, or looks at `motion.succeeded`.
+    """
+
+    scene: Scene
+    ts: Float[Array, "times"]  # s
+    q: Float[Array, "times coordinates"]
+    u: Float[Array, "times speeds"]
+    work: Float[Array, "times"] | None  # J, since the start; None where all forces have potentials and no row does work
+    t_end: Float[Array, ""]  # s
+    q_end: Float[Array, "coordinates"]
+    u_end: Float[Array, "speeds"]
+    result: Int[Array, ""]  # code, see `jourdain_jax.motion.trajectories.results`
+    event: Int[Array, ""]  # index into `event_names`, -1: none
+    accepted: Int[Array, ""]  # steps
+    rejected: Int[Array, ""]
+    last_step: Float[Array, ""]  # s, that the step-size control would take next; NaN where it keeps that to itself
+    fallback: Int[Array, ""]  # in what other way the motion was run again, see `results.FALLBACKS`; 0: as asked
+    moved_q: Float[Array, ""]  # how far the start was moved onto the constraints
+    moved_u: Float[Array, ""]
+    # of the privileged speeds, along the whole motion (lowered: of the elimination, relative to its usual size); negative if it changed sign;
+    # full state, dense: of those of the reduction, 1 where it has none
+    smallest_pivot: Float[Array, ""]
+    inputs: Inputs
+    state_form: str = eqx.field(static=True)  # "minimal" or "full"
+    reduction: str = eqx.field(static=True)
+    solver: str = eqx.field(static=True)
+    projected: bool = eqx.field(static=True)
+    event_names: tuple[str, ...] = eqx.field(static=True)
+
+    # Named access. -------------------------------------------------------------------------------------------------
+
+    def __getitem__(self, name: str) -> Float[Array, "times *shape"]:
+        """A coordinate, speed, quaternion or angular velocity by name, at all times; `"t"` for the times."""
+        if name == "t":
+            return self.ts
+        for names, array in ((self.scene.coordinate_names, self.q), (self.scene.speed_names, self.u)):
+            with nan_is_a_mark():
+                if name in names.view(array):
+                    return names.view(array)[name]
+        valid = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries, "t")
+        raise UnknownNameError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}")
+
+    def __contains__(self, name: str) -> bool:
+        return name == "t" or name in self.scene.coordinate_names or name in self.scene.speed_names
+
+    @property
+    def succeeded(self) -> Bool[Array, "*lanes"]:
+        """Whether the motion reached the end of its span, or an event; also under jit and vmap."""
+        return results.is_success(self.result)
+
+    @property
+    def valid(self) -> Bool[Array, "*lanes times"]:
+        """Which times were reached."""
+        return jnp.all(jnp.isfinite(self.q), axis=-1)
+
+    # Derived quantities. -------------------------------------------------------------------------------------------
+
+    def motions(self) -> Motion:
+        """Poses and velocities (inertial frame) of all bodies at all times (leading axis: times)."""
+        return over_times.motions(self)
+
+    def point(self, body: str, local=(0.0, 0.0, 0.0)) -> Float[Array, "*lanes times 3"]:
+        """Path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m, from the mass centre)."""
+        return over_times.path(self, body, local)
+
+    def energies(self) -> Energies:
+        """Kinetic and potential energy, and the work where it is tracked, in J; `.balance` is constant for a right motion."""
+        return energies_of(self, self.work)
+
+    def accelerations(self) -> Accelerations:
+        """Accelerations, multipliers, rank and smallest singular value at all times."""
+        return over_times.accelerations_over_times(self)
+
+    def constraint_forces(self) -> RowReactions:
+        """Constraint forces per row and per body at all times, eqs. (68)-(70); `.forces_on("disc")` by row, in N, inertial frame."""
+        return over_times.reactions_over_times(self)
+
+    def contact_forces(self) -> dict[str, ContactForce]:
+        """Normal and tangential force (N) on the body and friction coefficient needed, of every rolling contact at all times."""
+        return over_times.contact_forces_over_times(self)
+
+    def residuals(self) -> tuple[Float[Array, "*lanes times closures"], Float[Array, "*lanes times rows"]]:
+        """Residuals of the geometric rows (and quaternion norms), and of the velocity rows, at all times."""
+        return over_times.residuals(self)
+
+    def invariants(self) -> dict[str, Float[Array, "*lanes times"]]:
+        """The quantities that the scene states to be conserved, by name at all times; without the energy."""
+        return over_times.invariants(self)
+
+    def __str__(self) -> str:
+        with nan_is_a_mark():
+            return summary(self, self.message) if self._is_known_motion else self._outline
+
+    def _repr_html_(self) -> str:
+        return summary_html(self, self.message) if self._is_known_motion else preformatted(self._outline)
+
+    @property
+    def _is_known_motion(self) -> bool:
+        return self.q.ndim == 2 and not is_traced(self)
+
+    @property
+    def _outline(self) -> str:
+        """What is shown of many motions, and of one whose numbers are not known."""
+        return shapes_of(self) if is_traced(self) else f"Trajectories of {type(self.scene).__name__}, lanes {self.q.shape[:-2]}"
+
+    # How it ended. -------------------------------------------------------------------------------------------------
+
+    @property
+    def message(self) -> str:
+        """How the motion ended, in words."""
+        code = int(self.result)
+        text = results.MESSAGES[code]
+        if code == results.BAD_PARAMETER:
+            return f"{text} ({', '.join(self.faults)}); check where it was computed"
+        return f"{text} `{self.event_names[int(self.event)]}`" if code == results.EVENT else text
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What speaks against a motion, in words, most serious first; empty where nothing does. The printed summary shows them.
+
+        A failure; rows that gain or lose rank, or come near it, so that constraint forces and what follows may not be unique; privileged speeds of a
+        reduction that do not determine the others in this precision; contacts that would have to pull.
+        Computed where it is asked for; needs numbers: not under jit or vmap.
+        """
+        failure = () if int(self.result) in (results.SUCCESS, results.EVENT) else (self.message,)
+        return (*failure, *warnings_of(diagnose(self), self))
+
+    @property
+    def wrong_parameters(self) -> tuple[str, ...]:
+        """Names of the scene's parameters that are not finite or have the wrong sign."""
+        return tuple(name for name, wrong in parameter_faults(self.scene).items() if bool(wrong))
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Parameters that are not finite or have the wrong sign, otherwise bodies whose mass or inertia cannot be, as they stand in messages."""
+        reference = jnp.asarray(self.scene.coordinates.reference(), self.q.dtype)
+        bodies = () if self.wrong_parameters else body_faults(self.scene, self.t_end, reference).items()
+        return (
+            *(f"`{name}`" for name in self.wrong_parameters),
+            *(f"a negative mass or moment of inertia of body `{name}`" for name, wrong in bodies if bool(wrong)),
+        )
+
+    def nan_if_failed(self) -> "Trajectory":
+        """The trajectory itself, with NaN in place of its states where it reached neither its end nor an event: under `jit`, `vmap` and `grad`, lane by lane.
+
+            loss = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0).nan_if_failed().q_end[0]
+
+        Lanes that are left out of a loss by `jnp.where(motion.succeeded, ..., 0.0)` do not disturb its derivatives by what all lanes share.
+        """
+        parts = [x for x in (self.q, self.u, self.q_end, self.u_end, self.work) if x is not None]
+        marked = [jnp.where(jnp.expand_dims(self.succeeded, tuple(range(jnp.ndim(self.result), x.ndim))), x, jnp.nan) for x in parts]
+        return eqx.tree_at(lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None], self, marked)
+
+    def raise_if_failed(self) -> "Trajectory":
+        """The trajectory itself; a SimulationError with reason and time where it did not reach its end or an event."""
+        if int(self.result) not in (results.SUCCESS, results.EVENT):
+            raise results.SimulationError(f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: {self.message}")
+        return self

@@ -1,0 +1,49 @@
+"""Several values of one shape computed in one loop over their elements, so that what they share is computed once.
+
+XLA on a CPU gives each result of a program a loop of its own and computes in each whatever it needs. A reduction over several operands is one
+loop, though; so each value is reduced with a zero beside it. To JAX this is the identity: linear, element by element.
+"""
+
+import jax.numpy as jnp
+from jax import lax
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+
+def fused(values: tuple) -> tuple:
+    """The same real values, all of one shape and type."""
+    return values if len(values) < 2 else tuple(together_p.bind(*values))
+
+
+def _reduced_with_zeros(*values):
+    beside = [lax.pad(x[None], jnp.zeros((), x.dtype), [(0, 1, 0), *[(0, 0, 0)] * x.ndim]) for x in values]
+    zeros = [jnp.zeros((), x.dtype) for x in values]
+    return lax.reduce(beside, zeros, lambda a, b: [x + y for x, y in zip(a, b, strict=True)], (0,))
+
+
+def _jvp(primals, tangents):
+    return together_p.bind(*primals), together_p.bind(*(ad.instantiate_zeros(t) for t in tangents))
+
+
+def _transpose(cotangents, *_):
+    return [ad.instantiate_zeros(c) for c in cotangents]
+
+
+def _batched(values, axes):
+    # what is the same in all lanes stays so: a rule of differentiation must not give it an axis that the values by themselves do not have
+    alike = fused(tuple(x for x, axis in zip(values, axes, strict=True) if axis is None))
+    lanes = fused(tuple(jnp.moveaxis(x, axis, 0) for x, axis in zip(values, axes, strict=True) if axis is not None))
+    found = {None: iter(alike), 0: iter(lanes)}
+    new_axes = [None if axis is None else 0 for axis in axes]
+    return [next(found[axis]) for axis in new_axes], new_axes
+
+
+together_p = Primitive("together")
+together_p.multiple_results = True
+together_p.def_impl(lambda *values: list(values))
+together_p.def_abstract_eval(lambda *avals: list(avals))
+ad.primitive_jvps[together_p] = _jvp
+ad.primitive_transposes[together_p] = _transpose
+batching.primitive_batchers[together_p] = _batched
+mlir.register_lowering(together_p, mlir.lower_fun(lambda *values: list(values), multiple_results=True))
+mlir.register_lowering(together_p, mlir.lower_fun(_reduced_with_zeros, multiple_results=True), platform="cpu")

@@ -1,0 +1,253 @@
+"""Probes that prove identities: what two expressions have in common at them, they have in common everywhere.
+
+Sums, products, quotients, roots, sines and cosines of generic numbers agree at random only if they agree everywhere (Schwartz, 1980; Zippel, 1979). Numbers
+near those of a scene are not generic, though (a parameter may be tiny, time may stop before a switch), and a function that has branches, or saturates, may do
+elsewhere what it does at no probe. So inputs are drawn anew, of the order of one and larger; and any other function is replaced by one of its operands that
+is neither flat nor kinked anywhere. An identity that holds then holds whatever these functions are.
+
+Nothing is compared with a fixed tolerance. With every value goes a bound of its round-off (Higham, 2002, 3.3),
+
+    a + b: e_a + e_b + eps |a + b|        a b: |a| e_b + |b| e_a + e_a e_b + eps |a b|        a/b: (e_a + |a/b| e_b)/(|b| - e_b) + eps |a/b|
+
+and two values are equal where they differ by no more. Numbers in the code of a scene may be far from one (1e-24, 1e16), and would hide or be hidden: they are
+written as c = m R^j, R = 2^40, with |m| between 2^-20 and 2^20, and R is drawn anew at every probe. What holds of any R holds of this one.
+"""
+
+import math
+import zlib
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Self
+
+import numpy as np
+
+from jourdain_jax.eager.entrywise import FUNCTIONS
+from jourdain_jax.program.derivative import columns
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph
+
+KNOWN = ("add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos", "tan")  # taken for what they are
+STEPS, CLOSED = 30, 1e3  # of Newton's method; bounds of round-off that rows may be off
+FAR = 10.0  # half of the probes lie so much further out
+DIGITS = 40  # binary ones, that numbers in the code of a scene may span among themselves
+RADIX = 1.5, 3.0  # in the place of 2^DIGITS
+EPS = float(np.finfo(float).eps)
+SURE = 16.0  # bounds of round-off that equal values may differ by: bounds are of first order
+LOST = 1e3  # bounds of round-off below which a divisor, or what a root is taken of, is not told from zero
+FEWEST = 6  # probes at which an expression is a number
+
+
+class Bounded(np.ndarray):
+    """Values with a bound of their round-off, infinite where they say nothing."""
+
+    error: np.ndarray
+
+
+class IdentityProbes:
+    """Values of the nodes of a graph at generic inputs, with bounds of their round-off."""
+
+    def __init__(self, graph: Graph, inputs: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray | float]):
+        self.graph, self.inputs, self._errors = graph, dict(inputs), dict(errors)
+        self.count = max((np.size(x) for x in self.inputs.values()), default=1)
+        both = {name: np.concatenate([np.broadcast_to(x, self.count), np.broadcast_to(self._errors.get(name, 0.0), self.count)]) for name, x in inputs.items()}
+        radix = np.random.default_rng(4).uniform(*RADIX, self.count)
+        # the bounds follow the values in one array, as if they were further probes
+        self._both = Probes(graph, both, _SCALARS, _ARRAYS, lambda value: _moderate(value, radix))
+
+    def __call__(self, nodes: Sequence[int]) -> Bounded:
+        """Values, shape (nodes, probes)."""
+        values, errors = np.split(self._both(nodes), 2, axis=1)
+        found = values.view(Bounded)
+        found.error = np.where(np.isfinite(values), np.where(np.isnan(errors), np.inf, errors), 0.0)
+        return found
+
+    def with_inputs(self, changes: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray]) -> Self:
+        """The same probes with some inputs changed, and the bounds of their round-off."""
+        return type(self)(self.graph, self.inputs | dict(changes), self._errors | dict(errors))
+
+    def exchanged(self, names: Collection[str]) -> Self:
+        """The same probes, at each of which some inputs have the value that they had at another."""
+
+        def next_one(x):
+            return np.roll(np.broadcast_to(x, self.count), 1)
+
+        return self.with_inputs({name: next_one(self.inputs[name]) for name in names}, {name: next_one(self._errors.get(name, 0.0)) for name in names})
+
+
+def equal(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
+    """Of each pair of rows, values of expressions at generic probes, whether they are equal but for round-off, at those that are `regular`."""
+    bound = SURE * (a.error + b.error)
+    said = np.isfinite(bound) & regular
+    a, b = np.asarray(a), np.asarray(b)
+    finite = said & np.isfinite(b)
+    with np.errstate(invalid="ignore"):
+        alike = (a == b) | (np.abs(a - b) <= bound) | ~said | ~(np.isfinite(b) | np.isfinite(a))
+    return np.all(alike, axis=1) & (np.count_nonzero(finite, axis=1) >= FEWEST)
+
+
+def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:
+    """The replacements, each of one node by another, that by themselves change none of the `nodes`; `probes`: generic ones."""
+    graph, here = probes.graph, probes(nodes)
+
+    def unchanged(old, new):
+        return np.all(equal(probes(graph.substituted(nodes, {old: new})), here))
+
+    return {old: new for old, new in replacement.items() if unchanged(old, new)}
+
+
+def is_combination(a: np.ndarray, error: np.ndarray, rows: np.ndarray, errors: np.ndarray) -> bool:
+    """Whether the vectors `a`, shape (probes, entries), are combinations of the `rows`, shape (probes, rows, entries), at all probes that say something."""
+    said = np.isfinite(a).all(axis=1) & np.isfinite(error).all(axis=1) & np.isfinite(rows).all(axis=(1, 2)) & np.isfinite(errors).all(axis=(1, 2))
+    for v, e, B, E in zip(a[said], error[said], rows[said], errors[said], strict=True):
+        x = np.linalg.lstsq(B.T, v, rcond=None)[0]
+        size = np.linalg.norm(v) + np.abs(x) @ np.linalg.norm(B, axis=1)
+        if np.linalg.norm(v - x @ B) > SURE * (np.linalg.norm(e) + np.abs(x) @ np.linalg.norm(E, axis=1) + B.size * EPS * size):
+            return False
+    return int(np.count_nonzero(said)) >= FEWEST
+
+
+def identity_probes(probes: Probes, unchanged: Collection[str]) -> IdentityProbes:
+    """Such probes for the graph of `probes`; inputs named in `unchanged` (the parts of quaternions, which have a norm) keep their values.
+
+    Parameters, named p..., are positive.
+    """
+    generator, count = np.random.default_rng(2), probes.count
+    scale = np.where(np.arange(count) % 2, FAR, 1.0)
+
+    def drawn(name: str, value: np.ndarray) -> np.ndarray:
+        if name in unchanged:
+            return value
+        return generator.uniform(0.5, 1.5, count) if name.startswith("p") else scale * generator.normal(size=count)
+
+    return IdentityProbes(probes.graph, {name: drawn(name, value) for name, value in probes.inputs.items()}, dict.fromkeys(unchanged, 4 * EPS))
+
+
+def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinates: Mapping[str, int]) -> IdentityProbes:
+    """Generic `probes` with `coordinates` (names of inputs, their nodes) on rows = 0, by Newton's method from `near`; nothing is said where it does not arrive.
+
+    The probes unchanged where the rows hold another function than the known ones, of which nothing can be solved.
+    """
+    graph = probes.graph
+    needed = set(graph.reachable(rows))
+    moved = {name: n for name, n in coordinates.items() if n in needed}
+    if not moved or any(graph.op[n] not in (*KNOWN, "const", "input") for n in needed):
+        return probes
+    slopes = [n for column in columns(graph, rows, moved.values()) for n in column]
+    q = np.stack([np.broadcast_to(near.inputs[name], probes.count) for name in moved])
+    exact = dict.fromkeys(moved, np.zeros(()))
+    for turn in range(STEPS + 1):
+        here = probes.with_inputs(dict(zip(moved, q, strict=True)), exact)
+        found = here(rows)
+        values, J = np.nan_to_num(np.asarray(found)), np.nan_to_num(np.asarray(here(slopes))).reshape(len(moved), len(rows), -1)
+        inverse = np.linalg.pinv(J.transpose(2, 1, 0), rcond=1e-9)
+        step = np.einsum("pqr,rp->qp", inverse, values)
+        if turn == STEPS or np.all(np.abs(step) <= EPS * np.max(np.abs(q), axis=0)):
+            break
+        q = q - step / np.maximum(1.0, np.max(np.abs(step), axis=0))
+    errors = np.einsum("pqr,rp->qp", np.abs(inverse), np.abs(values) + found.error) + EPS * np.abs(q)
+    errors[:, ~np.all(np.abs(values) <= CLOSED * found.error, axis=0)] = np.inf
+    return probes.with_inputs(dict(zip(moved, q, strict=True)), dict(zip(moved, errors, strict=True)))
+
+
+def _moderate(value: float, radix: np.ndarray) -> np.ndarray:
+    """A number with R drawn anew, and the bound of its round-off."""
+    j = round(math.frexp(value)[1] / DIGITS) if math.isfinite(value) else 0
+    moderate = math.ldexp(value, -DIGITS * j) * radix**j
+    return np.concatenate([moderate, (2 * abs(j)) * EPS * np.abs(moderate)])
+
+
+# Functions of values and bounds, which follow one another in an array. -----------------------------------------------
+
+
+def _with(value: np.ndarray, error: np.ndarray) -> np.ndarray:
+    error += EPS * np.abs(value)
+    return np.concatenate([value, error])
+
+
+def _halves(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    half = len(x) // 2
+    return x[:half], x[half:]
+
+
+def _sum(x, y):
+    both, half = x + y, len(x) // 2
+    both[half:] += EPS * np.abs(both[:half])
+    return both
+
+
+def _difference(x, y):
+    (a, ea), (b, eb) = _halves(x), _halves(y)
+    return _with(a - b, ea + eb)
+
+
+def _negative(x):
+    return np.concatenate([-x[: len(x) // 2], x[len(x) // 2 :]])
+
+
+def _product(x, y):
+    (a, ea), (b, eb) = _halves(x), _halves(y)
+    return _with(a * b, np.abs(a) * eb + (np.abs(b) + eb) * ea)
+
+
+def _quotient(x, y):
+    (a, ea), (b, eb) = _halves(x), _halves(y)
+    value, size = a / b, np.abs(b)
+    error = (ea + np.abs(value) * eb) / size * (1 + 2 / LOST)
+    return _with(value, np.where((eb > 0) & (size <= LOST * eb), np.inf, error))
+
+
+def _root(x):
+    a, ea = _halves(x)
+    value = np.sqrt(a)
+    return _with(value, np.where((ea > 0) & (np.abs(a) <= LOST * ea), np.inf, np.where(ea > 0, ea / value, 0.0)))
+
+
+def _wave(function: Callable) -> Callable:
+    def wave(x):
+        a, ea = _halves(x)
+        return _with(function(a), np.minimum(ea, 2.0))
+
+    return wave
+
+
+def _tangent(x):
+    a, ea = _halves(x)
+    value = np.tan(a)
+    return _with(value, 2 * (1 + value**2) * ea)
+
+
+def _generic(name: str) -> Callable:
+    """A function of any number of numbers, another one for every name."""
+
+    def function(*operands):
+        weights = np.random.default_rng(zlib.crc32(name.encode())).uniform(0.3, 1.7, (2, len(operands)))
+        half = len(operands[0]) // 2
+        (phase, e), (rest, _) = (_halves(sum(w * x for w, x in zip(row, operands, strict=True))) for row in weights)
+        # no weight is more than six times another, so that this bounds the round-off of both sums
+        size = sum(np.abs(x[:half]) for x in operands)
+        return _with(np.sin(phase + 0.4) + 0.3 * rest, 3.0 * e + 2.0 * len(operands) * EPS * size)
+
+    return function
+
+
+def _kept(call, *operands) -> np.ndarray:
+    """One number per probe, made from all entries of the operands."""
+    return _generic(call.name)(*(column for x in operands for column in (x.T if x.ndim == 2 else [x])))
+
+
+_SCALARS = {op: _generic(op) for op in FUNCTIONS} | {
+    "add": _sum,
+    "sub": _difference,
+    "neg": _negative,
+    "mul": _product,
+    "div": _quotient,
+    "sqrt": _root,
+    "sin": _wave(np.sin),
+    "cos": _wave(np.cos),
+    "tan": _tangent,
+}
+_ARRAYS: dict[str, Callable] = {
+    "array": lambda shape_and_type, *entries: np.stack(entries, axis=-1) if entries else np.empty((0, 0)),
+    "kept": _kept,
+    "output": lambda which, number: _generic(f"output {which[0]}")(number),
+    "entry": lambda index, x: _generic(f"entry {index[0]}")(x) if x.ndim == 1 else x[:, index[0]],
+}

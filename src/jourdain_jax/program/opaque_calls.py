@@ -1,0 +1,218 @@
+"""A jaxpr run over scalars but for the parts that have no scalar form: these become calls in the graph.
+
+An equation without a rule is kept. So are those that hand large arrays to it, those that go on with large arrays from it, and what lies between
+two that are kept; so a network is one call. Kept equations that follow on one another, with nothing that is not kept in between, are one call:
+
+    level of a scalar = the largest level of what it is made from,   level of what is kept = that, and one more behind a scalar
+
+and those of one level that hang together are put together.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+
+from jourdain_jax.program.calls import Call
+from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.interpret import Nodes, Value, apply, inner_jaxpr, refuse
+
+LARGE = 16  # entries of an array that is not taken apart beside a call
+LARGEST = 4096  # entries of an array of scalars
+
+
+class _Variable:
+    """A value, or one yet to be known."""
+
+    __slots__ = ("aval",)
+
+    def __init__(self, aval):
+        self.aval = aval
+
+    @property
+    def is_large(self) -> bool:
+        return self.aval.size > LARGE
+
+    @property
+    def may_be_scalars(self) -> bool:
+        return bool(np.issubdtype(self.aval.dtype, np.floating) or self.aval.dtype == bool) and self.aval.size <= LARGEST
+
+
+@dataclass(eq=False)
+class _Step:
+    """An equation; its inputs are variables or numbers."""
+
+    equation: Any
+    around: Any  # the jaxpr it comes from
+    inputs: list
+    outputs: list[_Variable]
+    kept: bool = False
+    reason: str = ""
+    level: int = 0
+    part: "list[_Step]" = field(default_factory=list)
+
+    @property
+    def variables(self) -> list[_Variable]:
+        return [x for x in self.inputs if isinstance(x, _Variable)]
+
+    def results(self, inputs: list) -> list:
+        """What JAX makes of the inputs."""
+        given = {v: x for v, x in zip(self.equation.invars, inputs, strict=True) if not isinstance(v, Literal)}
+        alone = self.around.replace(constvars=[], invars=list(given), outvars=list(self.equation.outvars), eqns=[self.equation])
+        return jaxpr_as_fun(ClosedJaxpr(alone, []))(*given.values())
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A value that is no array of scalars: the node of an array."""
+
+    node: int
+
+
+def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[Value]:
+    """Outputs of a closed jaxpr at the given arguments, as `interpret`, with calls for the parts that have no scalar form."""
+    inputs: list[_Variable] = [_Variable(v.aval) for v in closed.jaxpr.invars]
+    steps: list[_Step] = []
+    outputs = _flat(closed.jaxpr, closed.consts, inputs, steps)
+    steps = _needed(steps, outputs)
+    numbers = _judged(Graph(graph.most_multiplications, graph.keeps_rules), steps, inputs)
+    steps = [step for step in steps if any(v not in numbers for v in step.outputs)]
+    for step in steps:
+        step.inputs = [numbers.get(x, x) if isinstance(x, _Variable) else x for x in step.inputs]
+    users = _users(steps)
+    asked = {v for v in outputs if isinstance(v, _Variable)}
+    _put_together(steps, users, asked)
+    values: dict = dict(zip(inputs, arguments, strict=True)) | numbers
+    for step in sorted(steps, key=lambda step: (step.level, not step.kept)):  # otherwise in the order in which they came
+        if not step.kept:
+            results = apply(graph, step.equation.primitive.name, step.equation, [values[x] if isinstance(x, _Variable) else x for x in step.inputs])
+            values |= dict(zip(step.outputs, results, strict=True))
+        elif step is step.part[0]:
+            values |= _called(graph, step.part, values, users, asked)
+    return [values[x] if isinstance(x, _Variable) else x for x in outputs]
+
+
+def _flat(jaxpr, constants, arguments, steps: list[_Step]) -> list:
+    """Appends all equations, those of inner jaxprs in their place; functions with derivatives of their own stay whole."""
+    environment = dict(zip(jaxpr.constvars, map(np.asarray, constants), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
+
+    def read(atom):
+        return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else environment[atom]
+
+    for equation in jaxpr.eqns:
+        name, inputs = equation.primitive.name, [read(x) for x in equation.invars]
+        refuse(name, equation)
+        inner = None if name.startswith("custom_") else inner_jaxpr(name, equation.params)
+        if inner is None:
+            results = [_Variable(v.aval) for v in equation.outvars]
+            steps.append(_Step(equation, jaxpr, inputs, results))
+        else:
+            results = _flat(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), inputs, steps)
+        environment |= dict(zip(equation.outvars, results, strict=True))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def _needed(steps: list[_Step], outputs: list) -> list[_Step]:
+    """Those on which the outputs depend."""
+    wanted, found = {x for x in outputs if isinstance(x, _Variable)}, []
+    for step in reversed(steps):
+        if not wanted.isdisjoint(step.outputs):
+            found.append(step)
+            wanted.update(step.variables)
+    return found[::-1]
+
+
+def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict:
+    """Finds by trying which steps have a scalar form; returns the variables that are numbers."""
+    values: dict = {}
+
+    def introduce(v: _Variable) -> Nodes | None:
+        """New symbols, if a variable may be scalars."""
+        if not v.may_be_scalars:
+            return None
+        names = [f"{len(scratch.op)}_{i}" for i in range(v.aval.size)]
+        return Nodes(np.array([scratch.input(name, True) for name in names], np.int64).reshape(v.aval.shape))
+
+    for v in inputs:
+        values[v] = introduce(v)
+    for step in steps:
+        given = [values[x] if isinstance(x, _Variable) else x for x in step.inputs]
+        size = max(v.aval.size for v in step.outputs)
+        try:
+            if any(x is None for x in given):
+                raise Unsupported("")  # it follows what is kept
+            if size > LARGEST and any(isinstance(x, Nodes) for x in given):
+                raise Unsupported(f"an array of {size} numbers")
+            results = apply(scratch, step.equation.primitive.name, step.equation, given)
+        except Unsupported as reason:
+            step.kept, step.reason = True, str(reason)
+            results = [introduce(v) for v in step.outputs]
+        values |= dict(zip(step.outputs, results, strict=True))
+    return {v: x for v, x in values.items() if isinstance(x, np.ndarray)}
+
+
+def _users(steps: list[_Step]) -> dict[_Variable, list[_Step]]:
+    """The steps that need each variable."""
+    users: dict[_Variable, list[_Step]] = {}
+    for step in steps:
+        for v in dict.fromkeys(step.variables):
+            users.setdefault(v, []).append(step)
+    return users
+
+
+def _put_together(steps: list[_Step], users: dict[_Variable, list[_Step]], asked: set[_Variable]) -> None:
+    """Keeps what belongs to what is kept, and finds the parts that are one call."""
+    maker = {v: step for step in steps for v in step.outputs}
+    number = {id(step): k for k, step in enumerate(steps)}
+
+    def from_kept(step: _Step) -> list[_Variable]:
+        return [v for v in step.variables if v in maker and maker[v].kept]
+
+    for step in steps:
+        step.kept = step.kept or any(v.is_large for v in from_kept(step))
+    for step in reversed(steps):
+        inside = all(v not in asked and v in users and all(user.kept for user in users[v]) for v in step.outputs)
+        step.kept = step.kept or (inside and (any(v.is_large for v in step.outputs) or bool(from_kept(step))))
+    for step in steps:
+        made_by = [maker[v] for v in step.variables if v in maker]
+        if not step.kept:
+            step.level = max((other.level for other in made_by), default=0)
+            continue
+        step.level = max((other.level + (not other.kept) for other in made_by), default=1)
+        step.part = [step]
+        for other in made_by:
+            if other.kept and other.level == step.level and other.part is not step.part:
+                joined = sorted([*other.part, *step.part], key=lambda member: number[id(member)])
+                for member in joined:
+                    member.part = joined
+
+
+def _called(graph: Graph, part: list[_Step], values: dict, users: dict[_Variable, list[_Step]], asked: set[_Variable]) -> dict:
+    """Values of what a part computes for others, by a call."""
+    made = [v for step in part for v in step.outputs]
+    operands = [v for v in dict.fromkeys(v for step in part for v in step.variables) if v not in made]
+    results = [v for v in made if v in asked or any(user.part is not part for user in users.get(v, ()))]
+    arrays = [_as_array(graph, values[v], v.aval) for v in operands]
+    found = graph.kept(_call(part, operands, results), arrays, [(v.aval.shape, str(v.aval.dtype)) for v in results])
+    taken_apart = [v in asked or not all(user.kept for user in users[v]) for v in results]
+    return {v: Nodes(graph.entries(node)) if apart else _Kept(node) for v, node, apart in zip(results, found, taken_apart, strict=True)}
+
+
+def _as_array(graph: Graph, value, aval) -> int:
+    return value.node if isinstance(value, _Kept) else graph.array(value.ids.ravel().tolist(), aval.shape, str(aval.dtype))
+
+
+def _call(part: list[_Step], operands: list[_Variable], results: list[_Variable]) -> Call:
+    """The part as a function of its operands."""
+
+    def function(*arrays):
+        known = dict(zip(operands, arrays, strict=True))
+        for step in part:
+            known |= dict(zip(step.outputs, step.results([known[x] if isinstance(x, _Variable) else x for x in step.inputs]), strict=True))
+        return [known[v] for v in results]
+
+    closed = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in operands))
+    reasons = tuple(dict.fromkeys(step.reason for step in part if step.reason))
+    return Call(closed, reasons or ("what is made of the arrays of another call",))

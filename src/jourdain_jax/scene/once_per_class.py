@@ -1,0 +1,28 @@
+"""What depends on a scene's class and the shapes of its parameters only, worked out once."""
+
+from collections.abc import Callable, Hashable
+from functools import wraps
+
+import jax
+import numpy as np
+
+from jourdain_jax.scene.scene import Scene
+
+MOST_CASES = 1024  # that are kept of one function
+
+
+def once_per_class(describe: Callable) -> Callable:
+    """A function of a scene (and of what else tells its cases apart) that depends on its class and the shapes of its parameters only: worked out once."""
+    known: dict = {}
+
+    @wraps(describe)
+    def of(scene: Scene, *case: Hashable):
+        leaves, treedef = jax.tree.flatten(scene)
+        key = (treedef, tuple(np.shape(x) for x in leaves), jax.config.jax_enable_x64, case)
+        if key not in known:
+            if len(known) >= MOST_CASES:
+                known.pop(next(iter(known)))  # the oldest
+            known[key] = describe(scene, *case)
+        return known[key]
+
+    return of
