@@ -172,6 +172,7 @@ class StateForm(eqx.Module):
         if self.lowered is not None:
             q, v = self.lowered.projected(fixed, t, tuple(y.q), tuple(y.v), inputs, self.affine)
             return Integrated(jnp.stack(q), jnp.stack(v) if v else y.v, y.work)
+        assert self.usual is not None  # where matrices are dense
         q = project_positions(scene, t, y.q, iterations=iterations, typical=self.usual.closures) if self.projects_positions else y.q
         v = y.v
         if self.projects_speeds:

@@ -185,7 +185,7 @@ def _vjp(residuals, cotangents, perturbed, moving, control, forward, method):
         t_0, t_1, y = _at(window.t, i - 1), _at(window.t, i), _at(window.y, i - 1)
         idle = t_0 == t_1
         moving = _where(idle, jax.tree.map(jnp.zeros_like, g.y), g.y)
-        gone = step_adjoint.back(problem_of, differentiable, method, t_0, t_1, y, moving)
+        gone = step_adjoint.step_vjp(problem_of, differentiable, method, t_0, t_1, y, moving)
         at_end = jnp.where(idle, g.t, g.t + gone.t_1)
         # the end of a step is a number, but where it is a time that was asked for, or a knot
         not_event = ~(located & (t_1 == end.t))
