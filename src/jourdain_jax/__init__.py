@@ -55,6 +55,7 @@ from jourdain_jax.equations.virtual_power import (
     unconstrained_equations,
     virtual_power,
 )
+from jourdain_jax.lowering.built import Built, build
 from jourdain_jax.lowering.lower import NotLowered, lower
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.batches.rollout import Rollout, rollout
@@ -90,6 +91,7 @@ __version__ = _version_of("jourdain-jax")
 __all__ = [
     "Accelerations",
     "Baumgarte",
+    "Built",
     "Contact",
     "Cylinder",
     "DifferentiationModeError",
@@ -133,6 +135,7 @@ __all__ = [
     "animate",
     "ball_contact",
     "bounds",
+    "build",
     "consistent",
     "constraint_rows",
     "coordinate_rates",

@@ -24,13 +24,14 @@ from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.unknowns import Unknowns, check_starts, unknowns_of
 from jourdain_jax.build.reference_parameters import reference_parameters
 from jourdain_jax.motion.integrators.forward_mode import simulate_forward
+from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.scene import Scene
 
 _NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
 
 
 def fit(
-    scene: Scene,
+    scene: Scene | BuiltFor,
     data: Measurements | Sequence[Measurements],
     free: "Mapping[str, Bijection | None] | Iterable[str]" = (),
     *,
@@ -61,13 +62,14 @@ def fit(
     **Raises** ValueError for names, shapes or numbers that do not fit, no or too many unknowns, and a start that contradicts the
     constraints.
     """
+    scene = as_scene(scene)
     problem = _problem(scene, data, free, repeats=False)
     with reference_parameters(scene):
         return _fit(problem, problem.measured(), simulation, cutoff, tolerance, max_iterations)
 
 
 def fit_batch(
-    scene: Scene,
+    scene: Scene | BuiltFor,
     data: Measurements | Sequence[Measurements],
     free: "Mapping[str, Bijection | None] | Iterable[str]" = (),
     *,
@@ -82,6 +84,7 @@ def fit_batch(
     `simulation` as in `fit`. **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has `converged` False and harms no other.
     **Raises** as `fit`.
     """
+    scene = as_scene(scene)
     problem = _problem(scene, data, free, repeats=True)
     counts = {values.shape[0] for run in problem.measured() for values in run.values()}
     if len(counts) != 1 or 0 in counts:

@@ -28,7 +28,7 @@ from jourdain_jax.analysis.tangent import (
 from jourdain_jax.calculus.reals import Numbers
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State
-from jourdain_jax.scene.arguments import as_input_vector, as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
@@ -90,7 +90,7 @@ class Linearization(Printed, eqx.Module):
 
 
 def linearize(
-    scene: Scene,
+    scene: Scene | BuiltFor,
     state: State | dict | None,
     coordinates: str | tuple[str, ...] | None = None,
     *,
@@ -117,7 +117,8 @@ def linearize(
 
     **Raises** ValueError: an unknown coordinate or speed, a coordinate that is both named and dependent, or whose rate is no privileged speed.
     """
-    f = as_input_vector(as_scene(scene), inputs)
+    scene = as_scene(scene)
+    f = as_input_vector(scene, inputs)
     state = as_state(scene, state, what="state", inputs=f)
     f = f.astype(state.q.dtype)
     coordinates = None if coordinates is None else as_names(coordinates)

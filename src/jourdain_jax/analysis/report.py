@@ -7,12 +7,10 @@ from jourdain_jax.build.domain import COORDINATE_DOMAIN, SPEED_DOMAIN
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.cyclic import cyclic_coordinates, ignorable_coordinates
-from jourdain_jax.equations.event_names import names_of_events
-from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.lowering.built import Built, build
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State
-from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.arguments import BuiltFor
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -130,7 +128,7 @@ class Report(Printed):
         return f"{worst}, typically {self.typical_pivot:.2g} (1 is best)"
 
 
-def report(scene: Scene, *, depth: int = 4, start: State | dict | None = None) -> Report:
+def report(scene: Scene | BuiltFor, *, depth: int = 4, start: State | dict | None = None) -> Report:
     """Degrees of freedom, rows, rank, redundancy, integrability, growth vector, cyclic and ignorable coordinates of a scene.
 
     `depth` bounds the number of fields in a bracket for the growth vector. `start`: a state, or named values as for `jj.start`, at which the rank is
@@ -138,7 +136,8 @@ def report(scene: Scene, *, depth: int = 4, start: State | dict | None = None) -
     for machines. Found numerically at random states of the scene's `domain` and at symmetric configurations (zero and right
     angles): what holds at all of them is taken to hold everywhere.
     """
-    structure = structure_of(as_scene(scene))
+    built = build(scene)
+    scene, structure = built.scene, structure_of(built.scene)
     by_row, growth = row_integrability(scene), growth_vector(scene, depth=depth)
     return Report(
         scene=type(scene).__name__,
@@ -162,12 +161,12 @@ def report(scene: Scene, *, depth: int = 4, start: State | dict | None = None) -
         ignorable_coordinates=ignorable_coordinates(scene),
         privileged_velocities=tuple(scene.speed_names.entries[i] for i in structure.independent),
         privileged_by_user=structure.chosen_by_user,
-        lowering=_lowering(scene),
+        lowering=_lowering(built),
         worst_pivot=structure.worst_pivot,
         typical_pivot=structure.typical_pivot,
         rank_losses=structure.rank_losses,
         rank_at_start=None if start is None else _rank_at(scene, as_state(scene, start)),
-        events=names_of_events(scene),
+        events=built.events,
         domain={name: (float(low), float(high)) for name, (low, high) in scene.domain.items()},
         conventions=scene.conventions,
     )
@@ -195,9 +194,9 @@ def _wrapped(label: str, text: str) -> list[str]:
     return [f"  {label if i == 0 else '':<{_LABEL - 2}}{line}" for i, line in enumerate(lines)]
 
 
-def _lowering(scene: Scene) -> str:
-    found = lowered(scene)
-    if not isinstance(found, Lowered):
-        return f"not lowered: {found}"
+def _lowering(built: Built) -> str:
+    found = built.program
+    if found is None:
+        return f"not lowered: {built.not_lowered}"
     calls = "".join(f"; {reason} has no scalar form: kept as a call" for reason in found.calls)
     return f"a scalar program of {found.operations} operations{calls}"

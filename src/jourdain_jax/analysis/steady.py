@@ -25,7 +25,7 @@ from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.motion.start import State
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.graph import Unsupported
-from jourdain_jax.scene.arguments import as_input_vector, as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.printing import Printed
@@ -55,7 +55,7 @@ class SteadyMotion(Printed, eqx.Module):
 
 
 def steady(
-    scene: Scene,
+    scene: Scene | BuiltFor,
     guess: "State | dict",
     *,
     held: str | tuple[str, ...] = (),
@@ -85,7 +85,8 @@ def steady(
     """
     if not isinstance(max_steps, int | np.integer) or max_steps < 1:
         raise ValueError(f"`max_steps` is {max_steps!r}, expected a whole number of at least 1")
-    t, q, u = _guessed(as_scene(scene), guess, t0)
+    scene = as_scene(scene)
+    t, q, u = _guessed(scene, guess, t0)
     f = as_input_vector(scene, inputs, q.dtype).astype(q.dtype)
     held = as_names(held)
     names = scene.coordinate_names.entries + scene.speed_names.entries

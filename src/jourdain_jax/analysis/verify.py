@@ -37,12 +37,12 @@ from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import equations_and_rows, kinetic_energy, newton_residual, potential_energy
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State
-from jourdain_jax.scene.arguments import as_input_vector, as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import loads_of, potential_of
 
 
-def verify(scene: Scene, state: State | dict | None = None, inputs: Numbers | dict | None = None, *, seed: int = 0) -> Verification:
+def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: Numbers | dict | None = None, *, seed: int = 0) -> Verification:
     """Check the equations of a scene, and what it states, at a consistent state; a failed check names its culprit.
 
         print(verify(disc, start(disc, lean=0.3, spin_rate=-3.0)))
@@ -63,7 +63,8 @@ def verify(scene: Scene, state: State | dict | None = None, inputs: Numbers | di
     """
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
-    inputs = as_input_vector(as_scene(scene), inputs)
+    scene = as_scene(scene)
+    inputs = as_input_vector(scene, inputs)
     state = as_state(scene, state, what="state", inputs=inputs)
     t, q, u = state.t, state.q, state.u
     found = _evaluate(scene, t, q, u, inputs, usual_rows(scene), plain_row_lengths(scene))

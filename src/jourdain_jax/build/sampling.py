@@ -91,9 +91,9 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
         )
         raise NoStateFoundError(
             f"no admissible state of `{type(scene).__name__}` was found in its `domain`: positions miss the geometric rows by "
-            f"{np.min(found.position_error[generic]):.1e} or more; state a `domain` nearer to an assembled configuration, or check the geometric rows against each "
-            "other (where parameters are traced, numbers near their defaults stood in for them, or near one where they have none: give defaults near the "
-            f"values in use){nowhere}"
+            f"{np.min(found.position_error[generic]):.1e} or more; state a `domain` nearer to an assembled configuration, or check the geometric rows "
+            "against each other (where parameters are traced, numbers near their defaults stood in for them, or near one where they have none: give "
+            f"defaults near the values in use){nowhere}"
         )
     outside = np.sort(found.outside[good & generic])
     return good & (found.outside <= max(outside[min(FEW_INSIDE, len(outside)) - 1], NEARLY_INSIDE))

@@ -1,7 +1,6 @@
 """Functions of numbers run at once on NumPy, uncompiled: a first call at a prompt takes a tenth of the time that compiling takes."""
 
-from collections import Counter
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from functools import lru_cache, wraps
 from inspect import signature
 
@@ -12,21 +11,6 @@ import numpy as np
 
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.eager.numpy_backend import uncompiled
-
-
-class Seldom:
-    """Counts calls: true for the first `often` ones of a kind, if their numbers are known. So long compiling does not pay (`eval_numpy` instead)."""
-
-    def __init__(self, often: int):
-        self.often = often
-        self._calls: Counter[Hashable] = Counter()
-
-    def __call__(self, kind: Hashable, numbers) -> bool:
-        """Whether this call of that kind is one of the first; `numbers`: anything with leaves."""
-        if is_traced(numbers):
-            return False
-        self._calls[kind] += 1
-        return self._calls[kind] <= self.often
 
 
 def eval_numpy(f: Callable) -> Callable:

@@ -31,6 +31,7 @@ from jourdain_jax.lowering.mismatch import diagnose_mismatch
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.identity_test import IdentityProbes, equal
+from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -64,7 +65,7 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
     return _lowered(_Key(with_reference_parameters(scene), structure, every_speed, massless))
 
 
-def lower(scene: Scene, every_speed: bool | None = None) -> Lowered:
+def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
     """The lowered equations of `scene`'s class: the scalar program that `simulate` and `rollout` integrate. Raises `NotLowered` with the reason.
 
     print(jj.lower(disc))                     operations after each step, what was dropped and why
@@ -73,6 +74,7 @@ def lower(scene: Scene, every_speed: bool | None = None) -> Lowered:
     `every_speed`: whether all speeds stay in the state and the rows are kept by multipliers (True), or dependent speeds are eliminated (False);
     default: the latter where privileged speeds serve everywhere in the scene's domain.
     """
+    scene = as_scene(scene)
     found = lowered(scene, every_speed)
     if isinstance(found, NotLowered):
         raise NotLowered(f"`{type(scene).__name__}` is not lowered: {found}") from None

@@ -34,7 +34,7 @@ from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.state_form import StateForm, cutoff_of, default_reduction
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.once_per_class import once_per_class
@@ -46,7 +46,7 @@ _OFF = 1e4  # units of round-off: a residual that is more
 
 
 def simulate(
-    scene: Scene,
+    scene: Scene | BuiltFor,
     start=None,
     *,
     t0: Number | None = None,
@@ -116,7 +116,7 @@ def _integrated(setup: Setup) -> Trajectory:
     return marked(integrate, setup)
 
 
-def set_up(scene: Scene, start=None, **options) -> Setup:
+def set_up(scene: Scene | BuiltFor, start=None, **options) -> Setup:
     """What `simulate` integrates for these arguments, which are its own."""
     bound = inspect.signature(simulate).bind(scene, start, **options)
     bound.apply_defaults()

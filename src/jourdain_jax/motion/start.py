@@ -17,12 +17,13 @@ from jourdain_jax.build.sampling import NoStateFoundError, seen_on_rows
 from jourdain_jax.build.structure import Structure, closure_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.damped import damped_root
 from jourdain_jax.calculus.reals import Number, Numbers
-from jourdain_jax.eager.eager import Seldom, eval_numpy
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.projection import closure_residual, position_error_of_rows, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs
-from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_scene, as_speeds, as_time
+from jourdain_jax.motion.quick_compilation import quickly_compiled
+from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import is_traced
@@ -92,17 +93,13 @@ def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable
     if is_traced(arguments):
         found = _put_onto_constraints(*arguments, guesses())
     else:
-        project = _uncompiled_projection if _seldom(jax.tree.structure(scene), ()) else _compiled_projection
-        found = project(*arguments, None)
-        if not found.arrived and _can_search(scene):
+        found = _compiled_projection(*arguments, None)
+        if not found.arrived and _can_search(scene):  # rare, and long to compile
             found = _uncompiled_projection(*arguments, guesses())
     found = jax.tree.map(jnp.asarray, found)
     return State(
         t, found.q, found.u, found.moved_q, found.moved_u, found.residual, (scene.coordinate_names, scene.speed_names), found.guess.astype(found.q.dtype)
     )
-
-
-_seldom = Seldom(often=8)
 
 
 class _Found(eqx.Module):
@@ -189,11 +186,11 @@ def _tolerance(dtype) -> float:
     return 1e3 * float(np.sqrt(np.finfo(dtype).eps))
 
 
-_compiled_projection = eqx.filter_jit(_put_onto_constraints)  # one program for every choice of what is held
+_compiled_projection = quickly_compiled(_put_onto_constraints, run_seldom=True)  # one program for every choice of what is held
 _uncompiled_projection = eval_numpy(_put_onto_constraints)
 
 
-def start(scene: Scene, *, t0: Number = 0.0, inputs=None, **values) -> State:
+def start(scene: Scene | BuiltFor, *, t0: Number = 0.0, inputs=None, **values) -> State:
     """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`.
 
     `values` that are given are kept, at time `t0` (s). Coordinates that are not given begin at zero (a quaternion at the identity) and follow from the rows;
@@ -203,12 +200,14 @@ def start(scene: Scene, *, t0: Number = 0.0, inputs=None, **values) -> State:
     `inputs`: as in `simulate`, name -> number, function of time, or `Sampled`; what they are at `t0` counts where velocity rows depend on them.
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
     """
-    return named_start(scene, values, t0, as_inputs(as_scene(scene), inputs).at(as_time(t0)))
+    scene = as_scene(scene)
+    return named_start(scene, values, t0, as_inputs(scene, inputs).at(as_time(t0)))
 
 
-def named_start(scene: Scene, values: Mapping, t0, inputs: Float[Array, "inputs"]) -> State:
-    """The same from a dictionary of `values`, and the `inputs` at time `t0` as a vector."""
-    q, u, given = as_scene(scene).named(**values)
+def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs: Float[Array, "inputs"]) -> State:
+    """A start from a dictionary of `values`, as of `start`, and the `inputs` at time `t0` as a vector."""
+    scene = as_scene(scene)
+    q, u, given = scene.named(**values)
     _check_finite({**values, "t0": t0})
     t, free_q = as_time(t0), np.array([name not in given for name in scene.coordinate_names.entries], bool)
     known = _structure(scene, t, q, free_q)

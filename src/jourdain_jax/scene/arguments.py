@@ -15,10 +15,18 @@ from jourdain_jax.scene.numbers import checked_real, described
 from jourdain_jax.scene.scene import Scene
 
 
+class BuiltFor:
+    """What was found about a scene; it may stand wherever that scene does."""
+
+    scene: Scene
+
+
 def as_scene(scene) -> Scene:
     """The scene itself; a ValueError where it is none, or the class and not one of its instances."""
     if isinstance(scene, Scene):
         return scene
+    if isinstance(scene, BuiltFor):
+        return scene.scene
     if isinstance(scene, type) and issubclass(scene, Scene):
         raise ValueError(f"`scene` is the class `{scene.__name__}`, expected a scene of it; write `{scene.__name__}()`, with parameters in the parentheses")
     raise ValueError(f"`scene` is {described(scene)}, expected a scene: an instance of a subclass of `jj.Scene`")

@@ -27,7 +27,7 @@ from jourdain_jax.motion.start import State
 from jourdain_jax.motion.state_form import StateForm
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.parameters import parameter_faults, parameters_of
@@ -115,7 +115,7 @@ class Rollout(Printed, eqx.Module):
 
 
 def rollout(
-    scene: Scene,
+    scene: Scene | BuiltFor,
     starts: "dict | State | None" = None,
     *,
     parameters: dict | None = None,
@@ -133,7 +133,8 @@ def rollout(
     Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`. In reverse mode a lane whose start
     or parameters are NaN makes derivatives by what all lanes share NaN, even where its result is not used, as everywhere in JAX: leave it out first.
     """
-    starts = dict(as_scene(scene).example) if starts is None else starts
+    scene = as_scene(scene)
+    starts = dict(scene.example) if starts is None else starts
     for what, given in (("starts", starts), ("parameters", parameters)):
         if given is not None and not isinstance(given, Mapping) and not (what == "starts" and isinstance(given, State)):
             raise ValueError(f'`{what}` is {described(given)}, expected a dictionary by name, such as {{"x": jnp.linspace(0.0, 1.0, 8)}}')

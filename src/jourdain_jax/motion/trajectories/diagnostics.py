@@ -11,10 +11,11 @@ from jaxtyping import Array, Float, Int
 from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.dynamics.reactions import ContactForce
-from jourdain_jax.eager.eager import Seldom, eval_numpy
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.motion.trajectories.over_times import Record, accelerations_over_times, contact_forces_over_times, energies, invariants, residuals
 from jourdain_jax.motion.trajectories.results import FALLBACKS
+from jourdain_jax.scene.numbers import is_traced
 
 
 class Energies(eqx.Module):
@@ -75,7 +76,7 @@ def diagnose(trajectory: Record) -> Diagnostics:
 
     Times that were not reached do not count.
     """
-    if trajectory.ts.shape[0] <= FEW_TIMES and _seldom((jax.tree.structure(trajectory), trajectory.ts.shape), trajectory):
+    if trajectory.ts.shape[0] <= FEW_TIMES and not is_traced(trajectory):
         return jax.tree.map(jnp.asarray, _uncompiled(trajectory, usual_rows(trajectory.scene)))
     return _diagnosed(trajectory, usual_rows(trajectory.scene))
 
@@ -85,7 +86,6 @@ COARSE = 1e-3  # of a step: a clock that resolves less rounds times visibly
 VIOLATED = 1e-4  # residual of a row, relative to the state
 DRIFTED = 1e-2  # of the energy that moves
 _ROUND_OFF = 1e-6  # of the whole energy: where less than that moves, as at rest, nothing is said of its drift
-_seldom = Seldom(often=100)
 
 
 def _diagnosed(trajectory: Record, usual: UsualRows) -> Diagnostics:

@@ -1,0 +1,87 @@
+"""The two phases: what is built once about a scene is one value, and what comes after does not depend on how often, or after what, it is called."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.models import MODELS, ChaplyginSleigh, DoublePendulumRods, TiltingDisc
+
+OFTEN = 12  # more than any number of calls that once changed the way
+
+
+@pytest.fixture(scope="module")
+def disc():
+    return jj.build(TiltingDisc())
+
+
+def test_what_is_built_is_there_part_by_part(disc):
+    assert disc.rows.names == ("contact_x", "contact_y") or len(disc.rows.names) == disc.rows.rank
+    assert disc.freedoms.count == len(disc.scene.speed_names) - disc.rows.rank
+    assert set(disc.freedoms.privileged) | set(disc.freedoms.dependent) == set(disc.scene.speed_names.entries)
+    assert disc.dependence.on_time == ()
+    assert disc.conserved.energy
+    assert set(disc.conserved.ignorable) >= {"x", "y", "yaw", "spin"}
+    assert disc.program.operations == jj.lower(TiltingDisc()).operations
+    assert (disc.state, disc.not_lowered) == ("minimal", "")
+    assert not disc.warnings
+    assert all(word in str(disc) for word in ("TiltingDisc, built", "privileged speeds", "27 operations", "conserved"))
+
+
+def test_warnings_say_where_rank_is_lost():
+    built = jj.build(DoublePendulumRods())
+    report = jj.report(DoublePendulumRods())
+    assert built.rows.rank_losses == report.rank_losses
+    assert bool(built.warnings) == bool(report.rank_losses)
+
+
+def test_what_was_built_is_pickled_as_its_scene(disc):
+    again = pickle.loads(pickle.dumps(disc))
+    assert str(again).split("way")[0].splitlines()[:6] == str(disc).splitlines()[:6]
+    assert again.rows == disc.rows
+    assert again.freedoms == disc.freedoms
+
+
+def test_what_was_built_stands_wherever_its_scene_does():
+    sleigh = ChaplyginSleigh()
+    built = jj.build(sleigh)
+    start, ts = {"x_rate": 0.5, "heading_rate": 0.3}, jnp.array([0.5, 1.0])
+    np.testing.assert_array_equal(jj.simulate(built, start, ts=ts).q, jj.simulate(sleigh, start, ts=ts).q)
+    many = {"x_rate": jnp.array([0.5, 0.6])}
+    np.testing.assert_array_equal(jj.rollout(built, many, ts=ts).lanes.q, jj.rollout(sleigh, many, ts=ts).lanes.q)
+    state = jj.start(built, **start)
+    np.testing.assert_array_equal(state.u, jj.start(sleigh, **start).u)
+    np.testing.assert_array_equal(jj.linearize(built, state).A, jj.linearize(sleigh, state).A)
+    assert str(jj.report(built)) == str(jj.report(sleigh))
+    assert jj.lower(built) is jj.lower(sleigh)
+    data = jj.Measurements(ts, {"heading": jnp.array([0.1, 0.2])}, 0.01, start=start)
+    fits = [jj.fit(scene, data, free=["offset"]) for scene in (built, sleigh)]
+    assert fits[0].estimates == fits[1].estimates
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_start_and_a_diagnosis_are_bit_equal_however_often_they_are_asked_for(name):
+    scene = MODELS[name]()
+    starts = [jj.start(scene, **scene.example) for _ in range(OFTEN)]
+    for start in starts[1:]:
+        assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(start), jax.tree.leaves(starts[0]), strict=True))
+    found = jj.accelerations(scene, starts[0].t, starts[0].q, starts[0].u).udot
+    jj.sample_states(scene, 2)  # anything in between
+    assert np.array_equal(found, jj.accelerations(scene, starts[-1].t, starts[-1].q, starts[-1].u).udot)
+
+
+@pytest.mark.parametrize("scene", [ChaplyginSleigh(), DoublePendulumRods()], ids=["minimal", "full"])
+def test_a_motion_and_its_diagnosis_are_bit_equal_however_often_they_are_asked_for(scene):
+    ts = jnp.linspace(0.0, 0.5, 4)
+    motions = [jj.simulate(scene, scene.example, ts=ts) for _ in range(OFTEN)]
+    inside = jax.jit(lambda start: jj.simulate(scene, start, ts=ts))
+    start = jj.start(scene, **scene.example)
+    compiled = [inside(start) for _ in range(3)]
+    for first, *others in (motions, compiled):
+        for other in others:
+            assert np.array_equal(first.q, other.q)
+            assert np.array_equal(first.u, other.u)
+    assert len({str(motion) for motion in motions for _ in range(10)}) == 1
