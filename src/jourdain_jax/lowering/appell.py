@@ -30,11 +30,9 @@ class Strategy:
     """How the equations are built; all give the same values."""
 
     explicit: bool = True
-    keep_sines: bool = False
     most_terms: int = 0  # of a normal form; 0: none are made
     most_terms_of_equations: int = 0  # the same for the entries of M and f
-    by_determinants: bool = False  # the accelerations in normal form, by Cramer's rule
-    free_z: bool = False  # implicit only: normal forms are made while dependent speeds are symbols
+    by_determinants: bool = False  # the accelerations in normal form, by Cramer's rule, while dependent speeds are symbols
     held: tuple[int, ...] = ()  # ignorable coordinates, held at the reference in the accelerations
 
     @property
@@ -90,10 +88,10 @@ class AppellOnGraph:
 
     def build(self, strategy: Strategy) -> Equations:
         """The equations by one strategy."""
-        forms = self._forms(strategy.keep_sines, strategy.most_terms)
+        forms = self._forms(strategy.most_terms)
         held = self._at_reference(strategy.held)
-        kinematics = _Kinematics(self, forms, held, strategy.explicit, strategy.free_z)
-        forms_of_equations = self._forms(strategy.keep_sines, strategy.most_terms_of_equations)
+        kinematics = _Kinematics(self, forms, held, strategy.explicit, strategy.by_determinants)
+        forms_of_equations = self._forms(strategy.most_terms_of_equations)
         M, f = self._equations(kinematics, forms_of_equations)
         if self.kept and self.multiplied:
             ydot, sines, margins, usual = self.kept.accelerations(M, f, *kinematics.rows_along_motion(self.multiplied), forms)
@@ -104,7 +102,7 @@ class AppellOnGraph:
         guards = {node for made in (forms, forms_of_equations) if made is not None for node in made.guards}
         guards |= set(margins)
         power = self._power(kinematics, ydot)
-        if strategy.free_z:
+        if strategy.by_determinants:
             *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
             qdot = self.graph.substituted(qdot, kinematics.known)
         true_z = {int(self.traced.u[k]): n for k, n in zip(self.dependent, z, strict=True)}
@@ -134,7 +132,7 @@ class AppellOnGraph:
                 moved[first : first + 4] = [g.div(part, g.call("sqrt", n)) for part in q[first : first + 4]]
         if not (self.kept and self.multiplied):
             return Projection(moved, [])
-        forms = self._forms(False, most_terms)
+        forms = self._forms(most_terms)
         M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
         phi = [int(at.phi[s]) for s in self.multiplied]
         return Projection(moved, self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms))
@@ -197,14 +195,14 @@ class AppellOnGraph:
         z = [known[k] for k in self.dependent]
         return z, simple(g.substituted(at.qdot.tolist(), {u[k]: n for k, n in known.items() if k not in self.independent})), found.pivots
 
-    def _forms(self, keep_sines: bool, most_terms: int):
+    def _forms(self, most_terms: int):
         if most_terms == 0:
             return None
         squares: dict[int, Polynomial] = {}
         for first in self.quaternions:
             w, *xyz = (int(n) for n in self.traced.q[first : first + 4])
             squares[w] = {(): 1.0} | {(n, n): -1.0 for n in xyz}
-        return NormalForms(self.graph, most_terms, keep_sines, self.probes.sign, squares)
+        return NormalForms(self.graph, most_terms, self.probes.sign, squares)
 
     def _equations(self, k: "_Kinematics", forms) -> tuple[list[list[int]], list[int]]:
         g, at = self.graph, k.at

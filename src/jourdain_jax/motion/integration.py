@@ -39,6 +39,7 @@ from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
 OWN_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
+OWN_ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode)
 
 
 class Options(eqx.Module):
@@ -56,9 +57,10 @@ class Options(eqx.Module):
 
     @property
     def by_erk_loop(self) -> bool:
-        """Whether our own explicit Runge-Kutta loop integrates it."""
+        """Whether our own explicit Runge-Kutta loop integrates it: it has a solver, a controller and an adjoint of its own, and nothing else was stated."""
         plain = self.controller is None and self.saveat is None and self.land
-        return plain and type(self.solver) in OWN_SOLVERS and type(self.adjoint) in (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode)
+        checkpoints = isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) and self.adjoint.checkpoints is not None
+        return plain and not checkpoints and type(self.solver) in OWN_SOLVERS and type(self.adjoint) in OWN_ADJOINTS
 
 
 class Solved(eqx.Module):

@@ -82,7 +82,8 @@ def simulate(
       `diffrax.diffeqsolve`. Default solver: Tsit5 for
       rtol >= 1e-6, Dopri8 below, and where these run out of steps on a stiff motion, `RadauIIA`; structure-preserving ones (`ImplicitMidpoint`,
       `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps of at most `dt0` between saved times.
-      Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order); `diffrax.ForwardMode()`
+      Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order, by recorded steps; with `checkpoints=`, that of
+      diffrax); `diffrax.ForwardMode()`
       for forward mode of any order; `diffrax.DirectAdjoint()` for all.
     - `state`: "minimal" (q and privileged speeds), "full" (q and u) or "auto"; `reduction`: as in `accelerations`.
     - `projection`: put the state back onto the constraints after each step, where the state form does not keep them by itself.

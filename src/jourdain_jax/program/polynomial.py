@@ -20,9 +20,8 @@ class TooLarge(Exception):
 
 
 class NormalForms:
-    """Normal forms of nodes of one graph.
+    """Normal forms of nodes of one graph; squares of sines are replaced by those of cosines (the other way took fewer operations in no model).
 
-    - `keep_sines`: squares of cosines are replaced, instead of those of sines.
     - `sign`: 1, -1 or 0 (unknown) for a node: |x| becomes x or -x where it is known, and x is noted in `guards` (with its sign).
     - `squares`: atoms whose squares are other polynomials (one entry of a unit quaternion).
     """
@@ -31,13 +30,12 @@ class NormalForms:
         self,
         graph: Graph,
         most_terms: int,
-        keep_sines: bool = False,
         sign: Callable[[int], int] = lambda node: 0,
         squares: Mapping[int, Polynomial] | None = None,
     ):
         self.graph, self.most_terms, self._sign = graph, most_terms, sign
         self.guards: set[int] = set()  # nodes that must stay positive
-        self._square_of, self._square_into = ("cos", "sin") if keep_sines else ("sin", "cos")
+        self._square_of, self._square_into = "sin", "cos"
         self._expanded: dict[int, Polynomial | None] = {graph.zero: {}}
         self._squares: dict[int, Polynomial] = dict(squares or {})
         self._simplified: dict[int, int] = {}
