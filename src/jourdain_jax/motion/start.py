@@ -207,7 +207,7 @@ def start(scene: Scene, *, t0: Number = 0.0, inputs=None, **values) -> State:
 
 
 def named_start(scene: Scene, values: Mapping, t0, inputs: Float[Array, "inputs"]) -> State:
-    """The same from a dictionary of `values`, and the `inputs` at time `t0` as a vector."""
+    """A consistent start from a dictionary of named `values`, and the `inputs` at time `t0` as a vector."""
     q, u, given = as_scene(scene).named(**values)
     _check_finite({**values, "t0": t0})
     t, free_q = as_time(t0), np.array([name not in given for name in scene.coordinate_names.entries], bool)
