@@ -1,7 +1,12 @@
 """The map of the code: `bench/code_map.py` reads the source that is there, and the layer table names all of it."""
 
+import ast
+import re
+
 import code_map
 from test_layers import LAYERS, LONGEST
+
+PAGE = code_map.ROOT / "docs" / "architecture.md"
 
 
 def test_the_layers_are_the_packages():
@@ -37,6 +42,24 @@ def test_a_call_through_a_callback_goes_up():
     assert result == 1
     assert found["files"] == {"calculus/below.py": 1, "motion/above.py": 1}
     assert found["up"] == [["calculus/below.py: calls", "motion/above.py: handed", 1]]
+
+
+def test_the_page_on_the_packages_names_what_there_is():
+    text = re.sub(r"\s+", " ", PAGE.read_text(encoding="utf-8"))
+    rows = re.findall(r"\| `(\w+)` \|", text)
+    assert tuple(reversed(rows)) == LAYERS
+    named = re.findall(r"`([\w/]+\.py): ([^`]+)`", text)
+    assert len(named) > 40
+    missing = [f"{file}: {name}" for file, names in named for name in names.split(", ") if name not in names_in(file)]
+    assert not missing, missing
+
+
+def names_in(file: str) -> set[str]:
+    """Functions and classes of a file, methods as `Class.method`."""
+    body = ast.parse((code_map.SOURCE / file).read_text(encoding="utf-8")).body
+    defined = [node for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+    inner = [f"{node.name}.{method.name}" for node in defined for method in ast.iter_child_nodes(node) if isinstance(method, ast.FunctionDef)]
+    return {node.name for node in defined} | set(inner)
 
 
 def compile_in(file: str, text: str) -> dict:
