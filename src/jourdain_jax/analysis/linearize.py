@@ -66,7 +66,7 @@ class Linearization(Printed, eqx.Module):
         return _ascending(jnp.linalg.eigvals(self._companion()))
 
     def modes(self) -> Modes:
-        """The same with the shapes of the named coordinates (no derivative)."""
+        """Eigenvalues, as `eigenvalues` gives them, with the shapes of the modes in the named coordinates (no derivative)."""
         values, vectors = jnp.linalg.eig(jax.lax.stop_gradient(self._companion()))
         order = jnp.lexsort((values.imag, values.real))
         shapes = vectors[: len(self.coordinates), order]

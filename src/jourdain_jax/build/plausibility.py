@@ -39,7 +39,7 @@ def pose_numbers(scene: Scene, t, q) -> PoseNumbers:
 
 
 def numbers_of(scene: Scene, pose: Pose) -> PoseNumbers:
-    """The same from known poses."""
+    """What the scene gives for its bodies and planes, from known poses."""
     rigid = {name: body.body for name, body in pose.bodies.items() if isinstance(body.body, RigidBody)}
     contacts = contacts_of(scene, pose)
     return PoseNumbers(

@@ -107,7 +107,7 @@ def _projected(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled
 
 
 def sampled_by_jax(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
-    """The same by JAX, for scenes without a scalar form."""
+    """Coordinates and speeds put on the rows by JAX, for scenes without a scalar form, and how well that went for the coordinates."""
     found = assembled_by_jax(scene, t, q, np.ones(len(q), bool))
     return found.q, _speeds_by_jax(scene, t, found.q, u), found
 

@@ -64,7 +64,7 @@ class Particulars(eqx.Module):
 
 
 def particulars_of(scene: Scene, motion: Motion) -> Particulars:
-    """The same on numbers."""
+    """What only probing looks at, computed on numbers."""
     return Particulars(numbers_of(scene, motion.pose()), potentials_of(scene, motion), explicit_rates(scene, motion))
 
 
@@ -85,7 +85,7 @@ def explicit_rates(scene: Scene, motion: Motion) -> dict[str, PyTree]:
 
 
 def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...] = (), with_events: bool = True) -> VelocityQuantities:
-    """The same on numbers; `of_inputs`: numbers of the loads whose potential depends on inputs."""
+    """What is traced, computed on numbers; `of_inputs`: numbers of the loads whose potential depends on inputs."""
     stated = loads_of(scene, motion)  # once: a second time a callback would be another one
     velocities, weights, loads = velocities_of(motion), inertias_of(motion), impressed(scene, motion, stated)
     return VelocityQuantities(

@@ -1,6 +1,6 @@
 """Markers that show what passes them in differentiation to a function of Python: they are identities.
 
-`shown_backwards(values, look)`: the cotangents, in reverse mode; `shown_forwards(values, look)`: the tangents, in forward mode, with a first axis of
+`tap_cotangents(values, look)`: the cotangents, in reverse mode; `tap_tangents(values, look)`: the tangents, in forward mode, with a first axis of
 directions.
 For derivatives taken outside of `jit` alone, where these are numbers: no program that is compiled holds a call back to Python.
 """

@@ -74,7 +74,7 @@ def power_of_nonconservative(scene: Scene, t, q, u, inputs, accelerations: Accel
 
 
 def power(scene: Scene, motion: Motion, accelerations: Accelerations | Reduced) -> Power:
-    """The same by origin."""
+    """The power that changes T + V, in W, split by where it comes from."""
     structure = structure_of(scene)
     zero = jnp.zeros_like(motion.t)
     return Power(

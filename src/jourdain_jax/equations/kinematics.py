@@ -77,7 +77,7 @@ def _velocities(scene: Scene, t: Float[Array, ""], q, u) -> Velocities:
 
 
 def velocities_of(motion: Motion) -> Velocities:
-    """The same from a known motion."""
+    """Velocities of the mass centres and body angular velocities, from a known motion."""
     bodies = motion.bodies.values()
     return Velocities(jnp.stack([b.velocity for b in bodies]), jnp.stack([b.angular_velocity_body for b in bodies]))
 
@@ -101,7 +101,7 @@ def inertias(scene: Scene, t, q) -> Inertias:
 
 
 def inertias_of(pose: Pose | Motion) -> Inertias:
-    """The same from known poses."""
+    """Masses and inertias of all bodies, from known poses."""
     bodies = [body.body for body in pose.bodies.values()]
     zero = jnp.zeros((3, 3), pose.q.array.dtype)
     return Inertias(jnp.stack([b.mass for b in bodies]), jnp.stack([b.inertia if isinstance(b, RigidBody) else zero for b in bodies]))

@@ -224,7 +224,7 @@ class NullSpaceQR(Reduction):
 
 
 class NullSpaceSVD(Reduction):
-    """The same as `NullSpaceQR` with a null space from the singular value decomposition."""
+    """Null space of the rows from their singular value decomposition; otherwise as `NullSpaceQR`."""
 
     name = "null space (SVD)"
 

@@ -65,7 +65,7 @@ def velocity_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
 
 
 def _rates_of_position_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
-    """`dg/dt` along the velocities that the motion carries, so that it can be differentiated by a body's velocity alone."""
+    """`dg/dt` along the velocities that the motion carries, so that it can be differentiated with respect to a body's velocity alone."""
 
     def g(t, q, bodies):
         return position_rows(scene, Pose(t, scene.coordinate_names.view(q), bodies))

@@ -36,7 +36,7 @@ def speed_scale(M: Float[Array, "speeds speeds"]) -> Float[Array, "speeds"]:
 
 
 def speed_scales(M: Float[np.ndarray, "states speeds speeds"]) -> Float[np.ndarray, "states speeds"]:
-    """The same of numbers at many states, on NumPy."""
+    """Scales of the speeds (see `speed_scale`) at many states, by NumPy."""
     diagonal = np.diagonal(M, axis1=1, axis2=2)
     return np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1)), 1)
 

@@ -109,7 +109,7 @@ def equations_and_rows(scene: Scene, t, q, u, inputs=None) -> tuple[Unconstraine
 
 
 def equations_of(scene: Scene, instant: Instant) -> UnconstrainedEquations:
-    """The same of a known instant."""
+    """M, h and Q of the equations without constraint forces, at a known instant."""
     partial = instant.by_speeds.bodies
     force, torque = _inertia_resultants(instant.weights, instant.value.bodies, instant.rate.bodies)
     h = jnp.einsum("bik,bi->k", partial.linear, force) + jnp.einsum("bik,bi->k", partial.angular, torque)

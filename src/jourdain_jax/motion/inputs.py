@@ -67,7 +67,7 @@ class Inputs(eqx.Module):
         return jnp.stack([jnp.asarray(channel(t), jnp.result_type(float)) for channel in self.channels]) if self.channels else jnp.zeros(0)
 
     def at(self, t) -> Float[Array, "inputs"]:
-        """The same; compiled where all is known, instead of one operation after another."""
+        """The vector of inputs at time t; compiled where all is known, instead of one operation after another."""
         return self(t) if self.constant or is_traced(self, t) else _compiled_inputs(self.programs)(self, jnp.asarray(t, jnp.result_type(float)))
 
     @property

@@ -22,7 +22,7 @@ def derivatives(graph: Graph, outputs: Iterable[int], direction: dict[int, int])
 
 
 def jacobian(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[dict[int, int]]:
-    """Of each output, its derivatives by the variables (nodes that are not looked into) on which it depends."""
+    """Of each output, its derivatives with respect to the variables (nodes that are not looked into) on which it depends."""
     return directional_derivative(graph, outputs, {n: {n: graph.one} for n in variables})
 
 
@@ -48,7 +48,7 @@ def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Map
 
 
 def columns(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[list[int]]:
-    """Derivatives of all outputs by each variable: the columns of the Jacobian, zeros among them."""
+    """Derivatives of all outputs with respect to each variable: the columns of the Jacobian, zeros among them."""
     variables, rows = list(variables), jacobian(graph, outputs, variables)
     return [[row.get(n, graph.zero) for row in rows] for n in variables]
 

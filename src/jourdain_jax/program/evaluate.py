@@ -33,7 +33,7 @@ class Probes:
         return self._table[np.array([self._row[n] for n in nodes], int)]
 
     def with_inputs(self, changes: Mapping[str, np.ndarray]) -> "Probes":
-        """The same probes with some inputs changed."""
+        """Probes at which some inputs are changed and all others are kept."""
         return Probes(self.graph, self.inputs | dict(changes), self._functions, self._of_arrays, self._constant)
 
     def sign(self, node: int) -> int:

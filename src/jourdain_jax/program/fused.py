@@ -11,7 +11,7 @@ from jax.interpreters import ad, batching, mlir
 
 
 def fused(values: tuple) -> tuple:
-    """The same real values, all of one shape and type."""
+    """The given real values, unchanged, computed in one loop; all must have one shape and type."""
     return values if len(values) < 2 else tuple(together_p.bind(*values))
 
 

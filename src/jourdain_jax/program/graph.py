@@ -249,7 +249,7 @@ class Graph:
         return np.array([self._node("entry", (output,), (i, len(shape))) for i in range(math.prod(shape))], np.int64).reshape(shape)
 
     def again(self, node: int, args: Iterable[int], of: "Graph | None" = None) -> int:
-        """The same operation on other arguments; `of`: the graph of the node, if another one."""
+        """The operation of a node, applied to other arguments; `of`: the graph of the node, if another one."""
         graph, args = of or self, tuple(args)
         op, value = graph.op[node], graph.value[node]
         if op == "array":

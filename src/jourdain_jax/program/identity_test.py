@@ -61,11 +61,11 @@ class IdentityProbes:
         return found
 
     def with_inputs(self, changes: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray]) -> Self:
-        """The same probes with some inputs changed, and the bounds of their round-off."""
+        """Probes at which some inputs, and the bounds of their round-off, are changed and all others are kept."""
         return type(self)(self.graph, self.inputs | dict(changes), self._errors | dict(errors))
 
     def exchanged(self, names: Collection[str]) -> Self:
-        """The same probes, at each of which some inputs have the value that they had at another."""
+        """Probes at each of which the named inputs have the value that they had at another probe; all others are kept."""
 
         def next_one(x):
             return np.roll(np.broadcast_to(x, self.count), 1)

@@ -85,7 +85,7 @@ def deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int]) ->
 
 
 def with_loops(graph: Graph, order: Sequence[int]) -> list[list[int] | Loop]:
-    """The same operations: loops, and what lies between them in a row; one row where loops would save little."""
+    """The nodes of `order`, with repeats gathered into loops and what lies between loops in lists; one list where loops would save little."""
     names = {name: k for k, name in enumerate(sorted({graph.op[n] for n in order}))}
     kinds = np.array([names[graph.op[n]] for n in order], int)
     alone = np.array([graph.op[n] in _ALONE for n in order], bool)

@@ -122,7 +122,7 @@ class Motion(eqx.Module):
         return name in self.bodies
 
     def pose(self) -> Pose:
-        """The same without velocities."""
+        """Time, coordinates and the poses of all bodies, without velocities."""
         return Pose(self.t, self.q, {name: BodyPose(name, motion.body) for name, motion in self.bodies.items()})
 
 

@@ -151,7 +151,7 @@ class Scene(eqx.Module, metaclass=_SceneClass):
         return self.coordinates.default_speeds if self.speeds is None else self.speeds
 
     def replace(self, **changes) -> "Scene":
-        """The same scene with some parameters changed: `changes`, name -> value in the parameter's unit.
+        """A copy of this scene with some parameters changed: `changes`, name -> value in the parameter's unit.
 
         ValueError for an unknown name (with the nearest valid one) or a value that the parameter does not allow.
         """

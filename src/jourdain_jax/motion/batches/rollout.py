@@ -131,7 +131,8 @@ def rollout(
     - `options`: further ones as in `simulate`.
 
     Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`. In reverse mode a lane whose start
-    or parameters are NaN makes derivatives by what all lanes share NaN, even where its result is not used, as everywhere in JAX: leave it out first.
+    or parameters are NaN makes derivatives with respect to what all lanes share NaN, even where its result is not used, as everywhere in JAX: leave it
+    out first.
     """
     scene = as_scene(scene)
     starts = dict(scene.example) if starts is None else starts

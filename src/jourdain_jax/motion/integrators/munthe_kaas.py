@@ -69,7 +69,7 @@ class MuntheKaas(diffrax.AbstractWrappedSolver):
         return self.solver.error_order(terms)
 
     def fitted(self, scene: Scene, form: StateForm, asked: str) -> StateForm:
-        """The same `form` of the state, without a projection where there would be only norms to keep; whatever was `asked` for.
+        """The given `form` of the state, without a projection where there would be only norms to keep; whatever was `asked` for.
 
         ValueError where the `scene` has no attitude.
         """

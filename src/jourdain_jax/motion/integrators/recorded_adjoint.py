@@ -51,7 +51,7 @@ class _Window(eqx.Module):
         return eqxi.unvmap_any(p.t != _at(self.t, self.last))
 
     def towards(self, goal) -> "_Window":
-        """The same, on the way to the goal with this number."""
+        """This window, its last state on the way to the goal with this number."""
         return replace(self, goal=_put(self.goal, self.last, goal))
 
 
@@ -83,7 +83,7 @@ class _Cotangents(eqx.Module):
 
 
 def motion(forward: Callable, problem: Problem, method: Method, y0: PyTree, t0, goals, dt0):
-    """`forward` of the other arguments, with derivatives in reverse mode by `y0`, `t0`, `goals` and whatever the functions of `problem` depend on."""
+    """`forward` of the other arguments; in reverse mode it has derivatives with respect to `y0`, `t0`, `goals` and all that the functions of `problem` read."""
     like = (t0, y0, problem.args)
     rates, project, events = (f if f is None else eqx.filter_closure_convert(f, *like) for f in (problem.rates, problem.project, problem.events))
     control = problem.norm, *jax.lax.stop_gradient((problem.rtol, problem.atol, problem.shortest)), problem.max_steps

@@ -42,7 +42,7 @@ def implicit_steps(max_steps: int) -> int:
 
 @eqx.filter_jit
 def _jacobian(form: StateForm, motion: Trajectory) -> Float[Array, "state state"]:
-    """Derivative of the rates at the end state, by the state without the work."""
+    """Derivative of the rates at the end state, with respect to the state without the work."""
     scene, t, inputs = motion.scene, motion.t_end, motion.inputs
     y = form.pack(motion.q_end, motion.u_end)
     x, unravel = ravel_pytree((y.q, y.v))

@@ -170,7 +170,7 @@ class Trajectory(eqx.Module):
 
             loss = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0).nan_if_failed().q_end[0]
 
-        Lanes that are left out of a loss by `jnp.where(motion.succeeded, ..., 0.0)` do not disturb its derivatives by what all lanes share.
+        Lanes that are left out of a loss by `jnp.where(motion.succeeded, ..., 0.0)` do not disturb its derivatives with respect to what all lanes share.
         """
         parts = [x for x in (self.q, self.u, self.q_end, self.u_end, self.work) if x is not None]
         marked = [jnp.where(jnp.expand_dims(self.succeeded, tuple(range(jnp.ndim(self.result), x.ndim))), x, jnp.nan) for x in parts]
