@@ -38,7 +38,7 @@ def test_probing_on_the_graph_agrees_with_jax(scene):
     states = np.append(t, np.zeros(len(symmetric))), np.concatenate([q, symmetric]), np.concatenate([u, u[: len(symmetric)]])
     generic = np.arange(len(states[0])) < 6
     expected, found = probed(scene, *states, -states[2], generic), probed_on_graph(scene, *states, -states[2], generic)
-    for name in ("q", "miss", "outside", "A", "A_other", "A_beyond", "M", "phi_at_rest", "potential_rates"):
+    for name in ("q", "position_error", "outside", "A", "A_other", "A_beyond", "M", "phi_at_rest", "potential_rates"):
         one, other = getattr(expected, name), getattr(found, name)
         np.testing.assert_allclose(other, one, rtol=1e-11, atol=1e-11 * (1 + np.max(np.abs(one), initial=0.0)), err_msg=name)
     for name in TIMED:

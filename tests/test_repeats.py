@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jourdain_jax.program import emit
+from jourdain_jax.program import emit, loop_rerolling
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.loop_rerolling import Before, Given, Loop, deepest_first, with_loops
 
@@ -114,7 +114,7 @@ def test_the_program_does_not_grow_with_the_chain_but_for_what_enters_and_leaves
 
 
 def test_what_does_not_repeat_makes_no_loop(monkeypatch):
-    monkeypatch.setattr(repeats, "WORTHWHILE", 0)
+    monkeypatch.setattr(loop_rerolling, "WORTHWHILE", 0)
     graph = Graph()
     x = end = graph.input("x", True)
     for op in np.random.default_rng(1).choice(["add", "mul", "sin", "cos", "sub"], 600):

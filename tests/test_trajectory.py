@@ -58,7 +58,7 @@ def test_the_path_of_a_point_is_where_the_body_says_it_is(rolling):
 def test_a_saved_trajectory_comes_back_as_it_was(rolling, tmp_path):
     path = tmp_path / "disc.npz"
     jj.save(rolling, path)
-    loaded = jj.load(path, TiltingDisc)
+    loaded = jj.load_trajectory(path, TiltingDisc)
     assert jax.tree.structure(loaded) == jax.tree.structure(rolling)
     for a, b in zip(jax.tree.leaves(loaded), jax.tree.leaves(rolling), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -69,7 +69,7 @@ def test_unreadable_files_are_refused_with_the_reason(rolling, tmp_path):
     path = tmp_path / "disc.npz"
     jj.save(rolling, path)
     with pytest.raises(ValueError, match="holds a trajectory of `TiltingDisc`, expected `ChaplyginSleigh`"):
-        jj.load(path, ChaplyginSleigh)
+        jj.load_trajectory(path, ChaplyginSleigh)
     (tmp_path / "cut.npz").write_bytes(path.read_bytes()[:200])
     (tmp_path / "text.npz").write_text("no numbers here")
     np.savez(tmp_path / "other.npz", a=1)
@@ -80,4 +80,4 @@ def test_unreadable_files_are_refused_with_the_reason(rolling, tmp_path):
         ("none.npz", "there is no file"),
     ):
         with pytest.raises(ValueError, match=sentence):
-            jj.load(tmp_path / name, TiltingDisc)
+            jj.load_trajectory(tmp_path / name, TiltingDisc)

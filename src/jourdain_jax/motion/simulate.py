@@ -20,6 +20,8 @@ from jourdain_jax.dynamics.accelerations import Baumgarte, as_reduction, as_stab
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.event_names import names_of_events
 from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.equations.reductions import NullSpaceQR
+from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.arguments import check_options
@@ -238,6 +240,7 @@ def state_form(
         affine=structure.affine,
         inputs_in_rows=inputs_in_rows,
         usual=usual_lengths(scene) if program is None else None,
+        may_branch=program is None and cutoff is not None and isinstance(reduction, NullSpaceQR) and bool(names_of_position_rows(scene)),
         cutoff=cutoff,
     )
 

@@ -50,6 +50,7 @@ class StateForm(eqx.Module):
     own_equations: str = eqx.field(static=True, default="")  # of a solver that takes no accelerations: what it solves instead
     inputs_in_rows: bool = eqx.field(static=True, default=False)  # some change in time, and rows depend on them: their rates are needed
     usual: UsualLengths | None = None  # of the rows, for dense matrices
+    may_branch: bool = eqx.field(static=True, default=False)  # where geometric rows lose rank, a cut-off leaves one out, and branches cross
     cutoff: float | None = eqx.field(static=True, default=None)  # of the projection of speeds: below it rows count as dependent; None: round-off
 
     @property
@@ -132,12 +133,7 @@ class StateForm(eqx.Module):
         """Whether steps in which some pivot changes its sign are tried again: in them the state, or a row that it is kept on, is lost."""
         if self.lowered is not None:
             return self.independent is not None and bool(self.lowered.pivots)
-        return self.independent is not None or self._passes_losses_of_rank
-
-    @property
-    def _passes_losses_of_rank(self) -> bool:
-        """Whether rows below a cut-off are left out for as long as they are."""
-        return self.independent is None and isinstance(self.reduction, NullSpaceQR) and self.reduction.cutoff is not None
+        return self.independent is not None or self.may_branch
 
     @staticmethod
     def _decided(pivot: Float[Array, ""]) -> Float[Array, ""]:
@@ -165,7 +161,7 @@ class StateForm(eqx.Module):
         rates = Integrated(motion.qdot.array, v, rate_of_work(scene, motion, found, self.of_inputs) if self.with_work else None)
         if known is not None:
             return rates, known.split.orientation()[None]
-        return rates, self._decided(found.pivot)[None] if self._passes_losses_of_rank else jnp.zeros(0, y.q.dtype)
+        return rates, self._decided(found.pivot)[None] if self.may_branch else jnp.zeros(0, y.q.dtype)
 
     def project(self, scene: Scene, fixed, t, y: Integrated, inputs, iterations: int = 2) -> Integrated:
         """The state put back onto geometric rows, quaternion norms and (full state) velocity rows; lanes only where it is lowered."""

@@ -12,7 +12,7 @@ from jax.interpreters import ad, batching, mlir
 
 def fused(values: tuple) -> tuple:
     """The given real values, unchanged, computed in one loop; all must have one shape and type."""
-    return values if len(values) < 2 else tuple(together_p.bind(*values))
+    return values if len(values) < 2 else tuple(fused_p.bind(*values))
 
 
 def _reduced_with_zeros(*values):
@@ -22,7 +22,7 @@ def _reduced_with_zeros(*values):
 
 
 def _jvp(primals, tangents):
-    return together_p.bind(*primals), together_p.bind(*(ad.instantiate_zeros(t) for t in tangents))
+    return fused_p.bind(*primals), fused_p.bind(*(ad.instantiate_zeros(t) for t in tangents))
 
 
 def _transpose(cotangents, *_):
@@ -38,12 +38,12 @@ def _batched(values, axes):
     return [next(found[axis]) for axis in new_axes], new_axes
 
 
-together_p = Primitive("together")
-together_p.multiple_results = True
-together_p.def_impl(lambda *values: list(values))
-together_p.def_abstract_eval(lambda *avals: list(avals))
-ad.primitive_jvps[together_p] = _jvp
-ad.primitive_transposes[together_p] = _transpose
-batching.primitive_batchers[together_p] = _batched
-mlir.register_lowering(together_p, mlir.lower_fun(lambda *values: list(values), multiple_results=True))
-mlir.register_lowering(together_p, mlir.lower_fun(_reduced_with_zeros, multiple_results=True), platform="cpu")
+fused_p = Primitive("fused")
+fused_p.multiple_results = True
+fused_p.def_impl(lambda *values: list(values))
+fused_p.def_abstract_eval(lambda *avals: list(avals))
+ad.primitive_jvps[fused_p] = _jvp
+ad.primitive_transposes[fused_p] = _transpose
+batching.primitive_batchers[fused_p] = _batched
+mlir.register_lowering(fused_p, mlir.lower_fun(lambda *values: list(values), multiple_results=True))
+mlir.register_lowering(fused_p, mlir.lower_fun(_reduced_with_zeros, multiple_results=True), platform="cpu")

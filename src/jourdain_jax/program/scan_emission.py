@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jourdain_jax.program.fused import fused
 from jourdain_jax.program.loop_rerolling import Before, Given, Here, Loop, sources
 
 UNROLLED = 2  # rounds that follow one another without a jump; measured: one is slower, four compile to more functions
@@ -56,7 +57,7 @@ def run_loop(loop: Loop, values: Values, wanted: set[int], operation: Callable) 
         for k, (op, arguments) in enumerate(zip(loop.ops, loop.arguments, strict=True)):
             at[Here(k)] = operation(op, arguments, [at[a] for a in arguments], waves)
         places = list(dict.fromkeys([*(s.place for s in carried), *kept]))
-        found = together(tuple(jnp.broadcast_to(jnp.asarray(at[Here(k)], real), shape) for k in places))
+        found = fused(tuple(jnp.broadcast_to(jnp.asarray(at[Here(k)], real), shape) for k in places))
         here = dict(zip(places, found, strict=True))
         return tuple(here[s.place] for s in carried), tuple(here[k] for k in kept)
 
