@@ -22,7 +22,9 @@ FUNCTIONS = {name: value for name, value in PUBLIC.items() if inspect.isfunction
 CLASSES = {value.__name__: value for value in (*PUBLIC.values(), *HANDED_OUT) if inspect.isclass(value)}
 SELF_EVIDENT = {"self", "scene", "t", "q", "u"}
 # functions of a state or of numbers with a unit: their text must state one
-UNITS = re.compile(r"\b(kg|m|s|N|J|W|rad|rad/s|m/s)\b")
+# as `(m)`, `(N m, inertial frame)`, `(s; default: 0)`, as `in N/m`, or as a unit that is no word or symbol of another kind
+UNIT = r"(?:kg|rad|[mNJWs])(?:[ /](?:kg|rad|[mNJWs])\b|\^\d)*"
+UNITS = re.compile(rf"(?<!\w)\({UNIT}[,;)]|\bin {UNIT}(?=[\s,.;:)]|$)|(?<![\w'])(?:(?:rad|m|N|kg)/(?:s|m|rad)\b|N m\b|N s/m\b|kg m\^2)")
 WITH_UNITS = ("rot_x", "rod", "knife_edge", "spring", "damper", "gravity", "torque", "point_force", "generalized_force", "fixed_point")
 WITH_UNITS += ("disc_contact", "ball_contact", "start", "simulate", "kinetic_energy", "potential_energy", "virtual_power", "newton_residual")
 WITH_UNITS += ("generalized_forces", "unconstrained_equations", "energy", "pose_at")
@@ -69,6 +71,16 @@ def test_a_public_class_and_its_methods_say_what_they_are(name):
 @pytest.mark.parametrize("name", WITH_UNITS)
 def test_what_takes_or_gives_a_quantity_states_its_unit(name):
     assert UNITS.search(inspect.getdoc(FUNCTIONS[name]))
+
+
+@pytest.mark.parametrize("text", ["The scene's row(s) of M, `m g e` at a time t.", "The rows in speeds; s, m and N.", "`strength`: g, in some way."])
+def test_a_docstring_without_a_unit_would_be_seen(text):
+    assert not UNITS.search(text)
+
+
+@pytest.mark.parametrize("text", ["A length (m).", "A torque (3,) (N m, here)", "c in N s/m.", "T in J", "g in m/s^2; e", "(kg m^2)", "t (s; default: 0)"])
+def test_a_unit_is_seen_as_one(text):
+    assert UNITS.search(text)
 
 
 @pytest.mark.parametrize("name", WITH_SOURCE)

@@ -81,6 +81,59 @@ def _check_lowered(name, scenes, states, udot, size):
         assert np.max(np.abs(qdot - rates), initial=0.0) <= tolerance("round_off") * (1 + np.max(np.abs(rates))), "rates of coordinates"
 
 
+WITHOUT_PROJECTION = {"pendulum-chain", "tilting-disc-quaternion", "trailer-chain", "two-wheel-axle-free", "two-wheel-axle-redundant", "whipple-bicycle"}
+SLOW_BACKWARDS = {"whipple-bicycle"}  # a minute for the compiler
+
+
+def short_motion(name: str, *, projection: bool):
+    """`(x, reverse) -> q, u at the end of two steps`, where x holds parameters, speeds at the start and the end of the span; and x.
+
+    Every step is accepted, whatever its error, and the first is shorter than half of the span: so the derivatives are those of the steps to round-off.
+    """
+    scene = MODELS[name]()
+    start = jj.start(scene, **scene.example)
+    flat, unravel = ravel_pytree(({key: value for key, value, _ in parameters_of(scene)}, start.u, jnp.array(0.02)))
+
+    def end(x, reverse: bool):
+        parameters, u, duration = unravel(x)
+        options = {"rtol": 1e3, "atol": 1e3, "dt0": 0.008, "work": False, "events": False, "projection": projection}
+        adjoint = None if reverse else diffrax.ForwardMode()
+        begun = eqx.tree_at(lambda s: s.u, start, u)
+        motion = jj.simulate(scene.replace(**parameters), begun, ts=start.t + duration[None], adjoint=adjoint, **options)
+        return jnp.concatenate([motion.q_end, motion.u_end])
+
+    return end, jnp.where(flat == 0, 0.01, flat)
+
+
+def check_both_modes(name: str, *, projection: bool, backwards: bool) -> None:
+    """Along one random direction: forward mode against central differences, and against reverse mode."""
+    end, x = short_motion(name, projection=projection)
+    generator = np.random.default_rng(0)
+    direction = jnp.asarray(generator.normal(size=x.shape) * np.abs(x))
+    forward = jax.jit(lambda x: jax.jvp(lambda x: end(x, False), (x,), (direction,)))
+    value, along = forward(x)
+    assert np.max(np.abs(along)) > 0
+    size = np.max(np.abs(along)) + 1e-3 * np.max(np.abs(value))
+    h = tolerance("difference_step")
+    difference = (forward(x + h * direction)[0] - forward(x - h * direction)[0]) / (2 * h)
+    assert np.max(np.abs(along - difference)) <= tolerance("gradient_fd") * size
+    if backwards:
+        weights = jnp.asarray(generator.normal(size=value.shape))
+        gradient = jax.jit(jax.grad(lambda x: weights @ end(x, True)))(x)
+        assert abs(float(gradient @ direction - weights @ along)) <= tolerance("ill_conditioned") * float(jnp.abs(gradient) @ jnp.abs(direction))
+
+
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_both_modes_agree_through_two_steps(name):
+    check_both_modes(name, projection=name not in WITHOUT_PROJECTION, backwards=name not in SLOW_BACKWARDS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(WITHOUT_PROJECTION))
+def test_both_modes_agree_through_two_steps_with_projection(name):
+    check_both_modes(name, projection=True, backwards=True)
+
+
 some_models = pytest.mark.parametrize("name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in sorted(MODELS)])
 
 
