@@ -2,7 +2,10 @@
 
 import inspect
 import re
+import textwrap
 
+import jax
+import jax.numpy as jnp
 import pytest
 
 import jourdain_jax as jj
@@ -98,3 +101,19 @@ def test_an_undocumented_argument_would_be_seen():
 def test_the_package_lists_every_public_name_once():
     assert not [name for name, value in PUBLIC.items() if not value.__module__.startswith("jourdain_jax")]
     assert jj.__all__ == sorted({*PUBLIC, "models"})  # without `__all__`, type checkers take what a typed package imports for private
+
+
+@pytest.mark.parametrize(
+    ("name", "holds"),
+    [
+        ("simulate", lambda made: made["motion"].q_end.shape == (5,) and abs(float(made["slope"])) > 0),
+        ("rollout", lambda made: made["lanes"]["lean"].shape == (16, 201) and not made["lanes"].failed.size),
+        ("fit", lambda made: abs(float(made["found"].scene.offset) - 0.25) < 1e-3),
+    ],
+)
+def test_the_examples_of_a_docstring_run(name, holds, capsys):
+    text = inspect.getdoc(FUNCTIONS[name]).split("**Examples**")[1]
+    made = {"jj": jj, "jax": jax, "jnp": jnp}
+    exec(textwrap.dedent(text), made)
+    assert capsys.readouterr().out
+    assert holds(made)

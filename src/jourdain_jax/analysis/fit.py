@@ -42,9 +42,6 @@ def fit(
 ) -> Fit:
     """Estimate the `free` parameters of a scene, and unknown initial values of its runs, from measurements.
 
-        data = jj.Measurements(ts, {"x": x, "heading": heading}, 0.01, start={"x_rate": 0.6, "heading_rate": 0.9})
-        print(jj.fit(sleigh, data, free={"inertia": jj.bounds(0.1, 2.0), "offset": None}))
-
     **Arguments**
     - `scene`: its parameters are fixed, or first guesses where they are free.
     - `data`: one run or several, each with its own times, channels, start and inputs.
@@ -61,6 +58,15 @@ def fit(
 
     **Raises** ValueError for names, shapes or numbers that do not fit, no or too many unknowns, and a start that contradicts the
     constraints.
+
+    **Examples**
+
+        truth, start, ts = jj.models.ChaplyginSleigh(offset=0.25), {"x_rate": 0.6, "heading_rate": 0.9}, jnp.linspace(0.0, 2.0, 21)
+        motion = jj.simulate(truth, start, ts=ts)
+        data = jj.Measurements(ts, {"x": motion["x"], "heading": motion["heading"]}, 0.01, start=start)       # sigma: 0.01 m, 0.01 rad
+        found = jj.fit(jj.models.ChaplyginSleigh(), data, free={"offset": jj.bounds(0.05, 1.0)})
+        print(found)                                              # estimates with 95 % intervals, and what the data cannot tell
+        found["offset"].value, found.scene.offset                 # near 0.25 m
     """
     scene = as_scene(scene)
     problem = _problem(scene, data, free, repeats=False)

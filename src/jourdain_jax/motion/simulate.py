@@ -74,8 +74,6 @@ def simulate(
 ) -> Trajectory:
     """Integrate a scene's equations of motion from `start` over [t0, t1].
 
-        motion = simulate(disc, {"lean": 0.3, "spin_rate": -3.0}, t1=5.0)
-
     **Arguments**
     - `start`: a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
     - `t0`, `t1`: ends of the span (s; defaults: the time of a `State`, otherwise 0; the last of `ts`, or the scene's
@@ -103,6 +101,18 @@ def simulate(
 
     **Raises** ValueError for bad arguments or a start that contradicts the constraints, `DifferentiationModeError` where the adjoint does not
     support the mode of differentiation.
+
+    **Examples**
+
+        disc = jj.models.TiltingDisc()
+        motion = jj.simulate(disc, {"lean": 0.3, "spin_rate": -3.0}, t1=2.0)
+        print(motion)                                             # result, steps, drift of the energy, contact forces
+        motion["lean"], motion.q_end, motion.ts                   # by name; as vectors
+
+        def lean_at_end(radius):                                  # a derivative with respect to a parameter
+            return jj.simulate(disc.replace(radius=radius), {"lean": 0.3, "spin_rate": -3.0}, ts=[1.0])["lean"][-1]
+
+        slope = jax.grad(lean_at_end)(0.5)
     """
     given = dict(locals())
     setup = _set_up(**given)

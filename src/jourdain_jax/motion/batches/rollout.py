@@ -133,6 +133,15 @@ def rollout(
     Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`. In reverse mode a lane whose start
     or parameters are NaN makes derivatives with respect to what all lanes share NaN, even where its result is not used, as everywhere in JAX: leave it
     out first.
+
+    **Examples**
+
+        disc = jj.models.TiltingDisc()
+        spins = jnp.linspace(-6.0, -3.0, 16)                      # rad/s
+        lanes = jj.rollout(disc, {"lean": 0.3, "spin_rate": spins}, parameters={"mass": jnp.full(16, 2.0)}, t1=1.0)
+        print(lanes)                                              # how many arrived, and why others did not
+        lanes["lean"].shape, lanes.quantiles("lean").shape        # (16, 201) and (3, 201)
+        lanes.failed, lanes.lane(3).energies().balance            # numbers of failed lanes; one lane as a trajectory
     """
     scene = as_scene(scene)
     starts = dict(scene.example) if starts is None else starts
