@@ -15,6 +15,8 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Complex, Float
 
+from jourdain_jax.calculus.newton import newton_root
+
 from .characteristic import (
     BicycleMatrices,
     bicycle_matrices,
@@ -23,7 +25,6 @@ from .characteristic import (
     hurwitz_polynomial,
     speed_polynomials,
 )
-from .implicit_root import implicit_root
 from .polynomial_roots import evaluate, real_roots
 
 Scalar = Float[Array, ""]
@@ -181,9 +182,15 @@ def _coincident_eigenvalues(s_and_v, matrices):
 
 def _polished(residual, guess: Scalar, matrices: BicycleMatrices) -> Scalar:
     """The root near `guess`, differentiable; NaN where `guess` is not finite."""
-    present = jnp.isfinite(guess)
-    speed = implicit_root(residual, jnp.where(present, guess, 1.0)[None], matrices, present)[0]
-    return jnp.where(present, speed, jnp.nan)
+    return _root(residual, guess[None], matrices, jnp.isfinite(guess))[0]
+
+
+def _root(residual, guess: Float[Array, " n"], matrices: BicycleMatrices, present) -> Float[Array, " n"]:
+    """x with `residual(x, matrices) = 0` near a bracketed `guess`; NaN where no root is `present`."""
+    guess = jnp.where(present, guess, 1.0)
+    # where there is no root, another function has one: no division by zero enters a batch's derivatives
+    found = newton_root(lambda x: jnp.where(present, residual(x, matrices), x - guess), guess, 1.0 + jnp.abs(guess))
+    return jnp.where(present, found.x, jnp.nan)
 
 
 def _double_root(matrices: BicycleMatrices, fixed: BicycleMatrices, below: Scalar, top: Scalar) -> tuple[Scalar, Scalar]:
@@ -207,9 +214,8 @@ def _double_root(matrices: BicycleMatrices, fixed: BicycleMatrices, below: Scala
     roots, merges = jax.vmap(examine)(candidates)
     chosen = jnp.argmax(jnp.where(merges, candidates, -jnp.inf))
     present = merges[chosen]
-    guess = jnp.where(present, jnp.stack([roots[chosen], candidates[chosen]]), 1.0)
-    s, v = implicit_root(_coincident_eigenvalues, guess, matrices, present)
-    return jnp.where(present, s, jnp.nan), jnp.where(present, v, jnp.nan)
+    s, v = _root(_coincident_eigenvalues, jnp.stack([roots[chosen], candidates[chosen]]), matrices, present)
+    return s, v
 
 
 def _widest_stable_range(matrices: BicycleMatrices, crossings: Float[Array, " crossings"], top: Scalar) -> tuple[Scalar, Scalar]:

@@ -1,7 +1,7 @@
-"""Looking at a scene with numbers in it, also while its parameters are being traced.
+"""Reference parameters: numbers that stand in for parameters that JAX traces.
 
-What holds of a scene at every state (the rank of its rows, which speeds are independent) is a static choice: it must be known before
-anything is compiled, and it is found by evaluating the scene at a few states.
+What holds of a scene at every state, such as the rank of its rows and which speeds are independent, must be known before anything is compiled. It is found
+by evaluating the scene at a few states, which takes numbers for its parameters.
 """
 
 import gc

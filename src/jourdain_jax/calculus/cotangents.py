@@ -1,8 +1,7 @@
-"""Markers that show what passes them in differentiation to a function of Python: they are identities.
+"""Taps: identities that call a Python function with the derivatives that pass through them.
 
-`tap_cotangents(values, look)`: the cotangents, in reverse mode; `tap_tangents(values, look)`: the tangents, in forward mode, with a first axis of
-directions.
-For derivatives taken outside of `jit` alone, where these are numbers: no program that is compiled holds a call back to Python.
+`tap_cotangents(values, look)` hands `look` the cotangents in reverse mode. `tap_tangents(values, look)` hands it the tangents in forward mode, with a first
+axis of directions. Both act outside of `jit` only, where derivatives are numbers: no compiled program calls back to Python.
 """
 
 from collections.abc import Callable

@@ -36,8 +36,8 @@ def newton_root(residual: Callable, guess: Float[Array, "unknowns"], scale: Floa
 
     def solve(f, x0):
         def running(carry):
-            _, _, fixed_point, k = carry
-            return ~fixed_point & (k < MOST_ITERATIONS)
+            _, _, settled, k = carry
+            return ~settled & (k < MOST_ITERATIONS)
 
         def iterate(carry):
             x, size, _, k = carry

@@ -1,5 +1,5 @@
-"""Probes elsewhere: at full turns of all angles, since a pivot that is large in a scene's domain may vanish where its headings have turned; and with
-speeds on the velocity rows, since rows that depend on each other have a solution there only.
+"""Probes outside the domain. Angles take any value, since a pivot that is large in the domain may vanish at another heading. Speeds lie on the velocity
+rows, since dependent rows have a solution only there.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""NaN as a mark: what a motion did not reach is NaN on purpose, which `jax_debug_nans` is not to take for a mistake."""
+"""Times that a motion did not reach hold NaN on purpose; `jax_debug_nans` must not report them as an error."""
 
 import jax
 

@@ -1,5 +1,5 @@
-"""What no probe need show: an expression of +, -, *, /, roots and waves that is zero at random states is zero everywhere; one with a branch, a function
-that is flat somewhere, or a call, may begin later or elsewhere.
+"""Which expressions are analytic. An expression of +, -, *, /, roots, sines and cosines that is zero at random states is zero everywhere. An expression
+with a branch, a function that is flat somewhere, or an opaque call may be zero at every probe and not elsewhere.
 """
 
 from collections.abc import Callable, Iterable
@@ -7,18 +7,18 @@ from collections.abc import Callable, Iterable
 from jourdain_jax.program.graph import BRANCHES, Graph
 
 FLAT_SOMEWHERE = {"exp", "exp2", "expm1", "log1p", "sinh", "cosh", "tanh", "logistic"}
-HIDING = {*BRANCHES, *FLAT_SOMEWHERE, "select", "is_finite", "kept"}
+NONANALYTIC = {*BRANCHES, *FLAT_SOMEWHERE, "select", "is_finite", "kept"}
 
 
 def is_nonanalytic(graph: Graph, outputs: Iterable[int]) -> list[bool]:
-    """Of each output, whether it is made of something that may begin where no probe lies, in the course of time, state or inputs."""
-    return _with(graph, outputs, lambda n: graph.op[n] in HIDING and graph.varies[n])
+    """For each output, whether some part of it that depends on time, state or inputs is not analytic."""
+    return _with(graph, outputs, lambda n: graph.op[n] in NONANALYTIC and graph.varies[n])
 
 
 def decided_by(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> bool:
     """Whether anything of that kind on the way to the outputs is decided by one of the variables."""
     outputs, variables = list(outputs), set(variables)
-    hiding = [n for n in graph.reachable(outputs) if graph.op[n] in HIDING]
+    hiding = [n for n in graph.reachable(outputs) if graph.op[n] in NONANALYTIC]
     return any(depend_on(graph, hiding, variables))
 
 

@@ -1,4 +1,4 @@
-"""Repeated blocks of a program: where the same operations come round after round, on values of the round before, of earlier loops, or of outside.
+"""Repeated blocks of a program, found and rolled up into loops: each round applies the same operations to values of the round before or from outside.
 
     k-th operation of round r:   n[r, k] = op[k](arguments)
     each argument, the same way in all rounds, is    Here(k')      n[r, k'] of the same round

@@ -1,7 +1,7 @@
 """Step-size control that ends a step at every given time.
 
-A step that would leave less than another of its size before the next time is shortened to half the way, so that no sliver remains (which
-would be taken for a step size that shrank to nothing); one that would nearly arrive, arrives.
+Where less than two steps are left to the next time, the step covers half of the rest, so that no tiny step remains, which would be taken for a step size
+that shrank to nothing. A step that would cover nearly all of the rest is stretched to cover it.
 """
 
 import diffrax
