@@ -13,7 +13,9 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # Most of the time of a test is spent compiling. With less effort on machine code the same tests take half as long; the flags belong to the
 # tested version of jaxlib (another one might not know them). Timings are taken in `bench/`, with none of this.
 if jaxlib.__version__.startswith("0.10."):
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
+    quick = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+    os.environ.setdefault("XLA_FLAGS", f"{quick} --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1")
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # no line numbers for each operation of a program
 
 import jax
 import pytest
@@ -21,7 +23,7 @@ from jaxtyping import install_import_hook
 
 # Before any import of the package: every annotated function is then checked, shapes and dtypes included. Not in `program`, whose small
 # functions on integers are called a million times.
-LAYERS = ("calculus", "scene", "equations", "lowering", "motion", "analysis", "models", "bicycle", "plotting", "cli")
+LAYERS = ("calculus", "scene", "equations", "build", "dynamics", "lowering", "motion", "analysis", "models", "bicycle", "plotting", "cli")
 if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":
     install_import_hook([f"jourdain_jax.{layer}" for layer in LAYERS], "beartype.beartype")
 
