@@ -29,7 +29,8 @@ if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":
 
 
 # What takes longest for its number of tests, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
-LONGEST = ("every_model", "generated_scenes", "float32", "notebooks", "bicycle_job", "bicycle_stability", "atlas", "reactions", "verify", "chains", "readme")
+LONGEST = ("every_model", "simulate", "kept_parts", "contacts_on_surfaces", "generated_scenes", "identify", "structure_preserving", "stiff", "rollout", "power")
+LONGEST += ("traced_parameters", "float32", "notebooks", "bicycle_job", "bicycle_stability", "atlas", "readme")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
