@@ -13,7 +13,9 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # Most of the time of a test is spent compiling. With less effort on machine code the same tests take half as long; the flags belong to the
 # tested version of jaxlib (another one might not know them). Timings are taken in `bench/`, with none of this.
 if jaxlib.__version__.startswith("0.10."):
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
+    quick = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+    os.environ.setdefault("XLA_FLAGS", f"{quick} --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1")
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # no line numbers for each operation of a program
 
 import jax
 import pytest
@@ -27,7 +29,8 @@ if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":
 
 
 # What takes longest for its number of tests, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
-LONGEST = ("every_model", "generated_scenes", "float32", "notebooks", "bicycle_job", "bicycle_stability", "atlas", "reactions", "verify", "chains", "readme")
+LONGEST = ("every_model", "simulate", "kept_parts", "contacts_on_surfaces", "generated_scenes", "identify", "structure_preserving", "stiff", "rollout", "power")
+LONGEST += ("traced_parameters", "float32", "notebooks", "bicycle_job", "bicycle_stability", "atlas", "readme")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

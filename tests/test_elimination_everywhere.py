@@ -40,7 +40,7 @@ def at_states(scene, program, t, q, u, nodes):
     return Probes(program.graph, {name: np.asarray(value, float) for name, value in values.items()})(nodes)
 
 
-@pytest.mark.parametrize("seed", [1, 3, 5, 12, 15])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (3, 5)), 12, pytest.param(15, marks=pytest.mark.slow)])
 def test_robots_and_beads_have_right_accelerations_at_every_heading(seed):
     anywhere = drawn(seed, narrow=False)
     t, q, u = jj.sample_states(anywhere, 64, seed=1)
@@ -104,14 +104,18 @@ def test_every_lane_of_beads_on_a_ring_arrives():
     np.testing.assert_allclose(lanes.lanes.q_end[4], one.q_end, atol=1e-8)
 
 
-@pytest.mark.parametrize("state", ["auto", "full"])
+WEIGHTLESS_ROBOT = PlanarRobot(trailers=1, maximal=True, **WEIGHTLESS), PlanarRobot(trailers=1, maximal=True).start(**ROBOT)
+WEIGHTLESS_CAR = TrailerChain(trailers=1, **WEIGHTLESS), TrailerChain(trailers=1).towing([0.0, 0.3], forward=1.0, turn=0.8)
+
+
 @pytest.mark.parametrize(
-    ("scene", "start"),
+    ("scene", "start", "state"),
     [
-        (PlanarRobot(trailers=1, maximal=True, **WEIGHTLESS), PlanarRobot(trailers=1, maximal=True).start(**ROBOT)),
-        (TrailerChain(trailers=1, **WEIGHTLESS), TrailerChain(trailers=1).towing([0.0, 0.3], forward=1.0, turn=0.8)),
+        pytest.param(*WEIGHTLESS_ROBOT, "full", id="robot-full"),
+        pytest.param(*WEIGHTLESS_CAR, "auto", id="car-auto"),
+        pytest.param(*WEIGHTLESS_ROBOT, "auto", id="robot-auto", marks=pytest.mark.slow),
+        pytest.param(*WEIGHTLESS_CAR, "full", id="car-full", marks=pytest.mark.slow),
     ],
-    ids=["robot", "car"],
 )
 def test_massless_trailers_follow_also_where_their_masses_are_traced(scene, start, state):
     motion, reference = motion_and_reference(scene, start, 2.0, traced=WEIGHTLESS, state=state)

@@ -35,7 +35,7 @@ def falling(t, y):
     return jnp.stack([y[1], -GRAVITY * jnp.ones_like(y[1])])
 
 
-@pytest.mark.parametrize("solver", [diffrax.Dopri8(), diffrax.Tsit5()], ids=["Dopri8", "Tsit5"])
+@pytest.mark.parametrize("solver", [pytest.param(diffrax.Dopri8(), id="Dopri8", marks=pytest.mark.slow), pytest.param(diffrax.Tsit5(), id="Tsit5")])
 def test_a_fall_is_located_with_derivatives_up_to_the_third(solver):
     def fall_time(height):
         return stopped(jnp.stack([height, 0.0 * height]), lambda t, y: y[0], rates=falling, solver=solver).t

@@ -144,7 +144,7 @@ def test_verification_passes(name):
     assert found.passed, str(found)
 
 
-@some_models
+@pytest.mark.parametrize("name", [pytest.param(name, marks=() if name == "skate" else pytest.mark.slow) for name in sorted(MODELS)])
 def test_derivatives_through_simulation_by_every_parameter(name):
     scene = MODELS[name]()
     flat, unravel = ravel_pytree({key: value for key, value, _ in parameters_of(scene)})

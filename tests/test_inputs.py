@@ -198,7 +198,9 @@ class Towed(jj.Scene):
         return {"belt": motion.u.y_rate - motion.u.x_rate - motion.inputs.speed}
 
 
-@pytest.mark.parametrize("options", [{}, {"state": "full"}, {"solver": diffrax.Kvaerno5()}], ids=["minimal", "full state", "diffrax"])
+@pytest.mark.parametrize(
+    "options", [{}, {"state": "full"}, pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow)], ids=["minimal", "full state", "diffrax"]
+)
 def test_rates_of_inputs_in_rows_accelerate_and_do_work(options):
     motion = jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, rtol=1e-9, atol=1e-9, inputs={"speed": lambda t: t**2}, **options).raise_if_failed()
     # x'' + y'' = 0, y'' - x'' = 2 t

@@ -103,7 +103,7 @@ LAWS = {
     "callback": (Acted(law=by_asking, numbers=np.array([2.0])), "the operation `pure_callback`"),
     "callback with a rule": (Acted(law=by_asking_with_rule, numbers=np.array([2.0])), "`_asked`, which has a derivative of its own"),
 }
-SMOOTH_ENOUGH = ["table", "network", "callback with a rule", *(pytest.param(name, marks=pytest.mark.slow) for name in ("recursion", "branches"))]
+SMOOTH_ENOUGH = ["table", "callback with a rule", *(pytest.param(name, marks=pytest.mark.slow) for name in ("network", "recursion", "branches"))]
 
 
 def rates_of(scene):

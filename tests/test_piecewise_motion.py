@@ -87,8 +87,17 @@ SMOOTH = {
 }
 
 
+SEEN = ("few samples", "a gather", "a late start")  # samples, an index, a kink late in time; the others are slow
+
+
 @pytest.mark.parametrize(
-    ("kind", "curve"), [*((Driven, name) for name in KINKED), (Prescribed, "jnp.interp"), (Prescribed, "steps"), (InGeometry, "jnp.interp")]
+    ("kind", "curve"),
+    [
+        *((Driven, name) if name in SEEN else pytest.param(Driven, name, marks=pytest.mark.slow) for name in KINKED),
+        (Prescribed, "jnp.interp"),
+        (Prescribed, "steps"),
+        (InGeometry, "jnp.interp"),
+    ],
 )
 def test_a_motion_whose_velocity_jumps_is_refused(kind, curve):
     scene = kind(curve=KINKED[curve])

@@ -24,8 +24,8 @@ RESULTS = {
     "Verification": (lambda: jj.verify(SLEIGH, {"heading_rate": 0.5}), "Verification of ChaplyginSleigh: passed"),
     "Rollout": (lambda: jj.rollout(SLEIGH, {"heading_rate": np.array([0.5, 0.6])}, progress=False, **RUN), "Rollout of ChaplyginSleigh: 2 lanes"),
     "Fit": (fitted, "Fit of ChaplyginSleigh: converged"),
-    "SteadyMotion": (lambda: jj.steady(TiltingDisc(), {"spin_rate": -3.0}, held="spin_rate"), "steady motion: residual"),
-    "Linearization": (lambda: jj.linearize(TiltingDisc(), {"spin_rate": -3.0}, "lean"), "Small motions: residual"),
+    "SteadyMotion": (lambda: jj.steady(SLEIGH, {"x_rate": 0.5}, held="x_rate"), "steady motion: residual"),
+    "Linearization": (lambda: jj.linearize(SLEIGH, {"x_rate": 0.5}, ()), "Small motions: residual"),
 }
 
 

@@ -98,10 +98,10 @@ def test_a_lane_that_does_not_exist_is_refused(sleighs):
 def test_another_tolerance_first_step_or_end_is_no_other_program():
     compiled = []
     jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: compiled.append(event) if event.endswith("backend_compile_duration") else None)
-    spins = {"lean": 0.3, "spin_rate": np.linspace(-6.0, -3.0, 3)}
+    starts = {"x_rate": 0.5, "heading_rate": np.linspace(0.4, 0.8, 3)}
 
     def ends(t1, **options):
-        return jj.rollout(TiltingDisc(), spins, t1=t1, ts=t1 * jnp.array([0.5, 1.0]), **options).lanes
+        return jj.rollout(ChaplyginSleigh(), starts, t1=t1, ts=t1 * jnp.array([0.5, 1.0]), **options).lanes
 
     loose = ends(1.0, rtol=1e-7, atol=1e-7, dt0=1e-3)
     same = ends(1.0)

@@ -37,7 +37,11 @@ def _applies(name, heading):
     return not (name in ("privileged", "gibbs-appell") and abs(np.cos(heading)) < 1e-9)
 
 
-@pytest.mark.parametrize("name", ["privileged", "qr", "svd", "kkt", "udwadia-kalaba", "gibbs-appell"])
+# those that are slow here factorise the rows of an upright disc in `test_discs.py`; the Gibbs function's own second derivatives take longest to compile
+SKATES = ["privileged", "qr", *(pytest.param(name, marks=pytest.mark.slow) for name in ("svd", "kkt", "udwadia-kalaba", "gibbs-appell"))]
+
+
+@pytest.mark.parametrize("name", SKATES)
 def test_derivatives_of_the_skates_accelerations_are_exact_at_any_heading(name):
     # heading 0 puts the row along a leading coordinate, where a plain QR differentiates to NaN
     reduction = jj.reductions(Skate())[name]

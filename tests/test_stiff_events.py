@@ -40,7 +40,7 @@ def followed(height, x):
 SOLVERS = {"default": {}, "RadauIIA": {"solver": jj.RadauIIA()}, "Kvaerno5": {"solver": diffrax.Kvaerno5(), "rtol": 1e-6, "atol": 1e-6}}
 
 
-@pytest.mark.parametrize("options", SOLVERS.values(), ids=SOLVERS)
+@pytest.mark.parametrize("options", [pytest.param(each, id=name, marks=[pytest.mark.slow] * (name == "Kvaerno5")) for name, each in SOLVERS.items()])
 def test_a_stiff_motion_is_right_at_an_event_by_every_solver_that_follows_it(options):
     for height, x in ((7.3, 0.85), (0.4, -1.0))[: 1 if "rtol" in options else 2]:
         motion = jj.simulate(Following(), {"y": height, "x": x}, ts=[6.0], max_steps=20_000, **options)

@@ -64,7 +64,7 @@ def _parallelograms(count: int, **options):
     return found.result, error
 
 
-@pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
+@pytest.mark.parametrize("rtol", [1e-4, 1e-6, pytest.param(1e-8, marks=pytest.mark.slow)])
 def test_a_parallelogram_passes_flat_on_its_branch_or_is_flagged(rtol):
     result, error = _parallelograms(128, rtol=rtol, atol=rtol)
     arrived = result == results.SUCCESS
