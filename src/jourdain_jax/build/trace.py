@@ -19,8 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num, PyTree
 
+from jourdain_jax.build.explicit_power import explicit_power
 from jourdain_jax.build.plausibility import PoseNumbers, numbers_of
-from jourdain_jax.equations.explicit_power import explicit_power
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, velocities_of
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import impressed, potential_energy, resultants

@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.build.explicit_power import explicit_rate, forces_for_potentials, power_of_loads
 from jourdain_jax.build.structure import Structure, structure_of
-from jourdain_jax.equations.explicit_power import explicit_rate, forces_for_potentials, power_of_loads
 from jourdain_jax.equations.kinematics import inertias, motion_at
 from jourdain_jax.equations.reductions import Accelerations, Reduced
 from jourdain_jax.equations.virtual_power import newton_residual, potential_energy

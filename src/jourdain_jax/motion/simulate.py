@@ -13,12 +13,12 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 
+from jourdain_jax.build.event_names import names_of_events
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.build.usual_lengths import usual_lengths
 from jourdain_jax.calculus.reals import Number
 from jourdain_jax.dynamics.accelerations import Baumgarte, as_reduction, as_stabilisation
 from jourdain_jax.dynamics.power import needs_work
-from jourdain_jax.equations.event_names import names_of_events
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reductions import NullSpaceQR
 from jourdain_jax.equations.rows import names_of_position_rows

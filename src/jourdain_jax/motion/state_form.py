@@ -11,13 +11,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.build.explicit_power import stored_by_inputs
 from jourdain_jax.build.structure import WELL_CONDITIONED, Structure
 from jourdain_jax.build.trace import event_values
 from jourdain_jax.build.usual_lengths import UsualLengths
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff, undecided
 from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations
 from jourdain_jax.dynamics.power import rate_of_work
-from jourdain_jax.equations.explicit_power import stored_by_inputs
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics, speeds_and_pivot, speeds_from_privileged
