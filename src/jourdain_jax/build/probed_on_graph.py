@@ -15,8 +15,8 @@ import numpy as np
 from jourdain_jax.build.assembling import ITERATIONS, Assembled, assemble, shortest, typical_lengths, without_rows
 from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.probed import Probed, generic_inputs
+from jourdain_jax.build.row_lengths import speed_scales
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
-from jourdain_jax.equations.scaling import speed_scales
 from jourdain_jax.program.analyticity import decided_by, depend_on, is_nonanalytic
 from jourdain_jax.program.derivative import columns, derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.build.probed import Probed
+from jourdain_jax.build.row_lengths import speed_scales
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
-from jourdain_jax.equations.scaling import speed_scales
 
 ERRORS = 100.0  # of a configuration: singular values below are of the error, not of the rows
 LARGE_COEFFICIENT, TAIL = 20.0, 3.0  # of the rows that stay, in a row that is left out: at any probe; with both signs, beside the median

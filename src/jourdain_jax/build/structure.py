@@ -18,10 +18,10 @@ from jourdain_jax.build.probed import TIMED, Probed, probed
 from jourdain_jax.build.probed_on_graph import follow_from_others, probed_on_graph
 from jourdain_jax.build.rank import Scaled, rank_of, redundant_rows, scaled_states
 from jourdain_jax.build.reference_parameters import once_per_values, without_collecting
+from jourdain_jax.build.row_lengths import speed_scales, typical_row_lengths
 from jourdain_jax.build.sampling import random_states, states_near_what_was_seen, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import check_smoothness
 from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, names_of_rows
-from jourdain_jax.equations.scaling import speed_scales, typical_row_lengths
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import as_names

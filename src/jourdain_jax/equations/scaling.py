@@ -35,12 +35,6 @@ def speed_scale(M: Float[Array, "speeds speeds"]) -> Float[Array, "speeds"]:
     return jnp.where(heavy, 1 / jnp.sqrt(jnp.where(heavy, diagonal, 1)), 1)
 
 
-def speed_scales(M: Float[np.ndarray, "states speeds speeds"]) -> Float[np.ndarray, "states speeds"]:
-    """Scales of the speeds (see `speed_scale`) at many states, by NumPy."""
-    diagonal = np.diagonal(M, axis1=1, axis2=2)
-    return np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1)), 1)
-
-
 def row_scale(A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray, "rows"] | None = None) -> Float[Array, "rows"]:
     """One over the length of each row, or over its `typical` length where it is shorter than that; 1 for a row that vanishes, where none is known.
 
@@ -50,23 +44,6 @@ def row_scale(A: Float[Array, "rows speeds"], typical: Float[Array | np.ndarray,
     if typical is not None:
         length = jnp.maximum(length, jnp.asarray(typical, length.dtype))
     return jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1), 1)
-
-
-def typical_row_lengths(A: Float[np.ndarray, "states rows speeds"], elsewhere: Float[np.ndarray, "others rows speeds"]) -> Float[np.ndarray, "rows"]:
-    """The length of each row at most states: the median, or the largest for a row that vanishes at half of them.
-
-    A row that is round-off at all `A` of what it is `elsewhere`, off the geometric rows, keeps that length, and so counts as zero.
-    """
-    length, beyond = (_usual(np.sqrt(np.sum(x**2, axis=2))) for x in (A, elsewhere))
-    return np.where(length > np.sqrt(np.finfo(A.dtype).eps) * beyond, length, beyond)
-
-
-def _usual(length: Float[np.ndarray, "states rows"]) -> Float[np.ndarray, "rows"]:
-    length = length[np.all(np.isfinite(length), axis=1)]
-    if not len(length):
-        return np.zeros(length.shape[1], length.dtype)
-    median = np.median(length, axis=0)
-    return np.where(median > 0, median, length.max(axis=0))
 
 
 def scaled(equations: UnconstrainedEquations, rows: ConstraintRows) -> ScaledProblem:
