@@ -35,6 +35,7 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 PROBES = 56  # at most
+USUAL_STATES = 16  # at which a motion finds out what is usual for its parameters
 LEAST_PROBES = 12  # at which programs can be compared, where so many were found
 # Of the program before simplification; beyond, the dense path is taken. There XLA needs a minute more for the program than for dense matrices (24 joint angles,
 # 20,762 operations: 71 and 7.5 s), though an evaluation takes 0.15 of the time (in a batch 0.22). Below, the dense path lost everywhere (bench/README.md).
@@ -220,7 +221,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         seconds=time.perf_counter() - begin,
         fixed=graph.fixed(outputs),
         usual=best.usual,
-        states={n: probes.inputs[str(graph.value[n])] for n in graph.reachable(best.usual.values()) if graph.op[n] == "input" and graph.varies[n]},
+        states=_some_states(graph, probes, best.usual.values()),
     )
 
 
@@ -344,6 +345,12 @@ def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expec
         if used.isdisjoint(q[list(group)].tolist()) or (unchanged(group) and regular_at_reference(group)):
             held += group
     return tuple(sorted(held))
+
+
+def _some_states(graph: Graph, probes: Probes, nodes) -> dict[int, np.ndarray]:
+    """Values of what varies among the inputs of some nodes, at the first probes."""
+    varying = [n for n in graph.reachable(nodes) if graph.op[n] == "input" and graph.varies[n]]
+    return {n: np.broadcast_to(probes.inputs[str(graph.value[n])], probes.count)[:USUAL_STATES] for n in varying}
 
 
 def _operands(graph: Graph, call: int) -> list[int]:
