@@ -164,3 +164,20 @@ def test_an_event_is_no_mistake_to_a_search_for_nan_and_a_mistake_still_is():
         assert "stopped at an event" in str(motion)
         with pytest.raises(FloatingPointError):
             jj.simulate(Wrong(), t1=5.0)
+
+
+WITH_MARKS = {
+    "energies": lambda motion, path: motion.energies().balance,
+    "a point": lambda motion, path: motion.point("stone", jnp.zeros(3)),
+    "a rollout": lambda motion, path: jj.rollout(Thrown(), {"x_rate": jnp.array([0.5, 1.0])}, t1=5.0).lanes.q,
+    "a file": lambda motion, path: (jj.save(motion, path), jj.load_trajectory(path, Thrown).q)[1],
+    "a derivative": lambda motion, path: jax.grad(lambda z: jj.simulate(Thrown(), {"z": z}, t1=5.0).t_end)(1.5),
+}
+
+
+@pytest.mark.parametrize("what", WITH_MARKS)
+def test_times_that_were_not_reached_are_no_mistake_to_a_search_for_nan(what, tmp_path):
+    motion = jj.simulate(Thrown(), t1=5.0)
+    with jax.debug_nans(True):
+        found = np.asarray(WITH_MARKS[what](motion, tmp_path / "motion.npz"))
+    assert np.isnan(found).any() == (what != "a derivative")

@@ -20,6 +20,7 @@ from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS
+from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.retries import lost_codes, mark_retried, next_retry, retry_options
 from jourdain_jax.motion.simulate import MOST_STEPS, TOLERANCE, default_solver, set_up, state_form, warn_float32
 from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
@@ -114,6 +115,7 @@ class Rollout(Printed, eqx.Module):
         return f" ({', '.join(dict.fromkeys(name for i in lanes for name in self.lane(int(i)).faults))})"
 
 
+@with_nan_as_a_mark
 def rollout(
     scene: Scene | BuiltFor,
     starts: "dict | State | None" = None,

@@ -13,6 +13,7 @@ from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.rows import UsualRows
+from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.trajectories.over_times import Record, accelerations_over_times, contact_forces_over_times, energies, invariants, residuals
 from jourdain_jax.motion.trajectories.results import FALLBACKS
 from jourdain_jax.scene.numbers import is_traced
@@ -26,6 +27,7 @@ class Energies(eqx.Module):
     work: Float[Array, "*lanes times"] | None
 
     @property
+    @with_nan_as_a_mark
     def balance(self) -> Float[Array, "*lanes times"]:
         """T + V - W; W is the work of forces without potential and of rows that do work."""
         total = self.kinetic + self.potential

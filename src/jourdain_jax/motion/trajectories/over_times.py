@@ -16,8 +16,9 @@ from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy
 from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.inputs import Inputs
+from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.numbers import checked_real
+from jourdain_jax.scene.numbers import checked_real, is_traced
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import invariants_of
 
@@ -53,7 +54,9 @@ def map_over_times(f, record: Record, by_inputs: bool = False):
 
     `by_inputs`: f needs the rates of the inputs, where rows depend on some that change. Of a batch of motions: with its axes of lanes first.
     """
-    return _compiled(record.inputs.programs)(f, record, by_inputs and _needs_rates(record))
+    mapped = _compiled(record.inputs.programs)
+    whole = jax.config.jax_debug_nans and not is_traced(record) and bool(jnp.all(jnp.isfinite(record.q)))  # then NaN is no mark
+    return (mapped if whole else with_nan_as_a_mark(mapped))(f, record, by_inputs and _needs_rates(record))
 
 
 def _along(f, record: Record, by_inputs: bool):

@@ -26,6 +26,7 @@ import numpy as np
 
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.inputs import Inputs, Sampled
+from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.trajectories.results import BAD_PARAMETER
 from jourdain_jax.motion.trajectories.storage_checks import COUNTS, check_arrays, check_fields, check_header, check_scenes, refused
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -120,6 +121,7 @@ def _check_saved(motion, path) -> None:
         raise ValueError(f"cannot write `{os.fspath(path)}`: it is a folder; give the name of a file in it, such as motion.npz")
 
 
+@with_nan_as_a_mark
 def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Trajectory:
     """Read a trajectory written by `save` from `path`. `scene`: the scene's class, or any scene of that class; parameters come from the file.
 
@@ -136,6 +138,7 @@ def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Traj
     return motion
 
 
+@with_nan_as_a_mark
 def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout:
     """Read a rollout written by `save` from `path`: all its lanes, failed ones too, each with its result code.
 
