@@ -198,7 +198,7 @@ def test_a_disc_on_a_hill_moves_by_its_angles_as_by_the_search_for_its_contact()
     motion = jj.simulate(by_angles, {"x": 0.1, "lean": 0.2, "yaw": 0.3, "spin_rate": 9.0, "yaw_rate": 0.4}, ts=np.linspace(0.0, 0.6, 5), rtol=1e-11, atol=1e-11)
     assert float(jj.diagnose(motion).energy_drift) <= tolerance("drift")
 
-    @jax.jit
+    @eval_numpy
     @jax.vmap
     def both(t, q, u):
         pose = jj.motion_at(by_angles, t, q, u)["body"]

@@ -141,6 +141,7 @@ def test_printed_table(sleigh_fit):
 # The rattleback. --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_rattleback_and_its_unknown_tilt_are_identified():
     ts = np.linspace(0.0, 0.5, 26)
     start = {"alpha": 0.1, "beta": 0.01, "w1": 0.0, "w2": 0.0, "w3": -5.0}

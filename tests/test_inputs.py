@@ -139,7 +139,9 @@ def work_by_quadrature():
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"lowering": False}, {"solver": diffrax.Kvaerno5()}, {"state": "full"}], ids=["lowered", "dense", "diffrax", "full state"]
+    "options",
+    [{}, {"lowering": False}, pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow), {"state": "full"}],
+    ids=["lowered", "dense", "diffrax", "full state"],
 )
 def test_the_work_of_a_sampled_input_in_a_potential_is_that_of_a_quadrature(options):
     inputs = {"hand": jj.Sampled(KNOTS, PLACES), "push": 0.7}

@@ -134,7 +134,11 @@ def test_functions_of_numbers_are_lowered():
     np.testing.assert_allclose(*(jax.vmap(jax.jit(lambda q, y, f=f: f(scene, q, y)))(q, y) for f in (by_program, dense)), rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("law", [lambda x, _: jax.nn.softplus(x), lambda x, _: jnp.sinc(x), lambda x, _: jax.nn.relu(x)], ids=["softplus", "sinc", "relu"])
+@pytest.mark.parametrize(
+    "law",
+    [pytest.param(lambda x, _: jax.nn.softplus(x), marks=pytest.mark.slow), lambda x, _: jnp.sinc(x), lambda x, _: jax.nn.relu(x)],
+    ids=["softplus", "sinc", "relu"],
+)
 def test_functions_of_jax_have_their_derivatives_where_their_branches_meet(law):
     scene = Acted(law=law)
     assert "which has a derivative of its own" in jj.lower(scene).calls[0]
