@@ -1,5 +1,6 @@
 """Batches: every lane as if it were alone, one bad lane harms no other, differentiable as a whole."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,3 +114,13 @@ def test_another_tolerance_first_step_or_end_is_no_other_program():
     assert np.all(same.accepted > loose.accepted)
     np.testing.assert_allclose(tight.q_end, loose.q_end, rtol=1e-5)
     np.testing.assert_allclose(longer.t_end, 1.5)
+
+
+def test_states_made_by_hand_are_starts_of_lanes():
+    sleigh = ChaplyginSleigh()
+    made = [jj.start(sleigh, x_rate=speed, heading_rate=0.3) for speed in (0.4, 0.6)]
+    starts = eqx.tree_at(lambda s: s.guess, jax.tree.map(lambda *x: jnp.stack(x), *made), jnp.zeros(()))  # what `jj.State` has by default
+    options = {"ts": jnp.array([0.2]), "projection": False}
+    lanes = jj.rollout(sleigh, starts, **options)
+    for k, state in enumerate(made):
+        np.testing.assert_allclose(lanes.lanes.q_end[k], jj.simulate(sleigh, state, **options).q_end, rtol=1e-9, atol=1e-12)

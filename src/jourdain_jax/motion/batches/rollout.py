@@ -280,7 +280,8 @@ def _lanes(scene: Scene, starts, parameters: dict):
             raise ValueError(f"scene `{type(scene).__name__}` has no parameter `{name}`; {nearest(name, known)}")
     lengths = {f"parameter `{name}`": value.shape[0] if value.ndim else None for name, value in parameters.items()}
     if isinstance(starts, State):
-        fixed, varied = {}, starts
+        many = starts.q.shape[:1] if starts.q.ndim == 2 else ()
+        fixed, varied = {}, eqx.tree_at(lambda s: s.guess, starts, jnp.broadcast_to(starts.guess, many))  # a state made by hand has one for all lanes
         lengths["`starts`"] = starts.q.shape[0] if starts.q.ndim == 2 else None
     else:
         arrays = {name: checked_real(value, f"start `{name}`").astype(jnp.result_type(float)) for name, value in starts.items()}
