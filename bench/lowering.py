@@ -94,7 +94,7 @@ def our_starts(y) -> jj.State:
     """States of discs, for minimal ones (lanes, 8): the contact point's speeds follow from the rows."""
     start = jax.tree.map(lambda x: jnp.broadcast_to(0.0 * x, (len(y), *jnp.shape(x))), jj.start(jj.models.MODELS["tilting-disc"]()))
     q, u = y[:, :5], jnp.concatenate([jnp.zeros((len(y), 2)), y[:, 5:]], axis=1)
-    return jj.State(start.t, q, u, start.moved_q, start.moved_u, start.residual, start.names)
+    return jj.State(start.t, q, u, start.moved_q, start.moved_u, start.residual, start.names, start.guess)
 
 
 RUN = {"ts": jnp.array([disc_run.END]), "solver": diffrax.Dopri8(), "events": False, "projection": False}

@@ -39,7 +39,7 @@ def by_rollout(problem: Problem) -> Callable:
     def states(y):
         u = jax.vmap(lambda y: speeds_from_privileged(scene, independent, jnp.zeros(()), y[:n], y[n:]))(y)
         same = jax.tree.map(lambda x: jnp.broadcast_to(0.0 * x, (len(y), *jnp.shape(x))), known)
-        return jj.State(same.t, y[:, :n], u, same.moved_q, same.moved_u, same.residual, known.names)
+        return jj.State(same.t, y[:, :n], u, same.moved_q, same.moved_u, same.residual, known.names, same.guess)
 
     @jax.jit
     def compiled(tolerance, state):
