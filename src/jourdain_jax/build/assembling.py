@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jourdain_jax.build.row_lengths import usual_lengths_of
+
 ITERATIONS = 25  # of Gauss-Newton, at most
 _DAMPED_ITERATIONS = 60
 _NEARLY_DEPENDENT = 1e-6  # of the triangular factor's diagonal: below, singular values decide
@@ -105,11 +107,7 @@ def _lengths(G: np.ndarray) -> np.ndarray:
 
 def typical_lengths(lengths: np.ndarray) -> np.ndarray:
     """What a row's length is at most states: the median, or the largest for a row that vanishes at half of them; 1 for one that always does."""
-    lengths = lengths[np.all(np.isfinite(lengths), axis=1)]
-    if not len(lengths):
-        return np.ones(lengths.shape[1])
-    typical = np.median(lengths, axis=0)
-    typical = np.where(typical > 0, typical, lengths.max(axis=0))
+    typical = usual_lengths_of(lengths)
     return np.where(typical > 0, typical, 1.0)
 
 

@@ -15,11 +15,12 @@ def typical_row_lengths(A: Float[np.ndarray, "states rows speeds"], elsewhere: F
 
     A row that is round-off at all `A` of what it is `elsewhere`, off the geometric rows, keeps that length, and so counts as zero.
     """
-    length, beyond = (_usual(np.sqrt(np.sum(x**2, axis=2))) for x in (A, elsewhere))
+    length, beyond = (usual_lengths_of(np.sqrt(np.sum(x**2, axis=2))) for x in (A, elsewhere))
     return np.where(length > np.sqrt(np.finfo(A.dtype).eps) * beyond, length, beyond)
 
 
-def _usual(length: Float[np.ndarray, "states rows"]) -> Float[np.ndarray, "rows"]:
+def usual_lengths_of(length: Float[np.ndarray, "states rows"]) -> Float[np.ndarray, "rows"]:
+    """The median over the states at which all are numbers, or the largest for a row that vanishes at half of them; 0 for one that always does."""
     length = length[np.all(np.isfinite(length), axis=1)]
     if not len(length):
         return np.zeros(length.shape[1], length.dtype)

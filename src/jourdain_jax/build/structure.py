@@ -87,6 +87,11 @@ class Structure:
         return len(self.row_names) - len(self.redundant_rows) > self.rank
 
     @property
+    def has_minimal_state(self) -> bool:
+        """Whether coordinates and privileged speeds are the state that is integrated, unless the user asks for another."""
+        return self.affine and self.well_conditioned
+
+    @property
     def well_conditioned(self) -> bool:
         """Whether the privileged velocities serve everywhere in the domain."""
         return not self.may_set_in and self.worst_pivot >= WELL_CONDITIONED * min(1.0, LONG / max(self.rank, 1))

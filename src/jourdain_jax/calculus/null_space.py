@@ -30,7 +30,7 @@ def null_space_qr(A: Float[Array, "rows columns"], cutoff: float | None = None) 
 
 
 def pivots_qr(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
-    """Magnitudes of the pivots of that decomposition, largest first, as a diagnostic: no derivative passes through them."""
+    """Magnitudes of the pivots of the column-pivoted QR decomposition of `A'`, largest first, as a diagnostic: no derivative passes through them."""
     if 0 in A.shape:
         return jnp.ones((0,), A.dtype)
     _, R, _ = jax.lax.linalg.qr(jax.lax.stop_gradient(A).T, full_matrices=True, pivoting=True)

@@ -66,7 +66,7 @@ class Conserved:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Built(BuiltFor, Printed):
-    """What `build` found about `scene`, part by part; it may be given wherever a scene is asked for. Printed as a table.
+    """What `build` found about `scene`, part by part; `simulate` and its like take it in the place of the scene. Printed as a table.
 
     It is pickled as its scene, and built again where it is loaded. What it says holds for the numbers of its scene and for those near them.
     """
@@ -122,7 +122,8 @@ def build(scene: Scene | BuiltFor) -> Built:
         print(built), built.freedoms.privileged, built.program.operations
         motion = jj.simulate(built, {"lean": 0.3}, t1=5.0)
 
-    `simulate`, `rollout`, `fit`, `linearize` and all other functions of a scene build on first use and keep what they found; each takes a `Built` too.
+    All functions of a scene build on first use and keep what they found. `start`, `simulate`, `rollout`, `fit`, `fit_batch`, `linearize`, `steady`, `report`,
+    `verify` and `lower` take what this returns in the place of `scene`; all others take its `.scene`.
     ValueError as of `structure_of`: no admissible state, no inertia along a free motion, numbers of bodies that cannot be.
     """
     scene = as_scene(scene)
@@ -143,7 +144,7 @@ def build(scene: Scene | BuiltFor) -> Built:
         conserved=Conserved(not needs_work(scene, known), () if program is None else program.held, names_of_invariants(scene)),
         program=program,
         not_lowered="" if program is not None else str(found),
-        state="minimal" if known.affine and known.well_conditioned else "full",
+        state="minimal" if known.has_minimal_state else "full",
         events=names_of_events(scene),
     )
 

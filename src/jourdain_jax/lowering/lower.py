@@ -59,7 +59,7 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
     `every_speed`: all speeds stay in the state, rows are kept by multipliers; default: where no privileged speeds serve everywhere.
     """
     structure = structure_of(scene)
-    every_speed = not (structure.affine and structure.well_conditioned) if every_speed is None else every_speed
+    every_speed = not structure.has_minimal_state if every_speed is None else every_speed
     every_speed = every_speed or not structure.row_names
     massless = bool(every_speed and structure.row_names) and may_be_massless(scene, structure)
     return _lowered(_Key(with_reference_parameters(scene), structure, every_speed, massless))

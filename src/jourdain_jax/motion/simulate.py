@@ -229,7 +229,7 @@ def state_form(
     if state == "minimal" and structure.may_set_in:
         named = ", ".join(f"`{name}`" for name in structure.may_set_in)
         raise ValueError(f"rows {named} of `{type(scene).__name__}` may set in where they do not follow from the others; use state='full'")
-    minimal = state == "minimal" or (state == "auto" and structure.affine and structure.well_conditioned)
+    minimal = state == "minimal" or (state == "auto" and structure.has_minimal_state)
     independent = structure.independent if minimal else None
     with_work = work and needs_work(scene, structure)
     dense = inputs_in_rows or (with_work and (structure.driven or structure.varying_inertia))

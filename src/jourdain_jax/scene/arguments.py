@@ -16,9 +16,12 @@ from jourdain_jax.scene.scene import Scene
 
 
 class BuiltFor:
-    """What was found about a scene; it may stand wherever that scene does."""
+    """What was found about a scene; functions that ask for `as_scene` take it in the place of that scene."""
 
     scene: Scene
+
+    def __getattr__(self, name: str):
+        raise AttributeError(f"`{type(self).__name__}` has no `{name}`; where a scene is asked for, pass its `.scene`")
 
 
 def as_scene(scene) -> Scene:

@@ -59,9 +59,9 @@ def map_over_times(f, record: Record, by_inputs: bool = False):
     return (mapped if whole else with_nan_as_a_mark(mapped))(f, record, by_inputs and _needs_rates(record))
 
 
-def _along(f, record: Record, by_inputs: bool):
+def _mapped(f, record: Record, by_inputs: bool):
     if record.q.ndim > 2:
-        return eqx.filter_vmap(lambda record: _along(f, record, by_inputs))(record)
+        return eqx.filter_vmap(lambda record: _mapped(f, record, by_inputs))(record)
 
     def one(t, q, u):
         reached = jnp.all(jnp.isfinite(q))
@@ -72,7 +72,7 @@ def _along(f, record: Record, by_inputs: bool):
     return jax.vmap(one)(record.ts, record.q, record.u)
 
 
-_compiled = for_programs(_along, by_itself)
+_compiled = for_programs(_mapped, by_itself)
 
 
 def motions(record: Record) -> Motion:
