@@ -1,5 +1,6 @@
 """The scalar program: graph, derivatives, normal forms, values, code."""
 
+import inspect
 import itertools
 import math
 import subprocess
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.eager.numpy_backend import uncompiled
 from jourdain_jax.program.derivative import derivatives, directional_derivative
 from jourdain_jax.program.emit import run, sine_and_cosine
@@ -323,3 +325,32 @@ def test_a_computation_of_too_many_scalars_is_refused_before_it_is_built(monkeyp
     graph = Graph()
     with pytest.raises(Unsupported, match="more than 50 scalars"):
         graph.total(graph.input(f"x{i}", True) for i in range(50))
+
+
+# The table of operations: a new entry is tested here.
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_an_operation_has_one_value_one_derivative_and_a_bound_of_its_round_off(graph, name):
+    operation = TABLE[name]
+    arity = 3 if name == "select" else len(inspect.signature(operation.value).parameters) if name == "logistic" else operation.value.nin
+    points = np.random.default_rng(3).uniform(0.2, 0.9, (arity, 20)) + (1.0 if name == "acosh" else 0.0)
+    names = ["x", "y", "z"][:arity]
+    variables = _x(graph, *names)
+    node = graph.call(name, *variables)
+    flags = [operation.kind == "choice" and name != "is_finite" and (name != "select" or k == 0) for k in range(arity)]
+    given = [x > 0.5 if flag else x for x, flag in zip(points, flags, strict=True)]
+
+    def in_jax(*moving):
+        return operation.in_jax(*(fixed if flag else x for fixed, x, flag in zip(given, moving, flags, strict=True))) * 1.0
+
+    value, rate = jax.jvp(in_jax, tuple(points), tuple(0.3 * points))
+    probes = Probes(graph, dict(zip(names, given, strict=True)))
+    np.testing.assert_allclose(probes([node])[0], value, rtol=1e-14)
+    direction = {x: graph.zero if flag else graph.mul(graph.const(0.3), x) for x, flag in zip(variables, flags, strict=True)}
+    np.testing.assert_allclose(probes(derivatives(graph, [node], direction))[0], rate, rtol=1e-12, atol=1e-14)
+    if operation.bounded:
+        single = [np.concatenate([x.astype(np.float32).astype(float), 6e-8 * np.abs(x)]) for x in points]
+        near, bound = np.split(operation.bounded(*single), 2)
+        assert np.all(np.abs(near - operation.value(*points)) <= bound)
+        assert np.all(bound <= 1e-4 * (1.0 + np.abs(near)))

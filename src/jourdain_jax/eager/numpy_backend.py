@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
-from jourdain_jax.eager.entrywise import FUNCTIONS
+from jourdain_jax.calculus.scalar_operations import VALUES
 from jourdain_jax.eager.indexing import gathered, scattered
 
 MOST_TURNS = 5000  # of a loop that states none: more of them are for ever
@@ -159,16 +159,10 @@ _CONTROL: dict[str, Callable] = {
 # Primitives.
 
 _ENTRYWISE: dict[str, Callable] = {
-    **FUNCTIONS,
+    **VALUES,
     "add_any": np.add,
-    "rem": np.fmod,
     "square": np.square,
     "rsqrt": lambda x: 1 / np.sqrt(x),
-    "pow": np.power,
-    "log1p": np.log1p,
-    "expm1": np.expm1,
-    "floor": np.floor,
-    "ceil": np.ceil,
     "and": np.bitwise_and,
     "or": np.bitwise_or,
     "xor": np.bitwise_xor,

@@ -8,7 +8,7 @@ from jourdain_jax.program.source import PYTHON, C, statements, sympy_expressions
 
 SHORT, FEW = 60, 8  # characters of an expression in the summary, and how many there may be
 _IN_C = {"auto", "char", "const", "default", "do", "double", "enum", "extern", "float", "goto", "inline", "int", "long", "register", "restrict", "short"}
-_IN_C |= {"signed", "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "case"} | set(C.functions.values())
+_IN_C |= {"signed", "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "case"} | C.names
 _ARGUMENTS = ("parameters", "t", "coordinates", "speeds", "inputs", "out")
 
 

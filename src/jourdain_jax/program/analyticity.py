@@ -4,10 +4,10 @@ with a branch, a function that is flat somewhere, or an opaque call may be zero 
 
 from collections.abc import Callable, Iterable
 
-from jourdain_jax.program.graph import BRANCHES, Graph
+from jourdain_jax.calculus.scalar_operations import TABLE
+from jourdain_jax.program.graph import Graph
 
-FLAT_SOMEWHERE = {"exp", "exp2", "expm1", "log1p", "sinh", "cosh", "tanh", "logistic"}
-NONANALYTIC = {*BRANCHES, *FLAT_SOMEWHERE, "select", "is_finite", "kept"}
+NONANALYTIC = {"kept", *(name for name, operation in TABLE.items() if operation.kind != "analytic")}
 
 
 def is_nonanalytic(graph: Graph, outputs: Iterable[int]) -> list[bool]:

@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.calls import EMITTED
 from jourdain_jax.program.fused import fused
-from jourdain_jax.program.graph import ARRAYS, COMPARISONS, Graph
+from jourdain_jax.program.graph import ARRAYS, Graph
 from jourdain_jax.program.loop_rerolling import Loop, deepest_first, sources, with_loops
 from jourdain_jax.program.scan_emission import Values, run_loop
 
@@ -89,34 +90,7 @@ def _together(nodes: list[int], values: Mapping[int, jax.Array]) -> dict[int, ja
     return {n: x for group in alike.values() for n, x in zip(group, fused(tuple(values[n] for n in group)), strict=True)}
 
 
-FUNCTIONS: dict[str, Callable] = {
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b,
-    "div": lambda a, b: a / b,
-    "neg": lambda a: -a,
-    "atan2": jnp.arctan2,
-    "asin": jnp.arcsin,
-    "acos": jnp.arccos,
-    "atan": jnp.arctan,
-    "asinh": jnp.arcsinh,
-    "acosh": jnp.arccosh,
-    "atanh": jnp.arctanh,
-    "pow": jnp.power,
-    "logistic": lax.logistic,
-    "rem": jnp.fmod,
-    "round": jnp.round,
-    "max": jnp.maximum,
-    "min": jnp.minimum,
-    **COMPARISONS,
-    "and": jnp.logical_and,
-    "or": jnp.logical_or,
-    "not": jnp.logical_not,
-    "is_finite": jnp.isfinite,
-    "select": lambda c, a, b: jnp.where(c, b, a),
-    **{name: getattr(jnp, name) for name in ("sqrt", "tan", "exp", "log", "tanh", "sinh", "cosh", "sign", "abs")},
-    **{name: getattr(jnp, name) for name in ("exp2", "expm1", "log1p", "cbrt", "floor", "ceil")},
-}
+FUNCTIONS: dict[str, Callable] = {name: operation.in_jax for name, operation in TABLE.items()}
 
 # pi/2 in three parts of 33 bits, and minimax polynomials on [-pi/4, pi/4] (K. C. Ng's, as in FreeBSD's libm)
 _HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)

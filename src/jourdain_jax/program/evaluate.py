@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 
-from jourdain_jax.eager.entrywise import FUNCTIONS
+from jourdain_jax.calculus.scalar_operations import VALUES
 from jourdain_jax.program.calls import AT_PROBES
 from jourdain_jax.program.graph import ARRAYS, Graph
 
@@ -16,7 +16,7 @@ class Probes:
         self,
         graph: Graph,
         inputs: Mapping[str, np.ndarray],
-        functions: Mapping[str, Callable] = FUNCTIONS,
+        functions: Mapping[str, Callable] = VALUES,
         arrays: Mapping[str, Callable] = AT_PROBES,
         constant: Callable = float,
     ):

@@ -6,11 +6,12 @@ Arguments of sums and products are ordered, so that a b and b a are one node.
 
 import heapq
 import math
-import operator
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
+
+from jourdain_jax.calculus.scalar_operations import BRANCHES, TABLE
 
 MOST_NODES = 500_000  # of one graph: some seconds of building
 MOST_FACTORS = 8  # of a product that is looked at for squares of sines
@@ -212,11 +213,11 @@ class Graph:
         """Any other function of scalars, by name; folded where all arguments are numbers."""
         if op in _ARITHMETIC:
             return getattr(self, op)(*args)
-        if all(self.op[a] == "const" for a in args) and op in _FOLDED:
-            try:
-                return self.const(_FOLDED[op](*(self.value[a] for a in args)))
-            except (ValueError, OverflowError, ZeroDivisionError):
-                pass  # not a number at build time: left to the program
+        if all(self.op[a] == "const" for a in args):
+            with np.errstate(all="ignore"):
+                value = TABLE[op].value(*(self.value[a] for a in args))
+            if np.isfinite(value):  # otherwise left to the program
+                return self.const(value)
         a = args[0]
         if op == "sin" and self.op[a] == "neg":
             return self.neg(self.call("sin", self.args[a][0]))
@@ -362,21 +363,4 @@ class Graph:
         return more
 
 
-COMPARISONS: dict[str, Callable] = {name: getattr(operator, name) for name in ("lt", "le", "gt", "ge", "eq", "ne")}
-BRANCHES = {*COMPARISONS, "max", "min", "abs", "sign", "floor", "ceil", "round", "rem"}
 _ARITHMETIC = {"add", "sub", "mul", "div", "neg"}
-_FOLDED: dict[str, Callable] = {
-    "sin": math.sin,
-    "cos": math.cos,
-    "tan": math.tan,
-    "sqrt": math.sqrt,
-    "exp": math.exp,
-    "log": math.log,
-    "tanh": math.tanh,
-    "abs": abs,
-    "sign": lambda x: math.copysign(1.0, x) if x else 0.0,
-    "max": max,
-    "min": min,
-    **COMPARISONS,
-    "select": lambda c, a, b: b if c else a,
-}

@@ -5,11 +5,8 @@ near those of a scene are not generic, though (a parameter may be tiny, time may
 elsewhere what it does at no probe. So inputs are drawn anew, of the order of one and larger; and any other function is replaced by one of its operands that
 is neither flat nor kinked anywhere. An identity that holds then holds whatever these functions are.
 
-Nothing is compared with a fixed tolerance. With every value goes a bound of its round-off (Higham, 2002, 3.3),
-
-    a + b: e_a + e_b + eps |a + b|        a b: |a| e_b + |b| e_a + e_a e_b + eps |a b|        a/b: (e_a + |a/b| e_b)/(|b| - e_b) + eps |a/b|
-
-and two values are equal where they differ by no more. Numbers in the code of a scene may be far from one (1e-24, 1e16), and would hide or be hidden: they are
+Nothing is compared with a fixed tolerance. With every value goes a bound of its round-off (`calculus/round_off.py`), and two values are equal where they
+differ by no more. Numbers in the code of a scene may be far from one (1e-24, 1e16), and would hide or be hidden: they are
 written as c = m R^j, R = 2^40, with |m| between 2^-20 and 2^20, and R is drawn anew at every probe. What holds of any R holds of this one.
 """
 
@@ -20,19 +17,17 @@ from typing import Self
 
 import numpy as np
 
-from jourdain_jax.eager.entrywise import FUNCTIONS
+from jourdain_jax.calculus.round_off import EPS, halves, with_bound
+from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.derivative import columns
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 
-KNOWN = ("add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos", "tan")  # taken for what they are
 STEPS, CLOSED = 30, 1e3  # of Newton's method; bounds of round-off that rows may be off
 FAR = 10.0  # half of the probes lie so much further out
 DIGITS = 40  # binary ones, that numbers in the code of a scene may span among themselves
 RADIX = 1.5, 3.0  # in the place of 2^DIGITS
-EPS = float(np.finfo(float).eps)
 SURE = 16.0  # bounds of round-off that equal values may differ by: bounds are of first order
-LOST = 1e3  # bounds of round-off below which a divisor, or what a root is taken of, is not told from zero
 FEWEST = 6  # probes at which an expression is a number
 
 
@@ -129,7 +124,7 @@ def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinat
     graph = probes.graph
     needed = set(graph.reachable(rows))
     moved = {name: n for name, n in coordinates.items() if n in needed}
-    if not moved or any(graph.op[n] not in (*KNOWN, "const", "input") for n in needed):
+    if not moved or any(graph.op[n] not in _KNOWN for n in needed):
         return probes
     slopes = [n for column in columns(graph, rows, moved.values()) for n in column]
     q = np.stack([np.broadcast_to(near.inputs[name], probes.count) for name in moved])
@@ -155,64 +150,7 @@ def _moderate(value: float, radix: np.ndarray) -> np.ndarray:
     return np.concatenate([moderate, (2 * abs(j)) * EPS * np.abs(moderate)])
 
 
-# Functions of values and bounds, which follow one another in an array. -----------------------------------------------
-
-
-def _with(value: np.ndarray, error: np.ndarray) -> np.ndarray:
-    error += EPS * np.abs(value)
-    return np.concatenate([value, error])
-
-
-def _halves(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    half = len(x) // 2
-    return x[:half], x[half:]
-
-
-def _sum(x, y):
-    both, half = x + y, len(x) // 2
-    both[half:] += EPS * np.abs(both[:half])
-    return both
-
-
-def _difference(x, y):
-    (a, ea), (b, eb) = _halves(x), _halves(y)
-    return _with(a - b, ea + eb)
-
-
-def _negative(x):
-    return np.concatenate([-x[: len(x) // 2], x[len(x) // 2 :]])
-
-
-def _product(x, y):
-    (a, ea), (b, eb) = _halves(x), _halves(y)
-    return _with(a * b, np.abs(a) * eb + (np.abs(b) + eb) * ea)
-
-
-def _quotient(x, y):
-    (a, ea), (b, eb) = _halves(x), _halves(y)
-    value, size = a / b, np.abs(b)
-    error = (ea + np.abs(value) * eb) / size * (1 + 2 / LOST)
-    return _with(value, np.where((eb > 0) & (size <= LOST * eb), np.inf, error))
-
-
-def _root(x):
-    a, ea = _halves(x)
-    value = np.sqrt(a)
-    return _with(value, np.where((ea > 0) & (np.abs(a) <= LOST * ea), np.inf, np.where(ea > 0, ea / value, 0.0)))
-
-
-def _wave(function: Callable) -> Callable:
-    def wave(x):
-        a, ea = _halves(x)
-        return _with(function(a), np.minimum(ea, 2.0))
-
-    return wave
-
-
-def _tangent(x):
-    a, ea = _halves(x)
-    value = np.tan(a)
-    return _with(value, 2 * (1 + value**2) * ea)
+# Functions of values and bounds that are taken for any function of theirs. -----------------------------------------------
 
 
 def _generic(name: str) -> Callable:
@@ -221,10 +159,10 @@ def _generic(name: str) -> Callable:
     def function(*operands):
         weights = np.random.default_rng(zlib.crc32(name.encode())).uniform(0.3, 1.7, (2, len(operands)))
         half = len(operands[0]) // 2
-        (phase, e), (rest, _) = (_halves(sum(w * x for w, x in zip(row, operands, strict=True))) for row in weights)
+        (phase, e), (rest, _) = (halves(sum(w * x for w, x in zip(row, operands, strict=True))) for row in weights)
         # no weight is more than six times another, so that this bounds the round-off of both sums
         size = sum(np.abs(x[:half]) for x in operands)
-        return _with(np.sin(phase + 0.4) + 0.3 * rest, 3.0 * e + 2.0 * len(operands) * EPS * size)
+        return with_bound(np.sin(phase + 0.4) + 0.3 * rest, 3.0 * e + 2.0 * len(operands) * EPS * size)
 
     return function
 
@@ -234,17 +172,8 @@ def _kept(call, *operands) -> np.ndarray:
     return _generic(call.name)(*(column for x in operands for column in (x.T if x.ndim == 2 else [x])))
 
 
-_SCALARS = {op: _generic(op) for op in FUNCTIONS} | {
-    "add": _sum,
-    "sub": _difference,
-    "neg": _negative,
-    "mul": _product,
-    "div": _quotient,
-    "sqrt": _root,
-    "sin": _wave(np.sin),
-    "cos": _wave(np.cos),
-    "tan": _tangent,
-}
+_KNOWN = {"const", "input", *(name for name, operation in TABLE.items() if operation.bounded)}  # taken for what they are
+_SCALARS = {name: operation.bounded or _generic(name) for name, operation in TABLE.items()}
 _ARRAYS: dict[str, Callable] = {
     "array": lambda shape_and_type, *entries: np.stack(entries, axis=-1) if entries else np.empty((0, 0)),
     "kept": _kept,

@@ -1,7 +1,7 @@
 """A jaxpr run over scalars: every array is an array of nodes of a `Graph`, every primitive acts on its entries.
 
 Integers and booleans that do not depend on inputs (indices, shapes, masks) stay NumPy arrays. A primitive without a rule raises
-`Unsupported`; `parts.py` makes a call of what it belongs to.
+`Unsupported`; `opaque_calls.py` makes a call of what it belongs to.
 """
 
 import os
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
+from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
 from jourdain_jax.program.graph import Graph, Unsupported
 
@@ -337,9 +338,7 @@ def _round(graph: Graph, method, x: int) -> int:
 
 
 _ELEMENTWISE: dict[str, Callable] = {
-    **{name: _call(name) for name in ("add", "sub", "mul", "div", "neg", "sin", "cos", "tan", "sqrt", "exp", "log", "tanh", "abs", "sign", "max", "min")},
-    **{name: _call(name) for name in ("lt", "le", "gt", "ge", "eq", "ne", "atan2", "and", "or", "not", "asin", "acos", "atan", "sinh", "cosh", "is_finite")},
-    **{name: _call(name) for name in ("asinh", "acosh", "atanh", "exp2", "expm1", "log1p", "logistic", "cbrt", "floor", "ceil", "rem")},
+    **{name: _call(name) for name in TABLE},
     "pow": lambda graph, params, x, y: _power(graph, x, y),
     "round": lambda graph, params, x: _round(graph, params["rounding_method"], x),
     "add_any": _call("add"),

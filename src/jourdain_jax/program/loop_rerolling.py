@@ -14,13 +14,14 @@ from typing import TypeAlias
 
 import numpy as np
 
-from jourdain_jax.program.graph import ARRAYS, COMPARISONS, Graph
+from jourdain_jax.calculus.scalar_operations import TABLE
+from jourdain_jax.program.graph import ARRAYS, Graph
 
 LONGEST = 400  # operations of one round
 LEAST = 48  # operations that one loop must save
 WORTHWHILE = 1000  # operations that all loops of a program must save: with fewer, a row compiles in seconds and runs up to a fifth faster
-_ALONE = {*ARRAYS, "entry", *COMPARISONS, "and", "or", "not", "is_finite", "select"}  # loops carry numbers
-_COMMUTATIVE = {"add", "mul", "max", "min"}
+_ALONE = {*ARRAYS, "entry", *(name for name, operation in TABLE.items() if not operation.is_number)}  # loops carry numbers
+_COMMUTATIVE = {name for name, operation in TABLE.items() if operation.commutes}
 
 
 @dataclass(frozen=True)
