@@ -111,7 +111,7 @@ def rates_of(scene):
     program = jj.lower(scene)
 
     def by_program(scene, q, y):
-        qdot, ydot, _ = program.rates(program.fixed_values(scene), 0.0, tuple(q), tuple(y), jnp.zeros(0))
+        qdot, ydot, _ = program.rates(program.fixed_values(scene), jnp.zeros(()), tuple(q), tuple(y), jnp.zeros(0))
         return jnp.stack([*qdot, *ydot])
 
     def dense(scene, q, y):
@@ -256,19 +256,13 @@ def test_a_networks_weights_have_gradients_through_a_motion_in_both_modes():
 
 
 class OnCam(jj.Scene):
-    """A bead whose height is a table of where it is: the part without a scalar form would have to be differentiated."""
+    """A bead whose height is a table of where it is."""
 
     mass: jnp.ndarray = jj.parameter(1.0, positive=True)
     coordinates = jj.coordinates("x")
 
     def bodies(self, t, q):
         return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, jnp.interp(q.x, jnp.linspace(-9.0, 9.0, 10), jnp.arange(10.0))]))}
-
-
-def test_a_pose_without_a_scalar_form_makes_the_whole_scene_dense():
-    with pytest.raises(jj.NotLowered, match="`OnCam` is not lowered: the operation `scan` has no scalar form"):
-        jj.lower(OnCam())
-    assert jj.simulate(OnCam(), {"x_rate": 1.0}, t1=0.5).reduction == "privileged"
 
 
 class Mixed(OnCam):
@@ -278,9 +272,14 @@ class Mixed(OnCam):
         return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, jnp.mean(jnp.full((40, 40), 0.3) @ jnp.sin(q.x + jnp.arange(40.0)))]))}
 
 
-def test_a_large_product_in_a_pose_is_taken_apart_as_its_derivatives_are_needed():
-    found = jj.lower(Mixed())
-    assert found.calls == ()
+@pytest.mark.parametrize(("scene", "reason"), [(OnCam(), "the operation `scan`"), (Mixed(), "a product of matrices with 1600 multiplications")])
+def test_a_part_of_a_pose_is_a_call_whose_derivatives_are_those_of_jax(scene, reason):
+    assert set(jj.lower(scene).calls) == {reason}
+    q, y = np.random.default_rng(4).uniform(-1.0, 1.0, (2, 6, 1)) + np.array([[[0.1]], [[2.0]]])
+    by_program, dense = rates_of(scene)
+    for derivative in (lambda f: f, lambda f: jax.jacfwd(f, argnums=(1, 2)), lambda f: jax.jacrev(f, argnums=(1, 2))):
+        found, expected = (jax.vmap(jax.jit(derivative(f)), in_axes=(None, 0, 0))(scene, q, y) for f in (by_program, dense))
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12), found, expected)
 
 
 class Effective(OnCam):

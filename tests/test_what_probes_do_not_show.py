@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.build import structure
 from jourdain_jax.models import ChaplyginSleigh
-from jourdain_jax.program.graph import Unsupported
 
 KNOTS = jnp.linspace(-3.0, 3.0, 7)
 
@@ -330,18 +328,6 @@ def test_the_work_of_what_begins_late_or_far_off_is_counted(scene, start, end, f
     changed = float(np.ptp(motion.energies().kinetic + motion.energies().potential))
     assert changed > 0.05
     np.testing.assert_allclose(motion.energies().balance, motion.energies().balance[0], atol=1e-4 * changed)
-
-
-def test_facts_without_a_graph_are_looked_for_far_off(monkeypatch):
-    def refuses(*_):
-        raise Unsupported("a graph")
-
-    monkeypatch.setattr(structure, "probed_on_graph", refuses)
-    found = [structure._probed_structure.__wrapped__(case[0]) for case in LATE[:4]]
-    assert [bool(getattr(s, case[3])) for s, case in zip(found, LATE, strict=False)] == [False, False, True, True]
-    plain = structure._probed_structure.__wrapped__(ChaplyginSleigh())
-    assert (plain.affine, plain.homogeneous, plain.timed, plain.driven, plain.varying_inertia) == (True, True, (), False, False)
-    assert not structure._probed_structure.__wrapped__(FastRow()).affine
 
 
 class FastRow(Plane):

@@ -2,22 +2,16 @@
 
     A u + d = 0,   qdot = N u + nu,          and their derivatives in x = (t, q)
 
-From the scene's scalar graph, where it has one: nothing is then traced or compiled for it.
+From the scene's scalar graph, on which derivatives are sparse: nothing is compiled for it.
 """
 
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.build.trace import named_values, traced_scene
-from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.kinematics import coordinate_rates
-from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.scene import Scene
 
 
@@ -35,27 +29,7 @@ class RowsOverStates:
     """The rows and rates of a scene as functions of points x = (t, q)."""
 
     def __init__(self, scene: Scene):
-        self.scene = scene
-        try:
-            self._look: _OnGraph | _ByJax = _OnGraph(scene)
-        except Unsupported:
-            self._look = _ByJax(scene)
-
-    def __call__(self, x: np.ndarray, u: np.ndarray, directions: list[np.ndarray]) -> tuple[LinearRows, list[LinearRows]]:
-        """Values at the points, taken at the speeds u (which matter where rows are nonlinear in them), and derivatives along each of the directions.
-
-        `x`, `u` and each direction have a leading axis of points.
-        """
-        return self._look(x, u, directions)
-
-
-class _OnGraph:
-    """On the graph: derivatives are sparse there."""
-
-    def __init__(self, scene: Scene):
         self.scene, self.traced = scene, traced_scene(scene)
-        if self.traced.own_derivatives:
-            raise Unsupported("a function with derivatives of its own")
         g, at, u = self.traced.graph, self.traced.at, self.traced.u.tolist()
         flat = [*at.phi.tolist(), *at.qdot.tolist()]
         slopes = jacobian(g, flat, u)
@@ -66,7 +40,11 @@ class _OnGraph:
         changes = jacobian(g, self.values, variables)
         self.changes = [(i, variables.index(n), node) for i, row in enumerate(changes) for n, node in row.items()]
 
-    def __call__(self, x, u, directions):
+    def __call__(self, x: np.ndarray, u: np.ndarray, directions: list[np.ndarray]) -> tuple[LinearRows, list[LinearRows]]:
+        """Values at the points, taken at the speeds u (which matter where rows are nonlinear in them), and derivatives along each of the directions.
+
+        `x`, `u` and each direction have a leading axis of points.
+        """
         named = named_values(self.scene, x[:, 0], x[:, 1:], u, np.zeros((len(x), len(self.scene.inputs))))
         probes = Probes(self.traced.graph, {name: np.asarray(value, float) for name, value in named.items()})
         found = probes([*self.values, *(node for _, _, node in self.changes)])
@@ -88,27 +66,3 @@ class _OnGraph:
             slopes[:, i, j] = flat[count + len(self.traced.q) :].T
         A, N = slopes[:, :rows], slopes[:, rows:]
         return LinearRows(A, flat[:rows].T - np.einsum("pij,pj->pi", A, u), N, flat[count : count + len(self.traced.q)].T)
-
-
-class _ByJax:
-    """By JAX, for scenes without a scalar form."""
-
-    def __init__(self, scene: Scene):
-        self.scene = scene
-
-    def __call__(self, x, u, directions):
-        here, change = _linear_rows(self.scene, x, u)
-        pieces = [np.asarray(piece) for piece in here]
-        along = [LinearRows(*(np.einsum("p...x,px->p...", np.asarray(piece), direction) for piece in change)) for direction in directions]
-        return LinearRows(*pieces), along
-
-
-@eval_numpy
-def _linear_rows(scene: Scene, x, u):
-    def pieces(x, u):
-        t, q = x[0], x[1:]
-        A = jax.jacfwd(lambda u: velocity_residual(scene, t, q, u))(u)
-        N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
-        return A, velocity_residual(scene, t, q, u) - A @ u, N, coordinate_rates(scene, t, q, jnp.zeros_like(u))
-
-    return jax.vmap(lambda x, u: (pieces(x, u), jax.jacfwd(pieces)(x, u)))(x, u)

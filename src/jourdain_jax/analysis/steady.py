@@ -24,7 +24,6 @@ from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.motion.start import State
 from jourdain_jax.program.derivative import jacobian
-from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.numbers import described
@@ -109,10 +108,7 @@ def _on_geometric_rows(scene: Scene) -> set[str]:
     in_quaternions = {names[first + k] for first, _ in scene.coordinates.quaternions for k in range(4)}
     if not names_of_position_rows(scene):
         return in_quaternions
-    try:
-        traced = traced_scene(scene)
-    except Unsupported:
-        return set(names)
+    traced = traced_scene(scene)
     found = {n for row in jacobian(traced.graph, traced.at.closure.tolist(), traced.q.tolist()) for n in row}
     return in_quaternions | {name for name, n in zip(names, traced.q.tolist(), strict=True) if n in found}
 

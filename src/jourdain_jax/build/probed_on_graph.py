@@ -3,7 +3,7 @@
     A = d phi/du,   beta = dv/du,   gamma = d omega/du,   M = sum m beta' beta + gamma' I gamma
     q <- q - G+ g(q),   G = dg/dq,           u <- u - M^-1 A' (A M^-1 A')+ phi(u)
 
-A scene is traced once for it, where JAX (`probed`) traces it a dozen times through nested transformations, which takes most of the time for large scenes.
+A scene is traced once for it: nested transformations would trace it a dozen times.
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,34 +17,36 @@ from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.probed import Probed, generic_inputs
 from jourdain_jax.build.row_lengths import speed_scales
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
-from jourdain_jax.program.analyticity import decided_by, depend_on, is_nonanalytic
+from jourdain_jax.program.analyticity import CALLS, NONANALYTIC, decided_by, depend_on, passes
 from jourdain_jax.program.derivative import columns, derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.program.identity_test import identity_probes, is_combination, on_rows
 from jourdain_jax.scene.scene import Scene
 
+# What poses and rows decide, and a motion can hardly be integrated without: where calls compute it, states far off are asked. Of loads nothing is believed.
+_MOTION = frozenset({"rows", "poses", "inertias", "coordinate rates", "rows at rest", "motion at rest", "inertia", "nonlinear"})
 
-def probed_on_graph(scene: Scene, t, q, u, u_other, generic) -> Probed:
+
+def probed_on_graph(scene: Scene, t, q, u, u_other, generic, far: int = 0) -> Probed:
     """The scene at states (t, q, u), put on the geometric rows; and its rows at `u_other`. `generic`: which states are random ones.
 
-    `Unsupported` where the scene has no scalar form, or derivatives of its own.
+    The last `far` states are meant to be far from the domain. `Unsupported` where a call has no derivative in JAX.
     """
-    return _AtStates(_traced(scene), scene, t, q, u, generic_inputs(scene), generic).probed(u_other)
+    return _AtStates(traced_scene(scene), scene, t, q, u, generic_inputs(scene), generic, far).probed(u_other)
 
 
 def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
-    """Coordinates and speeds put on the rows, and how well that went for the coordinates; `Unsupported` as above."""
-    at = _AtStates(_traced(scene), scene, t, q, u, np.zeros(len(scene.inputs)), np.ones(len(q), bool))
+    """Coordinates and speeds put on the rows, and how well that went for the coordinates."""
+    at = _AtStates(traced_scene(scene), scene, t, q, u, np.zeros(len(scene.inputs)), np.ones(len(q), bool))
     return at.real(at.q), at.real(at.speeds_on_rows()), at.found
 
 
 def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
     """Whether these velocity rows are combinations of the others wherever positions meet the geometric rows, at generic parameters; states as above.
 
-    `(A_s, phi_s(0)) = x' (A_k, phi_k(0))`, the residual of least squares being no more than the round-off of either side. `Unsupported` as above.
+    `(A_s, phi_s(0)) = x' (A_k, phi_k(0))`, the residual of least squares being no more than the round-off of either side.
     """
-    at = _AtStates(_traced(scene), scene, t, q, u, generic_inputs(scene), np.ones(len(t), bool))
+    at = _AtStates(traced_scene(scene), scene, t, q, u, generic_inputs(scene), np.ones(len(t), bool))
     graph, traced, speeds = at.graph, at.traced, at.traced.u.tolist()
     attitudes = {f"q_{first + i}": int(traced.q[first + i]) for first, _ in scene.coordinates.quaternions for i in range(4)}
     generic = on_rows(
@@ -59,20 +61,13 @@ def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
     return all(is_combination(A[:, s], E[:, s], A[:, kept], E[:, kept]) for s in rows)
 
 
-def _traced(scene: Scene) -> TracedScene:
-    traced = traced_scene(scene)
-    if traced.own_derivatives:
-        raise Unsupported("a function with derivatives of its own")
-    return traced
-
-
 class _AtStates:
     """Values on the graph at the probed states."""
 
-    def __init__(self, traced: TracedScene, scene: Scene, t, q, u, inputs, generic):
+    def __init__(self, traced: TracedScene, scene: Scene, t, q, u, inputs, generic, far: int = 0):
         self.traced, self.graph, self.scene = traced, traced.graph, scene
         self.inputs = np.tile(inputs, (len(t), 1))
-        self.t, self.u, self.generic = t, u, generic
+        self.t, self.u, self.generic, self.far = t, u, generic, far
         self.q_beyond, self.found = np.array(q, float), self._assembled(q)
         self.q = self.found.q
         self.values = self._probes(self.q, u)
@@ -101,6 +96,7 @@ class _AtStates:
         vanishing = {"rows at rest": at_rest[0], "motion at rest": at_rest[1], "inertia": inertia_rates, "rows of inputs": row_rates}
         vanishing |= {f"potential {k}": [rate] for k, rate in enumerate(potential_rates)} | timed
         vanishing["rank"] = [*at_rest[0], *(node for row in by_speed[:rows] for node in row.values())]
+        in_calls = self._passing(CALLS, vanishing, by_speed[:rows])
         return Probed(
             q=self.real(self.q),
             error=self.found.error,
@@ -117,15 +113,17 @@ class _AtStates:
             potential_rates=self._at(potential_rates),
             row_rates_of_inputs=self._at(row_rates),
             numbers=jax.tree.map(lambda nodes: self.real(self._at(nodes)), traced.particulars.numbers),
-            unproved=frozenset(name for name, nodes in vanishing.items() if any(is_nonanalytic(g, _flat(nodes)))) | self._nonlinear(by_speed[:rows]),
+            unproved=self._passing(NONANALYTIC, vanishing, by_speed[:rows]) | (in_calls - _MOTION),
+            in_calls=in_calls & _MOTION,
         )
 
-    def _nonlinear(self, by_speed: list[dict[int, int]]) -> set[str]:
-        """{"nonlinear"} where rows may be so at speeds beyond the probed ones."""
+    def _passing(self, kinds, vanishing: dict, by_speed: list[dict[int, int]]) -> frozenset[str]:
+        """What passes an operation of these kinds; "nonlinear" where the rows do so with the speeds."""
         g, u = self.graph, self.traced.u.tolist()
         entries = [node for row in by_speed for node in row.values()]
-        bent = any(a and b for a, b in zip(depend_on(g, entries, u), is_nonanalytic(g, entries), strict=True))
-        return {"nonlinear"} if bent or decided_by(g, self.traced.at.phi.tolist(), u) else set()
+        bent = any(a and b for a, b in zip(depend_on(g, entries, u), passes(g, entries, kinds), strict=True))
+        nonlinear = {"nonlinear"} if bent or decided_by(g, self.traced.at.phi.tolist(), u, kinds) else set()
+        return frozenset(name for name, nodes in vanishing.items() if any(passes(g, _flat(nodes), kinds))) | nonlinear
 
     def _at(self, nodes) -> np.ndarray:
         """Values of nodes, with a leading axis of states."""
@@ -194,7 +192,7 @@ class _AtStates:
             probes = self._probes(q, self.u[which], which)
             return _values(probes, rows), self._matrices(probes, entries, columns)
 
-        return assemble(look, q, *coordinate_bounds(self.scene), self.generic)
+        return assemble(look, q, *coordinate_bounds(self.scene), self.generic, self.far)
 
 
 def _flat(nodes) -> list[int]:

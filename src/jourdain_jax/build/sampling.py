@@ -4,16 +4,12 @@ at random states are singular.
 
 import itertools
 
-import jax
 import numpy as np
 
 from jourdain_jax.build.assembling import Assembled
 from jourdain_jax.build.domain import coordinate_bounds, speed_bounds
-from jourdain_jax.build.probed import Probed, assembled_by_jax
+from jourdain_jax.build.probed import Probed
 from jourdain_jax.build.probed_on_graph import sampled_on_graph
-from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.projection import project_speeds
-from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.scene import Scene
 
 SYMMETRIC_PROBES = 200
@@ -54,11 +50,11 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
         raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
     t, q, u = random_states(scene, drawn, np.random.default_rng(seed))
-    q, u, found = _projected(scene, t, q, u)
+    q, u, found = sampled_on_graph(scene, t, q, u)
     near = None if np.isfinite(found.error).any() else states_near_what_was_seen(scene, drawn, np.random.default_rng(seed))
     if near is not None:
         t, q, u = near
-        q, u, found = _projected(scene, t, q, u)
+        q, u, found = sampled_on_graph(scene, t, q, u)
     good = np.flatnonzero(usable_states(scene, found, np.ones(drawn, bool)))[:count]
     return t[good], q[good], u[good]
 
@@ -97,24 +93,6 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
         )
     outside = np.sort(found.outside[good & generic])
     return good & (found.outside <= max(outside[min(FEW_INSIDE, len(outside)) - 1], NEARLY_INSIDE))
-
-
-def _projected(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
-    try:
-        return sampled_on_graph(scene, t, q, u)
-    except Unsupported:
-        return sampled_by_jax(scene, t, q, u)
-
-
-def sampled_by_jax(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
-    """Coordinates and speeds put on the rows by JAX, for scenes without a scalar form, and how well that went for the coordinates."""
-    found = assembled_by_jax(scene, t, q, np.ones(len(q), bool))
-    return found.q, _speeds_by_jax(scene, t, found.q, u), found
-
-
-@eval_numpy
-def _speeds_by_jax(scene, t, q, u):
-    return jax.vmap(lambda t, q, u: project_speeds(scene, t, q, u))(t, q, u)
 
 
 def symmetric_configurations(scene: Scene) -> np.ndarray:

@@ -19,7 +19,6 @@ from jourdain_jax.build.trace import jaxpr_of_scene
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import coordinate_rates, pose_at
 from jourdain_jax.equations.rows import names_of_position_rows, position_residual
-from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.program.roughness import may_bend
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.scene import Scene
@@ -62,15 +61,11 @@ def _may_bend(scene: Scene) -> bool:
     """Whether anything decides between branches on the way from t and q."""
     parameters, size = len(jax.tree.leaves(scene)), (len(scene.coordinate_names), len(scene.speed_names))
     variables = (parameters, parameters + 1)
-    try:
-        closed, shape = jaxpr_of_scene(scene)
-    except Unsupported:
-        pass
-    else:
-        at = shape[0]
-        wanted = jax.tree.leaves(jax.tree.map(lambda x: any(x is y for y in (at.position, at.orientation, at.closure, at.qdot)), shape))
-        if not any(bent and asked for bent, asked in zip(may_bend(closed, variables), wanted, strict=True)):
-            return False
+    closed, shape = jaxpr_of_scene(scene)
+    at = shape[0]
+    wanted = jax.tree.leaves(jax.tree.map(lambda x: any(x is y for y in (at.position, at.orientation, at.closure, at.qdot)), shape))
+    if not any(bent and asked for bent, asked in zip(may_bend(closed, variables), wanted, strict=True)):
+        return False
     leaves, treedef = jax.tree.flatten(scene)
     real = jnp.result_type(float)
     numbers = [jax.ShapeDtypeStruct(np.shape(x), real) for x in leaves]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.build.plausibility import implausible
-from jourdain_jax.build.probed import TIMED, Probed, probed
+from jourdain_jax.build.probed import TIMED, Probed
 from jourdain_jax.build.probed_on_graph import follow_from_others, probed_on_graph
 from jourdain_jax.build.rank import Scaled, rank_of, redundant_rows, scaled_states
 from jourdain_jax.build.reference_parameters import once_per_values, without_collecting
@@ -31,8 +31,8 @@ from jourdain_jax.scene.scene import Scene
 RANDOM_PROBES = 24
 WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all probes, for the minimal state to be the default
 LONG = 24  # dependent speeds: of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
-FAR, FAR_PROBES = 100.0, 16  # where no graph is: further states, at times (s), coordinates and speeds up to this
 TRACED = 1e-3  # of the typical lengths of rows, where parameters are traced
+FAR, FAR_PROBES = 100.0, 16  # where calls hide what they do: further states, at times (s), coordinates and speeds up to this
 _EXHAUSTIVE = 3000
 _SHORTLIST = 40
 
@@ -115,22 +115,25 @@ def _sizes(found: Probed) -> np.ndarray:
 
 def _look(scene: Scene, *states_and_generic) -> Probed:
     try:
-        return probed_on_graph(scene, *states_and_generic)
-    except Unsupported:
-        return _looked_at_from_afar(scene, *states_and_generic)
+        found = probed_on_graph(scene, *states_and_generic)
+        return _looked_at_from_afar(scene, *states_and_generic) if found.in_calls else found
+    except Unsupported as reason:
+        raise ValueError(
+            f"the motion of `{type(scene).__name__}` needs {reason}, which JAX does not have in forward mode; give that part a rule with `jax.custom_jvp`"
+        ) from None
 
 
 def _looked_at_from_afar(scene: Scene, t, q, u, u_other, generic) -> Probed:
-    """By JAX, where no graph says what the probes do not show; so a few states far off are looked at too."""
+    """At a few states far off as well: no graph says what calls do where the probes do not show it."""
     generator = np.random.default_rng(1)
     far_q = q[:FAR_PROBES] * FAR ** generator.uniform(size=(FAR_PROBES, 1))
     for first, _ in scene.coordinates.quaternions:
         far_q[:, first : first + 4] = q[:FAR_PROBES, first : first + 4]
     far = FAR * generator.uniform(size=FAR_PROBES), far_q, *(FAR * generator.uniform(-1, 1, (2, *u[:FAR_PROBES].shape)))
     t, q, u, u_other = (np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True))
-    found = probed(scene, t, q, u, u_other, np.append(generic, np.zeros(FAR_PROBES, bool)), far=FAR_PROBES)
+    found = probed_on_graph(scene, t, q, u, u_other, np.append(generic, np.zeros(FAR_PROBES, bool)), far=FAR_PROBES)
     near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[:-FAR_PROBES], np.s_[-FAR_PROBES:]))
-    return replace(near, unproved=_seen(beyond, u[-FAR_PROBES:]) | {"rank"})  # which nothing proves
+    return replace(near, unproved=near.unproved | (found.in_calls & _seen(beyond, u[-FAR_PROBES:])))
 
 
 def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:
@@ -226,7 +229,9 @@ def _probed_structure(scene: Scene) -> Structure:
         rank=rank,
         ranks=tuple(ranks),
         redundant_rows=redundant,
-        may_set_in=redundant if redundant and "rank" in unproved and not _follow(scene, t, found.q, u, [names.index(name) for name in redundant]) else (),
+        may_set_in=redundant
+        if redundant and "rank" in unproved and not follow_from_others(scene, t, found.q, u, [names.index(name) for name in redundant])
+        else (),
         rank_losses=tuple(_describe(scene, c) for c, r in zip(found.q, ranks, strict=True) if r < rank),
         independent=independent,
         worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
@@ -282,12 +287,9 @@ def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
     )
 
 
-def _follow(scene: Scene, *state_and_rows) -> bool:
-    """Whether rows that follow from the others at the probes do so by an identity."""
-    try:
-        return follow_from_others(scene, *state_and_rows)
-    except Unsupported:
-        return False
+def _may_set_in(scene: Scene, redundant: tuple[str, ...], names: tuple[str, ...], states: tuple) -> tuple[str, ...]:
+    """The redundant rows, unless it is an identity that they follow from the others, and not only so at the probes."""
+    return () if redundant and follow_from_others(scene, *states, rows=[names.index(name) for name in redundant]) else redundant
 
 
 def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:

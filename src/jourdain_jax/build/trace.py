@@ -25,7 +25,7 @@ from jourdain_jax.equations.kinematics import inertias_of, motion_at, velocities
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import impressed, potential_energy, resultants
 from jourdain_jax.program.graph import MOST_MULTIPLICATIONS, Graph, Unsupported
-from jourdain_jax.program.interpret import Nodes, as_nodes, has_own_derivatives, interpret
+from jourdain_jax.program.interpret import Nodes, as_nodes, effects_of, interpret
 from jourdain_jax.program.opaque_calls import interpret_with_calls
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.once_per_class import once_per_class
@@ -125,32 +125,27 @@ class TracedScene:
     parameters: list[np.ndarray]  # nodes, one array per leaf of the scene
     at: VelocityQuantities
     particulars: Particulars
-    own_derivatives: bool  # some function has a rule of differentiation of its own, which JAX believes and the graph does not know
+    effects: str  # what in the scene does more than compute, as printing does; nothing: no part of it
 
 
-def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = (), calls: bool = True) -> TracedScene:
-    """The scene as a new graph, without its stop events where these alone cannot be; `Unsupported` where it cannot be.
+def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
+    """The scene as a new graph; parts without scalar form, and those with a derivative of their own, are calls.
 
-    `of_inputs`: numbers of the loads whose potential depends on inputs. `calls`: whether parts without scalar form, or with their own derivative, become calls.
+    `of_inputs`: numbers of the loads whose potential depends on inputs.
     """
-    interpretations = [(interpret, True), (interpret_with_calls, True), (interpret, False), (interpret_with_calls, False)]
-    for interpreted, with_events in interpretations if calls else interpretations[::2]:
-        try:
-            closed, shape = _traced(scene, of_inputs, with_events)
-            return _on_graph(scene, closed, shape, interpreted, Graph(MOST_MULTIPLICATIONS, keeps_rules=True) if calls else Graph())
-        except Unsupported as reason:
-            first = reason
-    raise first
-
-
-def jaxpr_of_scene(scene: Scene):
-    """A jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u and inputs, and their shapes; `Unsupported` as above."""
-    return _traced(scene, (), True)
+    closed, shape = jaxpr_of_scene(scene, of_inputs)
+    try:
+        return _on_graph(scene, closed, shape, interpret)
+    except Unsupported:
+        return _on_graph(scene, closed, shape, interpret_with_calls)
 
 
 @once_per_class
-def _traced(scene: Scene, of_inputs: tuple[int, ...], with_events: bool):
-    """A jaxpr of the scene's quantities, and their shapes."""
+def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...] = ()):
+    """A jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u and inputs, and their shapes.
+
+    `of_inputs`: numbers of the loads whose potential depends on inputs.
+    """
     leaves, treedef = jax.tree.flatten(scene)
     real = jnp.result_type(float)
     state = [jax.ShapeDtypeStruct(shape, real) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),), (len(scene.inputs),))]
@@ -159,21 +154,19 @@ def _traced(scene: Scene, of_inputs: tuple[int, ...], with_events: bool):
     def quantities(leaves, t, q, u, inputs):
         scene = jax.tree.unflatten(treedef, leaves)
         motion = motion_at(scene, t, q, u, inputs)
-        return velocity_quantities(scene, motion, of_inputs, with_events), particulars_of(scene, motion)
+        return velocity_quantities(scene, motion, of_inputs), particulars_of(scene, motion)
 
-    try:
-        return jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
-    except (ValueError, NotImplementedError) as error:  # the power of potentials takes a derivative of all loads, which nothing else may need
-        raise Unsupported(f"a function that JAX cannot differentiate ({str(error).split('.')[0]})") from None
+    return jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
 
 
-def _on_graph(scene: Scene, closed, shape, interpreted: Callable, graph: Graph) -> TracedScene:
+def _on_graph(scene: Scene, closed, shape, interpreted: Callable) -> TracedScene:
+    graph = Graph(MOST_MULTIPLICATIONS, keeps_rules=True)
     parameters = [_inputs(graph, f"p{k}", np.shape(x), False) for k, x in enumerate(jax.tree.leaves(scene))]
     sizes = {"t": (), "q": (len(scene.coordinate_names),), "u": (len(scene.speed_names),), "i": (len(scene.inputs),)}
     t, q, u, inputs = (_inputs(graph, name, size, True) for name, size in sizes.items())
     found = interpreted(graph, closed, [Nodes(x) for x in (*parameters, t, q, u, inputs)])
     at, particulars = jax.tree.unflatten(jax.tree.structure(shape), [as_nodes(graph, x) for x in found])
-    return TracedScene(graph, int(t), q, u, inputs, parameters, at, particulars, has_own_derivatives(closed.jaxpr))
+    return TracedScene(graph, int(t), q, u, inputs, parameters, at, particulars, effects_of(closed.jaxpr))
 
 
 def _inputs(graph: Graph, name: str, shape, varies: bool) -> np.ndarray:

@@ -119,33 +119,26 @@ def _built(key: _Key) -> Lowered:
     if key.every_speed and structure.dependent_rows and not structure.well_conditioned:
         raise NotLowered("its rows depend on each other, though none may be left out everywhere")
     try:
-        return _with_calls_or_without(key, begin)
+        return _program(key, begin)
     except Unsupported as reason:
         raise NotLowered(f"{reason} has no scalar form") from None
     except ZeroDivisionError:
         raise NotLowered("its rows are dependent in a way that no elimination order avoids") from None
 
 
-def _with_calls_or_without(key: _Key, begin: float) -> Lowered:
-    """With calls for the parts that have no scalar form; without any where such a part would have to be differentiated."""
-
+def _program(key: _Key, begin: float) -> Lowered:
     scene, structure = key.scene, key.structure
-
-    def built(calls: bool) -> Lowered:
-        traced = traced_scene(scene, structure.potentials_of_inputs, calls)
-        probes = _probes(scene, structure, traced.graph)
-        if key.every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
-            probes = on_velocity_rows(probes, traced, structure.affine)
-        quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
-        far = full_turns(probes, traced, quaternions)
-        kept = KeptRows(traced.graph, structure, key.massless, probes, far) if key.every_speed and structure.row_names else None
-        builder = AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference(), quaternions)
-        return _best(scene, structure, builder, begin)
-
-    try:
-        return built(True)
-    except Unsupported:
-        return built(False)
+    traced = traced_scene(scene, structure.potentials_of_inputs)
+    if traced.effects:
+        raise Unsupported(traced.effects)
+    probes = _probes(scene, structure, traced.graph)
+    if key.every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
+        probes = on_velocity_rows(probes, traced, structure.affine)
+    quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
+    far = full_turns(probes, traced, quaternions)
+    kept = KeptRows(traced.graph, structure, key.massless, probes, far) if key.every_speed and structure.row_names else None
+    builder = AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference(), quaternions)
+    return _best(scene, structure, builder, begin)
 
 
 def _probes(scene: Scene, structure: Structure, graph) -> Probes:

@@ -1,8 +1,6 @@
 """Which body, load or row makes a scalar program differ from the dense path: one whose derivatives are not those of what it computes.
 
-    w(t, q, u)  and  dw/ds along a direction in (t, q, u)      by JAX, and on the graph; w: velocities, loads, rows
-
-The graph differentiates what is computed; JAX believes a rule that someone wrote beside it (`jax.custom_jvp`).
+w(t, q, u)  and  dw/ds along a direction in (t, q, u)      by JAX, and on the graph; w: velocities, loads, rows
 """
 
 from collections.abc import Iterator
@@ -35,13 +33,11 @@ def diagnose_mismatch(scene: Scene, traced: TracedScene, probes: Probes, limit: 
     if values:
         return f"{' and '.join(values)} come to another value there"
     if rates:
-        return f"{' and '.join(rates)} {_HAS_ITS_OWN if traced.own_derivatives else _HAS_TWO}"
+        return f"{' and '.join(rates)} has more than one derivative there, at a kink"
     return _NOBODY
 
 
 _NOBODY = "bodies, loads and rows agree, but not the solutions of the equations; rows, or the inertia along what they leave free, may be nearly singular there"
-_HAS_ITS_OWN = "has a derivative of its own there"
-_HAS_TWO = "has more than one derivative there, at a kink"
 
 
 def _differing(scene: Scene, traced: TracedScene, probes: Probes, limit: float, parameters, t, q, u, inputs) -> Iterator[tuple[str, bool]]:

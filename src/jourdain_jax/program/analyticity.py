@@ -2,23 +2,24 @@
 with a branch, a function that is flat somewhere, or an opaque call may be zero at every probe and not elsewhere.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.graph import Graph
 
-NONANALYTIC = {"kept", *(name for name, operation in TABLE.items() if operation.kind != "analytic")}
+NONANALYTIC = frozenset(name for name, operation in TABLE.items() if operation.kind != "analytic")
+CALLS = frozenset({"kept"})
 
 
-def is_nonanalytic(graph: Graph, outputs: Iterable[int]) -> list[bool]:
-    """For each output, whether some part of it that depends on time, state or inputs is not analytic."""
-    return _with(graph, outputs, lambda n: graph.op[n] in NONANALYTIC and graph.varies[n])
+def passes(graph: Graph, outputs: Iterable[int], kinds: Collection[str]) -> list[bool]:
+    """For each output, whether some part of it that depends on time, state or inputs is an operation of these kinds."""
+    return _with(graph, outputs, lambda n: graph.op[n] in kinds and graph.varies[n])
 
 
-def decided_by(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> bool:
-    """Whether anything of that kind on the way to the outputs is decided by one of the variables."""
+def decided_by(graph: Graph, outputs: Iterable[int], variables: Iterable[int], kinds: Collection[str]) -> bool:
+    """Whether an operation of these kinds on the way to the outputs depends on one of the variables."""
     outputs, variables = list(outputs), set(variables)
-    hiding = [n for n in graph.reachable(outputs) if graph.op[n] in NONANALYTIC]
+    hiding = [n for n in graph.reachable(outputs) if graph.op[n] in kinds]
     return any(depend_on(graph, hiding, variables))
 
 

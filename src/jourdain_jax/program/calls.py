@@ -15,6 +15,7 @@ import numpy as np
 from jax.extend.core import Literal, jaxpr_as_fun
 
 from jourdain_jax.eager.numpy_backend import uncompiled
+from jourdain_jax.program.graph import Unsupported
 
 
 class Call:
@@ -35,6 +36,30 @@ class Call:
     def reason(self) -> str:
         """In words, without a verb."""
         return " and ".join(self.reasons)
+
+    @functools.cache  # noqa: B019  (calls are few, and live as long as their graph)
+    def slopes(self, moves: tuple[tuple[bool, ...], ...]) -> "Call":
+        """Of each result, its derivatives with respect to those entries of the operands that move, with a leading axis of these.
+
+        `Unsupported` where JAX has no forward derivative.
+        """
+        function, avals = jaxpr_as_fun(self.closed), [v.aval for v in self.closed.jaxpr.invars]
+        places = [(k, i) for k, of_operand in enumerate(moves) for i, does in enumerate(of_operand) if does]
+
+        def columns(*operands):
+            def along(k, i):
+                directions = [np.zeros(x.shape, x.dtype if np.issubdtype(x.dtype, np.floating) else jax.dtypes.float0) for x in avals]
+                directions[k].flat[i] = 1
+                return jax.jvp(function, operands, tuple(directions))[1]
+
+            found = zip(*(along(k, i) for k, i in places), strict=True)
+            return [jnp.stack(dx) if np.issubdtype(a.dtype, np.floating) else jnp.zeros(0) for dx, a in zip(found, self.closed.out_avals, strict=True)]
+
+        try:
+            closed = jax.make_jaxpr(columns)(*(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals))
+        except (TypeError, ValueError, NotImplementedError):
+            raise Unsupported(f"the derivative of {self.reason}") from None
+        return Call(closed, self.reasons)
 
     def results(self, *operands) -> tuple:
         """The results; operands, and so results, may have last axes of lanes."""

@@ -2,8 +2,10 @@
 
 from collections.abc import Iterable, Mapping
 
+import numpy as np
+
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.graph import Graph
 
 
 def derivatives(graph: Graph, outputs: Iterable[int], direction: dict[int, int]) -> list[int]:
@@ -52,13 +54,40 @@ def columns(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> l
     return [[row.get(n, graph.zero) for row in rows] for n in variables]
 
 
-def _derivative(graph: Graph, node: int, dots: list[int]) -> int:
+def _derivative(graph: Graph, node: int, dots: list):
+    """The rate of a node, given those of its arguments. That of an array is a tuple, entry by entry; that of a call a tuple of these."""
     op, args = graph.op[node], graph.args[node]
     if all(d == graph.zero for d in dots):
         return graph.zero
-    if op == "array":  # that it moves; the call of it has no derivative here
-        return graph.one
-    if op not in TABLE:
-        raise Unsupported(graph.value[node].reason if op == "kept" else f"the derivative of `{op}`")
-    rule = TABLE[op].derivative
-    return graph.zero if rule is None else rule(graph, node, *args, *dots)
+    if op in TABLE:
+        rule = TABLE[op].derivative
+        return graph.zero if rule is None else rule(graph, node, *args, *dots)
+    if op == "kept":
+        return _of_call(graph, node, dots)
+    value = graph.value[node]
+    if op == "array":
+        return tuple(dots) if np.issubdtype(value[1], np.floating) else graph.zero
+    return dots[0][value[0]]  # of a result, or of an entry
+
+
+def _of_call(graph: Graph, node: int, dots: list) -> tuple:
+    """`d y_i = sum_j J_ij d x_j`, where another call computes the columns of J for those entries of the operands that vary."""
+    operands, call = graph.args[node], graph.value[node]
+    entries = [graph.entries_of(a) for a in operands]
+    numbers = [np.issubdtype(graph.value[a][-1], np.floating) for a in operands]
+    rates = [[graph.zero] * len(xs) if dot == graph.zero else dot for xs, dot in zip(entries, dots, strict=True)]
+    moves = tuple(
+        tuple(number and (graph.varies[x] or dx != graph.zero) for x, dx in zip(xs, dxs, strict=True))
+        for xs, dxs, number in zip(entries, rates, numbers, strict=True)
+    )
+    moving = [dx for pair in zip(rates, moves, strict=True) for dx, does in zip(*pair, strict=True) if does]
+    found: list = []
+    slopes = graph.kept(call.slopes(moves), operands)
+    for k, aval in enumerate(call.closed.out_avals):
+        if not np.issubdtype(aval.dtype, np.floating):
+            found.append(graph.zero)
+            continue
+        (J,) = graph.results(slopes, {k: ((len(moving), *aval.shape), str(aval.dtype))})
+        columns = graph.entries(J).reshape(len(moving), -1)
+        found.append(tuple(graph.dot(column.tolist(), moving) for column in columns.T))
+    return tuple(found)

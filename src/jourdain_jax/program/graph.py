@@ -239,15 +239,22 @@ class Graph:
             return whole
         return self._node("array", entries, (shape, dtype))
 
-    def kept(self, call, operands: Iterable[int], results: Iterable[tuple[tuple[int, ...], str]]) -> list[int]:
-        """The results of a call of arrays, given their shapes and types."""
-        node = self._node("kept", tuple(operands), call)
-        return [self._node("output", (node,), (k, *result)) for k, result in enumerate(results)]
+    def kept(self, call, operands: Iterable[int]) -> int:
+        """A call of arrays."""
+        return self._node("kept", tuple(operands), call)
+
+    def results(self, call: int, shapes: Mapping[int, tuple[tuple[int, ...], str]]) -> list[int]:
+        """Results of a call, by number, given their shapes and types."""
+        return [self._node("output", (call,), (k, *shape)) for k, shape in shapes.items()]
 
     def entries(self, output: int) -> np.ndarray:
         """The entries of a result of a call."""
         _, shape, _ = self.value[output]
         return np.array([self._node("entry", (output,), (i, len(shape))) for i in range(math.prod(shape))], np.int64).reshape(shape)
+
+    def entries_of(self, array: int) -> list[int]:
+        """The entries of an array, or of a result of a call."""
+        return list(self.args[array]) if self.op[array] == "array" else self.entries(array).ravel().tolist()
 
     def again(self, node: int, args: Iterable[int], of: "Graph | None" = None) -> int:
         """The operation of a node, applied to other arguments; `of`: the graph of the node, if another one."""

@@ -39,16 +39,13 @@ def interpret(graph: Graph, closed, arguments: list[Value]) -> list[Value]:
     return _run(graph, closed.jaxpr, [_known(c) for c in closed.consts], arguments)
 
 
-def has_own_derivatives(jaxpr) -> bool:
-    """Whether a function among those traced has a rule of differentiation of its own, which the graph does not know."""
+def effects_of(jaxpr) -> str:
+    """Which operation does more than compute, as printing does, in words without a verb; nothing where none does."""
     for equation in jaxpr.eqns:
-        if equation.primitive.name.startswith(("custom_jvp_call", "custom_vjp_call")):
-            return True
-        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")):
-            inner = getattr(inner, "jaxpr", inner)
-            if hasattr(inner, "eqns") and has_own_derivatives(inner):
-                return True
-    return False
+        if equation.effects:
+            inner = inner_jaxpr(equation.primitive.name, equation.params)
+            return f"the operation `{equation.primitive.name}`, which has effects," if inner is None else effects_of(getattr(inner, "jaxpr", inner))
+    return ""
 
 
 def as_nodes(graph: Graph, value: Value) -> np.ndarray:
@@ -89,6 +86,8 @@ def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
     if name == "cond" and not isinstance(inputs[0], Nodes):
         chosen = equation.params["branches"][int(inputs[0])]
         return _run(graph, chosen.jaxpr, [_known(c) for c in chosen.consts], inputs[1:])
+    if not equation.outvars:
+        raise Unsupported(f"the operation `{name}`")
     symbolic = any(isinstance(x, Nodes) for x in inputs)
     out = equation.outvars[0].aval
     if name == "convert_element_type" and symbolic:
@@ -117,9 +116,7 @@ def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
 
 
 def refuse(name: str, equation) -> None:
-    """`Unsupported` where an equation can neither be scalars nor a call; ValueError where it can be no part of a scene."""
-    if equation.effects:
-        raise Unsupported(f"the operation `{name}`, which has effects,")
+    """ValueError where an equation can be no part of a scene."""
     if any(jnp.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in (*equation.invars, *equation.outvars)):
         raise ValueError(f"a method of the scene draws random numbers (`{name}`); draw them outside, and give them as parameters or inputs")
 

@@ -195,7 +195,7 @@ def _called(graph: Graph, part: list[_Step], values: dict, users: dict[_Variable
     operands = [v for v in dict.fromkeys(v for step in part for v in step.variables) if v not in made]
     results = [v for v in made if v in asked or any(user.part is not part for user in users.get(v, ()))]
     arrays = [_as_array(graph, values[v], v.aval) for v in operands]
-    found = graph.kept(_call(part, operands, results), arrays, [(v.aval.shape, str(v.aval.dtype)) for v in results])
+    found = graph.results(graph.kept(_call(part, operands, results), arrays), {k: (v.aval.shape, str(v.aval.dtype)) for k, v in enumerate(results)})
     taken_apart = [v in asked or not all(user.kept for user in users[v]) for v in results]
     return {v: Nodes(graph.entries(node)) if apart else _Kept(node) for v, node, apart in zip(results, found, taken_apart, strict=True)}
 
