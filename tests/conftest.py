@@ -33,8 +33,15 @@ LONGEST = ("every_model", "simulate", "kept_parts", "contacts_on_surfaces", "gen
 LONGEST += ("traced_parameters", "float32", "notebooks", "bicycle_job", "bicycle_stability", "atlas", "readme")
 
 
+SLOW = frozenset(line for line in (Path(__file__).parent / "slow.txt").read_text().splitlines() if not line.startswith("#"))
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest looks at marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest files first."""
+    """Marks what `slow.txt` names; the longest files first."""
+    for item in items:
+        if item.nodeid.removeprefix("tests/") in SLOW:
+            item.add_marker(pytest.mark.slow)
     last = len(LONGEST)
     order = {f"test_{name}": place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.path.stem, last))

@@ -23,3 +23,11 @@ def test_ruff_finds_nothing():
 def test_types_hold():
     result = _run("mypy")
     assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_the_list_of_slow_tests_names_tests_that_exist():
+    lines = [line for line in (ROOT / "tests" / "slow.txt").read_text().splitlines() if not line.startswith("#")]
+    assert len(set(lines)) == len(lines)
+    for line in lines:
+        file, _, name = line.partition("::")
+        assert f"def {name.partition('[')[0]}(" in (ROOT / "tests" / file).read_text(), line
