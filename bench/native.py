@@ -37,7 +37,13 @@ print(time.perf_counter() - begin)
 """
 Figure = dict
 BARE = {"events": False, "projection": False}  # as in `lowering.py`
-MOTIONS = (("tilting-disc", 10.0, BARE), ("chaplygin-sleigh", 12.0, BARE), ("rattleback", 2.0, BARE), ("whipple-bicycle", 2.0, BARE), ("tilting-disc", 10.0, {}))
+MOTIONS = (
+    ("tilting-disc", 10.0, BARE),
+    ("chaplygin-sleigh", 12.0, BARE),
+    ("rattleback", 2.0, BARE),
+    ("whipple-bicycle", 2.0, BARE),
+    ("tilting-disc", 10.0, {}),
+)
 
 
 def figure(name: str, model: str, value: float, required: float | None = None) -> Figure:

@@ -66,6 +66,11 @@ class Options(eqx.Module):
         checkpoints = isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) and self.adjoint.checkpoints is not None
         return plain and not checkpoints and type(self.solver) in OWN_SOLVERS and type(self.adjoint) in OWN_ADJOINTS
 
+    @property
+    def kind(self) -> Literal["forward", "reverse"]:
+        """The mode of differentiation of our own loop."""
+        return "forward" if isinstance(self.adjoint, diffrax.ForwardMode) else "reverse"
+
 
 class Solved(eqx.Module):
     """What either loop finds."""
@@ -144,7 +149,7 @@ def integrate_lanes(setups: Setup) -> Trajectory:
     program = setups.form.lowered
     if setups.options.by_erk_loop and program is not None:
         blocks = partial(in_blocks, _lanes_by_erk_loop, width(program))
-        solved = (differentiated_as(blocks, eqx.filter_vmap(_by_machine_code)) if setups.is_native else blocks)(fitting, begun)
+        solved = (differentiated_as(blocks, eqx.filter_vmap(_by_machine_code), setups.options.kind) if setups.is_native else blocks)(fitting, begun)
     else:
         # lanes often share their times: what XLA knows to be the same in all of them it moves through diffrax's `nextafter`, one operation per pass
         times = jax.lax.optimization_barrier((fitting.t0, fitting.t1, fitting.options.dt0))
@@ -164,7 +169,7 @@ def _begin(setup: Setup) -> Begun:
 
 def _solved(setup: Setup, begun: Begun) -> Solved:
     if setup.is_native:
-        return differentiated_as(_by_erk_loop, _by_machine_code)(setup, begun)
+        return differentiated_as(_by_erk_loop, _by_machine_code, setup.options.kind)(setup, begun)
     return (_by_erk_loop if setup.options.by_erk_loop else _by_diffrax)(setup, begun)
 
 
@@ -244,7 +249,8 @@ def _by_erk_loop(setup: Setup, begun: Begun) -> Solved:
 def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
     options = setup.options
     goals = _goals(setup)
-    control = native_motion.Control(*options.tolerances, _shortest(setup.t1 - setup.t0), options.dt0, options.max_steps)
+    rtol, atol = options.tolerances
+    control = native_motion.Control(rtol, atol, _shortest(setup.t1 - setup.t0), options.dt0, options.max_steps)
     ys, reached, end = native_motion.integrate(begun.args, type(options.solver), bool(options.event_names), begun.y0, goals, control)
     return _as_solved(goals, ys, reached, end)
 
@@ -276,8 +282,7 @@ def _lean(setup: Setup, y0, args, ts, knots, rates, rates_and_pivots, project, e
         knots=knots,
         rates_and_pivots=rates_and_pivots if setup.form.has_pivots else None,
     )
-    kind: Literal["forward", "reverse"] = "forward" if isinstance(options.adjoint, diffrax.ForwardMode) else "reverse"
-    ys, reached, end = erk_loop.integrate(problem, erk_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, options.dt0, kind)
+    ys, reached, end = erk_loop.integrate(problem, erk_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, options.dt0, options.kind)
     return _as_solved(goals, ys, reached, end)
 
 

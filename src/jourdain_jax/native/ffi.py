@@ -73,8 +73,8 @@ def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[
         inputs = [w.load("ptr", given, k) for k in range(arguments)]
         outputs = [w.load("ptr", returned, k) for k in range(results)]
         last = inputs[-1]
-        pointers = [[w.load("ptr", buffer, _DATA) for buffer in buffers] for buffers in (inputs, outputs)]
-        body(*pointers, w.load("ptr", last, _DIMS), w.load("i64", last, _RANK))
+        given_data, returned_data = ([w.load("ptr", buffer, _DATA) for buffer in buffers] for buffers in (inputs, outputs))
+        body(given_data, returned_data, w.load("ptr", last, _DIMS), w.load("i64", last, _RANK))
         w.give(nothing)
 
 

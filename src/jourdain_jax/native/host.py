@@ -4,13 +4,15 @@ import ctypes
 import ctypes.util
 import functools
 import threading
+from typing import Any
 
 from jourdain_jax.native.math_functions import LIBM, PREFIX
 
 try:
-    import llvmlite.binding as llvm
+    from llvmlite import binding
 except ImportError:  # an optional dependency
-    llvm = None
+    binding = None
+llvm: Any = binding
 
 _LANES = (("avx512f", 8), ("avx", 4))  # doubles of a register; else 2, as every 64-bit machine has
 _lock = threading.Lock()

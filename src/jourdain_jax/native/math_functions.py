@@ -37,7 +37,8 @@ def polynomial(w: Writer, coefficients: Sequence[float], x: Value) -> Value:
 
 def sine_and_cosine(w: Writer, x: Value) -> tuple[Value, Value]:
     """(sin x, cos x)"""
-    return tuple(_by_libm_where(w, ~(w.magnitude(x) <= LARGEST_ANGLE), x, _quick_waves(w, x), ("sin", "cos")))
+    s, c = _by_libm_where(w, ~(w.magnitude(x) <= LARGEST_ANGLE), x, _quick_waves(w, x), ("sin", "cos"))
+    return s, c
 
 
 def _quick_waves(w: Writer, x: Value) -> tuple[Value, Value]:

@@ -5,6 +5,7 @@ A lane is handed over with all rows of `Layout.given`, its progress at the start
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 from jourdain_jax.native.ir import Value, Writer
 
@@ -31,7 +32,7 @@ class Layout:
     def parts(self) -> list[range]:
         """Rows of the coordinates, of the speeds and of the work, where there are any."""
         ends = [0, self.coordinates, self.coordinates + self.speeds, self.y]
-        return [range(a, b) for a, b in zip(ends, ends[1:], strict=False) if b > a]
+        return [range(a, b) for a, b in pairwise(ends) if b > a]
 
     @cached_property
     def rows(self) -> dict[str, range]:

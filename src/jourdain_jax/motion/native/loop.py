@@ -54,9 +54,8 @@ def _write_loop(w: Writer, form: Form, arrays: list[Value], sizes: Value, rank: 
         w.call("step", "void", state)
         code = lanes["code"]
         on_its_way = (code.equals(float(RUNNING)) & lanes["t"].differs(lanes["goal"])) | code.equals(float(LOCATING)) | code.equals(IDLE)
-        with w.when(w.any(~on_its_way)):
-            with w.counted(0, w.lanes) as lane:
-                w.call("serve", "void", job, state, who, lane)
+        with w.when(w.any(~on_its_way)), w.counted(0, w.lanes) as lane:
+            w.call("serve", "void", job, state, who, lane)
 
 
 def _write_begin(w: Writer, form: Form) -> None:
@@ -95,9 +94,8 @@ def _write_serve(w: Writer, form: Form) -> None:
             number, saved = w.load("i64", who, lane), w.load("i64", who, lane + w.lanes)
             # at a time to save at; or at the end, whose state stands for all that is left
             last = w.where(runs, saved + 1, times)
-            with w.counted(saved, last) as k:
-                with w.counted(0, layout.y) as row:
-                    w.store(w.load("double", lanes.place(row, lane)), states, (number * times + k) * layout.y + row)
+            with w.counted(saved, last) as k, w.counted(0, layout.y) as row:
+                w.store(w.load("double", lanes.place(row, lane)), states, (number * times + k) * layout.y + row)
             w.store(last, who, lane + w.lanes)
             with w.when(last < times):
                 w.store(w.load("double", goals, number * times + last), lanes.place(layout.rows["goal"].start, lane))

@@ -12,6 +12,7 @@ from jourdain_jax.motion.integrators.erk_loop import ended
 from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
 from jourdain_jax.motion.native.functions import Form, event_program
 from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel
+from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.state_form import Integrated, StateForm
 from jourdain_jax.native import ffi, host
 from jourdain_jax.native.scalar_program import unsupported
@@ -88,9 +89,9 @@ def integrate(
     numbers = [x.astype(jnp.int32) for x in (code, accepted, rejected, event)]
     code, accepted, rejected, event = numbers
     last = Progress(t, _unpacked(layout, end[: layout.y]), h, code, jnp.zeros((), jnp.int32), accepted, rejected, event, None, pivot)
-    return _unpacked(layout, states), reached, ended(last, 0.0)
+    return jax.vmap(lambda y: _unpacked(layout, y))(states), reached, ended(last, 0.0)
 
 
-def _unpacked(layout, y: Float[Array, "*times y"]) -> Integrated:
+def _unpacked(layout: Layout, y: Float[Array, "y"]) -> Integrated:
     n = layout.coordinates
-    return Integrated(y[..., :n], y[..., n : n + layout.speeds], y[..., -1] if layout.with_work else None)
+    return Integrated(y[:n], y[n : n + layout.speeds], y[-1] if layout.with_work else None)

@@ -162,9 +162,7 @@ def _watched(w: Writer, form: Form, method: Method, p: Lanes, k: Value, at: Valu
     left, shift = p["search_left"], p["search_shift"]
     found, back = locating & left.equals(0.0), changes & (left > DIFFERENTIABLE + 1.0)
     stays = back | dips
-    new_y = [
-        w.where(found, w.fma(shift, w.load(w.real, k, i), b), w.where(stays, a, b)) for i, (a, b) in enumerate(zip(y, new_y, strict=True))
-    ]
+    new_y = [w.where(found, w.fma(shift, w.load(w.real, k, i), b), w.where(stays, a, b)) for i, (a, b) in enumerate(zip(y, new_y, strict=True))]
     tried = _count(w, dips)
     now = w.where(found, float(results.EVENT), w.where(locating, float(LOCATING), new["code"]))
     new = {
