@@ -1,6 +1,6 @@
 """The layer table of the package, held by reading every import in `src` (no import is executed).
 
-Bottom to top: calculus < eager < program < scene < equations < build < dynamics < lowering < motion < analysis < models < bicycle < plotting < cli.
+Bottom to top: calculus < eager < program < native < scene < equations < build < dynamics < lowering < motion < analysis < models < bicycle < plotting < cli.
 A layer imports itself and what lies below it; only the package's `__init__` sees everything.
 """
 
@@ -12,7 +12,23 @@ import pytest
 
 PACKAGE = "jourdain_jax"
 SOURCE = Path(__file__).parents[1] / "src" / PACKAGE
-LAYERS = ("calculus", "eager", "program", "scene", "equations", "build", "dynamics", "lowering", "motion", "analysis", "models", "bicycle", "plotting", "cli")
+LAYERS = (
+    "calculus",
+    "eager",
+    "program",
+    "native",
+    "scene",
+    "equations",
+    "build",
+    "dynamics",
+    "lowering",
+    "motion",
+    "analysis",
+    "models",
+    "bicycle",
+    "plotting",
+    "cli",
+)
 ENTRY_MODULES = ("__init__", "__main__")  # above every layer
 OWNERS = {"diffrax": ("motion",)}  # third-party packages that only the named layers know
 OPTIONAL = ("matplotlib", "IPython", "tqdm", "scipy", "sympy")  # may be imported inside a function

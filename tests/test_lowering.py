@@ -372,7 +372,7 @@ def test_derivatives_by_the_jacobian_on_the_graph_are_those_of_jax(order):
 
     def by_jax(x):
         a, q, y = split(x)
-        known = dict(zip(program._variables, (*a, 0.0, *q, *y), strict=True))
+        known = dict(zip(program.variables, (*a, 0.0, *q, *y), strict=True))
         return jnp.stack([jnp.asarray(r) for r in run(program.graph, [*program.qdot, *program.ydot], known)])
 
     np.testing.assert_allclose(by_rule(x), by_jax(x), rtol=1e-15)

@@ -27,7 +27,7 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
     """
     scalars = [i for i, n in enumerate(variables) if graph.op[n] not in ARRAYS]
     count = len(outputs)
-    graph, nodes, variables = _on_its_own(graph, [*outputs, *watched], variables)
+    graph, nodes, variables = on_its_own(graph, [*outputs, *watched], variables)
     outputs, watched = nodes[:count], nodes[count:]
     entries = _entries(graph, outputs, variables)
 
@@ -61,7 +61,7 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
     return own
 
 
-def _on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> tuple[Graph, list[int], list[int]]:
+def on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> tuple[Graph, list[int], list[int]]:
     """The outputs on a new graph whose inputs are the variables: no simplification can look behind these."""
     own = Graph()
     inputs = [own.input(str(k), True) for k in range(len(variables))]

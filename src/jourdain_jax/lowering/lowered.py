@@ -150,10 +150,10 @@ class Lowered:
 
     def _rates_and(self, more: list[int]) -> Callable[..., tuple]:
         outputs = [*self.qdot, *self.ydot, *more, *self.guards]
-        return differentiable(self.graph, outputs, self._variables, like=len(self.fixed) + 1, watched=self.pivots)
+        return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, watched=self.pivots)
 
     @property
-    def _variables(self) -> list[int]:
+    def variables(self) -> list[int]:
         """All nodes that are given from outside."""
         traced = self.traced
         state = [*traced.q.tolist(), *(int(traced.u[k]) for k in self.independent)]
@@ -202,7 +202,7 @@ class Lowered:
     def _known(self, fixed, t, q, y, inputs) -> dict[int, Float[Array, "*lanes"]]:
         shapes = self._fixed_shapes
         fixed = [jnp.moveaxis(x, 0, -1) if n in shapes and x.ndim > len(shapes[n]) else x for n, x in zip(self.fixed, fixed, strict=True)]  # lanes last
-        return dict(zip(self._variables, (*fixed, t, *q, *y, *inputs), strict=True))
+        return dict(zip(self.variables, (*fixed, t, *q, *y, *inputs), strict=True))
 
     @functools.cached_property
     def _fixed_shapes(self) -> dict[int, tuple[int, ...]]:

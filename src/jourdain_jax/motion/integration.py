@@ -7,6 +7,7 @@ Time counts from the start, tau = t - t0: far from zero a clock has few digits, 
 Rates, projection and events are given tau, and the scene and its inputs t0 + tau.
 """
 
+from functools import partial
 from operator import attrgetter
 from typing import Literal
 
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.build.plausibility import body_faults
+from jourdain_jax.calculus.differentiated_as import differentiated_as
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.input_programs import by_itself, for_programs
@@ -29,6 +31,7 @@ from jourdain_jax.motion.integrators.solver_choice import controller_of, marked_
 from jourdain_jax.motion.integrators.step_to_times import merged, step_to_times
 from jourdain_jax.motion.integrators.wrapping_solver import for_adjoint
 from jourdain_jax.motion.integrators.zero_tangents import ZeroTangentIfNonfinite
+from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.span import fitting_times, times_fit
 from jourdain_jax.motion.start import State
@@ -54,6 +57,7 @@ class Options(eqx.Module):
     land: bool = eqx.field(static=True)  # whether a step ends at every saved time
     saveat: diffrax.SaveAt | None  # None: at the times asked for
     event_names: tuple[str, ...] = eqx.field(static=True)
+    native: bool = eqx.field(static=True, default=True)  # whether machine code of our own may integrate it
 
     @property
     def by_erk_loop(self) -> bool:
@@ -61,6 +65,11 @@ class Options(eqx.Module):
         plain = self.controller is None and self.saveat is None and self.land
         checkpoints = isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) and self.adjoint.checkpoints is not None
         return plain and not checkpoints and type(self.solver) in OWN_SOLVERS and type(self.adjoint) in OWN_ADJOINTS
+
+    @property
+    def kind(self) -> Literal["forward", "reverse"]:
+        """The mode of differentiation of our own loop."""
+        return "forward" if isinstance(self.adjoint, diffrax.ForwardMode) else "reverse"
 
 
 class Solved(eqx.Module):
@@ -90,6 +99,20 @@ class Setup(eqx.Module):
     ts: Float[Array, "*lanes times"]
     form: StateForm
     options: Options
+
+    @property
+    def not_native(self) -> str:
+        """Why the loop over steps is one of XLA's and not machine code of our own, in words; empty where it is."""
+        if not self.options.native:
+            return "native=False"
+        if not self.options.by_erk_loop:
+            return "a solver, a controller or an adjoint of diffrax was asked for"
+        return native_motion.reason_against(self.form, self.inputs, self.scene, bool(self.options.event_names), self.start.q.dtype)
+
+    @property
+    def is_native(self) -> bool:
+        """Whether machine code of our own integrates it, where it is not differentiated."""
+        return not self.not_native
 
     def fitting(self) -> "Setup":
         """The setup with times that serve any loop, also where its own do not go together."""
@@ -125,7 +148,8 @@ def integrate_lanes(setups: Setup) -> Trajectory:
     begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
     program = setups.form.lowered
     if setups.options.by_erk_loop and program is not None:
-        solved = in_blocks(_lanes_by_erk_loop, width(program), fitting, begun)
+        blocks = partial(in_blocks, _lanes_by_erk_loop, width(program))
+        solved = (differentiated_as(blocks, eqx.filter_vmap(_by_machine_code), setups.options.kind) if setups.is_native else blocks)(fitting, begun)
     else:
         # lanes often share their times: what XLA knows to be the same in all of them it moves through diffrax's `nextafter`, one operation per pass
         times = jax.lax.optimization_barrier((fitting.t0, fitting.t1, fitting.options.dt0))
@@ -144,6 +168,8 @@ def _begin(setup: Setup) -> Begun:
 
 
 def _solved(setup: Setup, begun: Begun) -> Solved:
+    if setup.is_native:
+        return differentiated_as(_by_erk_loop, _by_machine_code, setup.options.kind)(setup, begun)
     return (_by_erk_loop if setup.options.by_erk_loop else _by_diffrax)(setup, begun)
 
 
@@ -220,6 +246,15 @@ def _by_erk_loop(setup: Setup, begun: Begun) -> Solved:
     return _lean(setup, begun.y0, begun.args, setup.ts, _knots(setup), *functions)
 
 
+def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
+    options = setup.options
+    goals = _goals(setup)
+    rtol, atol = options.tolerances
+    control = native_motion.Control(rtol, atol, _shortest(setup.t1 - setup.t0), options.dt0, options.max_steps)
+    ys, reached, end = native_motion.integrate(begun.args, type(options.solver), bool(options.event_names), begun.y0, goals, control)
+    return _as_solved(goals, ys, reached, end)
+
+
 def _lanes_by_erk_loop(setups: Setup, begun: Begun) -> Solved:
     """Lanes in lockstep: their axis comes first outside and last inside."""
     form, options = setups.form, setups.options
@@ -233,7 +268,7 @@ def _lanes_by_erk_loop(setups: Setup, begun: Begun) -> Solved:
 
 def _lean(setup: Setup, y0, args, ts, knots, rates, rates_and_pivots, project, events) -> Solved:
     options = setup.options
-    goals = jnp.concatenate([ts, setup.t1[None]]) - setup.t0
+    goals = _goals(setup, ts)
     problem = erk_loop.Problem(
         rates=rates,
         args=args,
@@ -247,8 +282,16 @@ def _lean(setup: Setup, y0, args, ts, knots, rates, rates_and_pivots, project, e
         knots=knots,
         rates_and_pivots=rates_and_pivots if setup.form.has_pivots else None,
     )
-    kind: Literal["forward", "reverse"] = "forward" if isinstance(options.adjoint, diffrax.ForwardMode) else "reverse"
-    ys, reached, end = erk_loop.integrate(problem, erk_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, options.dt0, kind)
+    ys, reached, end = erk_loop.integrate(problem, erk_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, options.dt0, options.kind)
+    return _as_solved(goals, ys, reached, end)
+
+
+def _goals(setup: Setup, ts=None) -> Float[Array, "times *lanes"]:
+    """Times since the start to go to; `ts`: those of the setup with lanes last."""
+    return jnp.concatenate([setup.ts if ts is None else ts, setup.t1[None]]) - setup.t0
+
+
+def _as_solved(goals, ys: PyTree, reached, end: erk_loop.Progress) -> Solved:
     ys = jax.tree.map(lambda x: x[:-1], ys)
     return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, end.pivot)
 

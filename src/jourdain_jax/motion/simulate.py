@@ -71,6 +71,7 @@ def simulate(
     work: bool = True,
     land_on_ts: bool = True,
     lowering: bool = True,
+    native: bool = True,
 ) -> Trajectory:
     """Integrate a scene's equations of motion from `start` over [t0, t1].
 
@@ -91,7 +92,8 @@ def simulate(
     - `land_on_ts`: end a step at every saved time. With False, values between steps come from the solver's dense output: fewer steps, but
       its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
     - `lowering`: integrate the scene's scalar program (`jj.lower`) where it has one and neither `reduction` nor `stabilisation` is given; with False,
-      the dense matrices.
+      the dense matrices. `native`: on CPUs, integrate that program by machine code made for it, where llvmlite is installed and the solver is a default one;
+      with False, by XLA, as derivatives always are. Both take the same steps.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
 
     Where nothing is traced, a motion that leaves the domain of its privileged speeds is run again with the full state, and a stiff one by an implicit
@@ -138,10 +140,10 @@ def set_up(scene: Scene | BuiltFor, start=None, **options) -> Setup:
 
 def _set_up(
     *, scene, start, t0, t1, ts, saveat, rtol, atol, solver, stepsize_controller, dt0, adjoint, max_steps, state, reduction, stabilisation,
-    projection, inputs, events, work, land_on_ts, lowering,
+    projection, inputs, events, work, land_on_ts, lowering, native,
 ) -> Setup:  # fmt: skip
     scene = as_scene(scene)
-    switches = {"projection": projection, "events": events, "work": work, "land_on_ts": land_on_ts, "lowering": lowering}
+    switches = {"projection": projection, "events": events, "work": work, "land_on_ts": land_on_ts, "lowering": lowering, "native": native}
     objects = {"solver": solver, "adjoint": adjoint, "stepsize_controller": stepsize_controller, "saveat": saveat}
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, switches=switches, **objects)
     as_stabilisation(stabilisation)
@@ -162,6 +164,7 @@ def _set_up(
         land=land_on_ts,
         saveat=None if saveat is None else _checked_saveat(saveat),
         event_names=names_of_events(scene) if events else (),
+        native=native,
     )
     start = _on_constraints(scene, t0, start, inputs, made_here) if projection else start
     return Setup(scene, start, inputs, t0, t1, ts, form, options)

@@ -93,8 +93,8 @@ def _together(nodes: list[int], values: Mapping[int, jax.Array]) -> dict[int, ja
 FUNCTIONS: dict[str, Callable] = {name: operation.in_jax for name, operation in TABLE.items()}
 
 # pi/2 in three parts of 33 bits, and minimax polynomials on [-pi/4, pi/4] (K. C. Ng's, as in FreeBSD's libm)
-_HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
-_SINE = (
+HALF_PI = (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
+SINE = (
     1.58969099521155010221e-10,
     -2.50507602534068634195e-08,
     2.75573137070700676789e-06,
@@ -102,7 +102,7 @@ _SINE = (
     8.33333333332248946124e-03,
     -1.66666666666666324348e-01,
 )
-_COSINE = (
+COSINE = (
     -1.13596475577881948265e-11,
     2.08757232129817482790e-09,
     -2.75573143513906633035e-07,
@@ -120,11 +120,11 @@ def sine_and_cosine(x):
         return jnp.sin(x), jnp.cos(x)
     turns = lax.round(x * (2 / jnp.pi), lax.RoundingMethod.TO_NEAREST_EVEN)
     r = x
-    for part in _HALF_PI:
+    for part in HALF_PI:
         r = r - turns * part
     square = r * r
-    sine = r + r * (square * _polynomial(_SINE, square))
-    cosine = 1.0 + square * (square * _polynomial(_COSINE, square) - 0.5)
+    sine = r + r * (square * _polynomial(SINE, square))
+    cosine = 1.0 + square * (square * _polynomial(COSINE, square) - 0.5)
     quadrant = turns - 4.0 * jnp.floor(0.25 * turns)
     odd = (quadrant == 1.0) | (quadrant == 3.0)
     s, c = jnp.where(odd, cosine, sine), jnp.where(odd, sine, cosine)

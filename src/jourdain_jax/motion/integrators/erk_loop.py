@@ -44,10 +44,15 @@ def integrate(
         ys, reached, end = _motion(problem, method, y0, t0, goals, dt0)
     else:
         ys, reached, end = recorded_adjoint.motion(_motion, problem, method, y0, t0, goals, dt0)
+    return ys, reached, ended(end, t0)
+
+
+def ended(end: Progress, t0) -> Progress:
+    """With the code of how the motion from `t0` ended, where no time is left to go to."""
     # the last steps against the average one
     shrank = (end.code == results.MAX_STEPS) & (end.h * end.accepted < _SHRANK * jnp.abs(end.t - t0))
     code = jnp.where(shrank, results.SHRANK, jnp.where(end.code == RUNNING, results.SUCCESS, end.code))
-    return ys, reached, eqx.tree_at(lambda p: p.code, end, code)
+    return eqx.tree_at(lambda p: p.code, end, code)
 
 
 def _motion(problem: Problem, method: Method, y0: PyTree, t0, goals, dt0) -> tuple[PyTree, Bool[Array, "times *lanes"], Progress]:

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 MOST_STEPS = 72
-_DIFFERENTIABLE = 2
-_LATE = 0.98  # of a step: a dip that is later is left to the next one
+DIFFERENTIABLE = 2
+LATE = 0.98  # of a step: a dip that is later is left to the next one
 
 
 class Bracket(eqx.Module):
@@ -109,7 +109,7 @@ class Search(eqx.Module):
     @property
     def trying(self) -> Bool[Array, "*lanes"]:
         """Whether trials start at the last state before the event; then Newton's shifts do, each where the last one ended."""
-        return self.left > _DIFFERENTIABLE + 1
+        return self.left > DIFFERENTIABLE + 1
 
 
 def none(t: Float[Array, "*lanes"], values: Float[Array, "events *lanes"]) -> Search:
@@ -126,8 +126,8 @@ def advanced(search: Search, begins: Bool[Array, "*lanes"], t_0, c_0, c_dot_0, t
     known = jax.tree.map(lambda new, old, kept: jnp.where(begins, new, jnp.where(trying, old, kept)), fresh, narrowed, search.known)
     step = jnp.where(begins, jnp.abs(now - jax.lax.stop_gradient(t_0)), search.step)
     left = jnp.where(begins, MOST_STEPS, jnp.maximum(search.left - 1, 0))
-    trial = next_trial(known, step, left <= _DIFFERENTIABLE + 3)
-    left = jnp.where(trying & trial.near, _DIFFERENTIABLE + 1, left).astype(jnp.int32)
+    trial = next_trial(known, step, left <= DIFFERENTIABLE + 3)
+    left = jnp.where(trying & trial.near, DIFFERENTIABLE + 1, left).astype(jnp.int32)
     shift = jnp.where(trial.near, 0.0, trial.t - jax.lax.stop_gradient(t_0))
     first = known.first
     newton = newton_shift(known, step, chosen(first, c_1), chosen(first, c_dot_0), search.left > 0)
@@ -162,7 +162,7 @@ def dip(h: Float[Array, "*lanes"], c_0, c_dot_0, c_1, c_dot_1) -> Dip:
     A, B = 3 * rise - 2 * m_0 - m_1, m_0 + m_1 - 2 * rise
     s = -m_0 / (A + jnp.sqrt(jnp.maximum(A**2 - 3 * B * m_0, 0.0)))
     lowest = c_0 + s * (m_0 + s * (A + s * B))
-    dips = (c_1 > 0) & (m_0 < 0) & (m_1 > 0) & (s < _LATE) & (lowest < -1e-12 * (c_0 + c_1))
+    dips = (c_1 > 0) & (m_0 < 0) & (m_1 > 0) & (s < LATE) & (lowest < -1e-12 * (c_0 + c_1))
     share = jnp.min(jnp.where(dips, s, 1.0), axis=0)
     return Dip(share < 1, share)
 

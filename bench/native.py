@@ -1,0 +1,153 @@
+"""Motions by machine code of our own against the same motions by XLA, in one run on one core: batches, alone, cold starts.
+
+    taskset -c 0 python bench/native.py [--quick] [--json FILE]
+
+Writes a list of {"figure", "model", "value", "required", "met"}; `required` is None where a figure is only told. Times of warm motions are processor
+time, the least of some repeats, the two ways in turn; cold ones are wall time of fresh processes.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from baselines import disc_run
+
+import jourdain_jax as jj
+from jourdain_jax.motion.simulate import set_up
+
+LANES = 1024
+WAYS = {"native": True, "XLA": False}
+COLD = """
+import time; begin = time.perf_counter()
+import jax, sys; jax.config.update("jax_enable_x64", True)
+import jourdain_jax as jj
+jax.block_until_ready(jj.simulate(jj.models.MODELS[sys.argv[1]](), native=sys.argv[2] == "native").q)
+print(time.perf_counter() - begin)
+"""
+Figure = dict
+BARE = {"events": False, "projection": False}  # as in `lowering.py`
+MOTIONS = (
+    ("tilting-disc", 10.0, BARE),
+    ("chaplygin-sleigh", 12.0, BARE),
+    ("rattleback", 2.0, BARE),
+    ("whipple-bicycle", 2.0, BARE),
+    ("tilting-disc", 10.0, {}),
+)
+
+
+def figure(name: str, model: str, value: float, required: float | None = None) -> Figure:
+    """One entry of the result."""
+    print(f"  {name}, {model}: {value:.4g}" + ("" if required is None else f" (required: {required:g})"), flush=True)
+    return {"figure": name, "model": model, "value": value, "required": required, "met": required is None or value <= required}
+
+
+def least_processor_time(runs: dict[str, Callable], repeats: int) -> dict[str, float]:
+    """Processor time of each run, s: the least of some repeats, in turn, after a first one that compiles."""
+    for run in runs.values():
+        run()
+    laps: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(repeats):
+        for name, run in runs.items():
+            begin = time.process_time()
+            run()
+            laps[name].append(time.process_time() - begin)
+    return {name: min(values) for name, values in laps.items()}
+
+
+def spread_starts(scene: jj.Scene, lanes: int) -> jj.State:
+    """Admissible starts near the scene's example: the disc's as in `disc_run`, of others each named number by 5 %."""
+    if isinstance(scene, jj.models.TiltingDisc):
+        y = disc_run.starts(lanes)
+        values = {"yaw": y[:, 2], "lean": y[:, 3], "spin": y[:, 4], "yaw_rate": y[:, 5], "lean_rate": y[:, 6], "spin_rate": y[:, 7]}
+    else:
+        random = np.random.default_rng(0)
+        values = {name: np.asarray(x) * (1 + 0.05 * random.normal(size=(lanes, *np.shape(x)))) for name, x in scene.example.items()}
+    return jax.vmap(lambda values: jj.start(scene, **values))({name: jnp.asarray(x) for name, x in values.items()})
+
+
+def runs_of(scene: jj.Scene, starts: jj.State, span: float, alone: bool, more: dict) -> dict[str, Callable]:
+    """Way -> compiled function of a tolerance and starts that returns final states and steps; `more`: options of `simulate`."""
+
+    def run(native, tolerance, starts):
+        options = {"ts": jnp.array([span]), "solver": diffrax.Dopri8(), "rtol": tolerance, "atol": tolerance, "native": native, **more}
+        if alone:
+            motion = jj.simulate(scene, jax.tree.map(lambda x: x[0], starts), **options)
+        else:
+            motion = jj.rollout(scene, starts, **options).lanes
+        return motion.q_end, motion.accepted, motion.rejected
+
+    return {way: partial(lambda run, tolerance: jax.block_until_ready(run(tolerance, starts)), jax.jit(partial(run, native))) for way, native in WAYS.items()}
+
+
+def batches(quick: bool) -> Iterator[Figure]:
+    """A thousand spread starts, and one alone, at three tolerances."""
+    lanes = 128 if quick else LANES
+    for name, span, more in MOTIONS[: 1 if quick else None]:
+        scene = jj.models.MODELS[name]()
+        assert not (reason := set_up(scene).not_native), reason
+        starts = spread_starts(scene, lanes)
+        for alone, who in ((False, f"batch of {lanes}"), (True, "alone")):
+            who = who if more else f"{who}, default options"
+            runs = runs_of(scene, starts, span, alone, more)
+            for tolerance in (1e-8, 1e-10, 1e-12):
+                found = {way: run(tolerance) for way, run in runs.items()}
+                times = least_processor_time({way: partial(run, tolerance) for way, run in runs.items()}, 3 if quick else 7)
+                count = 1 if alone else lanes
+                for way, seconds in times.items():
+                    yield figure(f"{who}, {tolerance:.0e}, {way}, us per trajectory", name, 1e6 * seconds / count)
+                required = 0.5 if not alone and name == "tilting-disc" else 1.0
+                yield figure(f"{who}, {tolerance:.0e}, native / XLA", name, times["native"] / times["XLA"], required)
+                apart = float(jnp.max(jnp.abs(found["native"][0] - found["XLA"][0])))
+                yield figure(f"{who}, {tolerance:.0e}, largest difference of final coordinates", name, apart)
+                steps = {way: float(np.mean(run[1] + run[2])) for way, run in found.items()}
+                yield figure(f"{who}, {tolerance:.0e}, tried steps, native", name, steps["native"])
+                yield figure(f"{who}, {tolerance:.0e}, tried steps, XLA", name, steps["XLA"])
+
+
+def compilation(quick: bool) -> Iterator[Figure]:
+    """The motion alone, lowered and compiled in this process, once the scene is built; fresh processes to the end of a first motion."""
+    for name in ("tilting-disc", "whipple-bicycle"):
+        scene = jj.models.MODELS[name]()
+        start = jj.start(scene)
+        seconds = {}
+        for way, native in WAYS.items():
+            begin = time.perf_counter()
+            jax.jit(lambda start, native=native, scene=scene: jj.simulate(scene, start, native=native, t1=1.01).q).lower(start).compile()
+            seconds[way] = time.perf_counter() - begin
+            yield figure(f"trace and compile one motion, {way}, s", name, seconds[way])
+        yield figure("trace and compile one motion, native / XLA", name, seconds["native"] / seconds["XLA"], 1.0)
+        for way in WAYS:
+            laps = [float(_output(COLD, name, way)) for _ in range(1 if quick else 3)]
+            yield figure(f"fresh process to the end of a first motion, {way}, s", name, min(laps))
+
+
+def _output(program: str, *arguments: str) -> str:
+    return subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True).stdout.split()[-1]
+
+
+def main() -> None:
+    """All figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="few lanes, the disc alone")
+    parser.add_argument("--json", help="write the figures to this file")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    figures = [entry for part in (batches, compilation) for entry in part(options.quick)]
+    if options.json:
+        with open(options.json, "w") as file:
+            json.dump(figures, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()

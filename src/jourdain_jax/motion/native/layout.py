@@ -1,0 +1,95 @@
+"""Where the numbers of a lane are: a lane is a column of rows, one row per number, and a row is one vector for all lanes side by side.
+
+A lane is handed over with all rows of `Layout.given`, its progress at the start among them, and handed back with those of its progress.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+from jourdain_jax.native.ir import Value, Writer
+
+PROGRESS = ("t", "h", "code", "accepted", "rejected", "event", "pivot")
+CONTROL = ("direction", "last_goal", "rtol", "atol", "shortest", "max_steps", "origin")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The rows of a lane."""
+
+    coordinates: int
+    speeds: int
+    with_work: bool
+    known: int  # numbers that the rates are given: what depends on parameters alone, then the inputs
+    events: int
+
+    @property
+    def y(self) -> int:
+        """Numbers of the integrated state."""
+        return self.coordinates + self.speeds + self.with_work
+
+    @property
+    def parts(self) -> list[range]:
+        """Rows of the coordinates, of the speeds and of the work, where there are any."""
+        ends = [0, self.coordinates, self.coordinates + self.speeds, self.y]
+        return [range(a, b) for a, b in pairwise(ends) if b > a]
+
+    @cached_property
+    def rows(self) -> dict[str, range]:
+        """Name -> rows."""
+        search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1}
+        counts = {"y": self.y, **dict.fromkeys((*PROGRESS, *CONTROL), 1), "known": self.known, "goal": 1, **(search if self.events else {})}
+        found, first = {}, 0
+        for name, count in counts.items():
+            found[name] = range(first, first + count)
+            first += count
+        return found
+
+    @property
+    def returned(self) -> int:
+        """How many rows are handed back."""
+        return self.y + len(PROGRESS)
+
+    @property
+    def given(self) -> int:
+        """How many rows are handed over."""
+        return self.rows["goal"].start
+
+    @property
+    def all(self) -> int:
+        """How many rows there are."""
+        return max(rows.stop for rows in self.rows.values())
+
+
+class Lanes:
+    """The rows of the lanes side by side, in memory at `pointer`."""
+
+    def __init__(self, w: Writer, layout: Layout, pointer: Value) -> None:
+        self.w, self.layout, self.pointer = w, layout, pointer
+
+    def __getitem__(self, name: str) -> Value:
+        return self.every(name)[0]
+
+    def __setitem__(self, name: str, value: Value) -> None:
+        self.put(name, [value])
+
+    def every(self, name: str) -> list[Value]:
+        """The vectors of all rows of this name."""
+        return [self.w.load(self.w.real, self.pointer, row) for row in self.layout.rows[name]]
+
+    def put(self, name: str, values: list[Value]) -> None:
+        """Sets all rows of this name."""
+        for row, value in zip(self.layout.rows[name], values, strict=True):
+            self.w.store(value, self.pointer, row)
+
+    def place(self, row, lane: Value) -> Value:
+        """Where the number of one lane is."""
+        return self.w.at(self.pointer, row * self.w.lanes + lane if isinstance(row, Value) else lane + row * self.w.lanes, "double")
+
+    def of(self, name: str, lane: Value) -> Value:
+        """The number of one lane."""
+        return self.w.load("double", self.place(self.layout.rows[name].start, lane))
+
+    def set(self, name: str, lane: Value, value) -> None:
+        """Sets the number of one lane."""
+        self.w.store(self.w.literal(value, "double"), self.place(self.layout.rows[name].start, lane))

@@ -1,0 +1,109 @@
+"""The loop over steps as machine code: lanes of a batch side by side, each replaced by the next one when it has ended.
+
+A call is given two arrays with one row per lane: the rows of `Layout.given`, and the times to save at. It returns the states there, and the rows of the
+progress at the end with the number of times that were reached one after the other.
+"""
+
+from jourdain_jax.motion.integrators.erk_step import LOCATING, RUNNING, Method
+from jourdain_jax.motion.native.functions import Form, write_events, write_projection, write_rates
+from jourdain_jax.motion.native.layout import Lanes
+from jourdain_jax.motion.native.step import IDLE, write_step
+from jourdain_jax.native.ffi import write_handler
+from jourdain_jax.native.ir import Value, Writer
+
+# words of a job, shared by all functions: pointers to the arrays, the number of lanes, of times, of the next lane, and how many are on their way
+_STARTS, _GOALS, _STATES, _ENDS, _COUNT, _TIMES, _NEXT, _BUSY = range(8)
+
+
+def written(form: Form, method: Method, lanes: int, fused: bool) -> str:
+    """The module of LLVM IR."""
+    w = Writer(lanes, fused)
+    write_rates(w, form)
+    if form.projects:
+        write_projection(w, form)
+    if form.has_events:
+        write_events(w, form)
+    write_step(w, form, method)
+    _write_begin(w, form)
+    _write_serve(w, form)
+    write_handler(w, 2, 2, lambda arguments, results, sizes, rank: _write_loop(w, form, [*arguments, *results], sizes, rank))
+    return w.text
+
+
+def _write_loop(w: Writer, form: Form, arrays: list[Value], sizes: Value, rank: Value) -> None:
+    """All lanes, from start to end."""
+    job, state, who = w.room("i64", 8), w.room(w.real, form.layout.all), w.room("i64", 2 * w.lanes)
+    for word, pointer in zip((_STARTS, _GOALS, _STATES, _ENDS), arrays, strict=True):
+        w.store(pointer, job, word)
+    count = w.room("i64")
+    w.store(w.literal(1, "i64"), count)
+    with w.counted(0, rank - 1) as axis:
+        w.store(w.load("i64", count) * w.load("i64", sizes, axis), count)
+    w.store(w.load("i64", count), job, _COUNT)
+    w.store(w.load("i64", sizes, rank - 1), job, _TIMES)
+    w.store(w.literal(0, "i64"), job, _NEXT)
+    w.store(w.literal(w.lanes, "i64"), job, _BUSY)
+    with w.counted(0, form.layout.all) as row:
+        w.store(w.number(1.0), state, row)
+    lanes = Lanes(w, form.layout, state)
+    with w.counted(0, w.lanes) as lane:
+        w.call("begin", "void", job, state, who, lane)
+        w.call("serve", "void", job, state, who, lane)
+    with w.repeated() as leave:
+        leave(w.load("i64", job, _BUSY).equals(0))
+        w.call("step", "void", state)
+        code = lanes["code"]
+        on_its_way = (code.equals(float(RUNNING)) & lanes["t"].differs(lanes["goal"])) | code.equals(float(LOCATING)) | code.equals(IDLE)
+        with w.when(w.any(~on_its_way)), w.counted(0, w.lanes) as lane:
+            w.call("serve", "void", job, state, who, lane)
+
+
+def _write_begin(w: Writer, form: Form) -> None:
+    """`begin(job, state, who, lane)`: the next lane of the batch takes this place; where there is none, it is idle."""
+    with w.function("begin", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "lane": "i64"}, attributes="noinline") as (job, state, who, lane):
+        lanes, given = Lanes(w, form.layout, state), form.layout.given
+        number = w.load("i64", job, _NEXT)
+        there = number < w.load("i64", job, _COUNT)
+        with w.when(there):
+            w.store(number + 1, job, _NEXT)
+            w.store(number, who, lane)
+            w.store(w.literal(0, "i64"), who, lane + w.lanes)
+            starts = w.load("ptr", job, _STARTS)
+            with w.counted(0, given) as row:
+                w.store(w.load("double", starts, number * given + row), lanes.place(row, lane))
+            lanes.set("goal", lane, w.load("double", w.load("ptr", job, _GOALS), number * w.load("i64", job, _TIMES)))
+            if form.has_events:
+                lanes.set("search_left", lane, 0.0)
+        with w.when(~there):
+            lanes.set("code", lane, IDLE)
+            w.store(w.load("i64", job, _BUSY) - 1, job, _BUSY)
+        w.give()
+
+
+def _write_serve(w: Writer, form: Form) -> None:
+    """`serve(job, state, who, lane)`: saves what is due, and where the lane has ended, hands it back and begins with the next one."""
+    layout = form.layout
+    with w.function("serve", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "lane": "i64"}, attributes="noinline") as (job, state, who, lane):
+        lanes = Lanes(w, layout, state)
+        goals, states, ends = (w.load("ptr", job, word) for word in (_GOALS, _STATES, _ENDS))
+        times = w.load("i64", job, _TIMES)
+        with w.repeated() as leave:
+            code, t, goal = (lanes.of(name, lane) for name in ("code", "t", "goal"))
+            runs = code.equals(float(RUNNING))
+            leave(code.equals(IDLE) | code.equals(float(LOCATING)) | (runs & t.differs(goal)))
+            number, saved = w.load("i64", who, lane), w.load("i64", who, lane + w.lanes)
+            # at a time to save at; or at the end, whose state stands for all that is left
+            last = w.where(runs, saved + 1, times)
+            with w.counted(saved, last) as k, w.counted(0, layout.y) as row:
+                w.store(w.load("double", lanes.place(row, lane)), states, (number * times + k) * layout.y + row)
+            w.store(last, who, lane + w.lanes)
+            with w.when(last < times):
+                w.store(w.load("double", goals, number * times + last), lanes.place(layout.rows["goal"].start, lane))
+            with w.when(last >= times):
+                each = layout.returned + 1
+                with w.counted(0, layout.returned) as row:
+                    w.store(w.load("double", lanes.place(row, lane)), ends, number * each + row)
+                reached = w.where(runs, times, saved)
+                w.store(w.converted("sitofp", reached, "double"), ends, number * each + layout.returned)
+                w.call("begin", "void", job, state, who, lane)
+        w.give()

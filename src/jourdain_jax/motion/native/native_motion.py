@@ -1,0 +1,97 @@
+"""One motion by machine code, and when: the rows of its lane from what `erk_loop.integrate` is given, and what that returns from the rows of the end."""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jourdain_jax.motion.inputs import Inputs, Sampled
+from jourdain_jax.motion.integrators.erk_loop import ended
+from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
+from jourdain_jax.motion.native.functions import Form, event_program
+from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel
+from jourdain_jax.motion.native.layout import Layout
+from jourdain_jax.motion.state_form import Integrated, StateForm
+from jourdain_jax.native import ffi, host
+from jourdain_jax.native.scalar_program import unsupported
+from jourdain_jax.program.graph import Unsupported
+
+LARGEST_PROGRAM = 20_000  # operations
+
+
+class Control(NamedTuple):
+    """How well and how far to integrate."""
+
+    rtol: Float[Array, ""]
+    atol: Float[Array, ""]
+    shortest: Float[Array, ""]
+    dt0: Float[Array, ""]
+    max_steps: int
+
+
+def reason_against(form: StateForm, inputs: Inputs, scene: PyTree, has_events: bool, real) -> str:
+    """Why machine code cannot integrate a scene, in words; empty where it can."""
+    if form.lowered is None:
+        return "the scene has no scalar program"
+    if jax.default_backend() != "cpu":
+        return "it is made for CPUs alone"
+    if host.reason_against():
+        return host.reason_against()
+    if ffi.version() is None:
+        return "the foreign function interface of this jaxlib is not known"
+    if real != jnp.float64:
+        return "it is made for double precision alone"
+    if not inputs.constant or any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
+        return "inputs change with time"
+    if has_events and not form.lowers_events:
+        return "a stop event is no part of the scalar program"
+    return _reason_against_program(_form(form, has_events))
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def _reason_against_program(form: Form) -> str:
+    """The same, of the program alone."""
+    graph = form.program.graph
+    operations = graph.operations(form.nodes)
+    if operations > LARGEST_PROGRAM:
+        return f"the scalar program has {operations} operations, more than {LARGEST_PROGRAM}"
+    reason = unsupported(graph, form.nodes)
+    if not reason and form.has_events:
+        try:
+            event_program(form)
+        except Unsupported as error:
+            return f"a stop event has no rate on the graph ({error})"
+    return reason
+
+
+def _form(form: StateForm, has_events: bool) -> Form:
+    assert form.lowered is not None
+    return Form(form.lowered, form.with_work, form.projects_positions or form.projects_speeds, form.affine, has_events, form.has_pivots)
+
+
+def integrate(
+    args: tuple, solver: type, has_events: bool, y0: Integrated, goals: Float[Array, "times"], control: Control
+) -> tuple[Integrated, Bool[Array, "times"], Progress]:
+    """As `erk_loop.integrate`, of one motion from time zero; `args`: as rates take them."""
+    form, _, inputs, fixed, origin = args
+    layout, run = kernel(_form(form, has_events), solver)
+    zero, one = jnp.zeros(()), jnp.ones(())
+    t, h, code, event = zero, jnp.abs(control.dt0), RUNNING * one, -one
+    progress = [t, h, code, zero, zero, event, jnp.inf * one]
+    limits = [jnp.sign(goals[-1]), goals[-1], control.rtol, control.atol, control.shortest, control.max_steps * one, origin]
+    known = [jnp.asarray(x, jnp.float64) for x in (*fixed, *inputs(origin))]
+    work = [] if y0.work is None else [y0.work[None]]
+    states, end = run(jnp.concatenate([y0.q, y0.v, *work, jnp.stack([*progress, *limits, *known])]), goals)
+    t, h, code, accepted, rejected, event, pivot, count = end[layout.y :]
+    reached = (jnp.arange(len(goals)) < count) | (goals == t)
+    numbers = [x.astype(jnp.int32) for x in (code, accepted, rejected, event)]
+    code, accepted, rejected, event = numbers
+    last = Progress(t, _unpacked(layout, end[: layout.y]), h, code, jnp.zeros((), jnp.int32), accepted, rejected, event, None, pivot)
+    return jax.vmap(lambda y: _unpacked(layout, y))(states), reached, ended(last, 0.0)
+
+
+def _unpacked(layout: Layout, y: Float[Array, "y"]) -> Integrated:
+    n = layout.coordinates
+    return Integrated(y[:n], y[n : n + layout.speeds], y[-1] if layout.with_work else None)

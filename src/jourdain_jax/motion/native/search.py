@@ -1,0 +1,119 @@
+"""The search for a stop event, as in `motion/integrators/event_search.py`, for lanes side by side."""
+
+import math
+
+from jourdain_jax.motion.integrators.event_search import DIFFERENTIABLE, LATE, MOST_STEPS
+from jourdain_jax.motion.native.layout import Lanes
+from jourdain_jax.native.ir import Value, Writer
+
+EPS = 2.0**-52
+_SMALL = math.sqrt(EPS)
+Values = list[Value]  # one per event
+
+
+def no_event(w: Writer, values: Values) -> Value:
+    """Whether all values are positive."""
+    found = values[0] > 0.0
+    for c in values[1:]:
+        found = found & (c > 0.0)
+    return found
+
+
+def first_event(w: Writer, before: Values, after: Values) -> Value:
+    """The number of the event that is the first to happen, by its secant."""
+    best, first = None, w.number(0.0)
+    for i, (b, a) in enumerate(zip(before, after, strict=True)):
+        share = b / (b - a)
+        share = w.where(a > 0.0, math.inf, w.where(w.magnitude(share) < math.inf, share, 1.0))
+        if best is None:
+            best = share
+        else:
+            first = w.where(share < best, float(i), first)
+            best = w.where(share < best, share, best)
+    return first
+
+
+def chosen(w: Writer, index: Value, values: Values) -> Value:
+    """The value with this index."""
+    found = values[0]
+    for i in range(1, len(values)):
+        found = w.where(index.equals(float(i)), values[i], found)
+    return found
+
+
+def dip(w: Writer, h: Value, c_0: Values, rate_0: Values, c_1: Values, rate_1: Values) -> tuple[Value, Value]:
+    """Whether a value falls below zero between the ends of a step, and after which part of the step the first one is lowest."""
+    shares = w.number(1.0)
+    for a, slope_a, b, slope_b in zip(c_0, rate_0, c_1, rate_1, strict=True):
+        m_0, m_1 = h * slope_a, h * slope_b
+        rise = b - a
+        A, B = 3.0 * rise - 2.0 * m_0 - m_1, m_0 + m_1 - 2.0 * rise
+        s = -m_0 / (A + w.intrinsic("sqrt", w.larger(A * A - 3.0 * B * m_0, 0.0)))
+        lowest = a + s * (m_0 + s * (A + s * B))
+        dips = (b > 0.0) & (m_0 < 0.0) & (m_1 > 0.0) & (s < LATE) & (lowest < -1e-12 * (a + b))
+        shares = w.smaller(shares, w.where(dips, s, 1.0))
+    return shares < 1.0, shares
+
+
+def advance(w: Writer, p: Lanes, begins: Value, trying: Value, locating: Value, t_0: Value, c_0: Values, rate_0: Values, t_1: Value, c_1: Values) -> Value:
+    """The search after a step, into its rows, in lanes where it `begins` or which are `locating`; the number of the event that is now the first."""
+    changes, count = begins | locating, len(c_1)
+    t, flat, left = p.every("search_t"), p.every("search_c"), p["search_left"]
+    c = [flat[i * count : (i + 1) * count] for i in range(3)]
+    # narrowed: the time tried, one on the other side of the event, and one that was either before
+    same_side = _same(w, no_event(w, c_1), no_event(w, c[0]))
+    narrowed_t = [t_1, w.where(same_side, t[1], t[0]), w.where(same_side, t[0], t[1])]
+    narrowed_c = [c_1, _each(w, same_side, c[1], c[0]), _each(w, same_side, c[0], c[1])]
+    fresh_t = [t_1, t_0, w.number(math.inf)]
+    fresh_c = [c_1, c_0, [w.number(math.nan)] * count]
+    known_t = [w.where(begins, a, w.where(trying, b, old)) for a, b, old in zip(fresh_t, narrowed_t, t, strict=True)]
+    known_c = [_each(w, begins, a, _each(w, trying, b, old)) for a, b, old in zip(fresh_c, narrowed_c, c, strict=True)]
+    step = w.where(begins, w.magnitude(t_1 - t_0), p["search_step"])
+    now_left = w.where(begins, float(MOST_STEPS), w.larger(left - 1.0, 0.0))
+    is_before = no_event(w, known_c[0])
+    before, after = _each(w, is_before, known_c[0], known_c[1]), _each(w, is_before, known_c[1], known_c[0])
+    first = first_event(w, before, after)
+    tried, near = _next_trial(w, known_t, [chosen(w, first, x) for x in known_c], step, now_left <= DIFFERENTIABLE + 3.0)
+    trying = begins | trying
+    now_left = w.where(trying & near, DIFFERENTIABLE + 1.0, now_left)
+    to_trial = w.where(near, 0.0, tried - t_0)
+    newton = _newton_shift(w, known_t, chosen(w, first, after), step, chosen(w, first, c_1), chosen(w, first, rate_0), left > 0.0)
+    shift = w.where(trying, to_trial, newton)
+    for name, new in (("search_t", known_t), ("search_c", [x for part in known_c for x in part])):
+        p.put(name, [w.where(changes, a, b) for a, b in zip(new, p.every(name), strict=True)])
+    for name, new in (("search_step", step), ("search_left", now_left), ("search_shift", shift)):
+        p[name] = w.where(changes, new, p[name])
+    return first
+
+
+def _same(w: Writer, a: Value, b: Value) -> Value:
+    return ~w.bitwise("xor", a, b)
+
+
+def _each(w: Writer, condition: Value, a: Values, b: Values) -> Values:
+    return [w.where(condition, x, y) for x, y in zip(a, b, strict=True)]
+
+
+def _next_trial(w: Writer, t: Values, c: Values, step: Value, last: Value) -> tuple[Value, Value]:
+    (t_1, t_2, t_3), (c_1, c_2, c_3) = t, c
+    width, tiny = t_2 - t_1, 2 * EPS * (w.magnitude(t_1) + w.magnitude(t_2))
+    xi, phi = (t_1 - t_2) / (t_3 - t_2), (c_1 - c_2) / (c_3 - c_2)
+    safe = (phi * phi < xi) & ((1.0 - phi) * (1.0 - phi) < 1.0 - xi)
+    inverse = c_1 / (c_2 - c_1) * c_3 / (c_2 - c_3) - (t_3 - t_1) / width * c_1 / (c_3 - c_1) * c_2 / (c_2 - c_3)
+    share = w.where(w.magnitude(t_3).equals(math.inf), c_1 / (c_1 - c_2), w.where(safe, inverse, 0.5))
+    share = w.where(w.magnitude(share) < math.inf, share, 0.5)
+    least = w.smaller(tiny / w.magnitude(width), 0.5)
+    slope = (c_1 - c_3) / (t_1 - t_3)
+    slope = w.where((w.magnitude(slope) < math.inf) & (w.magnitude(t_3) < math.inf), slope, (c_1 - c_2) / (t_1 - t_2))
+    small = (w.magnitude(c_1) <= _SMALL * step * w.magnitude(slope)) & (w.magnitude(c_1) <= 1e-3 * w.magnitude(c_2))
+    near = c_1.equals(0.0) | small
+    closed = (w.magnitude(width) <= 2.0 * tiny) | last
+    clipped = w.smaller(w.larger(share, least), 1.0 - least)
+    return w.where(closed, t_2, t_1 + clipped * width), near | (closed & (w.magnitude(c_1) < math.inf))
+
+
+def _newton_shift(w: Writer, t: Values, after: Value, step: Value, c: Value, rate: Value, searching: Value) -> Value:
+    beyond = w.is_nan(after)
+    far = w.magnitude(t[0] - t[1]) + _SMALL * step
+    usable = searching & (w.magnitude(c) < far * w.magnitude(rate)) & (w.magnitude(rate) < math.inf)
+    return w.where(usable & ~beyond, -c / rate, 0.0)

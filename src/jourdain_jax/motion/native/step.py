@@ -1,0 +1,210 @@
+"""One step of lanes side by side, as in `motion/integrators/erk_step.py`, which says what it does and why."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT
+from jourdain_jax.motion.integrators.erk_step import LARGEST_FACTOR, LEAST_FACTOR, LOCATING, NOISE, RUNNING, SAFETY, Method
+from jourdain_jax.motion.integrators.event_search import DIFFERENTIABLE
+from jourdain_jax.motion.native import search
+from jourdain_jax.motion.native.functions import Form
+from jourdain_jax.motion.native.layout import Lanes, Layout
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.math_functions import power
+
+UNROLLED = 12  # numbers of a state; more are gone through by loops, whose code is short
+IDLE = -9.0  # code of a place that has no lane
+
+
+def write_step(w: Writer, form: Form, method: Method) -> None:
+    """`step(state)`: one step, tried by all lanes that are on their way."""
+    with w.function("step", "void", {"state": "ptr"}, attributes="noinline") as (state,):
+        _write_step(w, form, method, Lanes(w, form.layout, state))
+        w.give()
+
+
+def _write_step(w: Writer, form: Form, method: Method, p: Lanes) -> None:
+    layout, y = form.layout, p.pointer  # the state comes first in the rows of a lane
+    rows = range(layout.y)
+    t, h, code, goal, direction = p["t"], p["h"], p["code"], p["goal"], p["direction"]
+    locating = code.equals(float(LOCATING))
+    rest = w.magnitude(goal - t)
+    lands = ~locating & (h >= 0.999 * rest)
+    size = w.where(lands, rest, w.where(2.0 * h > rest, 0.5 * rest, h))
+    shortened = size < h
+    step = w.where(locating, p["search_shift"], direction * size) if form.has_events else direction * size
+    t1 = w.where(lands, goal, t + step)
+    step = t1 - t
+    k, smallest, changed_sign = _stages(w, form, method, p, t, step)
+    y1, error = w.room(w.real, layout.y), w.room(w.real, layout.y)
+    _each_row(w, rows, y1, lambda i: w.fma(step, _weighted(w, method.b, k, layout, i), w.load(w.real, y, i)))
+    _each_row(w, rows, error, lambda i: step * _weighted(w, method.b_error, k, layout, i))
+    if form.projects:
+        _project(w, layout, p, t1, y1, error)
+    size_of_error = _norm(w, layout, p, error, y1)
+    if form.pivots:
+        size_of_error = w.where(changed_sign & ~locating, math.inf, size_of_error)
+    accept = locating | (size_of_error <= 1.0)
+    factor = SAFETY * power(w, w.where(size_of_error > 0.0, size_of_error, 1e-30), -1 / method.order)
+    factor = w.larger(w.where(size_of_error < math.inf, factor, 0.0), LEAST_FACTOR)
+    proposed = size * w.smaller(factor, w.where(accept, LARGEST_FACTOR, w.number(1.0)))
+    next_h = w.where(accept & shortened, w.larger(proposed, h), proposed)
+    accepted = p["accepted"] + _count(w, accept & ~locating)
+    rejected = p["rejected"] + _count(w, ~accept)
+    too_short = (next_h < p["shortest"]) | (t1 + direction * next_h).equals(t1)
+    arrived = accept & t1.equals(p["last_goal"])
+    new_code = w.where(((accepted + rejected) >= p["max_steps"]) & ~arrived, float(results.MAX_STEPS), float(RUNNING))
+    new_code = w.where(too_short, float(results.STEP_TOO_SMALL), new_code)
+    new = {"t": w.where(accept, t1, t), "h": next_h, "code": new_code, "accepted": accepted, "rejected": rejected}
+    _each_row(w, rows, y1, lambda i: w.where(accept, w.load(w.real, y1, i), w.load(w.real, y, i)))
+    if form.has_events:
+        new = _watched(w, form, method, p, k, step, accept, new, y1)
+    if form.pivots:
+        counts = accept & ~locating & new["code"].equals(float(RUNNING)) & new["t"].equals(t1)
+        pivot = w.where(counts, w.smaller(p["pivot"], smallest), p["pivot"])
+        new |= {"pivot": pivot, "code": w.where(counts & (pivot < SMALLEST_PIVOT), float(results.SINGULAR_PARTITION), new["code"])}
+    moving = locating | code.equals(float(RUNNING))
+    _each_row(w, rows, y, lambda i: w.where(moving, w.load(w.real, y1, i), w.load(w.real, y, i)))
+    for name, value in new.items():
+        p[name] = w.where(moving, value, p[name])
+
+
+def _for_rows(w: Writer, rows: range, body: Callable[[int | Value], None]) -> None:
+    """`body` for the number of every row."""
+    if len(rows) <= UNROLLED:
+        for i in rows:
+            body(i)
+    else:
+        with w.counted(rows.start, rows.stop) as i:
+            body(i)
+
+
+def _each_row(w: Writer, rows: range, into: Value, value: Callable[[int | Value], Value]) -> None:
+    """Sets rows of a state in memory."""
+    _for_rows(w, rows, lambda i: w.store(value(i), into, i))
+
+
+def _over_rows(w: Writer, rows: range, start: float, added: Callable[[Value, int | Value], Value]) -> Value:
+    """What `added(total, i)` makes of all rows one after the other."""
+    total = w.room(w.real)
+    w.store(w.number(start), total)
+    _for_rows(w, rows, lambda i: w.store(added(w.load(w.real, total), i), total))
+    return w.load(w.real, total)
+
+
+def _stages(w: Writer, form: Form, method: Method, p: Lanes, t: Value, step: Value) -> tuple[Value, Value, Value]:
+    """Where the slopes of all stages are; the smallest magnitude of a pivot, and whether any changed its sign."""
+    layout, count = form.layout, form.pivots
+    k, at, pivots = w.room(w.real, layout.y * method.needed), w.room(w.real, layout.y), w.room(w.real, max(count, 1))
+    low, high = [w.number(math.inf)] * count, [w.number(-math.inf)] * count
+
+    def next_state(i: int, row: int | Value) -> Value:
+        start = w.load(w.real, p.pointer, row)
+        return w.fma(step, _weighted(w, method.A[i], k, layout, row), start) if i else start
+
+    for i in range(method.needed):
+        _each_row(w, range(layout.y), at, partial(next_state, i))
+        w.call("rates", "void", p.pointer, w.fma(step, float(method.c[i]), t), at, w.at(k, i * layout.y, w.real), pivots)
+        now = [w.load(w.real, pivots, j) for j in range(count)]
+        low, high = [w.smaller(a, b) for a, b in zip(low, now, strict=True)], [w.larger(a, b) for a, b in zip(high, now, strict=True)]
+    smallest, changed = w.number(math.inf), w.literal(0, w.truth)
+    for a, b in zip(low, high, strict=True):
+        smallest = w.smaller(smallest, w.smaller(w.magnitude(a), w.magnitude(b)))
+        changed = changed | ((a < 0.0) & (b > 0.0))
+    return k, smallest, changed
+
+
+def _weighted(w: Writer, weights: np.ndarray, k: Value, layout: Layout, row: int | Value) -> Value:
+    """sum_j w_j k_j of one number of the state."""
+    used = [j for j in range(len(weights)) if weights[j] != 0]
+    total = w.load(w.real, k, used[0] * layout.y + row) * float(weights[used[0]])
+    for j in used[1:]:
+        total = w.fma(w.load(w.real, k, j * layout.y + row), float(weights[j]), total)
+    return total
+
+
+def _project(w: Writer, layout: Layout, p: Lanes, t1: Value, y1: Value, error: Value) -> None:
+    """Puts `y1` back onto the rows; the error is no smaller than how far that moved it, beyond noise."""
+    free = w.room(w.real, layout.y)
+    _each_row(w, range(layout.y), free, lambda i: w.load(w.real, y1, i))
+    w.call("project", "void", p.pointer, t1, y1)
+    for part in layout.parts:
+        noise = search.EPS**NOISE * _over_rows(w, part, 0.0, lambda largest, i: w.larger(largest, w.magnitude(w.load(w.real, y1, i))))
+
+        def larger_error(i: int | Value, noise: Value = noise) -> Value:
+            moved = w.magnitude(w.load(w.real, y1, i) - w.load(w.real, free, i)) - noise
+            return w.larger(w.magnitude(w.load(w.real, error, i)), w.larger(moved, 0.0))
+
+        _each_row(w, part, error, larger_error)
+
+
+def _norm(w: Writer, layout: Layout, p: Lanes, error: Value, y1: Value) -> Value:
+    """Root mean square of the errors of coordinates and speeds, relative to what is allowed; infinite where one is no number."""
+    rtol, atol, count = p["rtol"], p["atol"], layout.coordinates + layout.speeds
+
+    def added(total: Value, i: int | Value) -> Value:
+        size = w.larger(w.magnitude(w.load(w.real, p.pointer, i)), w.magnitude(w.load(w.real, y1, i)))
+        relative = w.load(w.real, error, i) / w.fma(rtol, size, atol)
+        return w.fma(relative, relative, total)
+
+    total = _over_rows(w, range(count), 0.0, added) / float(count)
+    return w.intrinsic("sqrt", w.where(w.is_nan(total), math.inf, total))
+
+
+def _count(w: Writer, happens: Value) -> Value:
+    return w.where(happens, 1.0, w.number(0.0))
+
+
+def _watched(w: Writer, form: Form, method: Method, p: Lanes, k: Value, step: Value, accept: Value, new: dict[str, Value], y1: Value) -> dict[str, Value]:
+    """The step in which an event may have happened or is being located, or before which one has; changes `y1`."""
+    layout, count, y = form.layout, form.layout.events, p.pointer
+    t, code, rows = p["t"], p["code"], range(layout.y)
+    locating, fresh = code.equals(float(LOCATING)), (p["accepted"] + p["rejected"]).equals(0.0)
+    accept = accept & ~locating & new["code"].equals(float(RUNNING))
+
+    def events(t: Value, y: Value, stage: int) -> tuple[list[Value], list[Value]]:
+        values, rates = w.room(w.real, count), w.room(w.real, count)
+        w.call("events", "void", p.pointer, t, y, w.at(k, stage * layout.y, w.real), values, rates)
+        return [w.load(w.real, values, i) for i in range(count)], [w.load(w.real, rates, i) for i in range(count)]
+
+    c_0, rate_0 = events(t, y, 0)
+    c_1, rate_1 = events(new["t"], y1, method.at_the_end)
+    dips, share = search.dip(w, step, c_0, rate_0, c_1, rate_1)
+    dips = accept & dips
+    happened = accept & ~dips & ~search.no_event(w, c_1)
+    was_trying = p["search_left"] > DIFFERENTIABLE + 1.0
+    changes, first = happened | locating, w.room(w.real)
+    w.store(p["event"], first)
+    with w.when(w.any(changes)):
+        w.store(search.advance(w, p, happened, was_trying, locating, t, c_0, rate_0, new["t"], c_1), first)
+    left, shift = p["search_left"], p["search_shift"]
+    found, back = locating & left.equals(0.0), changes & (left > DIFFERENTIABLE + 1.0)
+    # a motion that starts beyond an event has no motion at all
+    finite = _over_rows(w, rows, 0.0, lambda total, i: total + 0.0 * w.load(w.real, y, i)).equals(0.0)
+    over = fresh & finite & ~search.no_event(w, c_0)
+    which = w.number(float(count - 1))
+    for i in reversed(range(count - 1)):
+        which = w.where(c_0[i] > 0.0, which, float(i))
+    stays = back | dips | over
+
+    def state(i: int | Value) -> Value:
+        after = w.load(w.real, y1, i)
+        return w.where(stays, w.load(w.real, y, i), w.where(found, w.fma(shift, w.load(w.real, k, i), after), after))
+
+    _each_row(w, rows, y1, state)
+    tried = _count(w, dips)
+    now = w.where(found, float(results.EVENT), w.where(locating, float(LOCATING), new["code"]))
+    new = {
+        "t": w.where(found, new["t"] + shift, w.where(stays, t, new["t"])),
+        "h": w.where(dips, share * w.magnitude(step), w.where(locating, p["h"], new["h"])),
+        "code": w.where(happened, float(LOCATING), now),
+        "accepted": new["accepted"] - tried,
+        "rejected": new["rejected"] + tried,
+        "event": w.where(happened | (locating & was_trying), w.load(w.real, first), p["event"]),
+    }
+    begun = {"h": p["h"], "code": w.number(float(results.EVENT)), "accepted": p["accepted"], "rejected": p["rejected"], "event": which}
+    return new | {name: w.where(over, value, new[name]) for name, value in begun.items()}

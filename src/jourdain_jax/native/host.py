@@ -1,0 +1,87 @@
+"""The machine that runs this process: whether machine code can be made for it, how many lanes it takes at once, and the making."""
+
+import ctypes
+import ctypes.util
+import functools
+import threading
+from typing import Any
+
+from jourdain_jax.native.math_functions import LIBM, PREFIX
+
+try:
+    from llvmlite import binding
+except ImportError:  # an optional dependency
+    binding = None
+llvm: Any = binding
+
+_LANES = (("avx512f", 8), ("avx", 4))  # doubles of a register; else 2, as every 64-bit machine has
+_lock = threading.Lock()
+_engines: list = []  # what machine code lives in: as long as the process, which may call it
+
+
+@functools.cache
+def reason_against() -> str:
+    """Why no machine code is made here; empty where it is."""
+    if llvm is None:
+        return "llvmlite is not installed"
+    try:
+        llvm.initialize_native_target()
+        llvm.initialize_native_asmprinter()
+        _machine()
+        libm = ctypes.CDLL(ctypes.util.find_library("m"))
+        for name in LIBM:
+            llvm.add_symbol(PREFIX + name, ctypes.cast(getattr(libm, name), ctypes.c_void_p).value)
+    except (OSError, RuntimeError, AttributeError) as error:
+        return f"LLVM does not know this machine ({str(error).splitlines()[0]})"
+    return ""
+
+
+@functools.cache
+def features() -> dict[str, bool]:
+    """What the processor can do."""
+    return dict(llvm.get_host_cpu_features())
+
+
+def lanes() -> int:
+    """How many doubles a vector register holds."""
+    return next((count for name, count in _LANES if features().get(name)), 2)
+
+
+def fuses() -> bool:
+    """Whether products and sums are rounded once, in one instruction."""
+    return bool(features().get("fma") or features().get("neon"))
+
+
+@functools.cache
+def _machine():
+    target = llvm.Target.from_default_triple()
+    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2, jit=True)
+
+
+def description() -> str:
+    """What machine code depends on besides the program."""
+    return f"{llvm.llvm_version_info} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
+
+
+def object_code(text: str) -> bytes:
+    """Machine code of a module of LLVM IR."""
+    with _lock:
+        module = llvm.parse_assembly(text)
+        module.triple = llvm.get_process_triple()
+        options = llvm.create_pipeline_tuning_options(speed_level=2)
+        options.loop_vectorization = options.slp_vectorization = False
+        builder = llvm.create_pass_builder(_machine(), options)
+        builder.getModulePassManager().run(module, builder)
+        return _machine().emit_object(module)
+
+
+def address(code: bytes, name: str) -> int:
+    """Where a function of some machine code is, once it is in memory."""
+    with _lock:
+        # an engine takes its target machine with it
+        machine = llvm.Target.from_default_triple().create_target_machine(jit=True)
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+        engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+        engine.finalize_object()
+        _engines.append(engine)
+        return engine.get_function_address(name)

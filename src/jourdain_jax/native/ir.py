@@ -1,0 +1,265 @@
+"""LLVM IR as text, written by operators on values: vectors with one number per lane, and the scalars that control loops.
+
+`a + b`, `a < b`, `where(c, a, b)` each append an instruction to the function that is being written. Numbers of Python become literals. There are no
+flags that let LLVM change results: every lane is rounded as it is written here, whatever the width.
+"""
+
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+_COMPARED = {"lt": ("olt", "slt"), "le": ("ole", "sle"), "gt": ("ogt", "sgt"), "ge": ("oge", "sge"), "eq": ("oeq", "eq"), "ne": ("une", "ne")}
+
+
+@dataclass(frozen=True, eq=False)
+class Value:
+    """The result of an instruction, an argument or a literal."""
+
+    writer: "Writer"
+    type: str
+    name: str
+
+    def __add__(self, other) -> "Value":
+        return self.writer.binary("add", self, other)
+
+    def __radd__(self, other) -> "Value":
+        return self.writer.binary("add", self, other)
+
+    def __sub__(self, other) -> "Value":
+        return self.writer.binary("sub", self, other)
+
+    def __rsub__(self, other) -> "Value":
+        return self.writer.literal(other, self.type) - self
+
+    def __mul__(self, other) -> "Value":
+        return self.writer.binary("mul", self, other)
+
+    def __rmul__(self, other) -> "Value":
+        return self.writer.binary("mul", self, other)
+
+    def __truediv__(self, other) -> "Value":
+        return self.writer.binary("div", self, other)
+
+    def __rtruediv__(self, other) -> "Value":
+        return self.writer.literal(other, self.type) / self
+
+    def __neg__(self) -> "Value":
+        return self.writer.instruction(self.type, f"fneg {self.type} {self.name}")
+
+    def __lt__(self, other) -> "Value":
+        return self.writer.compared("lt", self, other)
+
+    def __le__(self, other) -> "Value":
+        return self.writer.compared("le", self, other)
+
+    def __gt__(self, other) -> "Value":
+        return self.writer.compared("gt", self, other)
+
+    def __ge__(self, other) -> "Value":
+        return self.writer.compared("ge", self, other)
+
+    def equals(self, other) -> "Value":
+        """Whether two values are equal; NaN is equal to nothing."""
+        return self.writer.compared("eq", self, other)
+
+    def differs(self, other) -> "Value":
+        """Whether two values are not equal."""
+        return self.writer.compared("ne", self, other)
+
+    def __and__(self, other) -> "Value":
+        return self.writer.bitwise("and", self, other)
+
+    def __or__(self, other) -> "Value":
+        return self.writer.bitwise("or", self, other)
+
+    def __invert__(self) -> "Value":
+        return self.writer.bitwise("xor", self, -1)
+
+
+class Writer:
+    """A module of functions on vectors of `lanes` doubles; `fused`: products and sums are rounded once where `fma` asks for it."""
+
+    def __init__(self, lanes: int, fused: bool) -> None:
+        self.lanes, self.fused = lanes, fused
+        self.real, self.truth, self.whole = f"<{lanes} x double>", f"<{lanes} x i1>", f"<{lanes} x i64>"
+        self._lines: list[str] = []
+        self._declared: dict[str, str] = {}
+        self._count, self._entry = 0, 0
+
+    @property
+    def text(self) -> str:
+        """The module."""
+        return "\n".join([*self._lines, *self._declared.values(), ""])
+
+    # functions and control
+
+    @contextmanager
+    def function(self, name: str, result: str, arguments: dict[str, str], how: str = "internal", attributes: str = "") -> Iterator[list[Value]]:
+        """A function; inside, its arguments (name -> type) as values."""
+        self._lines.append(f"define {how} {result} @{name}({', '.join(f'{type} %{n}' for n, type in arguments.items())}) nounwind {attributes} {{")
+        self._entry = len(self._lines)
+        yield [Value(self, type, f"%{n}") for n, type in arguments.items()]
+        self._lines.append("}\n")
+
+    def give(self, value: Value | None = None) -> None:
+        """Returns from the function."""
+        self._lines.append("  ret void" if value is None else f"  ret {value.type} {value.name}")
+
+    def label(self) -> str:
+        """A new name of a place."""
+        self._count += 1
+        return f"at{self._count}"
+
+    def place(self, label: str) -> None:
+        """The place with this name is here."""
+        self._lines.append(f"{label}:")
+
+    def go(self, label: str, condition: Value | None = None, otherwise: str = "") -> None:
+        """Goes on at a place, or where the condition does not hold at another."""
+        self._lines.append(f"  br label %{label}" if condition is None else f"  br i1 {condition.name}, label %{label}, label %{otherwise}")
+
+    @contextmanager
+    def when(self, condition: Value) -> Iterator[None]:
+        """What is written inside runs where the condition holds."""
+        inside, after = self.label(), self.label()
+        self.go(inside, condition, after)
+        self.place(inside)
+        yield
+        self.go(after)
+        self.place(after)
+
+    @contextmanager
+    def repeated(self) -> Iterator[Callable[[Value], None]]:
+        """A loop; it is given a function that leaves it where a condition holds."""
+        again, after = self.label(), self.label()
+        self.go(again)
+        self.place(again)
+
+        def leave(condition: Value) -> None:
+            on = self.label()
+            self.go(after, condition, on)
+            self.place(on)
+
+        yield leave
+        self.go(again)
+        self.place(after)
+
+    @contextmanager
+    def counted(self, first: Value | int, end: Value | int) -> Iterator[Value]:
+        """A loop over whole numbers from `first` up to before `end`."""
+        number = self.room("i64")
+        self.store(self.literal(first, "i64"), number)
+        with self.repeated() as leave:
+            now = self.load("i64", number)
+            leave(now >= end)
+            yield now
+            self.store(now + 1, number)
+
+    # instructions
+
+    def instruction(self, type: str, text: str) -> Value:
+        """The result of an instruction."""
+        self._count += 1
+        self._lines.append(f"  %v{self._count} = {text}")
+        return Value(self, type, f"%v{self._count}")
+
+    def literal(self, number, type: str) -> Value:
+        """A number of Python in this type; values pass."""
+        if isinstance(number, Value):
+            return number
+        scalar = type.split(" x ")[-1].rstrip(">")
+        text = f"0x{struct.pack('>d', float(number)).hex().upper()}" if scalar == "double" else str(int(number))
+        return Value(self, type, text if scalar == type else f"splat ({scalar} {text})")
+
+    def number(self, value: float) -> Value:
+        """A number in all lanes."""
+        return self.literal(value, self.real)
+
+    def binary(self, op: str, a: Value, b) -> Value:
+        """A sum, difference, product or quotient."""
+        b, prefix = self.literal(b, a.type), "f" if "double" in a.type else ""
+        return self.instruction(a.type, f"{prefix}{op} {a.type} {a.name}, {b.name}")
+
+    def bitwise(self, op: str, a: Value, b) -> Value:
+        """An operation on truth values or whole numbers, bit by bit."""
+        b = self.literal(b, a.type)
+        return self.instruction(a.type, f"{op} {a.type} {a.name}, {b.name}")
+
+    def compared(self, op: str, a: Value, b) -> Value:
+        """A comparison; with NaN only `ne` holds."""
+        b, real = self.literal(b, a.type), "double" in a.type
+        found = self.truth if a.type.startswith("<") else "i1"
+        return self.instruction(found, f"{'fcmp' if real else 'icmp'} {_COMPARED[op][0 if real else 1]} {a.type} {a.name}, {b.name}")
+
+    def is_nan(self, a: Value) -> Value:
+        """Whether a number is none."""
+        return self.instruction(self.truth, f"fcmp uno {a.type} {a.name}, {a.name}")
+
+    def where(self, condition: Value, a, b) -> Value:
+        """a where the condition holds, otherwise b."""
+        like = a if isinstance(a, Value) else b if isinstance(b, Value) else self.number(0.0)
+        a, b = self.literal(a, like.type), self.literal(b, like.type)
+        return self.instruction(a.type, f"select {condition.type} {condition.name}, {a.type} {a.name}, {b.type} {b.name}")
+
+    def call(self, function: str, result: str, *arguments: Value) -> Value:
+        """The result of a function; of `void` none is to be used."""
+        text = f"call {result} @{function}({', '.join(f'{a.type} {a.name}' for a in arguments)})"
+        if result == "void":
+            self._lines.append(f"  {text}")
+            return Value(self, "void", "")
+        return self.instruction(result, text)
+
+    def external(self, function: str, result: str, *arguments: Value) -> Value:
+        """As `call`, of a function from outside the module."""
+        self._declared[function] = f"declare {result} @{function}({', '.join(a.type for a in arguments)})"
+        return self.call(function, result, *arguments)
+
+    def intrinsic(self, name: str, a: Value, *more) -> Value:
+        """A function of LLVM of one or more numbers of a type."""
+        kind = f"v{self.lanes}f64" if a.type == self.real else "f64"
+        return self.external(f"llvm.{name}.{kind}", a.type, a, *(self.literal(b, a.type) for b in more))
+
+    def fma(self, a: Value, b, c) -> Value:
+        """a b + c, rounded once where the machine can."""
+        return self.intrinsic("fma", a, b, c) if self.fused else a * b + c
+
+    def magnitude(self, a: Value) -> Value:
+        """|a|"""
+        return self.intrinsic("fabs", a)
+
+    def smaller(self, a: Value, b) -> Value:
+        """The smaller of two numbers, NaN if either is."""
+        return self.intrinsic("minimum", a, b)
+
+    def larger(self, a: Value, b) -> Value:
+        """The larger of two numbers, NaN if either is."""
+        return self.intrinsic("maximum", a, b)
+
+    def converted(self, how: str, a: Value, to: str) -> Value:
+        """A conversion of LLVM, such as `sitofp`."""
+        return self.instruction(to, f"{how} {a.type} {a.name} to {to}")
+
+    def any(self, a: Value) -> Value:
+        """Whether a truth value holds in any lane."""
+        return self.external(f"llvm.vector.reduce.or.v{self.lanes}i1", "i1", a)
+
+    # memory
+
+    def room(self, type: str, count: int = 1) -> Value:
+        """Memory for some values, one piece per call of the function."""
+        self._count += 1
+        self._lines.insert(self._entry, f"  %v{self._count} = alloca {type}, i64 {count}, align 64")
+        return Value(self, "ptr", f"%v{self._count}")
+
+    def at(self, pointer: Value, index, type: str) -> Value:
+        """The place of the value with this index."""
+        return self.instruction("ptr", f"getelementptr {type}, ptr {pointer.name}, i64 {self.literal(index, 'i64').name}")
+
+    def load(self, type: str, pointer: Value, index=0) -> Value:
+        """What is in memory."""
+        return self.instruction(type, f"load {type}, ptr {self.at(pointer, index, type).name}")
+
+    def store(self, value: Value, pointer: Value, index=0) -> None:
+        """Puts a value into memory."""
+        self._lines.append(f"  store {value.type} {value.name}, ptr {self.at(pointer, index, value.type).name}")

@@ -1,0 +1,334 @@
+"""Machine code of our own against the same by XLA: single operations, programs, motions, derivatives, and when it is not taken."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.motion.integrators import erk_loop
+from jourdain_jax.motion.native import kernel as kernels
+from jourdain_jax.motion.native.functions import Form
+from jourdain_jax.motion.simulate import set_up
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.native import evaluation, ffi, host
+from jourdain_jax.program import emit
+from jourdain_jax.program.graph import Graph
+
+pytestmark = pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against())
+
+ONE = ["neg", "sqrt", "sin", "cos", "tan", "exp", "log", "tanh", "sinh", "cosh", "abs", "sign", "asin", "acos", "atan", "asinh", "acosh", "atanh"]
+ONE += ["exp2", "expm1", "log1p", "cbrt", "floor", "ceil", "round", "logistic", "is_finite"]
+TWO = ["add", "sub", "mul", "div", "atan2", "pow", "rem", "max", "min", "lt", "le", "gt", "ge", "eq", "ne"]
+SPECIAL = [0.0, -0.0, 1.0, -1.0, 0.5, 2.5, -2.5, np.inf, -np.inf, np.nan, 1e308, -1e308, 1e-300, 710.0, -745.2, 3.5e5, 1e6, 1e22]
+EXACT = {
+    "neg",
+    "sqrt",
+    "abs",
+    "sign",
+    "floor",
+    "ceil",
+    "round",
+    "is_finite",
+    "add",
+    "sub",
+    "mul",
+    "div",
+    "rem",
+    "max",
+    "min",
+    "lt",
+    "le",
+    "gt",
+    "ge",
+    "eq",
+    "ne",
+}
+
+
+def _all_operations() -> tuple[Graph, list[int], list[int]]:
+    graph = Graph()
+    a, b = graph.input("a", True), graph.input("b", True)
+    return graph, [graph.call(op, a) for op in ONE] + [graph.call(op, a, b) for op in TWO], [a, b]
+
+
+def test_every_operation_of_the_table_is_there():
+    known = {*ONE, *TWO, "and", "or", "not", "select"}
+    assert known == {*emit.FUNCTIONS, "sin", "cos"}
+
+
+def test_single_operations_are_those_of_xla_also_of_what_is_no_usual_number():
+    graph, outputs, inputs = _all_operations()
+    random = np.random.default_rng(0)
+    points = np.array([(x, y) for x in SPECIAL for y in SPECIAL])
+    points = np.concatenate([points, random.normal(size=(999, 2)) * 10.0 ** random.integers(-8, 5, size=(999, 2)), random.uniform(-3, 3, size=(1002, 2))])
+    found = np.asarray(evaluation.function(graph, outputs, inputs)(points))
+    expected = emit.run(graph, outputs, dict(zip(inputs, jnp.asarray(points.T), strict=True)))
+    for op, ours, theirs in zip(ONE + TWO, found.T, expected, strict=True):
+        theirs = np.asarray(theirs, float)
+        if op in ("sin", "cos"):  # those of `emit` are right for multiples of pi/2 of 20 bits
+            ours, theirs = ours[np.abs(points[:, 0]) < 5e5], theirs[np.abs(points[:, 0]) < 5e5]
+        with np.errstate(all="ignore"):
+            close = np.abs(ours - theirs) <= (0.0 if op in EXACT else 2e-13) * np.abs(theirs)  # XLA's own functions are right to 1e-13
+        right = (ours == theirs) | (np.isnan(ours) & np.isnan(theirs)) | close
+        assert right.all(), (op, points[: len(ours)][~right][0], ours[~right][0], theirs[~right][0])
+
+
+@pytest.mark.parametrize("op", ["sin", "cos", "exp", "log", "tan", "logistic"])
+def test_functions_of_our_own_are_right_to_a_unit_of_round_off(op):
+    graph = Graph()
+    x = graph.input("x", True)
+    random = np.random.default_rng(1)
+    values = {"exp": random.uniform(-700, 700, 300), "log": 10.0 ** random.uniform(-300, 300, 300), "logistic": random.uniform(-30, 30, 300)}
+    points = np.concatenate([values.get(op, random.normal(size=300) * 10.0 ** random.integers(-6, 20, size=300)), [1.0, 1 + 1e-9, 0.5]])
+    found = np.asarray(evaluation.function(graph, [graph.call(op, x)], [x])(points[:, None]))[:, 0]
+    function = (lambda x: 1 / (1 + mpmath.exp(-x))) if op == "logistic" else getattr(mpmath, op)
+    with mpmath.workdps(60):
+        exact = [function(mpmath.mpf(float(x))) for x in points]
+        errors = [float(abs((mpmath.mpf(float(y)) - e) / (e or 1))) for e, y in zip(exact, found, strict=True)]
+    assert max(errors) < {"tan": 3, "logistic": 3}.get(op, 1.1) * 2.0**-52
+
+
+def _random_program(random: np.random.Generator, size: int) -> tuple[Graph, list[int], list[int]]:
+    """A graph of operations drawn one after the other, of numbers and truth values that are there."""
+    graph = Graph()
+    inputs = [graph.input(f"x{i}", True) for i in range(4)]
+    numbers, truths = [*inputs, graph.const(0.75), graph.const(-2.0)], [graph.call("lt", inputs[0], inputs[1])]
+    smooth = [op for op in ONE if op not in ("is_finite", "floor", "ceil", "round", "sign")]
+    for _ in range(size):
+        a, b = (int(numbers[i]) for i in random.integers(len(numbers), size=2))
+        kind = random.integers(10)
+        if kind < 5:
+            op = str(random.choice(["add", "sub", "mul", "div", "max", "min"]))
+            if op != "div" or b != graph.zero:
+                numbers.append(graph.call(op, a, b))
+        elif kind < 8:
+            numbers.append(graph.call(str(random.choice(smooth)), a))
+        elif kind < 9:
+            c, d = (int(truths[i]) for i in random.integers(len(truths), size=2))
+            truths.append(graph.call(str(random.choice(["and", "or"])), c, d) if random.integers(2) else graph.call("lt", a, b))
+            truths.append(graph.call("not", truths[-1]))
+        else:
+            numbers.append(graph.call("select", int(random.choice(truths)), a, b))
+    return graph, numbers[6:], inputs
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_programs_have_the_values_of_xla(seed):
+    random = np.random.default_rng(seed)
+    graph, outputs, inputs = _random_program(random, 60)
+    points = random.normal(size=(101, 4))
+    found = np.asarray(evaluation.function(graph, outputs, inputs)(points))
+    values = emit.run(graph, outputs, dict(zip(inputs, jnp.asarray(points.T), strict=True)))
+    # each operation by itself amplifies what round-off its arguments have: compared where another round-off of the inputs changes little
+    nearby = emit.run(graph, outputs, dict(zip(inputs, jnp.asarray(points.T * (1 + 1e-13)), strict=True)))
+    for ours, theirs, moved in zip(found.T, values, nearby, strict=True):
+        theirs, moved = (np.broadcast_to(np.asarray(x, float), ours.shape) for x in (theirs, moved))
+        with np.errstate(all="ignore"):
+            allowed = 1e-12 * np.abs(theirs) + 100 * np.abs(moved - theirs)
+            unsettled = np.isnan(moved) | np.isnan(theirs) | np.isinf(theirs)
+            assert np.mean((np.abs(ours - theirs) <= allowed) | unsettled) > 0.95
+        assert np.mean(np.isnan(ours) == np.isnan(theirs)) > 0.98
+
+
+MODELS = {"tilting-disc": "auto", "whipple-bicycle": "auto", "tilting-disc-quaternion": "full", "pendulum-chain": "auto", "snakeboard": "auto"}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_rates_are_those_of_xla_at_random_states(name):
+    scene = jj.models.MODELS[name]()
+    program = set_up(scene, state=MODELS[name]).form.lowered
+    _, q, u = jj.sample_states(scene, 1000)
+    fixed, inputs = program.fixed_values(scene), jnp.zeros(len(scene.inputs))
+    y = u[:, np.array(program.independent, int)]
+    given = jnp.concatenate([*(jnp.full((1000, 1), x) for x in fixed), jnp.zeros((1000, 1)), q, y, jnp.zeros((1000, len(inputs)))], axis=1)
+    outputs = [*program.qdot, *program.ydot]
+    found = np.asarray(evaluation.function(program.graph, outputs, program.variables)(given))
+    rates = jax.jit(lambda q, y: program.rates(fixed, 0.0, tuple(q), tuple(y), inputs)[:2])
+    expected = np.stack([np.broadcast_to(x, 1000) for part in rates(q.T, y.T) for x in part], axis=1)
+    good = np.isfinite(expected).all(axis=1)
+    assert good.mean() > 0.9
+    size = np.max(np.abs(expected), axis=1, keepdims=True)
+    assert np.max((np.abs(found - expected) / size)[good]) < 1e-13
+
+
+def _motions(scene, starts=None, **options):
+    return [jj.simulate(scene, starts, native=native, **options) for native in (True, False)]
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("tilting-disc", {"t1": 3.0, "rtol": 1e-9, "atol": 1e-9}),
+        ("tilting-disc", {"t1": 3.0, "rtol": 1e-5, "atol": 1e-5}),
+        ("chaplygin-sleigh", {"ts": [7.0]}),
+        ("whipple-bicycle", {"ts": [1.0, 2.0]}),
+        ("tilting-disc-quaternion", {"t1": 2.0, "state": "full"}),
+        ("ball-on-turntable", {"ts": [2.0]}),
+        ("double-pendulum-rods", {"ts": [0.0, 3.0], "t1": 3.5, "solver": diffrax.Dopri5()}),
+        ("snakeboard", {"ts": [-2.0], "t1": -3.0}),
+    ],
+)
+def test_motions_are_those_of_xla_step_by_step(name, options):
+    ours, theirs = _motions(jj.models.MODELS[name](), **options)
+    assert (int(ours.accepted), int(ours.rejected), int(ours.result)) == (int(theirs.accepted), int(theirs.rejected), int(theirs.result))
+    for a, b in ((ours.q, theirs.q), (ours.u, theirs.u), (ours.q_end, theirs.q_end), (ours.u_end, theirs.u_end), (ours.t_end, theirs.t_end)):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
+    if ours.work is not None:
+        np.testing.assert_allclose(ours.work, theirs.work, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(ours.smallest_pivot, theirs.smallest_pivot, rtol=1e-9)
+
+
+def test_a_disc_that_falls_stops_where_it_does_by_xla():
+    disc = jj.models.TiltingDisc()
+    ours, theirs = _motions(disc, {"lean": 0.6, "spin_rate": -0.1}, t1=5.0)
+    assert int(ours.result) == int(theirs.result) == results.EVENT
+    assert int(ours.event) == int(theirs.event) == 0
+    assert (int(ours.accepted), int(ours.rejected)) == (int(theirs.accepted), int(theirs.rejected))
+    np.testing.assert_allclose(ours.t_end, theirs.t_end, rtol=1e-13)
+    np.testing.assert_allclose(ours.q_end, theirs.q_end, rtol=1e-10, atol=1e-12)
+    np.testing.assert_array_equal(np.isnan(ours.q), np.isnan(theirs.q))
+
+
+@pytest.mark.parametrize("options", [{"max_steps": 7}, {"rtol": 1e-300, "atol": 1e-300}])
+def test_motions_that_end_early_say_so_as_by_xla(options):
+    ours, theirs = _motions(jj.models.TiltingDisc(), t1=3.0, **options)
+    assert int(ours.result) == int(theirs.result) != 0
+    assert (int(ours.accepted), int(ours.rejected)) == (int(theirs.accepted), int(theirs.rejected))
+
+
+@pytest.fixture(scope="module")
+def disc_kernel():
+    """A kernel of the disc, and rows of a hundred lanes: some fall, one begins beyond the event, one is NaN, one infinite."""
+    scene = jj.models.TiltingDisc()
+    setup = set_up(scene, t1=1.0)
+    form = Form(setup.form.lowered, False, False, True, True, False)
+    lean = np.linspace(0.0, 1.5, 100)
+    lean[[3, 40, 77]] = 1.7, np.nan, np.inf
+    kernel = kernels.kernel(form, diffrax.Tsit5)
+    layout, fixed = kernel.layout, setup.form.lowered.fixed_values(scene)
+    starts = np.zeros((100, layout.given))
+    starts[:, 3], starts[:, 5:8] = lean, np.stack([0.5 + lean, 0.2 + np.zeros(100), -3 + 2 * lean], axis=1)
+    progress = {"h": 1e-4, "code": -1, "event": -1, "pivot": np.inf, "direction": 1, "last_goal": 1.0, "rtol": 1e-6, "atol": 1e-6}
+    for name, value in (progress | {"shortest": 1e-14, "max_steps": 1000}).items():
+        starts[:, layout.rows[name].start] = value
+    starts[:, layout.rows["known"].start : layout.rows["known"].stop] = fixed
+    return kernel, jnp.asarray(starts), jnp.broadcast_to(jnp.linspace(0.0, 1.0, 5), (100, 5))
+
+
+def test_a_lane_does_not_depend_on_its_company(disc_kernel):
+    kernel, starts, goals = disc_kernel
+    many = jax.jit(jax.vmap(kernel.run))
+    states, ends = (np.asarray(x) for x in many(starts, goals))
+    assert set(ends[:, kernel.layout.rows["code"].start]) >= {-1.0, 1.0}
+    for count in (1, 7, 9, 64):
+        order = np.random.default_rng(count).permutation(100)[:count]
+        for found, expected in zip(many(starts[order], goals[order]), (states, ends), strict=True):
+            np.testing.assert_array_equal(found, expected[order])
+    for lane in (0, 3, 40, 77, 99):  # alone, in narrow registers
+        for found, expected in zip(jax.jit(kernel.run)(starts[lane], goals[lane]), (states, ends), strict=True):
+            np.testing.assert_array_equal(found, expected[lane])
+
+
+def test_no_lanes_and_axes_of_lanes(disc_kernel):
+    kernel, starts, goals = disc_kernel
+    states, ends = jax.vmap(kernel.run)(starts[:0], goals[:0])
+    assert states.shape == (0, 5, kernel.layout.y)
+    assert len(ends) == 0
+    twice = jax.vmap(jax.vmap(kernel.run), in_axes=(0, None))(starts[:6].reshape(2, 3, -1), goals[:3])
+    once = jax.vmap(kernel.run)(starts[:6], goals[:6])
+    for a, b in zip(twice, once, strict=True):
+        np.testing.assert_array_equal(a.reshape(b.shape), b)
+
+
+def test_lanes_of_a_rollout_are_those_of_xla():
+    disc = jj.models.TiltingDisc()
+    starts = {"lean": jnp.asarray([0.1, 0.3, jnp.nan, 1.2, 0.2, 0.7, 0.0, 0.5, -0.4]), "spin_rate": jnp.linspace(-4.0, 0.0, 9)}
+    ours, theirs = (jj.rollout(disc, starts, ts=[0.5, 1.0], native=native) for native in (True, False))
+    np.testing.assert_array_equal(ours.result, theirs.result)
+    np.testing.assert_array_equal(ours.lanes.accepted, theirs.lanes.accepted)
+    np.testing.assert_array_equal(ours.lanes.rejected, theirs.lanes.rejected)
+    np.testing.assert_allclose(ours.lanes.q_end, theirs.lanes.q_end, rtol=1e-10, atol=1e-10)
+
+
+def test_the_same_call_gives_the_same_bits_eager_or_compiled():
+    disc = jj.models.TiltingDisc()
+
+    def run():
+        return jj.simulate(disc, {"lean": 0.3, "spin_rate": -3.0}, ts=[1.0]).q_end
+
+    first = run()
+    assert all(np.array_equal(run(), first) for _ in range(5))
+
+
+def _end(native, adjoint=None):
+    rods = jj.models.MODELS["double-pendulum-angles"]()
+
+    def end(x):
+        start = {"theta1": x[1], "theta2": -0.4, "theta2_rate": x[2]}
+        motion = jj.simulate(rods.replace(length1=x[0]), start, ts=[0.2, 0.4], rtol=1e-5, atol=1e-5, native=native, adjoint=adjoint)
+        return jnp.sum(motion.q_end**2) + motion.q[0, 1]
+
+    return end
+
+
+X = jnp.array([0.5, 0.3, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("derivative", "forward"),
+    [
+        (lambda f: jax.grad(f)(X), False),
+        (lambda f: jax.jit(jax.grad(lambda x: jnp.sum(jax.vmap(f)(x))))(jnp.stack([X, 1.1 * X])), False),
+        (lambda f: jax.vmap(jax.grad(f))(jnp.stack([X, 1.1 * X])), False),
+        (lambda f: jax.jit(jax.jacfwd(f))(X), True),
+        (lambda f: jax.jacfwd(jax.jacfwd(f))(X), True),
+    ],
+)
+def test_derivatives_are_those_of_xla(derivative, forward):
+    adjoint = diffrax.ForwardMode() if forward else None
+    np.testing.assert_allclose(derivative(_end(True, adjoint)), derivative(_end(False, adjoint)), rtol=1e-12)
+
+
+def test_derivatives_of_a_rollout_are_those_of_xla():
+    rods, rates = jj.models.MODELS["double-pendulum-angles"](), jnp.array([-3.0, -2.0, 1.0])
+
+    def slope(native):
+        options = {"ts": [0.3], "rtol": 1e-5, "native": native}
+        return jax.grad(lambda rate: jnp.sum(jj.rollout(rods, {"theta1": 0.2, "theta1_rate": rate}, **options).lanes.q_end[:, 1]))(rates)
+
+    np.testing.assert_allclose(slope(True), slope(False), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("adjoint", "mode"), [(None, jax.jacfwd), (diffrax.ForwardMode(), jax.grad), (None, jax.hessian)])
+def test_modes_of_differentiation_that_do_not_work_are_named(adjoint, mode):
+    with pytest.raises(jj.DifferentiationModeError):
+        mode(_end(True, adjoint))(X)
+
+
+def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
+    disc, bicycle = jj.models.TiltingDisc(), jj.models.MODELS["whipple-bicycle"]()
+    assert set_up(disc).not_native == ""
+    assert set_up(disc, native=False).not_native == "native=False"
+    assert "diffrax" in set_up(disc, solver=diffrax.Heun()).not_native
+    assert "scalar program" in set_up(disc, lowering=False).not_native
+    assert "inputs" in set_up(bicycle, inputs={"steer_torque": lambda t: jnp.sin(t)}).not_native
+    monkeypatch.setattr(host, "reason_against", lambda: "llvmlite is not installed")
+    assert set_up(disc).not_native == "llvmlite is not installed"
+    monkeypatch.setattr(host, "reason_against", lambda: "")
+    ffi.version.cache_clear()
+    monkeypatch.setattr(jax.ffi, "include_dir", lambda: "/nowhere")
+    assert "interface" in set_up(disc).not_native
+    ffi.version.cache_clear()
+
+
+def test_a_scene_is_integrated_without_llvmlite(monkeypatch):
+    scene = jj.models.MODELS["chaplygin-sleigh"]()
+    expected = jj.simulate(scene, ts=[1.3]).q_end
+    monkeypatch.setattr(host, "reason_against", lambda: "llvmlite is not installed")
+    called = []
+    monkeypatch.setattr(erk_loop, "_motion", lambda *a, motion=erk_loop._motion: called.append(1) or motion(*a))
+    np.testing.assert_allclose(jj.simulate(scene, ts=[1.3, 1.4]).q[0], expected, rtol=1e-7)
+    assert called
