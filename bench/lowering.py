@@ -30,7 +30,7 @@ from baselines.timing import fastest, seconds_per_evaluation
 import jourdain_jax as jj
 from jourdain_jax.models import PendulumChain, TiltingDisc, TrailerChain
 from jourdain_jax.motion.batches import lockstep
-from jourdain_jax.motion.simulate import state_form
+from jourdain_jax.motion.vector_fields.choice import vector_field
 
 Figure = dict
 BY_HAND_LANES, DENSE_LANES = 4096, 1024
@@ -324,7 +324,7 @@ SIZES = (
 
 def ways_of(scene: jj.Scene, program: jj.Lowered) -> dict[str, tuple]:
     """Way -> function of a state and of how often, the state, its lanes: by the program and densely, alone and in a batch as `rollout` runs it."""
-    form, fixed, inputs = state_form(scene, jj.structure_of(scene), lowering=False), program.fixed_values(scene), jnp.zeros(len(scene.inputs))
+    form, fixed, inputs = vector_field(scene, lowering=False), program.fixed_values(scene), jnp.zeros(len(scene.inputs))
     _, q, u = (jnp.asarray(x) for x in jj.sample_states(scene, DENSE_LANES))
     by_program = lambda y: program.rates(fixed, 0.0, *y, inputs)[:2]  # noqa: E731
     densely = lambda y: form.rates(scene, (), 0.0, y, inputs)  # noqa: E731

@@ -24,6 +24,7 @@ import numpy as np
 from baselines import disc_run
 
 import jourdain_jax as jj
+from jourdain_jax.motion.own_steps import reason_against_machine_code
 from jourdain_jax.motion.simulate import set_up
 
 LANES = 1024
@@ -95,7 +96,7 @@ def batches(quick: bool) -> Iterator[Figure]:
     lanes = 128 if quick else LANES
     for name, span, more in MOTIONS[: 1 if quick else None]:
         scene = jj.models.MODELS[name]()
-        assert not (reason := set_up(scene).not_native), reason
+        assert not (reason := reason_against_machine_code(set_up(scene))), reason
         starts = spread_starts(scene, lanes)
         for alone, who in ((False, f"batch of {lanes}"), (True, "alone")):
             who = who if more else f"{who}, default options"

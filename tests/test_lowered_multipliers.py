@@ -15,8 +15,8 @@ from jourdain_jax.build.reference_parameters import without_collecting
 from jourdain_jax.build.structure import LONG, structure_of
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.models import MODELS
-from jourdain_jax.motion.simulate import state_form
 from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.vector_fields.choice import vector_field
 
 
 def ends(scene, start, t1, **options):
@@ -83,8 +83,7 @@ def test_a_motion_through_a_loss_of_rank_is_right_or_continued_by_dense_matrices
 
 def test_which_scenes_keep_all_speeds():
     for name, scene in ((name, model()) for name, model in MODELS.items() if name in ("skate", "chaplygin-sleigh", "isokinetic-particle")):
-        structure = structure_of(scene)
-        form = state_form(scene, structure)
+        form = vector_field(scene)
         assert (form.name == "full") == (name != "chaplygin-sleigh")
         assert form.lowered is not None
         assert form.reduction_name == ("privileged, lowered" if name == "chaplygin-sleigh" else "multipliers (KKT), lowered")

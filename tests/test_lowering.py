@@ -21,8 +21,8 @@ from jourdain_jax.equations.minimal import speeds_from_privileged
 from jourdain_jax.lowering import lower as module
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.batches import lockstep
-from jourdain_jax.motion.simulate import state_form
 from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.fused import fused
 
@@ -219,7 +219,7 @@ def test_a_program_that_grows_past_the_budget_is_not_lowered_and_the_dense_path_
         with pytest.raises(jj.NotLowered, match="more than 50"):
             jj.lower(scene)
         assert "more than 50" in jj.report(scene).lowering
-        assert state_form(scene, jj.structure_of(scene)).lowered is None
+        assert vector_field(scene).lowered is None
     finally:
         module._lowered.cache_clear()
 

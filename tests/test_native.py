@@ -11,6 +11,7 @@ import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop
 from jourdain_jax.motion.native import kernel as kernels
 from jourdain_jax.motion.native.functions import Form
+from jourdain_jax.motion.own_steps import reason_against_machine_code
 from jourdain_jax.motion.simulate import set_up
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native import evaluation, ffi, host
@@ -139,7 +140,7 @@ MODELS = {"tilting-disc": "auto", "whipple-bicycle": "auto", "tilting-disc-quate
 @pytest.mark.parametrize("name", MODELS)
 def test_rates_are_those_of_xla_at_random_states(name):
     scene = jj.models.MODELS[name]()
-    program = set_up(scene, state=MODELS[name]).form.lowered
+    program = set_up(scene, state=MODELS[name]).field.lowered
     _, q, u = jj.sample_states(scene, 1000)
     fixed, inputs = program.fixed_values(scene), jnp.zeros(len(scene.inputs))
     y = u[:, np.array(program.independent, int)]
@@ -204,11 +205,11 @@ def disc_kernel():
     """A kernel of the disc, and rows of a hundred lanes: some fall, one begins beyond the event, one is NaN, one infinite."""
     scene = jj.models.TiltingDisc()
     setup = set_up(scene, t1=1.0)
-    form = Form(setup.form.lowered, False, False, True, True, False)
+    form = Form(setup.field.lowered, False, False, True, True, False)
     lean = np.linspace(0.0, 1.5, 100)
     lean[[3, 40, 77]] = 1.7, np.nan, np.inf
     kernel = kernels.kernel(form, diffrax.Tsit5)
-    layout, fixed = kernel.layout, setup.form.lowered.fixed_values(scene)
+    layout, fixed = kernel.layout, setup.field.lowered.fixed_values(scene)
     starts = np.zeros((100, layout.given))
     starts[:, 3], starts[:, 5:8] = lean, np.stack([0.5 + lean, 0.2 + np.zeros(100), -3 + 2 * lean], axis=1)
     progress = {"h": 1e-4, "code": -1, "event": -1, "pivot": np.inf, "direction": 1, "last_goal": 1.0, "rtol": 1e-6, "atol": 1e-6}
@@ -310,17 +311,17 @@ def test_modes_of_differentiation_that_do_not_work_are_named(adjoint, mode):
 
 def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
     disc, bicycle = jj.models.TiltingDisc(), jj.models.MODELS["whipple-bicycle"]()
-    assert set_up(disc).not_native == ""
-    assert set_up(disc, native=False).not_native == "native=False"
-    assert "diffrax" in set_up(disc, solver=diffrax.Heun()).not_native
-    assert "scalar program" in set_up(disc, lowering=False).not_native
-    assert "inputs" in set_up(bicycle, inputs={"steer_torque": lambda t: jnp.sin(t)}).not_native
+    assert reason_against_machine_code(set_up(disc)) == ""
+    assert reason_against_machine_code(set_up(disc, native=False)) == "native=False"
+    assert "diffrax" in reason_against_machine_code(set_up(disc, solver=diffrax.Heun()))
+    assert "scalar program" in reason_against_machine_code(set_up(disc, lowering=False))
+    assert "inputs" in reason_against_machine_code(set_up(bicycle, inputs={"steer_torque": lambda t: jnp.sin(t)}))
     monkeypatch.setattr(host, "reason_against", lambda: "llvmlite is not installed")
-    assert set_up(disc).not_native == "llvmlite is not installed"
+    assert reason_against_machine_code(set_up(disc)) == "llvmlite is not installed"
     monkeypatch.setattr(host, "reason_against", lambda: "")
     ffi.version.cache_clear()
     monkeypatch.setattr(jax.ffi, "include_dir", lambda: "/nowhere")
-    assert "interface" in set_up(disc).not_native
+    assert "interface" in reason_against_machine_code(set_up(disc))
     ffi.version.cache_clear()
 
 

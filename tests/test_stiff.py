@@ -137,7 +137,7 @@ TURNED = {"heading": 0.0, "heading_rate": 1.3}
 
 
 def test_every_other_way_is_tried_once_and_ways_add_up(damped):
-    form = set_up(TurnedSkate(), TURNED, t1=1.0).form
+    form = set_up(TurnedSkate(), TURNED, t1=1.0).field
     lost = lambda ways, code=results.SINGULAR_PARTITION: eqx.tree_at(  # noqa: E731
         lambda m: (m.result, m.fallback), damped, (jnp.array(code), jnp.array(ways))
     )

@@ -14,24 +14,24 @@ import jax.numpy as jnp
 from jourdain_jax.motion.integrators.radau import RadauIIA
 from jourdain_jax.motion.integrators.solver_choice import may_be_full
 from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS, implicit_steps, is_stiff
-from jourdain_jax.motion.state_form import StateForm
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.motion.vector_fields.field import VectorField
 
 Motions = TypeVar("Motions", bound=Trajectory)
 
 
-def next_retry(form: StateForm, motion: Trajectory, t0, options: dict) -> int:
+def next_retry(field: VectorField, motion: Trajectory, t0, options: dict) -> int:
     """The retries of a `motion` from `t0`: those already made and one more; AS_ASKED where none is left.
 
-    `form`: how it was integrated; `options`: those of `simulate` that were given.
+    `field`: how it was integrated; `options`: those of `simulate` that were given.
     """
     tried, solver = int(motion.fallback), options.get("solver")
-    lost = options.get("state", "auto") in may_be_another_form(form) and may_be_full(solver) and int(motion.result) in lost_codes(form)
+    lost = options.get("state", "auto") in may_be_another_form(field) and may_be_full(solver) and int(motion.result) in lost_codes(field)
     if lost and not tried & results.FULL_STATE:
         return tried | results.FULL_STATE
     free = solver is None and options.get("stepsize_controller") is None
-    if free and not tried & results.IMPLICIT and is_stiff(form, motion, t0):
+    if free and not tried & results.IMPLICIT and is_stiff(field, motion, t0):
         return tried | results.IMPLICIT
     return results.AS_ASKED
 
@@ -51,12 +51,12 @@ def mark_retried(motion: Motions, retries: int) -> Motions:
     return eqx.tree_at(lambda m: (m.result, m.fallback), motion, (code, jnp.full_like(motion.fallback, retries)))
 
 
-def may_be_another_form(form: StateForm) -> tuple[str, ...]:
+def may_be_another_form(field: VectorField) -> tuple[str, ...]:
     """The values of `state` that let a motion that was lost in this form run again, with the full state and dense matrices."""
-    return ("auto", "full") if form.name == "full" and form.lowered is not None else ("auto",) if form.name == "minimal" else ()
+    return ("auto", "full") if field.name == "full" and field.lowered is not None else ("auto",) if field.name == "minimal" else ()
 
 
-def lost_codes(form: StateForm) -> tuple[int, ...]:
+def lost_codes(field: VectorField) -> tuple[int, ...]:
     """Result codes after which another form of the state may do better."""
-    guarded = form.lowered is not None and (form.lowered.guards or form.lowered.pivots)
+    guarded = field.lowered is not None and (field.lowered.guards or field.lowered.pivots)
     return (results.SINGULAR_PARTITION, results.STEP_TOO_SMALL, results.NOT_FINITE, results.UNSOLVED_STEP) if guarded else (results.SINGULAR_PARTITION,)

@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from jourdain_jax.calculus.cotangents import tap_cotangents, tap_tangents
-from jourdain_jax.motion.integration import Setup
+from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.numbers import is_traced
 

@@ -14,35 +14,25 @@ import jax
 import jax.numpy as jnp
 
 from jourdain_jax.build.event_names import names_of_events
-from jourdain_jax.build.structure import Structure, structure_of
-from jourdain_jax.build.usual_lengths import usual_lengths
 from jourdain_jax.calculus.reals import Number
-from jourdain_jax.dynamics.accelerations import Baumgarte, as_reduction, as_stabilisation
-from jourdain_jax.dynamics.power import needs_work
-from jourdain_jax.equations.projection import closure_residual
-from jourdain_jax.equations.reductions import NullSpaceQR
-from jourdain_jax.equations.rows import names_of_position_rows
-from jourdain_jax.lowering.lower import lowered
-from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.dynamics.accelerations import Baumgarte, as_stabilisation
 from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.inputs import Inputs, as_inputs
-from jourdain_jax.motion.integration import Options, Setup, integrate
+from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
 from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
 from jourdain_jax.motion.marks import marked
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
+from jourdain_jax.motion.setup import Options, Setup
 from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
-from jourdain_jax.motion.state_form import StateForm, cutoff_of, default_reduction
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
-from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import is_traced
-from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
-_STATE_FORMS = ("auto", "minimal", "full")
 TOLERANCE, MOST_STEPS = 1e-8, 100_000
 _OFF = 1e4  # units of round-off: a residual that is more
 
@@ -121,7 +111,7 @@ def simulate(
     motion = warn_if_ill_conditioned(setup, _integrated)
     if isinstance(motion.result, jax.core.Tracer):
         return motion
-    while retries := next_retry(setup.form, motion, setup.t0, given):
+    while retries := next_retry(setup.field, motion, setup.t0, given):
         setup = _set_up(**(given | retry_options(retries, max_steps)))
         motion = mark_retried(warn_if_ill_conditioned(setup, _integrated), retries)
     return motion
@@ -152,7 +142,7 @@ def _set_up(
     made_here = not isinstance(start, State)
     inputs = as_inputs(scene, inputs)
     start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs)
-    form = fitted(solver, scene, state_form(scene, structure_of(scene), state, reduction, stabilisation, projection, work, lowering, inputs), state)
+    field = fitted(solver, scene, vector_field(scene, state, reduction, stabilisation, projection, work, lowering, inputs), state)
     warn_float32(start.q.dtype, rtol)
     options = Options(
         solver=default_solver(rtol) if solver is None else solver,
@@ -167,7 +157,7 @@ def _set_up(
         native=native,
     )
     start = _on_constraints(scene, t0, start, inputs, made_here) if projection else start
-    return Setup(scene, start, inputs, t0, t1, ts, form, options)
+    return Setup(scene, start, inputs, t0, t1, ts, field, options)
 
 
 def _first_step(solver, dt0, t0, t1):
@@ -218,47 +208,3 @@ def warn_float32(dtype, rtol) -> None:
             f"rtol = {rtol} asks for more digits than float32 has; set jax.config.update('jax_enable_x64', True), or loosen rtol and atol to 1e-5",
             stacklevel=3,
         )
-
-
-def state_form(
-    scene: Scene, structure: Structure, state="auto", reduction=None, stabilisation=None, projection=True, work=True, lowering=True, inputs=None
-) -> StateForm:
-    """How the scene's state is integrated, given what was asked."""
-    inputs_in_rows = structure.rows_of_inputs and not as_inputs(scene, inputs).constant
-    if state not in _STATE_FORMS:
-        raise ValueError(f"unknown state form `{state}`; {nearest(str(state), _STATE_FORMS)}")
-    if state == "minimal" and not structure.affine:
-        raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use state='full'")
-    if state == "minimal" and structure.may_set_in:
-        named = ", ".join(f"`{name}`" for name in structure.may_set_in)
-        raise ValueError(f"rows {named} of `{type(scene).__name__}` may set in where they do not follow from the others; use state='full'")
-    minimal = state == "minimal" or (state == "auto" and structure.has_minimal_state)
-    independent = structure.independent if minimal else None
-    with_work = work and needs_work(scene, structure)
-    dense = inputs_in_rows or (with_work and (structure.driven or structure.varying_inertia))
-    plain = lowering and reduction is None and stabilisation is None and not dense
-    program = lowered(scene, every_speed=not minimal) if plain else None
-    program = program if isinstance(program, Lowered) else None
-    cutoff = cutoff_of(structure) if reduction is None and not minimal else None
-    reduction = as_reduction(scene, default_reduction(structure, independent, program) if reduction is None else reduction)
-    return StateForm(
-        independent=independent,
-        reduction=reduction,
-        stabilisation=stabilisation,
-        with_work=with_work,
-        projects_positions=projection and _is_closed(scene),
-        projects_speeds=projection and not minimal and bool(structure.row_names),
-        lowered=program,
-        of_inputs=structure.potentials_of_inputs,
-        affine=structure.affine,
-        inputs_in_rows=inputs_in_rows,
-        usual=usual_lengths(scene) if program is None else None,
-        may_branch=program is None and cutoff is not None and isinstance(reduction, NullSpaceQR) and bool(names_of_position_rows(scene)),
-        cutoff=cutoff,
-    )
-
-
-@once_per_class
-def _is_closed(scene: Scene) -> bool:
-    """Whether there are geometric rows or quaternion norms to keep."""
-    return jax.eval_shape(lambda s: closure_residual(s, 0.0, s.named()[0]), scene).shape[0] > 0

@@ -14,7 +14,6 @@ from jaxtyping import Array, Float, Int
 from tqdm import tqdm
 
 from jourdain_jax.build.reference_parameters import reference_parameters
-from jourdain_jax.build.structure import structure_of
 from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.inputs import as_inputs
@@ -22,12 +21,13 @@ from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.retries import lost_codes, mark_retried, next_retry, retry_options
-from jourdain_jax.motion.simulate import MOST_STEPS, TOLERANCE, default_solver, set_up, state_form, warn_float32
+from jourdain_jax.motion.simulate import MOST_STEPS, TOLERANCE, default_solver, set_up, warn_float32
 from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
 from jourdain_jax.motion.start import State
-from jourdain_jax.motion.state_form import StateForm
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.motion.vector_fields.choice import vector_field
+from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import checked_real, described, is_traced
@@ -213,16 +213,16 @@ def _next_retries(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int
     begun = np.broadcast_to(np.asarray(starts.t if own_times else _first_time(options)), lanes.result.shape)
     found = np.full(lanes.result.shape, results.AS_ASKED)
     for tried in np.unique(lanes.fallback).tolist():
-        form = _form(scene, options | retry_options(tried, options.get("max_steps", MOST_STEPS)))
-        for i in np.flatnonzero((np.asarray(lanes.fallback) == tried) & np.isin(lanes.result, (*lost_codes(form), *OUT_OF_STEPS))):
-            found[i] = next_retry(form, jax.tree.map(lambda x, i=i: x[i], lanes), begun[i], options)
+        field = _form(scene, options | retry_options(tried, options.get("max_steps", MOST_STEPS)))
+        for i in np.flatnonzero((np.asarray(lanes.fallback) == tried) & np.isin(lanes.result, (*lost_codes(field), *OUT_OF_STEPS))):
+            found[i] = next_retry(field, jax.tree.map(lambda x, i=i: x[i], lanes), begun[i], options)
     return found
 
 
-def _form(scene: Scene, options: dict) -> StateForm:
+def _form(scene: Scene, options: dict) -> VectorField:
     """How the lanes' state is integrated."""
     how = {name: options[name] for name in ("state", "reduction", "stabilisation", "projection", "work", "lowering", "inputs") if name in options}
-    return state_form(scene, structure_of(scene), **how)
+    return vector_field(scene, **how)
 
 
 def _round_up(count: int) -> int:

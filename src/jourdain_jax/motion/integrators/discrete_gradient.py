@@ -27,7 +27,7 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step, Stepped
-from jourdain_jax.motion.state_form import Integrated, StateForm
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
 
@@ -47,14 +47,14 @@ class DiscreteGradient(FixedStepSolver):
     Source: Celledoni et al., J. Nonlinear Sci. 29 (2019) 1523 (arXiv 1605.02845); Gonzalez, J. Nonlinear Sci. 6 (1996) 449.
     """
 
-    def fitted(self, scene: Scene, form: StateForm, asked: str) -> StateForm:
-        """The minimal `form` of the state. ValueError where the energy of the `scene` is not constant, or there is no minimal state; `asked`: the
+    def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
+        """The minimal `field` of the state. ValueError where the energy of the `scene` is not constant, or there is no minimal state; `asked`: the
         state that was asked for.
         """
-        fault = _fault(scene, form, asked)
+        fault = _fault(scene, field, asked)
         if fault:
             raise ValueError(f"`DiscreteGradient` does not apply to `{type(scene).__name__}`: {fault}; use solver=jj.ImplicitMidpoint()")
-        return form
+        return field
 
     def stepped(self, step: Step, y: Integrated) -> Stepped:
         """The state `y` after one `step`."""
@@ -105,27 +105,27 @@ def _skew_times(args, t, q, v, gbar) -> Float[Array, "state"]:
 
 @eqx.filter_jit
 def _rates(args, t, q, v):
-    form, scene, inputs, fixed, _ = args
-    found = form.rates(scene, fixed, t, Integrated(q, v, None), form.now(inputs, t))
+    field, scene, inputs, fixed, _ = args
+    found = field.rates(scene, fixed, t, Integrated(q, v, None), field.now(inputs, t))
     return found.q, found.v
 
 
 @eqx.filter_jit
 def _energy(args, t, z, n: int) -> Float[Array, ""]:
     """H = T + V in J."""
-    form, scene, inputs, fixed, _ = args
-    q, u = form.unpack(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t))
+    field, scene, inputs, fixed, _ = args
+    q, u = field.unpack(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t))
     return kinetic_energy(scene, t, q, u) + potential_energy(scene, motion_at(scene, t, q, u, inputs(t)))
 
 
-def _fault(scene: Scene, form: StateForm, asked: str) -> str:
+def _fault(scene: Scene, field: VectorField, asked: str) -> str:
     """Why the method does not apply; empty where it does."""
     structure = structure_of(scene)
     if needs_work(scene, structure):
         return "its T + V is not constant (loads without a potential, rows that do work, or something that depends on time)"
     if names_of_position_rows(scene):
         return "its geometric rows would have to be projected after each step, which moves the energy"
-    if form.independent is None:
+    if field.independent is None:
         way_out = "" if asked == "full" or not structure.affine else " (state='minimal' keeps to the privileged speeds, where the motion allows it)"
         return f"it is integrated in all speeds, and the method needs the minimal state{way_out}"
     return ""

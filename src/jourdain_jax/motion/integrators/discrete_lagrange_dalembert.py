@@ -8,8 +8,6 @@ D_1 L_d + D_2 L_d + f^- + f^+ = -A' lambda. Both so have the same projection ont
 Source: J. Cortes and S. Martinez, Nonlinearity 14 (2001) 1365; R. McLachlan and M. Perlmutter, J. Nonlinear Sci. 16 (2006) 283.
 """
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,7 +20,8 @@ from jourdain_jax.equations.discrete_lagrangian import RULES, Interval, discrete
 from jourdain_jax.equations.lagrange import speeds_are_rates
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step, Stepped
-from jourdain_jax.motion.state_form import Integrated, StateForm
+from jourdain_jax.motion.vector_fields.by_matrices import full_without_projection
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
@@ -50,8 +49,8 @@ class DiscreteLagrangeDAlembert(FixedStepSolver):
         if self.rule not in RULES:
             raise ValueError(f"unknown rule `{self.rule}` of `DiscreteLagrangeDAlembert`; {nearest(str(self.rule), RULES)}")
 
-    def fitted(self, scene: Scene, form: StateForm, asked: str) -> StateForm:
-        """The full `form` of the state, which the method itself keeps on the rows. ValueError where it does not apply to the `scene`, and where
+    def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
+        """The full `field` of the state, which the method itself keeps on the rows. ValueError where it does not apply to the `scene`, and where
         another state was `asked` for.
         """
         structure, name = structure_of(scene), type(scene).__name__
@@ -61,7 +60,7 @@ class DiscreteLagrangeDAlembert(FixedStepSolver):
         if asked == "minimal":
             raise ValueError("`DiscreteLagrangeDAlembert` integrates all speeds; leave `state` at 'auto'")
         equations = f"discrete Lagrange-d'Alembert equations, {self.rule} rule"
-        return replace(form, independent=None, lowered=None, projects_positions=False, projects_speeds=False, own_equations=equations)
+        return full_without_projection(field, scene, equations)
 
     def stepped(self, step: Step, y: Integrated) -> Stepped:
         """The state `y` after one `step`."""
@@ -134,6 +133,6 @@ def _work(args, over: Interval, y: Integrated, q1, u1):
     """The work so far, by the midpoint rule."""
     if y.work is None:
         return None
-    form, scene, inputs, fixed, _ = args
+    field, scene, inputs, fixed, _ = args
     t = (over.t0 + over.t1) / 2
-    return y.work + over.h * form.rates(scene, fixed, t, Integrated((y.q + q1) / 2, (y.v + u1) / 2, y.work), form.now(inputs, t)).work
+    return y.work + over.h * field.rates(scene, fixed, t, Integrated((y.q + q1) / 2, (y.v + u1) / 2, y.work), field.now(inputs, t)).work

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jourdain_jax.motion.state_form import StateForm
+from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.scene import Scene
 
 
@@ -44,7 +44,7 @@ class FixedStepSolver(diffrax.AbstractSolver):
     interpolation_cls: ClassVar[Callable] = diffrax.LocalLinearInterpolation  # states are saved at ends of steps only
 
     @abc.abstractmethod
-    def fitted(self, scene: Scene, form: StateForm, asked: str) -> StateForm:
+    def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
         """The form of the state that this method integrates; `asked`: the `state` given to `simulate`. ValueError where it does not apply."""
 
     @abc.abstractmethod

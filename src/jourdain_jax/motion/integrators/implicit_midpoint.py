@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 
 from jourdain_jax.calculus.newton import newton_root
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step, Stepped
-from jourdain_jax.motion.state_form import StateForm
+from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.scene import Scene
 
 
@@ -30,9 +30,9 @@ class ImplicitMidpoint(FixedStepSolver):
     Source: Hairer, Lubich and Wanner, Geometric Numerical Integration (2006), sections II.1.2 and IV.2.
     """
 
-    def fitted(self, scene: Scene, form: StateForm, asked: str) -> StateForm:
-        """Any `form` of the state of any `scene` serves, whatever was `asked` for."""
-        return form
+    def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
+        """Any `field` of any `scene` serves, whatever was `asked` for."""
+        return field
 
     def stepped(self, step: Step, y: PyTree) -> Stepped:
         """The state `y` after one `step`."""

@@ -1,13 +1,13 @@
 """What the loops over steps integrate: rates, projection and events as functions of (tau, y, args), for one motion and for lanes side by side.
 
-`args`: the form of the state, the scene, its inputs, what the rates need of the scene, and the time from which tau counts.
+`args`: the vector field, the scene, its inputs, what the rates need of the scene, and the time from which tau counts; of lanes, with their axis first.
 """
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.motion.state_form import Integrated
+from jourdain_jax.motion.vector_fields.field import Integrated
 
 
 def state_norm(y: Integrated) -> Float[Array, "*lanes"]:
@@ -22,16 +22,16 @@ def state_norm(y: Integrated) -> Float[Array, "*lanes"]:
 
 @eqx.filter_jit  # traced once, not once per stage and derivative
 def rates(tau, y, args):
-    form, scene, inputs, fixed, origin = args
+    field, scene, inputs, fixed, origin = args
     t = origin + tau
-    return form.rates(scene, fixed, t, y, form.now(inputs, t))
+    return field.rates(scene, fixed, t, y, _at(field.now, inputs, t))
 
 
 @eqx.filter_jit
 def rates_and_pivots(tau, y, args):
-    form, scene, inputs, fixed, origin = args
+    field, scene, inputs, fixed, origin = args
     t = origin + tau
-    return form.rates_and_pivots(scene, fixed, t, y, form.now(inputs, t))
+    return field.rates_and_pivots(scene, fixed, t, y, _at(field.now, inputs, t))
 
 
 @eqx.filter_jit
@@ -39,50 +39,26 @@ def pivots(tau, y, args):
     return rates_and_pivots(tau, y, args)[1]
 
 
-@eqx.filter_jit  # traced once, not once per stage and derivative
+@eqx.filter_jit
 def project(tau, y, args):
-    form, scene, inputs, fixed, origin = args
+    field, scene, inputs, fixed, origin = args
     t = origin + tau
-    return form.project(scene, fixed, t, y, inputs(t))
-
-
-def project_of_lanes(tau, y, args):
-    form, scene, inputs, fixed, origin = args
-    t = origin + tau
-    return form.project(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
+    return field.project(scene, fixed, t, y, _at(_values, inputs, t))
 
 
 @eqx.filter_jit
 def events(tau, y, args) -> Float[Array, "events *lanes"]:
-    form, scene, inputs, fixed, origin = args
+    field, scene, inputs, fixed, origin = args
+    if jnp.ndim(tau) and not field.lowers_events:
+        return eqx.filter_vmap(events, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(tau, y, args)
     t = origin + tau
-    return form.events(scene, fixed, t, y, inputs(t))
+    return field.events(scene, fixed, t, y, _at(_values, inputs, t))
 
 
-def events_of_lanes(tau, y, args):
-    form, scene, inputs, fixed, origin = args
-    if form.lowers_events:
-        t = origin + tau
-        return form.events(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
-    return _lane_by_lane(events)(tau, y, args)
+def _values(inputs, t) -> Float[Array, "inputs"]:
+    return inputs(t)
 
 
-def _lane_by_lane(function):
-    """A function `(t, y, args)` of one lane for states with lanes last and `args` with lanes first."""
-    return lambda t, y, args: eqx.filter_vmap(function, in_axes=(0, -1, eqx.if_array(0)), out_axes=-1)(t, y, args)
-
-
-def rates_of_lanes(tau, y, args):
-    form, scene, inputs, fixed, origin = args
-    t = origin + tau
-    return form.rates(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
-
-
-def rates_and_pivots_of_lanes(tau, y, args):
-    form, scene, inputs, fixed, origin = args
-    t = origin + tau
-    return form.rates_and_pivots(scene, fixed, t, y, _inputs_of_lanes(inputs, t))
-
-
-def _inputs_of_lanes(inputs, t) -> Float[Array, "inputs lanes"]:
-    return eqx.filter_vmap(lambda inputs, t: inputs(t), out_axes=-1)(inputs, t)
+def _at(values, inputs, t) -> Float[Array, "inputs *lanes"]:
+    """`values(inputs, t)`, of every lane where there are lanes."""
+    return eqx.filter_vmap(values, out_axes=-1)(inputs, t) if jnp.ndim(t) else values(inputs, t)

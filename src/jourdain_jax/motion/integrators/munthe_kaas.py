@@ -21,7 +21,7 @@ from jourdain_jax.calculus.exponential import quaternion_exponential, rotation_v
 from jourdain_jax.calculus.rotations import quaternion_product, quaternion_rate
 from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
-from jourdain_jax.motion.state_form import Integrated, StateForm
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
 
@@ -68,8 +68,8 @@ class MuntheKaas(diffrax.AbstractWrappedSolver):
         """As the wrapped solver. `terms` as in diffrax."""
         return self.solver.error_order(terms)
 
-    def fitted(self, scene: Scene, form: StateForm, asked: str) -> StateForm:
-        """The given `form` of the state, without a projection where there would be only norms to keep; whatever was `asked` for.
+    def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
+        """The given `field` of the state, without a projection where there would be only norms to keep; whatever was `asked` for.
 
         ValueError where the `scene` has no attitude.
         """
@@ -78,7 +78,7 @@ class MuntheKaas(diffrax.AbstractWrappedSolver):
                 f"`MuntheKaas` advances attitudes, and `{type(scene).__name__}` has no quaternion among its coordinates; use "
                 f"solver={type(self.solver).__name__}() by itself, or state the attitude with jj.quaternion(...)"
             )
-        return replace(form, projects_positions=form.projects_positions and bool(names_of_position_rows(scene)))
+        return replace(field, projects_positions=field.projects_positions and bool(names_of_position_rows(scene)))
 
     def init(self, terms, t0, t1, y0, args):
         """Nothing is carried from step to step: slopes belong to the rotation vectors of one step. `terms`, `t0`, `t1`, `y0`, `args`: as in diffrax."""

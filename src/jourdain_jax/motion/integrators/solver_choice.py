@@ -9,13 +9,13 @@ from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
 from jourdain_jax.motion.integrators.even_steps import EvenSteps
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
 from jourdain_jax.motion.integrators.munthe_kaas import MuntheKaas
-from jourdain_jax.motion.state_form import StateForm
+from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.scene import Scene
 
 
-def fitted(solver, scene: Scene, form: StateForm, asked: str) -> StateForm:
+def fitted(solver, scene: Scene, field: VectorField, asked: str) -> VectorField:
     """The form of the state that the solver integrates; a ValueError where it does not apply to the scene. `asked`: the `state` of `simulate`."""
-    return solver.fitted(scene, form, asked) if isinstance(solver, FixedStepSolver | MuntheKaas) else form
+    return solver.fitted(scene, field, asked) if isinstance(solver, FixedStepSolver | MuntheKaas) else field
 
 
 def may_be_full(solver) -> bool:

@@ -13,25 +13,25 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jourdain_jax.motion.state_form import StateForm
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.numbers import is_traced
 
 OUT_OF_STEPS = (results.MAX_STEPS, results.SHRANK)
 _SHARE = 10  # a step of the implicit solver costs tens of explicit ones: it gets a tenth of the number
 
 
-def is_stiff(form: StateForm, motion: Trajectory, t0) -> bool:
+def is_stiff(field: VectorField, motion: Trajectory, t0) -> bool:
     """Whether stability kept the steps of a `motion` from `t0` short that ran out of them; False where its numbers are not known."""
     if int(motion.result) not in OUT_OF_STEPS or int(motion.accepted) == 0:
         return False
-    form, motion, t0 = (jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, x) for x in (form, motion, t0))
-    if is_traced((form, motion, t0)):
+    field, motion, t0 = (jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, x) for x in (field, motion, t0))
+    if is_traced((field, motion, t0)):
         return False
     step = float(motion.last_step)
     step = abs(float(motion.t_end) - float(t0)) / int(motion.accepted) if np.isnan(step) else step
-    J = np.asarray(_jacobian(form, motion)) * np.sign(float(motion.t_end) - float(t0))
+    J = np.asarray(_jacobian(field, motion)) * np.sign(float(motion.t_end) - float(t0))
     return bool(np.all(np.isfinite(J)) and step * np.max(-np.linalg.eigvals(J).real, initial=0.0) >= 1)
 
 
@@ -41,16 +41,16 @@ def implicit_steps(max_steps: int) -> int:
 
 
 @eqx.filter_jit
-def _jacobian(form: StateForm, motion: Trajectory) -> Float[Array, "state state"]:
+def _jacobian(field: VectorField, motion: Trajectory) -> Float[Array, "state state"]:
     """Derivative of the rates at the end state, with respect to the state without the work."""
     scene, t, inputs = motion.scene, motion.t_end, motion.inputs
-    y = form.pack(motion.q_end, motion.u_end)
+    y = field.pack(motion.q_end, motion.u_end)
     x, unravel = ravel_pytree((y.q, y.v))
-    fixed = form.fixed(scene)
+    fixed = field.fixed(scene)
 
     def rates(x):
         q, v = unravel(x)
-        found = form.rates(scene, fixed, t, dataclasses.replace(y, q=q, v=v), form.now(inputs, t))
+        found = field.rates(scene, fixed, t, dataclasses.replace(y, q=q, v=v), field.now(inputs, t))
         return jnp.concatenate([found.q, found.v])
 
     return jax.jacfwd(rates)(x)

@@ -13,7 +13,8 @@ from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
 from jourdain_jax.motion.native.functions import Form, event_program
 from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel
 from jourdain_jax.motion.native.layout import Layout
-from jourdain_jax.motion.state_form import Integrated, StateForm
+from jourdain_jax.motion.vector_fields.by_program import ByProgram
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.native import ffi, host
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.graph import Unsupported
@@ -31,9 +32,9 @@ class Control(NamedTuple):
     max_steps: int
 
 
-def reason_against(form: StateForm, inputs: Inputs, scene: PyTree, has_events: bool, real) -> str:
+def reason_against(field: VectorField, inputs: Inputs, scene: PyTree, has_events: bool, real) -> str:
     """Why machine code cannot integrate a scene, in words; empty where it can."""
-    if form.lowered is None:
+    if not isinstance(field, ByProgram):
         return "the scene has no scalar program"
     if jax.default_backend() != "cpu":
         return "it is made for CPUs alone"
@@ -45,9 +46,9 @@ def reason_against(form: StateForm, inputs: Inputs, scene: PyTree, has_events: b
         return "it is made for double precision alone"
     if not inputs.constant or any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
         return "inputs change with time"
-    if has_events and not form.lowers_events:
+    if has_events and not field.lowers_events:
         return "a stop event is no part of the scalar program"
-    return _reason_against_program(_form(form, has_events))
+    return _reason_against_program(_form(field, has_events))
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -66,17 +67,16 @@ def _reason_against_program(form: Form) -> str:
     return reason
 
 
-def _form(form: StateForm, has_events: bool) -> Form:
-    assert form.lowered is not None
-    return Form(form.lowered, form.with_work, form.projects_positions or form.projects_speeds, form.affine, has_events, form.has_pivots)
+def _form(field: ByProgram, has_events: bool) -> Form:
+    return Form(field.program, field.with_work, field.projects, field.affine, has_events, field.has_pivots)
 
 
 def integrate(
     args: tuple, solver: type, has_events: bool, y0: Integrated, goals: Float[Array, "times"], control: Control
 ) -> tuple[Integrated, Bool[Array, "times"], Progress]:
     """As `erk_loop.integrate`, of one motion from time zero; `args`: as rates take them."""
-    form, _, inputs, fixed, origin = args
-    layout, run = kernel(_form(form, has_events), solver)
+    field, _, inputs, fixed, origin = args
+    layout, run = kernel(_form(field, has_events), solver)
     zero, one = jnp.zeros(()), jnp.ones(())
     t, h, code, event = zero, jnp.abs(control.dt0), RUNNING * one, -one
     progress = [t, h, code, zero, zero, event, jnp.inf * one]

@@ -1,0 +1,91 @@
+"""Our own explicit Runge-Kutta loop as an integrator: as machine code where that serves, and as a loop of XLA where not, and for all derivatives.
+
+One motion, or lanes side by side: those of a scalar program in blocks of `lockstep.width`.
+"""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from jourdain_jax.calculus.differentiated_as import differentiated_as
+from jourdain_jax.motion.batches.lockstep import in_blocks, width
+from jourdain_jax.motion.integrators import erk_loop, integrands
+from jourdain_jax.motion.native import native_motion
+from jourdain_jax.motion.setup import Begun, Setup, Solved
+
+
+def solved_by_own_steps(setup: Setup, begun: Begun) -> Solved:
+    """One motion by our own loop."""
+    if reason_against_machine_code(setup):
+        return _by_xla(setup, begun)
+    return differentiated_as(_by_xla, _by_machine_code, setup.options.kind)(setup, begun)
+
+
+def lanes_solved_by_own_steps(setups: Setup, begun: Begun) -> Solved:
+    """Lanes of a scalar program by our own loop; all arrays have a leading axis of lanes."""
+    program = setups.field.lowered
+    assert program is not None
+    blocks = partial(in_blocks, _lanes_by_xla, width(program))
+    if reason_against_machine_code(setups):
+        return blocks(setups, begun)
+    return differentiated_as(blocks, eqx.filter_vmap(_by_machine_code), setups.options.kind)(setups, begun)
+
+
+def reason_against_machine_code(setup: Setup) -> str:
+    """Why the loop over steps is one of XLA's and not machine code of our own, in words; empty where it is."""
+    if not setup.options.native:
+        return "native=False"
+    if not setup.options.by_own_steps:
+        return "a solver, a controller or an adjoint of diffrax was asked for"
+    return native_motion.reason_against(setup.field, setup.inputs, setup.scene, bool(setup.options.event_names), setup.start.q.dtype)
+
+
+def _by_xla(setup: Setup, begun: Begun) -> Solved:
+    return _loop(setup, begun.y0, begun.args, setup.ts, setup.knots)
+
+
+def _lanes_by_xla(setups: Setup, begun: Begun) -> Solved:
+    """Lanes in lockstep: their axis comes first outside and last inside."""
+    y0, ts, knots = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (begun.y0, setups.ts, eqx.filter_vmap(lambda s: s.knots)(setups)))
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), _loop(setups, y0, begun.args, ts, knots))
+
+
+def _loop(setup: Setup, y0, args, ts, knots) -> Solved:
+    field, options = setup.field, setup.options
+    goals = _goals(setup, ts)
+    problem = erk_loop.Problem(
+        rates=integrands.rates,
+        args=args,
+        project=integrands.project if field.projects else None,
+        events=integrands.events if options.event_names else None,
+        norm=integrands.state_norm,
+        rtol=jnp.broadcast_to(options.tolerances[0], setup.t0.shape),
+        atol=jnp.broadcast_to(options.tolerances[1], setup.t0.shape),
+        shortest=setup.shortest,
+        max_steps=options.max_steps + (0 if knots is None else len(knots)),
+        knots=knots,
+        rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
+    )
+    ys, reached, end = erk_loop.integrate(problem, erk_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, options.dt0, options.kind)
+    return _as_solved(goals, ys, reached, end)
+
+
+def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
+    options, goals = setup.options, _goals(setup, setup.ts)
+    rtol, atol = options.tolerances
+    control = native_motion.Control(rtol, atol, setup.shortest, options.dt0, options.max_steps)
+    ys, reached, end = native_motion.integrate(begun.args, type(options.solver), bool(options.event_names), begun.y0, goals, control)
+    return _as_solved(goals, ys, reached, end)
+
+
+def _goals(setup: Setup, ts) -> Float[Array, "times *lanes"]:
+    """Times since the start to go to."""
+    return jnp.concatenate([ts, setup.t1[None]]) - setup.t0
+
+
+def _as_solved(goals, ys: PyTree, reached, end: erk_loop.Progress) -> Solved:
+    ys = jax.tree.map(lambda x: x[:-1], ys)
+    return Solved(goals[:-1], ys, reached[:-1], end.t, end.y, end.code, end.event, end.accepted, end.rejected, end.h, end.pivot)

@@ -1,0 +1,106 @@
+"""What is to be integrated and how, and what an integrator finds.
+
+Time counts from the start, tau = t - t0: far from zero a clock has few digits, and what does not depend on it is to be as right there as at t0 = 0.
+Rates, projection and events are given tau, and the scene and its inputs t0 + tau.
+"""
+
+from operator import attrgetter
+from typing import Literal
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jourdain_jax.motion.integrators.knots import knots_between
+from jourdain_jax.motion.integrators.solver_choice import steps_are_given
+from jourdain_jax.motion.span import fitting_times
+from jourdain_jax.motion.start import State
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
+from jourdain_jax.scene.scene import Scene
+
+OWN_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
+OWN_ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode)
+
+
+class Options(eqx.Module):
+    """How to integrate."""
+
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController | None  # None: the default one
+    tolerances: tuple  # rtol, atol
+    dt0: Float[Array, ""] | float
+    adjoint: diffrax.AbstractAdjoint
+    max_steps: int = eqx.field(static=True)
+    land: bool = eqx.field(static=True)  # whether a step ends at every saved time
+    saveat: diffrax.SaveAt | None  # None: at the times asked for
+    event_names: tuple[str, ...] = eqx.field(static=True)
+    native: bool = eqx.field(static=True, default=True)  # whether machine code of our own may integrate it
+
+    @property
+    def by_own_steps(self) -> bool:
+        """Whether our own explicit Runge-Kutta loop integrates it: it has a solver, a controller and an adjoint of its own, and nothing else was stated."""
+        plain = self.controller is None and self.saveat is None and self.land
+        checkpoints = isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) and self.adjoint.checkpoints is not None
+        return plain and not checkpoints and type(self.solver) in OWN_SOLVERS and type(self.adjoint) in OWN_ADJOINTS
+
+    @property
+    def kind(self) -> Literal["forward", "reverse"]:
+        """The mode of differentiation of our own loop."""
+        return "forward" if isinstance(self.adjoint, diffrax.ForwardMode) else "reverse"
+
+
+class Solved(eqx.Module):
+    """What either loop finds."""
+
+    ts: Float[Array, "times *lanes"]  # as t_end, since the start
+    ys: PyTree
+    reached: Bool[Array, "times *lanes"]
+    t_end: Float[Array, "*lanes"]
+    y_end: PyTree
+    code: Int[Array, "*lanes"]
+    event: Int[Array, "*lanes"]  # index of the event that ended the motion, -1: none
+    accepted: Int[Array, "*lanes"]
+    rejected: Int[Array, "*lanes"]
+    last_step: Float[Array, "*lanes"]  # s, that the step-size control would take next; NaN where it keeps that to itself
+    pivot: Float[Array, "*lanes"]  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was watched
+
+
+class Setup(eqx.Module):
+    """A motion to be integrated; in a batch all arrays have a leading axis of lanes."""
+
+    scene: Scene
+    start: State
+    inputs: PyTree
+    t0: Float[Array, "*lanes"]
+    t1: Float[Array, "*lanes"]
+    ts: Float[Array, "*lanes times"]
+    field: VectorField
+    options: Options
+
+    def fitting(self) -> "Setup":
+        """The setup with times that serve any loop, also where its own do not go together."""
+        of = attrgetter("ts", "t0", "t1", "options.dt0")
+        return eqx.tree_at(of, self, fitting_times(*of(self)))
+
+    @property
+    def shortest(self) -> Float[Array, "*lanes"]:
+        """The shortest step, s."""
+        return 1e-14 * jnp.abs(self.t1 - self.t0)
+
+    @property
+    def knots(self) -> Float[Array, "knots"] | None:
+        """Times since the start at which steps must end for the inputs' sake."""
+        if steps_are_given(self.options.controller):
+            return None
+        return knots_between((self.inputs, self.scene), self.options.tolerances[0], self.t0, self.t1, self.ts)
+
+
+class Begun(eqx.Module):
+    """The start of the integration, marked for the adjoint."""
+
+    right: Bool[Array, ""]  # whether all parameters are, and the masses and inertias that they make
+    timely: Bool[Array, ""]  # whether the times go together
+    start: State
+    args: tuple  # vector field, scene, inputs, what the rates need of the scene, the time from which times count
+    y0: Integrated

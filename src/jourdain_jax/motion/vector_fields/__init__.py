@@ -1,0 +1,1 @@
+"""What is integrated: one `VectorField` in three forms, by a scalar program, or by dense matrices in the minimal or the full state."""

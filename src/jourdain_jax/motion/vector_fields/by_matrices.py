@@ -1,0 +1,135 @@
+"""Rates by dense matrices that JAX differentiates, in the minimal or the full state: for scenes without a program, and for reductions that a user chooses."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.build.usual_lengths import UsualLengths, usual_lengths
+from jourdain_jax.calculus.pseudo_inverse import undecided
+from jourdain_jax.dynamics.accelerations import Baumgarte, bare_accelerations
+from jourdain_jax.dynamics.power import rate_of_work
+from jourdain_jax.equations.gibbs_appell import GibbsAppell
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics, speeds_and_pivot, speeds_from_privileged
+from jourdain_jax.equations.projection import project_positions, project_speeds
+from jourdain_jax.equations.reductions import Privileged
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.scene import Scene
+
+
+class ByMatrices(VectorField):
+    """What both states have in common."""
+
+    stabilisation: Baumgarte | None
+    usual: UsualLengths  # of the rows
+    inputs_in_rows: bool = eqx.field(static=True)  # some change in time, and rows depend on them: their rates are needed
+    cutoff: float | None = eqx.field(static=True)  # of the projection of speeds: below it rows count as dependent; None: round-off
+
+    def now(self, inputs, t):
+        """The values of the inputs, with their own rates where rows depend on them."""
+        return inputs.near(t) if self.inputs_in_rows else inputs(t)
+
+    def solved(self, scene: Scene, t, q, u, inputs) -> tuple[Motion, Any]:
+        """The motion with these speeds, and its accelerations by the reduction."""
+        found = bare_accelerations(scene, t, q, u, inputs, reduction=self.reduction, stabilisation=self.stabilisation, usual=self.usual.rows)
+        return motion_at(scene, t, q, u, inputs), found
+
+    def power(self, scene: Scene, motion: Motion, found) -> Float[Array, ""] | None:
+        """The rate of the work that is integrated, W."""
+        return rate_of_work(scene, motion, found, self.of_inputs) if self.with_work else None
+
+    def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
+        """The state put back onto geometric rows, quaternion norms and (full state) velocity rows."""
+        q = project_positions(scene, t, y.q, iterations=2, typical=self.usual.closures) if self.projects_positions else y.q
+        if not self.projects_speeds:
+            return Integrated(q, y.v, y.work)
+        return Integrated(q, project_speeds(scene, t, q, y.v, inputs, iterations=2, cutoff=self.cutoff, typical=self.usual.rows.lengths), y.work)
+
+
+class Minimal(ByMatrices):
+    """Coordinates and privileged speeds."""
+
+    independent: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def has_pivots(self) -> bool:
+        """The sign of det A_z."""
+        return True
+
+    def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
+        """Coordinates and all speeds."""
+        return y.q, speeds_from_privileged(scene, self.independent, t, y.q, y.v, inputs)
+
+    def pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, ""]:
+        """How well the privileged speeds determine the others, with the sign of det A_z."""
+        return speeds_and_pivot(scene, self.independent, t, y.q, y.v, inputs)[1]
+
+    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots"]]:
+        """As `rates`, and the sign of det A_z."""
+        known = minimal_kinematics(scene, self.independent, t, y.q, y.v, inputs)
+        own = isinstance(self.reduction, Privileged) and self.reduction.independent == self.independent and self.stabilisation is None
+        motion, found = accelerations_of(scene, known, t, y.q, inputs) if own else self.solved(scene, t, y.q, known.u, inputs)
+        v = found.udot[jnp.array(self.independent, jnp.int32)]
+        return Integrated(motion.qdot.array, v, self.power(scene, motion, found)), known.split.orientation()[None]
+
+
+class Full(ByMatrices):
+    """Coordinates and all speeds."""
+
+    may_branch: bool = eqx.field(static=True)  # where geometric rows lose rank, a cut-off leaves one out, and branches cross
+    own_equations: str = eqx.field(static=True, default="")  # of a solver that takes no accelerations: what it solves instead
+
+    @property
+    def reduction_name(self) -> str:
+        """Name of the reduction, as it stands in a trajectory."""
+        if self.own_equations:
+            return f"none, {self.own_equations}"
+        return super().reduction_name if self.cutoff is None else f"{super().reduction_name}, cut-off {self.cutoff:.0e}"
+
+    @property
+    def needs_pivot(self) -> bool:
+        """A state that is all there goes on, with a warning."""
+        return False
+
+    @property
+    def has_pivots(self) -> bool:
+        """Whether round-off might decide on which branch a motion goes on."""
+        return self.may_branch
+
+    def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
+        """Coordinates and all speeds."""
+        return y.q, y.v
+
+    def pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, ""]:
+        """The pivot of the reduction, without a sign; 1 where it has none."""
+        partitioned = isinstance(self.reduction, Privileged | GibbsAppell)
+        return bare_accelerations(scene, t, y.q, y.v, inputs, reduction=self.reduction).pivot if partitioned else jnp.ones(())
+
+    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots"]]:
+        """As `rates`; and 1 where the rows say on which branch the motion goes on, -1 where round-off does."""
+        motion, found = self.solved(scene, t, y.q, y.v, inputs)
+        rates = Integrated(motion.qdot.array, found.udot, self.power(scene, motion, found))
+        if not self.may_branch:
+            return rates, jnp.zeros(0, y.q.dtype)
+        return rates, jnp.where(found.pivot > undecided(found.pivot.dtype), 1.0, -1.0).astype(found.pivot.dtype)[None]
+
+
+def full_without_projection(field: VectorField, scene: Scene, own_equations: str) -> Full:
+    """The full state in place of another form, for a solver that keeps it on the rows by `own_equations`."""
+    return Full(
+        independent=None,
+        reduction=field.reduction,
+        with_work=field.with_work,
+        projects_positions=False,
+        projects_speeds=False,
+        of_inputs=field.of_inputs,
+        stabilisation=field.stabilisation if isinstance(field, ByMatrices) else None,
+        usual=usual_lengths(scene),
+        inputs_in_rows=isinstance(field, ByMatrices) and field.inputs_in_rows,
+        cutoff=None,
+        may_branch=False,
+        own_equations=own_equations,
+    )

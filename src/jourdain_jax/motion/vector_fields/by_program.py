@@ -1,0 +1,64 @@
+"""The rates of a lowered scene, by its scalar program; states may have a last axis of lanes."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
+from jourdain_jax.scene.scene import Scene
+
+
+class ByProgram(VectorField):
+    """The minimal or the full state of a lowered scene."""
+
+    program: Lowered = eqx.field(static=True)
+    affine: bool = eqx.field(static=True)  # rows are, in the speeds
+
+    @property
+    def lowered(self) -> Lowered:
+        """The scalar program."""
+        return self.program
+
+    @property
+    def reduction_name(self) -> str:
+        """Name of the reduction, as it stands in a trajectory."""
+        return f"{super().reduction_name}, lowered"
+
+    @property
+    def lowers_events(self) -> bool:
+        """Whether stop events are part of the scalar program."""
+        return bool(self.program.events)
+
+    @property
+    def has_pivots(self) -> bool:
+        """Whether an elimination divides by numbers that must not vanish."""
+        return self.independent is not None and bool(self.program.pivots)
+
+    def fixed(self, scene: Scene) -> tuple:
+        """What depends on parameters alone."""
+        return self.program.fixed_values(scene)
+
+    def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
+        """Coordinates and all speeds."""
+        return y.q, self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
+
+    def pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, ""]:
+        """The smallest pivot of the elimination, relative to its usual size."""
+        return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[1]
+
+    def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
+        """Values of the stop events, sorted by name; lanes only where `lowers_events`."""
+        if self.program.events:
+            return self.program.event_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
+        return super().events(scene, fixed, t, y, inputs)
+
+    def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots *lanes"]]:
+        """As `rates`, and the pivots of the elimination relative to their usual sizes."""
+        qdot, vdot, power, pivots = self.program.rates_and_pivots(fixed, t, tuple(y.q), tuple(y.v), inputs, self.with_work)
+        return Integrated(jnp.stack(qdot), jnp.stack(vdot) if vdot else y.v, power), jnp.stack(pivots) if pivots else jnp.zeros((0, *y.q.shape[1:]))
+
+    def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
+        """The state put back onto the rows."""
+        q, v = self.program.projected(fixed, t, tuple(y.q), tuple(y.v), inputs, self.affine)
+        return Integrated(jnp.stack(q), jnp.stack(v) if v else y.v, y.work)

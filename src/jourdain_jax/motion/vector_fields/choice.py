@@ -1,0 +1,85 @@
+"""Which form of the state is integrated, given what was asked."""
+
+import jax
+import jax.numpy as jnp
+
+from jourdain_jax.build.structure import WELL_CONDITIONED, Structure, structure_of
+from jourdain_jax.build.usual_lengths import usual_lengths
+from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
+from jourdain_jax.dynamics.accelerations import Baumgarte, as_reduction
+from jourdain_jax.dynamics.power import needs_work
+from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
+from jourdain_jax.equations.rows import names_of_position_rows
+from jourdain_jax.lowering.lower import lowered
+from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.motion.inputs import as_inputs
+from jourdain_jax.motion.vector_fields.by_matrices import Full, Minimal
+from jourdain_jax.motion.vector_fields.by_program import ByProgram
+from jourdain_jax.motion.vector_fields.field import VectorField
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.once_per_class import once_per_class
+from jourdain_jax.scene.scene import Scene
+
+_STATE_FORMS = ("auto", "minimal", "full")
+
+
+def vector_field(
+    scene: Scene, state="auto", reduction=None, stabilisation: Baumgarte | None = None, projection=True, work=True, lowering=True, inputs=None
+) -> VectorField:
+    """What is integrated of a scene; the arguments are those of `simulate`."""
+    structure = structure_of(scene)
+    _check(scene, structure, state)
+    minimal = state == "minimal" or (state == "auto" and structure.has_minimal_state)
+    independent = structure.independent if minimal else None
+    inputs_in_rows = structure.rows_of_inputs and not as_inputs(scene, inputs).constant
+    with_work = work and needs_work(scene, structure)
+    dense = inputs_in_rows or (with_work and (structure.driven or structure.varying_inertia))
+    program = lowered(scene, every_speed=not minimal) if lowering and reduction is None and stabilisation is None and not dense else None
+    program = program if isinstance(program, Lowered) else None
+    cutoff = _cutoff(structure) if reduction is None and not minimal else None
+    reduction = as_reduction(scene, _default_reduction(structure, independent, program) if reduction is None else reduction)
+    common = {
+        "independent": independent,
+        "reduction": reduction,
+        "with_work": with_work,
+        "projects_positions": projection and _is_closed(scene),
+        "projects_speeds": projection and not minimal and bool(structure.row_names),
+        "of_inputs": structure.potentials_of_inputs,
+    }
+    if program is not None:
+        return ByProgram(**common, program=program, affine=structure.affine)
+    common |= {"stabilisation": stabilisation, "usual": usual_lengths(scene), "inputs_in_rows": inputs_in_rows, "cutoff": cutoff}
+    if minimal:
+        return Minimal(**common)
+    return Full(**common, may_branch=cutoff is not None and isinstance(reduction, NullSpaceQR) and bool(names_of_position_rows(scene)))
+
+
+def _check(scene: Scene, structure: Structure, state) -> None:
+    if state not in _STATE_FORMS:
+        raise ValueError(f"unknown state form `{state}`; {nearest(str(state), _STATE_FORMS)}")
+    if state == "minimal" and not structure.affine:
+        raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use state='full'")
+    if state == "minimal" and structure.may_set_in:
+        named = ", ".join(f"`{name}`" for name in structure.may_set_in)
+        raise ValueError(f"rows {named} of `{type(scene).__name__}` may set in where they do not follow from the others; use state='full'")
+
+
+def _cutoff(structure: Structure) -> float | None:
+    """Where rows that are well conditioned at most states lose rank, motions pass more safely with a wider cut-off; None: round-off."""
+    return passing_cutoff(jnp.result_type(float)) if structure.typical_pivot >= WELL_CONDITIONED else None
+
+
+def _default_reduction(structure: Structure, independent: tuple[int, ...] | None, program: Lowered | None) -> Reduction:
+    """Privileged velocities for the minimal state; for the full one what a lowered program does, otherwise the null space by QR."""
+    if independent is not None:
+        return Privileged(independent)
+    if program is None:
+        return NullSpaceQR(_cutoff(structure))
+    return Privileged(structure.independent) if program.by_partition else Multipliers()
+
+
+@once_per_class
+def _is_closed(scene: Scene) -> bool:
+    """Whether there are geometric rows or quaternion norms to keep."""
+    return jax.eval_shape(lambda s: closure_residual(s, 0.0, s.named()[0]), scene).shape[0] > 0
