@@ -133,7 +133,7 @@ def _looked_at_from_afar(scene: Scene, t, q, u, u_other, generic) -> Probed:
     t, q, u, u_other = (np.concatenate(pair) for pair in zip((t, q, u, u_other), far, strict=True))
     found = probed_on_graph(scene, t, q, u, u_other, np.append(generic, np.zeros(FAR_PROBES, bool)), far=FAR_PROBES)
     near, beyond = (jax.tree.map(lambda x, part=part: x[part], found) for part in (np.s_[:-FAR_PROBES], np.s_[-FAR_PROBES:]))
-    return replace(near, unproved=near.unproved | (found.in_calls & _seen(beyond, u[-FAR_PROBES:])))
+    return replace(near, unproved=(near.unproved - found.in_calls) | (found.in_calls & _seen(beyond, u[-FAR_PROBES:])))
 
 
 def _seen(found: Probed, u: np.ndarray) -> frozenset[str]:

@@ -21,8 +21,8 @@ from jourdain_jax.program.graph import Unsupported
 class Call:
     """A closed jaxpr, and why it is one; calls are equal where they compute the same in the same way."""
 
-    def __init__(self, closed, reasons: tuple[str, ...]):
-        self.closed, self.reasons = closed, reasons
+    def __init__(self, closed, reasons: tuple[str, ...], derivative_of: "Call | None" = None):
+        self.closed, self.reasons, self.derivative_of = closed, reasons, derivative_of
         self._described = description(closed)
         self._hash = hash(self._described)
 
@@ -59,7 +59,7 @@ class Call:
             closed = jax.make_jaxpr(columns)(*(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals))
         except (TypeError, ValueError, NotImplementedError):
             raise Unsupported(f"the derivative of {self.reason}") from None
-        return Call(closed, self.reasons)
+        return Call(closed, self.reasons, derivative_of=self)
 
     def results(self, *operands) -> tuple:
         """The results; operands, and so results, may have last axes of lanes."""
