@@ -272,11 +272,31 @@ class Mixed(OnCam):
         return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, jnp.mean(jnp.full((40, 40), 0.3) @ jnp.sin(q.x + jnp.arange(40.0)))]))}
 
 
-@pytest.mark.parametrize(("scene", "reason"), [(OnCam(), "the operation `scan`"), (Mixed(), "a product of matrices with 1600 multiplications")])
-def test_a_pose_without_a_scalar_form_makes_the_whole_scene_dense(scene, reason):
-    with pytest.raises(jj.NotLowered, match=f"a pose or row needs derivatives of {reason}"):
-        jj.lower(scene)
-    assert jj.simulate(scene, {"x_rate": 1.0}, t1=0.5).reduction == "privileged"
+def test_a_loop_in_a_pose_makes_the_whole_scene_dense():
+    with pytest.raises(jj.NotLowered, match="`OnCam` is not lowered: the operation `scan` has no scalar form"):
+        jj.lower(OnCam())
+    assert jj.simulate(OnCam(), {"x_rate": 1.0}, t1=0.5).reduction == "privileged"
+
+
+class Softly(OnCam):
+    """A bead on a ramp that begins softly, by a function with a derivative of its own."""
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, jax.nn.softplus(q.x)]))}
+
+
+@pytest.mark.parametrize(
+    ("scene", "reason"),
+    [(Mixed(), "a product of matrices with 1600 multiplications"), (Softly(), "`logaddexp`, which has a derivative of its own,")],
+    ids=["product", "rule"],
+)
+def test_a_part_of_a_pose_is_a_call_whose_derivatives_are_those_of_jax(scene, reason):
+    assert set(jj.lower(scene).calls) == {reason}
+    q, y = np.random.default_rng(4).uniform(-1.0, 1.0, (2, 6, 1)) + np.array([[[0.1]], [[2.0]]])
+    by_program, dense = rates_of(scene)
+    for derivative in (lambda f: f, lambda f: jax.jacfwd(f, argnums=(1, 2)), lambda f: jax.jacrev(f, argnums=(1, 2))):
+        found, expected = (jax.vmap(jax.jit(derivative(f)), in_axes=(None, 0, 0))(scene, q, y) for f in (by_program, dense))
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12), found, expected)
 
 
 class Effective(OnCam):

@@ -127,6 +127,12 @@ class TracedScene:
     particulars: Particulars
     effects: str  # what in the scene does more than compute, as printing does; nothing: no part of it
 
+    @property
+    def motion(self) -> list[np.ndarray]:
+        """What poses and rows make of the state, and derivatives are taken of."""
+        at = self.at
+        return [at.v, at.omega, at.position, at.orientation, at.mass, at.inertia, at.phi, at.closure, at.qdot]
+
 
 def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
     """The scene as a new graph; parts without scalar form, and those with a derivative of their own, are calls.

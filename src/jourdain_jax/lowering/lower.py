@@ -131,6 +131,10 @@ def _program(key: _Key, begin: float) -> Lowered:
     traced = traced_scene(scene, structure.potentials_of_inputs)
     if traced.effects:
         raise Unsupported(traced.effects)
+    for call in traced.graph.calls(n for part in traced.motion for n in part.ravel().tolist()):
+        if loop := traced.graph.value[call].loop:
+            # measured: a ball on a hill, whose point of contact is found by Newton's method, takes four times as long as by dense matrices
+            raise Unsupported(f"the operation `{loop}`")
     probes = _probes(scene, structure, traced.graph)
     if key.every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
         probes = on_velocity_rows(probes, traced, structure.affine)
@@ -163,9 +167,6 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     counts = {explicit: graph.operations(_rates(found)) for explicit, found in plain.items()}
     first = min(plain)
     best, fewest, way = plain[first], counts[first], Strategy(first)
-    derived = next((graph.value[n] for n in graph.calls(_rates(best)) if graph.value[n].derivative_of), None)
-    if derived:  # measured: a ball on a hill, whose point of contact is found by Newton's method, takes four times as long as by dense matrices
-        raise NotLowered(f"a pose or row needs derivatives of {derived.reason}, which has no scalar form")
     if fewest > MOST_OPERATIONS:
         raise NotLowered(f"its scalar program has {fewest} operations, more than {MOST_OPERATIONS}")
     expected = _values(best, probes)

@@ -21,8 +21,8 @@ from jourdain_jax.program.graph import Unsupported
 class Call:
     """A closed jaxpr, and why it is one; calls are equal where they compute the same in the same way."""
 
-    def __init__(self, closed, reasons: tuple[str, ...], derivative_of: "Call | None" = None):
-        self.closed, self.reasons, self.derivative_of = closed, reasons, derivative_of
+    def __init__(self, closed, reasons: tuple[str, ...]):
+        self.closed, self.reasons = closed, reasons
         self._described = description(closed)
         self._hash = hash(self._described)
 
@@ -36,6 +36,11 @@ class Call:
     def reason(self) -> str:
         """In words, without a verb."""
         return " and ".join(self.reasons)
+
+    @property
+    def loop(self) -> str:
+        """The name of a loop in it; empty where there is none."""
+        return _loop_in(self.closed.jaxpr)
 
     @functools.cache  # noqa: B019  (calls are few, and live as long as their graph)
     def slopes(self, moves: tuple[tuple[bool, ...], ...]) -> "Call":
@@ -59,7 +64,7 @@ class Call:
             closed = jax.make_jaxpr(columns)(*(jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals))
         except (TypeError, ValueError, NotImplementedError):
             raise Unsupported(f"the derivative of {self.reason}") from None
-        return Call(closed, self.reasons, derivative_of=self)
+        return Call(closed, self.reasons)
 
     def results(self, *operands) -> tuple:
         """The results; operands, and so results, may have last axes of lanes."""
@@ -98,6 +103,20 @@ class Call:
                 return [np.stack(x) for x in zip(*(alone(*one) for one in zip(*operands, strict=True)), strict=True)]
 
         return results
+
+
+def _loop_in(jaxpr) -> str:
+    for equation in jaxpr.eqns:
+        if equation.primitive.name in ("while", "scan"):
+            return equation.primitive.name
+        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_jaxpr):
+            if _is_jaxpr(inner) and (name := _loop_in(getattr(inner, "jaxpr", inner))):
+                return name
+    return ""
+
+
+def _is_jaxpr(x) -> bool:
+    return hasattr(x, "eqns") or hasattr(x, "jaxpr")
 
 
 def _array(shape_and_type, *entries):
