@@ -206,5 +206,5 @@ def test_stand_ins_of_parameters_with_equal_defaults_differ(kind):
 def test_a_program_made_where_rows_do_no_work_is_not_taken_where_they_do():
     still, blown = (jj.simulate(Slope(slope=0.7, wind=wind), {"x": 0.5}, **OPTIONS) for wind in (0.0, 1.3))
     assert still.work is None
-    assert blown.reduction.endswith("lowered")
+    assert "lowered" in blown.reduction
     np.testing.assert_allclose(blown.work[-1], 0.5 * 2.0 * 1.3**2 * ((1 + blown["x"][-1]) ** 2 - 1.5**2), rtol=1e-8)

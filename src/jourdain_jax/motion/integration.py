@@ -14,7 +14,7 @@ from jourdain_jax.motion.diffrax_steps import solved_by_diffrax
 from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.solver_choice import marked_inputs, marked_outputs, time_origin
-from jourdain_jax.motion.own_steps import lanes_solved_by_own_steps, solved_by_own_steps
+from jourdain_jax.motion.own_steps import lanes_solved_by_own_steps, reason_against_machine_code, solved_by_own_steps
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.setup import Begun, Setup, Solved
 from jourdain_jax.motion.span import times_fit
@@ -117,7 +117,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         smallest_pivot=pivot,
         inputs=inputs,
         state_form=field.name,
-        reduction=field.reduction_name,
+        reduction=field.reduction_name if reason_against_machine_code(setup) else f"{field.reduction_name} to machine code",
         solver=type(options.solver).__name__,
         projected=moving,
         event_names=options.event_names,

@@ -40,7 +40,9 @@ def reason_against_machine_code(setup: Setup) -> str:
         return "native=False"
     if not setup.options.by_own_steps:
         return "a solver, a controller or an adjoint of diffrax was asked for"
-    return native_motion.reason_against(setup.field, setup.inputs, setup.scene, bool(setup.options.event_names), setup.start.q.dtype)
+    if not setup.inputs.constant:
+        return "inputs change with time"
+    return native_motion.reason_against(setup.field, setup.scene, bool(setup.options.event_names))
 
 
 def _by_xla(setup: Setup, begun: Begun) -> Solved:

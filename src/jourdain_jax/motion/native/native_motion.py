@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jourdain_jax.motion.inputs import Inputs, Sampled
+from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators.erk_loop import ended
 from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
 from jourdain_jax.motion.native.functions import Form, event_program
@@ -32,7 +32,7 @@ class Control(NamedTuple):
     max_steps: int
 
 
-def reason_against(field: VectorField, inputs: Inputs, scene: PyTree, has_events: bool, real) -> str:
+def reason_against(field: VectorField, scene: PyTree, has_events: bool) -> str:
     """Why machine code cannot integrate a scene, in words; empty where it can."""
     if not isinstance(field, ByProgram):
         return "the scene has no scalar program"
@@ -42,9 +42,9 @@ def reason_against(field: VectorField, inputs: Inputs, scene: PyTree, has_events
         return host.reason_against()
     if ffi.version() is None:
         return "the foreign function interface of this jaxlib is not known"
-    if real != jnp.float64:
+    if jnp.result_type(float) != jnp.float64:
         return "it is made for double precision alone"
-    if not inputs.constant or any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
+    if any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
         return "inputs change with time"
     if has_events and not field.lowers_events:
         return "a stop event is no part of the scalar program"

@@ -140,7 +140,7 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     if drift > DRIFTED * size:
         share = f"{drift:.1e} J, {drift / size:.0%} of the energy that moves"
         warned.append(f"{found.energy_kind}, which is constant for a right motion, drifts by {share}: tighten `rtol`")
-    pivot, dense = float(trajectory.smallest_pivot), not trajectory.reduction.endswith("lowered")
+    pivot, dense = float(trajectory.smallest_pivot), "lowered" not in trajectory.reduction
     # round-off over the square of the pivot is the error of an acceleration; other states than the full one end there
     if trajectory.state_form == "full" and dense and pivot < passing_cutoff(trajectory.q.dtype):
         warned.append(
