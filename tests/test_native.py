@@ -233,6 +233,18 @@ def test_a_lane_does_not_depend_on_its_company(disc_kernel):
             np.testing.assert_array_equal(found, expected[lane])
 
 
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_a_lane_does_not_depend_on_the_number_of_threads(disc_kernel, threads, monkeypatch):
+    usual, starts, goals = disc_kernel
+    starts, goals = jnp.tile(starts, (13, 1)), jnp.tile(goals, (13, 1))
+    kernels.kernel.cache_clear()
+    monkeypatch.setattr(host, "threads", lambda: threads)
+    other = kernels.kernel(usual.form, diffrax.Tsit5)
+    assert other is not usual
+    for found, expected in zip(jax.vmap(other.run)(starts, goals), jax.vmap(usual.run)(starts, goals), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
 def test_no_lanes_and_axes_of_lanes(disc_kernel):
     kernel, starts, goals = disc_kernel
     states, ends = jax.vmap(kernel.run)(starts[:0], goals[:0])

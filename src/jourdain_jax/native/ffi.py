@@ -13,7 +13,7 @@ from pathlib import Path
 
 import jax
 
-from jourdain_jax.native import host
+from jourdain_jax.native import disk, host
 from jourdain_jax.native.ir import Value, Writer
 
 HANDLER = "handler"
@@ -84,5 +84,6 @@ def registered(text: str) -> str:
     name = f"jourdain_jax_{hashlib.sha256(f'{host.description()} {text}'.encode()).hexdigest()[:24]}"
     capsule = ctypes.pythonapi.PyCapsule_New
     capsule.restype, capsule.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
-    jax.ffi.register_ffi_target(name, capsule(host.address(host.object_code(text), HANDLER), b"xla._CUSTOM_CALL_TARGET", None), platform="cpu")
+    code = disk.kept(name, lambda: host.object_code(text))
+    jax.ffi.register_ffi_target(name, capsule(host.address(code, HANDLER), b"xla._CUSTOM_CALL_TARGET", None), platform="cpu")
     return name

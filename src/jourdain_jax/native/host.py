@@ -3,6 +3,7 @@
 import ctypes
 import ctypes.util
 import functools
+import os
 import threading
 from typing import Any
 
@@ -45,6 +46,15 @@ def features() -> dict[str, bool]:
 def lanes() -> int:
     """How many doubles a vector register holds."""
     return next((count for name, count in _LANES if features().get(name)), 2)
+
+
+@functools.cache
+def threads() -> int:
+    """How many threads share a batch: one for every core that this process may use, or as many as `JOURDAIN_JAX_THREADS` says."""
+    if not hasattr(ctypes.CDLL(None), "pthread_create"):
+        return 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, int(os.environ.get("JOURDAIN_JAX_THREADS", cores)))
 
 
 def fuses() -> bool:

@@ -260,6 +260,10 @@ class Writer:
         """What is in memory."""
         return self.instruction(type, f"load {type}, ptr {self.at(pointer, index, type).name}")
 
+    def counted_up(self, pointer: Value, index) -> Value:
+        """A whole number in memory, which becomes one more, also where several threads ask."""
+        return self.instruction("i64", f"atomicrmw add ptr {self.at(pointer, index, 'i64').name}, i64 1 monotonic")
+
     def store(self, value: Value, pointer: Value, index=0) -> None:
         """Puts a value into memory."""
         self._lines.append(f"  store {value.type} {value.name}, ptr {self.at(pointer, index, value.type).name}")

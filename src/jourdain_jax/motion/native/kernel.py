@@ -26,8 +26,13 @@ MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the pro
 class Kernel(NamedTuple):
     """`run(starts, goals)` returns states at the goals, and the rows of the end."""
 
-    layout: Layout
+    form: Form
     run: Callable
+
+    @property
+    def layout(self) -> Layout:
+        """The rows of a lane."""
+        return self.form.layout
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -37,7 +42,7 @@ def kernel(form: Form, solver: type[diffrax.AbstractERK]) -> Kernel:
 
     @cache
     def name(lanes: int) -> str:
-        return ffi.registered(written(form, method, lanes, host.fuses()))
+        return ffi.registered(written(form, method, lanes, host.fuses(), 1 if lanes == ALONE else host.threads()))
 
     def call(lanes: int, starts: Float[Array, "*lanes rows"], goals: Float[Array, "*lanes times"]):
         shapes = (goals.shape[-1], layout.y), (layout.returned + 1,)
@@ -53,4 +58,4 @@ def kernel(form: Form, solver: type[diffrax.AbstractERK]) -> Kernel:
         starts, goals = (x if has_axis else jnp.broadcast_to(x, (count, *x.shape)) for x, has_axis in zip(arguments, batched, strict=True))
         return call(host.lanes(), starts, goals), (True, True)
 
-    return Kernel(layout, run)
+    return Kernel(form, run)

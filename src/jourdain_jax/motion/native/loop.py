@@ -1,4 +1,4 @@
-"""The loop over steps as machine code: lanes of a batch side by side, each replaced by the next one when it has ended.
+"""The loop over steps as machine code: lanes of a batch side by side, each replaced by the next one when it has ended, in several threads.
 
 A call is given two arrays with one row per lane: the rows of `Layout.given`, and the times to save at. It returns the states there, and the rows of the
 progress at the end with the number of times that were reached one after the other.
@@ -11,12 +11,13 @@ from jourdain_jax.motion.native.step import IDLE, write_step
 from jourdain_jax.native.ffi import write_handler
 from jourdain_jax.native.ir import Value, Writer
 
-# words of a job, shared by all functions: pointers to the arrays, the number of lanes, of times, of the next lane, and how many are on their way
-_STARTS, _GOALS, _STATES, _ENDS, _COUNT, _TIMES, _NEXT, _BUSY = range(8)
+# words of a job, shared by all threads: pointers to the arrays, the number of lanes, of times, and of the next lane
+_STARTS, _GOALS, _STATES, _ENDS, _COUNT, _TIMES, _NEXT = range(7)
+MANY = 8  # times as many lanes as side by side make it worth while to start another thread, which takes some 30 us
 
 
-def written(form: Form, method: Method, lanes: int, fused: bool) -> str:
-    """The module of LLVM IR."""
+def written(form: Form, method: Method, lanes: int, fused: bool, threads: int) -> str:
+    """The module of LLVM IR; `threads`: among which many lanes are shared."""
     w = Writer(lanes, fused)
     write_rates(w, form)
     if form.projects:
@@ -26,13 +27,14 @@ def written(form: Form, method: Method, lanes: int, fused: bool) -> str:
     write_step(w, form, method)
     _write_begin(w, form)
     _write_serve(w, form)
-    write_handler(w, 2, 2, lambda arguments, results, sizes, rank: _write_loop(w, form, [*arguments, *results], sizes, rank))
+    _write_loop(w, form)
+    write_handler(w, 2, 2, lambda arguments, results, sizes, rank: _write_job(w, [*arguments, *results], sizes, rank, threads))
     return w.text
 
 
-def _write_loop(w: Writer, form: Form, arrays: list[Value], sizes: Value, rank: Value) -> None:
-    """All lanes, from start to end."""
-    job, state, who = w.room("i64", 8), w.room(w.real, form.layout.all), w.room("i64", 2 * w.lanes)
+def _write_job(w: Writer, arrays: list[Value], sizes: Value, rank: Value, threads: int) -> None:
+    """All lanes, by this thread and by others that it starts and waits for."""
+    job = w.room("i64", 7)
     for word, pointer in zip((_STARTS, _GOALS, _STATES, _ENDS), arrays, strict=True):
         w.store(pointer, job, word)
     count = w.room("i64")
@@ -42,7 +44,30 @@ def _write_loop(w: Writer, form: Form, arrays: list[Value], sizes: Value, rank: 
     w.store(w.load("i64", count), job, _COUNT)
     w.store(w.load("i64", sizes, rank - 1), job, _TIMES)
     w.store(w.literal(0, "i64"), job, _NEXT)
-    w.store(w.literal(w.lanes, "i64"), job, _BUSY)
+    loop, nothing, others, started = Value(w, "ptr", "@loop"), Value(w, "ptr", "null"), w.room("i64", threads), w.room("i64")
+    w.store(w.literal(0, "i64"), started)
+    for more in range(1, threads):
+        with w.when(w.load("i64", count) >= (more + 1) * MANY * w.lanes):
+            number = w.load("i64", started)
+            failed = w.external("pthread_create", "i32", w.at(others, number, "i64"), nothing, loop, job)
+            w.store(number + w.where(failed.equals(0), w.literal(1, "i64"), 0), started)
+    w.call("loop", "ptr", job)
+    if threads > 1:
+        with w.counted(0, w.load("i64", started)) as number:
+            w.external("pthread_join", "i32", w.load("i64", others, number), nothing)
+
+
+def _write_loop(w: Writer, form: Form) -> None:
+    """`loop(job)`: lanes side by side until none is left."""
+    with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
+        _write_lanes(w, form, job)
+        w.give(Value(w, "ptr", "null"))
+
+
+def _write_lanes(w: Writer, form: Form, job: Value) -> None:
+    # of each place, which lane is there and how many of its times are saved; after them, at how many places there is one
+    state, who = w.room(w.real, form.layout.all), w.room("i64", 2 * w.lanes + 1)
+    w.store(w.literal(w.lanes, "i64"), who, 2 * w.lanes)
     with w.counted(0, form.layout.all) as row:
         w.store(w.number(1.0), state, row)
     lanes = Lanes(w, form.layout, state)
@@ -50,7 +75,7 @@ def _write_loop(w: Writer, form: Form, arrays: list[Value], sizes: Value, rank: 
         w.call("begin", "void", job, state, who, lane)
         w.call("serve", "void", job, state, who, lane)
     with w.repeated() as leave:
-        leave(w.load("i64", job, _BUSY).equals(0))
+        leave(w.load("i64", who, 2 * w.lanes).equals(0))
         w.call("step", "void", state)
         code = lanes["code"]
         on_its_way = (code.equals(float(RUNNING)) & lanes["t"].differs(lanes["goal"])) | code.equals(float(LOCATING)) | code.equals(IDLE)
@@ -62,10 +87,9 @@ def _write_begin(w: Writer, form: Form) -> None:
     """`begin(job, state, who, lane)`: the next lane of the batch takes this place; where there is none, it is idle."""
     with w.function("begin", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "lane": "i64"}, attributes="noinline") as (job, state, who, lane):
         lanes, given = Lanes(w, form.layout, state), form.layout.given
-        number = w.load("i64", job, _NEXT)
+        number = w.counted_up(job, _NEXT)
         there = number < w.load("i64", job, _COUNT)
         with w.when(there):
-            w.store(number + 1, job, _NEXT)
             w.store(number, who, lane)
             w.store(w.literal(0, "i64"), who, lane + w.lanes)
             starts = w.load("ptr", job, _STARTS)
@@ -76,7 +100,7 @@ def _write_begin(w: Writer, form: Form) -> None:
                 lanes.set("search_left", lane, 0.0)
         with w.when(~there):
             lanes.set("code", lane, IDLE)
-            w.store(w.load("i64", job, _BUSY) - 1, job, _BUSY)
+            w.store(w.load("i64", who, 2 * w.lanes) - 1, who, 2 * w.lanes)
         w.give()
 
 

@@ -76,7 +76,8 @@ def integrate(
 ) -> tuple[Integrated, Bool[Array, "times"], Progress]:
     """As `erk_loop.integrate`, of one motion from time zero; `args`: as rates take them."""
     field, _, inputs, fixed, origin = args
-    layout, run = kernel(_form(field, has_events), solver)
+    own = kernel(_form(field, has_events), solver)
+    layout, run = own.layout, own.run
     zero, one = jnp.zeros(()), jnp.ones(())
     t, h, code, event = zero, jnp.abs(control.dt0), RUNNING * one, -one
     progress = [t, h, code, zero, zero, event, jnp.inf * one]
