@@ -59,6 +59,6 @@ def _values(inputs, t) -> Float[Array, "inputs"]:
     return inputs(t)
 
 
-def _at(values, inputs, t) -> Float[Array, "inputs *lanes"]:
+def _at(values, inputs, t):
     """`values(inputs, t)`, of every lane where there are lanes."""
     return eqx.filter_vmap(values, out_axes=-1)(inputs, t) if jnp.ndim(t) else values(inputs, t)
