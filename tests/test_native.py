@@ -333,7 +333,8 @@ def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
     monkeypatch.setattr(host, "reason_against", lambda: "")
     ffi.version.cache_clear()
     monkeypatch.setattr(jax.ffi, "include_dir", lambda: "/nowhere")
-    assert "interface" in reason_against_machine_code(set_up(disc))
+    with pytest.warns(UserWarning, match="interface of this jaxlib is not known"):
+        assert "interface" in reason_against_machine_code(set_up(disc))
     ffi.version.cache_clear()
 
 

@@ -8,6 +8,7 @@ import ctypes
 import functools
 import hashlib
 import re
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,7 +30,14 @@ _MAJOR = 3  # of metadata, with the minor version after it
 
 @functools.cache
 def version() -> tuple[int, int] | None:
-    """Major and minor version of the interface; None where it is not known."""
+    """Major and minor version of the interface; None, with a warning, where it is not known."""
+    found = _stated_version()
+    if found is None:
+        warnings.warn("the foreign function interface of this jaxlib is not known: motions are integrated by XLA, more slowly", stacklevel=2)
+    return found
+
+
+def _stated_version() -> tuple[int, int] | None:
     try:
         header = (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text()
     except OSError:
