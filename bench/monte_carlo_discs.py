@@ -38,7 +38,7 @@ def main() -> None:
     options = parser.parse_args()
     disc = jj.models.TiltingDisc()
     starts = random_starts(options.lanes)
-    settings = {"ts": jnp.linspace(0.0, options.span, 41), "rtol": 1e-6, "atol": 1e-6, "land_on_ts": False}
+    settings = {"ts": jnp.linspace(0.0, options.span, 41), "rtol": 1e-6, "atol": 1e-6}
     seconds = []
     for _ in range(2):
         begin = time.perf_counter()
