@@ -18,6 +18,7 @@ from tolerances import relative_error
 
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
+from jourdain_jax.motion.trajectories import results
 
 NAMES = ("skate", "chaplygin-sleigh", "tilting-disc-quaternion")
 WITH_GRADIENT = ("chaplygin-sleigh",)
@@ -84,6 +85,24 @@ with warnings.catch_warnings(record=True) as caught:
     tight = jj.simulate(sleigh, sleigh.example, t1=0.1, rtol=1e-8, atol=1e-8)
 found["tight"] = {"warnings": [str(w.message) for w in caught], "finite": bool(jnp.all(jnp.isfinite(tight.q)))}
 found["few steps"] = motion_of(sleigh, sleigh.example, max_steps=3).message
+
+
+class Beside(jj.Scene):
+    "An oscillator, and a particle that goes past far away."
+    coordinates = jj.coordinates("x far")
+
+    def bodies(self, t, q):
+        return {name: jj.Particle(1.0, jnp.stack([x, 0 * x, 0 * x])) for name, x in (("a", q.x), ("b", q.far))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-1e4 * motion.q.x),)
+
+
+found["far away"] = motion_of(Beside(), {"x": 1.0, "far": 1e6, "far_rate": 1.0})["far"].tolist()
+board = MODELS["snakeboard"]()
+nowhere = {"steer": jnp.pi / 2, "steer_rate": 0.5, "y_rate": 0.5, "heading_rate": 0.3}  # at parallel rows with a sideways velocity
+ended = jj.simulate(board, nowhere, ts=jnp.array([0.0, 1.0]), rtol=1e-5, atol=1e-5)
+found["no motion continues"] = [int(ended.result), int(ended.accepted + ended.rejected)]
 found["verified"] = str(jj.verify(sleigh, jj.start(sleigh, **sleigh.example)))
 print(json.dumps(found))
 """
@@ -173,6 +192,18 @@ def test_tolerances_below_single_precision_are_warned_of(single):
 
 def test_result_codes_hold_in_single_precision(single):
     assert single["few steps"].startswith("ran out of steps")
+
+
+def test_increments_below_the_last_digit_of_a_state_add_up(single):
+    # at 1e6 m a step of 4 ms at 1 m/s is less than half of the last digit, 1/16 m
+    assert np.max(np.abs(np.array(single["far away"]) - (1e6 + TS))) <= 1 / 16
+
+
+def test_a_motion_that_nothing_continues_ends_soon_in_single_precision(single):
+    # once a coordinate stood still just before the rows that stop the motion, while time went on in 100,000 short steps
+    code, steps = single["no motion continues"]
+    assert code == results.STEP_TOO_SMALL
+    assert steps < 1000
 
 
 def test_verification_knows_what_single_precision_can_show(single):

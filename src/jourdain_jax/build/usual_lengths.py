@@ -41,13 +41,13 @@ def usual_lengths(scene: Scene) -> UsualLengths:
         A = jax.jacfwd(lambda u: velocity_residual(still, t, q, u, inputs.astype(q.dtype)))(u)
         return tuple(jnp.sqrt(jnp.sum(rows**2, axis=1)) for rows in (A * speed_scale(mass_matrix_at(still, t, q)), A))
 
-    scaled, plain = (_usual(x) for x in jax.vmap(lengths)(t, q))
+    scaled, plain = (usual(x) for x in jax.vmap(lengths)(t, q))
     norms = jnp.ones(len(scene.coordinates.quaternions), plain.dtype)
     closures = jnp.concatenate([plain[: len(names_of_position_rows(scene))], norms])
     return UsualLengths(UsualRows(scaled, jnp.asarray(known.rank, jnp.int32)), closures)
 
 
-def _usual(lengths: Float[Array, "states rows"]) -> Float[Array, "rows"]:
-    """The median, or the largest for a row that vanishes at half of the states."""
-    median = jnp.nanmedian(lengths, axis=0)
-    return jax.lax.stop_gradient(jnp.where(median > 0, median, jnp.nanmax(lengths, axis=0, initial=0.0)))
+def usual(sizes: Float[Array, "states *rows"]) -> Float[Array, "*rows"]:
+    """The median over states, or the largest for what vanishes at half of them; what is no number does not count, and no derivative passes through."""
+    median = jnp.nanmedian(sizes, axis=0)
+    return jax.lax.stop_gradient(jnp.where(median > 0, median, jnp.nanmax(sizes, axis=0, initial=0.0)))

@@ -21,7 +21,7 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations
 from jourdain_jax.equations.reductions import NullSpaceQR
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
-from jourdain_jax.lowering.elimination import pivots_ok, usual
+from jourdain_jax.lowering.elimination import pivots_ok
 from jourdain_jax.lowering.far import full_turns, on_velocity_rows
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered import Lowered, Stage
@@ -186,6 +186,8 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     outputs = graph.with_quotients(_with_equal_calls_once(builder.identity_probes, [n for group in groups for n in group]))
     ends = np.cumsum([len(group) for group in groups])
     qdot, ydot, z, pivots, guards, power, events, put_q, put_u = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
+    sizes = {graph.input(f"usual_pivot_{k}", False): n for k, n in enumerate(pivots)}
+    stands_for = best.usual | sizes
     names = scene.coordinate_names.entries
     leaves = tuple(jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(scene)[0])
     units = {f".{name}": metadata["unit"] for name, _, metadata in parameters_of(scene)}
@@ -204,7 +206,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         ydot=ydot,
         z=z,
         pivots=pivots,
-        typical=tuple(usual(np.abs(probes(pivots))).tolist()),
+        sizes=tuple(sizes),
         guards=guards,
         power=None if structure.driven else power[0],
         events=events,
@@ -216,9 +218,9 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         stages=tuple(stages),
         way=builder.kept.description if builder.kept else way.description,
         seconds=time.perf_counter() - begin,
-        fixed=graph.fixed(outputs),
-        usual=best.usual,
-        states=_some_states(graph, probes, best.usual.values()),
+        fixed=graph.fixed([*outputs, *sizes]),
+        usual=stands_for,
+        states=_some_states(graph, probes, stands_for.values()),
     )
 
 

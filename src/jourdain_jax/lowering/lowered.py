@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Num
 
 from jourdain_jax.build.trace import TracedScene
+from jourdain_jax.build.usual_lengths import usual
 from jourdain_jax.lowering import export
 from jourdain_jax.lowering.jacobian import differentiable
 from jourdain_jax.program.emit import run
@@ -46,7 +47,7 @@ class Lowered:
     ydot: tuple[int, ...]
     z: tuple[int, ...]  # dependent speeds
     pivots: tuple[int, ...]  # must not vanish
-    typical: tuple[float, ...]  # their magnitude at the probes
+    sizes: tuple[int, ...]  # inputs for what the magnitudes of the pivots usually are
     guards: tuple[int, ...]  # must stay positive
     power: int | None  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated); None where poses are driven
     events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
@@ -112,11 +113,12 @@ class Lowered:
         return tuple(jnp.asarray(x) for x in run(self.graph, self.fixed, known | self._usual_values(known)))
 
     def _usual_values(self, parameters: dict) -> dict[int, Float[Array, ""]]:
-        """What stands for usual values: medians over `states`, for these parameters."""
+        """What stands for usual magnitudes: those over `states`, for these parameters; 1 for what vanishes at all of them."""
         if not self.usual:
             return {}
         found = run(self.graph, list(self.usual.values()), parameters | {n: jnp.asarray(x) for n, x in self.states.items()})
-        return {n: jax.lax.stop_gradient(jnp.nanmedian(jnp.asarray(x))) for n, x in zip(self.usual, found, strict=True)}
+        sizes = [usual(jnp.abs(jnp.atleast_1d(jnp.asarray(x)))) for x in found]
+        return {n: jnp.where(size == 0, 1.0, size) for n, size in zip(self.usual, sizes, strict=True)}
 
     def rates(self, fixed, t, q: Sequence, y: Sequence, inputs, with_power: bool = False) -> tuple[tuple, tuple, Float[Array, "*lanes"] | None]:
         """`qdot` and `ydot`, tuples of scalars, and the power (W) where `with_power` asks for it; NaN where a guard is not positive.
@@ -132,7 +134,7 @@ class Lowered:
         """
         found = list((self._with_power if with_power else self._without_power)(*self._known(fixed, t, q, y, inputs).values()))
         count = len(found) - len(self.pivots)
-        pivots = tuple(value / size for value, size in zip(found[count:], self.typical, strict=True))
+        pivots = tuple(value / size for value, size in zip(found[count:], self.pivot_sizes(fixed), strict=True))
         count -= len(self.guards)
         for guard in found[count : count + len(self.guards)]:
             found[0] = jnp.where(guard > 0, found[0], jnp.nan)
@@ -170,7 +172,7 @@ class Lowered:
         real = jnp.result_type(*q)
         u = jnp.stack([jnp.asarray(every[i], real) for i in order])
         pivot = jnp.ones((), real)
-        for value, size in zip(out[len(self.z) :], self.typical, strict=True):
+        for value, size in zip(out[len(self.z) :], self.pivot_sizes(fixed), strict=True):
             ratio = jax.lax.stop_gradient(value) / size
             pivot = jnp.sign(pivot) * jnp.sign(ratio) * jnp.minimum(jnp.abs(pivot), jnp.abs(ratio))
         return u, pivot
@@ -190,6 +192,10 @@ class Lowered:
         if not self.projected_u:
             return q, tuple(y)
         return q, jax.lax.scan(lambda y, _: (step(self.projected_u, q, y), None), tuple(y), length=1 if affine else 2)[0]
+
+    def pivot_sizes(self, fixed) -> list[Float[Array, "*lanes"]]:
+        """What the magnitudes of the pivots usually are, for the parameters of a motion; `fixed`: from `fixed_values`."""
+        return [fixed[self.fixed.index(n)] for n in self.sizes]
 
     def event_values(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "events *lanes"]:
         """Values of the stop events, sorted by name.

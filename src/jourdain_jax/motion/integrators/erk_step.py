@@ -6,6 +6,9 @@
 The state is any tree of arrays; in a batch all arrays, times and step sizes among them, have a last axis of lanes, which keeps neighbours in memory
 neighbours. A step ends at every time asked for and at every knot of the inputs; the step size found before such a shortened step is remembered. The state
 advances by the difference of the times at the ends of a step, as they are after rounding.
+
+In single precision the state is summed with compensation (Kahan): what rounding leaves off an increment is added to the next one. Otherwise a state whose
+increments are smaller than its last digit stands still while time passes, and no error estimate sees it.
 """
 
 from collections.abc import Callable
@@ -68,6 +71,7 @@ class Progress(eqx.Module):
     event: Int[Array, "*lanes"]  # index of the event that ended the motion, or -1
     search: Search | None  # for that event
     pivot: Float[Array, "*lanes"]  # smallest magnitude so far of a pivot, at any stage of an accepted step
+    rest: PyTree  # what rounding has left off `y`, to be added by the next step; None where that cannot add up to much
 
 
 class Problem(eqx.Module):
@@ -115,7 +119,14 @@ def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0, directi
 def standing(problem: Problem, y: PyTree, t: Float[Array, "*lanes"], h: Float[Array, "*lanes"], direction) -> Progress:
     """On the way, with no step behind and no event to search for."""
     zero = jnp.zeros(jnp.shape(t), jnp.int32)
-    return Progress(t, y, h, zero + RUNNING, problem.knots_passed(t, direction), zero, zero, zero - 1, None, no_pivot(t))
+    rest = jax.lax.stop_gradient(jax.tree.map(jnp.zeros_like, y)) if _rounding_adds_up(problem, y) else None
+    return Progress(t, y, h, zero + RUNNING, problem.knots_passed(t, direction), zero, zero, zero - 1, None, no_pivot(t), rest)
+
+
+def _rounding_adds_up(problem: Problem, y: PyTree) -> bool:
+    """Whether what is rounded off in so many steps may add up to more than half of the digits: in float32, not in float64."""
+    eps = max(float(jnp.finfo(x.dtype).eps) for x in jax.tree.leaves(y))
+    return problem.max_steps * eps > eps**0.5
 
 
 def running(p: Progress, goal: Float[Array, "*lanes"]) -> Bool[Array, "*lanes"]:
@@ -141,6 +152,9 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     t1 = jnp.where(lands, target, p.t + h)
     h = t1 - p.t  # as rounded: the state and the time advance together
     y1, slopes, _, pivots = stages(problem, method, p.t, p.y, h, watched=True)
+    rest = p.rest
+    if rest is not None:
+        y1, rest = _compensated(p.y, rest, jax.tree.map(lambda k: as_in(h, k) * weighted(method.b, k), slopes))
     error = jax.tree.map(lambda k: as_in(h, k) * weighted(method.b_error, k), slopes)
     if problem.project is not None:
         free, y1 = y1, problem.project(t1, y1, problem.args)
@@ -162,8 +176,9 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     code = jnp.where(too_short, results.STEP_TOO_SMALL, RUNNING)
     code = jnp.where((code == RUNNING) & (accepted + rejected >= problem.max_steps) & ~(accept & (t1 == last_goal)), results.MAX_STEPS, code).astype(jnp.int32)
     y = jax.tree.map(lambda new, old: jnp.where(accept, as_in(new, old), old), y1, p.y)
+    rest = jax.tree.map(lambda new, old: jnp.where(accept & ~locating, new, old), rest, p.rest)
     passed = p.knot + (accept & ~locating & (t1 == knot)).astype(jnp.int32)
-    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, passed, accepted, rejected, p.event, p.search, p.pivot)
+    moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, passed, accepted, rejected, p.event, p.search, p.pivot, rest)
     if problem.events is not None:
         slopes = [jax.tree.map(lambda k, i=i: k[i], slopes) for i in (0, method.at_the_end)]  # first and last
         moved = _watched(problem, p, moved, h, slopes, accept & ~locating & (code == RUNNING))
@@ -173,6 +188,13 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     counts = accept & ~locating & (moved.code == RUNNING) & (moved.t == t1)
     pivot = jnp.where(counts, jnp.minimum(p.pivot, pivots.smallest), p.pivot)
     return replace(moved, pivot=pivot, code=jnp.where(counts & (pivot < SMALLEST_PIVOT), results.SINGULAR_PARTITION, moved.code).astype(jnp.int32))
+
+
+def _compensated(y: PyTree, rest: PyTree, increments: PyTree) -> tuple[PyTree, PyTree]:
+    """`y + increments`, and what rounding leaves off; `rest`: what it left off before."""
+    whole = jax.tree.map(lambda k, r: k + r, increments, rest)
+    y_1 = jax.tree.map(jnp.add, y, whole)
+    return y_1, jax.lax.stop_gradient(jax.tree.map(lambda k, new, old: k - (new - old), whole, y_1, y))
 
 
 def removed(projected: PyTree, free: PyTree, lane_axes: int) -> PyTree:
@@ -286,4 +308,5 @@ def _watched(problem: Problem, p: Progress, moved: Progress, h, slopes, accept) 
     code = jnp.where(happened, LOCATING, jnp.where(found, results.EVENT, jnp.where(locating, LOCATING, moved.code))).astype(jnp.int32)
     tried = dips.astype(jnp.int32)
     knot = jnp.where(dips, p.knot, moved.knot)
-    return Progress(t, y, jax.lax.stop_gradient(next_h), code, knot, moved.accepted - tried, moved.rejected + tried, event, search, moved.pivot)
+    rest = jax.tree.map(lambda new, old: jnp.where(dips, old, new), moved.rest, p.rest)
+    return Progress(t, y, jax.lax.stop_gradient(next_h), code, knot, moved.accepted - tried, moved.rejected + tried, event, search, moved.pivot, rest)
