@@ -63,7 +63,8 @@ def write_rates(w: Writer, form: Form) -> None:
     with w.function("rates", "void", arguments, attributes=how) as (state, tau, y, k, pivots):
         power = [program.power] if form.with_work and program.power is not None else []
         outputs = [*program.qdot, *program.ydot, *power, *program.guards, *program.pivots[: form.pivots]]
-        found = [as_real(w, x) for x in written(w, program.graph, outputs, _known(w, form, state, tau, y))]
+        known = _known(w, form, state, tau, y)
+        found = [as_real(w, x) for x in written(w, program.graph, outputs, known)]
         if form.with_work and not power:
             found.insert(layout.coordinates + layout.speeds, w.number(0.0))
         for guard in found[layout.y : layout.y + len(program.guards)]:
@@ -71,7 +72,7 @@ def write_rates(w: Writer, form: Form) -> None:
         for i in range(layout.y):
             w.store(found[i], k, i)
         for i in range(form.pivots):
-            w.store(found[layout.y + len(program.guards) + i] / program.typical[i], pivots, i)
+            w.store(found[layout.y + len(program.guards) + i] / known[program.sizes[i]], pivots, i)
         w.give()
 
 

@@ -89,7 +89,7 @@ def integrate(
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
     numbers = [x.astype(jnp.int32) for x in (code, accepted, rejected, event)]
     code, accepted, rejected, event = numbers
-    last = Progress(t, _unpacked(layout, end[: layout.y]), h, code, jnp.zeros((), jnp.int32), accepted, rejected, event, None, pivot)
+    last = Progress(t, _unpacked(layout, end[: layout.y]), h, code, jnp.zeros((), jnp.int32), accepted, rejected, event, None, pivot, None)
     return jax.vmap(lambda y: _unpacked(layout, y))(states), reached, ended(last, 0.0)
 
 
