@@ -1,4 +1,4 @@
-"""The atlas of where methods fail: hard cases E1 to E24, every method, float64 and float32.
+"""The atlas of where methods fail: hard cases E1 to E36, every method, float64 and float32.
 
     python bench/atlas.py [--quick] [--json FILE] [--out DIR] [--case NAME ...] [--method NAME ...] [--cache DIR]
     python bench/atlas.py --redraw FILE --out DIR

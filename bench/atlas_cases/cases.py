@@ -2,6 +2,7 @@
 
 import re
 
-from atlas_cases import cases_derivatives, cases_motion, cases_rows
+from atlas_cases import cases_between, cases_derivatives, cases_motion, cases_rows
 
-CASES = tuple(sorted((*cases_rows.CASES, *cases_motion.CASES, *cases_derivatives.CASES), key=lambda case: int(re.match(r"E(\d+)", case.name).group(1))))
+_ALL = (*cases_rows.CASES, *cases_motion.CASES, *cases_derivatives.CASES, *cases_between.CASES)
+CASES = tuple(sorted(_ALL, key=lambda case: int(re.match(r"E(\d+)", case.name).group(1))))

@@ -5,6 +5,7 @@ from long_runs_scenes import GaugeTwin
 from oracles import chaplygin_sleigh, rolling_disc, vertical_disc
 
 import jourdain_jax as jj
+from atlas_cases import elsewhere
 from atlas_cases.case import Case
 from atlas_cases.motions import Motion, against, drift, max_error
 from atlas_cases.outcomes import worst
@@ -56,6 +57,16 @@ def disc_off_its_rows(radius: float):
     return error
 
 
+def rolled_disc(run: dict, start: dict) -> elsewhere.Elsewhere:
+    """The disc in quaternions in contact with a plane, from a start of `leaning_disc`."""
+    m, a = run["mass"], run["radius"]
+    q = np.array([start.get(name, 0.0) for name in ("x", "y", "z", *(f"attitude_{axis}" for axis in "wxyz"))])
+    omega = np.array([start.get(f"attitude_omega_{axis}", 0.0) for axis in "xyz"])
+    turned = matrices(q[None, 3:])[0]
+    velocity = np.cross(turned @ omega, [q[0], q[1], q[2]])  # the contact is at the origin
+    return elsewhere.rolling(m, m * a**2 * np.array([0.25, 0.5, 0.25]), elsewhere.disc_shape(a), q, [*velocity, *omega])
+
+
 def disc_for_long(t_end: float) -> Motion:
     """The disc in quaternions: what is left of its rows."""
     run, scene = rolling_disc.RUN, jj.models.TiltingDiscQuaternion()
@@ -63,6 +74,7 @@ def disc_for_long(t_end: float) -> Motion:
     skip = {} if t_end <= 100 else LONG_RUN
     more = ("Baumgarte 1e4/s", "Munthe-Kaas") if t_end <= 20 else ()
     options = {"rtol": 1e-8, "atol": 1e-8, "steps": 400, "asked": ("rollout", *more), "step": 0.01 if t_end <= 20 else None}
+    options |= {"by_mujoco": lambda: rolled_disc(run, start)} if t_end <= 20 else {}
     return Motion(scene, start, np.linspace(0.0, t_end, 21), disc_off_its_rows(0.5), skip=skip, **options)
 
 
@@ -73,7 +85,8 @@ def disc_to_its_reference() -> Motion:
     known = rolling_disc.motion_yaw_lean_spin(ts, **run)
     start = leaning_disc(run["lean"], run["yaw_rate"], run["lean_rate"], run["spin_rate"], 0.5)
     error = against(scene, {"x": known["cx"], "y": known["cy"], "z": known["cz"]})
-    return Motion(scene, start, ts, error, rtol=1e-8, atol=1e-8, asked=("Baumgarte 1e4/s", "Kvaerno5", "Munthe-Kaas"))
+    more = {"asked": ("Baumgarte 1e4/s", "Kvaerno5", "Munthe-Kaas"), "by_mujoco": lambda: rolled_disc(run, start)}
+    return Motion(scene, start, ts, error, rtol=1e-8, atol=1e-8, **more)
 
 
 def four_bar() -> Motion:
@@ -89,8 +102,10 @@ def four_bar() -> Motion:
             off += [np.linalg.norm(rod, axis=1) - 1, np.sum(rod * rate, axis=1)]
         return max_error(worst(part, 0.0, 1.0) for part in off)
 
+    upright = (np.pi / 2, 0.0, np.pi / 2), (-2.0, 0.0, -2.0)
+    by_mujoco = lambda: elsewhere.four_bar((1.0,) * 4, (1.0,) * 3, -9.81, upright, elsewhere.ends_of_cranks)  # noqa: E731
     start = {"x0": 0.0, "x1": 1.0, "z0": 1.0, "z1": 1.0, "x0_rate": 2.0, "x1_rate": 2.0}
-    return Motion(scene, start, np.linspace(0.0, 100.0, 21), error, rtol=1e-8, atol=1e-8, steps=400, asked=("rollout",))
+    return Motion(scene, start, np.linspace(0.0, 100.0, 21), error, rtol=1e-8, atol=1e-8, steps=400, asked=("rollout",), by_mujoco=by_mujoco)
 
 
 def linkage() -> Motion:
@@ -143,7 +158,9 @@ def free_top(t_end: float) -> Motion:
 
     skip = NO_ROWS if t_end <= 100 else NO_ROWS | LONG_RUN
     more = {"asked": ("rollout", "Munthe-Kaas"), "step": 0.02} if t_end <= 100 else {"asked": ("rollout",)}
-    return Motion(scene, scene.example, np.linspace(0.0, t_end, 21), error, rtol=1e-11, atol=1e-11, skip=skip, **more)
+    u = [0.0, 0.0, 0.0, *(scene.example[f"attitude_omega_{axis}"] for axis in "xyz")]
+    by_mujoco = lambda: elsewhere.free_body(1.0, moments, [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], u)  # noqa: E731
+    return Motion(scene, scene.example, np.linspace(0.0, t_end, 21), error, rtol=1e-11, atol=1e-11, skip=skip, by_mujoco=by_mujoco, **more)
 
 
 def eccentric_ball() -> Motion:
@@ -160,7 +177,14 @@ def eccentric_ball() -> Motion:
         return np.sum(np.einsum("tij,tj->ti", turned, moments * u[:, 3:]) * arm, axis=1)
 
     start = {"z": 1.0 + 0.3 * np.cos(0.4), "attitude_w": np.cos(0.2), "attitude_x": np.sin(0.2), "attitude_omega_z": 4.0, "attitude_omega_x": 0.5}
-    return Motion(scene, start, np.linspace(0.0, 50.0, 26), drift(energy, jellett), asked=("rollout",))
+
+    def by_mujoco():
+        q = np.array([0.0, 0.0, start["z"], start["attitude_w"], start["attitude_x"], 0.0, 0.0])
+        omega, turned = np.array([0.5, 0.0, 4.0]), matrices(q[None, 3:])[0]
+        arm = 0.3 * turned[:, 2] + np.array([0.0, 0.0, 1.0])  # from the contact to the mass centre
+        return elsewhere.rolling(1.0, moments, elsewhere.ball_shape(1.0, (0.0, 0.0, -0.3)), q, [*np.cross(turned @ omega, arm), *omega])
+
+    return Motion(scene, start, np.linspace(0.0, 50.0, 26), drift(energy, jellett), asked=("rollout",), by_mujoco=by_mujoco)
 
 
 def near_fall(turn: float) -> Motion:

@@ -1,10 +1,13 @@
 """Cases about rows and bases: E1, E2, E5 to E8, E18, E21 to E24 of the table of hard cases."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 from oracles import ball_on_turntable, rolling_disc, skate, snakeboard, two_wheel_axle, vertical_disc
 
 import jourdain_jax as jj
+from atlas_cases import elsewhere
 from atlas_cases.case import Case
 from atlas_cases.instants import Instant
 from atlas_cases.motions import Motion, against
@@ -38,7 +41,32 @@ def tilting_disc() -> Motion:
     known, scene = rolling_disc.motion_yaw_lean_spin(ts, **run), jj.models.TiltingDisc()
     expected = {name: known[name] for name in ("x", "y", "yaw", "lean", "spin")}
     start = {name: run[name] for name in ("lean", "yaw_rate", "lean_rate", "spin_rate")}
-    return Motion(scene, start, ts, against(scene, expected))
+    return Motion(scene, start, ts, against(scene, expected), by_mujoco=lambda: _disc_elsewhere(expected, start))
+
+
+def _disc_elsewhere(expected: dict, start: dict) -> elsewhere.Elsewhere:
+    """The disc in contact with a plane; yaw and spin, known up to whole turns, next to the expected ones."""
+    run, (c, s) = rolling_disc.RUN, (np.cos(start["lean"]), np.sin(start["lean"]))
+    m, a, omega = run["mass"], run["radius"], np.array([start["lean_rate"], start["spin_rate"] + start["yaw_rate"] * s, start["yaw_rate"] * c])
+    frame = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
+    q = [*(a * frame[:, 2]), np.cos(start["lean"] / 2), np.sin(start["lean"] / 2), 0.0, 0.0]
+    u = [*np.cross(frame @ omega, a * frame[:, 2]), *omega]
+    saved = iter(range(len(expected["x"])))
+
+    def read(data):
+        k, turned = next(saved), np.empty(9)
+        elsewhere.mujoco.mju_quat2Mat(turned, data.qpos[3:])
+        turned = turned.reshape(3, 3)
+        axle = turned[:, 1]
+        lean, yaw = np.arcsin(np.clip(axle[2], -1.0, 1.0)), np.arctan2(-axle[0], axle[1])
+        ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+        up = np.cross(ahead, axle)
+        spin = np.arctan2(turned[:, 2] @ ahead, turned[:, 0] @ ahead)
+        whole = lambda name, angle: angle + 2 * np.pi * np.round((expected[name][k] - angle) / (2 * np.pi))  # noqa: E731
+        return np.array([*(data.qpos[:3] - a * up)[:2], whole("yaw", yaw), lean, whole("spin", spin)]), np.zeros(5)
+
+    model = elsewhere.rolling(m, m * a**2 * np.array([0.25, 0.5, 0.25]), elsewhere.disc_shape(a), q, u)
+    return replace(model, read=read)
 
 
 SNAKE_START = {"steer": 0.3, "steer_rate": 0.5, "x_rate": 1.0, "rotor_rate": 0.4}

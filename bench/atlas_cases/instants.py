@@ -14,6 +14,7 @@ from atlas_cases.outcomes import Outcome, judged, not_applicable, worst
 from jourdain_jax.eager.eager import eval_numpy
 
 ONLY_MOTION = "no motion is asked"
+ONLY_OF_MOTIONS = ("constraints", "integrators", "adjoints", "elsewhere")
 
 
 @dataclass
@@ -30,7 +31,7 @@ class Instant:
 
     def cell(self, method: Method, tolerance: float) -> Outcome:
         """Outcome of one method."""
-        if method.group in ("constraints", "integrators", "adjoints") or method.batch or method.naive in naive.SPEEDS_IN_BASIS or method.name in self.skip:
+        if method.group in ONLY_OF_MOTIONS or method.batch or method.naive in naive.SPEEDS_IN_BASIS or method.name in self.skip:
             return not_applicable(self.skip.get(method.name, ONLY_MOTION))
         q, u = jnp.asarray(self.q, jnp.result_type(float)), jnp.asarray(self.u, jnp.result_type(float))
         if method.naive is not None:
@@ -72,7 +73,7 @@ class DerivativeOfAccelerations:
 
     def cell(self, method: Method, tolerance: float) -> Outcome:
         """Outcome of one method."""
-        if method.group in ("constraints", "integrators", "adjoints") or method.batch or method.naive in naive.SPEEDS_IN_BASIS:
+        if method.group in ONLY_OF_MOTIONS or method.batch or method.naive in naive.SPEEDS_IN_BASIS:
             return not_applicable(ONLY_MOTION)
         weights = jnp.asarray(self.weights, jnp.result_type(float))
         scene, q, u = self.state(jnp.asarray(self.x))

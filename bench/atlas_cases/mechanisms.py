@@ -34,6 +34,7 @@ USUAL = {
     "forward mode": "the derivative is exact for steps that are off by the tolerance: a motion that amplifies errors spoils it, too",
     "direct adjoint": "the derivative is exact for steps that are off by the tolerance: a motion that amplifies errors spoils it, too",
     "backsolve adjoint": "it would solve the motion backwards, off the constraints and against its contraction: refused",
+    "MuJoCo": "constraints and contacts are springs with regularised friction: rods stretch, discs sink in and creep; steps have one length",
     "default": "the tolerance is met per step, and errors are amplified by the motion",
     "rollout": "the tolerance is met per step, and errors are amplified by the motion",
 }
@@ -52,6 +53,8 @@ PARALLEL = dict.fromkeys(
     "near parallel rows accelerations carry round-off over the smallest singular value: there no step meets a tight tolerance",
 )
 NEAR_FLAT = dict.fromkeys(ENGINE, "errors of the attitude count 1/theta^2: the swing ends elsewhere, steps shrink, or the disc runs into its stop event")
+
+CROSSING = dict.fromkeys(ENGINE, "two branches cross there: near it accelerations carry round-off over the distance, which may decide on which one it goes on")
 
 # Of a case, or of all cases of one number: method or group -> why it fails there.
 BY_CASE: dict[str, dict[str, str]] = {
@@ -72,6 +75,7 @@ BY_CASE: dict[str, dict[str, str]] = {
     | {"naive": "one freedom becomes three: digits are lost near there, and round-off may choose the branch on which it goes on"},
     "E12": STEPPED,
     "E12 angles": {"naive": "fixed steps across infinite rates of angles, to wherever their length puts it"},
+    "E13": {"MuJoCo": "RK4 with steps of one length, 1 ms: their truncation adds up over the run"},
     "E13 ball": UNPROJECTED,
     "E14": NEAR_FLAT | {"naive": "fixed steps too long for the swing through the flat position"},
     "E14 Euler": {"naive": "it goes on where the disc lies flat and no motion does"},
@@ -83,6 +87,11 @@ BY_CASE: dict[str, dict[str, str]] = {
     "E21 light": dict.fromkeys(
         ("privileged", "gibbs-appell", "fixed partition"), "a mass ratio of 1e8 is more than float32 holds: the light part is lost in sums"
     ),
+    "E27": CROSSING,
+    "E28": CROSSING,
+    "E30": {"MuJoCo": "it knows no stop events"},
+    "E31": {"MuJoCo": "steps of one length, in which the force is constant: the flanks of the blow fall between them"},
+    "E36": dict.fromkeys(ENGINE, "the edge is narrower than a step: no stage meets it, and the energy says so afterwards"),
     "E24": {"naive": "at rest the row has no slope, and whatever force comes out is made up"},
 }
 

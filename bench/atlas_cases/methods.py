@@ -76,6 +76,7 @@ class Method:
     reduction: str | None = None  # of `accelerations` and of `simulate`
     naive: str | None = None
     batch: bool = False  # by `rollout`
+    elsewhere: bool = False  # by another engine
 
     @property
     def even_steps(self) -> bool:
@@ -111,5 +112,6 @@ METHODS: tuple[Method, ...] = (
     *(Method(name, "integrators", lambda scene, make=make: {"solver": make()}) for name, make in INTEGRATORS.items()),
     *(Method(name, "adjoints", lambda scene, make=make: {"adjoint": make()}) for name, make in ADJOINTS.items()),
     *(Method(name, "naive", naive=name) for name in NAIVE),
+    Method("MuJoCo", "elsewhere", elsewhere=True),
 )
 GROUPS = tuple(dict.fromkeys(method.group for method in METHODS))

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
-from atlas_cases import naive
+from atlas_cases import elsewhere, naive
 from atlas_cases.case import by_type, single
+from atlas_cases.elsewhere import Elsewhere
 from atlas_cases.methods import Method
 from atlas_cases.outcomes import NAN, Outcome, judged, not_applicable, worst
 from jourdain_jax.motion.trajectories import results
@@ -46,9 +47,12 @@ class Motion:
     asked: tuple[str, ...] = ()  # costly methods, `SELDOM`, that are asked here
     step: float | None = None  # s, of integrators that take steps of one length; None: they are not asked
     naive_start: tuple | None = None  # (q, u) for methods that do not project a start
+    by_mujoco: Callable[[], Elsewhere] | None = None  # the case as a model of another engine
 
     def cell(self, method: Method, tolerance: float) -> Outcome:
         """Outcome of one method."""
+        if method.elsewhere:
+            return self._elsewhere(tolerance)
         why = self.skip.get(method.name, self.skip.get(method.group))
         if method.name in SELDOM and method.name not in self.asked:
             why = SELDOM[method.name]
@@ -101,6 +105,13 @@ class Motion:
             return found
         flag = warned(motion) or (self.flags(motion) if self.flags else "")
         return judged(error, tolerance, flag) if flag else found
+
+    def _elsewhere(self, tolerance: float) -> Outcome:
+        why = "its model of the case would be another one" if self.by_mujoco is None else elsewhere.MISSING if elsewhere.mujoco is None else ""
+        if why or single():
+            return not_applicable(why or "it computes in double precision")
+        with np.errstate(all="ignore"):
+            return judged(self.error(*self.by_mujoco().run(self.ts, float(self.options.get("t0", 0.0)))), tolerance)
 
     def _by_naive(self, method: Method, tolerance: float) -> Outcome:
         if self.naive_start is None:

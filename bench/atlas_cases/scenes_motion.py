@@ -1,6 +1,7 @@
 """Scenes of the atlas about long, stiff and singular motions: balls, discs, rattlebacks in quaternions, contact oscillators, a soft contact."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -151,6 +152,19 @@ class PendulumDrivenGear(jj.Scene):
 
     def velocity_constraints(self, motion):
         return {"gear": motion.u.x_rate + (1 + jnp.sin(motion.q.y)) * motion.u.z_rate}
+
+
+class SteepEdge(jj.Scene):
+    """A particle of 1 kg on a line, over an edge of its potential, 2 J high and 1e-6 m wide, at x = 1 m."""
+
+    width: Float[Array, ""] = jj.parameter(1e-6, unit="m", positive=True)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"ball": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def potential(self, pose):
+        return 2.0 * jax.nn.sigmoid((pose.q.x - 1.0) / self.width)
 
 
 class SoftWheel(jj.Scene):

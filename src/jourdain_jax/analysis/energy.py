@@ -16,7 +16,7 @@ from jourdain_jax.build.structure import structure_of
 from jourdain_jax.dynamics.accelerations import bare_accelerations
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy, unconstrained_equations
+from jourdain_jax.equations.virtual_power import energies_at, unconstrained_equations
 from jourdain_jax.scene.scene import Scene
 
 _ORIGINS = {
@@ -53,7 +53,7 @@ class EnergyBalance:
 
 def energy(scene: Scene, t, q, u, inputs=None) -> Energy:
     """Kinetic and potential energy (J) at (t, q, u). `inputs`: values of the scene's inputs (default: zero)."""
-    return Energy(kinetic_energy(scene, t, q, u), potential_energy(scene, motion_at(scene, t, q, u, inputs)))
+    return Energy(*energies_at(scene, motion_at(scene, t, q, u, inputs)))
 
 
 def energy_balance(scene: Scene, *, points: int = 8, seed: int = 0) -> EnergyBalance:

@@ -34,7 +34,7 @@ from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
 from jourdain_jax.equations.reductions import diagnosed
 from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
-from jourdain_jax.equations.virtual_power import equations_and_rows, kinetic_energy, newton_residual, potential_energy
+from jourdain_jax.equations.virtual_power import energies_at, equations_and_rows, newton_residual
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
@@ -131,7 +131,7 @@ def _size(found: dict, *others) -> float:
 
 
 def _energy_of(scene, t, q, u, inputs):
-    return kinetic_energy(scene, t, q, u) + potential_energy(scene, motion_at(scene, t, q, u, inputs))
+    return sum(energies_at(scene, motion_at(scene, t, q, u, inputs)))
 
 
 def _reductions(found: dict, applicable: list[str]) -> Check:

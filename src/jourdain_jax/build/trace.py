@@ -5,6 +5,7 @@ g                                    geometric rows at the level of positions
 F, L (body axes), Q_direct, power    impressed forces
 m, I                                 inertias
 c                                    stop events
+T, V                                 energies
 
 The same graph serves probing (`probed_on_graph`) and lowering. What JAX traced is kept per class and shapes of the parameters.
 """
@@ -23,7 +24,7 @@ from jourdain_jax.build.explicit_power import explicit_power
 from jourdain_jax.build.plausibility import PoseNumbers, numbers_of
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, velocities_of
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
-from jourdain_jax.equations.virtual_power import impressed, potential_energy, resultants
+from jourdain_jax.equations.virtual_power import energies_at, impressed, potential_energy, resultants
 from jourdain_jax.program.graph import MOST_MULTIPLICATIONS, Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, as_nodes, effects_of, interpret
 from jourdain_jax.program.opaque_calls import interpret_with_calls
@@ -53,6 +54,7 @@ class VelocityQuantities(eqx.Module):
     direct: Num[Entries, "speeds"]
     power: Num[Entries, ""]  # of loads without a potential, and of potentials that depend on time or on inputs
     events: Num[Entries, "events"]  # sorted by name
+    energies: Num[Entries, "2"]  # kinetic and potential
 
 
 class Particulars(eqx.Module):
@@ -104,6 +106,7 @@ def velocity_quantities(scene: Scene, motion: Motion, of_inputs: tuple[int, ...]
         loads.direct,
         explicit_power(scene, motion, of_inputs, stated),
         event_values(scene, motion) if with_events else jnp.zeros(0),
+        jnp.stack(energies_at(scene, motion, stated)),
     )
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.equations.kinematics import motion_at, partial_velocities, pose_at
 from jourdain_jax.equations.rows import position_residual, velocity_residual
-from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy, resultants
+from jourdain_jax.equations.virtual_power import energies_at, resultants
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import gauge_of, loads_of
 
@@ -28,10 +28,10 @@ RULES = ("midpoint", "trapezoidal")
 
 def lagrangian(scene: Scene, t, q, u, inputs=None) -> Float[Array, ""]:
     """`L = T - V - dS/dt` in J, for speeds that are the coordinate rates; S is the scene's gauge."""
-    L = kinetic_energy(scene, t, q, u) - potential_energy(scene, motion_at(scene, t, q, u, inputs))
+    T, V = energies_at(scene, motion_at(scene, t, q, u, inputs))
     if gauge_of(scene, pose_at(scene, t, q)) is None:
-        return L
-    return L - jax.jvp(lambda t, q: gauge_of(scene, pose_at(scene, t, q)), (t, q), (jnp.ones_like(t), u))[1]
+        return T - V
+    return T - V - jax.jvp(lambda t, q: gauge_of(scene, pose_at(scene, t, q)), (t, q), (jnp.ones_like(t), u))[1]
 
 
 def momentum(scene: Scene, t, q, u, inputs=None) -> Float[Array, "speeds"]:

@@ -17,7 +17,18 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
-from jourdain_jax.equations.kinematics import Inertias, Velocities, bias_accelerations, coordinate_rates, inertias, motion_at, partial_velocities, pose_at
+from jourdain_jax.equations.kinematics import (
+    Inertias,
+    Velocities,
+    bias_accelerations,
+    coordinate_rates,
+    inertias,
+    inertias_of,
+    motion_at,
+    partial_velocities,
+    pose_at,
+    velocities_of,
+)
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.bodies import RigidBody
@@ -72,12 +83,12 @@ def _rows(vectors: dict) -> Float[Array, "bodies 3"]:
     return jnp.stack(list(vectors.values()))
 
 
-def potential_energy(scene: Scene, motion: Motion) -> Float[Array, ""]:
-    """V in J at a `motion`: the potentials of the loads and of the scene."""
+def potential_energy(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Float[Array, ""]:
+    """V in J at a `motion`: the potentials of the loads and of the scene. `loads`: those of the scene at this motion, where they are known already."""
     if not isinstance(motion, Motion):
         raise ValueError(f"`motion` is {described(motion)}, expected a motion, such as `jj.motion_at(scene, t, q, u)`")
     V = jnp.zeros_like(motion.t)
-    for load in loads_of(scene, motion):
+    for load in loads_of(scene, motion) if loads is None else loads:
         if load.potential is not None:
             V = V + load.potential
     extra = potential_of(scene, motion.pose())
@@ -86,11 +97,18 @@ def potential_energy(scene: Scene, motion: Motion) -> Float[Array, ""]:
 
 def kinetic_energy(scene: Scene, t, q, u) -> Float[Array, ""]:
     """T = sum m v.v/2 + omega.I omega/2 in J."""
-    q, u = as_coordinates(scene, q), as_speeds(scene, u)
-    from_bodies = inertias(scene, t, q)
-    bodies = motion_at(scene, t, q, u).bodies.values()
-    v, w = jnp.stack([b.velocity for b in bodies]), jnp.stack([b.angular_velocity_body for b in bodies])
-    return 0.5 * (jnp.sum(from_bodies.mass * jnp.sum(v * v, 1)) + jnp.einsum("bi,bij,bj->", w, from_bodies.inertia, w))
+    return _kinetic_energy(motion_at(scene, t, as_coordinates(scene, q), as_speeds(scene, u)))
+
+
+def energies_at(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """T and V in J at a `motion`. `loads`: those of the scene at this motion, where they are known already."""
+    return _kinetic_energy(motion), potential_energy(scene, motion, loads)
+
+
+def _kinetic_energy(motion: Motion) -> Float[Array, ""]:
+    bodies, speeds = inertias_of(motion), velocities_of(motion)
+    v, w = speeds.linear, speeds.angular
+    return 0.5 * (jnp.sum(bodies.mass * jnp.sum(v * v, 1)) + jnp.einsum("bi,bij,bj->", w, bodies.inertia, w))
 
 
 @eager_if_concrete

@@ -56,6 +56,7 @@ class Equations:
     guards: list[int] = field(default_factory=list)  # must stay positive
     power: int = 0  # `rate_of_work`; for scenes that no prescribed pose drives
     events: list[int] = field(default_factory=list)  # values of the stop events
+    energies: list[int] = field(default_factory=list)  # kinetic and potential
     usual: dict[int, int] = field(default_factory=dict)  # inputs that stand for what a node usually is, with that node
 
 
@@ -106,13 +107,13 @@ class AppellOnGraph:
             *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
             qdot = self.graph.substituted(qdot, kinematics.known)
         true_z = {int(self.traced.u[k]): n for k, n in zip(self.dependent, z, strict=True)}
-        events = self.graph.substituted(self.traced.at.events.tolist(), true_z)
+        *events, T, V = self.graph.substituted([*self.traced.at.events.tolist(), *self.traced.at.energies.tolist()], true_z)
         if self.structure.homogeneous:
             (power,) = self.graph.substituted([int(self.traced.at.power)], true_z)
         elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
             power = power if equal(self.identity_probes([power]), self.identity_probes([true_power])).all() else true_power
-        return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots, *sines])), sorted(guards), power, events, usual)
+        return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots, *sines])), sorted(guards), power, events, [T, V], usual)
 
     def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}

@@ -182,10 +182,11 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
     put_back = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
-    groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power], best.events, put_back.q, put_back.u]
+    groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power], best.events, best.energies, put_back.q, put_back.u]
     outputs = graph.with_quotients(_with_equal_calls_once(builder.identity_probes, [n for group in groups for n in group]))
     ends = np.cumsum([len(group) for group in groups])
-    qdot, ydot, z, pivots, guards, power, events, put_q, put_u = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
+    parts = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
+    qdot, ydot, z, pivots, guards, power, events, energies, put_q, put_u = parts
     sizes = {graph.input(f"usual_pivot_{k}", False): n for k, n in enumerate(pivots)}
     stands_for = best.usual | sizes
     names = scene.coordinate_names.entries
@@ -210,6 +211,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         guards=guards,
         power=None if structure.driven else power[0],
         events=events,
+        energies=energies,
         projected_q=put_q,
         projected_u=put_u,
         by_partition=builder.kept is not None and builder.kept.by_partition,

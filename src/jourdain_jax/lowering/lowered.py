@@ -51,6 +51,7 @@ class Lowered:
     guards: tuple[int, ...]  # must stay positive
     power: int | None  # `rate_of_work` (d(T + V)/dt at constant inputs, or that part of it that is integrated); None where poses are driven
     events: tuple[int, ...]  # values of the stop events, sorted by name; none where they have no scalar form
+    energies: tuple[int, ...]  # kinetic and potential
     projected_q: tuple[int, ...]  # coordinates put back onto norms and geometric rows, one step of Gauss-Newton
     projected_u: tuple[int, ...]  # all speeds put back onto the rows; none where dependent speeds are eliminated
     by_partition: bool  # all speeds are in the state, but the accelerations come from privileged ones
@@ -161,21 +162,21 @@ class Lowered:
         state = [*traced.q.tolist(), *(int(traced.u[k]) for k in self.independent)]
         return [*self.fixed, traced.t, *state, *map(int, traced.inputs)]
 
-    def speeds_and_pivot(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds *lanes"], Float[Array, "*lanes"]]:
-        """All speeds, and the smallest pivot relative to its usual size: it changes sign where the elimination does not serve.
+    def observed(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds *lanes"], Float[Array, "*lanes"], Float[Array, "2 *lanes"]]:
+        """All speeds; the smallest pivot relative to its usual size, which changes sign where the elimination does not serve; kinetic and potential energy (J).
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
-        out = run(self.graph, [*self.z, *self.pivots], self._known(fixed, t, q, y, inputs))
+        out = self._stacked([*self.z, *self.energies, *self.pivots], fixed, t, q, y, inputs)
         order = np.argsort([*self.independent, *self.dependent])
-        every = [*y, *out[: len(self.z)]]
-        real = jnp.result_type(*q)
+        real, count = out.dtype, len(self.z)
+        every = [*y, *out[:count]]
         u = jnp.stack([jnp.asarray(every[i], real) for i in order])
         pivot = jnp.ones((), real)
-        for value, size in zip(out[len(self.z) :], self.pivot_sizes(fixed), strict=True):
+        for value, size in zip(out[count + 2 :], self.pivot_sizes(fixed), strict=True):
             ratio = jax.lax.stop_gradient(value) / size
             pivot = jnp.sign(pivot) * jnp.sign(ratio) * jnp.minimum(jnp.abs(pivot), jnp.abs(ratio))
-        return u, pivot
+        return u, pivot, out[count : count + 2]
 
     def projected(self, fixed, t, q: Sequence, y: Sequence, inputs, affine: bool) -> tuple[tuple, tuple]:
         """Coordinates and integrated speeds put back onto the rows; `affine`: rows are, so that one step is exact for the speeds.
@@ -202,7 +203,10 @@ class Lowered:
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
-        out = run(self.graph, self.events, self._known(fixed, t, q, y, inputs))
+        return self._stacked(self.events, fixed, t, q, y, inputs)
+
+    def _stacked(self, nodes: Sequence[int], fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "nodes *lanes"]:
+        out = run(self.graph, nodes, self._known(fixed, t, q, y, inputs))
         return jnp.stack([jnp.broadcast_to(jnp.asarray(c, jnp.result_type(*q)), jnp.shape(q[0])) for c in out])
 
     def _known(self, fixed, t, q, y, inputs) -> dict[int, Float[Array, "*lanes"]]:

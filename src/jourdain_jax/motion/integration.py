@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.diffrax_steps import solved_by_diffrax
+from jourdain_jax.motion.energy_check import energy_lost, observed_with_energies
 from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.solver_choice import marked_inputs, marked_outputs, time_origin
@@ -68,7 +69,7 @@ def _solved(setup: Setup, begun: Begun) -> Solved:
 def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
     t0, field, options, adjoint = setup.t0, setup.field, setup.options, setup.options.adjoint
     start, args = begun.start, begun.args
-    _, scene, inputs, fixed, origin = args
+    _, scene, inputs, _, origin = args
     solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, marked_outputs(adjoint, (solved.ys, solved.y_end)))
     moving = field.projects
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
@@ -80,28 +81,30 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
         y = integrands.project(tau, y, args) if moving and not options.by_own_steps else y
         t = origin + tau
-        q, u = field.unpack(scene, fixed, t, y, inputs(t))
-        work = None if y.work is None else y.work + field.stored(scene, t, q, inputs(t)) - stored_first
-        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (q, u, work)), field.pivot(scene, fixed, t, y, inputs(t))
+        seen, energies = observed_with_energies(setup, args, t, y)
+        work = None if y.work is None else y.work + field.stored(scene, t, seen.q, inputs(t)) - stored_first
+        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (seen.q, seen.u, work, energies)), seen.pivot
 
-    # the end state as one more saved one, so that all this is compiled once
-    end = solved.t_end, solved.y_end, begun.timely
-    with_end = jax.tree.map(lambda saved, last: jnp.concatenate([saved, last[None]]), (solved.ts, solved.ys, valid), end)
-    (q, u, work), pivots = jax.vmap(saved_state)(*with_end)
+    # start and end as two more saved states, so that all this is compiled once
+    start_and_end = (jnp.zeros_like(solved.t_end), begun.y0, begun.timely), (solved.t_end, solved.y_end, begun.timely)
+    all_states = jax.tree.map(lambda saved, first, last: jnp.concatenate([first[None], saved, last[None]]), (solved.ts, solved.ys, valid), *start_and_end)
+    (q, u, work, energies), pivots = jax.vmap(saved_state)(*all_states)
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
+    lost = False if energies is None else energy_lost(energies, work, solved.accepted)
+    code = jnp.where(results.is_success(solved.code) & lost, results.ENERGY_LOST, solved.code)
     return Trajectory(
         scene=setup.scene,
         ts=given.ts if options.saveat is None else origin + solved.ts,
-        q=q[:-1],
-        u=u[:-1],
-        work=None if work is None else work[:-1],
+        q=q[1:-1],
+        u=u[1:-1],
+        work=None if work is None else work[1:-1],
         t_end=jnp.where(begun.timely, jnp.where(solved.t_end == setup.t1 - origin, setup.t1, origin + solved.t_end), given.t0),
         q_end=q[-1],
         u_end=u[-1],
         result=results.with_causes(
-            _result(solved.code, solved.y_end, start, pivot if field.needs_pivot else jnp.inf),
+            _result(code, solved.y_end, start, pivot if field.needs_pivot else jnp.inf),
             parameters=begun.right,
             times=begun.timely,
             start=jnp.all(jnp.isfinite(start.q)) & jnp.all(jnp.isfinite(start.u)),

@@ -25,7 +25,7 @@ from jourdain_jax.calculus.newton import newton_root
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.rows import names_of_position_rows
-from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy
+from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step, Stepped
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
@@ -115,7 +115,7 @@ def _energy(args, t, z, n: int) -> Float[Array, ""]:
     """H = T + V in J."""
     field, scene, inputs, fixed, _ = args
     q, u = field.unpack(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t))
-    return kinetic_energy(scene, t, q, u) + potential_energy(scene, motion_at(scene, t, q, u, inputs(t)))
+    return sum(energies_at(scene, motion_at(scene, t, q, u, inputs(t))))
 
 
 def _fault(scene: Scene, field: VectorField, asked: str) -> str:

@@ -13,7 +13,7 @@ from jourdain_jax.dynamics.reactions import ContactForce, RowReactions, contact_
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import UsualRows, velocity_residual
-from jourdain_jax.equations.virtual_power import kinetic_energy, potential_energy
+from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.motion.marks import with_nan_as_a_mark
@@ -133,7 +133,7 @@ class _Point(eqx.Module):
 
 
 def _energies(scene, t, q, u, inputs):
-    return kinetic_energy(scene, t, q, u), potential_energy(scene, motion_at(scene, t, q, u, inputs))
+    return energies_at(scene, motion_at(scene, t, q, u, inputs))
 
 
 class _Accelerations(eqx.Module):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
+from jourdain_jax.motion.vector_fields.field import Integrated, Observed, VectorField
 from jourdain_jax.scene.scene import Scene
 
 
@@ -41,11 +41,11 @@ class ByProgram(VectorField):
 
     def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
         """Coordinates and all speeds."""
-        return y.q, self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
+        return y.q, self.program.observed(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
 
-    def pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, ""]:
-        """The smallest pivot of the elimination, relative to its usual size."""
-        return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[1]
+    def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
+        """All speeds, the smallest pivot of the elimination relative to its usual size, and energies."""
+        return Observed(y.q, *self.program.observed(fixed, t, tuple(y.q), tuple(y.v), inputs))
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
         """Values of the stop events, sorted by name; lanes only where `lowers_events`."""

@@ -27,6 +27,19 @@ class Integrated(eqx.Module):
     work: Float[Array, "*lanes"] | None
 
 
+class Observed(eqx.Module):
+    """What a vector field says of a state.
+
+    `pivot`: how well the privileged speeds determine the others, with a sign that changes where they do not; for the full state that of its reduction,
+    without a sign, and 1 where it has none.
+    """
+
+    q: Float[Array, "coordinates"]
+    u: Float[Array, "speeds"]  # all
+    pivot: Float[Array, ""]
+    energies: Float[Array, "2"]  # kinetic and potential, J
+
+
 class VectorField(eqx.Module):
     """How a scene's state is packed, unpacked, differentiated in time and projected. All choices are static.
 
@@ -99,11 +112,8 @@ class VectorField(eqx.Module):
         """Coordinates and all speeds."""
 
     @abc.abstractmethod
-    def pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, ""]:
-        """How well the privileged speeds determine the others, with a sign that changes where they do not.
-
-        For the full state those of its reduction, without a sign; 1 where it has none.
-        """
+    def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
+        """What is looked at where a state is saved."""
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
         """Values of the stop events, sorted by name; lanes only where `lowers_events`."""

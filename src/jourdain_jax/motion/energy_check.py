@@ -1,0 +1,47 @@
+"""Whether the energy of a motion changed by more than errors of its steps explain: a result code, inside `jit` and in every lane.
+
+T + V less the work done is constant for a right motion. Step-size control leaves in each number y of the state an error of about `atol + rtol |y|` per
+step. With dE the change of the energy by errors of that size in all numbers together, N steps change the energy by some N dE, and round-off by some N eps
+of it. Over all models, at tolerances from 1e-4 to 1e-11, no drift is larger than half of N dE (`bench/energy_drift.py`); ten times as much, and at least 1 %
+of the energy that moves, means that the motion is not that of the scene: it went through a singular position, or over a feature, without notice.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jourdain_jax.build.structure import structure_of
+from jourdain_jax.dynamics.power import needs_work
+from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
+from jourdain_jax.motion.setup import Setup
+from jourdain_jax.motion.vector_fields.field import Integrated, Observed
+
+MOST_STEP_ERRORS = 10  # times what N steps at their tolerance change
+DRIFTED = 1e-2  # of the energy that moves
+
+
+def has_balance(setup: Setup) -> bool:
+    """Whether T + V less the work is known along a motion, and steps are taken by tolerances."""
+    by_tolerance = setup.options.controller is None and not isinstance(setup.options.solver, FixedStepSolver)
+    return by_tolerance and (setup.field.with_work or not needs_work(setup.scene, structure_of(setup.scene)))
+
+
+def observed_with_energies(setup: Setup, args, t, y: Integrated) -> tuple[Observed, Float[Array, "2 2"] | None]:
+    """What is looked at in a state; T and V (J) there, and where each number is larger by the error that a step may leave in it; None: no balance."""
+    field, scene, inputs, fixed, _ = args
+    if not has_balance(setup):
+        return field.observed(scene, fixed, t, y, inputs(t)), None
+    rtol, atol = setup.options.tolerances
+    off = jax.tree.map(lambda x: x + jnp.where(x < 0, -1.0, 1.0) * (atol + rtol * jnp.abs(x)), jax.lax.stop_gradient(y))
+    both = jax.vmap(lambda y: field.observed(scene, fixed, t, y, inputs(t)))(jax.tree.map(lambda a, b: jnp.stack([a, b]), y, off))
+    return jax.tree.map(lambda x: x[0], both), jax.lax.stop_gradient(both.energies)
+
+
+def energy_lost(energies: Float[Array, "times 2 2"], work: Float[Array, "times"] | None, steps) -> Bool[Array, ""]:
+    """Whether T + V - W changed by more than N `steps` explain; NaN at times that were not reached."""
+    (T, V), off = energies[:, 0].T, energies[:, 1].T
+    balance = T + V if work is None else T + V - work
+    error = jnp.abs(off[0] - T) + jnp.abs(off[1] - V) + jnp.finfo(T.dtype).eps * (T + jnp.abs(V))
+    moved = jnp.nanmax(T) + jnp.nanmax(V) - jnp.nanmin(V)
+    allowed = jnp.fmax(DRIFTED * moved, MOST_STEP_ERRORS * steps * jnp.nanmax(error))
+    return jnp.nanmax(balance) - jnp.nanmin(balance) > allowed
