@@ -162,21 +162,25 @@ class Lowered:
         state = [*traced.q.tolist(), *(int(traced.u[k]) for k in self.independent)]
         return [*self.fixed, traced.t, *state, *map(int, traced.inputs)]
 
-    def observed(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds *lanes"], Float[Array, "*lanes"], Float[Array, "2 *lanes"]]:
-        """All speeds; the smallest pivot relative to its usual size, which changes sign where the elimination does not serve; kinetic and potential energy (J).
+    def speeds_and_pivot(self, fixed, t, q: Sequence, y: Sequence, inputs) -> tuple[Float[Array, "speeds *lanes"], Float[Array, "*lanes"]]:
+        """All speeds, and the smallest pivot relative to its usual size: it changes sign where the elimination does not serve.
 
         `fixed`, `q`, `y`, `inputs`: as in `rates`.
         """
-        out = self._stacked([*self.z, *self.energies, *self.pivots], fixed, t, q, y, inputs)
+        out = self._stacked([*self.z, *self.pivots], fixed, t, q, y, inputs)
         order = np.argsort([*self.independent, *self.dependent])
-        real, count = out.dtype, len(self.z)
+        real, count = jnp.result_type(*q), len(self.z)
         every = [*y, *out[:count]]
         u = jnp.stack([jnp.asarray(every[i], real) for i in order])
         pivot = jnp.ones((), real)
-        for value, size in zip(out[count + 2 :], self.pivot_sizes(fixed), strict=True):
+        for value, size in zip(out[count:], self.pivot_sizes(fixed), strict=True):
             ratio = jax.lax.stop_gradient(value) / size
             pivot = jnp.sign(pivot) * jnp.sign(ratio) * jnp.minimum(jnp.abs(pivot), jnp.abs(ratio))
-        return u, pivot, out[count : count + 2]
+        return u, pivot
+
+    def energy_values(self, fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "2 *lanes"]:
+        """Kinetic and potential energy, J: numbers to differentiation. `fixed`, `q`, `y`, `inputs`: as in `rates`."""
+        return self._stacked(self.energies, *jax.lax.stop_gradient((fixed, t, q, y, inputs)))
 
     def projected(self, fixed, t, q: Sequence, y: Sequence, inputs, affine: bool) -> tuple[tuple, tuple]:
         """Coordinates and integrated speeds put back onto the rows; `affine`: rows are, so that one step is exact for the speeds.
@@ -206,8 +210,8 @@ class Lowered:
         return self._stacked(self.events, fixed, t, q, y, inputs)
 
     def _stacked(self, nodes: Sequence[int], fixed, t, q: Sequence, y: Sequence, inputs) -> Float[Array, "nodes *lanes"]:
-        out = run(self.graph, nodes, self._known(fixed, t, q, y, inputs))
-        return jnp.stack([jnp.broadcast_to(jnp.asarray(c, jnp.result_type(*q)), jnp.shape(q[0])) for c in out])
+        out, like = run(self.graph, nodes, self._known(fixed, t, q, y, inputs)), q[0]
+        return jnp.stack([jnp.broadcast_to(jnp.asarray(c, like.dtype), jnp.shape(like)) for c in out]) if nodes else jnp.zeros((0, *like.shape), like.dtype)
 
     def _known(self, fixed, t, q, y, inputs) -> dict[int, Float[Array, "*lanes"]]:
         shapes = self._fixed_shapes

@@ -14,7 +14,7 @@ from jourdain_jax.build.structure import structure_of
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
 from jourdain_jax.motion.setup import Setup
-from jourdain_jax.motion.vector_fields.field import Integrated, Observed
+from jourdain_jax.motion.vector_fields.field import Integrated
 
 MOST_STEP_ERRORS = 10  # times what N steps at their tolerance change
 DRIFTED = 1e-2  # of the energy that moves
@@ -26,15 +26,13 @@ def has_balance(setup: Setup) -> bool:
     return by_tolerance and (setup.field.with_work or not needs_work(setup.scene, structure_of(setup.scene)))
 
 
-def observed_with_energies(setup: Setup, args, t, y: Integrated) -> tuple[Observed, Float[Array, "2 2"] | None]:
-    """What is looked at in a state; T and V (J) there, and where each number is larger by the error that a step may leave in it; None: no balance."""
+def energies_near(setup: Setup, args, t, y: Integrated) -> Float[Array, "2 2"]:
+    """T and V (J) at a state, and both where each number is larger by the error that a step may leave in it."""
     field, scene, inputs, fixed, _ = args
-    if not has_balance(setup):
-        return field.observed(scene, fixed, t, y, inputs(t)), None
     rtol, atol = setup.options.tolerances
-    off = jax.tree.map(lambda x: x + jnp.where(x < 0, -1.0, 1.0) * (atol + rtol * jnp.abs(x)), jax.lax.stop_gradient(y))
-    both = jax.vmap(lambda y: field.observed(scene, fixed, t, y, inputs(t)))(jax.tree.map(lambda a, b: jnp.stack([a, b]), y, off))
-    return jax.tree.map(lambda x: x[0], both), jax.lax.stop_gradient(both.energies)
+    off = jax.tree.map(lambda x: x + jnp.where(x < 0, -1.0, 1.0) * (atol + rtol * jnp.abs(x)), y)
+    both = jax.tree.map(lambda a, b: jnp.stack([a, b]), *jax.lax.stop_gradient((y, off)))
+    return jax.vmap(lambda y: field.energies(scene, fixed, t, y, inputs(t)))(both)
 
 
 def energy_lost(energies: Float[Array, "times 2 2"], work: Float[Array, "times"] | None, steps) -> Bool[Array, ""]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.diffrax_steps import solved_by_diffrax
-from jourdain_jax.motion.energy_check import energy_lost, observed_with_energies
+from jourdain_jax.motion.energy_check import energies_near, energy_lost, has_balance
 from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.solver_choice import marked_inputs, marked_outputs, time_origin
@@ -69,9 +69,9 @@ def _solved(setup: Setup, begun: Begun) -> Solved:
 def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
     t0, field, options, adjoint = setup.t0, setup.field, setup.options, setup.options.adjoint
     start, args = begun.start, begun.args
-    _, scene, inputs, _, origin = args
+    _, scene, inputs, fixed, origin = args
     solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, marked_outputs(adjoint, (solved.ys, solved.y_end)))
-    moving = field.projects
+    moving, balanced = field.projects, has_balance(setup)
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
     direction = jnp.sign(setup.t1 - t0)
     valid = solved.reached & (solved.ts * direction <= solved.t_end * direction) & begun.timely
@@ -81,7 +81,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
         y = integrands.project(tau, y, args) if moving and not options.by_own_steps else y
         t = origin + tau
-        seen, energies = observed_with_energies(setup, args, t, y)
+        seen, energies = field.observed(scene, fixed, t, y, inputs(t)), energies_near(setup, args, t, y) if balanced else None
         work = None if y.work is None else y.work + field.stored(scene, t, seen.q, inputs(t)) - stored_first
         return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (seen.q, seen.u, work, energies)), seen.pivot
 
@@ -92,7 +92,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
-    lost = False if energies is None else energy_lost(energies, work, solved.accepted)
+    lost = energy_lost(energies, jax.lax.stop_gradient(work), solved.accepted) if balanced else False
     code = jnp.where(results.is_success(solved.code) & lost, results.ENERGY_LOST, solved.code)
     return Trajectory(
         scene=setup.scene,

@@ -15,7 +15,6 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics, speeds_and_pivot, speeds_from_privileged
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Privileged
-from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.motion.vector_fields.field import Integrated, Observed, VectorField
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
@@ -67,7 +66,7 @@ class Minimal(ByMatrices):
     def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
         """With the sign of det A_z in the pivot."""
         u, pivot = speeds_and_pivot(scene, self.independent, t, y.q, y.v, inputs)
-        return Observed(y.q, u, pivot, _energies(scene, t, y.q, u, inputs))
+        return Observed(y.q, u, pivot)
 
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots"]]:
         """As `rates`, and the sign of det A_z."""
@@ -109,7 +108,7 @@ class Full(ByMatrices):
         """With the pivot of the reduction, without a sign; 1 where it has none."""
         partitioned = isinstance(self.reduction, Privileged | GibbsAppell)
         pivot = bare_accelerations(scene, t, y.q, y.v, inputs, reduction=self.reduction).pivot if partitioned else jnp.ones(())
-        return Observed(y.q, y.v, pivot, _energies(scene, t, y.q, y.v, inputs))
+        return Observed(y.q, y.v, pivot)
 
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots"]]:
         """As `rates`; and 1 where the rows say on which branch the motion goes on, -1 where round-off does."""
@@ -118,10 +117,6 @@ class Full(ByMatrices):
         if not self.may_branch:
             return rates, jnp.zeros(0, y.q.dtype)
         return rates, jnp.where(found.pivot > undecided(found.pivot.dtype), 1.0, -1.0).astype(found.pivot.dtype)[None]
-
-
-def _energies(scene: Scene, t, q, u, inputs) -> Float[Array, "2"]:
-    return jnp.stack(energies_at(scene, motion_at(scene, t, q, u, inputs)))
 
 
 def full_without_projection(field: VectorField, scene: Scene, own_equations: str) -> Full:

@@ -41,11 +41,15 @@ class ByProgram(VectorField):
 
     def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
         """Coordinates and all speeds."""
-        return y.q, self.program.observed(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
+        return y.q, self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
 
     def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
-        """All speeds, the smallest pivot of the elimination relative to its usual size, and energies."""
-        return Observed(y.q, *self.program.observed(fixed, t, tuple(y.q), tuple(y.v), inputs))
+        """All speeds, and the smallest pivot of the elimination relative to its usual size."""
+        return Observed(y.q, *self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs))
+
+    def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
+        """Kinetic and potential energy, J; numbers to differentiation."""
+        return self.program.energy_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
         """Values of the stop events, sorted by name; lanes only where `lowers_events`."""

@@ -9,12 +9,14 @@ Where some force or row does work that no potential accounts for, that work is i
 import abc
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.explicit_power import stored_by_inputs
 from jourdain_jax.build.trace import event_values
 from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.scene.scene import Scene
 
@@ -37,7 +39,6 @@ class Observed(eqx.Module):
     q: Float[Array, "coordinates"]
     u: Float[Array, "speeds"]  # all
     pivot: Float[Array, ""]
-    energies: Float[Array, "2"]  # kinetic and potential, J
 
 
 class VectorField(eqx.Module):
@@ -118,6 +119,11 @@ class VectorField(eqx.Module):
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
         """Values of the stop events, sorted by name; lanes only where `lowers_events`."""
         return event_values(scene, motion_at(scene, t, *self.unpack(scene, fixed, t, y, inputs), inputs))
+
+    def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
+        """Kinetic and potential energy, J; numbers to differentiation."""
+        scene, fixed, t, y, inputs = jax.lax.stop_gradient((scene, fixed, t, y, inputs))
+        return jnp.stack(energies_at(scene, motion_at(scene, t, *self.unpack(scene, fixed, t, y, inputs), inputs)))
 
     def rates(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
         """Time derivative of the integrated state."""
