@@ -26,5 +26,5 @@ def test_all_code_of_the_readme_runs(tmp_path, monkeypatch, capsys):
     plt.close("all")
     printed = capsys.readouterr().out
     assert "reached the end of its span" in printed
-    assert "Verification of ChaplyginSleigh: passed" in printed
+    assert "Verification of Sleigh: passed" in printed
     assert (tmp_path / "disc.png").stat().st_size > 5000

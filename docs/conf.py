@@ -1,0 +1,52 @@
+"""How the documentation is built: `python -m sphinx -W -b html docs docs/_build/html`. Nothing is fetched while it is built or read."""
+
+import shutil
+import sys
+from importlib.metadata import version as installed
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE))  # for `sphinx_parts`
+
+project = "jourdain-jax"
+author = "The jourdain-jax developers"
+copyright = author
+version = release = installed("jourdain-jax")
+
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx_design", "sphinx_parts.docstrings", "sphinx_parts.mathml"]
+exclude_patterns = ["_build", "gallery/scenes", "README.md", "**.ipynb_checkpoints"]
+myst_enable_extensions = ["colon_fence", "dollarmath", "deflist"]
+myst_heading_anchors = 3
+suppress_warnings = ["mystnb.unknown_mime_type"]
+default_role = "literal"  # docstrings quote code with single backticks
+
+# The tutorials in Markdown run when the site is built; the notebooks hold what their own runs printed.
+nb_execution_mode = "cache"
+nb_execution_cache_path = str(HERE / "_build" / ".jupyter_cache")
+nb_execution_timeout = 240
+nb_execution_raise_on_error = True
+nb_execution_excludepatterns = ["tutorials/notebooks/*"]
+nb_merge_streams = True
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # signatures show the types; shapes stand in the text
+autodoc_preserve_defaults = True
+
+html_theme = "furo"
+html_title = "jourdain-jax"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_sphinx = False
+pygments_style = "friendly"
+
+
+def _notebooks_in_place() -> None:
+    """The executed notebooks of the repository as pages."""
+    target = HERE / "tutorials" / "notebooks"
+    target.mkdir(exist_ok=True)
+    for notebook in sorted((HERE.parent / "notebooks").glob("*.ipynb")):
+        shutil.copyfile(notebook, target / notebook.name)
+
+
+_notebooks_in_place()

@@ -1,0 +1,53 @@
+"""The documentation names what is there: public names, pages, files; and reads docstrings as they are meant."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+import jourdain_jax as jj
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(page for page in DOCS.rglob("*.md") if not {"_build", "pages", "notebooks"} & set(page.relative_to(DOCS).parts))
+WRITTEN_BY_THE_BUILD = ("gallery/pages/", "tutorials/notebooks/", "notebooks/")
+
+
+def test_every_public_name_stands_once_in_the_reference():
+    named = [name for page in (DOCS / "reference").glob("*.md") for name in re.findall(r"auto\w+:: jourdain_jax\.(\w+)$", page.read_text(), re.MULTILINE)]
+    assert sorted(named) == sorted(set(jj.__all__) - {"models"})
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_to_pages_that_exist(page):
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
+        if target.startswith(("http", "mailto")) or any(target.removeprefix("../").startswith(part) for part in WRITTEN_BY_THE_BUILD):
+            continue
+        found = page.parent / target
+        assert found.exists() or found.with_suffix(".md").exists(), f"{page.name}: {target}"
+
+
+def test_files_that_the_theory_names_exist():
+    text = (DOCS / "theory.md").read_text(encoding="utf-8")
+    for name in re.findall(r"`([\w/]+\.py)`", text):
+        assert (ROOT / "src" / "jourdain_jax" / name).exists(), name
+
+
+def test_the_readme_has_at_most_nine_hundred_words():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900
+
+
+def _docstrings():
+    path = DOCS / "sphinx_parts" / "docstrings.py"
+    spec = importlib.util.spec_from_file_location("docstrings", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_docstrings_are_read_as_they_are_meant():
+    lines = ["Shape (times, *lanes), |x| of `a *b`.", "", "    x = 1", "", "    y = 2", "", "**Items**", "- `t`: **s**", "  and on", "- u"]
+    expected = ["Shape (times, \\*lanes), \\|x\\| of `a *b`.", "", "::", "", *lines[2:7], "", *lines[7:]]
+    assert _docstrings().as_rest(lines) == expected
