@@ -1,30 +1,34 @@
 """A ball on a plate that tilts about two axes through the middle of its top: the classic of control laboratories.
 
-About the middle, s'' = 5/7 (g/r) a and J a'' = m g r (s - a) + torque, with the tilt a and the ball's absolute angle of rolling s: a ball
-left alone runs off. Source: linear equations by Lagrange's method; S. Awtar et al., Mechatronics 12 (2002) 217 describes the apparatus.
+About the middle, s'' = 5/7 (g/r) a and J a'' = m g r (s - a) + torque, with the tilt a and the ball's absolute angle of rolling s: left alone,
+a ball runs off. Motors therefore tilt the plate against the place and the velocity of the ball. Source: linear equations by Lagrange's method; S. Awtar et al., Mechatronics 12 (2002) 217 describes the apparatus.
 """
 
 import jax.numpy as jnp
 
 import jourdain_jax as jj
 
-LOOK = "Two torques in quadrature lead the ball along a spiral; nothing holds it, and at last it runs down the tilting plate."
+LOOK = "The plate tilts so that the ball follows a point on a circle, with a lag. With all four gains zero it runs off."
 
 
 class BallOnPlate(jj.Scene):
-    """x, y of the contact on the plate; `roll` and `pitch` of the plate; attitude of the ball. Inputs: torques on the plate (N m)."""
+    """x, y of the contact on the plate; `roll` and `pitch` of the plate; attitude of the ball. Inputs: the place where the ball is wanted (m)."""
 
     ball_mass: object = jj.parameter(0.3, unit="kg", positive=True)
     radius: object = jj.parameter(0.03, unit="m", positive=True)
     plate_inertia: object = jj.parameter((0.05, 0.05, 0.1), unit="kg m^2", positive=True)
+    stiffness: object = jj.parameter(20.0, unit="N m", about="of the motors about the tilt that is wanted")
+    damping: object = jj.parameter(1.6, unit="N m s", about="of the motors")
+    place_gain: object = jj.parameter(0.9, unit="rad/m", about="tilt for each metre that the ball is away")
+    rate_gain: object = jj.parameter(0.5, unit="rad s/m", about="tilt for each m/s of the ball")
     gravity: object = jj.parameter(9.81, unit="m/s^2")
 
     coordinates = jj.coordinates("x y roll pitch", jj.quaternion("attitude"))
-    inputs = jj.inputs("roll_torque pitch_torque")
+    inputs = jj.inputs("wanted_x wanted_y")
     domain = {"x": (-0.2, 0.2), "y": (-0.2, 0.2), "roll": (-0.4, 0.4), "pitch": (-0.4, 0.4)}
     conventions = "z up; x, y along the plate; positive pitch lowers the side of x, positive roll raises the side of y."
-    example = {"x": 0.06, "y_rate": 0.15}
-    example_span = 1.2
+    example = {"x": 0.12}
+    example_span = 4.0
 
     def bodies(self, t, q):
         plate = jj.rot_x(q.roll) @ jj.rot_y(q.pitch)
@@ -36,8 +40,12 @@ class BallOnPlate(jj.Scene):
         }
 
     def loads(self, motion):
-        torques = jj.generalized_force(motion, roll_rate=motion.inputs.roll_torque, pitch_rate=motion.inputs.pitch_torque)
-        return jj.gravity(motion, self.gravity), torques
+        q, u, wanted = motion.q, motion.u, motion.inputs
+        pitch = self.place_gain * (wanted.wanted_x - q.x) - self.rate_gain * u.x_rate
+        roll = self.rate_gain * u.y_rate - self.place_gain * (wanted.wanted_y - q.y)
+        about_x = self.stiffness * (roll - q.roll) - self.damping * u.roll_rate
+        about_y = self.stiffness * (pitch - q.pitch) - self.damping * u.pitch_rate
+        return jj.gravity(motion, self.gravity), jj.generalized_force(motion, roll_rate=about_x, pitch_rate=about_y)
 
     def velocity_constraints(self, motion):
         ball, plate = motion["ball"], motion["plate"]

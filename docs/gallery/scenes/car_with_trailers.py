@@ -39,7 +39,7 @@ class CarWithTrailers(jj.Scene):
     def bodies(self, t, q):
         car, axle = jj.rot_z(q.heading), jnp.stack([q.x, q.y, 0.0 * q.x])
         middle = axle + 0.5 * self.wheelbase * car[:, 0]
-        made = {"car": jj.RigidBody.box(self.car_mass, (3.6, 1.3, 0.8), position=middle, orientation=car)}
+        made = {"car": jj.RigidBody.box(self.car_mass, (3.6, 1.0, 0.8), position=middle, orientation=car)}
         for name, side in (("left", 0.5), ("right", -0.5)):
             # tan(angle) = wheelbase / (R - side track) with R = wheelbase / tan(steer)
             angle = jnp.arctan(self.wheelbase * jnp.tan(q.steer) / (self.wheelbase - side * self.track * jnp.tan(q.steer)))
@@ -48,7 +48,7 @@ class CarWithTrailers(jj.Scene):
         for i in range(self.trailers):
             turned = jj.rot_z(q[f"trailer{i + 1}"])
             axle = axle - self.length * turned[:, 0]
-            made[f"trailer {i + 1}"] = jj.RigidBody.box(self.trailer_mass, (2.6, 1.3, 0.8), position=axle, orientation=turned)
+            made[f"trailer {i + 1}"] = jj.RigidBody.box(self.trailer_mass, (2.4, 1.2, 0.8), position=axle, orientation=turned)
         return made
 
     def loads(self, motion):

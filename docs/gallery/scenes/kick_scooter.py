@@ -4,6 +4,8 @@ Straight and upright, a push F gives F / (m + I_R/r_R^2 + I_F/r_F^2). The wheels
 Source of the equations: J. P. Meijaard et al., Proc. R. Soc. A 463 (2007) 1955; the numbers are those of an adult's scooter, estimated.
 """
 
+import jax.numpy as jnp
+
 import jourdain_jax as jj
 
 LOOK = "Left alone after two kicks it falls slowly over to one side and turns into the fall: a scooter of this kind has no stable range of speeds."
@@ -42,6 +44,13 @@ class KickScooter(jj.models.WhippleBicycle):
     example = {"rear_spin_rate": 30.0, "lean_rate": 0.02}
     example_span = 1.6
 
+    def bodies(self, t, q):
+        made = super().bodies(t, q)
+        for name, outline in (("rear frame", RIDER), ("front frame", FORK)):
+            body = made[name]
+            made[name] = jj.RigidBody(body.mass, body.inertia, body.position, body.orientation, outline)
+        return made
+
     def loads(self, motion):
         deck = motion["rear frame"]
         foot = deck.point((-self.xB, 0.0, self.zB + self.rR))  # behind the rider, at the height of the rear axle
@@ -50,3 +59,10 @@ class KickScooter(jj.models.WhippleBicycle):
     def effective_mass(self):
         """What a push has to move when the scooter runs straight: all masses and the turning of the wheels (kg)."""
         return self.mR + self.mB + self.mH + self.mF + self.IRyy / self.rR**2 + self.IFyy / self.rF**2
+
+
+# for drawing only, m: hub, deck, leg, trunk, head, arm; and the fork with its handlebar
+RIDER = jnp.array(
+    [[-0.35, 0, -0.85], [-0.2, 0, -0.87], [0.45, 0, -0.8], [0.0, 0, -0.85], [0.0, 0, 0.05], [0.08, 0, 0.45], [0.08, 0, 0.65], [0.08, 0, 0.4], [0.34, 0, 0.0]]
+)
+FORK = jnp.array([[0.1, 0, -0.45], [-0.07, 0, 0.4], [-0.07, 0.22, 0.4], [-0.07, -0.22, 0.4]])

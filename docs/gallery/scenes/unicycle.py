@@ -37,7 +37,7 @@ class Unicycle(jj.Scene):
         hub, rider = jnp.stack([q.x, q.y, 0.0 * q.x]) + self.radius * frame[:, 2], frame @ jj.rot_y(q.pitch)
         rim = self.wheel_mass * self.radius**2
         spun = frame @ jj.rot_y(q.spin)
-        outline = self.height * jnp.array([[0.0, 0.0, -1.0], [0.0, 0.0, 0.6]])
+        outline = self.height * jnp.array([[0, 0, -1], [0, 0, 0.4], [0, -0.5, 0.1], [0, 0, 0.4], [0, 0.5, 0.1], [0, 0, 0.4], [0, 0, 0.8]])
         return {
             "wheel": jj.RigidBody.thin_disc(self.wheel_mass, self.radius, axis="y", position=hub, orientation=spun, axial=rim, diametral=rim / 2),
             "rider": jj.RigidBody(self.rider_mass, self.rider_inertia, hub + self.height * rider[:, 2], rider, outline),

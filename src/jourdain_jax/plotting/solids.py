@@ -19,26 +19,30 @@ class Face:
     dark: float = 0.0
 
 
-def solid_of(outline: np.ndarray, thickness: float) -> list[Face]:
-    """Faces of the body with this outline (points, 3) in m, body frame; a dot without one. `thickness` in m: of bars, half of it for plates."""
+Part = list[Face]  # the faces of one convex piece, or nearly so: what lies before it hides it, and the other way round
+
+
+def solid_of(outline: np.ndarray, thickness: float) -> list[Part]:
+    """Parts of the body with this outline (points, 3) in m, body frame; a dot without one. `thickness` in m: of bars, half of it for plates."""
     points = np.asarray(outline, float)
     if len(points) < 2 or np.ptp(points, axis=0).max() == 0.0:
-        return _ball(0.9 * thickness)
+        return [_ball(0.9 * thickness)]
     lengths = np.linalg.norm(points, axis=1)
     size = lengths.max()
     rank = np.linalg.matrix_rank(points - points.mean(axis=0), tol=_ROUND * size)
     if rank == 3 and np.ptp(lengths) < _ROUND * size and len(points) > 20:
-        return _ball(size)
+        return [_ball(size)]
     if rank == 2 and len(points) > 20 and np.ptp(lengths[:40]) < _ROUND * size:
-        return _wheel(points[:40], 0.07 * size)
+        return [_wheel(points[:40], 0.1 * size)]
     if rank == 3 and lengths.min() > _ROUND * size:
-        return _hull(points)
+        return [_hull(points)]
     if rank == 2 and np.linalg.norm(points[-1] - points[0]) < _ROUND * size and lengths.min() > _ROUND * size:
-        return _plate(points[:-1], 0.25 * thickness)
-    return [face for a, b in zip(points[:-1], points[1:], strict=True) if np.linalg.norm(b - a) > _ROUND * size for face in _bar(a, b, thickness / 2)]
+        return [_plate(points[:-1], 0.25 * thickness)]
+    ends = zip(points[:-1], points[1:], strict=True)
+    return [part for a, b in ends if np.linalg.norm(b - a) > _ROUND * size for part in bar(a, b, thickness / 2)]
 
 
-def _ball(radius: float) -> list[Face]:
+def _ball(radius: float) -> Part:
     """A ball, its octants painted in turn, so that one sees it roll."""
     across, around = np.linspace(0, np.pi, 13), np.linspace(0, 2 * np.pi, 25)
     faces = []
@@ -50,7 +54,7 @@ def _ball(radius: float) -> list[Face]:
     return faces
 
 
-def _wheel(circle: np.ndarray, half: float) -> list[Face]:
+def _wheel(circle: np.ndarray, half: float) -> Part:
     """A disc of some width, its quarters painted in turn, so that one sees it turn."""
     normal = np.cross(circle[0], circle[10])
     normal *= half / np.linalg.norm(normal)
@@ -63,15 +67,15 @@ def _wheel(circle: np.ndarray, half: float) -> list[Face]:
     return faces
 
 
-def _plate(rim: np.ndarray, half: float) -> list[Face]:
+def _plate(rim: np.ndarray, half: float) -> Part:
     normal = np.sum(np.cross(rim, np.roll(rim, -1, axis=0)), axis=0)
     normal *= half / np.linalg.norm(normal)
     sides = [Face(np.array([a - normal, b - normal, b + normal, a + normal])) for a, b in zip(rim, np.roll(rim, -1, axis=0), strict=True)]
     return [Face(rim + normal), Face(rim[::-1] - normal), *sides]
 
 
-def _bar(a: np.ndarray, b: np.ndarray, radius: float) -> list[Face]:
-    """A bar of round section in pieces, so that nearer things hide no more than what is behind them."""
+def bar(a: np.ndarray, b: np.ndarray, radius: float) -> list[Part]:
+    """A bar of round section from `a` to `b` (m) in pieces, so that nearer things hide no more than what is behind them."""
     along = (b - a) / np.linalg.norm(b - a)
     side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
     side /= np.linalg.norm(side)
@@ -79,11 +83,14 @@ def _bar(a: np.ndarray, b: np.ndarray, radius: float) -> list[Face]:
     ring = radius * (np.cos(angle) * side + np.sin(angle) * np.cross(along, side))
     pieces = int(np.clip(np.linalg.norm(b - a) / (4 * radius), 1, 12))
     ends = [a + (b - a) * k / pieces for k in range(pieces + 1)]
-    faces = [Face(np.array([p + r, p + s, q + s, q + r])) for p, q in zip(ends[:-1], ends[1:], strict=True) for r, s in zip(ring[:-1], ring[1:], strict=True)]
-    return [*faces, Face(a + ring[:0:-1]), Face(b + ring[1:])]
+    parts = []
+    for p, q in zip(ends[:-1], ends[1:], strict=True):
+        sides = [Face(np.array([p + r, p + s, q + s, q + r])) for r, s in zip(ring[:-1], ring[1:], strict=True)]
+        parts.append([*sides, Face(p + ring[:0:-1]), Face(q + ring[1:])])
+    return parts
 
 
-def _hull(points: np.ndarray) -> list[Face]:
+def _hull(points: np.ndarray) -> Part:
     """Faces of the convex hull; triangles in one plane make one face."""
     from scipy.spatial import ConvexHull
 
