@@ -82,13 +82,13 @@ SCENE_PICTURES = {
     "roller_racer": Picture(
         title="Roller racer",
         view='"above"',
-        start="handlebar=-0.5",
+        start="",
         span="6.0",
         paths='[("seat", (0, 0, 0))]',
-        inputs='{"swing": lambda t: 2.4 * jnp.cos(6.0 * t)}',
+        inputs='{"wanted": lambda t: 0.7 * jnp.sin(5.0 * t)}',
     ),
     "two_wheeled_pendulum": Picture(
-        title="Two-wheeled inverted pendulum", span="4.0", start="pitch=0.0", inputs='{"speed": 1.0, "turn": lambda t: 0.8 * jnp.sin(1.5 * t)}'
+        title="Two-wheeled inverted pendulum", span="4.0", start="pitch=0.0", inputs='{"speed": 1.0, "turn": lambda t: 0.5 * jnp.sin(2.0 * t)}'
     ),
     "satellite": Picture(
         title="Satellite with reaction wheels",
@@ -97,11 +97,11 @@ SCENE_PICTURES = {
         start="",
         span="2.0",
         paths='[("bus", (0.3, 0.25, 0.2))]',
-        inputs='{"torque_x": lambda t: 1.0 * (1.0 - t), "torque_y": 0.3, "torque_z": lambda t: 0.5 * jnp.sin(t)}',
+        inputs='{"torque_x": lambda t: 1.0 * (t - 1.0), "torque_y": 0.3, "torque_z": lambda t: 0.5 * jnp.sin(t)}',
     ),
 }
 AXLE = Picture(
-    "Both methods of the paper roll alike: heading and axle turn evenly, and it drifts across the slope (x points downhill) instead of running away.",
+    "All methods of the paper agree: heading and axle turn evenly, and it drifts across the slope (x points downhill) instead of running away.",
     view='"above"',
     at="4",
     span="5.0",
@@ -119,9 +119,11 @@ MODEL_PICTURES = {
     "skate": Picture("Set turning, it drifts across the slope (x points downhill) and comes back up, in cycloids.", view='"above"', at="6", span="5.0"),
     "chaplygin-sleigh": Picture("It starts backwards, turns over, and runs off straight with the blade behind.", view='"above"', at="6"),
     "vertical-disc": Picture("Both rates stay what they are: the path is a circle.", at="3", start="heading_rate=0.5, roll_rate=2.0", span="5.0"),
-    "tilting-disc": Picture("It rolls along loops while its lean and its turning swing about a steady motion.", at="3", span="3.0"),
-    "tilting-disc-quaternion": Picture("The same disc with its attitude as a quaternion, which also serves where it lies flat.", at="3", span="3.0"),
-    "rosenberg-particle": Picture("No force acts, and yet the row bends the path: y grows evenly, x ever more slowly.", at="4"),
+    "tilting-disc": Picture("It rolls along loops while its lean and its turning swing about a steady motion.", at="(0.0, 0.9, 1.8)", span="2.4"),
+    "tilting-disc-quaternion": Picture(
+        "The same disc with its attitude as a quaternion, which also serves where it lies flat.", at="(0.0, 0.9, 1.8)", span="2.4"
+    ),
+    "rosenberg-particle": Picture("No force acts, and yet the row bends the path: y grows evenly, and x slows down as y moves away from zero.", at="4"),
     "heisenberg-particle": Picture(
         "Rows on the velocities need not bend a path: this one is a straight line, where a vakonomic reading gives a helix.", at="4", span="4.0"
     ),

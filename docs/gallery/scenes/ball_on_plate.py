@@ -1,7 +1,8 @@
 """A ball on a plate that tilts about two axes through the middle of its top: the classic of control laboratories.
 
-About the middle, s'' = 5/7 (g/r) a and J a'' = m g r (s - a) + torque, with the tilt a and the ball's absolute angle of rolling s: left alone,
-a ball runs off. Motors therefore tilt the plate against the place and the velocity of the ball. Source: linear equations by Lagrange's method; S. Awtar et al., Mechatronics 12 (2002) 217 describes the apparatus.
+About the middle, s'' = 5/7 (g/r) a and J a'' = m g r (s - a) + torque, with the tilt a and the ball's absolute angle of rolling s: left
+alone, a ball runs off. Motors therefore tilt the plate against the place and the velocity of the ball.
+Source: linear equations by Lagrange's method; S. Awtar et al., Mechatronics 12 (2002) 217 describes the apparatus.
 """
 
 import jax.numpy as jnp

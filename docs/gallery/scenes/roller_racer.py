@@ -8,11 +8,11 @@ import jax.numpy as jnp
 
 import jourdain_jax as jj
 
-LOOK = "No wheel is driven: the torque in the pivot alone, to and fro, sets it going along a wavy line."
+LOOK = "No wheel is driven: arms that swing the handlebar to and fro set it going along a wavy line."
 
 
 class RollerRacer(jj.Scene):
-    """x, y of the seat's axle, heading; angle of the handlebar from the seat. Input: `swing`, a torque in the pivot (N m)."""
+    """x, y of the seat's axle, heading; angle of the handlebar from the seat. Input: `wanted`, the angle at which the arms hold the handlebar (rad)."""
 
     seat_mass: object = jj.parameter(20.0, unit="kg", positive=True)
     seat_inertia: object = jj.parameter(1.5, unit="kg m^2", positive=True)
@@ -20,9 +20,11 @@ class RollerRacer(jj.Scene):
     bar_inertia: object = jj.parameter(0.05, unit="kg m^2", positive=True)
     ahead: object = jj.parameter(0.6, unit="m", positive=True, about="a, from the seat's axle forward to the pivot")
     behind: object = jj.parameter(0.1, unit="m", positive=True, about="b, from the pivot back to the handlebar's axle")
+    stiffness: object = jj.parameter(60.0, unit="N m", non_negative=True, about="of the arms")
+    damping: object = jj.parameter(3.0, unit="N m s", non_negative=True, about="of the arms")
 
     coordinates = jj.coordinates("x y heading handlebar")
-    inputs = jj.inputs("swing")
+    inputs = jj.inputs("wanted")
     domain = {"heading": (-3.2, 3.2), "handlebar": (-1.0, 1.0)}
     conventions = "z up; angles positive counterclockwise seen from above; the handlebar's axle trails the pivot."
     example = {"x_rate": 1.0, "handlebar": 0.5}
@@ -38,7 +40,8 @@ class RollerRacer(jj.Scene):
         }
 
     def loads(self, motion):
-        return (jj.generalized_force(motion, handlebar_rate=motion.inputs.swing),)
+        torque = self.stiffness * (motion.inputs.wanted - motion.q.handlebar) - self.damping * motion.u.handlebar_rate
+        return (jj.generalized_force(motion, handlebar_rate=torque),)
 
     def velocity_constraints(self, motion):
         return {name: jj.knife_edge(motion[name], motion[name].position, motion[name].orientation[:, 1]) for name in ("seat", "handlebar")}

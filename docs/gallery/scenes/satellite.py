@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 import jourdain_jax as jj
 
-LOOK = "The wheels are driven one after another; the satellite turns against them, and its total angular momentum stays zero."
+LOOK = "The wheels are driven from rest; the satellite turns against them, and its total angular momentum stays zero."
 
 
 class Satellite(jj.Scene):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 import jourdain_jax as jj
 
-LOOK = "The rear wheels turn at different rates, by a tenth of the track: what a differential is for. The outer one carries more in a turn."
+LOOK = "The rear wheels turn at different rates, which is what a differential is for; the outer one carries more than the inner one."
 
 
 class Tricycle(jj.Scene):

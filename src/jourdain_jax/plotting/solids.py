@@ -5,6 +5,7 @@ a line through the mass centre or an open one is a bar along it; other points in
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -37,8 +38,8 @@ def solid_of(outline: np.ndarray, thickness: float) -> list[Part]:
     if rank == 3 and lengths.min() > _ROUND * size:
         return [_hull(points)]
     if rank == 2 and np.linalg.norm(points[-1] - points[0]) < _ROUND * size and lengths.min() > _ROUND * size:
-        return [_plate(points[:-1], 0.25 * thickness)]
-    ends = zip(points[:-1], points[1:], strict=True)
+        return _plate(points[:-1], 0.25 * thickness)
+    ends = pairwise(points)
     return [part for a, b in ends if np.linalg.norm(b - a) > _ROUND * size for part in bar(a, b, thickness / 2)]
 
 
@@ -58,18 +59,26 @@ def _wheel(circle: np.ndarray, half: float) -> Part:
     """A disc of some width, its quarters painted in turn, so that one sees it turn."""
     normal = np.cross(circle[0], circle[10])
     normal *= half / np.linalg.norm(normal)
-    following = np.roll(circle, -1, axis=0)
+    quarters = [(np.append(circle, circle[:1], axis=0)[k : k + 11], 0.35 * (k // 10 % 2)) for k in range(0, 40, 10)]
     faces = []
-    for k, (a, b) in enumerate(zip(circle, following, strict=True)):
-        dark = 0.35 * (k // 10 % 2)
-        faces += [Face(np.array([normal, a + normal, b + normal]), dark), Face(np.array([-normal, b - normal, a - normal]), dark)]
-        faces.append(Face(np.array([a - normal, b - normal, b + normal, a + normal]), 0.5))
-    return faces
+    for arc, dark in quarters:
+        faces += [Face(np.array([normal, *(arc + normal)]), dark), Face(np.array([-normal, *(arc[::-1] - normal)]), dark)]
+    return faces + [Face(np.array([a - normal, b - normal, b + normal, a + normal]), 0.5) for a, b in zip(circle, np.roll(circle, -1, axis=0), strict=True)]
 
 
-def _plate(rim: np.ndarray, half: float) -> Part:
+def _plate(rim: np.ndarray, half: float) -> list[Part]:
+    """A plate; one with four corners in tiles, so that what stands on it is seen."""
     normal = np.sum(np.cross(rim, np.roll(rim, -1, axis=0)), axis=0)
     normal *= half / np.linalg.norm(normal)
+    tiles = [rim]
+    if len(rim) == 4:
+        steps = np.linspace(0.0, 1.0, 21)
+        at = lambda r, s: (1 - r) * ((1 - s) * rim[0] + s * rim[3]) + r * ((1 - s) * rim[1] + s * rim[2])  # noqa: E731
+        tiles = [np.array([at(r, s), at(q, s), at(q, t), at(r, t)]) for r, q in pairwise(steps) for s, t in pairwise(steps)]
+    return [_thick(tile, normal) for tile in tiles]
+
+
+def _thick(rim: np.ndarray, normal: np.ndarray) -> Part:
     sides = [Face(np.array([a - normal, b - normal, b + normal, a + normal])) for a, b in zip(rim, np.roll(rim, -1, axis=0), strict=True)]
     return [Face(rim + normal), Face(rim[::-1] - normal), *sides]
 
@@ -84,8 +93,8 @@ def bar(a: np.ndarray, b: np.ndarray, radius: float) -> list[Part]:
     pieces = int(np.clip(np.linalg.norm(b - a) / (4 * radius), 1, 12))
     ends = [a + (b - a) * k / pieces for k in range(pieces + 1)]
     parts = []
-    for p, q in zip(ends[:-1], ends[1:], strict=True):
-        sides = [Face(np.array([p + r, p + s, q + s, q + r])) for r, s in zip(ring[:-1], ring[1:], strict=True)]
+    for p, q in pairwise(ends):
+        sides = [Face(np.array([p + r, p + s, q + s, q + r])) for r, s in pairwise(ring)]
         parts.append([*sides, Face(p + ring[:0:-1]), Face(q + ring[1:])])
     return parts
 

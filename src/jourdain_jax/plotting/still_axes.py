@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+_ROOM = np.array([36.0, 14.0])  # pixels, of a number
 GROUND, GRID, SHADOW, INK = "#f4f4f1", "#d9d9d4", "#d3d3ce", "#444444"
 
 
@@ -44,7 +45,7 @@ def draw_floor(axes, camera: Camera, corners: np.ndarray, polygons: list[np.ndar
     low, high = corners.min(axis=0), corners.max(axis=0)
     side = float(max(high - low))
     base = 0.0 if -0.05 * side < low[2] < 0.2 * side else low[2] - 0.05 * side
-    xs, ys = (_ticks(low[k], high[k], 0.25 * side) for k in range(2))
+    xs, ys = (_ticks(low[k], high[k], 0.25 * side, max(1, round(5 * (high[k] - low[k]) / side))) for k in range(2))
     zs = [z for z in _ticks(base, high[2], 0.15 * side, 3) if z >= base - 1e-9 * side]
     flat = lambda *point: camera.flat(np.array(point))  # noqa: E731
     rim = [(x, y) for x, y in ((xs[0], ys[0]), (xs[-1], ys[0]), (xs[-1], ys[-1]), (xs[0], ys[-1]))]
@@ -56,15 +57,15 @@ def draw_floor(axes, camera: Camera, corners: np.ndarray, polygons: list[np.ndar
     axes.add_collection(PolyCollection([camera.flat(p) for p in inside], facecolors=SHADOW, edgecolors=SHADOW, linewidths=0.3, zorder=2))
     near_x, near_y = xs[-1] if camera.towards[0] > 0 else xs[0], ys[0] if camera.towards[1] < 0 else ys[-1]
     pole = min(rim, key=lambda corner: flat(*corner, base)[0])
+    heights = np.array([flat(*pole, base), *(flat(*pole, z) for z in zs)])
+    _limits(axes, np.concatenate([camera.flat(corners), heights, [flat(*corner, base) for corner in rim]]), 0.09)
     _edge(axes, [(x, flat(x, near_y, base)) for x in xs], "x in m", flat((xs[0] + xs[-1]) / 2, (ys[0] + ys[-1]) / 2, base))
     _edge(axes, [(y, flat(near_x, y, base)) for y in ys], "y in m", flat((xs[0] + xs[-1]) / 2, (ys[0] + ys[-1]) / 2, base))
-    heights = np.array([flat(*pole, base), *(flat(*pole, z) for z in zs)])
     axes.plot(*heights.T, color=GRID, lw=0.9, zorder=1)
     for z, place in zip(zs, heights[1:], strict=True):
         if z > base + 0.05 * side:
             _text(axes, f"{z:g}", place, (-5, 0), ha="right", va="center")
     _text(axes, "z in m", heights[-1], (0, 6), ha="center", va="bottom")
-    _limits(axes, np.concatenate([camera.flat(corners), heights, [flat(*corner, base) for corner in rim]]), 0.09)
 
 
 def _ticks(low: float, high: float, least: float, most: int = 5) -> list[float]:
@@ -81,8 +82,11 @@ def _edge(axes, ticks: list, name: str, middle: np.ndarray) -> None:
     away = (first + last) / 2 - middle
     aside = "right" if away[0] < 0 else "left"
     sign = -1 if aside == "right" else 1
-    for value, place in ticks[1:-1] if len(ticks) > 3 else ticks:
-        _text(axes, f"{value:g}", place, (4 * sign, -4), ha=aside, va="top")
+    pixels, written = axes.transData.transform([place for _, place in ticks]), -np.inf
+    for (value, place), pixel in list(zip(ticks, pixels, strict=True))[1 : -1 if len(ticks) > 3 else None]:
+        if np.max(np.abs(pixel - written) / _ROOM) >= 1:
+            _text(axes, f"{value:g}", place, (4 * sign, -4), ha=aside, va="top")
+            written = pixel
     _text(axes, name, (first + last) / 2, (22 * sign, -18), ha=aside, va="top")
 
 
