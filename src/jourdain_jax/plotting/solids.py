@@ -75,12 +75,8 @@ def _plate(rim: np.ndarray, half: float) -> list[Part]:
         steps = np.linspace(0.0, 1.0, 21)
         at = lambda r, s: (1 - r) * ((1 - s) * rim[0] + s * rim[3]) + r * ((1 - s) * rim[1] + s * rim[2])  # noqa: E731
         tiles = [np.array([at(r, s), at(q, s), at(q, t), at(r, t)]) for r, q in pairwise(steps) for s, t in pairwise(steps)]
-    return [_thick(tile, normal) for tile in tiles]
-
-
-def _thick(rim: np.ndarray, normal: np.ndarray) -> Part:
     sides = [Face(np.array([a - normal, b - normal, b + normal, a + normal])) for a, b in zip(rim, np.roll(rim, -1, axis=0), strict=True)]
-    return [Face(rim + normal), Face(rim[::-1] - normal), *sides]
+    return [*([Face(tile + normal), Face(tile[::-1] - normal)] for tile in tiles), *([side] for side in sides)]
 
 
 def bar(a: np.ndarray, b: np.ndarray, radius: float) -> list[Part]:

@@ -17,7 +17,6 @@ from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.numbers import described
 
 VIEWS = {"above": (90.0, -90.0), "side": (0.0, -90.0), "space": (28.0, -60.0)}  # elevation and azimuth, degrees
-_LIGHT = np.array([-0.35, -0.5, 0.79])
 _LINK = "#8a8a86"
 _PATH_WIDTH = 1.3  # points
 Ends = tuple[str, Sequence[float]]
@@ -83,7 +82,7 @@ def draw_still(
         draw_plane(axes, camera, _corners(painted), "y in m" if view == "above" else "z in m")
     else:
         axes = figure.add_axes((0.01, 0.01, 0.98, 0.89))
-        draw_floor(axes, camera, _corners(painted), [polygon for part in painted if part.casts for polygon in part.polygons], _LIGHT)
+        draw_floor(axes, camera, _corners(painted), [polygon for part in painted if part.casts for polygon in part.polygons])
     _fill(axes, camera, painted)
     _legend(figure, plt, colours, len(paths))
     axes.set_aspect("equal")
@@ -117,8 +116,8 @@ def _reach(bodies, chosen, traces) -> float:
     return float(max([np.ptp(together, axis=0).max(), 1e-3, *(np.ptp(outline, axis=0).max() for outline in outlines)]))
 
 
-def _in_space(body, k: int, thickness: float) -> list[tuple[list[np.ndarray], list[float]]]:
-    """Polygons of each part of a body at a saved time, and how dark they are."""
+def _in_space(body, k: int, thickness: float) -> list[Part]:
+    """Parts of a body at a saved time, in space."""
     rigid = isinstance(body, RigidBody)
     turned, place = np.asarray(body.orientation)[k] if rigid else np.eye(3), np.asarray(body.position)[k]
     parts = solid_of(np.asarray(body.outline)[k] if rigid else np.zeros((0, 3)), thickness)
@@ -136,7 +135,7 @@ def _lit(part: Part, colour: str, strength: float, camera: Camera, clear: bool) 
             normal = np.cross(face.corners[2] - face.corners[0], face.corners[-1] - face.corners[0])
         normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
         if normal @ camera.towards > 1e-9:
-            shade = (0.62 + 0.38 * max(float(normal @ _LIGHT), 0.0)) * (1 - face.dark)
+            shade = (0.62 + 0.38 * max(float(normal @ camera.light), 0.0)) * (1 - face.dark)
             polygons.append(face.corners)
             colours.append((*(1 - strength * (1 - shade * np.array(to_rgb(colour)))), 0.3 if clear else 1.0))
     painted = _painted(polygons, colours, camera, 0.0 if clear else 0.4)

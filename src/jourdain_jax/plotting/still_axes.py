@@ -16,6 +16,12 @@ class Camera:
     up: np.ndarray
     towards: np.ndarray
 
+    @property
+    def light(self) -> np.ndarray:
+        """Unit vector towards the light: from over the eye's left shoulder."""
+        light = 0.5 * self.towards - 0.45 * self.right + np.array([0.0, 0.0, 0.6])
+        return light / np.linalg.norm(light)
+
     def flat(self, points: np.ndarray) -> np.ndarray:
         """Points (..., 3) in the picture (..., 2), m."""
         return np.stack([points @ self.right, points @ self.up], axis=-1)
@@ -37,7 +43,7 @@ def draw_plane(axes, camera: Camera, corners: np.ndarray, upwards: str) -> None:
     _limits(axes, camera.flat(corners), 0.06)
 
 
-def draw_floor(axes, camera: Camera, corners: np.ndarray, polygons: list[np.ndarray], light: np.ndarray) -> None:
+def draw_floor(axes, camera: Camera, corners: np.ndarray, polygons: list[np.ndarray]) -> None:
     """A tiled floor (the plane z = 0 where bodies stand on it, else below them), shadows of the polygons, and three axes in m along its edges."""
     from matplotlib.collections import PolyCollection
 
@@ -52,7 +58,7 @@ def draw_floor(axes, camera: Camera, corners: np.ndarray, polygons: list[np.ndar
     axes.add_collection(PolyCollection([[flat(*corner, base) for corner in rim]], facecolors=GROUND, edgecolors=GRID, zorder=0))
     lines = [[flat(x, ys[0], base), flat(x, ys[-1], base)] for x in xs] + [[flat(xs[0], y, base), flat(xs[-1], y, base)] for y in ys]
     axes.add_collection(PolyCollection(lines, facecolors="none", edgecolors=GRID, linewidths=0.7, closed=False, zorder=1))
-    fallen = [polygon - np.outer((polygon[:, 2] - base) / light[2], light) for polygon in polygons]
+    fallen = [polygon - np.outer((polygon[:, 2] - base) / camera.light[2], camera.light) for polygon in polygons]
     inside = [np.column_stack([np.clip(p[:, 0], xs[0], xs[-1]), np.clip(p[:, 1], ys[0], ys[-1]), np.full(len(p), base)]) for p in fallen]
     axes.add_collection(PolyCollection([camera.flat(p) for p in inside], facecolors=SHADOW, edgecolors=SHADOW, linewidths=0.3, zorder=2))
     near_x, near_y = xs[-1] if camera.towards[0] > 0 else xs[0], ys[0] if camera.towards[1] < 0 else ys[-1]
