@@ -3,7 +3,7 @@
     python docs/make_gallery.py [--out DIR] [NAME ...]
 
 A page shows a picture, the lines that draw it (they are what this script runs), what to look at, and the source. Pages are MyST Markdown for Sphinx with
-sphinx-design; nothing is fetched. Without names all pages are written, with names those alone and an index of them. About 2 minutes on one core.
+sphinx-design; nothing is fetched. Without names all pages are written (about 2 minutes on one core), with names those alone; the index lists all pages of the folder.
 """
 
 import argparse
@@ -315,7 +315,8 @@ def main(arguments: list[str] | None = None) -> None:
         began = time.perf_counter(), time.process_time()
         write(known[name], out)
         print(f"{name}: {time.perf_counter() - began[0]:.1f} s, {time.process_time() - began[1]:.1f} s of processor time", flush=True)
-    (out / "index.md").write_text(index_of([known[name] for name in names]))
+    there = [entry for name, entry in known.items() if (out / f"{name}.md").exists()]
+    (out / "index.md").write_text(index_of(there))
 
 
 if __name__ == "__main__":

@@ -95,11 +95,15 @@ def test_a_unicycle_leans_and_pitches_by_the_eigenvalues_of_the_closed_form():
         assert (lean.real > 0.1) == (spin < 4.45)  # the critical spin
 
 
-def test_a_ball_on_a_free_plate_has_the_eigenvalues_of_the_closed_form():
+def test_a_ball_at_rest_on_a_free_plate_sets_off_as_in_the_closed_form():
     plate = scene_of("ball_on_plate", stiffness=0.0, damping=0.0)
-    J, m, r = 0.05, 0.3, 0.03
-    roots = np.roots([J, 0.0, m * G * r, 0.0, -5 / 7 * m * G**2])
-    among(roots, jj.linearize(plate, {}).state_eigenvalues())
+    J, m, r, x, tilt = 0.05, 0.3, 0.03, 0.12, 0.3
+    start = jj.start(plate, x=x, pitch=tilt)
+    rates = dict(zip(plate.speed_names.entries, jj.accelerations(plate, 0.0, start.q, start.u).udot, strict=True))
+    # 7/5 m r^2 s'' = m g r sin(a),   (J + m x^2) a'' = m g x cos(a),   x = r (s - a)
+    pitch = m * G * x * np.cos(tilt) / (J + m * x**2)
+    np.testing.assert_allclose(rates["pitch_rate"], pitch, rtol=1e-12)
+    np.testing.assert_allclose(rates["x_rate"], 5 / 7 * G * np.sin(tilt) - r * pitch, rtol=1e-12)
 
 
 def test_the_pendulum_of_a_spherical_robot_swings_at_the_frequency_of_the_closed_form():

@@ -1,6 +1,6 @@
 """A kick scooter with its rider standing still: a Whipple bicycle with small wheels and a low deck, pushed from behind.
 
-Straight and upright, a push F gives F / (m + I_R/r_R^2 + I_F/r_F^2). The wheels are too light and small to steer it upright by themselves.
+Straight and upright, a push F gives F / (m + I_R/r_R^2 + I_F/r_F^2). At 1 to 3 m/s its rider must steer: left alone it falls.
 Source of the equations: J. P. Meijaard et al., Proc. R. Soc. A 463 (2007) 1955; the numbers are those of an adult's scooter, estimated.
 """
 
@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 import jourdain_jax as jj
 
-LOOK = "Left alone after two kicks it falls slowly over to one side and turns into the fall: a scooter of this kind has no stable range of speeds."
+LOOK = "One kick, and nobody steers: at this speed it leans ever more while the front wheel turns into the fall, too little and too late."
 
 
 class KickScooter(jj.models.WhippleBicycle):

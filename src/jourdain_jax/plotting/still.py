@@ -12,12 +12,13 @@ import numpy as np
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
 from jourdain_jax.plotting.solids import Part, bar, solid_of
-from jourdain_jax.plotting.still_axes import INK, Camera, camera_at, draw_floor, draw_plane
+from jourdain_jax.plotting.still_axes import Camera, camera_at, draw_floor, draw_plane
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.numbers import described
 
 VIEWS = {"above": (90.0, -90.0), "side": (0.0, -90.0), "space": (28.0, -60.0)}  # elevation and azimuth, degrees
 _LINK = "#8a8a86"
+_PATH = (0.27, 0.27, 0.27)  # the colour of paths
 _PATH_WIDTH = 1.3  # points
 Ends = tuple[str, Sequence[float]]
 
@@ -67,7 +68,7 @@ def draw_still(
     thickness = 0.022 * _reach(bodies.values(), chosen, traces)
     palette = plt.rcParams["axes.prop_cycle"].by_key()["color"]
     colours = {name: palette[k % len(palette)] for k, name in enumerate(bodies)}
-    painted = [_painted([trace[k : k + 2]], [INK], camera, _PATH_WIDTH) for trace in traces for k in range(len(trace) - 1)]
+    painted = [_painted([trace[k : k + 2]], [_PATH], camera, _PATH_WIDTH) for trace in traces for k in range(len(trace) - 1)]
     for order, k in enumerate(chosen):
         strength = 1.0 if len(chosen) == 1 else 0.35 + 0.65 * order / (len(chosen) - 1)
         for name, body in bodies.items():
@@ -169,5 +170,5 @@ def _legend(figure, plt, colours: dict[str, str], paths: int) -> None:
     names = names if len(names) <= 4 else [*names[:2], names[-1]]
     handles = [plt.Rectangle((0, 0), 1, 1, color=colours[name], label=name) for name in names]
     if paths:
-        handles.append(plt.Line2D([], [], color=INK, lw=_PATH_WIDTH, label="path" if paths == 1 else "paths"))
+        handles.append(plt.Line2D([], [], color=_PATH, lw=_PATH_WIDTH, label="path" if paths == 1 else "paths"))
     figure.legend(handles=handles, loc="upper center", ncols=len(handles), frameon=False, fontsize=9, handlelength=1.4, columnspacing=1.6)
