@@ -1,0 +1,68 @@
+"""A kick scooter with its rider standing still: a Whipple bicycle with small wheels and a low deck, pushed from behind.
+
+Straight and upright, a push F gives F / (m + I_R/r_R^2 + I_F/r_F^2). At 1 to 3 m/s its rider must steer: left alone it falls.
+Source of the equations: J. P. Meijaard et al., Proc. R. Soc. A 463 (2007) 1955; the numbers are those of an adult's scooter, estimated.
+"""
+
+import jax.numpy as jnp
+
+import jourdain_jax as jj
+
+LOOK = "One kick, and nobody steers: at this speed it leans ever more while the front wheel turns into the fall, too little and too late."
+
+
+class KickScooter(jj.models.WhippleBicycle):
+    """The Whipple bicycle with a scooter's numbers. Inputs: those of the bicycle, and `push`: the foot's force on the ground, forward on the deck (N)."""
+
+    w: object = jj.parameter(0.86, unit="m", positive=True, about="wheelbase")
+    c: object = jj.parameter(0.03, unit="m", about="trail")
+    lam: object = jj.parameter(0.21, unit="rad", about="steer axis tilt")
+    rR: object = jj.parameter(0.10, unit="m", positive=True, about="rear wheel radius")
+    rF: object = jj.parameter(0.10, unit="m", positive=True, about="front wheel radius")
+    mR: object = jj.parameter(0.6, unit="kg", positive=True, about="rear wheel mass")
+    mF: object = jj.parameter(0.6, unit="kg", positive=True, about="front wheel mass")
+    IRxx: object = jj.parameter(0.0018, unit="kg m^2", non_negative=True)
+    IRyy: object = jj.parameter(0.0035, unit="kg m^2", non_negative=True)
+    IFxx: object = jj.parameter(0.0018, unit="kg m^2", non_negative=True)
+    IFyy: object = jj.parameter(0.0035, unit="kg m^2", non_negative=True)
+    xB: object = jj.parameter(0.35, unit="m", about="deck and rider, forward")
+    zB: object = jj.parameter(-0.95, unit="m", about="deck and rider, down")
+    mB: object = jj.parameter(78.0, unit="kg", positive=True)
+    IBxx: object = jj.parameter(15.0, unit="kg m^2", non_negative=True)
+    IByy: object = jj.parameter(15.5, unit="kg m^2", non_negative=True)
+    IBzz: object = jj.parameter(1.2, unit="kg m^2", non_negative=True)
+    IBxz: object = jj.parameter(0.5, unit="kg m^2")
+    xH: object = jj.parameter(0.76, unit="m")
+    zH: object = jj.parameter(-0.55, unit="m")
+    mH: object = jj.parameter(2.0, unit="kg", positive=True)
+    IHxx: object = jj.parameter(0.18, unit="kg m^2", non_negative=True)
+    IHyy: object = jj.parameter(0.17, unit="kg m^2", non_negative=True)
+    IHzz: object = jj.parameter(0.012, unit="kg m^2", non_negative=True)
+    IHxz: object = jj.parameter(-0.03, unit="kg m^2")
+
+    inputs = jj.inputs("lean_torque steer_torque push")
+    example = {"rear_spin_rate": 30.0, "lean_rate": 0.02}
+    example_span = 1.6
+
+    def bodies(self, t, q):
+        made = super().bodies(t, q)
+        for name, outline in (("rear frame", RIDER), ("front frame", FORK)):
+            body = made[name]
+            made[name] = jj.RigidBody(body.mass, body.inertia, body.position, body.orientation, outline)
+        return made
+
+    def loads(self, motion):
+        deck = motion["rear frame"]
+        foot = deck.point((-self.xB, 0.0, self.zB + self.rR))  # behind the rider, at the height of the rear axle
+        return *super().loads(motion), jj.point_force(foot, motion.inputs.push * deck.orientation[:, 0])
+
+    def effective_mass(self):
+        """What a push has to move when the scooter runs straight: all masses and the turning of the wheels (kg)."""
+        return self.mR + self.mB + self.mH + self.mF + self.IRyy / self.rR**2 + self.IFyy / self.rF**2
+
+
+# for drawing only, m: hub, deck, leg, trunk, head, arm; and the fork with its handlebar
+RIDER = jnp.array(
+    [[-0.35, 0, -0.85], [-0.2, 0, -0.87], [0.45, 0, -0.8], [0.0, 0, -0.85], [0.0, 0, 0.05], [0.08, 0, 0.45], [0.08, 0, 0.65], [0.08, 0, 0.4], [0.34, 0, 0.0]]
+)
+FORK = jnp.array([[0.1, 0, -0.45], [-0.07, 0, 0.4], [-0.07, 0.22, 0.4], [-0.07, -0.22, 0.4]])

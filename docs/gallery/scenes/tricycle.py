@@ -1,0 +1,54 @@
+"""A tricycle (a fork-lift, a tug): the front wheel is driven and steered, two rear wheels roll freely.
+
+Three wheels carry a determined share each. In a turn with the steer angle d the rear wheels turn at (R -+ track/2)/r with
+R = wheelbase / tan(d), the front wheel at sqrt(R^2 + wheelbase^2)/r. Source: R. Siegwart and I. Nourbakhsh, Autonomous Mobile Robots (2004), 3.2.
+"""
+
+import jax.numpy as jnp
+
+import jourdain_jax as jj
+
+LOOK = "The rear wheels turn at different rates, which is what a differential is for; the outer one carries more than the inner one."
+
+
+class Tricycle(jj.Scene):
+    """x, y under the middle of the rear axle, heading, steer; angles of the wheels. Inputs: `drive` about the front axle and `steer_torque` (N m)."""
+
+    frame_mass: object = jj.parameter(60.0, unit="kg", positive=True)
+    ahead: object = jj.parameter(0.4, unit="m", about="of the frame's mass centre before the rear axle")
+    height: object = jj.parameter(0.5, unit="m", positive=True, about="of the frame's mass centre")
+    wheel_mass: object = jj.parameter(2.0, unit="kg", positive=True)
+    radius: object = jj.parameter(0.2, unit="m", positive=True)
+    wheelbase: object = jj.parameter(1.1, unit="m", positive=True)
+    track: object = jj.parameter(0.8, unit="m", positive=True)
+    gravity: object = jj.parameter(9.81, unit="m/s^2")
+
+    coordinates = jj.coordinates("x y heading steer left right front")
+    inputs = jj.inputs("drive steer_torque")
+    privileged = ("steer_rate", "front_rate")
+    domain = {"heading": (-3.2, 3.2), "steer": (-1.0, 1.0)}
+    conventions = "z up; heading from x towards y; steer positive to the left; positive wheel angles roll forward."
+    example = {"steer": 0.5, "front_rate": 6.0}
+    example_span = 6.0
+
+    def bodies(self, t, q):
+        frame, o = jj.rot_z(q.heading), 0.0 * q.x
+        axle, fork = jnp.stack([q.x, q.y, o + self.radius]), frame @ jj.rot_z(q.steer)
+        centre = axle + self.ahead * frame[:, 0] + jnp.stack([o, o, o + self.height - self.radius])
+        made = {"frame": jj.RigidBody.box(self.frame_mass, (0.9, 0.5, 0.4), position=centre, orientation=frame)}
+        places = {"left": 0.5 * self.track * frame[:, 1], "right": -0.5 * self.track * frame[:, 1], "front": self.wheelbase * frame[:, 0]}
+        for name, place in places.items():
+            turned = (fork if name == "front" else frame) @ jj.rot_y(q[name])
+            made[name] = jj.RigidBody.thin_disc(self.wheel_mass, self.radius, axis="y", position=axle + place, orientation=turned)
+        return made
+
+    def loads(self, motion):
+        front = motion["front"].orientation[:, 1]
+        return (
+            jj.gravity(motion, self.gravity),
+            jj.torque(motion, "front", motion.inputs.drive * front, reaction="frame"),
+            jj.torque(motion, "front", motion.inputs.steer_torque * motion["frame"].orientation[:, 2], reaction="frame"),
+        )
+
+    def contacts(self, pose):
+        return {name: jj.disc_contact(pose[name], self.radius) for name in ("left", "right", "front")}

@@ -1,0 +1,323 @@
+"""Writes the pages of the gallery: one for every scene of `docs/gallery/scenes` and every model of `jj.models.MODELS`, and their index.
+
+    python docs/make_gallery.py [--out DIR] [NAME ...]
+
+A page shows a picture, the lines that draw it (they are what this script runs), what to look at, and the source. Pages are MyST Markdown for Sphinx with
+sphinx-design; nothing is fetched. Without names all pages are written (about 2 minutes on one core), with names those alone; the index lists all pages of the folder.
+"""
+
+import argparse
+import contextlib
+import importlib
+import inspect
+import os
+import re
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+# a page runs once: less effort on machine code saves a third of the time
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
+
+import jourdain_jax as jj
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENES = ROOT / "docs" / "gallery" / "scenes"
+PAGES = ROOT / "docs" / "gallery" / "pages"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """How a motion is drawn, as pieces of the code on its page, and what to look at (scenes say the latter themselves, as `LOOK`)."""
+
+    look: str = ""
+    title: str = ""
+    view: str = '"space"'
+    at: str = "3"
+    paths: str = ""
+    start: str = "**scene.example"
+    span: str = "scene.example_span"
+    inputs: str = ""
+    links: str = ""
+    clear: str = ""
+
+
+SCENE_PICTURES = {
+    "robot_with_trailer": Picture(
+        title="Robot with a trailer",
+        view='"above"',
+        start="left_rate=4.0, right_rate=6.0",
+        span="6.0",
+        paths='[("hull", (0, 0, 0)), ("trailer", (0, 0, 0))]',
+        links='[(("hull", (-0.2, 0, 0)), ("trailer", (0, 0, 0)))]',
+    ),
+    "car_with_trailers": Picture(
+        title="Car with Ackermann steering and trailers",
+        view='"above"',
+        paths='[("car", (-1.3, 0, 0)), ("trailer 2", (0, 0, 0))]',
+        links='[(("car", (-1.3, 0, 0)), ("trailer 1", (0, 0, 0))), (("trailer 1", (0, 0, 0)), ("trailer 2", (0, 0, 0)))]',
+    ),
+    "tricycle": Picture(title="Tricycle", at="2", span="2.2", paths='[("front", (0, 0, 0)), ("left", (0, 0, 0)), ("right", (0, 0, 0))]'),
+    "kick_scooter": Picture(
+        title="Kick scooter",
+        view="(18, -60)",
+        at="2",
+        span="0.8",
+        paths='[("rear frame", (0, 0, 0))]',
+        inputs='{"push": lambda t: 150.0 * jnp.exp(-(((t - 0.3) / 0.1) ** 2))}',
+    ),
+    "unicycle": Picture(title="Unicycle with a rider", at="4", span="1.6", paths='[("rider", (0, 0, 0)), ("wheel", (0, 0, 0))]'),
+    "ball_on_plate": Picture(
+        title="Ball on a plate",
+        at="1",
+        view="(38, -60)",
+        paths='[("ball", (0, 0, 0))]',
+        inputs='{"wanted_x": lambda t: 0.12 * jnp.cos(1.5 * t), "wanted_y": lambda t: 0.12 * jnp.sin(1.5 * t)}',
+    ),
+    "spherical_robot": Picture(
+        title="Spherical robot driven by a pendulum", at="3", span="1.2", paths='[("shell", (0, 0, 0))]', clear='("shell",)', inputs='{"drive": 0.2}'
+    ),
+    "roller_racer": Picture(
+        title="Roller racer",
+        view='"above"',
+        start="",
+        span="6.0",
+        paths='[("seat", (0, 0, 0))]',
+        inputs='{"wanted": lambda t: 0.7 * jnp.sin(5.0 * t)}',
+    ),
+    "two_wheeled_pendulum": Picture(
+        title="Two-wheeled inverted pendulum", span="4.0", start="pitch=0.0", inputs='{"speed": 1.0, "turn": lambda t: 0.5 * jnp.sin(2.0 * t)}'
+    ),
+    "satellite": Picture(
+        title="Satellite with reaction wheels",
+        at="1",
+        view="(24, 40)",
+        start="",
+        span="2.0",
+        paths='[("bus", (0.3, 0.25, 0.2))]',
+        inputs='{"torque_x": lambda t: 1.0 * (t - 1.0), "torque_y": 0.3, "torque_z": lambda t: 0.5 * jnp.sin(t)}',
+    ),
+}
+AXLE = Picture(
+    "All methods of the paper agree: heading and axle turn evenly, and it drifts across the slope (x points downhill) instead of running away.",
+    view='"above"',
+    at="4",
+    span="5.0",
+    paths='[("wheel1", (0, 0, 0)), ("wheel2", (0, 0, 0))]',
+    links='[(("wheel1", (0, 0, 0)), ("wheel2", (0, 0, 0)))]',
+)
+PENDULUM = '[(("", (0, 0, 0)), ("first", (0, 0, 0))), (("first", (0, 0, 0)), ("second", (0, 0, 0)))]'
+BOTH = '[("first", (0, 0, 0)), ("second", (0, 0, 0))]'
+CHAIN = '[(("", (0, 0, 0)), ("particle 1", (0, 0, 0))), *((("particle %d" % i, (0, 0, 0)), ("particle %d" % (i + 1), (0, 0, 0))) for i in range(1, 5))]'
+MODEL_PICTURES = {
+    "two-wheel-axle-free": AXLE,
+    "two-wheel-axle-coordinates": AXLE,
+    "two-wheel-axle-quasi": AXLE,
+    "two-wheel-axle-redundant": AXLE,
+    "skate": Picture("Set turning, it drifts across the slope (x points downhill) and comes back up, in cycloids.", view='"above"', at="6", span="5.0"),
+    "chaplygin-sleigh": Picture("It starts backwards, turns over, and runs off straight with the blade behind.", view='"above"', at="6"),
+    "vertical-disc": Picture("Both rates stay what they are: the path is a circle.", at="3", start="heading_rate=0.5, roll_rate=2.0", span="5.0"),
+    "tilting-disc": Picture("It rolls along loops while its lean and its turning swing about a steady motion.", at="(0.0, 0.9, 1.8)", span="2.4"),
+    "tilting-disc-quaternion": Picture(
+        "The same disc with its attitude as a quaternion, which also serves where it lies flat.", at="(0.0, 0.9, 1.8)", span="2.4"
+    ),
+    "rosenberg-particle": Picture("No force acts, and yet the row bends the path: y grows evenly, and x slows down as y moves away from zero.", at="4"),
+    "heisenberg-particle": Picture(
+        "Rows on the velocities need not bend a path: this one is a straight line, where a vakonomic reading gives a helix.", at="4", span="4.0"
+    ),
+    "ball-on-turntable": Picture("On a turning table the ball goes round in a circle, like a charge in a magnetic field, at 2/7 of the table's rate.", at="4"),
+    "suslov": Picture(
+        "It ends in a steady turn about its second axis, whatever the start; the bars are its axes.",
+        at="(3.0,)",
+        span="8.0",
+        paths='[("body", (1.0, 0.0, 0.0))]',
+    ),
+    "snakeboard": Picture(
+        "The wheels steer past the place where both rows are parallel; the motion passes through.",
+        view='"above"',
+        at="(0.0, 0.8, 1.6)",
+        span="1.6",
+        start="steer=0.1, x_rate=1.0, rotor_rate=0.4, steer_rate=0.3",
+        paths='[("board", (0, 0, 0))]',
+    ),
+    "rattleback": Picture(
+        "Spun the wrong way, it rattles; in the end it turns back.", at="(0.05,)", span="0.5", view="(30, -60)", paths='[("stone", (0.2, 0, 0))]'
+    ),
+    "whipple-bicycle": Picture(
+        "At 4.5 m/s it catches itself: lean turns the handlebar into the fall.",
+        at="2",
+        span="0.6",
+        paths='[("rear wheel", (0, 0, 0)), ("front wheel", (0, 0, 0))]',
+    ),
+    "double-pendulum-rods": Picture(
+        "Two rods of fixed length as geometric rows; compare the pendulum in angles.", view='"side"', span="1.2", paths=BOTH, links=PENDULUM
+    ),
+    "double-pendulum-angles": Picture("The same pendulum in angles: no row is left.", view='"side"', span="1.2", paths=BOTH, links=PENDULUM),
+    "free-rigid-body": Picture(
+        "The end of an axis runs along a curve that need not close: Euler's equations; the bars are its axes.",
+        at="(8.0,)",
+        span="8.0",
+        paths='[("body", (1.0, 0.0, 0.0))]',
+    ),
+    "spring-and-rod": Picture(
+        "A rod keeps two particles apart while a spring holds the first to the origin.", view='"side"', span="1.5", paths=BOTH, links=PENDULUM
+    ),
+    "isokinetic-particle": Picture(
+        "A row that is quadratic in the speeds keeps the speed: the path bends down along a closed form.", view='"side"', at="5", span="0.6"
+    ),
+    "trailer-chain": Picture(
+        "The trailers follow the car on smaller and smaller circles.", view='"above"', paths='[("car", (0, 0, 0)), ("trailer 3", (0, 0, 0))]'
+    ),
+    "pendulum-chain": Picture(
+        "Rods alone hold the particles; without damping the energy stays.", view='"side"', span="1.0", paths='[("particle 5", (0, 0, 0))]', links=CHAIN
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One page: what its scene is called in code, where it is written, and how it is drawn."""
+
+    name: str  # of the page
+    kind: type[jj.Scene]
+    source: Path
+    import_line: str
+    made: str
+    picture: Picture
+    look: str
+
+    @property
+    def title(self) -> str:
+        return self.picture.title or self.name.replace("-", " ").capitalize()
+
+
+def entries() -> dict[str, Entry]:
+    """Every page of the gallery by name: the scenes of this folder first, then the models."""
+    if str(SCENES.parent) not in sys.path:
+        sys.path.insert(0, str(SCENES.parent))
+    found = {}
+    for path in sorted(SCENES.glob("*.py")):
+        module = importlib.import_module(f"scenes.{path.stem}")
+        kind = next(k for k in vars(module).values() if isinstance(k, type) and issubclass(k, jj.Scene) and k.__module__ == module.__name__)
+        name, picture = path.stem.replace("_", "-"), SCENE_PICTURES.get(path.stem, Picture())
+        found[name] = Entry(name, kind, path, f"from scenes.{path.stem} import {kind.__name__}\n", f"{kind.__name__}()", picture, module.LOOK)
+    for name, kind in jj.models.MODELS.items():
+        picture = MODEL_PICTURES.get(name, Picture(look=f"How {name.replace('-', ' ')} moves from its example start."))
+        source = Path(inspect.getfile(kind)).resolve()
+        found[name] = Entry(name, kind, source, "", f"jj.models.{kind.__name__}()", picture, picture.look)
+    return found
+
+
+def code_of(entry: Entry) -> str:
+    """The lines that draw the picture of a page, `NAME.png` in the working folder."""
+    p = entry.picture
+    inputs = f", inputs={p.inputs}" if p.inputs else ""
+    start = f"jj.start(scene, {p.start})" if p.start else "jj.start(scene)"
+    more = "".join(f",\n    {name}={value}" for name, value in (("paths", p.paths), ("links", p.links), ("clear", p.clear)) if value)
+    lines = [
+        "import jax.numpy as jnp\n\n" if "jnp." in inputs else "",
+        "import jourdain_jax as jj\nfrom jourdain_jax.plotting.still import draw_still\n",
+        entry.import_line,
+        f"\nscene = {entry.made}\nmotion = jj.simulate(scene, {start}, t1={p.span}{inputs})\n",
+        f'draw_still(\n    motion,\n    "{entry.name}.png",\n    view={p.view},\n    at={p.at}{more},\n)',
+    ]
+    return "".join(lines)
+
+
+def prose_of(docstring: str) -> str:
+    """A docstring as Markdown: what is indented becomes a block of its own, stars and underscores stay what they are."""
+    blocks = []
+    for block in re.split(r"\n\s*\n", inspect.cleandoc(docstring)):
+        if block.startswith("    "):
+            blocks.append(f"```text\n{inspect.cleandoc(block)}\n```")
+        else:
+            parts = re.split(r"(`[^`]*`)", block)
+            blocks.append("".join(part if part.startswith("`") else re.sub(r"([*_<$~\[\]])", r"\\\1", part) for part in parts))
+    return "\n\n".join(blocks)
+
+
+def page_of(entry: Entry, out: Path) -> str:
+    """The text of a page."""
+    link = Path(os.path.relpath(entry.source, out)).as_posix()
+    shown = entry.source.relative_to(ROOT).as_posix()
+    where = " in the folder `docs/gallery`" if entry.import_line else ""
+    included = f"\n## The scene\n\n```{{literalinclude}} {link}\n:language: python\n```\n" if entry.import_line else ""
+    module = inspect.getdoc(sys.modules[entry.kind.__module__]) or ""
+    return f"""# {entry.title}
+
+{prose_of(module)}
+
+![{entry.title}: the motion, earlier times paler]({entry.name}.png)
+
+**What to look at.** {entry.look}
+
+## The lines that draw it
+
+Run{where}:
+
+```python
+{code_of(entry)}
+```
+{included}
+Source: [{shown}]({link})
+"""
+
+
+def index_of(chosen: list[Entry]) -> str:
+    """Thumbnails of the chosen pages, and their table of contents."""
+    cards = "\n".join(f":::{{grid-item-card}} {entry.title}\n:img-top: {entry.name}.png\n:link: {entry.name}\n:link-type: doc\n:::\n" for entry in chosen)
+    pages = "\n".join(entry.name for entry in chosen)
+    return f"""# Gallery
+
+Each page has a picture, the lines that draw it, what to look at, and the source. Earlier times are drawn paler; lengths are in metres.
+
+::::{{grid}} 1 2 3 3
+:gutter: 2
+
+{cards}
+::::
+
+```{{toctree}}
+:hidden:
+:maxdepth: 1
+
+{pages}
+```
+"""
+
+
+def write(entry: Entry, out: Path) -> Path:
+    """Run the lines of a page in the folder `out`, and write the page beside its picture."""
+    with contextlib.chdir(out):
+        exec(compile(code_of(entry), f"{entry.name}.md", "exec"), {})
+    page = out / f"{entry.name}.md"
+    page.write_text(page_of(entry, out))
+    return page
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Write the pages that are asked for; exits with a message where a name is unknown."""
+    parser = argparse.ArgumentParser(description="Write the pages of the gallery.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="pages (default: all)")
+    parser.add_argument("--out", type=Path, default=PAGES, metavar="DIR", help="folder to write to (default: docs/gallery/pages)")
+    asked = parser.parse_args(arguments)
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    known = entries()
+    names = [name.replace("_", "-") for name in asked.names] or list(known)
+    for name in names:
+        if name not in known:
+            parser.error(f"no page `{name}`, expected some of: {', '.join(known)}")
+    out = asked.out.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        began = time.perf_counter(), time.process_time()
+        write(known[name], out)
+        print(f"{name}: {time.perf_counter() - began[0]:.1f} s, {time.process_time() - began[1]:.1f} s of processor time", flush=True)
+    there = [entry for name, entry in known.items() if (out / f"{name}.md").exists()]
+    (out / "index.md").write_text(index_of(there))
+
+
+if __name__ == "__main__":
+    main()
