@@ -3,6 +3,7 @@
 One motion, or lanes side by side: those of a scalar program in blocks of `lockstep.width`.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jourdain_jax.calculus.differentiated_as import differentiated_as
+from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.integrators import erk_loop, integrands
 from jourdain_jax.motion.native import native_motion
@@ -21,7 +22,7 @@ def solved_by_own_steps(setup: Setup, begun: Begun) -> Solved:
     """One motion by our own loop."""
     if reason_against_machine_code(setup):
         return _by_xla(setup, begun)
-    return differentiated_as(_by_xla, _by_machine_code, setup.options.kind)(setup, begun)
+    return differentiated_as(_by_xla, _by_machine_code, setup.options.kind, _rules(setup, lambda f: f))(setup, begun)
 
 
 def lanes_solved_by_own_steps(setups: Setup, begun: Begun) -> Solved:
@@ -31,7 +32,7 @@ def lanes_solved_by_own_steps(setups: Setup, begun: Begun) -> Solved:
     blocks = partial(in_blocks, _lanes_by_xla, width(program))
     if reason_against_machine_code(setups):
         return blocks(setups, begun)
-    return differentiated_as(blocks, eqx.filter_vmap(_by_machine_code), setups.options.kind)(setups, begun)
+    return differentiated_as(blocks, eqx.filter_vmap(_by_machine_code), setups.options.kind, _rules(setups, eqx.filter_vmap))(setups, begun)
 
 
 def reason_against_machine_code(setup: Setup) -> str:
@@ -76,11 +77,40 @@ def _loop(setup: Setup, y0, args, ts, knots) -> Solved:
 
 
 def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
-    options, goals = setup.options, _goals(setup, setup.ts)
-    rtol, atol = options.tolerances
-    control = native_motion.Control(rtol, atol, setup.shortest, options.dt0, options.max_steps)
-    ys, reached, end = native_motion.integrate(begun.args, type(options.solver), bool(options.event_names), begun.y0, goals, control)
-    return _as_solved(goals, ys, reached, end)
+    goals = _goals(setup, setup.ts)
+    return _as_solved(goals, *native_motion.integrate(*_of_machine_code(setup, begun, goals)))
+
+
+def _of_machine_code(setup: Setup, begun: Begun, goals) -> tuple:
+    options = setup.options
+    control = native_motion.Control(*options.tolerances, setup.shortest, options.dt0, options.max_steps)
+    return begun.args, type(options.solver), bool(options.event_names), begun.y0, goals, control
+
+
+def _rules(setup: Setup, mapped: Callable) -> Rules | None:
+    """Derivatives by machine code; `mapped`: of a function of one motion, that of all lanes."""
+    if native_motion.reason_against_derivatives(setup.field, bool(setup.options.event_names)):
+        return None
+    return Rules(_times_are_numbers, lambda arguments, along: mapped(_pushed)(*arguments, *along))
+
+
+def _times_are_numbers(setup: Setup, begun: Begun) -> bool:
+    """Whether no time and no tolerance varies, given what does."""
+    of_times = setup.ts, setup.t0, setup.t1, setup.options.tolerances, setup.options.dt0, begun.args[-1]
+    return not any(jax.tree.leaves(of_times))
+
+
+def _pushed(setup: Setup, begun: Begun, along: Setup, d: Begun) -> PyTree:
+    """Tangents of the motion, along those of its start and of what the rates are given."""
+    goals = _goals(setup, setup.ts)
+    dy0 = jax.tree.map(lambda x, dx: jnp.zeros_like(x) if dx is None else dx, begun.y0, d.y0)
+    return native_motion.tangents(*_of_machine_code(setup, begun, goals), dy0, _known(d.args), partial(_as_solved, goals))
+
+
+def _known(args: tuple) -> list:
+    """Of each number that the rates are given: what depends on parameters alone, and constant inputs."""
+    _, _, inputs, fixed, _ = args
+    return [*fixed, *(channel.value for channel in inputs.channels)]
 
 
 def _goals(setup: Setup, ts) -> Float[Array, "times *lanes"]:

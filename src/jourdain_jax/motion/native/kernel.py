@@ -24,7 +24,7 @@ MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the pro
 
 
 class Kernel(NamedTuple):
-    """`run(starts, goals)` returns states at the goals, and the rows of the end."""
+    """`run(starts, goals)` returns states (and their tangents, where the form has some) at the goals, and the rows of the end."""
 
     form: Form
     run: Callable
@@ -45,7 +45,7 @@ def kernel(form: Form, solver: type[diffrax.AbstractERK]) -> Kernel:
         return ffi.registered(written(form, method, lanes, host.fuses(), 1 if lanes == ALONE else host.threads()))
 
     def call(lanes: int, starts: Float[Array, "*lanes rows"], goals: Float[Array, "*lanes times"]):
-        shapes = (goals.shape[-1], layout.y), (layout.returned + 1,)
+        shapes = (goals.shape[-1], layout.integrated), (layout.returned + 1,)
         results = tuple(jax.ShapeDtypeStruct((*goals.shape[:-1], *shape), jnp.float64) for shape in shapes)
         return jax.ffi.ffi_call(name(lanes), results, vmap_method="broadcast_all")(starts, goals)
 

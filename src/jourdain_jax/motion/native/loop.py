@@ -118,8 +118,8 @@ def _write_serve(w: Writer, form: Form) -> None:
             number, saved = w.load("i64", who, lane), w.load("i64", who, lane + w.lanes)
             # at a time to save at; or at the end, whose state stands for all that is left
             last = w.where(runs, saved + 1, times)
-            with w.counted(saved, last) as k, w.counted(0, layout.y) as row:
-                w.store(w.load("double", lanes.place(row, lane)), states, (number * times + k) * layout.y + row)
+            with w.counted(saved, last) as k, w.counted(0, layout.integrated) as row:
+                w.store(w.load("double", lanes.place(row, lane)), states, (number * times + k) * layout.integrated + row)
             w.store(last, who, lane + w.lanes)
             with w.when(last < times):
                 w.store(w.load("double", goals, number * times + last), lanes.place(layout.rows["goal"].start, lane))

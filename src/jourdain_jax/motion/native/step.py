@@ -29,7 +29,7 @@ def write_step(w: Writer, form: Form, method: Method) -> None:
 
 def _write_step(w: Writer, form: Form, method: Method, p: Lanes) -> None:
     layout, y = form.layout, p.pointer  # the state comes first in the rows of a lane
-    rows = range(layout.y)
+    rows = range(layout.integrated)
     t, h, code, goal, direction = p["t"], p["h"], p["code"], p["goal"], p["direction"]
     locating = code.equals(float(LOCATING))
     rest = w.magnitude(goal - t)
@@ -40,9 +40,9 @@ def _write_step(w: Writer, form: Form, method: Method, p: Lanes) -> None:
     t1 = w.where(lands, goal, t + step)
     step = t1 - t
     k, smallest, changed_sign = _stages(w, form, method, p, t, step)
-    y1, error = w.room(w.real, layout.y), w.room(w.real, layout.y)
+    y1, error = w.room(w.real, layout.integrated), w.room(w.real, layout.y)
     _each_row(w, rows, y1, lambda i: w.fma(step, _weighted(w, method.b, k, layout, i), w.load(w.real, y, i)))
-    _each_row(w, rows, error, lambda i: step * _weighted(w, method.b_error, k, layout, i))
+    _each_row(w, range(layout.y), error, lambda i: step * _weighted(w, method.b_error, k, layout, i))
     if form.projects:
         _project(w, layout, p, t1, y1, error)
     size_of_error = _norm(w, layout, p, error, y1)
@@ -99,7 +99,8 @@ def _over_rows(w: Writer, rows: range, start: float, added: Callable[[Value, int
 def _stages(w: Writer, form: Form, method: Method, p: Lanes, t: Value, step: Value) -> tuple[Value, Value, Value]:
     """Where the slopes of all stages are; the smallest magnitude of a pivot, and whether any changed its sign."""
     layout, count = form.layout, form.pivots
-    k, at, pivots = w.room(w.real, layout.y * method.needed), w.room(w.real, layout.y), w.room(w.real, max(count, 1))
+    every = layout.integrated
+    k, at, pivots = w.room(w.real, every * method.needed), w.room(w.real, every), w.room(w.real, max(count, 1))
     low, high = [w.number(math.inf)] * count, [w.number(-math.inf)] * count
 
     def next_state(i: int, row: int | Value) -> Value:
@@ -107,8 +108,8 @@ def _stages(w: Writer, form: Form, method: Method, p: Lanes, t: Value, step: Val
         return w.fma(step, _weighted(w, method.A[i], k, layout, row), start) if i else start
 
     for i in range(method.needed):
-        _each_row(w, range(layout.y), at, partial(next_state, i))
-        w.call("rates", "void", p.pointer, w.fma(step, float(method.c[i]), t), at, w.at(k, i * layout.y, w.real), pivots)
+        _each_row(w, range(every), at, partial(next_state, i))
+        w.call("rates", "void", p.pointer, w.fma(step, float(method.c[i]), t), at, w.at(k, i * every, w.real), pivots)
         now = [w.load(w.real, pivots, j) for j in range(count)]
         low, high = [w.smaller(a, b) for a, b in zip(low, now, strict=True)], [w.larger(a, b) for a, b in zip(high, now, strict=True)]
     smallest, changed = w.number(math.inf), w.literal(0, w.truth)
@@ -121,9 +122,9 @@ def _stages(w: Writer, form: Form, method: Method, p: Lanes, t: Value, step: Val
 def _weighted(w: Writer, weights: np.ndarray, k: Value, layout: Layout, row: int | Value) -> Value:
     """sum_j w_j k_j of one number of the state."""
     used = [j for j in range(len(weights)) if weights[j] != 0]
-    total = w.load(w.real, k, used[0] * layout.y + row) * float(weights[used[0]])
+    total = w.load(w.real, k, used[0] * layout.integrated + row) * float(weights[used[0]])
     for j in used[1:]:
-        total = w.fma(w.load(w.real, k, j * layout.y + row), float(weights[j]), total)
+        total = w.fma(w.load(w.real, k, j * layout.integrated + row), float(weights[j]), total)
     return total
 
 
@@ -162,13 +163,13 @@ def _count(w: Writer, happens: Value) -> Value:
 def _watched(w: Writer, form: Form, method: Method, p: Lanes, k: Value, step: Value, accept: Value, new: dict[str, Value], y1: Value) -> dict[str, Value]:
     """The step in which an event may have happened or is being located, or before which one has; changes `y1`."""
     layout, count, y = form.layout, form.layout.events, p.pointer
-    t, code, rows = p["t"], p["code"], range(layout.y)
+    t, code, rows = p["t"], p["code"], range(layout.integrated)
     locating, fresh = code.equals(float(LOCATING)), (p["accepted"] + p["rejected"]).equals(0.0)
     accept = accept & ~locating & new["code"].equals(float(RUNNING))
 
     def events(t: Value, y: Value, stage: int) -> tuple[list[Value], list[Value]]:
         values, rates = w.room(w.real, count), w.room(w.real, count)
-        w.call("events", "void", p.pointer, t, y, w.at(k, stage * layout.y, w.real), values, rates)
+        w.call("events", "void", p.pointer, t, y, w.at(k, stage * layout.integrated, w.real), values, rates)
         return [w.load(w.real, values, i) for i in range(count)], [w.load(w.real, rates, i) for i in range(count)]
 
     c_0, rate_0 = events(t, y, 0)
@@ -184,7 +185,7 @@ def _watched(w: Writer, form: Form, method: Method, p: Lanes, k: Value, step: Va
     left, shift = p["search_left"], p["search_shift"]
     found, back = locating & left.equals(0.0), changes & (left > DIFFERENTIABLE + 1.0)
     # a motion that starts beyond an event has no motion at all
-    finite = _over_rows(w, rows, 0.0, lambda total, i: total + 0.0 * w.load(w.real, y, i)).equals(0.0)
+    finite = _over_rows(w, range(layout.y), 0.0, lambda total, i: total + 0.0 * w.load(w.real, y, i)).equals(0.0)
     over = fresh & finite & ~search.no_event(w, c_0)
     which = w.number(float(count - 1))
     for i in reversed(range(count - 1)):
@@ -196,6 +197,9 @@ def _watched(w: Writer, form: Form, method: Method, p: Lanes, k: Value, step: Va
         return w.where(stays, w.load(w.real, y, i), w.where(found, w.fma(shift, w.load(w.real, k, i), after), after))
 
     _each_row(w, rows, y1, state)
+    along = {}
+    if form.moving is not None:
+        along = {"dt": _tangents_at_event(w, form, p, k, found, new["t"], rate_0, y1)}
     tried = _count(w, dips)
     now = w.where(found, float(results.EVENT), w.where(locating, float(LOCATING), new["code"]))
     new = {
@@ -205,6 +209,31 @@ def _watched(w: Writer, form: Form, method: Method, p: Lanes, k: Value, step: Va
         "accepted": new["accepted"] - tried,
         "rejected": new["rejected"] + tried,
         "event": w.where(happened | (locating & was_trying), w.load(w.real, first), p["event"]),
+        **along,
     }
     begun = {"h": p["h"], "code": w.number(float(results.EVENT)), "accepted": p["accepted"], "rejected": p["rejected"], "event": which}
     return new | {name: w.where(over, value, new[name]) for name, value in begun.items()}
+
+
+def _tangents_at_event(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Value, rate: list[Value], y1: Value) -> Value:
+    """The tangent of the time of an event, zero where none is found; adds to those of the state `y1` there.
+
+    dt = -(dc/dy dy + dc/dp dp)/cdot,   dy <- dy + f dt
+    """
+    layout, place = form.layout, w.room(w.real)
+    w.store(p["dt"], place)
+    with w.when(w.any(found)):
+        values = w.room(w.real, layout.events)
+        w.call("event_tangents", "void", p.pointer, t, y1, values)
+        dc = search.chosen(w, p["event"], [w.load(w.real, values, i) for i in range(layout.events)])
+        slope = search.chosen(w, p["event"], rate)
+        usable = found & slope.differs(0.0) & (w.magnitude(slope) < math.inf)
+        dt = w.where(usable, -dc / slope, 0.0)
+        w.store(w.where(found, dt, p["dt"]), place)
+
+        def moved(i: int | Value) -> Value:
+            before = w.load(w.real, y1, i + layout.y)
+            return w.where(usable, w.fma(w.load(w.real, k, i), dt, before), before)
+
+        _for_rows(w, range(layout.y), lambda i: w.store(moved(i), y1, i + layout.y))
+    return w.load(w.real, place)
