@@ -17,7 +17,7 @@ class Rules(NamedTuple):
 
     serve: Callable[..., bool]  # (*perturbed): whether they serve, given for each array of the arguments whether it varies
     push: Callable  # (arguments, tangents): tangents of the result
-    pull: Callable | None = None  # (perturbed, arguments, result, cotangents): cotangents of the arguments
+    pull: Callable  # (perturbed, arguments, cotangents): cotangents of those arguments that vary
 
 
 def differentiated_as(differentiable: Callable, quick: Callable, kind: Literal["forward", "reverse"], rules: Rules | None = None) -> Callable:
@@ -85,6 +85,9 @@ def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
 
     @own.def_fwd
     def forth(perturbed, arguments):
+        if rules is not None and rules.serve(*perturbed):
+            found = quick(*arguments)
+            return lanes_first(found), (None, eqx.filter_eval_shape(lambda: found))
         moving, fixed = eqx.partition(arguments, perturbed)
         found, pull = eqx.filter_vjp(lambda moving: differentiable(*eqx.combine(moving, fixed)), moving)
         return lanes_first(found), (pull, eqx.filter_eval_shape(lambda: found))
@@ -92,7 +95,10 @@ def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
     @own.def_bwd
     def back(residuals, cotangents, perturbed, arguments):
         pull, shapes = residuals
-        return pull(jax.tree.map(_filled, shapes, cotangents, is_leaf=lambda x: x is None))[0]
+        g = jax.tree.map(_filled, shapes, cotangents, is_leaf=lambda x: x is None)
+        if pull is None:
+            return rules.pull(perturbed, arguments, g)
+        return pull(g)[0]
 
     return lambda *arguments: own(arguments)
 

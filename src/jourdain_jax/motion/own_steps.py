@@ -91,7 +91,11 @@ def _rules(setup: Setup, mapped: Callable) -> Rules | None:
     """Derivatives by machine code; `mapped`: of a function of one motion, that of all lanes."""
     if native_motion.reason_against_derivatives(setup.field, bool(setup.options.event_names)):
         return None
-    return Rules(_times_are_numbers, lambda arguments, along: mapped(_pushed)(*arguments, *along))
+
+    def pull(perturbed, arguments, g):
+        return mapped(partial(_pulled, perturbed))(*arguments, g)
+
+    return Rules(_times_are_numbers, lambda arguments, along: mapped(_pushed)(*arguments, *along), pull)
 
 
 def _times_are_numbers(setup: Setup, begun: Begun) -> bool:
@@ -105,6 +109,20 @@ def _pushed(setup: Setup, begun: Begun, along: Setup, d: Begun) -> PyTree:
     goals = _goals(setup, setup.ts)
     dy0 = jax.tree.map(lambda x, dx: jnp.zeros_like(x) if dx is None else dx, begun.y0, d.y0)
     return native_motion.tangents(*_of_machine_code(setup, begun, goals), dy0, _known(d.args), partial(_as_solved, goals))
+
+
+def _pulled(perturbed: tuple, setup: Setup, begun: Begun, g: Solved) -> tuple:
+    """Cotangents of what varies, from those of the motion."""
+    goals, shape = _goals(setup, setup.ts), jax.tree.map(lambda x: jnp.zeros((1, *x.shape)), begun.y0)
+    states = jax.tree.map(lambda g, zero: jnp.concatenate([g, zero]), g.ys, shape)
+    by_start, by_known = native_motion.cotangents(*_of_machine_code(setup, begun, goals), _known(perturbed[1].args), (states, g.y_end, g.t_end))
+    none_else = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
+    field, scene, inputs, fixed, origin = none_else[1].args
+    y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)
+    if inputs.channels:
+        inputs = eqx.tree_at(lambda x: [c.value for c in x.channels], inputs, by_known[len(fixed) :], is_leaf=lambda x: x is None)
+    args = field, scene, inputs, tuple(by_known[: len(fixed)]), origin
+    return none_else[0], eqx.tree_at(lambda b: (b.y0, b.args), none_else[1], (y0, args), is_leaf=lambda x: x is None)
 
 
 def _known(args: tuple) -> list:

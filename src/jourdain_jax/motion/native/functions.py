@@ -45,6 +45,11 @@ class Form:
         return len(self.program.pivots) if self.has_pivots else 0
 
     @property
+    def moves(self) -> list[int]:
+        """A projection step by step, 1: of the coordinates, 0: of the speeds."""
+        return [1, 1] + [0] * (0 if not self.program.projected_u else 1 if self.affine else 2)
+
+    @property
     def nodes(self) -> list[int]:
         """All that is evaluated."""
         program = self.program
@@ -81,7 +86,7 @@ def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
 
 
 def _found(w: Writer, form: Form, own: Outputs, known: dict[int, Value], state: Value, y: Value) -> tuple[list[Value], list[Value]]:
-    """The values of outputs, and their tangents; `known`: as from `_known`."""
+    """The values of outputs, and their tangents; `known`: as from `known_values`."""
     given = dict(zip(own.variables, known.values(), strict=True))
     given |= {n: w.load(w.real, y, form.layout.y + i) for i, n in enumerate(own.states)}
     if own.known:
@@ -90,7 +95,7 @@ def _found(w: Writer, form: Form, own: Outputs, known: dict[int, Value], state: 
     return found[: len(own.values)], found[len(own.values) :]
 
 
-def _known(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> dict[int, Value]:
+def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> dict[int, Value]:
     """Values of all nodes that are given from outside."""
     program, layout, lanes = form.program, form.layout, Lanes(w, form.layout, state)
     states = [w.load(w.real, y, k) for k in range(layout.coordinates + layout.speeds)]
@@ -106,7 +111,7 @@ def write_rates(w: Writer, form: Form) -> None:
     with w.function("rates", "void", arguments, attributes=how) as (state, tau, y, k, pivots):
         power = [program.power] if form.with_work and program.power is not None else []
         rates = [*program.qdot, *program.ydot, *power]
-        known = _known(w, form, state, tau, y)
+        known = known_values(w, form, state, tau, y)
         found, tangents = _found(w, form, outputs_of(form, [*rates, *program.guards, *program.pivots[: form.pivots]], len(rates)), known, state, y)
         if form.with_work and not power:
             found.insert(layout.coordinates + layout.speeds, w.number(0.0))
@@ -124,7 +129,7 @@ def write_projection(w: Writer, form: Form) -> None:
     """`project(state, tau, y)`: puts the state `y` back onto the rows."""
     program, layout = form.program, form.layout
     with w.function("projected_once", "void", {"state": "ptr", "tau": w.real, "y": "ptr", "q_moves": "i1"}, attributes="noinline") as (state, tau, y, q_moves):
-        known = _known(w, form, state, tau, y)
+        known = known_values(w, form, state, tau, y)
         for condition, nodes, first in ((q_moves, program.projected_q, 0), (~q_moves, program.projected_u, layout.coordinates)):
             with w.when(condition):
                 found, tangents = _found(w, form, outputs_of(form, nodes, len(nodes)), known, state, y)
@@ -134,8 +139,8 @@ def write_projection(w: Writer, form: Form) -> None:
                     w.store(x, y, layout.y + first + i)
         w.give()
     with w.function("project", "void", {"state": "ptr", "tau": w.real, "y": "ptr"}) as (state, tau, y):
-        for moves in [1, 1] + [0] * (0 if not program.projected_u else 1 if form.affine else 2):
-            w.call("projected_once", "void", state, tau, y, w.literal(moves, "i1"))
+        for q_moves in form.moves:
+            w.call("projected_once", "void", state, tau, y, w.literal(q_moves, "i1"))
         w.give()
 
 
@@ -165,7 +170,7 @@ def write_events(w: Writer, form: Form) -> None:
     program, own, count = form.program, event_program(form), form.layout.events
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "slope": "ptr", "c": "ptr", "rate": "ptr"}
     with w.function("events", "void", arguments, attributes="noinline") as (state, tau, y, slope, c, rate):
-        known = dict(zip(own.variables, _known(w, form, state, tau, y).values(), strict=True))
+        known = dict(zip(own.variables, known_values(w, form, state, tau, y).values(), strict=True))
         known |= {n: w.load(w.real, slope, i) for i, n in enumerate(own.slopes)}
         found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *own.rates], known)]
         for i in range(count):
@@ -174,7 +179,7 @@ def write_events(w: Writer, form: Form) -> None:
         w.give()
     if form.moving is not None:
         with w.function("event_tangents", "void", {"state": "ptr", "tau": w.real, "y": "ptr", "dc": "ptr"}, attributes="noinline") as (state, tau, y, dc):
-            _, tangents = _found(w, form, outputs_of(form, program.events, count), _known(w, form, state, tau, y), state, y)
+            _, tangents = _found(w, form, outputs_of(form, program.events, count), known_values(w, form, state, tau, y), state, y)
             for i, x in enumerate(tangents):
                 w.store(x, dc, i)
             w.give()

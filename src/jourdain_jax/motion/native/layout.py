@@ -47,7 +47,7 @@ class Layout:
         search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1}
         tangents = {"dt": 0 if self.moving is None else 1}, {"dknown": self.moving or 0}
         counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), **tangents[0], **dict.fromkeys(CONTROL, 1), "known": self.known, **tangents[1]}
-        counts |= {"goal": 1, **(search if self.events else {})}
+        counts |= {"goal": 1, "taken": 1, **(search if self.events else {})}
         found, first = {}, 0
         for name, count in counts.items():
             found[name] = range(first, first + count)

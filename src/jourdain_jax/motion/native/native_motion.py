@@ -13,7 +13,7 @@ from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators.erk_loop import ended
 from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
 from jourdain_jax.motion.native.functions import Form, event_program, outputs_of
-from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel
+from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel, kernel_back
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
@@ -108,6 +108,19 @@ def tangents(
     primals = states[:, :n], jnp.concatenate([end[:n], end[2 * n : -2], end[-1:]])
     pushed = states[:, n:], jnp.zeros_like(primals[1]).at[:n].set(end[n : 2 * n]).at[plain.rows["t"].start].set(dt)
     return jax.jvp(lambda *found: of(*_unpacked(plain, goals, *found)), primals, pushed)[1]
+
+
+def cotangents(
+    args: tuple, solver: type, has_events: bool, y0: Integrated, goals: Float[Array, "times"], control: Control, asked: Sequence[bool], g: tuple
+) -> tuple[Integrated, list]:
+    """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for; `g`: of states, of the last and of its time."""
+    which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
+    form, (ys, y_end, t_end) = _form(args[0], has_events), g
+    starts = jnp.concatenate([_packed(y0), *_rows(args, goals, control)])
+    ends = jnp.concatenate([_packed(y_end), t_end[None]])
+    found = kernel_back(form, solver, which)(starts, jax.vmap(_packed)(ys), ends, goals)
+    known = dict(zip(which, found[form.layout.y :], strict=True))
+    return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
 
 
 def _rows(args: tuple, goals: Float[Array, "times"], control: Control) -> tuple[Array, Array, Array]:
