@@ -77,14 +77,15 @@ def _loop(setup: Setup, y0, args, ts, knots) -> Solved:
 
 
 def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
-    goals = _goals(setup, setup.ts)
-    return _as_solved(goals, *native_motion.integrate(*_of_machine_code(setup, begun, goals)))
+    motion = _motion(setup, begun)
+    return _as_solved(motion.goals, *native_motion.integrate(motion))
 
 
-def _of_machine_code(setup: Setup, begun: Begun, goals) -> tuple:
+def _motion(setup: Setup, begun: Begun) -> native_motion.Motion:
     options = setup.options
-    control = native_motion.Control(*options.tolerances, setup.shortest, options.dt0, options.max_steps)
-    return begun.args, type(options.solver), bool(options.event_names), begun.y0, goals, control
+    rtol, atol = options.tolerances
+    control = native_motion.Control(rtol, atol, setup.shortest, options.dt0, options.max_steps)
+    return native_motion.Motion(begun.args, type(options.solver), bool(options.event_names), begun.y0, _goals(setup, setup.ts), control)
 
 
 def _rules(setup: Setup, mapped: Callable) -> Rules | None:
@@ -106,16 +107,15 @@ def _times_are_numbers(setup: Setup, begun: Begun) -> bool:
 
 def _pushed(setup: Setup, begun: Begun, along: Setup, d: Begun) -> PyTree:
     """Tangents of the motion, along those of its start and of what the rates are given."""
-    goals = _goals(setup, setup.ts)
+    motion = _motion(setup, begun)
     dy0 = jax.tree.map(lambda x, dx: jnp.zeros_like(x) if dx is None else dx, begun.y0, d.y0)
-    return native_motion.tangents(*_of_machine_code(setup, begun, goals), dy0, _known(d.args), partial(_as_solved, goals))
+    return native_motion.tangents(motion, dy0, _known(d.args), partial(_as_solved, motion.goals))
 
 
 def _pulled(perturbed: tuple, setup: Setup, begun: Begun, g: Solved) -> tuple:
     """Cotangents of what varies, from those of the motion."""
-    goals, shape = _goals(setup, setup.ts), jax.tree.map(lambda x: jnp.zeros((1, *x.shape)), begun.y0)
-    states = jax.tree.map(lambda g, zero: jnp.concatenate([g, zero]), g.ys, shape)
-    by_start, by_known = native_motion.cotangents(*_of_machine_code(setup, begun, goals), _known(perturbed[1].args), (states, g.y_end, g.t_end))
+    states = jax.tree.map(lambda g: jnp.concatenate([g, jnp.zeros((1, *g.shape[1:]))]), g.ys)  # nobody asks for the last one: it is that of the end
+    by_start, by_known = native_motion.cotangents(_motion(setup, begun), _known(perturbed[1].args), states, g.y_end, g.t_end)
     none_else = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
     field, scene, inputs, fixed, origin = none_else[1].args
     y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)

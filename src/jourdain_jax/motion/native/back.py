@@ -1,7 +1,8 @@
 """The loop over steps, gone through once more and then back, as machine code: cotangents of the start from those of the states and the end.
 
 Lanes side by side begin and end together here. On the way forth every try of a step leaves a slot: the state before it, the slopes of its stages, by how
-far the state went on (zero where the step was refused, or the lane had ended), and how many times had been saved after it. On the way back, with the step a number,
+far the state went on (zero where the step was refused, or the lane had ended), and how many times had been saved after it. On the way back, a step being a
+number,
 
     Y_i = y_0 + h sum_j a_ij k_j,   v_i = b_i g_1 + sum_l a_li G_l,   (G_i, g_p) = (df/dy, df/dp)'(Y_i) h v_i,   g_0 = g_1 + sum G_i
 

@@ -37,7 +37,14 @@ class Form:
         """The rows of a lane."""
         program = self.program
         known = len(program.fixed) + len(program.inputs)
-        return Layout(len(program.qdot), len(program.ydot), self.with_work, known, len(program.events) if self.has_events else 0, None if self.moving is None else len(self.moving))
+        return Layout(
+            len(program.qdot),
+            len(program.ydot),
+            self.with_work,
+            known,
+            len(program.events) if self.has_events else 0,
+            None if self.moving is None else len(self.moving),
+        )
 
     @property
     def pivots(self) -> int:

@@ -15,6 +15,7 @@ from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
 from jourdain_jax.motion.native.functions import Form, event_program, outputs_of
 from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel, kernel_back
 from jourdain_jax.motion.native.layout import Layout
+from jourdain_jax.motion.native.pulled import pulled_program, rates_of
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.native import ffi, host
@@ -32,6 +33,17 @@ class Control(NamedTuple):
     shortest: Float[Array, ""]
     dt0: Float[Array, ""]
     max_steps: int
+
+
+class Motion(NamedTuple):
+    """What is integrated from where, to which times since the start, and how well."""
+
+    args: tuple  # as rates take them
+    solver: type
+    has_events: bool
+    y0: Integrated
+    goals: Float[Array, "times"]
+    control: Control
 
 
 def reason_against(field: VectorField, scene: PyTree, has_events: bool) -> str:
@@ -69,63 +81,57 @@ def _reason_against_program(form: Form) -> str:
     return reason
 
 
-def reason_against_derivatives(field: ByProgram, has_events: bool) -> str:
+def reason_against_derivatives(field: VectorField, has_events: bool) -> str:
     """Why machine code that integrates a scene cannot differentiate it, in words; empty where it can."""
-    return _reason_against_derivatives(_form(field, has_events, ()))
+    assert isinstance(field, ByProgram)
+    return _reason_against_derivatives(_form(field, has_events))
 
 
 @lru_cache(maxsize=MOST_KERNELS)
 def _reason_against_derivatives(form: Form) -> str:
-    own = outputs_of(form, [*form.program.qdot, *form.program.ydot], len(form.program.qdot) + len(form.program.ydot))
-    reason = unsupported(own.graph, [*own.values, *own.tangents])
-    operations = own.graph.operations([*own.values, *own.tangents])
-    return reason or (f"rates and tangents take {operations} operations, more than {LARGEST_PROGRAM}" if operations > LARGEST_PROGRAM else "")
+    along = outputs_of(replace(form, moving=()), rates_of(form), len(rates_of(form)))
+    graph, back, *_ = pulled_program(form, rates_of(form), ())
+    reason = unsupported(along.graph, along.tangents) or unsupported(graph, back)
+    operations = max(along.graph.operations([*along.values, *along.tangents]), graph.operations(back))
+    return reason or (f"a derivative of the rates takes {operations} operations, more than {LARGEST_PROGRAM}" if operations > LARGEST_PROGRAM else "")
 
 
 def _form(field: ByProgram, has_events: bool, moving: tuple[int, ...] | None = None) -> Form:
     return Form(field.program, field.with_work, field.projects, field.affine, has_events, field.has_pivots, moving)
 
 
-def integrate(
-    args: tuple, solver: type, has_events: bool, y0: Integrated, goals: Float[Array, "times"], control: Control
-) -> tuple[Integrated, Bool[Array, "times"], Progress]:
-    """As `erk_loop.integrate`, of one motion from time zero; `args`: as rates take them."""
-    own = kernel(_form(args[0], has_events), solver)
-    return _unpacked(own.layout, goals, *own.run(jnp.concatenate([_packed(y0), *_rows(args, goals, control)]), goals))
+def integrate(motion: Motion) -> tuple[Integrated, Bool[Array, "times"], Progress]:
+    """As `erk_loop.integrate`, of one motion from time zero."""
+    own = kernel(_form(motion.args[0], motion.has_events), motion.solver)
+    return _unpacked(own.layout, motion.goals, *own.run(jnp.concatenate([_packed(motion.y0), *_rows(motion)]), motion.goals))
 
 
-def tangents(
-    args: tuple, solver: type, has_events: bool, y0: Integrated, goals: Float[Array, "times"], control: Control, dy0: Integrated, dknown: Sequence, of: Callable
-) -> PyTree:
+def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, of: Callable) -> PyTree:
     """The tangents of `of` what `integrate` returns; `dy0`, `dknown`: of the state, and of each of the numbers that the rates are given, None: zero."""
     moving = tuple(i for i, d in enumerate(dknown) if d is not None)
-    own = kernel(_form(args[0], has_events, moving), solver)
-    layout, (progress, limits, known) = own.layout, _rows(args, goals, control)
+    own = kernel(_form(motion.args[0], motion.has_events, moving), motion.solver)
+    layout, (progress, limits, known) = own.layout, _rows(motion)
     more = [jnp.asarray(dknown[i], jnp.float64)[None] for i in moving]
-    states, end = own.run(jnp.concatenate([_packed(y0), _packed(dy0), progress, jnp.zeros(1), limits, known, *more]), goals)
-    n, dt = layout.y, end[layout.rows["dt"].start]
-    plain = replace(layout, moving=None)
+    states, end = own.run(jnp.concatenate([_packed(motion.y0), _packed(dy0), progress, jnp.zeros(1), limits, known, *more]), motion.goals)
+    n, plain = layout.y, replace(layout, moving=None)
     primals = states[:, :n], jnp.concatenate([end[:n], end[2 * n : -2], end[-1:]])
-    pushed = states[:, n:], jnp.zeros_like(primals[1]).at[:n].set(end[n : 2 * n]).at[plain.rows["t"].start].set(dt)
-    return jax.jvp(lambda *found: of(*_unpacked(plain, goals, *found)), primals, pushed)[1]
+    along = jnp.zeros_like(primals[1]).at[:n].set(end[n : 2 * n]).at[plain.rows["t"].start].set(end[layout.rows["dt"].start])
+    return jax.jvp(lambda *found: of(*_unpacked(plain, motion.goals, *found)), primals, (states[:, n:], along))[1]
 
 
-def cotangents(
-    args: tuple, solver: type, has_events: bool, y0: Integrated, goals: Float[Array, "times"], control: Control, asked: Sequence[bool], g: tuple
-) -> tuple[Integrated, list]:
-    """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for; `g`: of states, of the last and of its time."""
+def cotangents(motion: Motion, asked: Sequence[bool], ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> tuple[Integrated, list]:
+    """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of the states and of the end."""
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
-    form, (ys, y_end, t_end) = _form(args[0], has_events), g
-    starts = jnp.concatenate([_packed(y0), *_rows(args, goals, control)])
-    ends = jnp.concatenate([_packed(y_end), t_end[None]])
-    found = kernel_back(form, solver, which)(starts, jax.vmap(_packed)(ys), ends, goals)
+    form = _form(motion.args[0], motion.has_events)
+    starts, ends = jnp.concatenate([_packed(motion.y0), *_rows(motion)]), jnp.concatenate([_packed(y_end), t_end[None]])
+    found = kernel_back(form, motion.solver, which)(starts, jax.vmap(_packed)(ys), ends, motion.goals)
     known = dict(zip(which, found[form.layout.y :], strict=True))
     return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
 
 
-def _rows(args: tuple, goals: Float[Array, "times"], control: Control) -> tuple[Array, Array, Array]:
+def _rows(motion: Motion) -> tuple[Array, Array, Array]:
     """Progress, control and what is known, as a lane is given them."""
-    _, _, inputs, fixed, origin = args
+    (_, _, inputs, fixed, origin), goals, control = motion.args, motion.goals, motion.control
     zero, one = jnp.zeros(()), jnp.ones(())
     t, h, code, event = zero, jnp.abs(control.dt0), RUNNING * one, -one
     progress = [t, h, code, zero, zero, event, jnp.inf * one]

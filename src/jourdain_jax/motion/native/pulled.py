@@ -1,13 +1,13 @@
 """Cotangents through rates, projection and stop events of a lowered scene, as functions of machine code.
 
-    G_y = (df/dy)' g,   G_p += (df/dp)' g          p: those of the numbers that the rates are given which are asked for
+G_y = (df/dy)' g,   G_p += (df/dp)' g          p: those of the numbers that the rates are given which are asked for
 """
 
 from collections.abc import Sequence
 
 from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.motion.native.functions import Form, known_values
-from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.ir import Writer
 from jourdain_jax.native.scalar_program import as_real, written
 from jourdain_jax.program.derivative import cotangents
 from jourdain_jax.program.graph import Graph
