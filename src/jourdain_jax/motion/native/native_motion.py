@@ -15,7 +15,7 @@ from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
 from jourdain_jax.motion.native.functions import Form, event_program, outputs_of
 from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel, kernel_back
 from jourdain_jax.motion.native.layout import Layout
-from jourdain_jax.motion.native.pulled import pulled_program, rates_of
+from jourdain_jax.motion.native.pulled import pulled_program, steps_of
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.native import ffi, host
@@ -89,11 +89,15 @@ def reason_against_derivatives(field: VectorField, has_events: bool) -> str:
 
 @lru_cache(maxsize=MOST_KERNELS)
 def _reason_against_derivatives(form: Form) -> str:
-    along = outputs_of(replace(form, moving=()), rates_of(form), len(rates_of(form)))
-    graph, back, *_ = pulled_program(form, rates_of(form), ())
-    reason = unsupported(along.graph, along.tangents) or unsupported(graph, back)
-    operations = max(along.graph.operations([*along.values, *along.tangents]), graph.operations(back))
-    return reason or (f"a derivative of the rates takes {operations} operations, more than {LARGEST_PROGRAM}" if operations > LARGEST_PROGRAM else "")
+    for nodes in steps_of(form).values():
+        along = outputs_of(replace(form, moving=()), nodes, len(nodes))
+        graph, back, *_ = pulled_program(form, nodes, ())
+        if reason := unsupported(along.graph, along.tangents) or unsupported(graph, back):
+            return reason
+        operations = max(along.graph.operations([*along.values, *along.tangents]), graph.operations(back))
+        if operations > LARGEST_PROGRAM:
+            return f"a derivative of a part of it takes {operations} operations, more than {LARGEST_PROGRAM}"
+    return ""
 
 
 def _form(field: ByProgram, has_events: bool, moving: tuple[int, ...] | None = None) -> Form:

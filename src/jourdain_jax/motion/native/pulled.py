@@ -23,15 +23,19 @@ def rates_of(form: Form) -> list[int]:
 
 def write_pulled(w: Writer, form: Form, asked: Sequence[int]) -> None:
     """`pull_rates`, `pull_q`, `pull_u` and `pull_events`, each `(state, tau, y, g, to_y, to_known)`; `asked`: which of the numbers known."""
-    program, layout = form.program, form.layout
-    q, u = _state_nodes(form)[: layout.coordinates], _state_nodes(form)[layout.coordinates :]
-    _write(w, form, "pull_rates", rates_of(form), asked)
+    for name, nodes in steps_of(form).items():
+        _write(w, form, f"pull_{name}", nodes, asked, work_stays=name in ("q", "u"))
+
+
+def steps_of(form: Form) -> dict[str, list[int]]:
+    """What a step consists of: rates, all of a state after either part of a projection, stop events."""
+    program, count = form.program, form.layout.coordinates
+    q, u = _state_nodes(form)[:count], _state_nodes(form)[count:]
+    found = {"rates": rates_of(form)}
     if form.projects:
-        _write(w, form, "pull_q", [*program.projected_q, *u], asked, work_stays=True)
-        if program.projected_u:
-            _write(w, form, "pull_u", [*q, *program.projected_u], asked, work_stays=True)
-    if form.has_events:
-        _write(w, form, "pull_events", program.events, asked)
+        found["q"] = [*program.projected_q, *u]
+        found |= {"u": [*q, *program.projected_u]} if program.projected_u else {}
+    return found | ({"events": list(program.events)} if form.has_events else {})
 
 
 def pulled_program(form: Form, nodes: Sequence[int], asked: Sequence[int]) -> tuple[Graph, list[int], list[int], list[int]]:
