@@ -80,6 +80,7 @@ LANES = X * (1 + 0.05 * np.random.default_rng(0).normal(size=(11, 6)))
         (lambda f: jax.jit(jax.jacfwd(jax.jacfwd(f)))(X), FORWARD),
         (lambda f: jax.jit(lambda x, v: jax.jvp(jax.vmap(f), (x,), (v,)))(LANES, LANES), FORWARD),
     ],
+    ids=["vmap of grad", "grad of vmap", "vmap of jacfwd", "jacfwd of jacfwd", "jvp of vmap"],
 )
 def test_nested_derivatives_up_to_an_event_are_those_of_xla(derivative, adjoint):
     ours, theirs = (derivative(lambda x, native=native: jnp.sum(_ends(x, native, adjoint, True) ** 2)) for native in (True, False))
@@ -87,7 +88,7 @@ def test_nested_derivatives_up_to_an_event_are_those_of_xla(derivative, adjoint)
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("adjoint", [None, FORWARD])
+@pytest.mark.parametrize("adjoint", [None, FORWARD], ids=["reverse", "forward"])
 def test_lanes_that_fail_or_are_no_numbers_do_not_touch_others(adjoint):
     x = LANES.at[2, 3].set(jnp.nan).at[5, 4].set(jnp.inf).at[7].set(0.0).at[7, :2].set(1.0)
     mode = jax.grad if adjoint is None else jax.jacfwd
@@ -121,7 +122,7 @@ def test_cotangents_reach_back_over_more_steps_than_there_is_memory_for_at_first
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
 
 
-@pytest.mark.parametrize("adjoint", [None, FORWARD])
+@pytest.mark.parametrize("adjoint", [None, FORWARD], ids=["reverse", "forward"])
 def test_the_loop_of_xla_is_not_traced_unless_a_time_varies(adjoint, monkeypatch):
     traced = []
     monkeypatch.setattr(erk_loop, "integrate", lambda *a, integrate=erk_loop.integrate: traced.append(1) or integrate(*a))
@@ -171,26 +172,37 @@ CASES = {
     "tilting-disc, at rest": ({"lean": 0.0}, {"t1": 0.5}, ["radius", "gravity"]),
     "chaplygin-sleigh": (None, {"t1": 2.0}, ["mass", "inertia"]),
     "tilting-disc-quaternion": (None, {"t1": 0.5, "state": "full"}, ["radius"]),
-    "whipple-bicycle": (None, {"t1": 0.5}, ["w", "g", "mB"]),
+    "whipple-bicycle": (None, {"t1": 0.5, "projection": False}, ["w", "g", "mB"]),
+    "whipple-bicycle, projected": (None, {"t1": 0.5}, ["w", "g", "mB"]),
     "double-pendulum-rods": (None, {"t1": 0.5}, []),
 }
 
 
-@pytest.mark.parametrize("adjoint", [None, FORWARD])
-@pytest.mark.parametrize("name", CASES)
-def test_derivatives_of_a_model_are_those_of_xla(name, adjoint):
+def _slope(name: str, native: bool, adjoint) -> np.ndarray:
+    """Of a number made of saved states and the end of a motion, with respect to parameters and two directions of the start."""
     start, options, parameters = CASES[name]
     scene = jj.models.MODELS[name.split(",")[0]]()
     begun = jj.start(scene, **(scene.example if start is None else start))
     x = jnp.array([float(getattr(scene, p)) for p in parameters] + [0.0, 0.0])
     q, u = (jnp.asarray(np.random.default_rng(0).normal(size=(2, len(part)))) for part in (begun.q, begun.u))
 
-    def end(x, native):
+    def end(x):
         own = scene.replace(**{p: x[i] for i, p in enumerate(parameters)}) if parameters else scene
         state = jj.State(begun.t, begun.q + x[-2] * q[0], begun.u + x[-1] * u[0], begun.moved_q, begun.moved_u, begun.residual, begun.names, begun.guess)
         motion = jj.simulate(own, state, rtol=1e-10, atol=1e-10, native=native, adjoint=adjoint, **options)
         return q[1] @ motion.q_end + u[1] @ motion.u_end + motion.t_end + jnp.nansum(motion.q[:3] ** 2)
 
-    mode = jax.grad if adjoint is None else jax.jacfwd
-    ours, theirs = (jax.jit(mode(lambda x, native=native: end(x, native)))(x) for native in (True, False))
-    np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9 * float(jnp.max(jnp.abs(theirs))))
+    return np.asarray(jax.jit((jax.grad if adjoint is None else jax.jacfwd)(end))(x))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_both_modes_of_a_model_agree(name):
+    found, expected = (_slope(name, True, adjoint) for adjoint in (None, FORWARD))
+    assert np.any(expected != 0)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_tangents_of_a_model_are_those_of_xla(name):
+    found, expected = (_slope(name, native, FORWARD) for native in (True, False))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)))
