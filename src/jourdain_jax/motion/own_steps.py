@@ -88,21 +88,20 @@ def _motion(setup: Setup, begun: Begun) -> native_motion.Motion:
     return native_motion.Motion(begun.args, type(options.solver), bool(options.event_names), begun.y0, _goals(setup, setup.ts), control)
 
 
-def _rules(setup: Setup, mapped: Callable) -> Rules | None:
+def _rules(setup: Setup, mapped: Callable) -> Rules:
     """Derivatives by machine code; `mapped`: of a function of one motion, that of all lanes."""
-    if native_motion.reason_against_derivatives(setup.field, bool(setup.options.event_names)):
-        return None
+
+    def serve(varies: Setup, begun: Begun) -> bool:
+        of_times = varies.ts, varies.t0, varies.t1, varies.options.tolerances, varies.options.dt0, begun.args[-1]
+        return not any(jax.tree.leaves(of_times)) and not native_motion.reason_against_derivatives(setup.field, bool(setup.options.event_names))
+
+    def push(arguments, along):
+        return mapped(_pushed)(*arguments, *along)
 
     def pull(perturbed, arguments, g):
         return mapped(partial(_pulled, perturbed))(*arguments, g)
 
-    return Rules(_times_are_numbers, lambda arguments, along: mapped(_pushed)(*arguments, *along), pull)
-
-
-def _times_are_numbers(setup: Setup, begun: Begun) -> bool:
-    """Whether no time and no tolerance varies, given what does."""
-    of_times = setup.ts, setup.t0, setup.t1, setup.options.tolerances, setup.options.dt0, begun.args[-1]
-    return not any(jax.tree.leaves(of_times))
+    return Rules(serve, push, pull)
 
 
 def _pushed(setup: Setup, begun: Begun, along: Setup, d: Begun) -> PyTree:
