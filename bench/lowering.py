@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from baselines import dense, disc_run, heyoka_disc
 from baselines.hand_derived import HAND_DERIVED, operations
-from baselines.timing import fastest, seconds_per_evaluation
+from baselines.timing import fastest, least_processor_time, seconds_per_evaluation
 
 import jourdain_jax as jj
 from jourdain_jax.models import PendulumChain, TiltingDisc, TrailerChain
@@ -147,43 +147,71 @@ def disc_motions(quick: bool) -> Iterator[Figure]:
         yield figure(name, "tilting-disc", theirs / seconds, required, aim, at_least=True)
 
 
-def gradients(quick: bool) -> Iterator[Figure]:
-    """Gradient of a final-state loss by 8 numbers, best mode, relative to one forward solve at the same tolerance."""
-    scene = jj.models.MODELS["tilting-disc"]()
-    values = np.array([1.0, 0.5, 9.81, *disc_run.START[[3, 5, 6, 7]], 0.0])
-    forward, reverse = diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()
+# span in s, names of parameters, and which coordinates and speeds of the start vary: eight numbers in all
+BY_EIGHT = {
+    "tilting-disc": (10.0, ("mass", "radius", "gravity"), (2, 3), (4, 3, 5)),
+    "whipple-bicycle": (2.0, ("w", "c", "g", "mB"), (3, 5), (3, 6)),
+}
+AT_MOST = {"tilting-disc": 4, "whipple-bicycle": 6}  # solves
+
+
+def final_losses(name: str) -> tuple[Callable, np.ndarray]:
+    """A loss of the final coordinates of every lane, as a function of eight numbers each and of an adjoint; the eight numbers."""
+    scene = jj.models.MODELS[name]()
+    span, parameters, of_q, of_u = BY_EIGHT[name]
+    start = jj.start(scene, **({"lean": 0.3, "yaw_rate": 0.5, "spin_rate": -3.0} if name == "tilting-disc" else scene.example))
+    values = np.array([*(float(getattr(scene, p)) for p in parameters), *start.q[jnp.array(of_q)], *start.u[jnp.array(of_u)]])
 
     def losses(x, adjoint):
-        """Of every lane; by mass, radius, gravity, lean, yaw, lean and spin rates, yaw."""
-        zero = jnp.zeros(len(x))
-        y = jnp.stack([zero, zero, x[:, 7], x[:, 3], zero, *x[:, 4:7].T], axis=1)
-        options = RUN | {"rtol": 1e-9, "atol": 1e-9, "adjoint": adjoint}
+        options = RUN | {"ts": jnp.array([span]), "rtol": 1e-9, "atol": 1e-9, "adjoint": adjoint}
+        starts = jax.tree.map(lambda y: jnp.broadcast_to(y, (len(x), *jnp.shape(y))), start)
+        first, middle = len(parameters), len(parameters) + len(of_q)
+        q, u = starts.q.at[:, jnp.array(of_q)].set(x[:, first:middle]), starts.u.at[:, jnp.array(of_u)].set(x[:, middle:])
+        starts = jj.State(starts.t, q, u, starts.moved_q, starts.moved_u, starts.residual, starts.names, starts.guess)
         if len(x) == 1:
-            own = scene.replace(mass=x[0, 0], radius=x[0, 1], gravity=x[0, 2])
-            return jnp.sum(jj.simulate(own, jax.tree.map(lambda x: x[0], our_starts(y)), **options).q_end ** 2)[None]
-        lanes = jj.rollout(scene, our_starts(y), parameters={"mass": x[:, 0], "radius": x[:, 1], "gravity": x[:, 2]}, **options).lanes
+            own = scene.replace(**{p: x[0, k] for k, p in enumerate(parameters)})
+            return jnp.sum(jj.simulate(own, jax.tree.map(lambda x: x[0], starts), **options).q_end ** 2)[None]
+        lanes = jj.rollout(scene, starts, parameters={p: x[:, k] for k, p in enumerate(parameters)}, **options).lanes
         return jnp.sum(lanes.q_end**2, axis=1)
 
-    def by_forward_mode(x):
-        along = jnp.eye(8)[:, None, :] + jnp.zeros_like(x)
-        return jax.vmap(lambda v: jax.jvp(lambda x: losses(x, forward), (x,), (v,))[1])(along).T
+    return losses, values
 
-    ways = {
-        "solve": lambda x: losses(x, forward),
-        "forward": by_forward_mode,
-        "reverse": jax.grad(lambda x: jnp.sum(losses(x, reverse))),
-    }
-    for where, lanes, required, aim in (("alone", 1, 5, 3), ("batched", 1024, 8, 4))[: 1 if quick else 2]:
-        x = jnp.asarray(values * (1 + 0.01 * np.random.default_rng(0).normal(size=(lanes, 8))))
-        timed, found = {}, {}
-        for name, f in ways.items():
-            compiled = jax.jit(f)
-            timed[name] = fastest(lambda compiled=compiled, x=x: jax.block_until_ready(compiled(x)), 3)
-            found[name] = compiled(x)
-        np.testing.assert_allclose(found["forward"], found["reverse"], rtol=1e-5, atol=1e-5)
-        print(f"  {where}: " + ", ".join(f"{name} {1e3 * t / lanes:.3f} ms" for name, t in timed.items()), flush=True)
-        best = min(timed["forward"], timed["reverse"])
-        yield figure(f"gradient by 8 numbers / one solve, {where}", "tilting-disc", best / timed["solve"], required, aim)
+
+def gradients(quick: bool) -> Iterator[Figure]:
+    """Gradient of a final-state loss by 8 numbers, best mode, relative to one forward solve at the same tolerance; what each mode takes to compile."""
+    forward, reverse = diffrax.ForwardMode(), diffrax.RecursiveCheckpointAdjoint()
+    kept, os.environ["JOURDAIN_JAX_CACHE"] = os.environ.get("JOURDAIN_JAX_CACHE"), "0"  # nothing that was compiled before
+    for name in ("tilting-disc",) if quick else BY_EIGHT:
+        losses, values = final_losses(name)
+
+        def by_forward_mode(x, losses=losses):
+            along = jnp.eye(8)[:, None, :] + jnp.zeros_like(x)
+            return jax.vmap(lambda v: jax.jvp(lambda x: losses(x, forward), (x,), (v,))[1])(along).T
+
+        ways = {
+            "solve": lambda x, losses=losses: losses(x, forward),
+            "forward": by_forward_mode,
+            "reverse": jax.grad(lambda x, losses=losses: jnp.sum(losses(x, reverse))),
+        }
+        for where, lanes in (("alone", 1), ("batched", 1024))[: 1 if quick else 2]:
+            x = jnp.asarray(values * (1 + 0.01 * np.random.default_rng(0).normal(size=(lanes, 8))))
+            runs, found = {}, {}
+            for way, f in ways.items():
+                begin = time.process_time()
+                runs[way] = jax.jit(f).lower(x).compile()
+                seconds = time.process_time() - begin
+                found[way] = np.asarray(runs[way](x))
+                if way != "solve" and where == "alone":
+                    yield figure(f"trace and compile the gradient by 8 numbers, {way} mode, s", name, seconds, *((6, 3) if way == "forward" else (10, 5)))
+            timed = least_processor_time({way: lambda run=run, x=x: jax.block_until_ready(run(x)) for way, run in runs.items()}, 7)
+            scale = np.max(np.abs(found["reverse"]))
+            np.testing.assert_allclose(found["forward"], found["reverse"], rtol=1e-5, atol=1e-5 * scale)
+            print(f"  {name}, {where}: " + ", ".join(f"{way} {1e3 * t / lanes:.3f} ms" for way, t in timed.items()), flush=True)
+            best = min(timed["forward"], timed["reverse"])
+            yield figure(f"gradient by 8 numbers / one solve, {where}", name, best / timed["solve"], AT_MOST[name], 3)
+    os.environ.pop("JOURDAIN_JAX_CACHE")
+    if kept is not None:
+        os.environ["JOURDAIN_JAX_CACHE"] = kept
 
 
 def cold_seconds(name: str, way: str) -> float:

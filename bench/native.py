@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from baselines import disc_run
+from baselines.timing import least_processor_time
 
 import jourdain_jax as jj
 from jourdain_jax.motion.own_steps import reason_against_machine_code
@@ -51,19 +52,6 @@ def figure(name: str, model: str, value: float, required: float | None = None) -
     """One entry of the result."""
     print(f"  {name}, {model}: {value:.4g}" + ("" if required is None else f" (required: {required:g})"), flush=True)
     return {"figure": name, "model": model, "value": value, "required": required, "met": required is None or value <= required}
-
-
-def least_processor_time(runs: dict[str, Callable], repeats: int) -> dict[str, float]:
-    """Processor time of each run, s: the least of some repeats, in turn, after a first one that compiles."""
-    for run in runs.values():
-        run()
-    laps: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in range(repeats):
-        for name, run in runs.items():
-            begin = time.process_time()
-            run()
-            laps[name].append(time.process_time() - begin)
-    return {name: min(values) for name, values in laps.items()}
 
 
 def spread_starts(scene: jj.Scene, lanes: int) -> jj.State:

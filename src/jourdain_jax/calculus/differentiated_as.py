@@ -1,25 +1,35 @@
 """A function by two ways of computing it: one that runs, and one that is differentiated."""
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from jourdain_jax.calculus.lanes_first import lanes_first
 
 
-def differentiated_as(differentiable: Callable, quick: Callable, kind: Literal["forward", "reverse"]) -> Callable:
-    """`quick`, which JAX cannot differentiate, with the derivatives of `differentiable`, which computes the same and takes its place in any derivative.
+class Rules(NamedTuple):
+    """Derivatives of the function that runs, by itself; trees of tangents and cotangents have None where there is none."""
 
-    Both take trees of arrays and of anything else, and return trees of arrays. `kind`: the mode of differentiation of `differentiable`.
+    serve: Callable[..., bool]  # (*perturbed): whether they serve, given for each array of the arguments whether it varies
+    push: Callable  # (arguments, tangents): tangents of the result
+    pull: Callable  # (perturbed, arguments, cotangents): cotangents of those arguments that vary
+
+
+def differentiated_as(differentiable: Callable, quick: Callable, kind: Literal["forward", "reverse"], rules: Rules | None = None) -> Callable:
+    """`quick`, which JAX cannot differentiate, with derivatives by `rules` where they serve, and otherwise those of `differentiable`, which computes the same.
+
+    Both take trees of arrays and of anything else, and return trees of arrays. `kind`: the mode of differentiation of `differentiable`. The rules are for
+    first derivatives; those of higher order, of what the rules compute, are again those of `differentiable`.
     """
-    return (_forward if kind == "forward" else _reverse)(differentiable, quick)
+    return (_forward if kind == "forward" else _reverse)(differentiable, quick, rules)
 
 
-def _forward(differentiable: Callable, quick: Callable) -> Callable:
+def _forward(differentiable: Callable, quick: Callable, rules: Rules | None) -> Callable:
     def run(*arguments):
         arrays, rest = eqx.partition(arguments, eqx.is_array)
         leaves, treedef = jax.tree.flatten(arrays)
@@ -32,11 +42,24 @@ def _forward(differentiable: Callable, quick: Callable) -> Callable:
         def rule(leaves, tangents):
             moving = [i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero)]
 
-            def of_moving(*values):
-                return of(differentiable, [dict(zip(moving, values, strict=True)).get(i, leaf) for i, leaf in enumerate(leaves)])
+            def pushed(leaves, *along):
+                def of_moving(*values):
+                    return of(differentiable, [dict(zip(moving, values, strict=True)).get(i, leaf) for i, leaf in enumerate(leaves)])
 
-            found, rates = jax.jvp(of_moving, tuple(leaves[i] for i in moving), tuple(tangents[i] for i in moving))
-            return lanes_first(found), lanes_first(rates)
+                return jax.jvp(of_moving, tuple(leaves[i] for i in moving), along)
+
+            along = [tangents[i] for i in moving]
+            if rules is None or not rules.serve(*jax.tree.unflatten(treedef, [i in moving for i in range(len(leaves))])):
+                found, rates = pushed(leaves, *along)
+                return lanes_first(found), lanes_first(rates)
+
+            def pushed_by_rules(leaves, *along):
+                given = jax.tree.unflatten(treedef, [dict(zip(moving, along, strict=True)).get(i) for i in range(len(leaves))])
+                return _with_tangents(rules.push(eqx.combine(jax.tree.unflatten(treedef, leaves), rest), given))
+
+            found = own(*leaves)
+            rates = _forward(lambda *x: _with_tangents(pushed(*x)[1]), pushed_by_rules, None)(list(leaves), *along)
+            return found, _without_gaps(found, rates)
 
         own.defjvp(rule, symbolic_zeros=True)
         return own(*leaves)
@@ -44,13 +67,27 @@ def _forward(differentiable: Callable, quick: Callable) -> Callable:
     return run
 
 
-def _reverse(differentiable: Callable, quick: Callable) -> Callable:
+def _with_tangents(rates) -> list:
+    """The tangents of numbers, without those of what has none."""
+    return [x for x in jax.tree.leaves(rates) if x.dtype != jax.dtypes.float0]
+
+
+def _without_gaps(found, rates: list):
+    """The tangents of all that was found, given those of numbers."""
+    left = iter(rates)
+    return jax.tree.map(lambda x: next(left) if jnp.issubdtype(x.dtype, jnp.inexact) else np.zeros(x.shape, jax.dtypes.float0), found)
+
+
+def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> Callable:
     @eqx.filter_custom_vjp
     def own(arguments):
         return lanes_first(quick(*arguments))
 
     @own.def_fwd
     def forth(perturbed, arguments):
+        if rules is not None and rules.serve(*perturbed):
+            found = quick(*arguments)
+            return lanes_first(found), (None, eqx.filter_eval_shape(lambda: found))
         moving, fixed = eqx.partition(arguments, perturbed)
         found, pull = eqx.filter_vjp(lambda moving: differentiable(*eqx.combine(moving, fixed)), moving)
         return lanes_first(found), (pull, eqx.filter_eval_shape(lambda: found))
@@ -58,7 +95,10 @@ def _reverse(differentiable: Callable, quick: Callable) -> Callable:
     @own.def_bwd
     def back(residuals, cotangents, perturbed, arguments):
         pull, shapes = residuals
-        return pull(jax.tree.map(_filled, shapes, cotangents, is_leaf=lambda x: x is None))[0]
+        g = jax.tree.map(_filled, shapes, cotangents, is_leaf=lambda x: x is None)
+        if pull is None:
+            return rules.pull(perturbed, arguments, g)
+        return pull(g)[0]
 
     return lambda *arguments: own(arguments)
 

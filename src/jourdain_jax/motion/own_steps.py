@@ -1,8 +1,9 @@
-"""Our own explicit Runge-Kutta loop as an integrator: as machine code where that serves, and as a loop of XLA where not, and for all derivatives.
+"""Our own explicit Runge-Kutta loop as an integrator: as machine code where that serves, first derivatives too, and as a loop of XLA where not.
 
 One motion, or lanes side by side: those of a scalar program in blocks of `lockstep.width`.
 """
 
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jourdain_jax.calculus.differentiated_as import differentiated_as
+from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.integrators import erk_loop, integrands
 from jourdain_jax.motion.native import native_motion
@@ -21,7 +22,7 @@ def solved_by_own_steps(setup: Setup, begun: Begun) -> Solved:
     """One motion by our own loop."""
     if reason_against_machine_code(setup):
         return _by_xla(setup, begun)
-    return differentiated_as(_by_xla, _by_machine_code, setup.options.kind)(setup, begun)
+    return differentiated_as(_by_xla, _by_machine_code, setup.options.kind, _rules(setup, lambda f: f))(setup, begun)
 
 
 def lanes_solved_by_own_steps(setups: Setup, begun: Begun) -> Solved:
@@ -31,7 +32,7 @@ def lanes_solved_by_own_steps(setups: Setup, begun: Begun) -> Solved:
     blocks = partial(in_blocks, _lanes_by_xla, width(program))
     if reason_against_machine_code(setups):
         return blocks(setups, begun)
-    return differentiated_as(blocks, eqx.filter_vmap(_by_machine_code), setups.options.kind)(setups, begun)
+    return differentiated_as(blocks, eqx.filter_vmap(_by_machine_code), setups.options.kind, _rules(setups, eqx.filter_vmap))(setups, begun)
 
 
 def reason_against_machine_code(setup: Setup) -> str:
@@ -76,11 +77,57 @@ def _loop(setup: Setup, y0, args, ts, knots) -> Solved:
 
 
 def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
-    options, goals = setup.options, _goals(setup, setup.ts)
+    motion = _motion(setup, begun)
+    return _as_solved(motion.goals, *native_motion.integrate(motion))
+
+
+def _motion(setup: Setup, begun: Begun) -> native_motion.Motion:
+    options = setup.options
     rtol, atol = options.tolerances
     control = native_motion.Control(rtol, atol, setup.shortest, options.dt0, options.max_steps)
-    ys, reached, end = native_motion.integrate(begun.args, type(options.solver), bool(options.event_names), begun.y0, goals, control)
-    return _as_solved(goals, ys, reached, end)
+    return native_motion.Motion(begun.args, type(options.solver), bool(options.event_names), begun.y0, _goals(setup, setup.ts), control)
+
+
+def _rules(setup: Setup, mapped: Callable) -> Rules:
+    """Derivatives by machine code; `mapped`: of a function of one motion, that of all lanes."""
+
+    def serve(varies: Setup, begun: Begun) -> bool:
+        of_times = varies.ts, varies.t0, varies.t1, varies.options.tolerances, varies.options.dt0, begun.args[-1]
+        return not any(jax.tree.leaves(of_times)) and not native_motion.reason_against_derivatives(setup.field, bool(setup.options.event_names))
+
+    def push(arguments, along):
+        return mapped(_pushed)(*arguments, *along)
+
+    def pull(perturbed, arguments, g):
+        return mapped(partial(_pulled, perturbed))(*arguments, g)
+
+    return Rules(serve, push, pull)
+
+
+def _pushed(setup: Setup, begun: Begun, along: Setup, d: Begun) -> PyTree:
+    """Tangents of the motion, along those of its start and of what the rates are given."""
+    motion = _motion(setup, begun)
+    dy0 = jax.tree.map(lambda x, dx: jnp.zeros_like(x) if dx is None else dx, begun.y0, d.y0)
+    return native_motion.tangents(motion, dy0, _known(d.args), partial(_as_solved, motion.goals))
+
+
+def _pulled(perturbed: tuple, setup: Setup, begun: Begun, g: Solved) -> tuple:
+    """Cotangents of what varies, from those of the motion."""
+    states = jax.tree.map(lambda g: jnp.concatenate([g, jnp.zeros((1, *g.shape[1:]))]), g.ys)  # nobody asks for the last one: it is that of the end
+    by_start, by_known = native_motion.cotangents(_motion(setup, begun), _known(perturbed[1].args), states, g.y_end, g.t_end)
+    none_else = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
+    field, scene, inputs, fixed, origin = none_else[1].args
+    y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)
+    if inputs.channels:
+        inputs = eqx.tree_at(lambda x: [c.value for c in x.channels], inputs, by_known[len(fixed) :], is_leaf=lambda x: x is None)
+    args = field, scene, inputs, tuple(by_known[: len(fixed)]), origin
+    return none_else[0], eqx.tree_at(lambda b: (b.y0, b.args), none_else[1], (y0, args), is_leaf=lambda x: x is None)
+
+
+def _known(args: tuple) -> list:
+    """Of each number that the rates are given: what depends on parameters alone, and constant inputs."""
+    _, _, inputs, fixed, _ = args
+    return [*fixed, *(channel.value for channel in inputs.channels)]
 
 
 def _goals(setup: Setup, ts) -> Float[Array, "times *lanes"]:

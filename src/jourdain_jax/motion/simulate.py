@@ -83,7 +83,7 @@ def simulate(
       its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
     - `lowering`: integrate the scene's scalar program (`jj.lower`) where it has one and neither `reduction` nor `stabilisation` is given; with False,
       the dense matrices. `native`: on CPUs, integrate that program by machine code made for it, where llvmlite is installed and the solver is a default one;
-      with False, by XLA, as derivatives always are, and as `jax.export` needs. Both take the same steps.
+      with False, by XLA, as `jax.export` needs, and as derivatives of higher order and with respect to times are. Both take the same steps.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
 
     Where nothing is traced, a motion that leaves the domain of its privileged speeds is run again with the full state, and a stiff one by an implicit

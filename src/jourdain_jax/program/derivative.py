@@ -48,6 +48,50 @@ def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Map
     return [tangents[n] for n in outputs]
 
 
+def cotangents(graph: Graph, outputs: Iterable[int], weights: Iterable[int], variables: Iterable[int]) -> list[int]:
+    """sum_i w_i d output_i/d variable for each variable (nodes that are not looked into), in one sweep from the outputs back.
+
+    What a branch that is not taken would give is zero, however its derivative is: there a weight of zero counts, also times what is no number.
+    """
+    variables = list(variables)
+    total: dict[int, int] = {}
+    for output, weight in zip(outputs, weights, strict=True):
+        total[output] = graph.add(total.get(output, graph.zero), weight)
+    needed = graph.needed(list(total), variables)
+    leads_to = set(variables)
+    for node in needed:
+        if any(a in leads_to for a in graph.args[node]):
+            leads_to.add(node)
+    branches = [a for node in needed if graph.op[node] in ("select", "max", "min") for a in graph.args[node]]
+    in_branch = set(graph.needed(branches, variables))
+    for node in reversed(needed):
+        weight = total.get(node, graph.zero)
+        if weight == graph.zero or node not in leads_to:
+            continue
+        op, args = graph.op[node], graph.args[node]
+        for i, a in enumerate(args):
+            if a in leads_to:
+                part = _part(graph, node, i, weight)
+                if node in in_branch and op not in ("add", "sub", "neg", "select"):
+                    part = graph.call("select", graph.call("eq", weight, graph.zero), part, graph.zero)
+                total[a] = graph.add(total.get(a, graph.zero), part)
+    return [total.get(n, graph.zero) for n in variables]
+
+
+def _part(graph: Graph, node: int, i: int, weight: int) -> int:
+    """What the weight of a node gives to its argument with number i."""
+    op, args = graph.op[node], graph.args[node]
+    if op == "mul":
+        return graph.mul(weight, args[1 - i])
+    if op == "div":
+        share = graph.div(weight, args[1])
+        return graph.neg(graph.mul(share, node)) if i else share
+    if op == "select":
+        return graph.zero if i == 0 else graph.call("select", args[0], *((weight, graph.zero) if i == 1 else (graph.zero, weight)))
+    slope = _derivative(graph, node, [graph.one if k == i else graph.zero for k in range(len(args))])
+    return graph.mul(weight, slope)
+
+
 def columns(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[list[int]]:
     """Derivatives of all outputs with respect to each variable: the columns of the Jacobian, zeros among them."""
     variables, rows = list(variables), jacobian(graph, outputs, variables)

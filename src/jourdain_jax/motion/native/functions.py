@@ -1,5 +1,11 @@
-"""Rates, projection and stop events of a lowered scene as functions of machine code: of the rows of lanes, time since the start, and a state in memory."""
+"""Rates, projection and stop events of a lowered scene as functions of machine code: of the rows of lanes, time since the start, and a state in memory.
 
+Where a tangent is pushed along, it follows its state in memory, and each function also gives the tangents of what it gives:
+
+    d f(t, y, p) = df/dy dy + df/dp dp          p: numbers that the rates are given, of which those in `Form.moving` have tangents
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,18 +30,31 @@ class Form:
     affine: bool
     has_events: bool
     has_pivots: bool
+    moving: tuple[int, ...] | None = None  # which of the numbers known have a tangent; None: nothing has one
 
     @property
     def layout(self) -> Layout:
         """The rows of a lane."""
         program = self.program
         known = len(program.fixed) + len(program.inputs)
-        return Layout(len(program.qdot), len(program.ydot), self.with_work, known, len(program.events) if self.has_events else 0)
+        return Layout(
+            len(program.qdot),
+            len(program.ydot),
+            self.with_work,
+            known,
+            len(program.events) if self.has_events else 0,
+            None if self.moving is None else len(self.moving),
+        )
 
     @property
     def pivots(self) -> int:
         """How many are watched."""
         return len(self.program.pivots) if self.has_pivots else 0
+
+    @property
+    def moves(self) -> list[int]:
+        """A projection step by step, 1: of the coordinates, 0: of the speeds."""
+        return [1, 1] + [0] * (0 if not self.program.projected_u else 1 if self.affine else 2)
 
     @property
     def nodes(self) -> list[int]:
@@ -47,7 +66,43 @@ class Form:
         return [*program.qdot, *program.ydot, *power, *program.guards, *program.pivots, *projected, *events]
 
 
-def _known(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> dict[int, Value]:
+class Outputs(NamedTuple):
+    """Nodes with their tangents, on a graph of their own where they have some."""
+
+    graph: Graph
+    values: list[int]
+    tangents: list[int]  # none where nothing has one
+    variables: list[int]  # for those of the scene's program
+    states: list[int]  # inputs for the tangents of the state
+    known: list[int]  # and of those numbers known that have one
+
+
+def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
+    """The first `pushed` of the nodes with their tangents."""
+    program, layout = form.program, form.layout
+    if form.moving is None:
+        return Outputs(program.graph, list(nodes), [], program.variables, [], [])
+    graph, values, variables = on_its_own(program.graph, nodes, program.variables)
+    count, first = layout.coordinates + layout.speeds, len(program.fixed) + 1  # time, then the state
+    others = [*variables[: first - 1], *variables[first + count :]]
+    states = [graph.input(f"tangent of state {i}", True) for i in range(count)]
+    known = [graph.input(f"tangent of number {i}", True) for i in form.moving]
+    direction = dict(zip(variables[first : first + count], states, strict=True)) | {others[i]: n for i, n in zip(form.moving, known, strict=True)}
+    rates = [rate.get(0, graph.zero) for rate in directional_derivative(graph, values[:pushed], {0: direction})]
+    return Outputs(graph, values, rates, variables, states, known)
+
+
+def _found(w: Writer, form: Form, own: Outputs, known: dict[int, Value], state: Value, y: Value) -> tuple[list[Value], list[Value]]:
+    """The values of outputs, and their tangents; `known`: as from `known_values`."""
+    given = dict(zip(own.variables, known.values(), strict=True))
+    given |= {n: w.load(w.real, y, form.layout.y + i) for i, n in enumerate(own.states)}
+    if own.known:
+        given |= dict(zip(own.known, Lanes(w, form.layout, state).every("dknown"), strict=True))
+    found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *own.tangents], given)]
+    return found[: len(own.values)], found[len(own.values) :]
+
+
+def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> dict[int, Value]:
     """Values of all nodes that are given from outside."""
     program, layout, lanes = form.program, form.layout, Lanes(w, form.layout, state)
     states = [w.load(w.real, y, k) for k in range(layout.coordinates + layout.speeds)]
@@ -62,15 +117,16 @@ def write_rates(w: Writer, form: Form) -> None:
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "k": "ptr", "pivots": "ptr"}
     with w.function("rates", "void", arguments, attributes=how) as (state, tau, y, k, pivots):
         power = [program.power] if form.with_work and program.power is not None else []
-        outputs = [*program.qdot, *program.ydot, *power, *program.guards, *program.pivots[: form.pivots]]
-        known = _known(w, form, state, tau, y)
-        found = [as_real(w, x) for x in written(w, program.graph, outputs, known)]
+        rates = [*program.qdot, *program.ydot, *power]
+        known = known_values(w, form, state, tau, y)
+        found, tangents = _found(w, form, outputs_of(form, [*rates, *program.guards, *program.pivots[: form.pivots]], len(rates)), known, state, y)
         if form.with_work and not power:
             found.insert(layout.coordinates + layout.speeds, w.number(0.0))
+            tangents += [w.number(0.0)] if tangents else []
         for guard in found[layout.y : layout.y + len(program.guards)]:
             found[0] = w.where(guard > 0.0, found[0], float("nan"))
-        for i in range(layout.y):
-            w.store(found[i], k, i)
+        for i, x in enumerate([*found[: layout.y], *tangents]):
+            w.store(x, k, i)
         for i in range(form.pivots):
             w.store(found[layout.y + len(program.guards) + i] / known[program.sizes[i]], pivots, i)
         w.give()
@@ -80,17 +136,18 @@ def write_projection(w: Writer, form: Form) -> None:
     """`project(state, tau, y)`: puts the state `y` back onto the rows."""
     program, layout = form.program, form.layout
     with w.function("projected_once", "void", {"state": "ptr", "tau": w.real, "y": "ptr", "q_moves": "i1"}, attributes="noinline") as (state, tau, y, q_moves):
-        known = _known(w, form, state, tau, y)
-        with w.when(q_moves):
-            for i, x in enumerate(written(w, program.graph, program.projected_q, known)):
-                w.store(as_real(w, x), y, i)
-        with w.when(~q_moves):
-            for i, x in enumerate(written(w, program.graph, program.projected_u, known)):
-                w.store(as_real(w, x), y, layout.coordinates + i)
+        known = known_values(w, form, state, tau, y)
+        for condition, nodes, first in ((q_moves, program.projected_q, 0), (~q_moves, program.projected_u, layout.coordinates)):
+            with w.when(condition):
+                found, tangents = _found(w, form, outputs_of(form, nodes, len(nodes)), known, state, y)
+                for i, x in enumerate(found):
+                    w.store(x, y, first + i)
+                for i, x in enumerate(tangents):
+                    w.store(x, y, layout.y + first + i)
         w.give()
     with w.function("project", "void", {"state": "ptr", "tau": w.real, "y": "ptr"}) as (state, tau, y):
-        for moves in [1, 1] + [0] * (0 if not program.projected_u else 1 if form.affine else 2):
-            w.call("projected_once", "void", state, tau, y, w.literal(moves, "i1"))
+        for q_moves in form.moves:
+            w.call("projected_once", "void", state, tau, y, w.literal(q_moves, "i1"))
         w.give()
 
 
@@ -117,13 +174,19 @@ def event_program(form: Form) -> EventProgram:
 
 def write_events(w: Writer, form: Form) -> None:
     """`events(state, tau, y, slope, c, rate)`: the values of all stop events of the state `y`, and their rates where `y` changes at the rate `slope`."""
-    own, count = event_program(form), form.layout.events
+    program, own, count = form.program, event_program(form), form.layout.events
     arguments = {"state": "ptr", "tau": w.real, "y": "ptr", "slope": "ptr", "c": "ptr", "rate": "ptr"}
     with w.function("events", "void", arguments, attributes="noinline") as (state, tau, y, slope, c, rate):
-        known = dict(zip(own.variables, _known(w, form, state, tau, y).values(), strict=True))
+        known = dict(zip(own.variables, known_values(w, form, state, tau, y).values(), strict=True))
         known |= {n: w.load(w.real, slope, i) for i, n in enumerate(own.slopes)}
         found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *own.rates], known)]
         for i in range(count):
             w.store(found[i], c, i)
             w.store(found[count + i], rate, i)
         w.give()
+    if form.moving is not None:
+        with w.function("event_tangents", "void", {"state": "ptr", "tau": w.real, "y": "ptr", "dc": "ptr"}, attributes="noinline") as (state, tau, y, dc):
+            _, tangents = _found(w, form, outputs_of(form, program.events, count), known_values(w, form, state, tau, y), state, y)
+            for i, x in enumerate(tangents):
+                w.store(x, dc, i)
+            w.give()

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.motion.integrators.erk_loop import method_of
+from jourdain_jax.motion.native import back, loop
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Layout
-from jourdain_jax.motion.native.loop import written
 from jourdain_jax.native import ffi, host
 
 ALONE = 2  # places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
@@ -24,7 +24,7 @@ MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the pro
 
 
 class Kernel(NamedTuple):
-    """`run(starts, goals)` returns states at the goals, and the rows of the end."""
+    """`run(starts, goals)` returns states (and their tangents, where the form has some) at the goals, and the rows of the end."""
 
     form: Form
     run: Callable
@@ -40,22 +40,46 @@ def kernel(form: Form, solver: type[diffrax.AbstractERK]) -> Kernel:
     """The kernel for what is integrated, by the tableau of a solver of diffrax."""
     method, layout = method_of(solver()), form.layout
 
+    def shapes(starts, goals):
+        return (goals.shape[-1], layout.integrated), (layout.returned + 1,)
+
+    def run(starts: Float[Array, "rows"], goals: Float[Array, "times"]) -> tuple[Float[Array, "times y"], Float[Array, "ends"]]:
+        return tuple(called(starts, goals))
+
+    called = _called(lambda lanes, threads: loop.written(form, method, lanes, host.fuses(), threads), shapes)
+    return Kernel(form, run)
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def kernel_back(form: Form, solver: type[diffrax.AbstractERK], asked: tuple[int, ...]) -> Callable:
+    """A function of the rows of a start, cotangents of the states at the goals and of the end (with its time last), and the goals.
+
+    It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given.
+    """
+    method, count = method_of(solver()), form.layout.y + len(asked)
+    called = _called(lambda lanes, threads: back.written(form, method, lanes, host.fuses(), threads, asked), lambda *_: ((count,),))
+    return lambda *arguments: called(*arguments)[0]
+
+
+def _called(text: Callable[[int, int], str], shapes: Callable) -> Callable:
+    """A module of LLVM IR, written for so many lanes and threads, as a function of arrays without lanes; `shapes`: of its results, given the arguments."""
+
     @cache
     def name(lanes: int) -> str:
-        return ffi.registered(written(form, method, lanes, host.fuses(), 1 if lanes == ALONE else host.threads()))
+        return ffi.registered(text(lanes, 1 if lanes == ALONE else host.threads()))
 
-    def call(lanes: int, starts: Float[Array, "*lanes rows"], goals: Float[Array, "*lanes times"]):
-        shapes = (goals.shape[-1], layout.y), (layout.returned + 1,)
-        results = tuple(jax.ShapeDtypeStruct((*goals.shape[:-1], *shape), jnp.float64) for shape in shapes)
-        return jax.ffi.ffi_call(name(lanes), results, vmap_method="broadcast_all")(starts, goals)
+    def call(lanes: int, *arguments):
+        results = tuple(jax.ShapeDtypeStruct((*arguments[-1].shape[:-1], *shape), jnp.float64) for shape in shapes(*arguments))
+        return tuple(jax.ffi.ffi_call(name(lanes), results, vmap_method="broadcast_all")(*arguments))
 
     @jax.custom_batching.custom_vmap
-    def run(starts: Float[Array, "rows"], goals: Float[Array, "times"]) -> tuple[Float[Array, "times y"], Float[Array, "ends"]]:
-        return call(ALONE, starts, goals)
+    def run(*arguments):
+        return call(ALONE, *arguments)
 
     @run.def_vmap
     def run_many(count: int, batched: list[bool], *arguments):
-        starts, goals = (x if has_axis else jnp.broadcast_to(x, (count, *x.shape)) for x, has_axis in zip(arguments, batched, strict=True))
-        return call(host.lanes(), starts, goals), (True, True)
+        every = [x if has_axis else jnp.broadcast_to(x, (count, *x.shape)) for x, has_axis in zip(arguments, batched, strict=True)]
+        found = call(host.lanes(), *every)
+        return found, (True,) * len(found)
 
-    return Kernel(form, run)
+    return run

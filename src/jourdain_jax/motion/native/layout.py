@@ -1,6 +1,7 @@
 """Where the numbers of a lane are: a lane is a column of rows, one row per number, and a row is one vector for all lanes side by side.
 
-A lane is handed over with all rows of `Layout.given`, its progress at the start among them, and handed back with those of its progress.
+A lane is handed over with all rows of `Layout.given`, its progress at the start among them, and handed back with those of its progress. Where a tangent is
+pushed along, the state is followed by its own, and so are the numbers that the rates are given; `dt` is that of the time of an event.
 """
 
 from dataclasses import dataclass
@@ -22,11 +23,17 @@ class Layout:
     with_work: bool
     known: int  # numbers that the rates are given: what depends on parameters alone, then the inputs
     events: int
+    moving: int | None = None  # of those known, how many have a tangent; None: nothing has one
 
     @property
     def y(self) -> int:
         """Numbers of the integrated state."""
         return self.coordinates + self.speeds + self.with_work
+
+    @property
+    def integrated(self) -> int:
+        """Numbers of the state and of its tangent."""
+        return self.y if self.moving is None else 2 * self.y
 
     @property
     def parts(self) -> list[range]:
@@ -38,7 +45,9 @@ class Layout:
     def rows(self) -> dict[str, range]:
         """Name -> rows."""
         search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1}
-        counts = {"y": self.y, **dict.fromkeys((*PROGRESS, *CONTROL), 1), "known": self.known, "goal": 1, **(search if self.events else {})}
+        tangents = {"dt": 0 if self.moving is None else 1}, {"dknown": self.moving or 0}
+        counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), **tangents[0], **dict.fromkeys(CONTROL, 1), "known": self.known, **tangents[1]}
+        counts |= {"goal": 1, "taken": 1, **(search if self.events else {})}
         found, first = {}, 0
         for name, count in counts.items():
             found[name] = range(first, first + count)
@@ -48,7 +57,7 @@ class Layout:
     @property
     def returned(self) -> int:
         """How many rows are handed back."""
-        return self.y + len(PROGRESS)
+        return self.rows[CONTROL[0]].start
 
     @property
     def given(self) -> int:

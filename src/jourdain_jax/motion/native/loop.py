@@ -11,39 +11,45 @@ from jourdain_jax.motion.native.step import IDLE, write_step
 from jourdain_jax.native.ffi import write_handler
 from jourdain_jax.native.ir import Value, Writer
 
-# words of a job, shared by all threads: pointers to the arrays, the number of lanes, of times, and of the next lane
-_STARTS, _GOALS, _STATES, _ENDS, _COUNT, _TIMES, _NEXT = range(7)
+# words of a job, shared by all threads: the number of lanes, of times, and of the next lane, then pointers to the arrays
+COUNT, TIMES, NEXT, FIRST_ARRAY = range(4)
+_STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
 MANY = 8  # times as many lanes as side by side make it worth while to start another thread, which takes some 30 us
 
 
 def written(form: Form, method: Method, lanes: int, fused: bool, threads: int) -> str:
     """The module of LLVM IR; `threads`: among which many lanes are shared."""
     w = Writer(lanes, fused)
+    write_functions(w, form, method)
+    _write_begin(w, form)
+    _write_serve(w, form)
+    _write_loop(w, form, method)
+    write_handler(w, 2, 2, lambda arguments, results, sizes, rank: write_job(w, [*arguments, *results], sizes, rank, threads))
+    return w.text
+
+
+def write_functions(w: Writer, form: Form, method: Method) -> None:
+    """`step`, and what it calls."""
     write_rates(w, form)
     if form.projects:
         write_projection(w, form)
     if form.has_events:
         write_events(w, form)
     write_step(w, form, method)
-    _write_begin(w, form)
-    _write_serve(w, form)
-    _write_loop(w, form)
-    write_handler(w, 2, 2, lambda arguments, results, sizes, rank: _write_job(w, [*arguments, *results], sizes, rank, threads))
-    return w.text
 
 
-def _write_job(w: Writer, arrays: list[Value], sizes: Value, rank: Value, threads: int) -> None:
-    """All lanes, by this thread and by others that it starts and waits for."""
-    job = w.room("i64", 7)
-    for word, pointer in zip((_STARTS, _GOALS, _STATES, _ENDS), arrays, strict=True):
-        w.store(pointer, job, word)
+def write_job(w: Writer, arrays: list[Value], sizes: Value, rank: Value, threads: int) -> None:
+    """All lanes, by this thread and by others that it starts and waits for; `sizes`: of an array of lanes and times."""
+    job = w.room("i64", FIRST_ARRAY + len(arrays))
+    for word, pointer in enumerate(arrays):
+        w.store(pointer, job, FIRST_ARRAY + word)
     count = w.room("i64")
     w.store(w.literal(1, "i64"), count)
     with w.counted(0, rank - 1) as axis:
         w.store(w.load("i64", count) * w.load("i64", sizes, axis), count)
-    w.store(w.load("i64", count), job, _COUNT)
-    w.store(w.load("i64", sizes, rank - 1), job, _TIMES)
-    w.store(w.literal(0, "i64"), job, _NEXT)
+    w.store(w.load("i64", count), job, COUNT)
+    w.store(w.load("i64", sizes, rank - 1), job, TIMES)
+    w.store(w.literal(0, "i64"), job, NEXT)
     loop, nothing, others, started = Value(w, "ptr", "@loop"), Value(w, "ptr", "null"), w.room("i64", threads), w.room("i64")
     w.store(w.literal(0, "i64"), started)
     for more in range(1, threads):
@@ -57,16 +63,16 @@ def _write_job(w: Writer, arrays: list[Value], sizes: Value, rank: Value, thread
             w.external("pthread_join", "i32", w.load("i64", others, number), nothing)
 
 
-def _write_loop(w: Writer, form: Form) -> None:
+def _write_loop(w: Writer, form: Form, method: Method) -> None:
     """`loop(job)`: lanes side by side until none is left."""
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
-        _write_lanes(w, form, job)
+        _write_lanes(w, form, method, job)
         w.give(Value(w, "ptr", "null"))
 
 
-def _write_lanes(w: Writer, form: Form, job: Value) -> None:
+def _write_lanes(w: Writer, form: Form, method: Method, job: Value) -> None:
     # of each place, which lane is there and how many of its times are saved; after them, at how many places there is one
-    state, who = w.room(w.real, form.layout.all), w.room("i64", 2 * w.lanes + 1)
+    state, who, k = w.room(w.real, form.layout.all), w.room("i64", 2 * w.lanes + 1), w.room(w.real, form.layout.integrated * method.needed)
     w.store(w.literal(w.lanes, "i64"), who, 2 * w.lanes)
     with w.counted(0, form.layout.all) as row:
         w.store(w.number(1.0), state, row)
@@ -76,7 +82,7 @@ def _write_lanes(w: Writer, form: Form, job: Value) -> None:
         w.call("serve", "void", job, state, who, lane)
     with w.repeated() as leave:
         leave(w.load("i64", who, 2 * w.lanes).equals(0))
-        w.call("step", "void", state)
+        w.call("step", "void", state, k)
         code = lanes["code"]
         on_its_way = (code.equals(float(RUNNING)) & lanes["t"].differs(lanes["goal"])) | code.equals(float(LOCATING)) | code.equals(IDLE)
         with w.when(w.any(~on_its_way)), w.counted(0, w.lanes) as lane:
@@ -87,15 +93,15 @@ def _write_begin(w: Writer, form: Form) -> None:
     """`begin(job, state, who, lane)`: the next lane of the batch takes this place; where there is none, it is idle."""
     with w.function("begin", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "lane": "i64"}, attributes="noinline") as (job, state, who, lane):
         lanes, given = Lanes(w, form.layout, state), form.layout.given
-        number = w.counted_up(job, _NEXT)
-        there = number < w.load("i64", job, _COUNT)
+        number = w.counted_up(job, NEXT)
+        there = number < w.load("i64", job, COUNT)
         with w.when(there):
             w.store(number, who, lane)
             w.store(w.literal(0, "i64"), who, lane + w.lanes)
             starts = w.load("ptr", job, _STARTS)
             with w.counted(0, given) as row:
                 w.store(w.load("double", starts, number * given + row), lanes.place(row, lane))
-            lanes.set("goal", lane, w.load("double", w.load("ptr", job, _GOALS), number * w.load("i64", job, _TIMES)))
+            lanes.set("goal", lane, w.load("double", w.load("ptr", job, _GOALS), number * w.load("i64", job, TIMES)))
             if form.has_events:
                 lanes.set("search_left", lane, 0.0)
         with w.when(~there):
@@ -110,7 +116,7 @@ def _write_serve(w: Writer, form: Form) -> None:
     with w.function("serve", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "lane": "i64"}, attributes="noinline") as (job, state, who, lane):
         lanes = Lanes(w, layout, state)
         goals, states, ends = (w.load("ptr", job, word) for word in (_GOALS, _STATES, _ENDS))
-        times = w.load("i64", job, _TIMES)
+        times = w.load("i64", job, TIMES)
         with w.repeated() as leave:
             code, t, goal = (lanes.of(name, lane) for name in ("code", "t", "goal"))
             runs = code.equals(float(RUNNING))
@@ -118,8 +124,8 @@ def _write_serve(w: Writer, form: Form) -> None:
             number, saved = w.load("i64", who, lane), w.load("i64", who, lane + w.lanes)
             # at a time to save at; or at the end, whose state stands for all that is left
             last = w.where(runs, saved + 1, times)
-            with w.counted(saved, last) as k, w.counted(0, layout.y) as row:
-                w.store(w.load("double", lanes.place(row, lane)), states, (number * times + k) * layout.y + row)
+            with w.counted(saved, last) as k, w.counted(0, layout.integrated) as row:
+                w.store(w.load("double", lanes.place(row, lane)), states, (number * times + k) * layout.integrated + row)
             w.store(last, who, lane + w.lanes)
             with w.when(last < times):
                 w.store(w.load("double", goals, number * times + last), lanes.place(layout.rows["goal"].start, lane))

@@ -1,5 +1,7 @@
 """One motion by machine code, and when: the rows of its lane from what `erk_loop.integrate` is given, and what that returns from the rows of the end."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -10,9 +12,10 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators.erk_loop import ended
 from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
-from jourdain_jax.motion.native.functions import Form, event_program
-from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel
+from jourdain_jax.motion.native.functions import Form, event_program, outputs_of
+from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel, kernel_back
 from jourdain_jax.motion.native.layout import Layout
+from jourdain_jax.motion.native.pulled import pulled_program, steps_of
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.native import ffi, host
@@ -30,6 +33,17 @@ class Control(NamedTuple):
     shortest: Float[Array, ""]
     dt0: Float[Array, ""]
     max_steps: int
+
+
+class Motion(NamedTuple):
+    """What is integrated from where, to which times since the start, and how well."""
+
+    args: tuple  # as rates take them
+    solver: type
+    has_events: bool
+    y0: Integrated
+    goals: Float[Array, "times"]
+    control: Control
 
 
 def reason_against(field: VectorField, scene: PyTree, has_events: bool) -> str:
@@ -67,32 +81,82 @@ def _reason_against_program(form: Form) -> str:
     return reason
 
 
-def _form(field: ByProgram, has_events: bool) -> Form:
-    return Form(field.program, field.with_work, field.projects, field.affine, has_events, field.has_pivots)
+def reason_against_derivatives(field: VectorField, has_events: bool) -> str:
+    """Why machine code that integrates a scene cannot differentiate it, in words; empty where it can."""
+    assert isinstance(field, ByProgram)
+    return _reason_against_derivatives(_form(field, has_events))
 
 
-def integrate(
-    args: tuple, solver: type, has_events: bool, y0: Integrated, goals: Float[Array, "times"], control: Control
-) -> tuple[Integrated, Bool[Array, "times"], Progress]:
-    """As `erk_loop.integrate`, of one motion from time zero; `args`: as rates take them."""
-    field, _, inputs, fixed, origin = args
-    own = kernel(_form(field, has_events), solver)
-    layout, run = own.layout, own.run
+@lru_cache(maxsize=MOST_KERNELS)
+def _reason_against_derivatives(form: Form) -> str:
+    for nodes in steps_of(form).values():
+        along = outputs_of(replace(form, moving=()), nodes, len(nodes))
+        graph, back, *_ = pulled_program(form, nodes, ())
+        if reason := unsupported(along.graph, along.tangents) or unsupported(graph, back):
+            return reason
+        operations = max(along.graph.operations([*along.values, *along.tangents]), graph.operations(back))
+        if operations > LARGEST_PROGRAM:
+            return f"a derivative of a part of it takes {operations} operations, more than {LARGEST_PROGRAM}"
+    return ""
+
+
+def _form(field: ByProgram, has_events: bool, moving: tuple[int, ...] | None = None) -> Form:
+    return Form(field.program, field.with_work, field.projects, field.affine, has_events, field.has_pivots, moving)
+
+
+def integrate(motion: Motion) -> tuple[Integrated, Bool[Array, "times"], Progress]:
+    """As `erk_loop.integrate`, of one motion from time zero."""
+    own = kernel(_form(motion.args[0], motion.has_events), motion.solver)
+    return _unpacked(own.layout, motion.goals, *own.run(jnp.concatenate([_packed(motion.y0), *_rows(motion)]), motion.goals))
+
+
+def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, of: Callable) -> PyTree:
+    """The tangents of `of` what `integrate` returns; `dy0`, `dknown`: of the state, and of each of the numbers that the rates are given, None: zero."""
+    moving = tuple(i for i, d in enumerate(dknown) if d is not None)
+    own = kernel(_form(motion.args[0], motion.has_events, moving), motion.solver)
+    layout, (progress, limits, known) = own.layout, _rows(motion)
+    more = [jnp.asarray(dknown[i], jnp.float64)[None] for i in moving]
+    states, end = own.run(jnp.concatenate([_packed(motion.y0), _packed(dy0), progress, jnp.zeros(1), limits, known, *more]), motion.goals)
+    n, plain = layout.y, replace(layout, moving=None)
+    primals = states[:, :n], jnp.concatenate([end[:n], end[2 * n : -2], end[-1:]])
+    along = jnp.zeros_like(primals[1]).at[:n].set(end[n : 2 * n]).at[plain.rows["t"].start].set(end[layout.rows["dt"].start])
+    return jax.jvp(lambda *found: of(*_unpacked(plain, motion.goals, *found)), primals, (states[:, n:], along))[1]
+
+
+def cotangents(motion: Motion, asked: Sequence[bool], ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> tuple[Integrated, list]:
+    """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of the states and of the end."""
+    which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
+    form = _form(motion.args[0], motion.has_events)
+    starts, ends = jnp.concatenate([_packed(motion.y0), *_rows(motion)]), jnp.concatenate([_packed(y_end), t_end[None]])
+    found = kernel_back(form, motion.solver, which)(starts, jax.vmap(_packed)(ys), ends, motion.goals)
+    known = dict(zip(which, found[form.layout.y :], strict=True))
+    return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
+
+
+def _rows(motion: Motion) -> tuple[Array, Array, Array]:
+    """Progress, control and what is known, as a lane is given them."""
+    (_, _, inputs, fixed, origin), goals, control = motion.args, motion.goals, motion.control
     zero, one = jnp.zeros(()), jnp.ones(())
     t, h, code, event = zero, jnp.abs(control.dt0), RUNNING * one, -one
     progress = [t, h, code, zero, zero, event, jnp.inf * one]
     limits = [jnp.sign(goals[-1]), goals[-1], control.rtol, control.atol, control.shortest, control.max_steps * one, origin]
     known = [jnp.asarray(x, jnp.float64) for x in (*fixed, *inputs(origin))]
-    work = [] if y0.work is None else [y0.work[None]]
-    states, end = run(jnp.concatenate([y0.q, y0.v, *work, jnp.stack([*progress, *limits, *known])]), goals)
+    return jnp.stack(progress), jnp.stack(limits), jnp.stack(known) if known else jnp.zeros(0)
+
+
+def _packed(y: Integrated) -> Float[Array, "y"]:
+    return jnp.concatenate([y.q, y.v, *([] if y.work is None else [y.work[None]])])
+
+
+def _unpacked(layout: Layout, goals, states: Float[Array, "times y"], end: Float[Array, "ends"]) -> tuple[Integrated, Bool[Array, "times"], Progress]:
     t, h, code, accepted, rejected, event, pivot, count = end[layout.y :]
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
     numbers = [x.astype(jnp.int32) for x in (code, accepted, rejected, event)]
     code, accepted, rejected, event = numbers
-    last = Progress(t, _unpacked(layout, end[: layout.y]), h, code, jnp.zeros((), jnp.int32), accepted, rejected, event, None, pivot, None)
-    return jax.vmap(lambda y: _unpacked(layout, y))(states), reached, ended(last, 0.0)
+    last = Progress(t, _state(layout, end[: layout.y]), h, code, jnp.zeros((), jnp.int32), accepted, rejected, event, None, pivot, None)
+    return jax.vmap(lambda y: _state(layout, y))(states), reached, ended(last, 0.0)
 
 
-def _unpacked(layout: Layout, y: Float[Array, "y"]) -> Integrated:
+def _state(layout: Layout, y: Float[Array, "y"]) -> Integrated:
     n = layout.coordinates
     return Integrated(y[:n], y[n : n + layout.speeds], y[-1] if layout.with_work else None)

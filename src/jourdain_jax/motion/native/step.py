@@ -21,15 +21,15 @@ IDLE = -9.0  # code of a place that has no lane
 
 
 def write_step(w: Writer, form: Form, method: Method) -> None:
-    """`step(state)`: one step, tried by all lanes that are on their way."""
-    with w.function("step", "void", {"state": "ptr"}, attributes="noinline") as (state,):
-        _write_step(w, form, method, Lanes(w, form.layout, state))
+    """`step(state, k)`: one step, tried by all lanes that are on their way; `k`: room for the slopes of its stages."""
+    with w.function("step", "void", {"state": "ptr noalias", "k": "ptr noalias"}, attributes="noinline") as (state, k):
+        _write_step(w, form, method, Lanes(w, form.layout, state), k)
         w.give()
 
 
-def _write_step(w: Writer, form: Form, method: Method, p: Lanes) -> None:
+def _write_step(w: Writer, form: Form, method: Method, p: Lanes, k: Value) -> None:
     layout, y = form.layout, p.pointer  # the state comes first in the rows of a lane
-    rows = range(layout.y)
+    rows = range(layout.integrated)
     t, h, code, goal, direction = p["t"], p["h"], p["code"], p["goal"], p["direction"]
     locating = code.equals(float(LOCATING))
     rest = w.magnitude(goal - t)
@@ -39,10 +39,10 @@ def _write_step(w: Writer, form: Form, method: Method, p: Lanes) -> None:
     step = w.where(locating, p["search_shift"], direction * size) if form.has_events else direction * size
     t1 = w.where(lands, goal, t + step)
     step = t1 - t
-    k, smallest, changed_sign = _stages(w, form, method, p, t, step)
-    y1, error = w.room(w.real, layout.y), w.room(w.real, layout.y)
-    _each_row(w, rows, y1, lambda i: w.fma(step, _weighted(w, method.b, k, layout, i), w.load(w.real, y, i)))
-    _each_row(w, rows, error, lambda i: step * _weighted(w, method.b_error, k, layout, i))
+    smallest, changed_sign = _stages(w, form, method, p, k, t, step)
+    y1, error = w.room(w.real, layout.integrated), w.room(w.real, layout.y)
+    each_row(w, rows, y1, lambda i: w.fma(step, weighted(w, method.b, k, layout, i), w.load(w.real, y, i)))
+    each_row(w, range(layout.y), error, lambda i: step * weighted(w, method.b_error, k, layout, i))
     if form.projects:
         _project(w, layout, p, t1, y1, error)
     size_of_error = _norm(w, layout, p, error, y1)
@@ -60,7 +60,8 @@ def _write_step(w: Writer, form: Form, method: Method, p: Lanes) -> None:
     new_code = w.where(((accepted + rejected) >= p["max_steps"]) & ~arrived, float(results.MAX_STEPS), float(RUNNING))
     new_code = w.where(too_short, float(results.STEP_TOO_SMALL), new_code)
     new = {"t": w.where(accept, t1, t), "h": next_h, "code": new_code, "accepted": accepted, "rejected": rejected}
-    _each_row(w, rows, y1, lambda i: w.where(accept, w.load(w.real, y1, i), w.load(w.real, y, i)))
+    new["taken"] = w.where(accept, step, 0.0)  # by how far the state has gone on
+    each_row(w, rows, y1, lambda i: w.where(accept, w.load(w.real, y1, i), w.load(w.real, y, i)))
     if form.has_events:
         new = _watched(w, form, method, p, k, step, accept, new, y1)
     if form.pivots:
@@ -68,12 +69,12 @@ def _write_step(w: Writer, form: Form, method: Method, p: Lanes) -> None:
         pivot = w.where(counts, w.smaller(p["pivot"], smallest), p["pivot"])
         new |= {"pivot": pivot, "code": w.where(counts & (pivot < SMALLEST_PIVOT), float(results.SINGULAR_PARTITION), new["code"])}
     moving = locating | code.equals(float(RUNNING))
-    _each_row(w, rows, y, lambda i: w.where(moving, w.load(w.real, y1, i), w.load(w.real, y, i)))
+    each_row(w, rows, y, lambda i: w.where(moving, w.load(w.real, y1, i), w.load(w.real, y, i)))
     for name, value in new.items():
-        p[name] = w.where(moving, value, p[name])
+        p[name] = w.where(moving, value, w.number(0.0) if name == "taken" else p[name])
 
 
-def _for_rows(w: Writer, rows: range, body: Callable[[int | Value], None]) -> None:
+def for_rows(w: Writer, rows: range, body: Callable[[int | Value], None]) -> None:
     """`body` for the number of every row."""
     if len(rows) <= UNROLLED:
         for i in rows:
@@ -83,63 +84,64 @@ def _for_rows(w: Writer, rows: range, body: Callable[[int | Value], None]) -> No
             body(i)
 
 
-def _each_row(w: Writer, rows: range, into: Value, value: Callable[[int | Value], Value]) -> None:
+def each_row(w: Writer, rows: range, into: Value, value: Callable[[int | Value], Value]) -> None:
     """Sets rows of a state in memory."""
-    _for_rows(w, rows, lambda i: w.store(value(i), into, i))
+    for_rows(w, rows, lambda i: w.store(value(i), into, i))
 
 
-def _over_rows(w: Writer, rows: range, start: float, added: Callable[[Value, int | Value], Value]) -> Value:
+def over_rows(w: Writer, rows: range, start: float, added: Callable[[Value, int | Value], Value]) -> Value:
     """What `added(total, i)` makes of all rows one after the other."""
     total = w.room(w.real)
     w.store(w.number(start), total)
-    _for_rows(w, rows, lambda i: w.store(added(w.load(w.real, total), i), total))
+    for_rows(w, rows, lambda i: w.store(added(w.load(w.real, total), i), total))
     return w.load(w.real, total)
 
 
-def _stages(w: Writer, form: Form, method: Method, p: Lanes, t: Value, step: Value) -> tuple[Value, Value, Value]:
-    """Where the slopes of all stages are; the smallest magnitude of a pivot, and whether any changed its sign."""
+def _stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value, t: Value, step: Value) -> tuple[Value, Value]:
+    """The smallest magnitude of a pivot, and whether any changed its sign; puts the slopes of all stages into `k`."""
     layout, count = form.layout, form.pivots
-    k, at, pivots = w.room(w.real, layout.y * method.needed), w.room(w.real, layout.y), w.room(w.real, max(count, 1))
+    every = layout.integrated
+    at, pivots = w.room(w.real, every), w.room(w.real, max(count, 1))
     low, high = [w.number(math.inf)] * count, [w.number(-math.inf)] * count
 
     def next_state(i: int, row: int | Value) -> Value:
         start = w.load(w.real, p.pointer, row)
-        return w.fma(step, _weighted(w, method.A[i], k, layout, row), start) if i else start
+        return w.fma(step, weighted(w, method.A[i], k, layout, row), start) if i else start
 
     for i in range(method.needed):
-        _each_row(w, range(layout.y), at, partial(next_state, i))
-        w.call("rates", "void", p.pointer, w.fma(step, float(method.c[i]), t), at, w.at(k, i * layout.y, w.real), pivots)
+        each_row(w, range(every), at, partial(next_state, i))
+        w.call("rates", "void", p.pointer, w.fma(step, float(method.c[i]), t), at, w.at(k, i * every, w.real), pivots)
         now = [w.load(w.real, pivots, j) for j in range(count)]
         low, high = [w.smaller(a, b) for a, b in zip(low, now, strict=True)], [w.larger(a, b) for a, b in zip(high, now, strict=True)]
     smallest, changed = w.number(math.inf), w.literal(0, w.truth)
     for a, b in zip(low, high, strict=True):
         smallest = w.smaller(smallest, w.smaller(w.magnitude(a), w.magnitude(b)))
         changed = changed | ((a < 0.0) & (b > 0.0))
-    return k, smallest, changed
+    return smallest, changed
 
 
-def _weighted(w: Writer, weights: np.ndarray, k: Value, layout: Layout, row: int | Value) -> Value:
+def weighted(w: Writer, weights: np.ndarray, k: Value, layout: Layout, row: int | Value) -> Value:
     """sum_j w_j k_j of one number of the state."""
     used = [j for j in range(len(weights)) if weights[j] != 0]
-    total = w.load(w.real, k, used[0] * layout.y + row) * float(weights[used[0]])
+    total = w.load(w.real, k, used[0] * layout.integrated + row) * float(weights[used[0]])
     for j in used[1:]:
-        total = w.fma(w.load(w.real, k, j * layout.y + row), float(weights[j]), total)
+        total = w.fma(w.load(w.real, k, j * layout.integrated + row), float(weights[j]), total)
     return total
 
 
 def _project(w: Writer, layout: Layout, p: Lanes, t1: Value, y1: Value, error: Value) -> None:
     """Puts `y1` back onto the rows; the error is no smaller than how far that moved it, beyond noise."""
     free = w.room(w.real, layout.y)
-    _each_row(w, range(layout.y), free, lambda i: w.load(w.real, y1, i))
+    each_row(w, range(layout.y), free, lambda i: w.load(w.real, y1, i))
     w.call("project", "void", p.pointer, t1, y1)
     for part in layout.parts:
-        noise = search.EPS**NOISE * _over_rows(w, part, 0.0, lambda largest, i: w.larger(largest, w.magnitude(w.load(w.real, y1, i))))
+        noise = search.EPS**NOISE * over_rows(w, part, 0.0, lambda largest, i: w.larger(largest, w.magnitude(w.load(w.real, y1, i))))
 
         def larger_error(i: int | Value, noise: Value = noise) -> Value:
             moved = w.magnitude(w.load(w.real, y1, i) - w.load(w.real, free, i)) - noise
             return w.larger(w.magnitude(w.load(w.real, error, i)), w.larger(moved, 0.0))
 
-        _each_row(w, part, error, larger_error)
+        each_row(w, part, error, larger_error)
 
 
 def _norm(w: Writer, layout: Layout, p: Lanes, error: Value, y1: Value) -> Value:
@@ -151,7 +153,7 @@ def _norm(w: Writer, layout: Layout, p: Lanes, error: Value, y1: Value) -> Value
         relative = w.load(w.real, error, i) / w.fma(rtol, size, atol)
         return w.fma(relative, relative, total)
 
-    total = _over_rows(w, range(count), 0.0, added) / float(count)
+    total = over_rows(w, range(count), 0.0, added) / float(count)
     return w.intrinsic("sqrt", w.where(w.is_nan(total), math.inf, total))
 
 
@@ -162,13 +164,13 @@ def _count(w: Writer, happens: Value) -> Value:
 def _watched(w: Writer, form: Form, method: Method, p: Lanes, k: Value, step: Value, accept: Value, new: dict[str, Value], y1: Value) -> dict[str, Value]:
     """The step in which an event may have happened or is being located, or before which one has; changes `y1`."""
     layout, count, y = form.layout, form.layout.events, p.pointer
-    t, code, rows = p["t"], p["code"], range(layout.y)
+    t, code, rows = p["t"], p["code"], range(layout.integrated)
     locating, fresh = code.equals(float(LOCATING)), (p["accepted"] + p["rejected"]).equals(0.0)
     accept = accept & ~locating & new["code"].equals(float(RUNNING))
 
     def events(t: Value, y: Value, stage: int) -> tuple[list[Value], list[Value]]:
         values, rates = w.room(w.real, count), w.room(w.real, count)
-        w.call("events", "void", p.pointer, t, y, w.at(k, stage * layout.y, w.real), values, rates)
+        w.call("events", "void", p.pointer, t, y, w.at(k, stage * layout.integrated, w.real), values, rates)
         return [w.load(w.real, values, i) for i in range(count)], [w.load(w.real, rates, i) for i in range(count)]
 
     c_0, rate_0 = events(t, y, 0)
@@ -184,7 +186,7 @@ def _watched(w: Writer, form: Form, method: Method, p: Lanes, k: Value, step: Va
     left, shift = p["search_left"], p["search_shift"]
     found, back = locating & left.equals(0.0), changes & (left > DIFFERENTIABLE + 1.0)
     # a motion that starts beyond an event has no motion at all
-    finite = _over_rows(w, rows, 0.0, lambda total, i: total + 0.0 * w.load(w.real, y, i)).equals(0.0)
+    finite = over_rows(w, range(layout.y), 0.0, lambda total, i: total + 0.0 * w.load(w.real, y, i)).equals(0.0)
     over = fresh & finite & ~search.no_event(w, c_0)
     which = w.number(float(count - 1))
     for i in reversed(range(count - 1)):
@@ -195,16 +197,45 @@ def _watched(w: Writer, form: Form, method: Method, p: Lanes, k: Value, step: Va
         after = w.load(w.real, y1, i)
         return w.where(stays, w.load(w.real, y, i), w.where(found, w.fma(shift, w.load(w.real, k, i), after), after))
 
-    _each_row(w, rows, y1, state)
+    each_row(w, rows, y1, state)
+    along = {}
+    if form.moving is not None:
+        along = {"dt": _tangents_at_event(w, form, p, k, found, new["t"], rate_0, y1)}
     tried = _count(w, dips)
     now = w.where(found, float(results.EVENT), w.where(locating, float(LOCATING), new["code"]))
     new = {
         "t": w.where(found, new["t"] + shift, w.where(stays, t, new["t"])),
+        "taken": w.where(stays, 0.0, new["taken"]),
         "h": w.where(dips, share * w.magnitude(step), w.where(locating, p["h"], new["h"])),
         "code": w.where(happened, float(LOCATING), now),
         "accepted": new["accepted"] - tried,
         "rejected": new["rejected"] + tried,
         "event": w.where(happened | (locating & was_trying), w.load(w.real, first), p["event"]),
+        **along,
     }
     begun = {"h": p["h"], "code": w.number(float(results.EVENT)), "accepted": p["accepted"], "rejected": p["rejected"], "event": which}
     return new | {name: w.where(over, value, new[name]) for name, value in begun.items()}
+
+
+def _tangents_at_event(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Value, rate: list[Value], y1: Value) -> Value:
+    """The tangent of the time of an event, zero where none is found; adds to those of the state `y1` there.
+
+    dt = -(dc/dy dy + dc/dp dp)/cdot,   dy <- dy + f dt
+    """
+    layout, place = form.layout, w.room(w.real)
+    w.store(p["dt"], place)
+    with w.when(w.any(found)):
+        values = w.room(w.real, layout.events)
+        w.call("event_tangents", "void", p.pointer, t, y1, values)
+        dc = search.chosen(w, p["event"], [w.load(w.real, values, i) for i in range(layout.events)])
+        slope = search.chosen(w, p["event"], rate)
+        usable = found & slope.differs(0.0) & (w.magnitude(slope) < math.inf)
+        dt = w.where(usable, -dc / slope, 0.0)
+        w.store(w.where(found, dt, p["dt"]), place)
+
+        def moved(i: int | Value) -> Value:
+            before = w.load(w.real, y1, i + layout.y)
+            return w.where(usable, w.fma(w.load(w.real, k, i), dt, before), before)
+
+        for_rows(w, range(layout.y), lambda i: w.store(moved(i), y1, i + layout.y))
+    return w.load(w.real, place)

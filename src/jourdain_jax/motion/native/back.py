@@ -1,0 +1,341 @@
+"""The loop over steps, gone through once more and then back, as machine code: cotangents of the start from those of the states and the end.
+
+Lanes side by side begin and end together here. On the way forth every try of a step leaves a slot: the state before it, the slopes of its stages, by how
+far the state went on (zero where the step was refused, or the lane had ended), and how many times had been saved after it. On the way back, a step being a
+number,
+
+    Y_i = y_0 + h sum_j a_ij k_j,   v_i = b_i g_1 + sum_l a_li G_l,   (G_i, g_p) = (df/dy, df/dp)'(Y_i) h v_i,   g_0 = g_1 + sum G_i
+
+and where a motion ended at a stop event, at its time t_e = t - c(t, y)/cdot and in the state y - f c/cdot, first
+
+    s = -(g_t + g_y . f)/cdot,   g_y += s dc/dy,   g_p += s dc/dp
+
+As `motion/integrators/recorded_adjoint.py` and `step_adjoint.py` have it.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from jourdain_jax.motion.integrators.erk_step import LOCATING, RUNNING, Method
+from jourdain_jax.motion.native import search
+from jourdain_jax.motion.native.functions import Form
+from jourdain_jax.motion.native.layout import Lanes
+from jourdain_jax.motion.native.loop import COUNT, FIRST_ARRAY, NEXT, TIMES, write_functions, write_job
+from jourdain_jax.motion.native.pulled import write_pulled
+from jourdain_jax.motion.native.step import IDLE, each_row, weighted
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.native.ffi import write_handler
+from jourdain_jax.native.ir import Value, Writer
+
+_STARTS, _TO_STATES, _TO_ENDS, _GOALS, _FOUND = range(FIRST_ARRAY, FIRST_ARRAY + 5)
+FIRST_SLOTS = 64  # for which there is memory at first; then twice as many, and so on
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """Rows of a slot."""
+
+    y: int
+    k: int
+
+    @property
+    def t(self) -> int:
+        return self.y + self.k
+
+    @property
+    def taken(self) -> int:
+        return self.t + 1
+
+    @property
+    def saved(self) -> int:
+        return self.t + 2
+
+    @property
+    def all(self) -> int:
+        return self.t + 3
+
+
+def written(form: Form, method: Method, lanes: int, fused: bool, threads: int, asked: Sequence[int]) -> str:
+    """The module of LLVM IR; `asked`: of which of the numbers that the rates are given cotangents are asked."""
+    w = Writer(lanes, fused)
+    write_functions(w, form, method)
+    write_pulled(w, form, asked)
+    _write_more_room(w)
+    _write_begin(w, form)
+    _write_note(w, form)
+    _write_added(w, form)
+    _write_step_back(w, form, method, len(asked))
+    if form.has_events:
+        _write_event_back(w, form, len(asked))
+    with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
+        _write_blocks(w, form, method, len(asked), job)
+        w.give(Value(w, "ptr", "null"))
+    write_handler(w, 4, 1, lambda arguments, results, sizes, rank: write_job(w, [*arguments, *results], sizes, rank, threads))
+    return w.text
+
+
+def _write_more_room(w: Writer) -> None:
+    """`more_room(old, bytes)`: twice as many bytes, the first of them as before; null where there are none."""
+    with w.function("more_room", "ptr", {"old": "ptr", "bytes": "i64"}, attributes="noinline") as (old, size):
+        new = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), size * 2)
+        there = w.converted("ptrtoint", new, "i64").differs(0)
+        with w.when(there):
+            w.external("memcpy", "ptr", new, old, size)
+        w.external("free", "void", old)
+        w.give(new)
+
+
+def _write_blocks(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
+    """Lanes side by side, forth and back, until none is left."""
+    layout, slot = form.layout, _Slot(form.layout.y, form.layout.y * method.needed)
+    size = slot.all * w.lanes * 8
+    state, who, saved, begun = w.room(w.real, layout.all), w.room("i64", w.lanes), w.room(w.real), w.room(w.real)
+    g, by_known = w.room(w.real, layout.y), w.room(w.real, max(asked, 1))
+    record, bytes_there, count = w.room("ptr"), w.room("i64"), w.room("i64")
+    lanes = Lanes(w, layout, state)
+    w.store(w.literal(FIRST_SLOTS * size, "i64"), bytes_there)
+    w.store(w.external("aligned_alloc", "ptr", w.literal(64, "i64"), w.literal(FIRST_SLOTS * size, "i64")), record)
+
+    def has_room() -> Value:
+        return w.converted("ptrtoint", w.load("ptr", record), "i64").differs(0)
+
+    with w.repeated() as leave:
+        leave(w.load("i64", job, NEXT) >= w.load("i64", job, COUNT))
+        leave(~has_room())
+        with w.counted(0, layout.all) as row:
+            w.store(w.number(1.0), state, row)
+        with w.counted(0, w.lanes) as lane:
+            w.call("begin", "void", job, state, who, lane)
+        w.store(w.number(0.0), saved)
+        w.call("note", "void", job, state, who, saved)
+        w.store(w.load(w.real, saved), begun)
+        w.store(w.literal(0, "i64"), count)
+        with w.repeated() as ended:
+            code, number = lanes["code"], w.load("i64", count)
+            ended(~w.any(code.equals(float(RUNNING)) | code.equals(float(LOCATING))))
+            with w.when((number + 1) * size > w.load("i64", bytes_there)):
+                w.store(w.call("more_room", "ptr", w.load("ptr", record), w.load("i64", bytes_there)), record)
+                w.store(w.load("i64", bytes_there) * 2, bytes_there)
+            ended(~has_room())
+            here = w.at(w.load("ptr", record), number * slot.all, w.real)
+            each_row(w, range(layout.y), here, lambda i: w.load(w.real, state, i))
+            w.store(lanes["t"], here, slot.t)
+            w.call("step", "void", state, w.at(here, slot.y, w.real))
+            w.store(lanes["taken"], here, slot.taken)
+            w.call("note", "void", job, state, who, saved)
+            w.store(w.load(w.real, saved), here, slot.saved)
+            w.store(number + 1, count)
+        leave(~has_room())
+        _write_back(w, form, method, asked, job, (state, who, saved, begun, g, by_known, record, count))
+    with w.when(~has_room()):
+        _give_nan(w, form, asked, job, who)
+    w.external("free", "void", w.load("ptr", record))
+
+
+def _write_back(w: Writer, form: Form, method: Method, asked: int, job: Value, rooms: tuple[Value, ...]) -> None:
+    """The way back of a block, and its results."""
+    state, who, saved, begun, g, by_known, record, count = rooms
+    layout, slot = form.layout, _Slot(form.layout.y, form.layout.y * method.needed)
+    each_row(w, range(asked), by_known, lambda i: w.number(0.0))
+    ends, per_end = w.load("ptr", job, _TO_ENDS), layout.y + 1
+    with w.counted(0, w.lanes) as lane:
+        number = w.load("i64", who, lane)
+        with w.counted(0, layout.y) as row:
+            found = w.load("double", ends, w.where(number >= 0, number, 0) * per_end + row)
+            w.store(w.where(number >= 0, found, w.literal(0.0, "double")), w.at(g, row * w.lanes + lane, "double"))
+    # what was not reached repeats the last state
+    all_times = w.room(w.real)
+    with w.counted(0, w.lanes) as lane:
+        w.store(w.converted("sitofp", w.load("i64", job, TIMES), "double"), w.at(all_times, lane, "double"))
+    w.call("added", "void", job, who, w.load(w.real, saved), w.load(w.real, all_times), g)
+    if form.has_events:
+        w.call("event_back", "void", job, state, who, g, by_known)
+    with w.repeated() as leave:
+        number = w.load("i64", count)
+        leave(number <= 0)
+        here = w.at(w.load("ptr", record), (number - 1) * slot.all, w.real)
+        before = w.room(w.real)
+        w.store(w.load(w.real, begun), before)
+        with w.when(number > 1):
+            w.store(w.load(w.real, w.at(w.load("ptr", record), (number - 2) * slot.all, w.real), slot.saved), before)
+        w.call("added", "void", job, who, w.load(w.real, before), w.load(w.real, here, slot.saved), g)
+        with w.when(w.any(w.load(w.real, here, slot.taken).differs(0.0))):
+            w.call("step_back", "void", state, here, g, by_known)
+        w.store(number - 1, count)
+    w.call("added", "void", job, who, w.number(0.0), w.load(w.real, begun), g)
+    found, each = w.load("ptr", job, _FOUND), layout.y + asked
+    with w.counted(0, w.lanes) as lane:
+        number = w.load("i64", who, lane)
+        with w.when(number >= 0):
+            with w.counted(0, layout.y) as row:
+                w.store(w.load("double", g, row * w.lanes + lane), found, number * each + row)
+            with w.counted(0, asked) as row:
+                w.store(w.load("double", by_known, row * w.lanes + lane), found, number * each + layout.y + row)
+
+
+def _give_nan(w: Writer, form: Form, asked: int, job: Value, who: Value) -> None:
+    """Where no memory is left: NaN for this block and for all lanes that are left."""
+    found, each = w.load("ptr", job, _FOUND), form.layout.y + asked
+
+    def lost(number: Value) -> None:
+        with w.counted(0, each) as row:
+            w.store(w.literal(math.nan, "double"), found, number * each + row)
+
+    with w.counted(0, w.lanes) as lane:
+        number = w.load("i64", who, lane)
+        with w.when(number >= 0):
+            lost(number)
+    with w.repeated() as leave:
+        number = w.counted_up(job, NEXT)
+        leave(number >= w.load("i64", job, COUNT))
+        lost(number)
+
+
+def _write_begin(w: Writer, form: Form) -> None:
+    """`begin(job, state, who, lane)`: the next lane of the batch takes this place; where there is none, it is idle."""
+    with w.function("begin", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "lane": "i64"}, attributes="noinline") as (job, state, who, lane):
+        lanes, given = Lanes(w, form.layout, state), form.layout.given
+        number = w.counted_up(job, NEXT)
+        there = number < w.load("i64", job, COUNT)
+        w.store(w.where(there, number, -1), who, lane)
+        with w.when(there):
+            starts = w.load("ptr", job, _STARTS)
+            with w.counted(0, given) as row:
+                w.store(w.load("double", starts, number * given + row), lanes.place(row, lane))
+            lanes.set("goal", lane, w.load("double", w.load("ptr", job, _GOALS), number * w.load("i64", job, TIMES)))
+        with w.when(~there):
+            lanes.set("code", lane, IDLE)
+        lanes.set("taken", lane, 0.0)
+        if form.has_events:
+            lanes.set("search_left", lane, 0.0)
+        w.give()
+
+
+def _write_note(w: Writer, form: Form) -> None:
+    """`note(job, state, who, saved)`: counts the times that were reached, sets the next one, and ends lanes that have reached all."""
+    with w.function("note", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "saved": "ptr"}, attributes="noinline") as (job, state, who, saved):
+        lanes = Lanes(w, form.layout, state)
+        with w.when(w.any(lanes["code"].equals(float(RUNNING)) & lanes["t"].equals(lanes["goal"]))), w.counted(0, w.lanes) as lane:
+            times, number = w.load("i64", job, TIMES), w.load("i64", who, lane)
+            with w.repeated() as leave:
+                leave(~(lanes.of("code", lane).equals(float(RUNNING)) & lanes.of("t", lane).equals(lanes.of("goal", lane))))
+                reached = w.converted("fptosi", w.load("double", saved, lane), "i64") + 1
+                w.store(w.converted("sitofp", reached, "double"), w.at(saved, lane, "double"))
+                with w.when(reached >= times):
+                    lanes.set("code", lane, float(results.SUCCESS))
+                with w.when(reached < times):
+                    lanes.set("goal", lane, w.load("double", w.load("ptr", job, _GOALS), number * times + reached))
+        w.give()
+
+
+def _write_added(w: Writer, form: Form) -> None:
+    """`added(job, who, first, end, g)`: adds the cotangents of the states saved at the times number `first` to `end - 1`."""
+    count = form.layout.y
+    arguments = {"job": "ptr", "who": "ptr", "first": w.real, "end": w.real, "g": "ptr"}
+    with w.function("added", "void", arguments, attributes="noinline") as (job, who, first, end, g):
+        firsts, ends = w.room(w.real), w.room(w.real)
+        w.store(first, firsts)
+        w.store(end, ends)
+        with w.when(w.any(first < end)), w.counted(0, w.lanes) as lane:
+            number, times = w.load("i64", who, lane), w.load("i64", job, TIMES)
+            with w.when(number >= 0):
+                a, b = (w.converted("fptosi", w.load("double", x, lane), "i64") for x in (firsts, ends))
+                with w.counted(a, b) as k, w.counted(0, count) as row:
+                    more = w.load("double", w.load("ptr", job, _TO_STATES), (number * times + k) * count + row)
+                    place = w.at(g, row * w.lanes + lane, "double")
+                    w.store(w.load("double", place) + more, place)
+        w.give()
+
+
+def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
+    """`step_back(state, here, g, by_known)`: back over the step in the slot `here`, in lanes that went on in it."""
+    layout, slot = form.layout, _Slot(form.layout.y, form.layout.y * method.needed)
+    rows, count = range(layout.y), layout.y
+    arguments = dict.fromkeys(("state", "here", "g", "by_known"), "ptr")
+    with w.function("step_back", "void", arguments, attributes="noinline") as (state, here, g, by_known):
+        h, t = w.load(w.real, here, slot.taken), w.load(w.real, here, slot.t)
+        took, k = h.differs(0.0), w.at(here, slot.y, w.real)
+        g1, v, at, G, added = (w.room(w.real, n) for n in (count, count, count, count * method.needed, max(asked, 1)))
+        each_row(w, rows, g1, lambda i: w.load(w.real, g, i))
+        each_row(w, range(asked), added, lambda i: w.number(0.0))
+        if form.projects:
+            each_row(w, rows, at, lambda i: w.fma(h, weighted(w, method.b, k, layout, i), w.load(w.real, here, i)))
+            _project_back(w, form, state, t + h, at, g1, added)
+
+        def state_at(stage: int, i: int | Value) -> Value:
+            start = w.load(w.real, here, i)
+            return w.fma(h, weighted(w, method.A[stage], k, layout, i), start) if stage else start
+
+        def cotangent(stage: int, later: list[int], i: int | Value) -> Value:
+            total = w.load(w.real, g1, i) * float(method.b[stage])
+            for j in later:
+                total = w.fma(w.load(w.real, G, j * count + i), float(method.A[j][stage]), total)
+            return h * total
+
+        used: list[int] = []
+        for stage in reversed(range(method.needed)):
+            later = [j for j in used if method.A[j][stage] != 0]
+            if method.b[stage] == 0 and not later:
+                continue
+            each_row(w, rows, at, partial(state_at, stage))
+            each_row(w, rows, v, partial(cotangent, stage, later))
+            w.call("pull_rates", "void", state, w.fma(h, float(method.c[stage]), t), at, v, w.at(G, stage * count, w.real), added)
+            used.append(stage)
+
+        def total(i: int | Value) -> Value:
+            found = w.load(w.real, g1, i)
+            for stage in used:
+                found = found + w.load(w.real, G, stage * count + i)
+            return w.where(took, found, w.load(w.real, g, i))
+
+        each_row(w, rows, g, total)
+        each_row(w, range(asked), by_known, lambda i: w.load(w.real, by_known, i) + w.where(took, w.load(w.real, added, i), 0.0))
+        w.give()
+
+
+def _project_back(w: Writer, form: Form, state: Value, t1: Value, free: Value, g: Value, added: Value) -> None:
+    """Cotangents `g` of a state put back onto the rows become those of the state `free` before."""
+    moves = form.moves
+    rows, count = range(form.layout.y), form.layout.y
+    before = w.room(w.real, count * len(moves))
+    for number, q_moves in enumerate(moves):
+        each_row(w, rows, w.at(before, number * count, w.real), lambda i: w.load(w.real, free, i))
+        w.call("projected_once", "void", state, t1, free, w.literal(q_moves, "i1"))
+    out = w.room(w.real, count)
+    for number, q_moves in reversed(list(enumerate(moves))):
+        w.call("pull_q" if q_moves else "pull_u", "void", state, t1, w.at(before, number * count, w.real), g, out, added)
+        each_row(w, rows, g, lambda i: w.load(w.real, out, i))
+
+
+def _write_event_back(w: Writer, form: Form, asked: int) -> None:
+    """`event_back(job, state, who, g, by_known)`: cotangents at the time and state of an event become those of a state at a number for a time."""
+    layout, count = form.layout, form.layout.y
+    arguments = dict.fromkeys(("job", "state", "who", "g", "by_known"), "ptr")
+    with w.function("event_back", "void", arguments, attributes="noinline") as (job, state, who, g, by_known):
+        lanes = Lanes(w, layout, state)
+        located = lanes["code"].equals(float(results.EVENT)) & (lanes["accepted"] > 0.0)
+        with w.when(w.any(located)):
+            f, out, pivots, added = (w.room(w.real, max(n, 1)) for n in (count, count, form.pivots, asked))
+            values, rates, weights = (w.room(w.real, layout.events) for _ in range(3))
+            t, g_t = lanes["t"], w.room(w.real)
+            with w.counted(0, w.lanes) as lane:
+                number = w.load("i64", who, lane)
+                there = w.load("double", w.load("ptr", job, _TO_ENDS), w.where(number >= 0, number, 0) * (count + 1) + count)
+                w.store(there, w.at(g_t, lane, "double"))
+            w.call("rates", "void", state, t, state, f, pivots)
+            w.call("events", "void", state, t, state, f, values, rates)
+            rate = search.chosen(w, lanes["event"], [w.load(w.real, rates, i) for i in range(layout.events)])
+            total = w.load(w.real, g_t)
+            for i in range(count):
+                total = w.fma(w.load(w.real, g, i), w.load(w.real, f, i), total)
+            usable = located & rate.differs(0.0) & (w.magnitude(rate) < math.inf)
+            by_value = w.where(usable, -total / rate, 0.0)
+            for i in range(layout.events):
+                w.store(w.where(lanes["event"].equals(float(i)), by_value, 0.0), weights, i)
+            each_row(w, range(asked), added, lambda i: w.number(0.0))
+            w.call("pull_events", "void", state, t, state, weights, out, added)
+            each_row(w, range(count), g, lambda i: w.load(w.real, g, i) + w.where(usable, w.load(w.real, out, i), 0.0))
+            each_row(w, range(asked), by_known, lambda i: w.load(w.real, by_known, i) + w.where(usable, w.load(w.real, added, i), 0.0))
+        w.give()

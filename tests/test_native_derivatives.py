@@ -1,0 +1,208 @@
+"""Derivatives by machine code of our own: against closed forms, against those of XLA, of lanes that end in all ways, and when they are left to XLA."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.motion.integrators import erk_loop
+from jourdain_jax.native import host
+from jourdain_jax.program import emit
+from jourdain_jax.program.derivative import cotangents, jacobian
+from jourdain_jax.program.graph import Graph
+
+pytestmark = pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against())
+
+FORWARD = diffrax.ForwardMode()
+
+
+class Oscillator(jj.Scene):
+    """A particle on a spring with a constant push, and a wall at x = -wall."""
+
+    mass: object = jj.parameter(1.5, unit="kg", positive=True)
+    stiffness: object = jj.parameter(6.0, unit="N/m", positive=True)
+    wall: object = jj.parameter(0.8, unit="m")
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("push")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.push - self.stiffness * motion.q.x),)
+
+    def events(self, motion):
+        return {"wall": self.wall + motion.q.x}
+
+
+X = jnp.array([1.5, 6.0, 0.8, 1.1, 0.7, 0.3])  # mass, stiffness, wall, x, its rate, push
+
+
+def _ends(x, native=True, adjoint=None, events=False, **options):
+    """Two states on the way and at the end, the time of the end."""
+    scene = Oscillator(mass=x[0], stiffness=x[1], wall=x[2])
+    options = {"ts": jnp.array([0.0, 0.3, 0.9]), "t1": 3.0, "rtol": 1e-11, "atol": 1e-11} | options
+    motion = jj.simulate(scene, {"x": x[3], "x_rate": x[4]}, inputs={"push": x[5]}, native=native, adjoint=adjoint, events=events, **options)
+    return jnp.stack([motion.q[1, 0], motion.u[2, 0], motion.q_end[0], motion.u_end[0], motion.t_end])
+
+
+def _exact(x, events=False):
+    """x = c + A cos(w t - phase) about c = push/stiffness; the wall is met where the cosine is -(wall + c)/A."""
+    w, centre = jnp.sqrt(x[1] / x[0]), x[5] / x[1]
+    a, b = x[3] - centre, x[4] / w
+
+    def at(t):
+        return centre + a * jnp.cos(w * t) + b * jnp.sin(w * t), w * (b * jnp.cos(w * t) - a * jnp.sin(w * t))
+
+    end = (jnp.arctan2(b, a) + jnp.arccos(-(x[2] + centre) / jnp.hypot(a, b))) / w if events else 3.0 + 0.0 * w
+    return jnp.stack([at(0.3)[0], at(0.9)[1], *at(end), end])
+
+
+@pytest.mark.parametrize("events", [False, True])
+@pytest.mark.parametrize("mode", ["jacfwd", "jacrev"])
+def test_sensitivities_of_an_oscillator_are_those_of_its_closed_form(mode, events):
+    adjoint = FORWARD if mode == "jacfwd" else None
+    found = jax.jit(getattr(jax, mode)(lambda x: _ends(x, adjoint=adjoint, events=events)))(X)
+    np.testing.assert_allclose(found, jax.jacfwd(lambda x: _exact(x, events))(X), rtol=1e-9, atol=1e-9)
+
+
+LANES = X * (1 + 0.05 * np.random.default_rng(0).normal(size=(11, 6)))
+
+
+@pytest.mark.parametrize(
+    ("derivative", "adjoint"),
+    [
+        (lambda f: jax.jit(jax.vmap(jax.grad(f)))(LANES), None),
+        (lambda f: jax.jit(jax.grad(lambda x: jnp.sum(jnp.sin(jax.vmap(f)(x)))))(LANES), None),
+        (lambda f: jax.jit(jax.vmap(jax.jacfwd(f)))(LANES), FORWARD),
+        (lambda f: jax.jit(jax.jacfwd(jax.jacfwd(f)))(X), FORWARD),
+        (lambda f: jax.jit(lambda x, v: jax.jvp(jax.vmap(f), (x,), (v,)))(LANES, LANES), FORWARD),
+    ],
+    ids=["vmap of grad", "grad of vmap", "vmap of jacfwd", "jacfwd of jacfwd", "jvp of vmap"],
+)
+def test_nested_derivatives_up_to_an_event_are_those_of_xla(derivative, adjoint):
+    ours, theirs = (derivative(lambda x, native=native: jnp.sum(_ends(x, native, adjoint, True) ** 2)) for native in (True, False))
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("adjoint", [None, FORWARD], ids=["reverse", "forward"])
+def test_lanes_that_fail_or_are_no_numbers_do_not_touch_others(adjoint):
+    x = LANES.at[2, 3].set(jnp.nan).at[5, 4].set(jnp.inf).at[7].set(0.0).at[7, :2].set(1.0)
+    mode = jax.grad if adjoint is None else jax.jacfwd
+    found = {}
+    for native in (True, False):  # 20 steps are enough for some
+        slope = mode(lambda x, native=native: jnp.sum(_ends(x, native, adjoint, True, max_steps=20)[:4]))
+        found[native] = np.asarray(jax.jit(jax.vmap(slope))(x))
+    good = [i for i in range(11) if i not in (2, 5)]
+    np.testing.assert_allclose(found[True][good], found[False][good], rtol=1e-9, atol=1e-9)
+    assert np.isfinite(found[True][good]).all()
+
+
+def test_cotangents_of_a_lane_do_not_depend_on_its_company():
+    every = jax.jit(jax.vmap(jax.grad(lambda x: jnp.sum(_ends(x, events=True)))))
+    expected = np.asarray(every(LANES))
+    for count in (1, 3, 8, 9):
+        order = np.random.default_rng(count).permutation(11)[:count]
+        np.testing.assert_allclose(every(LANES[order]), expected[order], rtol=1e-13, atol=1e-14)
+
+
+def test_cotangents_reach_back_over_more_steps_than_there_is_memory_for_at_first():
+    def end(x, closed):
+        options = {"ts": jnp.array([40.0]), "t1": 40.0}
+        w = jnp.sqrt(x[1] / x[0])
+        return x[3] * jnp.cos(40 * w) + x[4] / w * jnp.sin(40 * w) if closed else _ends(x, **options)[2]
+
+    x = X.at[5].set(0.0)
+    scene = Oscillator(mass=x[0], stiffness=x[1])
+    assert int(jj.simulate(scene, {"x": x[3], "x_rate": x[4]}, ts=[40.0], rtol=1e-11, atol=1e-11, events=False).accepted) > 128
+    found, expected = (jax.jit(jax.grad(lambda x, closed=closed: end(x, closed)))(x)[:5] for closed in (False, True))
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("adjoint", [None, FORWARD], ids=["reverse", "forward"])
+def test_the_loop_of_xla_is_not_traced_unless_a_time_varies(adjoint, monkeypatch):
+    traced = []
+    monkeypatch.setattr(erk_loop, "integrate", lambda *a, integrate=erk_loop.integrate: traced.append(1) or integrate(*a))
+    mode = jax.grad if adjoint is None else jax.jacfwd
+    mode(lambda x: _ends(x, adjoint=adjoint, max_steps=1234)[2])(X)
+    assert not traced
+    slope = mode(lambda t: _ends(X, adjoint=adjoint, max_steps=1234, ts=jnp.array([0.1, 0.3, 0.9]) * t, t1=3.0 * t)[2])(1.0)
+    assert traced
+    np.testing.assert_allclose(slope, 3.0 * _exact(X)[3], rtol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_cotangents_of_a_program_are_its_jacobian_transposed(seed):
+    random, graph = np.random.default_rng(seed), Graph()
+    inputs = [graph.input(f"x{i}", True) for i in range(4)]
+    nodes = list(inputs)
+    for _ in range(40):
+        a, b = (int(nodes[i]) for i in random.integers(len(nodes), size=2))
+        op = str(random.choice(["add", "sub", "mul", "div", "sin", "cos", "tanh", "sqrt", "neg", "atan2", "max", "select"]))
+        if op == "select":
+            nodes.append(graph.call("select", graph.call("lt", a, b), a, b))
+        elif op == "div":
+            nodes.append(graph.div(a, graph.add(graph.const(2.0), graph.mul(b, b))))
+        elif op == "sqrt":
+            nodes.append(graph.call("sqrt", graph.add(graph.one, graph.mul(a, a))))
+        else:
+            nodes.append(graph.call(op, a, b) if op in ("add", "sub", "mul", "atan2", "max") else graph.call(op, a))
+    outputs, weights = nodes[-5:], [graph.input(f"w{i}", True) for i in range(5)]
+    values = dict(zip([*inputs, *weights], jnp.asarray(random.normal(size=9)), strict=True))
+    by_rows = [[row.get(n, graph.zero) for n in inputs] for row in jacobian(graph, outputs, inputs)]
+    J = np.array(emit.run(graph, [n for row in by_rows for n in row], values), float).reshape(5, 4)
+    found = np.array(emit.run(graph, cotangents(graph, outputs, weights, inputs), values), float)
+    np.testing.assert_allclose(found, np.asarray([values[n] for n in weights]) @ J, rtol=1e-11, atol=1e-13)
+
+
+def test_a_branch_that_is_not_taken_has_no_cotangent_however_steep_it_is():
+    graph = Graph()
+    x, w = graph.input("x", True), graph.input("w", True)
+    root = graph.call("select", graph.call("gt", x, graph.zero), graph.zero, graph.call("sqrt", x))
+    (found,) = emit.run(graph, cotangents(graph, [root], [w], [x]), {x: jnp.zeros(()), w: jnp.ones(())})
+    assert float(found) == 0.0
+
+
+CASES = {
+    "tilting-disc": ({"lean": 0.3, "spin_rate": -3.0}, {"t1": 1.0}, ["radius", "gravity"]),
+    "tilting-disc, falling": ({"lean": 0.6, "spin_rate": -0.1}, {"t1": 5.0}, ["radius", "mass"]),
+    "tilting-disc, at rest": ({"lean": 0.0}, {"t1": 0.5}, ["radius", "gravity"]),
+    "chaplygin-sleigh": (None, {"t1": 2.0}, ["mass", "inertia"]),
+    "tilting-disc-quaternion": (None, {"t1": 0.5, "state": "full"}, ["radius"]),
+    "whipple-bicycle": (None, {"t1": 0.5, "projection": False}, ["w", "g", "mB"]),
+    "whipple-bicycle, projected": (None, {"t1": 0.5}, ["w", "g", "mB"]),
+    "double-pendulum-rods": (None, {"t1": 0.5}, []),
+}
+
+
+def _slope(name: str, native: bool, adjoint) -> np.ndarray:
+    """Of a number made of saved states and the end of a motion, with respect to parameters and two directions of the start."""
+    start, options, parameters = CASES[name]
+    scene = jj.models.MODELS[name.split(",")[0]]()
+    begun = jj.start(scene, **(scene.example if start is None else start))
+    x = jnp.array([float(getattr(scene, p)) for p in parameters] + [0.0, 0.0])
+    q, u = (jnp.asarray(np.random.default_rng(0).normal(size=(2, len(part)))) for part in (begun.q, begun.u))
+
+    def end(x):
+        own = scene.replace(**{p: x[i] for i, p in enumerate(parameters)}) if parameters else scene
+        state = jj.State(begun.t, begun.q + x[-2] * q[0], begun.u + x[-1] * u[0], begun.moved_q, begun.moved_u, begun.residual, begun.names, begun.guess)
+        motion = jj.simulate(own, state, rtol=1e-10, atol=1e-10, native=native, adjoint=adjoint, **options)
+        return q[1] @ motion.q_end + u[1] @ motion.u_end + motion.t_end + jnp.nansum(motion.q[:3] ** 2)
+
+    return np.asarray(jax.jit((jax.grad if adjoint is None else jax.jacfwd)(end))(x))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_both_modes_of_a_model_agree(name):
+    found, expected = (_slope(name, True, adjoint) for adjoint in (None, FORWARD))
+    assert np.any(expected != 0)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_tangents_of_a_model_are_those_of_xla(name):
+    found, expected = (_slope(name, native, FORWARD) for native in (True, False))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)))
