@@ -64,7 +64,7 @@ class Design(Printed):
             return "levels"
         column = np.asarray(what)
         if column.ndim != 1 or column.dtype.kind not in "fiu" or not column.size:
-            raise ValueError(f"`{name}` varies as {described(what)}, expected a distribution such as jj.Normal(0.0, 1.0), jj.Levels([...]), or a list of numbers")
+            raise ValueError(f"`{name}` varies as {described(what)}, expected a distribution such as jj.Normal(0, 1), jj.Levels([...]) or a list of numbers")
         if not np.all(np.isfinite(column)):
             raise ValueError(f"the column `{name}` has {int(np.sum(~np.isfinite(column)))} entries that are not finite; leave these rows out")
         return "columns"

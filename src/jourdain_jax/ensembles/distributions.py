@@ -1,12 +1,13 @@
 """How a parameter or a start value varies over the lanes of a study: distributions, and levels of a grid.
 
 A distribution maps numbers u that are even on (0, 1) to values by its inverse distribution function, one number for one value, so that a sampler
-which spreads u well (Latin hypercube, Sobol) spreads the values well.
+which spreads u well (Latin hypercube, Sobol) spreads the values well. Its numbers may be given as anything that is one number, and are floats from then on.
 """
 
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,7 @@ class Distribution:
         """The values at the probabilities `u`, which lie between 0 and 1."""
 
 
-def _check(owner, **numbers: float) -> None:
+def _check(owner, **numbers: Any) -> None:
     for name, value in numbers.items():
         object.__setattr__(owner, name, float(checked_known(value, f"`{name}` of {type(owner).__name__}", (), advice="give one number")))
         if not np.isfinite(getattr(owner, name)):
@@ -38,8 +39,8 @@ def _check_order(owner, low: float, high: float) -> None:
 class Normal(Distribution):
     """A normal distribution with the given `mean` and standard deviation `sigma`, in the unit of what varies; sigma = 0: always the mean."""
 
-    mean: float
-    sigma: float
+    mean: Any
+    sigma: Any
 
     def __post_init__(self):
         _check(self, mean=self.mean, sigma=self.sigma)
@@ -55,8 +56,8 @@ class Normal(Distribution):
 class Uniform(Distribution):
     """Evenly between `low` and `high`, in the unit of what varies."""
 
-    low: float
-    high: float
+    low: Any
+    high: Any
 
     def __post_init__(self):
         _check(self, low=self.low, high=self.high)
@@ -71,8 +72,8 @@ class Uniform(Distribution):
 class LogNormal(Distribution):
     """A positive quantity whose logarithm is normal: `median` in the unit of what varies, `sigma` the standard deviation of its natural logarithm."""
 
-    median: float
-    sigma: float
+    median: Any
+    sigma: Any
 
     def __post_init__(self):
         _check(self, median=self.median, sigma=self.sigma)
@@ -88,8 +89,8 @@ class LogNormal(Distribution):
 class LogUniform(Distribution):
     """A positive quantity whose logarithm is even between those of `low` and `high`, in the unit of what varies."""
 
-    low: float
-    high: float
+    low: Any
+    high: Any
 
     def __post_init__(self):
         _check(self, low=self.low, high=self.high)

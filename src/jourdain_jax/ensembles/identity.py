@@ -88,8 +88,8 @@ def _names_in(code: CodeType) -> set[str]:
 def _class(kind: type, of) -> object:
     if _is_installed(kind.__module__):
         return "class", kind.__module__, kind.__qualname__
-    own = ((name, member) for name, member in sorted(vars(kind).items()) if not (name.startswith("__") and name.endswith("__")) and not name.startswith("_abc_"))
-    return "class", kind.__qualname__, tuple((name, of(member)) for name, member in own), tuple(of(base) for base in kind.__bases__)
+    own = tuple((name, of(member)) for name, member in sorted(vars(kind).items()) if name == "__call__" or not name.startswith(("__", "_abc_")))
+    return "class", kind.__qualname__, own, tuple(of(base) for base in kind.__bases__)
 
 
 def _is_installed(module: str | None) -> bool:

@@ -18,7 +18,6 @@ from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
 
 
-
 class Output:
     """Base of the outputs: `of(motion)` is the number, `unit` its unit; `over_times` says whether it looks at saved times, or only at the end."""
 

@@ -3,6 +3,7 @@
 The first Ctrl-C lets the chunk under way end; a second one ends at once. Both leave a folder from which the same call goes on.
 """
 
+import functools
 import signal
 import sys
 import threading
@@ -93,10 +94,11 @@ def _chunk(task: Task, chunk: int | None) -> int:
     if chunk is None:
         return int(unit * max(1, len(task.design) // (MOST_CHUNKS * unit)))
     if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1 or chunk % unit:
-        raise ValueError(f"`chunk` is {chunk!r}, expected a multiple of {unit} lanes, which are computed together in this study; {max(1, round(chunk / unit)) * unit} is near")
+        raise ValueError(f"`chunk` is {chunk!r}, expected a multiple of {unit} lanes, such as {4 * unit}: so many are computed together in this study")
     return int(chunk)
 
 
+@functools.cache
 def versions() -> dict[str, str]:
     """Versions of what computes."""
     return {"python": python_version()} | {name: version_of(name) for name in PACKAGES}
@@ -140,10 +142,6 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
         warnings.warn(f"`{store.path}` was begun with other versions: {', '.join(changed)}; what is computed now may differ in its last digits", stacklevel=3)
 
 
-class Interrupted(KeyboardInterrupt):
-    """A run was interrupted; what was done is kept."""
-
-
 @contextmanager
 def _interruptions() -> Iterator[Callable[[], bool]]:
     """A function that says whether Ctrl-C was pressed. Pressed twice, it interrupts as always."""
@@ -178,18 +176,18 @@ def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int
             warnings.warn(f"{len(torn)} chunks of `{path}` are damaged and are computed again: {_listed(torn)}", stacklevel=3)
         whole = set(done)
         missing = [number for number in range(shard[0] - 1, store.chunks, shard[1]) if number not in whole]
-        kept = _lanes(store, done)
-        bar = tqdm(total=kept + _lanes(store, missing), initial=kept, unit="lane", unit_scale=True, disable=not progress, smoothing=0.1)
+        known = _lanes(store, done)
+        bar = tqdm(total=known + _lanes(store, missing), initial=known, unit="lane", unit_scale=True, disable=not progress, smoothing=0.1)
         failed, finished, began = 0, 0, time.monotonic()
         with bar, _interruptions() as interrupted:
             for lanes, wrong in workers(task, store, missing, interrupted):
                 failed, finished = failed + wrong, finished + 1
                 bar.update(lanes)
-                bar.set_postfix_str(f"{100 * failed / max(1, bar.n - kept):.2g} % failed", refresh=False)
+                bar.set_postfix_str(f"{100 * failed / max(1, bar.n - known):.2g} % failed", refresh=False)
             stopped = finished < len(missing)
         if stopped:
-            say = f"interrupted after {time.monotonic() - began:.0f} s: {len(done) + finished} of {store.chunks} chunks are kept in `{path}`; the same call goes on from there"
-            raise Interrupted(say)
+            kept = f"{len(done) + finished} of {store.chunks} chunks are kept in `{path}`"
+            raise KeyboardInterrupt(f"interrupted after {time.monotonic() - began:.0f} s: {kept}; the same call goes on from there")
     return store
 
 

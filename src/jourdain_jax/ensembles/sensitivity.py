@@ -56,7 +56,7 @@ def sobol_indices(values, names: Sequence[str], *, confidence: float = 0.95) -> 
     values, names = np.asarray(values, float), tuple(names)
     group = len(names) + 2
     if values.ndim != 1 or values.size % group or not values.size:
-        raise ValueError(f"there are {values.size} values, expected a multiple of {group}: the samples of a design of {len(names)} variables with sampler='saltelli'")
+        raise ValueError(f"there are {values.size} values, expected a multiple of {group}: of a design of {len(names)} variables with sampler='saltelli'")
     if not 0 < confidence < 1:
         raise ValueError(f"`confidence` is {confidence}, expected a number between 0 and 1")
     groups = values.reshape(-1, group)

@@ -93,6 +93,8 @@ class Store:
                 group.create_group("run")
                 zarr.consolidate_metadata(beside, zarr_format=3)
             (beside / "run" / "chunks").mkdir()
+            for name in columns:
+                (beside / name / "c").mkdir(exist_ok=True)
             entries = {name: vars(column) | {"attributes": dict(column.attributes)} for name, column in columns.items()}
             write_whole(beside / "run" / "study.json", json.dumps({"format": FORMAT, **study, "columns": entries}, indent=1).encode(), wait=True)
             try:
@@ -101,7 +103,8 @@ class Store:
                 if error.errno not in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
                     raise
         except OSError as error:
-            raise OSError(error.errno, f"cannot write the study ({os.strerror(error.errno or 0)}); choose a folder that can be written to", str(path)) from error
+            text = f"cannot write the study ({os.strerror(error.errno or 0)}); choose a folder that can be written to"
+            raise OSError(error.errno, text, str(path)) from error
         finally:
             shutil.rmtree(beside, ignore_errors=True)
         return Store(path)
@@ -143,7 +146,12 @@ class Store:
         return number * self.chunk, min((number + 1) * self.chunk, self.lanes)
 
     def _file(self, name: str, number: int) -> Path:
-        return self.path.joinpath(name, "c", str(number), *("0" for _ in self.columns[name].more))
+        """Of an array with more axes than that of lanes, which are not cut, every chunk has a folder of its own."""
+        more = len(self.columns[name].more)
+        folder = self.path / name / "c"
+        if not more:
+            return folder / str(number)
+        return folder.joinpath(str(number), *["0"] * more)
 
     def _receipt_file(self, number: int) -> Path:
         return self.path / "run" / "chunks" / str(number)
@@ -159,7 +167,8 @@ class Store:
                 content = full.tobytes()
                 checksums[name] = crc32c.value(content)
                 file = self._file(name, number)
-                file.parent.mkdir(parents=True, exist_ok=True)
+                if column.more:
+                    file.parent.mkdir(parents=True, exist_ok=True)
                 write_whole(file, content + checksums[name].to_bytes(4, "little"))
             write_whole(self._receipt_file(number), _packed(Receipt(*self.span(number), arrays, checksums), crc32c))
         except OSError as error:
@@ -198,7 +207,8 @@ class Store:
 
     def done(self) -> tuple[list[int], list[int]]:
         """Numbers of the chunks that are whole, and of those that have a receipt and are not; the receipts of the latter are removed."""
-        whole, torn = [], []
+        whole: list[int] = []
+        torn: list[int] = []
         for number in self.receipts():
             (whole if self.is_whole(number) else torn).append(number)
         for number in torn:
@@ -220,9 +230,10 @@ class Store:
 
     def take_chunk(self, other: "Store", number: int) -> None:
         """Copy a chunk that another folder of the same study holds."""
-        for name in self.columns:
+        for name, column in self.columns.items():
             file = self._file(name, number)
-            file.parent.mkdir(parents=True, exist_ok=True)
+            if column.more:
+                file.parent.mkdir(parents=True, exist_ok=True)
             write_whole(file, other._file(name, number).read_bytes())
         write_whole(self._receipt_file(number), other._receipt_file(number).read_bytes())
 

@@ -4,6 +4,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from jourdain_jax.ensembles.outputs import as_outputs
 from jourdain_jax.ensembles.result import StudyResult
 from jourdain_jax.ensembles.run import in_this_process, run
 from jourdain_jax.ensembles.task import AT_START, SAVES, Task
+from jourdain_jax.ensembles.workers import in_processes
 from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
@@ -42,8 +44,8 @@ class Study(Printed):
     """
 
     scene: Scene
-    vary: Mapping | None = None
-    start: Mapping | None = None
+    vary: Any = None  # a dictionary by name, as is `start`
+    start: Any = None
     sampler: str = "random"
     samples: int | None = None
     seed: int = 0
@@ -126,6 +128,7 @@ class Study(Printed):
         every: int = 1,
         chunk: int | None = None,
         progress: bool = True,
+        processes: int = 1,
         shard: tuple[int, int] = (1, 1),
         command: str = "",
         **options,
@@ -142,6 +145,8 @@ class Study(Printed):
         - `save`: "outputs": parameters, starts, outputs, result code and steps of every lane; "trajectories": these, and states at `ts` of `every` so-many-th
           lane; "statistics": counts, sums and histograms alone, nothing per lane.
         - `chunk`: lanes that are stored together (default: about a thousandth of all); at most one is computed again after a crash.
+        - `processes`: how many compute, each on its share of the cores; more than one need a script whose top level is guarded by
+          `if __name__ == "__main__":`, and outputs that are no functions within functions.
         - `shard`: (k, n): only the k-th of n shares of the chunks, for a folder of its own on one of n machines; `jj.merge_studies` puts them together.
         - `progress`: a bar; `command`: text that is kept with the study; `options`: further ones as in `rollout` (`rtol`, `atol`, `solver`, ...).
 
@@ -152,7 +157,10 @@ class Study(Printed):
         shards = tuple(shard)
         if len(shards) != 2 or not all(isinstance(x, int) for x in shards) or not 1 <= shards[0] <= shards[1]:
             raise ValueError(f"`shard` is {shard}, expected (k, n) with 1 <= k <= n")
-        store = run(task, path, chunk=chunk, progress=progress, shard=shards, command=command, workers=in_this_process)
+        if isinstance(processes, bool) or not isinstance(processes, int) or processes < 1:
+            raise ValueError(f"`processes` is {processes!r}, expected a whole number of at least 1")
+        compute = in_this_process if processes == 1 else in_processes(task, processes)
+        store = run(task, path, chunk=chunk, progress=progress, shard=shards, command=command, workers=compute)
         return StudyResult(store, task)
 
     def _text(self) -> str:

@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -33,7 +34,7 @@ BLOCK_MEMORY = 2**26  # bytes of saved states of a block, at most
 AT_START = "_at_start"  # how columns of start values are called, after the coordinate or speed
 CODES = ("success", "event", "max_steps", "step_too_small", "not_finite", "inconsistent_start", "singular_partition", "bad_parameter", "bad_start",
          "unsolved_step", "shrank", "stiff", "off_constraints", "bad_times")  # fmt: skip
-OF_LANES = {
+OF_LANES: dict[str, tuple[str, float, dict]] = {
     "result": ("int8", -1, {"long_name": "how the motion ended", "flag_values": list(range(len(CODES))), "flag_meanings": " ".join(CODES)}),
     "event": ("int8", -1, {"long_name": "which stop event ended the motion; -1: none"}),
     "steps": ("int32", -1, {"long_name": "accepted steps"}),
@@ -60,7 +61,7 @@ class Task:
     design: Design  # parameters by name, start values by name and AT_START
     constants: Mapping[str, object]  # start values that all lanes share
     outputs: Mapping[str, Output]
-    options: Mapping[str, object]  # of `rollout`, `ts` among them
+    options: Mapping[str, Any]  # of `rollout`, `ts` among them
     save: str
     every: int
 
@@ -143,7 +144,7 @@ class Task:
         """The arrays of the store."""
         if self.save == "statistics":
             return {}
-        events = {"event_names": list(names_of_events(self.scene))}
+        events: dict = {"event_names": list(names_of_events(self.scene))}
         units = {name: about["unit"] for name, _, about in parameters_of(self.scene)}
         found = {}
         for name in self.design.names:
