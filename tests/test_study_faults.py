@@ -6,15 +6,18 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from test_studies import assert_same
 
 import jourdain_jax as jj
 from jourdain_jax.ensembles import files, store, task
 from jourdain_jax.ensembles.files import write_whole
+from jourdain_jax.ensembles.identity import digest
 from jourdain_jax.ensembles.store import Store
 
 COUNT = 90  # lanes, in three chunks
@@ -237,33 +240,77 @@ def test_clocks_do_not_matter(whole, tmp_path, monkeypatch):
     assert_same(run(tmp_path / "discs.zarr"), whole)
 
 
-# Another process. ------------------------------------------------------------------------------------------------
+def test_what_is_not_installed_is_named_with_its_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    with pytest.raises(ImportError, match=r"needs the package `zarr`, .*jourdain-jax\[ensembles\]"):
+        run(tmp_path / "discs.zarr")
+
+
+def test_a_function_counts_by_what_it_does():
+    def made(factor, text="x"):
+        return lambda motion: factor * motion.q_end[0] if text in {"a", "b", "x"} else 0.0
+
+    assert digest(made(2.0)) == digest(made(2.0))
+    assert len({digest(made(2.0)), digest(made(3.0)), digest(made(2.0, "y")), digest(lambda motion: motion.q_end[0])}) == 4
+    assert digest(jj.models.TiltingDisc()) != digest(jj.models.TiltingDisc(mass=2.0))
+    assert digest(np.arange(3.0)) != digest(np.arange(3))
+
+
+def test_a_study_that_cannot_be_sent_to_other_processes_says_so(tmp_path):
+    with pytest.raises(ValueError, match="at the top level of a module"):
+        run(tmp_path / "discs.zarr", outputs={"lean": lambda motion: motion.q_end[3]}, processes=2)
+    with pytest.raises(ValueError, match="`processes` is 0"):
+        run(tmp_path / "discs.zarr", processes=0)
+
+
+# Other processes. ------------------------------------------------------------------------------------------------
 
 SCRIPT = """
+import sys
 import jourdain_jax as jj
 from jourdain_jax.ensembles import task
-task.LARGEST_BLOCK = 32
-study = jj.Study(jj.models.TiltingDisc(), start={"lean": jj.Uniform(-0.5, 0.5), "spin_rate": jj.Uniform(-4.0, 0.0)}, samples=2000, seed=3)
-print("ready", flush=True)
-study.run("discs.zarr", t1=1.0, rtol=1e-6, atol=1e-6, progress=False)
-print("done", flush=True)
+
+def spread(motion, allowed=frozenset({"lean", "yaw", "spin", "x"})):
+    return motion.q_end[3] - motion.q_end[2] if "lean" in allowed and "q" not in {"a", "b", "c"} else 0.0
+
+if __name__ == "__main__":
+    study = jj.Study(jj.models.TiltingDisc(), start={"lean": jj.Uniform(-0.5, 0.5), "spin_rate": jj.Uniform(-4.0, 0.0)}, samples=400_000, seed=3)
+    outputs = {"lean": jj.End("lean"), "spread": spread}
+    study.run(sys.argv[1], t1=1.0, rtol=1e-6, atol=1e-6, progress=False, outputs=outputs, processes=int(sys.argv[2]))
 """
 
 
+def _started(folder, name, processes=1):
+    (folder / "script.py").write_text(SCRIPT)
+    return subprocess.Popen([sys.executable, "script.py", name, str(processes)], cwd=folder)
+
+
+def _chunks(path):
+    return len(list(path.glob("run/chunks/[0-9]*")))
+
+
+def _wait_for(process, path, count):
+    while process.poll() is None and _chunks(path) < count:
+        time.sleep(1e-3)
+
+
 @pytest.mark.slow
-def test_runs_that_are_killed_lose_and_repeat_nothing(tmp_path):
-    generator, kills = np.random.default_rng(0), 0
-    environment = os.environ | {"XLA_FLAGS": os.environ.get("XLA_FLAGS", "")}
-    path = tmp_path / "discs.zarr" / "run" / "chunks"
-    while kills < 20:
-        process = subprocess.Popen([sys.executable, "-c", SCRIPT], cwd=tmp_path, env=environment, stdout=subprocess.PIPE, text=True)
-        held = len(list(path.glob("[0-9]*"))) if path.exists() else 0
-        wanted = held + int(generator.integers(1, 4))
-        while process.poll() is None and not (path.exists() and len(list(path.glob("[0-9]*"))) >= wanted):
-            pass
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-        kills += 1
-    own = jj.Study(jj.models.TiltingDisc(), start={"lean": jj.Uniform(-0.5, 0.5), "spin_rate": jj.Uniform(-4.0, 0.0)}, samples=2000, seed=3)
-    ask = {"t1": 1.0, "rtol": 1e-6, "atol": 1e-6, "progress": False}
-    assert_same(own.run(tmp_path / "discs.zarr", **ask), own.run(tmp_path / "whole.zarr", **ask))
+def test_runs_and_workers_that_are_killed_lose_and_repeat_nothing(tmp_path):
+    """Twenty times, at random moments: every other time the run itself, otherwise one of its workers."""
+    generator, path = np.random.default_rng(0), tmp_path / "discs.zarr"
+    for kill in range(20):
+        process = _started(tmp_path, "discs.zarr", 1 + kill % 2)
+        _wait_for(process, path, _chunks(path) + int(generator.integers(1, 6)))
+        time.sleep(generator.uniform(0.0, 0.05))
+        assert process.poll() is None
+        if kill % 2:
+            workers = [other for other in psutil.Process(process.pid).children() if "spawn_main" in " ".join(other.cmdline())]
+            workers[int(generator.integers(len(workers)))].kill()
+            _wait_for(process, path, _chunks(path) + 4)
+        process.kill()
+        process.wait()
+    before = {file.name: file.stat().st_mtime_ns for file in path.glob("run/chunks/[0-9]*")}
+    assert _started(tmp_path, "discs.zarr").wait() == 0
+    assert all((path / "run" / "chunks" / name).stat().st_mtime_ns == time for name, time in before.items())  # none is done twice
+    assert _started(tmp_path, "whole.zarr").wait() == 0
+    assert_same(jj.load_study(path), jj.load_study(tmp_path / "whole.zarr"))

@@ -1,7 +1,9 @@
 """Statistics of studies: right, and the same bits whatever the order of blocks. Sobol' indices against closed forms."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import special
 
 import jourdain_jax as jj
 from jourdain_jax.ensembles.statistics import Grid, combined, counts_of_block, extremes_of_block, sums_of_block
@@ -119,3 +121,55 @@ def test_groups_without_a_value_are_left_out_and_counted():
         jj.sobol_indices(values[:-1], design.names)
     with pytest.raises(ValueError, match="that varies"):
         jj.sobol_indices(np.ones(20), design.names)
+
+
+class Pendulum(jj.Scene):
+    """A pendulum that is let go at an angle and stops where it hangs down."""
+
+    length: object = jj.parameter(1.0, unit="m", positive=True)
+    gravity: object = jj.parameter(9.81, unit="m/s^2")
+    coordinates = jj.coordinates("angle")
+    example = {"angle": 1.0}
+
+    def bodies(self, t, q):
+        return {"bob": jj.Particle(1.0, self.length * jnp.stack([jnp.sin(q.angle), 0.0 * q.angle, -jnp.cos(q.angle)]))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, self.gravity),)
+
+    def events(self, motion):
+        return {"down": motion.q.angle}
+
+
+def test_the_indices_of_a_pendulums_period_lie_within_their_limits(tmp_path):
+    """T / 4 = sqrt(L / g) K(sin(angle / 2)), with the complete elliptic integral K."""
+    ranges = {"length": (0.5, 1.5), "gravity": (9.0, 10.5), "angle_at_start": (0.2, 2.8)}
+    length, gravity, angle = (jj.Uniform(*limits) for limits in ranges.values())
+    study = jj.Study(Pendulum(), vary={"length": length, "gravity": gravity}, start={"angle": angle}, sampler="saltelli", samples=5 * 2**9, seed=4)
+    result = study.run(tmp_path / "pendulum.zarr", t1=3.0, rtol=1e-8, outputs={"quarter": jj.EventTime("down")}, progress=False)
+    assert result.counts == {"event": len(result)}
+
+    def quarter(length, gravity, angle):
+        return np.sqrt(length / gravity) * special.ellipk(np.sin(angle / 2) ** 2)
+
+    at = study.design.values()
+    found = result.to_xarray()["quarter"].values
+    np.testing.assert_allclose(found, quarter(*at.values()), rtol=1e-7)
+
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    points = [low + (high - low) * (nodes + 1) / 2 for low, high in ranges.values()]
+    values = quarter(*np.meshgrid(*points, indexing="ij"))
+    mean = np.einsum("ijk,i,j,k->", values, *[weights / 2] * 3)
+    centred = values - mean
+    variance = np.einsum("ijk,i,j,k->", centred**2, *[weights / 2] * 3)
+    indices = result.sensitivity("quarter")
+    for i in range(3):
+        alone = np.tensordot(np.tensordot(np.moveaxis(centred, i, 0), weights / 2, (2, 0)), weights / 2, (1, 0))  # mean given quantity i
+        given_others = np.tensordot(np.moveaxis(centred, i, 0), weights / 2, (0, 0))
+        first = np.sum(alone**2 * weights / 2) / variance
+        total = 1 - np.einsum("ij,i,j->", given_others**2, weights / 2, weights / 2) / variance
+        assert abs(indices.first[i] - first) <= indices.first_half_width[i] < 0.15
+        assert abs(indices.total[i] - total) <= indices.total_half_width[i] < 0.15
+    assert "length" in str(indices)
+    with pytest.raises(ValueError, match="no output `period`"):
+        result.sensitivity("period")
