@@ -24,7 +24,7 @@
 import json
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
@@ -36,7 +36,7 @@ from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import described
 
 ACTIONS = ("status", "resume", "export", "merge")
-VARYING = {"normal": Normal, "uniform": Uniform, "log-normal": LogNormal, "log-uniform": LogUniform}
+VARYING: dict[str, Callable] = {"normal": Normal, "uniform": Uniform, "log-normal": LogNormal, "log-uniform": LogUniform}
 OUTPUTS = {"end": End, "largest": Largest, "smallest": Smallest, "largest-magnitude": LargestMagnitude, "event-time": EventTime, "happened": Happened}
 KEYS = ("model", "t1", "samples", "sampler", "seed", "save", "every", "chunk", "set", "vary", "start", "outputs", "options", "correlation")
 
@@ -154,11 +154,9 @@ def _show(found: StudyResult, options) -> None:
     if not options.json:
         print(found)
         return
-    statistics = found.statistics if sum(found.counts.values()) else None
     outputs = {}
-    for i, name in enumerate(found.outputs if statistics else ()):
+    for i, name in enumerate(found.outputs if found.counts else ()):
         limits = {str(level): found.quantile(name, level) for level in (0.025, 0.5, 0.975)}
-        mean, deviation, lanes = (float(x) for x in (statistics.mean[i], statistics.deviation[i], statistics.lanes[i, i]))
-        outputs[name] = {"lanes": int(lanes), "mean": mean, "deviation": deviation, "quantiles": limits}
+        outputs[name] = {"lanes": int(found.statistics.lanes[i, i]), "mean": found.mean(name), "deviation": found.deviation(name), "quantiles": limits}
     print(json.dumps({"folder": str(found.store.path), "lanes": len(found), "complete": found.complete, "counts": found.counts,
                       "failed": found.failed.tolist(), "outputs": outputs}, indent=2))  # fmt: skip

@@ -11,7 +11,7 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
@@ -55,7 +55,7 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
     return workers
 
 
-def _until_a_worker_dies(sent: bytes, store: Store, numbers: list[int], count: int, interrupted) -> Iterator[tuple[int, int]]:
+def _until_a_worker_dies(sent: bytes, store: Store, numbers: list[int], count: int, interrupted) -> Generator[tuple[int, int], None, list[int]]:
     """Run chunks; returns the numbers of those that were under way when a worker died, empty where none did."""
     context = get_context("spawn")
     places = context.Queue()
