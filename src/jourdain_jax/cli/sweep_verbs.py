@@ -22,6 +22,7 @@
 """
 
 import json
+import math
 import sys
 import tomllib
 from collections.abc import Callable, Mapping
@@ -156,7 +157,13 @@ def _show(found: StudyResult, options) -> None:
         return
     outputs = {}
     for i, name in enumerate(found.outputs if found.counts else ()):
-        limits = {str(level): found.quantile(name, level) for level in (0.025, 0.5, 0.975)}
-        outputs[name] = {"lanes": int(found.statistics.lanes[i, i]), "mean": found.mean(name), "deviation": found.deviation(name), "quantiles": limits}
+        limits = {str(level): [_or_none(x) for x in found.quantile(name, level)] for level in (0.025, 0.5, 0.975)}
+        numbers = {"mean": _or_none(found.mean(name)), "deviation": _or_none(found.deviation(name)), "quantiles": limits}
+        outputs[name] = {"lanes": int(found.statistics.lanes[i, i])} | numbers
     print(json.dumps({"folder": str(found.store.path), "lanes": len(found), "complete": found.complete, "counts": found.counts,
                       "failed": found.failed.tolist(), "outputs": outputs}, indent=2))  # fmt: skip
+
+
+def _or_none(x: float) -> float | None:
+    """What JSON has no number for is none."""
+    return x if math.isfinite(x) else None

@@ -184,7 +184,7 @@ def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int
                 failed, finished = failed + wrong, finished + 1
                 bar.update(lanes)
                 bar.set_postfix_str(f"{100 * failed / max(1, bar.n - known):.2g} % failed", refresh=False)
-            stopped = finished < len(missing)
+            stopped = interrupted() and finished < len(missing)
         if stopped:
             kept = f"{len(done) + finished} of {store.chunks} chunks are kept in `{path}`"
             raise KeyboardInterrupt(f"interrupted after {time.monotonic() - began:.0f} s: {kept}; the same call goes on from there")

@@ -1,7 +1,7 @@
 """Several processes that compute the chunks of one study; each is started afresh (never forked from one in which JAX runs) and has its share of the cores.
 
-A worker that dies takes nothing with it: chunks that it had not finished are given to new workers. A chunk on which workers died three times is left out, and
-named at the end, when all others are done.
+A worker that dies takes nothing with it: chunks that were under way are given to a new worker, one at a time. A chunk on which workers died three times is left
+out, and named at the end, when all others are done.
 """
 
 import contextlib
@@ -10,7 +10,6 @@ import pickle
 import signal
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -35,18 +34,18 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
         raise ValueError(f"this study cannot be sent to other processes ({error}); {text}") from None
 
     def workers(task: Task, store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
-        deaths: Counter[int] = Counter()
-        waiting = list(numbers)
+        waiting, bad = list(numbers), []
         while waiting and not interrupted():
-            unfinished = yield from _until_a_worker_dies(sent, store, waiting, count, interrupted)
-            if interrupted():
-                return
-            deaths.update(unfinished)
-            finished = {number for number in waiting if store.receipt(number) is not None}
-            waiting = [number for number in waiting if number not in finished and deaths[number] < MOST_DEATHS]
-        bad = sorted(number for number, died in deaths.items() if died >= MOST_DEATHS and store.receipt(number) is None)
+            suspects = yield from _until_a_worker_dies(sent, store, waiting, count, interrupted)
+            for number in suspects:
+                for _ in range(MOST_DEATHS - 1):  # alone, so that no other chunk is blamed
+                    if interrupted() or not (yield from _until_a_worker_dies(sent, store, [number], 1, interrupted)):
+                        break
+                else:
+                    bad.append(number)
+            waiting = [number for number in waiting if number not in bad and store.receipt(number) is None]
         if bad:
-            lanes = ", ".join("{} to {}".format(*(first, last - 1)) for first, last in map(store.span, bad[:5])) + (" ..." if len(bad) > 5 else "")
+            lanes = ", ".join(f"{first} to {last - 1}" for first, last in map(store.span, bad[:5])) + (" ..." if len(bad) > 5 else "")
             raise RuntimeError(
                 f"workers died {MOST_DEATHS} times on lanes {lanes} of `{store.path}`; all other chunks are kept. Simulate these lanes alone with "
                 "`result.lane(k).simulate()`, in a process of its own, to see which it is"
@@ -74,7 +73,14 @@ def _until_a_worker_dies(sent: bytes, store: Store, numbers: list[int], count: i
                     yield future.result()
                     del running[future]
         except BrokenProcessPool:
-            return list(running.values())
+            suspects = []
+            for number in running.values():
+                receipt = store.receipt(number)
+                if receipt is None:
+                    suspects.append(number)
+                else:  # kept before the worker died
+                    yield receipt.last - receipt.first, receipt.arrays["failed"].size
+            return suspects
 
 
 def _begin(sent: bytes, path: str, places) -> None:
