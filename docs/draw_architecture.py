@@ -20,6 +20,7 @@ ROOMS = (
     ("plotting", "pictures and animations of motions", False),
     ("bicycle", "measured bicycles: files, stability, uncertainty", False),
     ("models", "textbook scenes, to be read as examples", False),
+    ("ensembles", "studies of many motions: designs, storage", False),
     ("analysis", "report, verify, linearize, steady, fit", False),
     ("motion", "starts, simulate, and one motion as one program", False),
     ("motion/batches", "rollout: many motions in lockstep", True),

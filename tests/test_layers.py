@@ -1,6 +1,7 @@
 """The layer table of the package, held by reading every import in `src` (no import is executed).
 
-Bottom to top: calculus < eager < program < native < scene < equations < build < dynamics < lowering < motion < analysis < models < bicycle < plotting < cli.
+Bottom to top: calculus < eager < program < native < scene < equations < build < dynamics < lowering < motion < analysis < ensembles < models < bicycle <
+plotting < cli.
 A layer imports itself and what lies below it; only the package's `__init__` sees everything.
 """
 
@@ -24,6 +25,7 @@ LAYERS = (
     "lowering",
     "motion",
     "analysis",
+    "ensembles",
     "models",
     "bicycle",
     "plotting",
@@ -31,7 +33,7 @@ LAYERS = (
 )
 ENTRY_MODULES = ("__init__", "__main__")  # above every layer
 OWNERS = {"diffrax": ("motion",)}  # third-party packages that only the named layers know
-OPTIONAL = ("matplotlib", "IPython", "tqdm", "scipy", "sympy")  # may be imported inside a function
+OPTIONAL = ("matplotlib", "IPython", "tqdm", "scipy", "sympy", "zarr", "google_crc32c", "xarray")  # may be imported inside a function
 VAGUE_NAMES = ("utils", "util", "misc", "common", "helpers", "helper")
 LONGEST = 400
 

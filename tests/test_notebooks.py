@@ -11,8 +11,8 @@ FOLDER = Path(__file__).parent.parent / "notebooks"
 SOURCES = sorted(FOLDER.glob("*.py"))
 
 
-# what the second shows is also looked at in `test_bicycle_job.py` and `test_bicycle_stability.py`
-@pytest.mark.parametrize("source", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * path.stem.startswith("02")) for path in SOURCES])
+# what these show is also looked at in `test_bicycle_job.py`, `test_bicycle_stability.py` and `test_studies.py`
+@pytest.mark.parametrize("source", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * path.stem.startswith(("02", "04"))) for path in SOURCES])
 def test_a_notebook_runs_to_its_end(source, tmp_path, monkeypatch):
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel then shows its figures in the notebook
     notebook = jupytext.read(source)

@@ -41,6 +41,13 @@ from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
 from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
+from jourdain_jax.ensembles.design import Design
+from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
+from jourdain_jax.ensembles.files import InUseError
+from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Largest, LargestMagnitude, Quantity, Smallest
+from jourdain_jax.ensembles.result import StudyResult, load_study, merge_studies
+from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
+from jourdain_jax.ensembles.study import Study
 from jourdain_jax.equations.gibbs_appell import GibbsAppell, gibbs_equations, gibbs_function
 from jourdain_jax.equations.instant import constraint_rows
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
@@ -94,27 +101,39 @@ __all__ = [
     "Built",
     "Contact",
     "Cylinder",
+    "Design",
     "DifferentiationModeError",
     "DiscreteGradient",
     "DiscreteLagrangeDAlembert",
+    "End",
     "Energy",
     "EnergyBalance",
+    "EventTime",
     "Fit",
     "GibbsAppell",
+    "Happened",
     "HeightMap",
     "ImplicitMidpoint",
+    "InUseError",
+    "Largest",
+    "LargestMagnitude",
+    "Levels",
     "Linearization",
     "Load",
+    "LogNormal",
+    "LogUniform",
     "Lowered",
     "Measurements",
     "Multipliers",
     "MuntheKaas",
+    "Normal",
     "NotLowered",
     "NullSpaceQR",
     "NullSpaceSVD",
     "Particle",
     "Plane",
     "Privileged",
+    "Quantity",
     "RadauIIA",
     "Report",
     "RigidBody",
@@ -123,13 +142,18 @@ __all__ = [
     "Scene",
     "SensitivityWarning",
     "SimulationError",
+    "Smallest",
+    "SobolIndices",
     "Sphere",
     "Spline",
     "State",
     "SteadyMotion",
+    "Study",
+    "StudyResult",
     "Surface",
     "Trajectory",
     "UdwadiaKalaba",
+    "Uniform",
     "Verification",
     "accelerations",
     "animate",
@@ -161,9 +185,11 @@ __all__ = [
     "lagrange_equations",
     "linearize",
     "load_rollout",
+    "load_study",
     "load_trajectory",
     "log_likelihood",
     "lower",
+    "merge_studies",
     "models",
     "motion_at",
     "newton_residual",
@@ -189,6 +215,7 @@ __all__ = [
     "sample_states",
     "save",
     "simulate",
+    "sobol_indices",
     "speeds",
     "spring",
     "start",

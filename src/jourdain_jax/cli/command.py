@@ -14,11 +14,13 @@ import jaxlib
 
 from jourdain_jax.cli.bicycle_verbs import add as add_bicycle_verbs
 from jourdain_jax.cli.model_verbs import add as add_model_verbs
+from jourdain_jax.cli.sweep_verbs import add as add_sweep_verb
+from jourdain_jax.ensembles.files import InUseError
 from jourdain_jax.motion.trajectories.versions import version_of
 from jourdain_jax.scene.names import nearest
 
 OK, FAILED, USAGE = 0, 1, 2
-VERBS = ("models", "report", "verify", "simulate", "bicycle", "demo")
+VERBS = ("models", "report", "verify", "simulate", "bicycle", "demo", "sweep")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -32,6 +34,7 @@ def parser() -> argparse.ArgumentParser:
     verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
     add_model_verbs(verbs)
     add_bicycle_verbs(verbs)
+    add_sweep_verb(verbs)
     return top
 
 
@@ -59,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _compile_quickly()
     try:
         return OK if options.run(options) else FAILED
-    except ValueError as error:
+    except (ValueError, InUseError, ImportError) as error:
         print(f"jourdain-jax: {error}", file=sys.stderr)
         return USAGE
     except BrokenPipeError:  # the reader of our output (head, less) has gone

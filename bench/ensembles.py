@@ -1,0 +1,215 @@
+"""Studies of many motions: how many per second, what storage and interruption cost, memory, and whether bits depend on how a study is run.
+
+    python bench/ensembles.py [--quick] [--json FILE] [--only NAME ...] [--folder FOLDER]
+
+The motions: two seconds of a rolling disc with random lean, yaw, lean and spin rates, some of which fall, at a tolerance of 1e-6; end values, result codes and
+steps are stored. Every measurement runs in a fresh process, and a program is compiled before the clock starts.
+
+    rate        discs per second, storage included (wall time; and per second of processor time, where other programs share the machine)
+    storage     processor time within the writing of chunks, of that of the whole run
+    busy        steps of all lanes over steps for which lanes of a vector are there, if lanes that end are replaced at once; and without replacement
+    memory      growth of the largest resident memory from fewer to more lanes
+    processes   wall time by one process with one thread over that by two
+    bits        arrays and statistics that differ between runs with other chunks, by two processes, interrupted, and the plain one
+    kills       lanes computed again, of all lanes, and missing or repeated ones, of a long run that is killed 20 times at random
+    indices     largest error of Sobol' indices of Ishigami's function over their stated limits
+
+The JSON is a list of {"figure", "model", "value", "required", "met"}. `--quick`: a tenth of the lanes.
+"""
+
+import argparse
+import heapq
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+import jourdain_jax as jj
+from jourdain_jax.ensembles.store import Store
+
+MODEL, SPAN, TOLERANCE = "tilting-disc", 2.0, 1e-6
+WIDTH = 8  # lanes of a vector
+OUTPUTS = {"lean": jj.End("lean", "rad"), "yaw": jj.End("yaw", "rad"), "fell": jj.Happened("fallen"), "fall time": jj.EventTime("fallen")}
+
+
+def discs(lanes: int) -> jj.Study:
+    """Discs with random starts."""
+    start = {"lean": jj.Uniform(-0.6, 0.6), "yaw_rate": jj.Normal(0.0, 0.5), "lean_rate": jj.Normal(0.0, 0.3), "spin_rate": jj.Uniform(-9.0, 0.0)}
+    return jj.Study(jj.models.TiltingDisc(), start=start, samples=lanes, seed=1)
+
+
+def run(lanes: int, path, **options) -> jj.StudyResult:
+    """A study of so many discs in a folder."""
+    return discs(lanes).run(path, t1=SPAN, rtol=TOLERANCE, atol=TOLERANCE, outputs=OUTPUTS, progress=False, **options)
+
+
+# In a process of its own. ----------------------------------------------------------------------------------------
+
+
+def timed(lanes: int, folder: Path, **options) -> dict:
+    """Seconds of a run after one that compiled its program: by the clock, of the processor, of the processor within writing."""
+    if options.get("processes", 1) == 1:
+        run(4096, folder / "warm", **options)
+    within, write = [0.0], Store.write
+
+    def watched(self, *what):
+        began = time.process_time()
+        write(self, *what)
+        within[0] += time.process_time() - began
+
+    Store.write = watched
+    clock, processor = time.perf_counter(), time.process_time()
+    result = run(lanes, folder / "timed", **options)
+    found = {"wall": time.perf_counter() - clock, "processor": time.process_time() - processor, "writing": within[0], "counts": result.counts}
+    return found | {"peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
+
+
+def in_fresh_process(lanes: int, folder: Path, threads: int | None = None, **options) -> dict:
+    """`timed` in a process of its own."""
+    environment = os.environ | ({} if threads is None else {"JOURDAIN_JAX_THREADS": str(threads)})
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    command = [sys.executable, __file__, "--timed", json.dumps({"lanes": lanes, "folder": str(folder), **options})]
+    return json.loads(subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout.splitlines()[-1])
+
+
+# Figures. --------------------------------------------------------------------------------------------------------
+
+
+def figure(name: str, value: float, required: float | None = None, *, at_least: bool = False, model: str = MODEL) -> dict:
+    """One entry of the JSON."""
+    met = None if required is None else bool(value >= required if at_least else value <= required)
+    return {"figure": name, "model": model, "value": value, "required": required, "met": met}
+
+
+def rate(lanes: int, folder: Path) -> Iterator[dict]:
+    """Rate and storage."""
+    found = min((in_fresh_process(lanes, folder / "rate") for _ in range(3)), key=lambda found: found["wall"])
+    cores = len(os.sched_getaffinity(0))
+    yield figure(f"discs per second of wall time, {cores} cores, storage included", lanes / found["wall"], 25_000, at_least=True)
+    yield figure("discs per second of processor time, storage included", lanes / found["processor"])
+    yield figure("share of processor time spent on storage", found["writing"] / found["processor"], 0.05)
+
+
+def busy(lanes: int, folder: Path) -> Iterator[dict]:
+    """Busy share, from the steps of every lane."""
+    shutil.rmtree(folder / "busy", ignore_errors=True)
+    result = run(min(lanes, 20_000), folder / "busy")
+    arrays = result.to_xarray()
+    steps, block = (arrays["steps"] + arrays["rejected_steps"]).values, result.store.study["block"]
+    there = plain = 0
+    for first in range(0, len(steps), block):
+        ends = [0] * WIDTH
+        for count in steps[first : first + block].tolist():
+            heapq.heapreplace(ends, ends[0] + count)
+        there += WIDTH * max(ends)
+        plain += len(steps[first : first + block]) * steps[first : first + block].max()
+    yield figure("busy share of lanes, by their steps, ended lanes replaced", steps.sum() / there, 0.9, at_least=True)
+    yield figure("busy share of lanes, by their steps, all waiting for the last", steps.sum() / plain)
+
+
+def memory(lanes: int, folder: Path) -> Iterator[dict]:
+    """Resident memory."""
+    few, many = (in_fresh_process(count, folder / "memory")["peak"] for count in (lanes, 10 * lanes))
+    yield figure(f"growth of resident memory from {lanes} to {10 * lanes} lanes, MB", many - few, 300)
+
+
+def processes(lanes: int, folder: Path) -> Iterator[dict]:
+    """Two processes over one, start and compilation included."""
+    one = in_fresh_process(5 * lanes, folder / "processes", threads=1)["wall"]
+    two = in_fresh_process(5 * lanes, folder / "processes", processes=2)["wall"]
+    yield figure("wall time by one process with one thread over that by two processes", one / two, 1.8, at_least=True)
+
+
+def bits(lanes: int, folder: Path) -> Iterator[dict]:
+    """Arrays that differ."""
+    shutil.rmtree(folder / "bits", ignore_errors=True)
+    lanes = min(lanes, 20_000)
+    plain = run(lanes, folder / "bits" / "plain")
+    ways = {"chunks of 8192": {"chunk": 8192}, "one chunk": {"chunk": 2048 * -(-lanes // 2048)}, "two processes": {"processes": 2}}
+    others = {way: run(lanes, folder / "bits" / way, **options) for way, options in ways.items()}
+    run(lanes, folder / "bits" / "in two parts", shard=(2, 2))
+    others["the second half first"] = run(lanes, folder / "bits" / "in two parts")
+    for way, other in others.items():
+        one, two = plain.to_xarray().load(), other.to_xarray().load()
+        differing = [name for name in one.variables if not np.array_equal(one[name].values, two[name].values, equal_nan=True)]
+        for name in ("mean", "covariance", "counts", "extremes"):
+            if not np.array_equal(getattr(plain.statistics, name), getattr(other.statistics, name), equal_nan=True):
+                differing.append(name)
+        yield figure(f"arrays that differ: {way}", len(differing), 0)
+
+
+def kills(lanes: int, folder: Path) -> Iterator[dict]:
+    """Twenty kills."""
+    generator, path = np.random.default_rng(0), folder / "kills"
+    shutil.rmtree(path, ignore_errors=True)
+    lanes *= 20
+    for _ in range(20):
+        options = json.dumps({"lanes": lanes, "folder": str(path), "killed": True})
+        process = subprocess.Popen([sys.executable, __file__, "--timed", options])
+        place = path / "timed" / "run" / "chunks"
+        before = len(list(place.glob("[0-9]*"))) if place.exists() else 0
+        while process.poll() is None and (len(list(place.glob("[0-9]*"))) if place.exists() else 0) <= before:
+            time.sleep(1e-3)
+        time.sleep(generator.uniform(0.0, 1.0))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    result = run(lanes, path / "timed")
+    # at most the chunk under way, and the block with which every process begins
+    again = 20 * (result.store.chunk + result.store.study["block"]) / lanes
+    yield figure("lanes computed again after 20 kills, at most, of all", again, 0.02)
+    yield figure("lanes missing or repeated after 20 kills", len(result) - sum(result.counts.values()), 0)
+
+
+def indices(lanes: int, folder: Path) -> Iterator[dict]:
+    """Ishigami's function; its indices in closed form."""
+    a, b = 7.0, 0.1
+    design = jj.Design(dict.fromkeys(("x1", "x2", "x3"), jj.Uniform(-np.pi, np.pi)), sampler="saltelli", samples=5 * 2**14, seed=1)
+    x = design.values()
+    found = jj.sobol_indices(np.sin(x["x1"]) + a * np.sin(x["x2"]) ** 2 + b * x["x3"] ** 4 * np.sin(x["x1"]), design.names)
+    one, two, three = 0.5 * (1 + b * np.pi**4 / 5) ** 2, a**2 / 8, b**2 * np.pi**8 * (1 / 18 - 1 / 50)
+    first, total = np.array([one, two, 0.0]) / (one + two + three), np.array([one + three, two, three]) / (one + two + three)
+    errors = [abs(found.first - first) / found.first_half_width, abs(found.total - total) / found.total_half_width]
+    yield figure("largest error of a Sobol' index over its stated limit", float(np.max(errors)), 1.0, model="Ishigami's function")
+
+
+MEASURED = {measure.__name__: measure for measure in (rate, busy, memory, processes, bits, kills, indices)}
+
+
+def main() -> int:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a tenth of the lanes")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to this file")
+    parser.add_argument("--only", nargs="+", choices=MEASURED, default=list(MEASURED), help="these alone")
+    parser.add_argument("--folder", type=Path, help="where studies are written (default: a temporary one)")
+    parser.add_argument("--timed", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.timed:
+        asked = json.loads(options.timed)
+        folder, lanes, killed = Path(asked.pop("folder")), asked.pop("lanes"), asked.pop("killed", False)
+        print(json.dumps(run(lanes, folder / "timed").counts if killed else timed(lanes, folder, **asked)))
+        return 0
+    figures = []
+    with tempfile.TemporaryDirectory() as temporary:
+        for name in options.only:
+            for found in MEASURED[name](10_000 if options.quick else 100_000, options.folder or Path(temporary)):
+                figures.append(found)
+                needed = "" if found["required"] is None else f"  (required {found['required']:g}: {'met' if found['met'] else 'MISSED'})"
+                print(f"{found['figure']}: {found['value']:.6g}{needed}", flush=True)
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

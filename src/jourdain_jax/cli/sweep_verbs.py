@@ -1,0 +1,169 @@
+"""The verb `sweep`: run a study that a file describes, look at it, go on with it, export it.
+
+    model = "tilting-disc"                       # a name of `jourdain-jax models`
+    t1 = 2.0                                     # s
+    samples = 1000
+    sampler = "sobol"                            # optional, as are `seed`, `save`, `every`, and the tables `set`, `options`, `correlation`
+
+    [set]                                        # parameters that all lanes share
+    mass = 1.0
+    [vary]                                       # parameters that vary: normal, uniform, log-normal, log-uniform, levels, table
+    radius = { normal = [0.5, 0.01] }
+    [start]                                      # the same of coordinates and speeds, or numbers
+    lean = { uniform = [-0.6, 0.6] }
+    spin_rate = -3.0
+    [outputs]                                    # end, largest, smallest, largest-magnitude, event-time, happened; optional
+    "final lean" = { end = "lean", unit = "rad" }
+    fell = { happened = "fallen" }
+    [options]                                    # of `jj.rollout`
+    rtol = 1e-6
+    [correlation]
+    "radius lean" = 0.5
+"""
+
+import json
+import math
+import sys
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
+from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Largest, LargestMagnitude, Smallest
+from jourdain_jax.ensembles.result import StudyResult, load_study, merge_studies
+from jourdain_jax.ensembles.study import Study
+from jourdain_jax.models.registry import model
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import described
+
+ACTIONS = ("status", "resume", "export", "merge")
+VARYING: dict[str, Callable] = {"normal": Normal, "uniform": Uniform, "log-normal": LogNormal, "log-uniform": LogUniform}
+OUTPUTS = {"end": End, "largest": Largest, "smallest": Smallest, "largest-magnitude": LargestMagnitude, "event-time": EventTime, "happened": Happened}
+KEYS = ("model", "t1", "samples", "sampler", "seed", "save", "every", "chunk", "set", "vary", "start", "outputs", "options", "correlation")
+
+
+def add(verbs) -> None:
+    """Add the verb to the parser."""
+    sweep = verbs.add_parser("sweep", help="many motions: run a study that a TOML file describes; `sweep status|resume|export|merge FOLDER`")
+    sweep.add_argument("words", nargs="+", metavar="FILE | ACTION FOLDER", help="a TOML file; or one of " + ", ".join(ACTIONS) + ", and folders of studies")
+    sweep.add_argument("--out", help="folder of the study to make or go on with; of `export`, the file to write (.nc)")
+    sweep.add_argument("--workers", type=int, default=1, help="processes that compute (default 1)")
+    sweep.add_argument("--shard", default="1/1", metavar="K/N", help="compute the K-th of N shares only, for `sweep merge` later")
+    sweep.add_argument("--quiet", action="store_true", help="no bar")
+    sweep.add_argument("--json", action="store_true", help="machine-readable")
+    sweep.set_defaults(run=_sweep)
+
+
+def _sweep(options) -> bool:
+    action, *paths = options.words
+    if action not in ACTIONS:
+        if paths:
+            raise ValueError(f"`{action}` is not known to `sweep`; {nearest(action, ACTIONS)} To run a study: jourdain-jax sweep FILE.toml --out FOLDER")
+        return _run(_text_of(action), options.out or str(Path(action).with_suffix(".zarr")), options)
+    if not paths or (action != "merge" and len(paths) > 1):
+        raise ValueError(f"`sweep {action}` takes {'folders' if action == 'merge' else 'one folder'} of a study")
+    if action == "resume":
+        text = load_study(paths[0]).store.study["command"]
+        if not text:
+            raise ValueError(f"`{paths[0]}` was begun from Python; run the same program again to go on")
+        return _run(text, paths[0], options)
+    found = merge_studies(paths[0], paths[1:]) if action == "merge" else load_study(paths[0])
+    if action == "export":
+        return _export(found, options)
+    _show(found, options)
+    return found.complete
+
+
+def _text_of(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ValueError(f"there is no file `{path}`; give a TOML file, or one of {', '.join(ACTIONS)}") from None
+
+
+def _run(text: str, out: str, options) -> bool:
+    try:
+        asked = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"the file is no TOML: {error}") from None
+    study, how = described_study(asked)
+    try:
+        found = study.run(out, processes=options.workers, shard=_shard(options.shard), progress=not options.quiet, command=text, **how)
+    except KeyboardInterrupt as stopped:
+        print(f"jourdain-jax: {stopped or 'interrupted'}; or: jourdain-jax sweep resume {out}", file=sys.stderr)
+        return False
+    _show(found, options)
+    return not found.failed.size
+
+
+def described_study(asked: Mapping) -> tuple[Study, dict]:
+    """The study that a file describes, and how it is to be run."""
+    for key in asked:
+        if key not in KEYS:
+            raise ValueError(f"the file has an entry `{key}`; {nearest(key, KEYS)}")
+    if "model" not in asked:
+        raise ValueError("the file names no `model`; write, for example, model = 'tilting-disc'")
+    scene = model(asked["model"], **asked.get("set", {}))
+    vary = {name: _varying(name, how) for name, how in asked.get("vary", {}).items()}
+    start = {name: _varying(name, how) if isinstance(how, Mapping) else how for name, how in asked["start"].items()} if "start" in asked else None
+    correlation = {tuple(pair.split()): value for pair, value in asked.get("correlation", {}).items()}
+    known = {name: asked[name] for name in ("sampler", "samples", "seed") if name in asked}
+    outputs = {name: _output(name, how) for name, how in asked["outputs"].items()} if "outputs" in asked else None
+    how = {name: asked[name] for name in ("t1", "save", "every", "chunk") if name in asked} | asked.get("options", {})
+    return Study(scene, vary=vary, start=start, correlation=correlation or None, **known), how | {"outputs": outputs}
+
+
+def _varying(name: str, how):
+    kinds = (*VARYING, "levels", "table")
+    if not isinstance(how, Mapping) or len(how) != 1:
+        raise ValueError(f"`{name}` varies as {described(how)}; write, for example, {name} = {{ normal = [1.0, 0.1] }}")
+    kind, numbers = next(iter(how.items()))
+    if kind not in kinds or not isinstance(numbers, list):
+        raise ValueError(f"`{name}` varies as `{kind}` = {numbers}, expected a list of numbers by one of these names; {nearest(kind, kinds)}")
+    if kind in VARYING and len(numbers) != 2:
+        raise ValueError(f"`{name}`: `{kind}` has {len(numbers)} numbers, expected 2")
+    return VARYING[kind](*numbers) if kind in VARYING else Levels(numbers) if kind == "levels" else numbers
+
+
+def _output(name: str, how):
+    unit = dict(how).pop("unit", "") if isinstance(how, Mapping) else ""
+    kinds = [key for key in how if key != "unit"] if isinstance(how, Mapping) else []
+    if len(kinds) != 1 or kinds[0] not in OUTPUTS:
+        raise ValueError(f"output `{name}` is {described(how)}; write, for example, {{ end = 'lean', unit = 'rad' }}. {nearest(str(kinds[:1]), OUTPUTS)}")
+    kind = OUTPUTS[kinds[0]]
+    return kind(how[kinds[0]], unit) if kind not in (EventTime, Happened) else kind(how[kinds[0]])
+
+
+def _shard(text: str) -> tuple[int, int]:
+    try:
+        k, n = map(int, text.split("/"))
+    except ValueError:
+        raise ValueError(f"--shard is `{text}`, expected K/N, such as 1/4") from None
+    return k, n
+
+
+def _export(found: StudyResult, options) -> bool:
+    out = options.out or str(found.store.path.with_suffix(".nc"))
+    if Path(out).suffix != ".nc":
+        raise ValueError(f"cannot export to `{out}`: expected a name that ends in .nc")
+    found.to_netcdf(out)
+    print(f"wrote {out}")
+    return True
+
+
+def _show(found: StudyResult, options) -> None:
+    if not options.json:
+        print(found)
+        return
+    outputs = {}
+    for i, name in enumerate(found.outputs if found.counts else ()):
+        limits = {str(level): [_or_none(x) for x in found.quantile(name, level)] for level in (0.025, 0.5, 0.975)}
+        numbers = {"mean": _or_none(found.mean(name)), "deviation": _or_none(found.deviation(name)), "quantiles": limits}
+        outputs[name] = {"lanes": int(found.statistics.lanes[i, i])} | numbers
+    print(json.dumps({"folder": str(found.store.path), "lanes": len(found), "complete": found.complete, "counts": found.counts,
+                      "failed": found.failed.tolist(), "outputs": outputs}, indent=2))  # fmt: skip
+
+
+def _or_none(x: float) -> float | None:
+    """What JSON has no number for is none."""
+    return x if math.isfinite(x) else None

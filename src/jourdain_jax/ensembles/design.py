@@ -1,0 +1,152 @@
+"""The samples of a study: the values of what varies, for any range of sample numbers.
+
+Correlated normal distributions: with z = Phi^-1(u), independent standard normal, and the Cholesky factor L of the correlation matrix, L z has that
+correlation; u of the varying quantity is Phi(L z), which its distribution maps to a value. So any distributions may be given a correlation of ranks, and that
+of normal ones is the one stated.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from jourdain_jax.ensembles.distributions import Distribution, Levels
+from jourdain_jax.ensembles.optional import special_functions
+from jourdain_jax.ensembles.samplers import MOST_SOBOL, SAMPLERS
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import described
+from jourdain_jax.scene.printing import Printed
+
+GRID, TABLE = "grid", "table"
+
+
+@dataclass(frozen=True, repr=False)
+class Design(Printed):
+    """The samples of a study: names and what varies, how samples are drawn, how many.
+
+    - `variables`: name -> a distribution (`Normal`, `Uniform`, `LogNormal`, `LogUniform`), `Levels` of a grid, or a column of a table (one number per sample).
+      All of one kind.
+    - `sampler`: "random", "latin-hypercube", "sobol", or "saltelli" (for Sobol' indices); grids and tables have none.
+    - `samples`: how many; a grid has as many as levels cross, a table as many as rows. `seed`: sample k follows from the seed and k alone (of a Latin
+      hypercube from their number as well).
+    - `correlation`: pair of names -> correlation coefficient, of normal distributions (of others, of the normal scores of their ranks).
+
+        design = jj.Design({"mass": jj.Normal(12.0, 0.3), "radius": jj.Uniform(0.3, 0.4)}, sampler="sobol", samples=1024, seed=7)
+        design.values(0, 8)["mass"]                               # of samples 0 to 7, in kg
+    """
+
+    variables: Mapping
+    sampler: str = "random"
+    samples: int | None = None
+    seed: int = 0
+    correlation: Mapping | None = None
+    _factor: np.ndarray | None = field(default=None, init=False)
+
+    def __post_init__(self):
+        kinds = {self._kind(name, what) for name, what in self.variables.items()}
+        if len(kinds) != 1:
+            found = "nothing varies" if not kinds else f"there are {' and '.join(sorted(kinds))} at once"
+            raise ValueError(f"{found}; give distributions, or `Levels` that are crossed, or the columns of one table")
+        kind = kinds.pop()
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int | np.integer) or not 0 <= self.seed < 2**63:
+            raise ValueError(f"`seed` is {self.seed!r}, expected a whole number from 0 to 2^63 - 1")
+        if kind == "distributions":
+            self._check_sampler()
+        else:
+            self._check_given(GRID if kind == "levels" else TABLE)
+        object.__setattr__(self, "_factor", self._cholesky())
+
+    @staticmethod
+    def _kind(name: str, what) -> str:
+        if isinstance(what, Distribution):
+            return "distributions"
+        if isinstance(what, Levels):
+            return "levels"
+        column = np.asarray(what)
+        if column.ndim != 1 or column.dtype.kind not in "fiu" or not column.size:
+            raise ValueError(f"`{name}` varies as {described(what)}, expected a distribution such as jj.Normal(0, 1), jj.Levels([...]) or a list of numbers")
+        if not np.all(np.isfinite(column)):
+            raise ValueError(f"the column `{name}` has {int(np.sum(~np.isfinite(column)))} entries that are not finite; leave these rows out")
+        return "columns"
+
+    def _check_sampler(self) -> None:
+        if self.sampler not in SAMPLERS:
+            raise ValueError(f"unknown sampler `{self.sampler}`; {nearest(str(self.sampler), SAMPLERS)} Grids take `jj.Levels`, tables columns.")
+        if isinstance(self.samples, bool) or not isinstance(self.samples, int | np.integer) or self.samples < 1:
+            raise ValueError(f"`samples` is {self.samples!r}, expected a whole number of at least 1")
+        if self.sampler in ("sobol", "saltelli") and self.samples > MOST_SOBOL:
+            raise ValueError(f"`samples` is {self.samples}, expected at most {MOST_SOBOL} for a Sobol sequence; take sampler='random'")
+        group = len(self.variables) + 2
+        if self.sampler == "saltelli" and (self.samples % group or self.correlation):
+            wrong = "variables are correlated, for which Sobol' indices are not defined" if self.correlation else f"`samples` is {self.samples}"
+            raise ValueError(f"{wrong}; sampler 'saltelli' takes independent variables and a multiple of {group} samples (variables + 2)")
+
+    def _check_given(self, kind: str) -> None:
+        if self.correlation:
+            raise ValueError(f"a {kind} has no `correlation`; give distributions")
+        if self.sampler not in ("random", kind):
+            raise ValueError(f"`sampler` is {self.sampler!r}, but the values form a {kind}, which draws nothing; leave it out")
+        if kind == GRID:
+            count = int(np.prod([len(levels.levels) for levels in self.variables.values()]))
+        else:
+            object.__setattr__(self, "variables", {name: np.asarray(column, float) for name, column in self.variables.items()})
+            lengths = {name: len(column) for name, column in self.variables.items()}
+            if len(set(lengths.values())) > 1:
+                raise ValueError("columns differ in length: " + ", ".join(f"`{name}` has {length}" for name, length in lengths.items()))
+            count = next(iter(lengths.values()))
+        if self.samples not in (None, count):
+            raise ValueError(f"`samples` is {self.samples}, but the {kind} has {count}; leave `samples` out")
+        object.__setattr__(self, "sampler", kind)
+        object.__setattr__(self, "samples", count)
+
+    def _cholesky(self) -> np.ndarray | None:
+        if not self.correlation:
+            return None
+        names = self.names
+        matrix = np.eye(len(names))
+        for pair, value in self.correlation.items():
+            for name in pair:
+                if name not in names:
+                    raise ValueError(f"`correlation` names `{name}`, which does not vary; {nearest(name, names)}")
+            if len(set(pair)) != 2 or not -1 < value < 1:
+                raise ValueError(f"the correlation of {pair} is {value}, expected two names and a number between -1 and 1")
+            i, j = map(names.index, pair)
+            matrix[i, j] = matrix[j, i] = value
+        try:
+            return np.linalg.cholesky(matrix)
+        except np.linalg.LinAlgError:
+            raise ValueError(f"no quantities have these correlations: the matrix\n{matrix}\nis not positive definite; make them smaller") from None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of what varies, in order."""
+        return tuple(self.variables)
+
+    def __len__(self) -> int:
+        return int(self.samples)  # type: ignore[arg-type]
+
+    def values(self, first: int = 0, last: int | None = None) -> dict[str, np.ndarray]:
+        """The values of samples `first` to `last` - 1 (default: all), by name, each of shape (last - first,)."""
+        last = len(self) if last is None else last
+        if not 0 <= first <= last <= len(self):
+            raise ValueError(f"samples {first} to {last} are not among 0 to {len(self)}")
+        if self.sampler == TABLE:
+            return {name: column[first:last] for name, column in self.variables.items()}
+        if self.sampler == GRID:
+            shape = [len(levels.levels) for levels in self.variables.values()]
+            places = np.unravel_index(np.arange(first, last), shape)
+            return {name: np.asarray(levels.levels)[place] for (name, levels), place in zip(self.variables.items(), places, strict=True)}
+        u = SAMPLERS[self.sampler](int(self.seed), first, last, len(self.variables), len(self))
+        if self._factor is not None:
+            special = special_functions()
+            # row by row: a product of matrices may round differently with the number of rows
+            u = special.ndtr(np.einsum("ij,kj->ki", self._factor, special.ndtri(u)))
+        return {name: distribution.values(u[:, i]) for i, (name, distribution) in enumerate(self.variables.items())}
+
+    def _text(self) -> str:
+        lines = [f"Design: {len(self)} samples, {self.sampler}" + ("" if self.sampler in (GRID, TABLE) else f", seed {self.seed}")]
+        for name, what in self.variables.items():
+            shown = f"{len(what)} values from {what.min():g} to {what.max():g}" if isinstance(what, np.ndarray) else repr(what)
+            lines.append(f"  {name}: {shown}")
+        lines += [f"  correlation of {' and '.join(pair)}: {value:g}" for pair, value in (self.correlation or {}).items()]
+        return "\n".join(lines)

@@ -1,0 +1,116 @@
+"""How a parameter or a start value varies over the lanes of a study: distributions, and levels of a grid.
+
+A distribution maps numbers u that are even on (0, 1) to values by its inverse distribution function, one number for one value, so that a sampler
+which spreads u well (Latin hypercube, Sobol) spreads the values well. Its numbers may be given as anything that is one number, and are floats from then on.
+"""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jourdain_jax.ensembles.optional import special_functions
+from jourdain_jax.scene.numbers import checked_known
+
+
+class Distribution:
+    """Base of the distributions: `values(u)` is the inverse distribution function."""
+
+    @abstractmethod
+    def values(self, u: np.ndarray) -> np.ndarray:
+        """The values at the probabilities `u`, which lie between 0 and 1."""
+
+
+def _check(owner, **numbers: Any) -> None:
+    for name, value in numbers.items():
+        object.__setattr__(owner, name, float(checked_known(value, f"`{name}` of {type(owner).__name__}", (), advice="give one number")))
+        if not np.isfinite(getattr(owner, name)):
+            raise ValueError(f"`{name}` of {type(owner).__name__} is {value}, expected a finite number")
+
+
+def _check_order(owner, low: float, high: float) -> None:
+    if not low < high:
+        raise ValueError(f"{type(owner).__name__} has low = {low:g} and high = {high:g}, expected low < high")
+
+
+@dataclass(frozen=True)
+class Normal(Distribution):
+    """A normal distribution with the given `mean` and standard deviation `sigma`, in the unit of what varies; sigma = 0: always the mean."""
+
+    mean: Any
+    sigma: Any
+
+    def __post_init__(self):
+        _check(self, mean=self.mean, sigma=self.sigma)
+        if self.sigma < 0:
+            raise ValueError(f"`sigma` of Normal is {self.sigma:g}, expected a standard deviation of at least 0")
+
+    def values(self, u: np.ndarray) -> np.ndarray:
+        """The values at the probabilities `u`: mean + sigma Phi^-1(u)."""
+        return self.mean + self.sigma * special_functions().ndtri(u)
+
+
+@dataclass(frozen=True)
+class Uniform(Distribution):
+    """Evenly between `low` and `high`, in the unit of what varies."""
+
+    low: Any
+    high: Any
+
+    def __post_init__(self):
+        _check(self, low=self.low, high=self.high)
+        _check_order(self, self.low, self.high)
+
+    def values(self, u: np.ndarray) -> np.ndarray:
+        """The values at the probabilities `u`: low + (high - low) u."""
+        return self.low + (self.high - self.low) * u
+
+
+@dataclass(frozen=True)
+class LogNormal(Distribution):
+    """A positive quantity whose logarithm is normal: `median` in the unit of what varies, `sigma` the standard deviation of its natural logarithm."""
+
+    median: Any
+    sigma: Any
+
+    def __post_init__(self):
+        _check(self, median=self.median, sigma=self.sigma)
+        if self.median <= 0 or self.sigma < 0:
+            raise ValueError(f"LogNormal has median {self.median:g} and sigma {self.sigma:g}, expected a positive median and sigma >= 0")
+
+    def values(self, u: np.ndarray) -> np.ndarray:
+        """The values at the probabilities `u`: median exp(sigma Phi^-1(u))."""
+        return self.median * np.exp(self.sigma * special_functions().ndtri(u))
+
+
+@dataclass(frozen=True)
+class LogUniform(Distribution):
+    """A positive quantity whose logarithm is even between those of `low` and `high`, in the unit of what varies."""
+
+    low: Any
+    high: Any
+
+    def __post_init__(self):
+        _check(self, low=self.low, high=self.high)
+        _check_order(self, self.low, self.high)
+        if self.low <= 0:
+            raise ValueError(f"`low` of LogUniform is {self.low:g}, expected a positive number")
+
+    def values(self, u: np.ndarray) -> np.ndarray:
+        """The values at the probabilities `u`: low (high / low)^u."""
+        return self.low * (self.high / self.low) ** u
+
+
+@dataclass(frozen=True)
+class Levels:
+    """The `levels` that a quantity takes in a grid (in its unit): every one is crossed with every one of the other quantities; the last named changes first."""
+
+    levels: tuple[float, ...]
+
+    def __init__(self, levels: Sequence[float]):
+        found = np.asarray(checked_known(levels, "`levels`", advice="give a list of numbers"), float)
+        if found.ndim != 1 or not found.size or not np.all(np.isfinite(found)):
+            raise ValueError(f"`levels` has the shape {found.shape}, expected a list of finite numbers, at least one")
+        object.__setattr__(self, "levels", tuple(found.tolist()))

@@ -1,0 +1,65 @@
+"""Files that are whole or absent: written beside their place and moved there in one step, with checksums; and the lock of a folder.
+
+A process that is killed leaves files whole. A machine that loses power may leave torn ones, which their checksums show. Small files that are written once
+are waited for until they are on the disk.
+"""
+
+import contextlib
+import json
+import os
+import secrets
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+try:
+    import fcntl
+except ImportError:  # not on this system: no lock is held there
+    fcntl = None  # type: ignore[assignment]
+
+
+def write_whole(path: Path, content: bytes, *, wait: bool = False) -> None:
+    """Put a file in its place; `wait`: until it is on the disk."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(3)}")
+    try:
+        with open(beside, "wb") as file:
+            file.write(content)
+            if wait:
+                file.flush()
+                os.fsync(file.fileno())
+        os.replace(beside, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            beside.unlink()
+        raise
+
+
+class InUseError(RuntimeError):
+    """Another process runs a study in this folder."""
+
+
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold the lock file `path`; an `InUseError` that says who holds it otherwise. The system lets go of it when its owner dies, in whatever way."""
+    with open(path, "a+b") as file:
+        if fcntl is not None:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InUseError(f"`{path.parent.parent}` is in use{_owner(file)}; wait for that run, or end it, or give another folder") from None
+        file.truncate(0)
+        file.write(json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
+        file.flush()
+        try:
+            yield
+        finally:
+            file.truncate(0)
+
+
+def _owner(file) -> str:
+    file.seek(0)
+    try:
+        found = json.loads(file.read())
+        return f" by process {found['pid']} on {found['host']}"
+    except (ValueError, KeyError, TypeError):
+        return ""

@@ -1,0 +1,169 @@
+"""What is kept of each motion of a study: one number per output, with its unit.
+
+Outputs are functions of a `Trajectory`, run on all lanes of a block as one compiled program. Of a motion that failed they are NaN.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jourdain_jax.build.event_names import names_of_events
+from jourdain_jax.motion.trajectories.results import EVENT
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import described
+from jourdain_jax.scene.scene import Scene
+
+
+class Output:
+    """Base of the outputs: `of(motion)` is the number, `unit` its unit; `over_times` says whether it looks at saved times, or only at the end."""
+
+    unit: str = ""
+    over_times: bool = True
+
+    @abstractmethod
+    def of(self, motion: Trajectory) -> Float[Array, ""]:
+        """The number, of one `motion`; by operations of JAX."""
+
+    def check(self, scene: Scene) -> None:
+        """ValueError where the scene has not what the output names."""
+
+
+@dataclass(frozen=True)
+class _OfQuantity(Output):
+    """Of a coordinate or speed, by `name`; its `unit` is written beside the numbers."""
+
+    name: str
+    unit: str = ""
+
+    def check(self, scene: Scene) -> None:
+        valid = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+        if self.name not in valid:
+            raise ValueError(f"{type(self).__name__}({self.name!r}): `{type(scene).__name__}` has no such coordinate or speed; {nearest(self.name, valid)}")
+
+    def _at_end(self, motion: Trajectory) -> Float[Array, ""]:
+        names = motion.scene.coordinate_names
+        if self.name in names.entries:
+            return motion.q_end[names.entries.index(self.name)]
+        return motion.u_end[motion.scene.speed_names.entries.index(self.name)]
+
+    def _along(self, motion: Trajectory) -> Float[Array, "times"]:
+        """The values at the saved times that were reached, and at the end; the value at the end in place of others."""
+        values, end = motion[self.name], self._at_end(motion)
+        return jnp.append(jnp.where(jnp.isfinite(values), values, end), end)
+
+
+@dataclass(frozen=True)
+class End(_OfQuantity):
+    """The value of the coordinate or speed `name` where the motion ended: at its last time, or at an event. `unit`: text that is kept with it."""
+
+    over_times = False
+
+    def of(self, motion: Trajectory) -> Float[Array, ""]:
+        """The last value of the `motion`."""
+        return self._at_end(motion)
+
+
+@dataclass(frozen=True)
+class Largest(_OfQuantity):
+    """The largest value of the coordinate or speed `name` at the saved times and the end. `unit`: text that is kept with it."""
+
+    def of(self, motion: Trajectory) -> Float[Array, ""]:
+        """The largest value along the `motion`."""
+        return jnp.max(self._along(motion))
+
+
+@dataclass(frozen=True)
+class Smallest(_OfQuantity):
+    """The smallest value of the coordinate or speed `name` at the saved times and the end. `unit`: text that is kept with it."""
+
+    def of(self, motion: Trajectory) -> Float[Array, ""]:
+        """The smallest value along the `motion`."""
+        return jnp.min(self._along(motion))
+
+
+@dataclass(frozen=True)
+class LargestMagnitude(_OfQuantity):
+    """The largest magnitude of the coordinate or speed `name` at the saved times and the end. `unit`: text that is kept with it."""
+
+    def of(self, motion: Trajectory) -> Float[Array, ""]:
+        """The largest magnitude along the `motion`."""
+        return jnp.max(jnp.abs(self._along(motion)))
+
+
+@dataclass(frozen=True)
+class _OfEvent(Output):
+    """Of a stop event, by `event`, its name; of any where that is None."""
+
+    event: str | None = None
+    over_times = False
+
+    def check(self, scene: Scene) -> None:
+        valid = names_of_events(scene)
+        if not valid:
+            raise ValueError(f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` states no stop events; give it a method `events`")
+        if self.event is not None and self.event not in valid:
+            raise ValueError(f"{type(self).__name__}({self.event!r}): `{type(scene).__name__}` has no such stop event; {nearest(self.event, valid)}")
+
+    def _happened(self, motion: Trajectory):
+        stopped = motion.result == EVENT
+        return stopped if self.event is None else stopped & (motion.event == motion.event_names.index(self.event))
+
+
+@dataclass(frozen=True)
+class EventTime(_OfEvent):
+    """The time (s) at which the stop event `event` ended the motion (default: any event); NaN where it did not."""
+
+    unit = "s"
+
+    def of(self, motion: Trajectory) -> Float[Array, ""]:
+        """When the event ended the `motion`."""
+        return jnp.where(self._happened(motion), motion.t_end, jnp.nan)
+
+
+@dataclass(frozen=True)
+class Happened(_OfEvent):
+    """1 where the stop event `event` ended the motion (default: any event), otherwise 0: its mean is the fraction of lanes."""
+
+    def of(self, motion: Trajectory) -> Float[Array, ""]:
+        """Whether the event ended the `motion`."""
+        return jnp.where(self._happened(motion), 1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Quantity(Output):
+    """A number that `function` makes of a `Trajectory` by operations of JAX, with its `unit` as a text.
+
+        jj.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m")
+    """
+
+    function: Callable
+    unit: str = ""
+
+    def of(self, motion: Trajectory) -> Float[Array, ""]:
+        """The number of one `motion`."""
+        found = self.function(motion)
+        shape = getattr(found, "shape", None if not isinstance(found, int | float) else ())
+        if shape != ():
+            raise ValueError(f"an output is {described(found)}, expected one number for one motion; take an entry or reduce it, or give one output for each")
+        return jnp.asarray(found, motion.q_end.dtype)
+
+
+def as_outputs(scene: Scene, outputs: Mapping | None) -> dict[str, Output]:
+    """Outputs by name, checked; functions become a `Quantity`; None: the end values of all coordinates and speeds."""
+    if outputs is None:
+        outputs = {f"{name} at the end": End(name) for name in (*scene.coordinate_names.entries, *scene.speed_names.entries)}
+    if not isinstance(outputs, Mapping) or not outputs:
+        raise ValueError(f'`outputs` is {described(outputs)}, expected a dictionary by name, such as {{"final lean": jj.End("lean", "rad")}}')
+    found = {}
+    for name, output in outputs.items():
+        if not isinstance(name, str) or not name or "/" in name or name.startswith(("_", ".")):
+            raise ValueError(f"an output is called {name!r}, expected a text without `/` that begins with neither `_` nor `.`")
+        if isinstance(output, type) or not (isinstance(output, Output) or callable(output)):
+            raise ValueError(f"output `{name}` is {described(output)}, expected an output such as jj.End('lean'), or a function of a trajectory")
+        found[name] = output if isinstance(output, Output) else Quantity(output)
+        found[name].check(scene)
+    return found

@@ -1,0 +1,256 @@
+"""What came out of a study: statistics, failures, single lanes, labelled arrays."""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from jourdain_jax.ensembles.optional import draws_with, labelled_by
+from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
+from jourdain_jax.ensembles.statistics import CELLS, Grid, Statistics, combined
+from jourdain_jax.ensembles.store import Store
+from jourdain_jax.ensembles.task import CODES, Task
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.printing import Printed
+
+LEVELS = (0.025, 0.5, 0.975)
+
+
+@dataclass(frozen=True, repr=False)
+class Lane(Printed):
+    """One lane of a study: what it takes to repeat it alone, and what is kept of it."""
+
+    task: Task
+    number: int
+    starts: dict[str, object]  # as `jj.start` takes them
+    parameters: dict[str, float]
+    kept: dict[str, float]  # result code, steps, outputs; empty where nothing is kept of single lanes
+
+    def simulate(self, **options) -> Trajectory:
+        """The motion of this lane, with the options of the study; `options` replace some, such as `ts=` or `rtol=`."""
+        return self.task.simulated(self.number, **options)
+
+    def _text(self) -> str:
+        given = {name: f"{np.asarray(value).tolist()}" for name, value in (self.parameters | self.starts).items()}
+        lines = [f"Lane {self.number}: " + ", ".join(f"{name} = {value}" for name, value in given.items())]
+        if self.kept:
+            lines.append(f"  {results.MESSAGES.get(int(self.kept['result']), 'not computed yet')}")
+            lines += [f"  {name} = {value:.6g}" for name, value in self.kept.items() if name not in ("result", *given)]
+        return "\n".join(lines)
+
+
+class StudyResult(Printed):
+    """What came out of a study, read from its folder.
+
+    `store.path` is the folder; it opens with `xarray.open_zarr` too. Numbers cover the chunks that are done: `complete` says whether all are.
+    """
+
+    def __init__(self, store: Store, task: Task | None = None):
+        self.store, self.task = store, task
+
+    def __len__(self) -> int:
+        return self.store.lanes
+
+    @cached_property
+    def _gathered(self) -> dict:
+        """What the receipts hold, together."""
+        receipts = [receipt for receipt in map(self.store.receipt, self.store.receipts()) if receipt is not None]
+        count = len(self.outputs)
+        cells = np.zeros(count * (CELLS + 2), np.int64)
+        for receipt in receipts:
+            place, more = receipt.arrays["cells"]
+            cells[place] += more
+        extremes = np.stack([[np.full(count, np.inf), np.full(count, -np.inf)], *(r.arrays["extremes"] for r in receipts)])
+        none = np.zeros(0, np.int64)
+        return {
+            "chunks": len(receipts),
+            "codes": sum((r.arrays["codes"] for r in receipts), np.zeros(len(CODES), np.int64)),
+            "again": sum(int(r.arrays["again"][0]) for r in receipts),
+            "steps": sum((r.arrays["steps"] for r in receipts), np.zeros(2, np.int64)),
+            "failed": np.concatenate([none, *(r.arrays["failed"] for r in receipts)]),
+            "failed_codes": np.concatenate([none, *(r.arrays["failed_codes"] for r in receipts)]),
+            "sums": [r.arrays["sums"] for r in receipts],
+            "cells": cells.reshape(count, CELLS + 2),
+            "extremes": np.stack([extremes[:, 0].min(axis=0), extremes[:, 1].max(axis=0)]),
+        }
+
+    # How far, and what became of the lanes. ------------------------------------------------------------------------
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return tuple(self.store.study["outputs"])
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """Names of what varies: parameters, and start values with `_at_start`."""
+        return tuple(self.store.study["varied"])
+
+    @property
+    def complete(self) -> bool:
+        """Whether all chunks are done."""
+        return self._gathered["chunks"] == self.store.chunks
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Lanes per result code, by its name; those that no lane has are left out."""
+        return {name: int(count) for name, count in zip(CODES, self._gathered["codes"], strict=True) if count}
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Numbers of the lanes that reached neither their end nor an event."""
+        return self._gathered["failed"]
+
+    def lane(self, number: int) -> Lane:
+        """The lane `number`: its parameters and start, what is kept of it, and `.simulate()`; IndexError where there is none."""
+        if not 0 <= number < len(self):
+            raise IndexError(f"lane {number} does not exist; this study has {len(self)} lanes, 0 to {len(self) - 1}")
+        if self.task is None:
+            raise ValueError("which scene this was is not known here; call `study.run` with the same arguments, which computes nothing twice")
+        starts, parameters = self.task.arguments(number, number + 1)
+        first = {name: value if name in self.task.constants else float(value[0]) for name, value in starts.items()}
+        kept = {}
+        if self.store.columns:
+            kept = {name: float(array[number]) for name, array in self.to_xarray().items() if array.dims == ("lane",)}
+        return Lane(self.task, number, first, {name: float(value[0]) for name, value in parameters.items()}, kept)
+
+    # Statistics. ---------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def statistics(self) -> Statistics:
+        """Means, covariances, histograms and extremes of the outputs over the lanes that have them."""
+        grid = self.store.read_grid()
+        if grid is None:
+            raise ValueError(f"no chunk of `{self.store.path}` is done yet; run the study first")
+        found = self._gathered
+        sums = [block for chunk in found["sums"] for block in chunk]
+        return combined(self.outputs, Grid.from_dict(grid), sums, found["cells"], found["extremes"])
+
+    def mean(self, output: str) -> float:
+        """Mean of an `output` over the lanes that have it."""
+        return float(self.statistics.mean[self._place(output)])
+
+    def deviation(self, output: str) -> float:
+        """Standard deviation of an `output` over the lanes that have it."""
+        return float(self.statistics.deviation[self._place(output)])
+
+    def covariance(self, first: str, second: str) -> float:
+        """Covariance of the outputs `first` and `second` over the lanes that have both."""
+        return float(self.statistics.covariance[self._place(first), self._place(second)])
+
+    def quantile(self, output: str, level: float) -> tuple[float, float]:
+        """Two numbers between which the quantile `level` (0 to 1) of an `output` lies: the cell of the histogram that holds it."""
+        if not 0 <= level <= 1:
+            raise ValueError(f"`level` is {level}, expected a number from 0 to 1")
+        self._place(output)
+        return self.statistics.quantile(output, level)
+
+    def histogram(self, output: str, cells: int = 64) -> tuple[np.ndarray, np.ndarray]:
+        """Lanes per cell of an `output` and the edges of the cells, some `cells` in number, each of several of the cells in which lanes are counted."""
+        self._place(output)
+        counts, edges = self.statistics.histogram(output)
+        inside = np.flatnonzero(counts)
+        first, last = (inside[0], inside[-1] + 1) if inside.size else (0, len(counts))
+        starts = np.arange(first, last, max(1, math.ceil((last - first) / cells)))
+        return np.add.reduceat(counts[:last], starts), np.append(edges[starts], edges[last])
+
+    def sensitivity(self, output: str, confidence: float = 0.95) -> SobolIndices:
+        """First-order and total Sobol' indices of an `output`, with intervals that hold each with the given `confidence`; needs sampler="saltelli"."""
+        self._place(output)
+        if self.store.study["sampler"] != "saltelli":
+            raise ValueError(f"Sobol' indices need sampler='saltelli'; this study has '{self.store.study['sampler']}'")
+        if not self.store.columns or not self.complete:
+            raise ValueError("Sobol' indices need all lanes of a study with save='outputs'" + ("" if self.complete else "; run it to its end"))
+        return sobol_indices(self.to_xarray()[output].values, self.varied, confidence=confidence)
+
+    def _place(self, output: str) -> int:
+        if output not in self.outputs:
+            raise ValueError(f"the study has no output `{output}`; {nearest(output, self.outputs)}")
+        return self.outputs.index(output)
+
+    # Arrays, files, pictures. --------------------------------------------------------------------------------------
+
+    def to_xarray(self):
+        """All arrays as an `xarray.Dataset` with names and units, read where they are used; lanes that are not done are NaN, their result is -1."""
+        return labelled_by().open_zarr(self.store.path, chunks=None, consolidated=True)
+
+    def to_netcdf(self, path: str | os.PathLike) -> None:
+        """Write all arrays to the NetCDF file `path`, by whichever engine of xarray is installed."""
+        found = self.to_xarray().load()
+        found.attrs = {name: value if isinstance(value, int | float | str) else repr(value) for name, value in found.attrs.items()}
+        found.attrs.pop("coordinates", None)
+        for array in found.variables.values():
+            array.attrs = {name: np.array(value, array.dtype) if name.startswith("flag_") and isinstance(value, list) else
+                           " ".join(value) if isinstance(value, list) else value for name, value in array.attrs.items()}  # fmt: skip
+            array.encoding = {}
+        found.to_netcdf(path)
+
+    def plot(self, *outputs: str, path: str | os.PathLike | None = None):
+        """Histograms of `outputs` (default: all) in one figure, which is returned, and written to `path` where that is given. Needs matplotlib."""
+        plt = draws_with()
+        names = outputs or self.outputs
+        figure, axes = plt.subplots(1, len(names), figsize=(3.6 * len(names), 3.0), squeeze=False, layout="constrained")
+        for axis, name in zip(axes[0], names, strict=True):
+            counts, edges = self.histogram(name)
+            axis.stairs(counts, edges, fill=True, color="#1f5fa8", alpha=0.8)
+            axis.axvline(self.mean(name), color="#b3470f", lw=1.2)
+            unit = self.store.columns[name].attributes.get("units", "") if name in self.store.columns else ""
+            axis.set_xlabel(f"{name} ({unit})" if unit else name)
+            axis.spines[["top", "right"]].set_visible(False)
+        axes[0, 0].set_ylabel("lanes")
+        if path is not None:
+            figure.savefig(path, dpi=150)
+        return figure
+
+    def _text(self) -> str:
+        found = self._gathered
+        done = int(found["codes"].sum())
+        lines = [f"Study in {self.store.path}: {done} of {len(self)} lanes" + ("" if self.complete else "; run it again to go on")]
+        lines += [f"  {count} {results.MESSAGES[CODES.index(name)].split(';')[0]}" for name, count in self.counts.items()]
+        if self.failed.size:
+            lines.append("  failed: lanes " + ", ".join(map(str, self.failed[:10])) + (" ..." if self.failed.size > 10 else ""))
+        if found["again"]:
+            lines.append(f"  {found['again']} were run again in another way")
+        if done:
+            lines.append(f"  {found['steps'][0] / done:.1f} steps accepted and {found['steps'][1] / done:.1f} rejected a lane")
+            width = max(map(len, self.outputs))
+            lines.append(f"  {'':<{width}} {'lanes':>9} {'mean':>12} {'deviation':>12} {'2.5 %':>12} {'median':>12} {'97.5 %':>12}")
+            for i, name in enumerate(self.outputs):
+                middle = (f"{sum(self.quantile(name, level)) / 2:12.5g}" for level in LEVELS)
+                numbers = f"{self.statistics.lanes[i, i]:>9} {self.statistics.mean[i]:12.5g} {self.statistics.deviation[i]:12.5g} {' '.join(middle)}"
+                lines.append(f"  {name:<{width}} {numbers}")
+        return "\n".join(lines)
+
+
+def load_study(path: str | os.PathLike) -> StudyResult:
+    """What is in the folder `path` of a study, finished or not, without its scene: `study.run` with the same arguments gives `.lane(k).simulate()` too.
+
+    Raises ValueError where the folder holds no study, or one of a format that this version does not know.
+    """
+    return StudyResult(Store(path))
+
+
+def merge_studies(path: str | os.PathLike, shares: Sequence[str | os.PathLike]) -> StudyResult:
+    """Bring chunks from the folders `shares`, which hold shares of one study (`study.run(..., shard=(k, n))`), into the folder `path`, itself one of them.
+
+    Chunks that are damaged are left out; what is missing afterwards is computed by `study.run` as always. Raises ValueError where a folder holds another study.
+    """
+    target = Store(path)
+    with target.lock():
+        held = set(target.done()[0])
+        for share in shares:
+            other = Store(share)
+            different = [name for name in ("identity", "chunk", "block", "samples") if other.study[name] != target.study[name]]
+            if different or other.read_grid() not in (None, target.read_grid()):
+                raise ValueError(f"`{share}` holds no share of the study in `{path}`: {' and '.join(different) or 'the grid of statistics'} differ")
+            for number in other.receipts():
+                if number not in held and other.is_whole(number):
+                    target.take_chunk(other, number)
+                    held.add(number)
+    return StudyResult(target)
+

@@ -1,0 +1,209 @@
+"""Running a study: the chunks that are missing, one after another, each kept before the next begins; a bar; what an interruption does.
+
+The first Ctrl-C lets the chunk under way end; a second one ends at once. Both leave a folder from which the same call goes on.
+"""
+
+import functools
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from platform import python_version
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from jourdain_jax.ensembles.statistics import Grid
+from jourdain_jax.ensembles.store import Store
+from jourdain_jax.ensembles.task import Lanes, Task, receipt_of
+from jourdain_jax.motion.trajectories.versions import version_of
+from jourdain_jax.scene.parameters import parameters_of
+
+MOST_CHUNKS = 1000
+PACKAGES = ("jourdain-jax", "jax", "jaxlib", "diffrax", "numpy", "scipy", "zarr", "llvmlite")
+
+
+class Runner:
+    """Computes and keeps chunks of one task in this process.
+
+    The first block is computed first in every process: it gives the grid of the statistics, and what was compiled for it serves all others.
+    """
+
+    def __init__(self, task: Task, store: Store):
+        self.task, self.store = task, store
+        self._first = task.run_block(0)
+        found, kept = Grid.of(self._first.outputs).as_dict(), store.read_grid()
+        if kept is None:
+            store.write_grid(kept := found)
+        elif kept != found:
+            warnings.warn(
+                f"the first {task.block} lanes of `{store.path}` come out with other bits here than where the study was begun (another machine, or other "
+                "versions); results are right, but not bit-equal to those of one machine",
+                stacklevel=2,
+            )
+        self.grid = Grid.from_dict(kept)
+
+    def run(self, number: int) -> tuple[int, int]:
+        """Compute and keep a chunk; how many lanes it has, and how many of them failed."""
+        first, last = self.store.span(number)
+        blocks: dict[int, Lanes] = {}
+        for block in range(first // self.task.block, -(-last // self.task.block)):
+            blocks[block] = self._first if block == 0 else self.task.run_block(block)
+        values = {name: np.concatenate([lanes.columns[name] for lanes in blocks.values()]) for name in self.store.columns}
+        receipt = receipt_of(self.task, self.grid, blocks)
+        self.store.write(number, values, receipt)
+        return last - first, receipt["failed"].size
+
+
+def opened(task: Task, path, chunk: int | None, command: str) -> Store:
+    """The folder of the task: a new one, or the one that holds it already; ValueError where it holds another study."""
+    _check_names(task)
+    if not Store.is_taken(path):
+        store = Store.make(path, _study(task, chunk, command), task.columns(), _constants(task), attributes(task))
+    else:
+        store = Store(path)
+    _check_same(store, task, chunk)
+    return store
+
+
+def _check_names(task: Task) -> None:
+    names = task.column_names()
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"`{twice[0]}` would name two arrays of the study; arrays are {', '.join(map(repr, names))}: call the output otherwise")
+
+
+def _constants(task: Task) -> dict[str, tuple]:
+    if task.save != "trajectories":
+        return {}
+    found = {"time": ("time", np.asarray(task.ts, float), {"units": "s"})}
+    if task.every > 1:
+        found["saved_lane"] = ("saved_lane", np.arange(0, len(task.design), task.every, dtype=np.int32), {"long_name": "lane whose trajectory is kept"})
+    return found
+
+
+def _chunk(task: Task, chunk: int | None) -> int:
+    """Lanes of a chunk: whole blocks, whole strides of saved lanes; by default about a thousandth of all."""
+    unit = np.lcm(task.block, task.every)
+    if chunk is None:
+        return int(unit * max(1, len(task.design) // (MOST_CHUNKS * unit)))
+    if isinstance(chunk, bool) or not isinstance(chunk, int | np.integer) or chunk < 1 or chunk % unit:
+        raise ValueError(f"`chunk` is {chunk!r}, expected a multiple of {unit} lanes, such as {4 * unit}: so many are computed together in this study")
+    return int(chunk)
+
+
+@functools.cache
+def versions() -> dict[str, str]:
+    """Versions of what computes."""
+    return {"python": python_version()} | {name: version_of(name) for name in PACKAGES}
+
+
+def _study(task: Task, chunk: int | None, command: str) -> dict:
+    about = {"samples": len(task.design), "block": task.block, "chunk": _chunk(task, chunk), "save": task.save, "outputs": list(task.outputs)}
+    return about | {"varied": list(task.design.names), "sampler": task.design.sampler, "identity": task.identity(), "versions": versions(), "command": command}
+
+
+def attributes(task: Task) -> dict:
+    """What the store says of itself."""
+    parameters = {name: {"value": np.asarray(value).tolist(), "unit": about["unit"]} for name, value, about in parameters_of(task.scene)}
+    return {
+        "title": f"study of {type(task.scene).__name__}",
+        "scene": f"{type(task.scene).__module__}.{type(task.scene).__qualname__}",
+        "parameters": parameters,
+        "start": {name: np.asarray(value).tolist() for name, value in task.constants.items()},
+        "design": str(task.design),
+        "sampler": task.design.sampler,
+        "seed": int(task.design.seed),
+        "samples": len(task.design),
+        "options": {name: np.asarray(x).tolist() if isinstance(x, int | float | np.ndarray | jax.Array) else repr(x) for name, x in task.options.items()},
+        "precision": str(jnp.result_type(float)),
+        "versions": versions(),
+        "command": " ".join(sys.argv),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "coordinates": " ".join(task.design.names) if task.save != "statistics" else "",
+    }
+
+
+def _check_same(store: Store, task: Task, chunk: int | None) -> None:
+    held, own = store.study["identity"], task.identity()
+    other = [name for name in own if held.get(name) != own[name]]
+    if other:
+        raise ValueError(f"`{store.path}` holds another study: its {' and '.join(other)} differ from this one's; give a new name, or ask for the same")
+    if chunk is not None and chunk != store.chunk:
+        raise ValueError(f"`{store.path}` was begun with chunks of {store.chunk} lanes, and `chunk` is {chunk}; leave `chunk` out")
+    changed = [f"{name} {held} (now {versions()[name]})" for name, held in store.study["versions"].items() if versions().get(name) != held]
+    if changed:
+        warnings.warn(f"`{store.path}` was begun with other versions: {', '.join(changed)}; what is computed now may differ in its last digits", stacklevel=3)
+
+
+@contextmanager
+def _interruptions() -> Iterator[Callable[[], bool]]:
+    """A function that says whether Ctrl-C was pressed. Pressed twice, it interrupts as always."""
+    pressed = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield pressed.is_set
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def press(number, frame):
+        if pressed.is_set():
+            raise KeyboardInterrupt
+        pressed.set()
+
+    signal.signal(signal.SIGINT, press)
+    try:
+        yield pressed.is_set
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int, int], command: str, workers: Callable) -> Store:
+    """Compute what is missing of a task in the folder `path`.
+
+    `shard`: (k, n), the chunks whose number is k - 1 modulo n; `workers`: (task, store, numbers, interrupted) -> numbers of lanes and of failed lanes, chunk
+    by chunk.
+    """
+    store = opened(task, path, chunk, command)
+    with store.lock():
+        done, torn = store.done()
+        if torn:
+            warnings.warn(f"{len(torn)} chunks of `{path}` are damaged and are computed again: {_listed(torn)}", stacklevel=3)
+        whole = set(done)
+        missing = [number for number in range(shard[0] - 1, store.chunks, shard[1]) if number not in whole]
+        known = _lanes(store, done)
+        bar = tqdm(total=known + _lanes(store, missing), initial=known, unit="lane", unit_scale=True, disable=not progress, smoothing=0.1)
+        failed, finished, began = 0, 0, time.monotonic()
+        with bar, _interruptions() as interrupted:
+            for lanes, wrong in workers(task, store, missing, interrupted):
+                failed, finished = failed + wrong, finished + 1
+                bar.update(lanes)
+                bar.set_postfix_str(f"{100 * failed / max(1, bar.n - known):.2g} % failed", refresh=False)
+            stopped = interrupted() and finished < len(missing)
+        if stopped:
+            kept = f"{len(done) + finished} of {store.chunks} chunks are kept in `{path}`"
+            raise KeyboardInterrupt(f"interrupted after {time.monotonic() - began:.0f} s: {kept}; the same call goes on from there")
+    return store
+
+
+def in_this_process(task: Task, store: Store, numbers, interrupted) -> Iterator[tuple[int, int]]:
+    """One chunk after another."""
+    runner = None
+    for number in numbers:
+        if interrupted():
+            return
+        runner = runner or Runner(task, store)
+        yield runner.run(number)
+
+
+def _lanes(store: Store, numbers) -> int:
+    return sum(last - first for first, last in map(store.span, numbers))
+
+
+def _listed(numbers: Mapping | list[int]) -> str:
+    return ", ".join(map(str, list(numbers)[:10])) + (" ..." if len(numbers) > 10 else "")

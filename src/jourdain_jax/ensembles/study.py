@@ -1,0 +1,168 @@
+"""A study: what varies over many motions of one scene, and how they are run."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from jourdain_jax.ensembles.design import Design
+from jourdain_jax.ensembles.distributions import Distribution, Levels
+from jourdain_jax.ensembles.outputs import as_outputs
+from jourdain_jax.ensembles.result import StudyResult
+from jourdain_jax.ensembles.run import in_this_process, run
+from jourdain_jax.ensembles.task import AT_START, SAVES, Task
+from jourdain_jax.ensembles.workers import in_processes
+from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
+from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import described
+from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.scene import Scene
+
+TIMES = 201  # saved, where outputs look along the motion
+
+
+@dataclass(frozen=True, repr=False)
+class Study(Printed):
+    """Many motions of one scene, whose parameters or start values vary.
+
+    - `scene`; `vary`: parameter -> how it varies; `start`: coordinate or speed -> how it varies, or one number for all lanes (the rest is solved for, as by
+      `jj.start`; default: the scene's example). How: a distribution (`jj.Normal`, `jj.Uniform`, `jj.LogNormal`, `jj.LogUniform`), `jj.Levels` of a grid, or
+      a list with one number per lane; all of one kind.
+    - `sampler`, `samples`, `seed`, `correlation`: as in `jj.Design`. Lane k follows from the seed and k alone.
+
+        disc = jj.models.TiltingDisc()
+        study = jj.Study(disc, vary={"radius": jj.Normal(0.5, 0.01)}, start={"lean": jj.Uniform(-0.6, 0.6), "spin_rate": -3.0}, sampler="sobol", samples=1024)
+        result = study.run("discs.zarr", t1=2.0, outputs={"lean": jj.End("lean", "rad"), "fallen": jj.Happened("fallen")})
+        print(result)
+
+    Raises ValueError for unknown names and for what cannot vary. Needs the extra `ensembles`.
+    """
+
+    scene: Scene
+    vary: Any = None  # a dictionary by name, as is `start`
+    start: Any = None
+    sampler: str = "random"
+    samples: int | None = None
+    seed: int = 0
+    correlation: Mapping | None = None
+
+    def __post_init__(self):
+        object.__setattr__(self, "scene", as_scene(self.scene))
+        _ = self.design  # says what is wrong
+
+    @cached_property
+    def _named(self) -> tuple[dict, dict]:
+        """What varies, by the names of its columns, and the start values that do not."""
+        for what, given in (("vary", self.vary), ("start", self.start)):
+            if given is not None and not isinstance(given, Mapping):
+                raise ValueError(f'`{what}` is {described(given)}, expected a dictionary by name, such as {{"mass": jj.Normal(12.0, 0.3)}}')
+        known = {name: np.ndim(value) for name, value, _ in parameters_of(self.scene)}
+        varying = {}
+        for name, how in (self.vary or {}).items():
+            if name not in known:
+                raise ValueError(f"scene `{type(self.scene).__name__}` has no parameter `{name}`; {nearest(name, known)}")
+            if known[name]:
+                raise ValueError(f"parameter `{name}` is an array; what varies must be one number: vary a parameter from which the scene makes that array")
+            if np.ndim(how) == 0 and not isinstance(how, Distribution | Levels):
+                raise ValueError(f"parameter `{name}` is to vary as {described(how)}; set one value on the scene itself, or give a distribution")
+            varying[name] = how
+        q, u = self.scene.coordinate_names, self.scene.speed_names
+        groups = {group for names in (q, u) for group, _, _ in names.groups}
+        constants = {}
+        for name, how in (self.scene.example if self.start is None else self.start).items():
+            if name not in q and name not in u:
+                raise ValueError(f"`{type(self.scene).__name__}` has no coordinate or speed `{name}` to start with; {nearest(name, (*q, *u, *groups))}")
+            if not isinstance(how, Distribution | Levels) and (np.ndim(how) == 0 or name in groups):
+                constants[name] = how
+            elif name in groups:
+                raise ValueError(f"start `{name}` is a vector; what varies must be one number: vary its entries")
+            else:
+                varying[name + AT_START] = how
+        return varying, constants
+
+    @cached_property
+    def design(self) -> Design:
+        """The samples: parameters by name, start values by name with `_at_start`."""
+        varying, _ = self._named
+        pairs = {tuple(map(self._column, pair)): value for pair, value in (self.correlation or {}).items()}
+        return Design(varying, self.sampler, self.samples, self.seed, pairs or None)
+
+    def _column(self, name: str) -> str:
+        return name if name in (self.vary or {}) else name + AT_START if name in (self.start or {}) else name
+
+    def task(self, *, t1=None, ts=None, t0=None, outputs: Mapping | None = None, save: str = "outputs", every: int = 1, **options) -> Task:
+        """All that decides the numbers of a run; arguments as in `run`: `t1`, `ts`, `t0` in s, `outputs`, `save`, `every`, `options`."""
+        if save not in SAVES:
+            raise ValueError(f"`save` is {save!r}; {nearest(str(save), SAVES)}")
+        if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1 or (every > 1 and save != "trajectories"):
+            raise ValueError(f"`every` is {every!r}, expected a whole number of at least 1; it says of which lanes save='trajectories' keeps the trajectory")
+        for name in ("saveat", "adjoint", "progress", "parameters", "starts"):
+            if name in options:
+                raise ValueError(f"`{name}` is no option of a study; times to save at are `ts`, and what is kept is said by `outputs` and `save`")
+        known = as_outputs(self.scene, outputs)
+        first = as_end("t0", 0.0 if t0 is None else t0)
+        times = None if ts is None else saved_times(ts)
+        last = as_end("t1", t1) if t1 is not None else times[-1] if times is not None else first + self.scene.example_span
+        check_span(first, last)
+        if times is None:
+            along = save == "trajectories" or any(output.over_times for output in known.values())
+            times = np.linspace(float(first), float(last), TIMES) if along else np.array([float(last)])
+        check_times(times, first, last)
+        settled = {"t0": float(first), "t1": float(last), "ts": np.asarray(times, float)} | options
+        return Task(self.scene, self.design, self._named[1], known, settled, save, int(every))
+
+    def run(
+        self,
+        path: str | os.PathLike,
+        *,
+        t1=None,
+        ts=None,
+        t0=None,
+        outputs: Mapping | None = None,
+        save: str = "outputs",
+        every: int = 1,
+        chunk: int | None = None,
+        progress: bool = True,
+        processes: int = 1,
+        shard: tuple[int, int] = (1, 1),
+        command: str = "",
+        **options,
+    ) -> StudyResult:
+        """Run what is missing of the study in the folder `path`, which is made where there is none, and open it.
+
+        The same call on the same folder goes on where an earlier one ended, in whatever way it ended. Results are bit-equal over `chunk`, order and
+        interruptions.
+
+        - `t0`, `t1`: span (s; default: 0 and the scene's `example_span`); `ts`: times (s) that outputs look at (default: 201 even ones; the end alone where
+          all outputs look at the end).
+        - `outputs`: name -> `jj.End`, `jj.Largest`, `jj.Smallest`, `jj.LargestMagnitude`, `jj.EventTime`, `jj.Happened`, `jj.Quantity`, or a function of a
+          trajectory; default: the end values of all coordinates and speeds. NaN where a motion failed.
+        - `save`: "outputs": parameters, starts, outputs, result code and steps of every lane; "trajectories": these, and states at `ts` of `every` so-many-th
+          lane; "statistics": counts, sums and histograms alone, nothing per lane.
+        - `chunk`: lanes that are stored together (default: about a thousandth of all); at most one is computed again after a crash.
+        - `processes`: how many compute, each on its share of the cores; more than one need a script whose top level is guarded by
+          `if __name__ == "__main__":`, and outputs that are no functions within functions.
+        - `shard`: (k, n): only the k-th of n shares of the chunks, for a folder of its own on one of n machines; `jj.merge_studies` puts them together.
+        - `progress`: a bar; `command`: text that is kept with the study; `options`: further ones as in `rollout` (`rtol`, `atol`, `solver`, ...).
+
+        Raises ValueError where the folder holds another study, `InUseError` where another process runs it, OSError where it cannot be written.
+        Ctrl-C: the chunk under way ends, all is kept, and KeyboardInterrupt says so.
+        """
+        task = self.task(t1=t1, ts=ts, t0=t0, outputs=outputs, save=save, every=every, **options)
+        shards = tuple(shard)
+        if len(shards) != 2 or not all(isinstance(x, int) for x in shards) or not 1 <= shards[0] <= shards[1]:
+            raise ValueError(f"`shard` is {shard}, expected (k, n) with 1 <= k <= n")
+        if isinstance(processes, bool) or not isinstance(processes, int) or processes < 1:
+            raise ValueError(f"`processes` is {processes!r}, expected a whole number of at least 1")
+        compute = in_this_process if processes == 1 else in_processes(task, processes)
+        store = run(task, path, chunk=chunk, progress=progress, shard=shards, command=command, workers=compute)
+        return StudyResult(store, task)
+
+    def _text(self) -> str:
+        constants = ", ".join(f"{name} = {np.asarray(value).tolist()}" for name, value in self._named[1].items())
+        return f"Study of {type(self.scene).__name__}\n{self.design}" + (f"\n  all start with {constants}" if constants else "")

@@ -1,0 +1,200 @@
+"""What a run of a study computes: lanes in blocks of a fixed size, each by one `rollout` and one compiled program of outputs.
+
+Block b holds lanes b B to (b + 1) B - 1, whatever the chunks in which results are stored; the last one is filled up with copies of its last lane. All blocks
+run the same compiled programs on arrays of the same shapes, so a lane's numbers do not depend on chunks, order or processes.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.build.event_names import names_of_events
+from jourdain_jax.ensembles.design import Design
+from jourdain_jax.ensembles.identity import digest
+from jourdain_jax.ensembles.outputs import Output
+from jourdain_jax.ensembles.statistics import Grid, counts_of_block, extremes_of_block, sums_of_block
+from jourdain_jax.ensembles.store import Column
+from jourdain_jax.motion.batches.rollout import rollout
+from jourdain_jax.motion.marks import nan_is_a_mark
+from jourdain_jax.motion.simulate import simulate
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.scene import Scene
+
+LARGEST_BLOCK = 2048  # lanes: enough that few wait for the last one, few enough that a chunk is a fraction of a second
+BLOCK_MEMORY = 2**26  # bytes of saved states of a block, at most
+AT_START = "_at_start"  # how columns of start values are called, after the coordinate or speed
+CODES = ("success", "event", "max_steps", "step_too_small", "not_finite", "inconsistent_start", "singular_partition", "bad_parameter", "bad_start",
+         "unsolved_step", "shrank", "stiff", "off_constraints", "bad_times")  # fmt: skip
+OF_LANES: dict[str, tuple[str, float, dict]] = {
+    "result": ("int8", -1, {"long_name": "how the motion ended", "flag_values": list(range(len(CODES))), "flag_meanings": " ".join(CODES)}),
+    "event": ("int8", -1, {"long_name": "which stop event ended the motion; -1: none"}),
+    "steps": ("int32", -1, {"long_name": "accepted steps"}),
+    "rejected_steps": ("int32", -1, {"long_name": "rejected steps"}),
+    "retries": ("int8", -1, {"long_name": "how it was run again", "flag_masks": [1, 2], "flag_meanings": "full_state implicit_solver"}),
+    "end_time": ("float64", math.nan, {"long_name": "time at which the motion ended", "units": "s"}),
+}
+SAVES = ("statistics", "outputs", "trajectories")
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """What a block gave: values of the columns, by name, and those of all outputs, shape (lanes, outputs)."""
+
+    columns: Mapping[str, np.ndarray]
+    outputs: np.ndarray
+
+
+@dataclass(frozen=True)
+class Task:
+    """A study with all that says which numbers come out of it."""
+
+    scene: Scene
+    design: Design  # parameters by name, start values by name and AT_START
+    constants: Mapping[str, object]  # start values that all lanes share
+    outputs: Mapping[str, Output]
+    options: Mapping[str, Any]  # of `rollout`, `ts` among them
+    save: str
+    every: int
+
+    @property
+    def block(self) -> int:
+        """Lanes of a block."""
+        width = len(self.scene.coordinate_names) + len(self.scene.speed_names) + 2
+        block = min(LARGEST_BLOCK, max(8, 1 << (len(self.design) - 1).bit_length()))
+        while block > 8 and 8 * block * width * len(self.ts) > BLOCK_MEMORY:
+            block //= 2
+        return block
+
+    @property
+    def blocks(self) -> int:
+        """How many there are."""
+        return -(-len(self.design) // self.block)
+
+    @property
+    def ts(self) -> np.ndarray:
+        """Saved times, s."""
+        return np.asarray(self.options["ts"])
+
+    # Lanes. --------------------------------------------------------------------------------------------------------
+
+    def arguments(self, first: int, last: int, fill_to: int | None = None) -> tuple[dict, dict]:
+        """Start values and parameters of some lanes; the last repeated up to `fill_to` lanes."""
+        values = self.design.values(first, last)
+        if fill_to is not None:
+            values = {name: np.pad(column, (0, fill_to - len(column)), mode="edge") for name, column in values.items()}
+        parameters = {name: column for name, column in values.items() if not name.endswith(AT_START)}
+        starts = {name.removesuffix(AT_START): column for name, column in values.items() if name.endswith(AT_START)}
+        return dict(self.constants) | starts, parameters
+
+    def simulated(self, lane: int, **options) -> Trajectory:
+        """The motion of one lane alone; `options` replace those of the study."""
+        starts, parameters = self.arguments(lane, lane + 1)
+        own = self.scene.replace(**{name: column[0] for name, column in parameters.items()}) if parameters else self.scene
+        first = {name: value if name in self.constants else value[0] for name, value in starts.items()}
+        return simulate(own, first, **(dict(self.options) | options))
+
+    def run_block(self, number: int) -> Lanes:
+        """All lanes of a block."""
+        first = number * self.block
+        last = min(first + self.block, len(self.design))
+        starts, parameters = self.arguments(first, last, self.block)
+        rolled = rollout(self.scene, starts, parameters=parameters or None, chunk=self.block, progress=False, **self.options).lanes
+        with nan_is_a_mark():
+            outputs = np.asarray(self._outputs_of(rolled))[: last - first]
+        if self.save == "statistics":
+            return Lanes({**self._of_lanes(rolled, last - first)}, outputs)
+        columns = self.design.values(first, last) | self._of_lanes(rolled, last - first) | dict(zip(self.outputs, outputs.T, strict=True))
+        if self.save == "trajectories":
+            kept = slice(-first % self.every, last - first, self.every)
+            for names, array in ((self.scene.coordinate_names, rolled.q), (self.scene.speed_names, rolled.u)):
+                values = np.asarray(array)[kept]
+                columns |= {name: values[..., i] for i, name in enumerate(names.entries)}
+        return Lanes(columns, outputs)
+
+    @staticmethod
+    def _of_lanes(rolled: Trajectory, count: int) -> dict[str, np.ndarray]:
+        found = (rolled.result, rolled.event, rolled.accepted, rolled.rejected, rolled.fallback, rolled.t_end)
+        return {name: np.asarray(x)[:count].astype(dtype) for (name, (dtype, _, _)), x in zip(OF_LANES.items(), found, strict=True)}
+
+    @cached_property
+    def _outputs_of(self):
+        outputs = tuple(self.outputs.values())
+
+        def of_lane(motion: Trajectory):
+            sound = motion.nan_if_failed()
+            return jnp.stack([jnp.where(motion.succeeded, output.of(sound), jnp.nan) for output in outputs])
+
+        return eqx.filter_jit(eqx.filter_vmap(of_lane))
+
+    def __getstate__(self):
+        return {name: value for name, value in vars(self).items() if name != "_outputs_of"}  # what was compiled stays in its process
+
+    # What is kept. -------------------------------------------------------------------------------------------------
+
+    def columns(self) -> dict[str, Column]:
+        """The arrays of the store."""
+        if self.save == "statistics":
+            return {}
+        events: dict = {"event_names": list(names_of_events(self.scene))}
+        units = {name: about["unit"] for name, _, about in parameters_of(self.scene)}
+        found = {}
+        for name in self.design.names:
+            about = f"start value of {name.removesuffix(AT_START)}" if name.endswith(AT_START) else f"parameter {name}"
+            found[name] = Column("float64", math.nan, {"long_name": about, "role": "varied"} | _unit(units.get(name, "")))
+        for name, (dtype, fill, about) in OF_LANES.items():
+            found[name] = Column(dtype, fill, about | (events if name == "event" else {}))
+        for name, output in self.outputs.items():
+            found[name] = Column("float64", math.nan, {"long_name": name, "role": "output"} | _unit(output.unit))
+        if self.save == "trajectories":
+            for name in (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries):
+                found[name] = Column("float64", math.nan, {"long_name": f"{name} along the motion"}, (("time", len(self.ts)),), self.every)
+        return found
+
+    def column_names(self) -> list[str]:
+        """Names of all arrays, in order; a name may occur twice."""
+        along = [*self.scene.coordinate_names.entries, *self.scene.speed_names.entries, "time"] if self.save == "trajectories" else []
+        return [*self.design.names, *OF_LANES, *self.outputs, *along]
+
+    def identity(self) -> dict[str, str]:
+        """Digests of all that decides the numbers, by what a user would call it."""
+        return {
+            "scene": digest((type(self.scene), self.scene)),
+            "start": digest(dict(self.constants)),
+            "design": digest((dict(self.design.variables), self.design.sampler, len(self.design), self.design.seed, self.design.correlation)),
+            "outputs": digest(dict(self.outputs)),
+            "options": digest(dict(sorted(self.options.items()))),
+            "save": digest((self.save, self.every)),
+            "precision": digest(str(jnp.result_type(float))),
+            "backend": jax.default_backend(),
+        }
+
+
+def _unit(unit: str) -> dict[str, str]:
+    return {"units": unit} if unit else {}
+
+
+def receipt_of(task: Task, grid: Grid, blocks: Mapping[int, Lanes]) -> dict[str, np.ndarray]:
+    """What is kept of a chunk besides its columns: counts per result code, failed lanes, sums of each block, counts per cell, extremes."""
+    code = {number: lanes.columns["result"] for number, lanes in blocks.items()}
+    wrong = {number: np.flatnonzero((codes != results.SUCCESS) & (codes != results.EVENT)) for number, codes in code.items()}
+    cells = sum(counts_of_block(grid, lanes.outputs) for lanes in blocks.values())
+    extremes = np.stack([extremes_of_block(lanes.outputs) for lanes in blocks.values()])
+    return {
+        "codes": sum(np.bincount(codes, minlength=len(CODES)) for codes in code.values()),
+        "again": np.array([sum(int(np.sum(lanes.columns["retries"] > 0)) for lanes in blocks.values())]),
+        "steps": np.array([sum(int(np.sum(lanes.columns[name], dtype=np.int64)) for lanes in blocks.values()) for name in ("steps", "rejected_steps")]),
+        "failed": np.concatenate([number * task.block + index for number, index in wrong.items()]).astype(np.int64),
+        "failed_codes": np.concatenate([code[number][index] for number, index in wrong.items()]),
+        "sums": np.stack([sums_of_block(grid, lanes.outputs) for lanes in blocks.values()]),
+        "cells": np.stack([place := np.flatnonzero(cells), cells.reshape(-1)[place]]).astype(np.int32),
+        "extremes": np.stack([extremes[:, 0].min(axis=0), extremes[:, 1].max(axis=0)]),
+    }

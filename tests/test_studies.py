@@ -1,0 +1,205 @@
+"""Studies: every lane is the motion that `simulate` gives, and its bits do not depend on chunks, shares or what else is kept."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray
+
+import jourdain_jax as jj
+from jourdain_jax.ensembles import task
+from jourdain_jax.motion.trajectories import results
+
+COUNT, BAD = 150, 37  # lanes; one whose radius is negative
+OUTPUTS = {
+    "final lean": jj.End("lean", "rad"),
+    "largest lean": jj.LargestMagnitude("lean", "rad"),
+    "fell": jj.Happened("fallen"),
+    "fall time": jj.EventTime("fallen"),
+    "distance": jj.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m"),
+}
+ASKED = {"t1": 1.0, "ts": np.linspace(0.0, 1.0, 11), "rtol": 1e-6, "atol": 1e-6, "progress": False}
+
+
+@pytest.fixture(autouse=True)
+def _blocks_are_small(monkeypatch):
+    monkeypatch.setattr(task, "LARGEST_BLOCK", 32)
+
+
+def discs():
+    """A table of discs with random starts, one of which is none."""
+    generator = np.random.default_rng(2)
+    radius = generator.uniform(0.4, 0.6, COUNT)
+    radius[BAD] = -0.5
+    start = {"lean": generator.uniform(-0.6, 0.6, COUNT), "lean_rate": generator.normal(0.0, 0.5, COUNT), "spin_rate": -0.5}
+    return jj.Study(jj.models.TiltingDisc(), vary={"radius": radius}, start=start)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(task, "LARGEST_BLOCK", 32)
+        return discs().run(tmp_path_factory.mktemp("whole") / "discs.zarr", outputs=OUTPUTS, **ASKED)
+
+
+def assert_same(found, expected):
+    """All arrays and statistics have the same bits."""
+    assert found.complete
+    one, other = found.to_xarray().load(), expected.to_xarray().load()
+    assert set(one.variables) == set(other.variables)
+    for name in one.variables:
+        np.testing.assert_array_equal(one[name].values, other[name].values, err_msg=name)
+    assert_same_statistics(found, expected)
+
+
+def assert_same_statistics(found, expected):
+    for name in ("mean", "covariance", "counts", "extremes", "lanes"):
+        np.testing.assert_array_equal(getattr(found.statistics, name), getattr(expected.statistics, name), err_msg=name)
+    assert found.counts == expected.counts
+    np.testing.assert_array_equal(found.failed, expected.failed)
+
+
+def test_every_lane_is_the_motion_that_simulate_gives(whole):
+    arrays = whole.to_xarray()
+    assert arrays.sizes["lane"] == COUNT
+    fell = np.flatnonzero(arrays["fell"].values == 1.0)
+    assert 3 < fell.size < COUNT
+    for number in (0, 31, 32, COUNT - 1, int(fell[0])):
+        lane = whole.lane(number)
+        motion = lane.simulate()
+        assert int(arrays["result"][number]) == int(motion.result)
+        assert int(arrays["steps"][number]) == int(motion.accepted)
+        for name, output in OUTPUTS.items():
+            assert float(arrays[name][number]) == pytest.approx(float(output.of(motion)), rel=1e-9, abs=1e-9, nan_ok=True), name
+        assert float(motion.scene.radius) == lane.parameters["radius"] == float(arrays["radius"][number])
+    assert "stopped at an event" in str(whole.lane(int(fell[0])))
+
+
+def test_a_failed_lane_is_named_and_left_out_of_statistics(whole):
+    assert whole.failed.tolist() == [BAD]
+    assert whole.counts["bad_parameter"] == 1
+    arrays = whole.to_xarray()
+    assert int(arrays["result"][BAD]) == results.BAD_PARAMETER
+    assert all(np.isnan(arrays[name][BAD]) for name in OUTPUTS)
+    own = np.delete(arrays["distance"].values, BAD)
+    assert whole.mean("distance") == pytest.approx(own.mean(), rel=1e-13)
+    assert whole.deviation("distance") == pytest.approx(own.std(ddof=1), rel=1e-12)
+    assert whole.statistics.lanes[0, 0] == COUNT - 1
+    assert f"failed: lanes {BAD}" in str(whole)
+    with pytest.raises(ValueError, match="radius"):
+        whole.lane(BAD).simulate()
+
+
+def test_the_folder_opens_in_xarray_with_names_units_and_what_was_asked(whole):
+    arrays = xarray.open_zarr(whole.store.path)
+    assert arrays["final lean"].attrs["units"] == "rad"
+    assert arrays["radius"].attrs["units"] == "m"
+    assert set(arrays.coords) == {"radius", "lean_at_start", "lean_rate_at_start"}
+    assert arrays.attrs["scene"].endswith("TiltingDisc")
+    assert arrays.attrs["parameters"]["mass"] == {"value": 1.0, "unit": "kg"}
+    assert arrays.attrs["start"] == {"spin_rate": -0.5}
+    assert arrays.attrs["versions"]["jax"]
+    assert arrays["result"].attrs["flag_meanings"].split()[int(arrays["result"][BAD])] == "bad_parameter"
+    assert len(task.CODES) == len(results.MESSAGES)
+    assert all(getattr(results, name.upper()) == code for code, name in enumerate(task.CODES))
+
+
+def test_netcdf_holds_the_same(whole, tmp_path):
+    whole.to_netcdf(tmp_path / "discs.nc")
+    with xarray.open_dataset(tmp_path / "discs.nc") as arrays:
+        for name in whole.to_xarray().variables:
+            np.testing.assert_array_equal(arrays[name].values, whole.to_xarray()[name].values)
+        assert arrays["final lean"].attrs["units"] == "rad"
+
+
+@pytest.mark.parametrize("chunk", [64, 160])
+def test_chunks_do_not_change_a_bit(whole, chunk, tmp_path):
+    assert whole.store.chunk == 32
+    assert_same(discs().run(tmp_path / "discs.zarr", outputs=OUTPUTS, chunk=chunk, **ASKED), whole)
+
+
+def test_shares_of_several_machines_make_one_study(whole, tmp_path):
+    study = discs()
+    folders = [tmp_path / f"share{k}" for k in (1, 2, 3)]
+    parts = [study.run(folder, outputs=OUTPUTS, shard=(k, 3), **ASKED) for k, folder in enumerate(folders, start=1)]
+    assert not any(part.complete for part in parts)
+    assert "run it again" in str(parts[0])
+    assert_same(jj.merge_studies(folders[0], folders[1:]), whole)
+    vary = study.vary | {"radius": study.vary["radius"] + 0.01}
+    other = jj.Study(study.scene, vary, study.start).run(tmp_path / "other", outputs=OUTPUTS, **ASKED)
+    with pytest.raises(ValueError, match="no share"):
+        jj.merge_studies(folders[0], [other.store.path])
+
+
+def test_statistics_need_no_lanes(whole, tmp_path):
+    found = discs().run(tmp_path / "discs.zarr", outputs=OUTPUTS, save="statistics", chunk=96, **ASKED)
+    assert_same_statistics(found, whole)
+    assert not found.to_xarray().variables
+    assert sum(file.stat().st_size for file in found.store.path.rglob("*") if file.is_file()) < 50_000
+    assert found.lane(3).kept == {}
+
+
+def test_trajectories_of_some_lanes_are_kept(whole, tmp_path):
+    found = discs().run(tmp_path / "discs.zarr", outputs=OUTPUTS, save="trajectories", every=12, **ASKED)
+    assert_same_statistics(found, whole)
+    arrays = found.to_xarray()
+    assert arrays["lean"].dims == ("saved_lane", "time")
+    np.testing.assert_array_equal(arrays["saved_lane"].values, np.arange(0, COUNT, 12))
+    np.testing.assert_array_equal(arrays["time"].values, ASKED["ts"])
+    for place in (0, 5, 12):
+        np.testing.assert_allclose(arrays["lean"][place].values, found.lane(12 * place).simulate()["lean"], rtol=1e-9, atol=1e-9)
+
+
+def test_a_study_is_opened_without_its_scene(whole):
+    found = jj.load_study(whole.store.path)
+    assert str(found) == str(whole)
+    with pytest.raises(ValueError, match=r"study\.run"):
+        found.lane(0)
+    with pytest.raises(IndexError, match="lane 150 does not exist"):
+        whole.lane(COUNT)
+
+
+def test_results_print_and_draw_themselves(whole, tmp_path):
+    assert f"{COUNT} of {COUNT} lanes" in str(whole)
+    assert "final lean" in whole._repr_html_()
+    whole.plot("final lean", "distance", path=tmp_path / "discs.png")
+    assert (tmp_path / "discs.png").stat().st_size > 5000
+    counts, edges = whole.histogram("distance", cells=20)
+    assert counts.sum() == COUNT - 1
+    assert len(counts) <= 20
+    assert len(edges) == len(counts) + 1
+    assert "radius" in str(discs())
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda d: jj.Study(d, vary={"radios": jj.Normal(0.5, 0.1)}, samples=8), "did you mean `radius`"),
+        (lambda d: jj.Study(d, vary={"radius": 0.5}, samples=8), "set one value on the scene"),
+        (lambda d: jj.Study(d, vary=[1.0]), "`vary` is"),
+        (lambda d: jj.Study(d, start={"laen": jj.Normal(0.5, 0.1)}, samples=8), "did you mean `lean`"),
+        (lambda d: jj.Study(d, start={"lean": 0.2}, samples=8), "nothing varies"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(save="everything"), "`save` is 'everything'"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(every=2), "`every` is 2"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(t1=-np.inf), "t1"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(adjoint=None), "no option of a study"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.End("leen")}), "did you mean `lean`"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.EventTime("fell")}), "did you mean `fallen`"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"a/b": jj.End("lean")}), "without `/`"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).task(outputs={"x": jj.End}), "expected an output"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).run("x", outputs={"radius": jj.End("lean")}), "would name two arrays"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5] * 9}).run("x", chunk=7), "a multiple of 16"),
+        (lambda d: jj.Study(d, vary={"radius": [0.5]}).run("x", shard=(3, 2)), "`shard` is"),
+    ],
+)
+def test_a_wrong_study_says_what_is_wrong(make, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        make(jj.models.TiltingDisc())
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_output_that_is_no_number_or_unknown_is_named(whole, tmp_path):
+    with pytest.raises(ValueError, match="expected one number for one motion"):
+        discs().run(tmp_path / "discs.zarr", outputs={"all": lambda motion: motion.q_end}, **ASKED)
+    with pytest.raises(ValueError, match="no output `lean`"):
+        whole.mean("lean")
