@@ -13,7 +13,8 @@ from oracles import chaplygin_sleigh as sleigh_oracle
 from oracles import rattleback as rattleback_oracle
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.bijections import bounds, positive, unbounded
+from jourdain_jax.analysis.ranges import bounds, positive, unbounded
+from jourdain_jax.analysis.arrow import arrow, triangle
 from jourdain_jax.analysis.fit import fit, fit_batch
 from jourdain_jax.analysis.information import hidden_combinations, information
 from jourdain_jax.analysis.likelihood import log_likelihood
@@ -281,10 +282,33 @@ def test_log_likelihood_is_the_gaussian_one_and_differentiable():
 
 def test_a_parameter_at_its_bound_is_said_to_be_there():
     found = fit(Cart(mass=3.0), cart_run(), {"mass": bounds(2.5, 4.0)})
+    assert found.converged
     assert found.at_bound.all()
+    assert float(found["mass"].value) == found["mass"].low == 2.5
     assert "`mass` lies at a bound" in found.warning
     assert "WARNING: `mass` lies at a bound" in str(found)
-    assert np.isnan(found["mass"].low)
+    assert np.isnan(found["mass"].standard_error)
+
+
+@pytest.mark.parametrize("damping", [1e-12, 0.05])
+def test_a_damping_of_zero_is_found_and_gets_a_one_sided_limit(damping):
+    # without damping: x = x0 cos(w t); the noise of the second case asks for less than none
+    x = 0.3 * np.cos(np.sqrt(5.0 / 2.0) * TS)
+    v = -0.3 * np.sqrt(5.0 / 2.0) * np.sin(np.sqrt(5.0 / 2.0) * TS)
+    push = 0.0 if damping < 1e-6 else 0.002
+    run = cart_run(values={"x": x * (1 + push * TS), "x_rate": v * (1 + push * TS)}, inputs=None)
+    found = fit(Cart(mass=2.2, damping=0.6), run, ("mass", "damping"))
+    assert found.converged
+    assert found.steps < 15
+    assert found["damping"].value == found["damping"].low or found["damping"].value < 1e-6
+    if damping > 1e-6:
+        assert found.at_bound.tolist() == [False, True]
+        assert "one-sided, at its bound" in str(found)
+        assert found.warning == ""
+        # the limit: 2.706 more in chi-square, by a fit with the damping held there
+        limit = float(found["damping"].high)
+        held = fit(Cart(mass=2.0, damping=limit), run, ("mass",))
+        assert float(held.chi_square - found.chi_square) == pytest.approx(2.706, rel=0.05)
 
 
 def test_a_motion_that_fails_gives_a_flag_and_no_numbers():
@@ -315,28 +339,57 @@ def test_one_bad_repeat_harms_no_other():
 # Information. -------------------------------------------------------------------------------------------------------------
 
 
+def told(J, size, local=0, runs=1):
+    """Information of a dense Jacobian whose last columns are the `local` unknowns of each of `runs` runs, block by block."""
+    shared = J.shape[1] - runs * local
+    blocks = [np.concatenate([J[i::runs, shared + i * local : shared + (i + 1) * local], J[i::runs, :shared]], axis=1) for i in range(runs)]
+    triangles = np.stack([triangle(np.zeros(len(block)), block) for block in blocks])[None]
+    places = np.arange(J.shape[1])
+    return information(arrow(triangles, local), np.asarray(size, float)[None], places, np.zeros((1, len(places)), bool), np.zeros(1, bool), 1e-6, True)
+
+
 def test_information_of_full_rank_is_the_inverse():
     J = np.random.default_rng(0).normal(size=(30, 3)) * np.array([1.0, 100.0, 1e-3])
-    found = information(jnp.asarray(J), jnp.array([1.0, 0.01, 1e3]), 1e-6)
+    found = told(J, [1.0, 0.01, 1e3])
     np.testing.assert_allclose(found.covariance, np.linalg.inv(J.T @ J), rtol=1e-9)
+    np.testing.assert_allclose(found.standard_errors, np.sqrt(np.diagonal(np.linalg.inv(J.T @ J))), rtol=1e-9)
     assert int(found.rank) == 3
     assert found.identifiable.all()
+
+
+def test_information_of_runs_with_unknowns_of_their_own_is_that_of_all_columns():
+    generator, runs = np.random.default_rng(3), 4
+    J = np.zeros((80, 2 + 3 * runs))
+    J[:, :2] = generator.normal(size=(80, 2))
+    for i in range(runs):
+        J[i::runs, 2 + 3 * i : 5 + 3 * i] = generator.normal(size=(20, 3))
+    found = told(J, np.exp(generator.normal(size=14)), 3, runs)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(J.T @ J), rtol=1e-9, atol=1e-12)
+    assert int(found.rank) == 14
+    # the first shared unknown does what an own unknown of each run does: neither shows, all else keeps its interval
+    J[:, 0] = sum(J[:, 2 + 3 * i] for i in range(runs))
+    found = told(J, np.ones(14), 3, runs)
+    assert int(found.rank) == 13
+    assert np.flatnonzero(~found.identifiable).tolist() == [0, 2, 5, 8, 11]
+    rest = np.delete(J, 0, axis=1)
+    known = np.delete(np.delete(np.linalg.inv(rest.T @ rest), [1, 4, 7, 10], axis=0), [1, 4, 7, 10], axis=1)
+    kept = np.flatnonzero(found.identifiable)
+    np.testing.assert_allclose(found.covariance[np.ix_(kept, kept)], known, rtol=1e-9, atol=1e-12)
 
 
 def test_information_of_deficient_rank_keeps_the_unknowns_that_are_not_involved():
     generator = np.random.default_rng(1)
     shown, alone = generator.normal(size=(30, 1)), generator.normal(size=(30, 1))
-    size = jnp.array([2.0, 5.0, 3.0])
+    size = np.array([2.0, 5.0, 3.0])
     # only theta_0^2 theta_2 shows, and theta_1
     J = np.concatenate([2 * shown / 2.0, alone / 5.0, shown / 3.0], axis=1)
-    found = information(jnp.asarray(J), size, 1e-6)
+    found = told(J, size)
     assert int(found.rank) == 2
     assert found.identifiable.tolist() == [False, True, False]
     pair = np.concatenate([shown, alone / 5.0], axis=1)
     assert found.covariance[1, 1] == pytest.approx(np.linalg.inv(pair.T @ pair)[1, 1], rel=1e-9)
     assert np.isnan(found.covariance[0]).all()
-    hidden = np.asarray(found.directions)[2:]
-    (sentence,) = hidden_combinations(hidden, np.asarray(size), np.array([2.0, 5.0, 3.0]), ("p", "q", "r"))
+    (sentence,) = hidden_combinations(found.hidden[0], size, np.array([2.0, 5.0, 3.0]), ("p", "q", "r"))
     assert "`p` and `r` do not show separately: no channel changes along d p/p : d r/r = -0.5 : 1" in sentence
     assert "what shows is r p^2" in sentence
 
@@ -354,16 +407,6 @@ def test_two_hidden_directions_and_a_parameter_that_does_nothing():
     for sentence in hidden_combinations(rows, np.ones(3), np.ones(3), ("a", "b", "c")):
         assert "`c` do not show separately" in sentence
         assert "what shows" not in sentence
-
-
-def test_bijections_are_inverses_within_their_bounds():
-    guess = jnp.array(0.7)
-    for bijection in (bounds(0.1, 2.0), positive(), unbounded(), unbounded(3.0)):
-        assert bijection.value(bijection.coordinate(guess), guess) == pytest.approx(0.7, rel=1e-14)
-    far = jnp.array([-30.0, 30.0])
-    assert (bounds(0.1, 2.0).value(far, guess) >= 0.1).all()
-    assert (bounds(0.1, 2.0).value(far, guess) <= 2.0).all()
-    assert (positive().value(far, guess) > 0).all()
 
 
 # Bad input. ---------------------------------------------------------------------------------------------------------------

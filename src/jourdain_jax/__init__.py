@@ -24,7 +24,7 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
 
 from jourdain_jax import models
-from jourdain_jax.analysis.bijections import bounds, positive, unbounded
+from jourdain_jax.analysis.ranges import bounds, positive, unbounded
 from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
 from jourdain_jax.analysis.fit import fit, fit_batch
 from jourdain_jax.analysis.fit_result import Fit

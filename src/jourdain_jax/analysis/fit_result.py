@@ -6,18 +6,24 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.information import Information, hidden_combinations
 from jourdain_jax.analysis.table import table
+from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 
+CORRELATED = 0.98
+MOST_COMPARED, MOST_NAMED = 1000, 8  # unknowns; pairs of them in the table
+FAR_BEYOND = 3.0  # standard errors: an estimate that is held at its bound by more is no chance
+
+
 class Estimate(eqx.Module):
     """One unknown, in its unit; NaN for what the measurements cannot tell."""
 
-    value: Float[Array, "*repeats"]
-    standard_error: Float[Array, "*repeats"]
-    low: Float[Array, "*repeats"]  # ends of the 95 % interval
-    high: Float[Array, "*repeats"]
+    value: Float[np.ndarray, "*repeats"]
+    standard_error: Float[np.ndarray, "*repeats"]
+    low: Float[np.ndarray, "*repeats"]  # ends of the 95 % interval
+    high: Float[np.ndarray, "*repeats"]
     unit: str = eqx.field(static=True)
 
 
@@ -39,19 +45,21 @@ class Fit(Printed, eqx.Module):
     """
 
     scene: Scene  # with the estimates
-    starts: tuple[dict[str, Float[Array, "..."]], ...]  # initial values of each run, with the estimates
-    values: Float[Array, "unknowns"]
-    sizes: Float[Array, "unknowns"]  # against which the rank is judged
-    standard_errors: Float[Array, "unknowns"]  # NaN where not identifiable
-    low: Float[Array, "unknowns"]  # ends of the 95 % intervals; NaN where not identifiable
-    high: Float[Array, "unknowns"]
-    at_bound: Bool[Array, "unknowns"]  # estimates that a bound decides; they have no interval
+    starts: tuple[dict[str, Float[Array | np.ndarray, "..."]], ...]  # initial values of each run, with the estimates
+    values: Float[np.ndarray, "*repeats unknowns"]
+    sizes: Float[np.ndarray, "*repeats unknowns"]  # against which the rank is judged
+    standard_errors: Float[np.ndarray, "*repeats unknowns"]  # NaN where not identifiable
+    low: Float[np.ndarray, "*repeats unknowns"]  # ends of the 95 % intervals; NaN where not identifiable
+    high: Float[np.ndarray, "*repeats unknowns"]
+    at_bound: Bool[np.ndarray, "*repeats unknowns"]  # estimates at a bound: no standard error, and a one-sided interval
+    beyond: Float[np.ndarray, "*repeats unknowns"]  # of these, by how many standard errors the data would put them beyond; NaN elsewhere
     information: Information
-    residuals: tuple[dict[str, Float[Array, "..."]], ...]  # (times, *channel): (prediction - value) / sigma; NaN where missing
-    chi_square: Float[Array, ""]
-    samples: Int[Array, ""]  # with a finite sigma
-    converged: Bool[Array, ""]
-    steps: Int[Array, ""]  # tried
+    residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # (times, *channel): (prediction - value) / sigma; NaN where missing
+    chi_square: Float[np.ndarray, "*repeats"]
+    samples: Int[np.ndarray, "*repeats"]  # with a finite sigma
+    converged: Bool[np.ndarray, "*repeats"]
+    stuck: Bool[np.ndarray, "*repeats"]  # no step lowers the sum of squares, however short, and this is no minimum
+    steps: Int[np.ndarray, "*repeats"]  # tried
     labels: tuple[str, ...] = eqx.field(static=True)  # names of the unknowns
     units: tuple[str, ...] = eqx.field(static=True)
     cutoff: float = eqx.field(static=True)
@@ -68,24 +76,24 @@ class Fit(Printed, eqx.Module):
         return {name: self[name] for name in self.labels}
 
     @property
-    def covariance(self) -> Float[Array, "*repeats unknowns unknowns"]:
+    def covariance(self) -> Float[np.ndarray, "*repeats unknowns unknowns"]:
         """Covariance of the estimates in the order of `labels`, to first order; NaN where not identifiable."""
         return self.information.covariance
 
     @property
-    def correlation(self) -> Float[Array, "*repeats unknowns unknowns"]:
+    def correlation(self) -> Float[np.ndarray, "*repeats unknowns unknowns"]:
         """Correlation of the estimates."""
         return self.covariance / (self.standard_errors[..., :, None] * self.standard_errors[..., None, :])
 
     @property
-    def degrees_of_freedom(self) -> Int[Array, "*repeats"]:
+    def degrees_of_freedom(self) -> Int[np.ndarray, "*repeats"]:
         """Samples less the directions that were determined."""
-        return self.samples - self.information.rank
+        return np.asarray(self.samples - self.information.rank)
 
     @property
-    def reduced_chi_square(self) -> Float[Array, "*repeats"]:
+    def reduced_chi_square(self) -> Float[np.ndarray, "*repeats"]:
         """Sum of squared residuals per degree of freedom: near 1 where scene and sigmas are right."""
-        return self.chi_square / self.degrees_of_freedom
+        return np.asarray(self.chi_square / self.degrees_of_freedom)
 
     # Of one fit, not of a batch. -----------------------------------------------------------------------------------
 
@@ -94,19 +102,40 @@ class Fit(Printed, eqx.Module):
         """What the measurements cannot tell, one sentence per combination of unknowns."""
         if not np.isfinite(self.chi_square):
             return ()
-        hidden = np.asarray(self.information.directions)[int(self.information.rank) :]
-        return hidden_combinations(hidden, np.asarray(self.sizes), np.asarray(self.values), self.labels)
+        return hidden_combinations(self.information.hidden[0], self.sizes, self.values, self.labels)
+
+    @property
+    def correlated(self) -> tuple[str, ...]:
+        """Pairs of unknowns whose estimates correlate by `CORRELATED` or more in magnitude, strongest first, one sentence each."""
+        some = np.flatnonzero(np.isfinite(self.standard_errors))[:MOST_COMPARED]
+        found = np.triu(self.correlation[np.ix_(some, some)], 1)
+        pairs = sorted(zip(*np.nonzero(np.abs(found) >= CORRELATED), strict=True), key=lambda ij: -abs(found[ij]))
+        return tuple(
+            f"`{self.labels[some[i]]}` and `{self.labels[some[j]]}` correlate at {np.sign(found[i, j]) * min(abs(found[i, j]), 0.9999):.4g}: "
+            "the data tell a combination of them far better than either"
+            for i, j in pairs
+        )
+
+    @property
+    def impossible(self) -> tuple[str, ...]:
+        """Bodies of the fitted scene that no distribution of mass can make, one sentence each."""
+        q, _, _ = self.scene.named(**self.starts[0])
+        return impossible_bodies(self.scene, q)
 
     @property
     def warning(self) -> str:
         """Why the estimates should not be relied on, in one sentence; empty where nothing speaks against them."""
         if not np.isfinite(self.chi_square):
             return "the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`"
-        if np.any(self.at_bound):
-            names = ", ".join(f"`{name}`" for name, at in zip(self.labels, np.asarray(self.at_bound), strict=True) if at)
+        if self.stuck:
+            return "no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere"
+        if np.any(self.beyond > FAR_BEYOND):
+            names = ", ".join(f"`{name}`" for name, far in zip(self.labels, self.beyond, strict=True) if far > FAR_BEYOND)
             return f"{names} lies at a bound, which decides its value; all standard errors lose their meaning: widen the bounds"
         if not self.converged:
             return "no minimum was found; raise `max_iterations`, or start nearer to it"
+        if self.impossible:
+            return self.impossible[0]
         # chi-square has mean n and variance 2 n
         if self.reduced_chi_square > 1 + 5 * np.sqrt(2 / max(int(self.degrees_of_freedom), 1)):
             return "the residuals are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, or sigmas that are too small"
@@ -135,12 +164,15 @@ def _text(fit: Fit) -> str:
     rows = [("unknown", "unit", "estimate", "std. error", "95 % interval")]
     for name, e in fit.estimates.items():
         error = f"{e.standard_error:.2g}" if np.isfinite(e.standard_error) else "-"
-        interval = f"[{e.low:.6g}, {e.high:.6g}]" if np.isfinite(e.low) else "none"
+        interval = f"[{e.low:.6g}, {e.high:.6g}]" if not np.isnan(e.low + e.high) else "none"
+        interval += " (one-sided, at its bound)" if fit.at_bound[fit.labels.index(name)] else ""
         rows.append((name, e.unit, f"{e.value:.6g}", error, interval))
     lines += table(rows)
     if fit.not_identifiable:
         lines.append(f"singular values below {fit.cutoff:g} of the largest count as zero:")
         lines += [f"  {sentence}" for sentence in fit.not_identifiable]
+    lines += [f"  {sentence}" for sentence in fit.correlated[:MOST_NAMED]]
+    lines += [f"  and {len(fit.correlated) - MOST_NAMED} more pairs"] if len(fit.correlated) > MOST_NAMED else []
     rows = [("run", "channel", "samples", "mean", "rms", "largest residual (in sigmas)")]
     for s in fit.residual_summary():
         rows.append((str(s.run), s.channel, str(s.samples), f"{s.mean:.2g}", f"{s.rms:.3g}", f"{s.largest:.3g}"))

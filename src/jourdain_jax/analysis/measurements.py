@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.analysis.bijections import Bijection
+from jourdain_jax.analysis.channels import channel
+from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.calculus.reals import Number
-from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.numbers import checked_real, described
@@ -46,7 +46,7 @@ class Measurements(eqx.Module):
     values: dict[str, Float[Array, "..."]]
     sigma: dict[str, Float[Array, "..."]]
     start: dict[str, Float[Array, "..."]]
-    unknown_start: dict[str, Bijection | None]
+    unknown_start: dict[str, Range | None]
     inputs: dict | Inputs | None
     functions: dict[str, Callable]
     t0: Float[Array, ""]  # s
@@ -102,15 +102,12 @@ class Measurements(eqx.Module):
             if not _holds(lambda x: x > 0, value):
                 raise ValueError(f"sigma of channel `{name}` must be above zero (and not NaN); give the standard deviation of its noise")
 
-    def counted(self) -> Int[Array, ""]:
-        """Number of samples with a finite sigma, each component of a channel counted by itself."""
-        return sum(jnp.sum(jnp.isfinite(self.sigma_of(name))) for name in self.values)
-
-    def sigma_of(self, name: str) -> Float[Array, "times *channel"]:
-        """Sigma of each measured value of the channel `name`, in its unit, shape (times, *channel)."""
+    def sigma_of(self, name: str, repeats: bool = False) -> Float[Array, "..."]:
+        """Sigma of each measured value of the channel `name`, in its unit; `repeats`: the values have a leading axis of repeats."""
         sigma, values = self.sigma[name], self.values[name]
         # one sigma per time acts on all components of the channel
-        aligned = sigma.reshape(sigma.shape + (1,) * (values.ndim - sigma.ndim)) if sigma.ndim else sigma
+        dimensions = values.ndim - int(repeats)
+        aligned = sigma.reshape(sigma.shape + (1,) * (dimensions - sigma.ndim)) if sigma.ndim else sigma
         return jnp.broadcast_to(aligned, values.shape)
 
 
@@ -144,16 +141,16 @@ def _check_same_names(what: str, names, expected) -> None:
 
 
 def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measurements:
-    """The run with its inputs made ready, after its channels and shapes were compared with the scene.
+    """The run with its inputs and functions made ready, after its channels and shapes were compared with the scene.
 
     `repeats`: values have a leading axis. Raises ValueError for an unknown channel, start value or input, and for wrong shapes.
     """
     where = f"run {index} of `{type(scene).__name__}`"
-    q, u, _ = scene.named(**run.start)
-    motion = jax.eval_shape(lambda s: motion_at(s, 0.0, q, u), scene)
+    scene.named(**run.start)
+    channels = {name: channel(function, scene) for name, function in run.functions.items()}
     times = run.ts.shape[0]
     for name, values in run.values.items():
-        shape = (times, *_channel_shape(run, name, motion, where))
+        shape = (times, *(channels[name].shape if name in channels else _named_shape(scene, run, name, where)))
         found = values.shape[1:] if repeats else values.shape
         if found != shape:
             expected = f"(repeats, {', '.join(map(str, shape))})" if repeats else f"{shape}"
@@ -161,16 +158,17 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
             raise ValueError(f"channel `{name}` of {where} has shape {values.shape}, expected {expected} for {times} times{hint}")
         if run.sigma[name].shape not in ((), (times,), shape):
             raise ValueError(f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, expected (), {(times,)} or {shape}")
-    return eqx.tree_at(lambda r: r.inputs, run, as_inputs(scene, run.inputs), is_leaf=lambda x: x is None)
+    ready = as_inputs(scene, run.inputs), channels
+    return eqx.tree_at(lambda r: (r.inputs, r.functions), run, ready, is_leaf=lambda x: x is None or x is run.functions)
 
 
-def _channel_shape(run: Measurements, name: str, motion, where: str) -> tuple[int, ...]:
-    if name in run.functions:
-        return jax.eval_shape(run.functions[name], motion).shape
-    lengths = {slot: length for slot, _, length in motion.q.slots + motion.u.slots}
-    if name not in lengths:
+def _named_shape(scene: Scene, run: Measurements, name: str, where: str) -> tuple[int, ...]:
+    """The shape of a coordinate or speed: of a quaternion (4,), of its rates (3,)."""
+    groups = {group: length for names in (scene.coordinate_names, scene.speed_names) for group, _, length in names.groups}
+    entries = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    if name not in groups and name not in entries:
         raise ValueError(
-            f"{where} has unknown channel `{name}`; {nearest(name, (*lengths, *run.functions))} "
+            f"{where} has unknown channel `{name}`; {nearest(name, (*groups, *entries, *run.functions))} "
             "For other quantities give a function of the motion in `functions`."
         )
-    return (lengths[name],) if lengths[name] else ()
+    return (groups[name],) if name in groups else ()
