@@ -31,6 +31,7 @@ from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.gradients import derivative_exists
 from jourdain_jax.analysis.likelihood import log_likelihood
 from jourdain_jax.analysis.linearize import Linearization, linearize
+from jourdain_jax.analysis.losses import huber, student_t
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.report import Report, report
 from jourdain_jax.analysis.steady import SteadyMotion, steady
@@ -155,6 +156,7 @@ __all__ = [
     "gibbs_equations",
     "gibbs_function",
     "gravity",
+    "huber",
     "inputs",
     "kinetic_energy",
     "knife_edge",
@@ -194,6 +196,7 @@ __all__ = [
     "start",
     "steady",
     "structure_of",
+    "student_t",
     "torque",
     "unbounded",
     "unconstrained_equations",

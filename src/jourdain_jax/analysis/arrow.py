@@ -33,6 +33,12 @@ class Arrow:
 
     local: Float[np.ndarray, "members runs local width"]
     shared: Float[np.ndarray, "members rows columns"]
+    scores: Float[np.ndarray, "members runs _"]  # of each run: gradient in the shared unknowns, its own ones being fitted
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """All that it holds, with the axis of members first."""
+        return self.local, self.shared, self.scores
 
     @property
     def counts(self) -> tuple[int, int, int]:
@@ -42,13 +48,17 @@ class Arrow:
 
     def at(self, members) -> "Arrow":
         """That of some members."""
-        return Arrow(self.local[members], self.shared[members])
+        return Arrow(*(x[members] for x in self.arrays))
 
     def scaled(self, size: Float[np.ndarray, "members unknowns"]) -> "Arrow":
         """In unknowns divided by `size`."""
         shared, local = self.split(size)
         whole = np.concatenate([local, np.broadcast_to(shared[:, None], (*local.shape[:2], shared.shape[1])), np.ones((*local.shape[:2], 1))], axis=-1)
-        return Arrow(self.local * whole[:, :, None], self.shared * np.concatenate([shared, np.ones((len(shared), 1))], axis=-1)[:, None])
+        return Arrow(
+            self.local * whole[:, :, None],
+            self.shared * np.concatenate([shared, np.ones((len(shared), 1))], axis=-1)[:, None],
+            self.scores * shared[:, None],
+        )
 
     def split(self, x: Shaped[np.ndarray, "members unknowns"]) -> tuple[np.ndarray, np.ndarray]:
         """Shared unknowns (members, shared), and those of the runs (members, runs, local)."""
@@ -117,5 +127,7 @@ def eliminated(local: np.ndarray, below: Float[np.ndarray, "members runs local"]
 def arrow(triangles: Float[np.ndarray, "members runs width width"], local: int) -> Arrow:
     """From the triangles of all runs, with `local` unknowns of their own in the first columns."""
     members, runs, width, _ = triangles.shape
-    rest = triangles[:, :, local:, local:].reshape(members, runs * (width - local), width - local)
-    return Arrow(triangles[:, :, :local], np.linalg.qr(rest, mode="r") if runs > 1 else rest)
+    rest = triangles[:, :, local:, local:]
+    scores = np.einsum("bkij,bki->bkj", rest[..., :-1], rest[..., -1])
+    together = rest.reshape(members, runs * (width - local), width - local)
+    return Arrow(triangles[:, :, :local], np.linalg.qr(together, mode="r") if runs > 1 else together, scores)

@@ -6,7 +6,7 @@ by Levenberg-Marquardt. Jacobians come by forward mode through the simulation, r
 Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), chapter 3.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +14,10 @@ import numpy as np
 
 from jourdain_jax.analysis.arrow import arrow, triangle
 from jourdain_jax.analysis.fit_result import Fit
-from jourdain_jax.analysis.information import information
+from jourdain_jax.analysis.information import information, students_t_95
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised, Minimum, minimise
 from jourdain_jax.analysis.likelihood import as_runs
+from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.profile import limits_at_bounds
@@ -30,6 +31,8 @@ from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 
 _NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
+_LEAST_SIGMA = 1e-12  # of a channel that is met exactly
+_FEWEST_RUNS = 5  # that tell how much runs differ
 
 
 def fit(
@@ -40,6 +43,8 @@ def fit(
     cutoff: float = 1e-6,
     tolerance: float = 1e-4,
     max_iterations: int = 50,
+    loss: Loss | None = None,
+    errors: str = "sigmas",
     **simulation,
 ) -> Fit:
     """Estimate the `free` parameters of a scene, and unknown initial values of its runs, from measurements.
@@ -53,6 +58,9 @@ def fit(
       well above the relative accuracy of the simulation.
     - `tolerance`: the fit has converged when a step changes no residual by more than about this many sigmas, and no unknown by
       more than about this fraction. `max_iterations`: steps tried at most.
+    - `loss`: `huber()` or `student_t()` where some samples are far out (default: least squares).
+    - `errors`: whence standard errors and intervals come. "sigmas": from the sigmas, which holds for noise that is white. "runs": from how much runs differ
+      (the sandwich of clusters, which needs five runs or more), which holds whatever the noise within a run, also where the scene is not quite right.
     - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events are ignored.
 
     **Returns** a `Fit`: estimates with covariance and 95 % intervals (the sigmas are taken as known), residuals, the fitted
@@ -70,7 +78,7 @@ def fit(
         print(found)                                              # estimates with 95 % intervals, and what the data cannot tell
         found["offset"].value, found.scene.offset                 # near 0.25 m
     """
-    return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), repeats=False)
+    return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, repeats=False)
 
 
 def fit_batch(
@@ -81,18 +89,20 @@ def fit_batch(
     cutoff: float = 1e-6,
     tolerance: float = 1e-4,
     max_iterations: int = 50,
+    loss: Loss | None = None,
+    errors: str = "sigmas",
     **simulation,
 ) -> Fit:
     """`fit` for many repeats of the same experiment, as one batch.
 
-    Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free`, `cutoff`, `tolerance`, `max_iterations` and
-    `simulation` as in `fit`. **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has `converged` False and harms no other.
+    Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free`, `cutoff`, `tolerance`,
+    `max_iterations`, `loss`, `errors` and `simulation` as in `fit`. **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has `converged` False and harms no other.
     **Raises** as `fit`.
     """
-    return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), repeats=True)
+    return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, repeats=True)
 
 
-def _fit(scene, data, free, simulation: dict, control: Control, repeats: bool) -> Fit:
+def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | None, errors: str, repeats: bool) -> Fit:
     scene = as_scene(scene)
     if is_traced((scene, data, control.tolerance, control.cutoff, simulation)):
         raise DifferentiationModeError(
@@ -100,15 +110,31 @@ def _fit(scene, data, free, simulation: dict, control: Control, repeats: bool) -
             "for many repeats use `fit_batch`, for derivatives of the fit's objective `log_likelihood`."
         )
     runs = as_runs(scene, data, repeats=repeats)
+    _check_choices(runs, loss, errors)
     unknowns = unknowns_of(scene, runs, free)
     with reference_parameters(scene):
         check_starts(scene, runs, unknowns)
         members = _repeats(runs) if repeats else None
         _check_enough(runs, unknowns, repeats)
-        problem = _Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members))
+        problem = _Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members), loss or LEAST_SQUARES)
         theta = np.broadcast_to(unknowns.guess, (members or 1, unknowns.guess.size))
         limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
-        return _result(problem, minimise(problem.linearised, theta, limits, control), limits, control)
+        return _result(problem, minimise(problem.linearised, theta, limits, control), limits, control, errors)
+
+
+def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:
+    if loss is not None and not isinstance(loss, Loss):
+        raise ValueError(f"`loss` is {loss!r}, expected `huber()`, `student_t()`, or None for least squares")
+    if errors not in ("sigmas", "runs"):
+        raise ValueError(f'`errors` is {errors!r}, expected "sigmas" or "runs"')
+    if errors == "runs" and len(runs) < _FEWEST_RUNS:
+        raise ValueError(f'errors="runs" takes standard errors from how runs differ, but there are {len(runs)}; give {_FEWEST_RUNS} or more, or errors="sigmas"')
+    unknown = sorted({name for run in runs for name in run.unknown_sigma})
+    if unknown and loss is not None:
+        raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a robust loss needs to know what is far out; give a number")
+    for name in unknown:
+        if any(name in run.values and name not in run.unknown_sigma for run in runs):
+            raise ValueError(f"sigma of channel `{name}` is None in one run and given in another; give it in all runs, or in none")
 
 
 def _repeats(runs: Sequence[Measurements]) -> int:
@@ -129,47 +155,91 @@ def _check_enough(runs: Sequence[Measurements], unknowns: Unknowns, repeats: boo
 class _Problem:
     """Residuals with their derivatives, of any members at any numbers."""
 
-    def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Lanes):
-        self.scene, self.runs, self.unknowns, self.lanes = scene, runs, unknowns, lanes
+    def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss):
+        self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
+        self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
 
     def linearised(self, theta: np.ndarray, members: np.ndarray) -> Linearised:
-        """Half the sum of squares with its arrow, of some members."""
+        """What is minimised, with its arrow, of some members: sum of rho(r); for channels whose sigma is not known, n log sigma with sigma^2 = mean r^2."""
         shared, local = self.unknowns.split(theta)
-        (_, runs, m), p = local.shape, shared.shape[1]
-        triangles, costs = np.empty((len(theta), runs, m + p + 1, m + p + 1)), np.zeros(len(theta))
-        residual = np.empty((len(theta), runs), object)
+        (count, runs, m), p, kinds = local.shape, shared.shape[1], 1 + len(self.estimated)
+        triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
+        cost, squares, samples = np.zeros(count), np.zeros((count, kinds)), self.lanes.counted(self.estimated, members)
+        residual = np.empty((count, runs), object)
         for b, j, r, J in self.lanes.evaluate(shared, local, members):
             with np.errstate(over="ignore", invalid="ignore"):
-                triangles[b, j] = triangle(r, J)
-                np.add.at(costs, b, 0.5 * np.sum(r**2, axis=1))
+                for k, (rows, counted) in enumerate(self._kinds(int(j[0]), r)):
+                    root = np.sqrt(self.loss.weight(rows))
+                    triangles[b, j, k] = triangle(root * rows, root[..., None] * J[:, counted])
+                    np.add.at(squares, (b, k), np.sum(rows**2, axis=1))
+                    if k == 0:
+                        np.add.at(cost, b, self.loss.value(rows))
             for place, one in zip(zip(b, j, strict=True), r, strict=True):
                 residual[place] = one
-            if len(theta) == 1 and not np.all(np.isfinite(triangles[b, j])):  # whatever the other runs say
+            if count == 1 and not np.all(np.isfinite(triangles[b, j])):  # whatever the other runs say
                 triangles.fill(np.nan)
                 break
-        finite = np.isfinite(triangles).all(axis=(1, 2, 3)) & np.isfinite(costs)
-        return Linearised(np.where(finite, costs, np.inf), arrow(np.where(finite[:, None, None, None], triangles, 0.0), m), residual)
+        sigma = np.sqrt(np.maximum(squares[:, 1:] / samples, _LEAST_SIGMA**2))
+        cost = cost + np.sum(samples * np.log(sigma), axis=1)
+        finite = np.isfinite(triangles).all(axis=(1, 2, 3, 4)) & np.isfinite(cost)
+        scaled = np.where(finite[:, None, None, None, None], triangles, 0.0) / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
+        together = scaled[:, :, 0] if kinds == 1 else np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
+        return Linearised(np.where(finite, cost, np.inf), arrow(together, m), residual, sigma)
+
+    def by_channel(self, run: int, found: Minimum, one: Callable) -> dict[str, np.ndarray]:
+        """Residuals of a run in units of sigma by channel; NaN where a sample is missing, or they were not worked out since another run had failed."""
+        flat = [np.zeros(0) if r is None else r for r in found.at.residual[:, run]]
+        longest = max(map(len, flat))
+        parts = self.lanes.by_channel(run, one(np.stack([np.full(longest, np.nan) if len(r) < longest else r for r in flat])))
+        for k, name in enumerate(self.estimated):
+            if name in parts:
+                sigma = one(found.at.sigma[:, k])
+                parts[name] = parts[name] / sigma.reshape(sigma.shape + (1,) * (parts[name].ndim - sigma.ndim))
+        return parts
+
+    def inflation(self, residuals, samples, rank) -> np.ndarray:
+        """By what the covariance of each member is to be multiplied: for the loss, and for sigmas that are estimated."""
+        members = self.lanes.members or 1
+        by_member = [np.concatenate([r.reshape(members, -1)[b] for run in residuals for r in run.values()]) for b in range(members)]
+        of_loss = np.array([self.loss.inflation(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in by_member])
+        every = bool(self.estimated) and all(set(run.values) <= set(self.estimated) for run in self.runs)
+        left = np.maximum(samples - rank, 1)
+        return of_loss * np.broadcast_to(samples / left if every else 1.0, (members,))
+
+    def _kinds(self, run: int, r: np.ndarray):
+        """Residuals and their places: those of channels whose sigma is known, then those of each other channel."""
+        if not self.estimated:
+            yield r, slice(None)
+            return
+        channels = self.lanes.channels(run)
+        known = [np.arange(r.shape[1])[where] for name, where in channels.items() if name not in self.estimated]
+        for counted in (np.concatenate([np.zeros(0, int), *known]), *(np.arange(r.shape[1])[channels.get(name, slice(0))] for name in self.estimated)):
+            yield r[:, counted], counted
 
 
-def _result(problem: _Problem, found: Minimum, limits: Limits, control: Control) -> Fit:
+def _result(problem: _Problem, found: Minimum, limits: Limits, control: Control, errors: str) -> Fit:
     unknowns, theta, single = problem.unknowns, found.theta, problem.lanes.members is None
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     low, high = limits.low[places], limits.high[places]
     bound = (theta <= limits.low) | (theta >= limits.high)
     limit, beyond = (one(x[:, places]) for x in limits_at_bounds(problem.linearised, found, limits, control))
+    residuals = tuple(problem.by_channel(run, found, one) for run in range(len(problem.runs)))
+    samples = sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())
     known = information(found.at.arrow, size, places, bound, fails, control.cutoff, single)
+    known = known.times(one(problem.inflation(residuals, samples, known.rank)))
     reach = _NORMAL_95 * known.standard_errors
+    if errors == "runs":
+        known = known.between_runs(one(found.at.arrow.scores))
+        reach = students_t_95(len(problem.runs) - 1) * known.standard_errors
     values = one(theta[:, places])
     shared, local = unknowns.split(theta)
     scene = unknowns.layout.scene(problem.scene, jnp.asarray(one(shared)))
     if not single:
         scene = jax.tree.map(lambda x, own: x if x is not own else jnp.broadcast_to(own, (len(theta), *own.shape)), scene, problem.scene)
-    starts = tuple(unknowns.layout.start(run.start, one(local[:, i])) for i, run in enumerate(problem.runs))
-    residuals = tuple(problem.lanes.by_channel(i, one(_stacked(found.at.residual[:, i]))) for i in range(len(problem.runs)))
     return Fit(
         scene=scene,
-        starts=starts,
+        starts=tuple(unknowns.layout.start(run.start, one(local[:, i])) for i, run in enumerate(problem.runs)),
         values=values,
         sizes=one(size[:, places]),
         standard_errors=known.standard_errors,
@@ -179,18 +249,19 @@ def _result(problem: _Problem, found: Minimum, limits: Limits, control: Control)
         beyond=beyond,
         information=known,
         residuals=residuals,
-        chi_square=one(np.where(fails, np.nan, 2 * found.at.cost)),
-        samples=np.asarray(sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())),
+        sigma={name: one(found.at.sigma[:, k]) for k, name in enumerate(problem.estimated)},
+        chi_square=np.where(one(fails), np.nan, sum(_sum_of_squares(r, single) for run in residuals for r in run.values())),
+        samples=np.asarray(samples),
         converged=one(found.converged),
         stuck=one(found.stuck),
         steps=one(found.steps),
         labels=unknowns.labels,
         units=unknowns.units,
         cutoff=control.cutoff,
+        errors=errors,
     )
 
 
-def _stacked(residuals: np.ndarray) -> np.ndarray:
-    """Residuals of a run, of all members; NaN where they were not worked out, since another run had failed."""
-    length = max((len(r) for r in residuals if r is not None), default=None)
-    return np.stack([np.full(length or 0, np.nan) if r is None else r for r in residuals])
+def _sum_of_squares(r: np.ndarray, single: bool) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        return np.asarray(np.nansum(r**2, axis=tuple(range(0 if single else 1, r.ndim))))

@@ -55,6 +55,7 @@ class Fit(Printed, eqx.Module):
     beyond: Float[np.ndarray, "*repeats unknowns"]  # of these, by how many standard errors the data would put them beyond; NaN elsewhere
     information: Information
     residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # (times, *channel): (prediction - value) / sigma; NaN where missing
+    sigma: dict[str, Float[np.ndarray, "*repeats"]]  # of channels whose noise was estimated
     chi_square: Float[np.ndarray, "*repeats"]
     samples: Int[np.ndarray, "*repeats"]  # with a finite sigma
     converged: Bool[np.ndarray, "*repeats"]
@@ -63,6 +64,7 @@ class Fit(Printed, eqx.Module):
     labels: tuple[str, ...] = eqx.field(static=True)  # names of the unknowns
     units: tuple[str, ...] = eqx.field(static=True)
     cutoff: float = eqx.field(static=True)
+    errors: str = eqx.field(static=True)  # whence standard errors come: "sigmas" or "runs"
 
     def __getitem__(self, name: str) -> Estimate:
         if name not in self.labels:
@@ -124,22 +126,49 @@ class Fit(Printed, eqx.Module):
 
     @property
     def warning(self) -> str:
-        """Why the estimates should not be relied on, in one sentence; empty where nothing speaks against them."""
+        """Why the estimates should not be relied on, the first reason in one sentence; empty where nothing speaks against them."""
+        return next(iter(self.warnings), "")
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why estimates or intervals should not be relied on, the most serious reason first, one sentence each."""
         if not np.isfinite(self.chi_square):
-            return "the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`"
+            return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`",)
+        found = []
         if self.stuck:
-            return "no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere"
+            found.append("no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere")
+        elif not self.converged:
+            found.append("no minimum was found; raise `max_iterations`, or start nearer to it")
         if np.any(self.beyond > FAR_BEYOND):
             names = ", ".join(f"`{name}`" for name, far in zip(self.labels, self.beyond, strict=True) if far > FAR_BEYOND)
-            return f"{names} lies at a bound, which decides its value; all standard errors lose their meaning: widen the bounds"
-        if not self.converged:
-            return "no minimum was found; raise `max_iterations`, or start nearer to it"
-        if self.impossible:
-            return self.impossible[0]
+            found.append(f"{names} lies at a bound, which decides its value; all standard errors lose their meaning: widen the bounds")
+        found += self.impossible
         # chi-square has mean n and variance 2 n
         if self.reduced_chi_square > 1 + 5 * np.sqrt(2 / max(int(self.degrees_of_freedom), 1)):
-            return "the residuals are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, or sigmas that are too small"
-        return ""
+            found.append(
+                "the residuals are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, or sigmas that are too small"
+            )
+        if self.errors == "sigmas":
+            coloured = [f"`{name}` ({rho:.2f})" for name, (rho, limit) in self.autocorrelation.items() if abs(rho) > limit]
+            if coloured:
+                found.append(
+                    f"residuals of {', '.join(coloured)} are not white (in brackets: correlation of neighbouring ones), which makes intervals too narrow: the "
+                    'scene, a sensor or the noise is not right; with five runs or more, errors="runs" gives intervals that allow for it'
+                )
+        return tuple(found)
+
+    @property
+    def autocorrelation(self) -> dict[str, tuple[float, float]]:
+        """Of each channel, the correlation of neighbouring residuals over all runs, and what white residuals hardly exceed (3.5 / sqrt(pairs))."""
+        found = {}
+        for name in dict.fromkeys(name for run in self.residuals for name in run):
+            runs = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in self.residuals if name in run]
+            products = np.concatenate([np.ravel(r[1:] * r[:-1]) for r in runs])
+            squares = np.concatenate([np.ravel(r) ** 2 for r in runs])
+            pairs, size = np.isfinite(products).sum(), np.nanmean(squares) if np.isfinite(squares).any() else 0.0
+            if pairs and size > 0:
+                found[name] = float(np.nanmean(products) / size), 3.5 / float(np.sqrt(pairs))
+        return found
 
     def residual_summary(self) -> tuple[ChannelResiduals, ...]:
         """Count, mean, rms and largest residual per run and channel."""
@@ -160,7 +189,10 @@ def _text(fit: Fit) -> str:
         f"Fit of {type(fit.scene).__name__}: {'converged' if fit.converged else 'NOT CONVERGED'} in {int(fit.steps)} steps; "
         f"{int(fit.samples)} samples, {len(fit.labels)} unknowns, reduced chi-square {float(fit.reduced_chi_square):.4g}"
     ]
-    lines += [f"WARNING: {fit.warning}"] if fit.warning else []
+    lines += [f"WARNING: {sentence}" for sentence in fit.warnings]
+    if fit.errors == "runs":
+        lines.append(f"standard errors from how much the {len(fit.residuals)} runs differ")
+    lines += [f"sigma of `{name}`, estimated: {float(sigma):.4g}" for name, sigma in fit.sigma.items()]
     rows = [("unknown", "unit", "estimate", "std. error", "95 % interval")]
     for name, e in fit.estimates.items():
         error = f"{e.standard_error:.2g}" if np.isfinite(e.standard_error) else "-"

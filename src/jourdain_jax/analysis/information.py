@@ -47,6 +47,33 @@ class Information(eqx.Module):
         return np.where(both, found, np.nan)
 
 
+    def times(self, factor: Float[np.ndarray, "*members"]) -> "Information":
+        """With all covariances multiplied by this factor."""
+        f = factor[..., None]
+        changed = self.standard_errors * np.sqrt(f), self.shared * f[..., None], self.own * f[..., None, None]
+        return eqx.tree_at(lambda i: (i.standard_errors, i.shared, i.own), self, changed)
+
+    def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
+        """With the covariance of the shared unknowns from how much runs differ: C (sum g g') C n / (n - 1), g: scores of n runs, C: the covariance so far.
+
+        Own unknowns follow the shared ones; the spread of their own noise stays as it is. Source: K.-Y. Liang and S. L. Zeger, Biometrika 73 (1986) 13.
+        """
+        runs, p = scores.shape[-2:]
+        shared = self.shared @ (np.swapaxes(scores, -1, -2) @ scores) @ self.shared * runs / (runs - 1)
+        of_shared = np.diagonal(shared, axis1=-2, axis2=-1)
+        of_own = np.diagonal(self.own, axis1=-2, axis2=-1) + np.einsum("...kij,...jl,...kil->...ki", self.follow, shared, self.follow)
+        variance = np.concatenate([of_shared, of_own.reshape(*of_own.shape[:-2], -1)], axis=-1)[..., np.array(self.estimated, int)]
+        errors = np.where(self.identifiable, np.sqrt(variance), np.nan)
+        return eqx.tree_at(lambda i: (i.standard_errors, i.shared), self, (errors, shared))
+
+
+def students_t_95(degrees: int) -> float:
+    """97.5 % quantile of Student's t, to 0.1 % from four degrees of freedom on: M. Abramowitz and I. A. Stegun, Handbook (1964), 26.7.5."""
+    z, n = 1.959963984540054, degrees
+    terms = z**3 + z, 5 * z**5 + 16 * z**3 + 3 * z, 3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z, 79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z
+    return z + sum(term / (scale * n ** (k + 1)) for k, (term, scale) in enumerate(zip(terms, (4, 96, 384, 92160), strict=True)))
+
+
 def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimated: np.ndarray, bound, fails, cutoff: float, single: bool) -> Information:
     """Information of an arrow in units of sigma.
 

@@ -27,6 +27,7 @@ class Linearised:
     cost: Float[np.ndarray, "members"]  # F; not finite where the motion fails
     arrow: Arrow  # J and residuals with J'r = dF/dtheta
     residual: np.ndarray  # (members, runs) of vectors
+    sigma: Float[np.ndarray, "members channels"]  # of channels whose noise is estimated
 
 
 @dataclass(frozen=True)
@@ -87,8 +88,10 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Fl
             better = np.isfinite(trial.cost) & ((found > 1e-4 * promised) | level)
             ratio = np.where(np.isfinite(found), found / np.maximum(promised, np.finfo(float).tiny), -1.0)
         rising = here[better]
-        theta[rising], at.cost[rising], at.residual[rising] = (x + d)[better], trial.cost[better], trial.residual[better]
-        at.arrow.local[rising], at.arrow.shared[rising] = trial.arrow.local[better], trial.arrow.shared[better]
+        theta[rising], at.cost[rising] = (x + d)[better], trial.cost[better]
+        at.residual[rising], at.sigma[rising] = trial.residual[better], trial.sigma[better]
+        for kept, new in zip(at.arrow.arrays, trial.arrow.arrays, strict=True):
+            kept[rising] = new[better]
         damping[here] = np.where(better, np.where(ratio > 0.75, damping[here] / 10, np.where(ratio < 0.25, damping[here] * 3, damping[here])), damping[here] * growth[here])
         damping[here] = np.where(better & level, LEAST, np.maximum(damping[here], LEAST))
         growth[here] = np.where(better, 4.0, growth[here] * 2)

@@ -32,13 +32,15 @@ def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **
     """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
     Differentiable in scene, start values, measured values and sigmas (reverse mode, unless `adjoint` says otherwise); -inf where
-    the motion fails. `simulation`: options of `simulate`. Samples with an infinite sigma do not count.
+    the motion fails. `simulation`: options of `simulate`. Missing samples (NaN, or an infinite sigma) do not count.
 
         jax.grad(lambda a: jj.log_likelihood(sleigh.replace(offset=a), data))(0.25)
 
     **Raises** ValueError for measurements that do not fit the scene.
     """
     runs = as_runs(scene, data)
+    if unknown := sorted({name for run in runs for name in run.unknown_sigma}):
+        raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a likelihood needs the standard deviation of its noise; give a number")
     total = jnp.zeros(())
     for alike in equal_runs(runs):  # one batch
 

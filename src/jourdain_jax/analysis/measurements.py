@@ -29,7 +29,8 @@ class Measurements(eqx.Module):
     - `ts`: times in s, strictly increasing.
     - `values`: channel -> measured values, shape (times, *channel). A channel is a coordinate, a speed, or a name in `functions`.
     - `sigma`: standard deviation of the noise, in the unit of the channel: channel -> number, (times,) or the shape of its
-      values; or one number for all channels. An infinite sigma marks a sample that is missing (give any finite value there).
+      values; or one number for all channels. None: not known; one sigma for all samples of the channel in all runs is estimated.
+      NaN in `values`, or an infinite sigma, marks a sample that is missing.
     - `start`: coordinate or speed -> value at `t0`. These are held; what is not given is solved for, as by `jj.start`.
     - `unknown_start`: names in `start` whose values are first guesses, to be estimated; or name -> `bounds(...)`, `positive()`,
       `unbounded()` (None: unbounded).
@@ -38,7 +39,7 @@ class Measurements(eqx.Module):
       `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`.
     - `t0`: time of the start in s; default: the first of `ts`.
 
-    **Raises** ValueError for times that do not increase, values that are not finite, sigmas that are not positive, and names
+    **Raises** ValueError for times that do not increase, values that are infinite, channels without any value, sigmas that are not positive, and names
     that do not match.
     """
 
@@ -50,6 +51,7 @@ class Measurements(eqx.Module):
     inputs: dict | Inputs | None
     functions: dict[str, Callable]
     t0: Float[Array, ""]  # s
+    unknown_sigma: tuple[str, ...] = eqx.field(static=True)  # channels; their sigma here is 1
 
     def __init__(
         self,
@@ -71,7 +73,8 @@ class Measurements(eqx.Module):
                 raise ValueError(f'`{what}` of `Measurements` is {described(part)}, expected a dictionary by name, such as {{"x": ...}}')
         self.values = _reals("values of channel", values)
         given = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.values, sigma)
-        self.sigma = _reals("sigma of channel", given)
+        self.unknown_sigma = tuple(sorted(name for name, value in given.items() if value is None))
+        self.sigma = _reals("sigma of channel", {name: 1.0 if value is None else value for name, value in given.items()})
         self.start = _reals("start value", start)
         self.unknown_start = dict(unknown_start) if isinstance(unknown_start, Mapping) else dict.fromkeys(as_names(unknown_start))
         self.inputs = inputs
@@ -93,11 +96,13 @@ class Measurements(eqx.Module):
             if name not in self.start:
                 raise ValueError(f"unknown start value `{name}` has no first guess; give one in `start`. {nearest(name, self.start)}")
         for name, value in self.values.items():
-            if not _holds(np.isfinite, value):
+            if not _holds(lambda x: ~np.isinf(x), value):
                 raise ValueError(
-                    f"channel `{name}` holds values that are not finite, the first at sample {_first_bad(value)}; leave these "
-                    "samples out, or give them any finite value and an infinite sigma"
+                    f"channel `{name}` holds values that are infinite, the first at sample {int(np.argwhere(np.isinf(np.asarray(value)))[0][0])}; "
+                    "give NaN for samples that are missing"
                 )
+            if not _holds(lambda x: ~np.all(np.isnan(x)), value):
+                raise ValueError(f"channel `{name}` holds no value at all, only NaN; leave the channel out")
         for name, value in self.sigma.items():
             if not _holds(lambda x: x > 0, value):
                 raise ValueError(f"sigma of channel `{name}` must be above zero (and not NaN); give the standard deviation of its noise")
@@ -125,10 +130,6 @@ def _check_times(ts) -> None:
         raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
     if not (_holds(np.isfinite, ts) and _holds(lambda t: np.diff(t) > 0, ts)):
         raise ValueError("`ts` must be finite and strictly increasing; sort the samples by time and merge repeated ones")
-
-
-def _first_bad(x) -> int:
-    return int(np.argwhere(~np.isfinite(np.asarray(x)))[0][0])
 
 
 def _check_same_names(what: str, names, expected) -> None:

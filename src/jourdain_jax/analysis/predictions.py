@@ -87,10 +87,28 @@ class Lanes:
         for group in self._groups:
             yield from group.evaluate(shared, local, members)
 
+    def counted(self, names: Sequence[str], members: np.ndarray) -> Float[np.ndarray, "members names"]:
+        """Samples of each of these channels that are not missing, in all runs."""
+        found = np.zeros((len(members), len(names)))
+        for k, name in enumerate(names):
+            for group in self._groups:
+                weights = group.weights.get(name)
+                if weights is not None:
+                    here = np.count_nonzero(weights, axis=tuple(range(2, weights.ndim))) if self.members is not None else np.count_nonzero(weights)
+                    found[:, k] += here.sum(axis=0)[members] if self.members is not None else here
+        return found
+
+    def channels(self, run: int) -> dict[str, slice]:
+        """Where the samples of each channel are in the residuals of a run."""
+        return self._group_of(run).channels
+
     def by_channel(self, run: int, flat: Float[np.ndarray, "*members samples"]) -> dict[str, np.ndarray]:
         """Weighted residuals of a run by channel, NaN where a sample is missing."""
-        group = next(g for g in self._groups if run in g.indices)
+        group = self._group_of(run)
         return group.by_channel(group.indices.index(run), flat, self.lengths[run])
+
+    def _group_of(self, run: int) -> "_Group":
+        return next(g for g in self._groups if run in g.indices)
 
 
 class _Group:
@@ -105,7 +123,9 @@ class _Group:
         self._common, rest = eqx.partition((scene, simulation), _is_array)
         static = jax.tree.flatten((rest, eqx.partition(filled[0], _is_array)[1], layout))
         self._run = _program(static[1], tuple(static[0]))
-        self.samples = sum(int(np.prod(w.shape[0 if members is None else 1 :])) for w in filled[0].weights.values())
+        sizes = {name: int(np.prod(w.shape[0 if members is None else 1 :])) for name, w in sorted(filled[0].weights.items())}
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        self.channels = {name: slice(begin, end) for name, begin, end in zip(sizes, ends[:-1], ends[1:], strict=True)}
         states = times * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
         self._width = int(min(MOST_LANES, max(1, TOUCHED // states)))
         self._kept: tuple = ((), [])
@@ -149,17 +169,19 @@ class _Group:
         r, J = (np.asarray(x)[:kept] for x in found)
         return b[:kept], runs[:kept], r, J
 
+    @property
+    def weights(self) -> dict[str, np.ndarray]:
+        """Weights by channel, shape (runs, *members, times, *channel)."""
+        return self._arrays.weights
+
     def by_channel(self, place: int, flat, times: int) -> dict[str, np.ndarray]:
-        found, begin = {}, 0
-        weights = jax.tree.map(lambda x: x[place], self._arrays.weights)
-        for name in sorted(weights):
-            weight = weights[name]
+        """Residuals of the run at this place by channel; all NaN where `flat` is empty, since they were not worked out."""
+        found = {}
+        for name, where in self.channels.items():
+            weight = self._arrays.weights[name][place]
             shape = weight.shape if self._members is None else weight.shape[1:]
-            size = int(np.prod(shape))
-            part = flat[..., begin : begin + size].reshape(*flat.shape[:-1], *shape)
-            begin += size
-            cut = (slice(None),) * (flat.ndim - 1) + (slice(times),)
-            found[name] = np.where(weight > 0, part, np.nan)[cut]
+            part = flat[..., where].reshape((*flat.shape[:-1], *shape)) if flat.shape[-1] else np.full((*flat.shape[:-1], *shape), np.nan)
+            found[name] = np.where(weight > 0, part, np.nan)[(slice(None),) * (flat.ndim - 1) + (slice(times),)]
         return found
 
 
