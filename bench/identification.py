@@ -2,9 +2,10 @@
 
     python bench/identification.py [--quick] [--only NAME ...] [--json FILE]
 
-Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), coverage, windows (57 runs of the steer-by-wire bicycle with
-an unknown start each; the data are in `data/sbw_bicycle`). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and
-takes fewer repeats. Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
+Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), coverage, windows (57 runs of the steer-by-wire
+bicycle with an unknown start each; the data are in `data/sbw_bicycle`). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick`
+leaves out windows and takes fewer repeats. Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh
+process.
 """
 
 import argparse
@@ -90,8 +91,10 @@ def disc(repeats: int) -> list[Figure]:
 
     times = processor_times({"fit": ours, "differences": differences, "jacfwd": forward}, repeats)
     apart = np.max(np.abs(found["fit"].values - found["scipy"].x) / found["fit"].standard_errors)
-    print(f"  fit {1e3 * times['fit']:.1f} ms ({int(found['fit'].steps)} steps), SciPy with differences {1e3 * times['differences']:.1f} ms "
-          f"({found['scipy'].nfev} steps), with jacfwd {1e3 * times['jacfwd']:.1f} ms ({found['jacfwd'].nfev} steps)")
+    print(
+        f"  fit {1e3 * times['fit']:.1f} ms ({int(found['fit'].steps)} steps), SciPy with differences {1e3 * times['differences']:.1f} ms "
+        f"({found['scipy'].nfev} steps), with jacfwd {1e3 * times['jacfwd']:.1f} ms ({found['jacfwd'].nfev} steps)"
+    )
     return [
         figure("warm fit over SciPy with differences", "tilting-disc", times["fit"] / times["differences"], 0.5),
         figure("warm fit over SciPy with jacfwd", "tilting-disc", times["fit"] / times["jacfwd"], 0.6),
@@ -165,7 +168,9 @@ def coverage(repeats: int) -> list[Figure]:
         fits = jj.fit_batch(jj.models.TiltingDisc(radius=0.51, gravity=10.0), data, ("radius", "gravity"))
         truth = np.array([0.5, 9.81, 0.3, -3.0])
         share = np.mean((fits.low < truth) & (truth < fits.high), axis=0)
-        found += [figure(f"intervals that hold the truth, %, {label}, {name}", "tilting-disc", 100 * float(s)) for label, s in zip(fits.labels, share, strict=True)]
+        found += [
+            figure(f"intervals that hold the truth, %, {label}, {name}", "tilting-disc", 100 * float(s)) for label, s in zip(fits.labels, share, strict=True)
+        ]
         for entry in found[-4:]:
             entry |= {"required": [93, 97], "met": 93 <= entry["value"] <= 97}
     return found
@@ -178,7 +183,7 @@ class SteerByWire(WhippleBicycle):
     """A Whipple bicycle whose steer motor gives `gain` times what is commanded, with damping of steer and lean."""
 
     steer_damping: jnp.ndarray = jj.parameter(0.3, unit="N m s/rad", non_negative=True)
-    lean_damping: jnp.ndarray = jj.parameter(1.0, unit="N m s/rad")
+    lean_damping: jnp.ndarray = jj.parameter(1.0, unit="N m s/rad", non_negative=True)
     gain: jnp.ndarray = jj.parameter(1.0)
 
     def loads(self, motion):
@@ -193,7 +198,7 @@ NOMINAL = {
     "IBxx": 1.64, "IByy": 2.0, "IBzz": 1.94, "IBxz": 0.654, "xH": 0.944, "zH": -0.595, "mH": 0.6, "IHxx": 0.1, "IHyy": 0.1, "IHzz": 0.1, "IHxz": -0.00044,
     "rF": 0.3498, "mF": 1.780, "IFxx": 0.0644, "IFyy": 0.1289,
 }  # fmt: skip
-FREE = {name: None for name in ("gain", "steer_damping", "lean_damping", "IBxz", "zB", "c")} | {
+FREE = dict.fromkeys(("gain", "steer_damping", "lean_damping", "IBxz", "zB", "c")) | {
     "IBxx": jj.bounds(0.2, 8.0),
     "IBzz": jj.bounds(0.2, 8.0),
     "IHzz": jj.bounds(0.001, 1.0),
@@ -232,7 +237,9 @@ def report_windows() -> None:
     again, warm = fit_windows(57)
     print("\n".join(line for line in str(found).split("\n") if "run " not in line and not line.strip()[:2].isdigit()))
     small = processor_times({count: lambda count=count: fit_windows(count, max_iterations=2) for count in (8, 32)}, 2)
-    print(json.dumps({"cold": cold, "warm": warm, "memory": memory, "steps": int(found.steps), "converged": bool(again.converged), "ratio": small[32] / small[8]}))
+    print(
+        json.dumps({"cold": cold, "warm": warm, "memory": memory, "steps": int(found.steps), "converged": bool(again.converged), "ratio": small[32] / small[8]})
+    )
 
 
 START_UP = 3.0  # s, to import all; counted in

@@ -13,13 +13,13 @@ from oracles import chaplygin_sleigh as sleigh_oracle
 from oracles import rattleback as rattleback_oracle
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.ranges import bounds, positive, unbounded
+from jourdain_jax.analysis import predictions
 from jourdain_jax.analysis.arrow import arrow, triangle
 from jourdain_jax.analysis.fit import fit, fit_batch
-from jourdain_jax.analysis import predictions
 from jourdain_jax.analysis.information import hidden_combinations, information, students_t_95
 from jourdain_jax.analysis.likelihood import log_likelihood
 from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.ranges import bounds, unbounded
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
 from jourdain_jax.models.rattleback import Rattleback
@@ -603,7 +603,10 @@ def test_two_hidden_directions_and_a_parameter_that_does_nothing():
         (lambda: fit(CART, cart_run(), ("mass",), errors="hac"), "`errors` is 'hac', expected"),
         (lambda: fit(CART, cart_run(), ("mass",), errors="runs"), "from how runs differ, but there are 1; give 5 or more"),
         (lambda: fit(CART, cart_run(sigma={"x": None, "x_rate": 1.0}), ("mass",), loss=jj.huber()), "sigma of channel `x` is None, but a robust loss"),
-        (lambda: fit(CART, [cart_run(), cart_run(sigma={"x": None, "x_rate": 1.0})], ("mass",)), "sigma of channel `x` is None in one run and given in another"),
+        (
+            lambda: fit(CART, [cart_run(), cart_run(sigma={"x": None, "x_rate": 1.0})], ("mass",)),
+            "sigma of channel `x` is None in one run and given in another",
+        ),
         (lambda: log_likelihood(CART, cart_run(sigma=None)), "sigma of channel `x` is None, but a likelihood needs"),
         (lambda: jj.huber(0.0), r"huber\(0.0\): expected a positive finite number"),
         (lambda: jj.student_t(np.inf), r"student_t\(inf\): expected a positive finite number"),

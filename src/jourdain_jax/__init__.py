@@ -24,7 +24,6 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
 
 from jourdain_jax import models
-from jourdain_jax.analysis.ranges import bounds, positive, unbounded
 from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
 from jourdain_jax.analysis.fit import fit, fit_batch
 from jourdain_jax.analysis.fit_result import Fit
@@ -33,6 +32,7 @@ from jourdain_jax.analysis.likelihood import log_likelihood
 from jourdain_jax.analysis.linearize import Linearization, linearize
 from jourdain_jax.analysis.losses import huber, student_t
 from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.ranges import bounds, positive, unbounded
 from jourdain_jax.analysis.report import Report, report
 from jourdain_jax.analysis.steady import SteadyMotion, steady
 from jourdain_jax.analysis.verification import Verification

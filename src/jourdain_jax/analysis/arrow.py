@@ -88,7 +88,7 @@ class Arrow:
 
     def step(self, damping: Float[np.ndarray, "members"], D, held, moved, cutoff) -> Float[np.ndarray, "members unknowns"]:
         """The damped step; unknowns that are `held` move by `moved`. D: (members, unknowns), positive."""
-        _, m, p = self.counts
+        _, m, _ = self.counts
         local, shared = self.local.copy(), self.shared.copy()
         (held_s, held_l), (moved_s, moved_l) = (self.split(x) for x in (held, np.where(held, moved, 0.0)))
         local[..., -1] += np.einsum("bkij,bkj->bki", local[..., :m], moved_l) + np.einsum("bkij,bj->bki", local[..., m:-1], moved_s)

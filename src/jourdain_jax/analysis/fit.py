@@ -63,11 +63,13 @@ def fit(
       (the sandwich of clusters, which needs five runs or more), which holds whatever the noise within a run, also where the scene is not quite right.
     - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events are ignored.
 
-    **Returns** a `Fit`: estimates with covariance and 95 % intervals (the sigmas are taken as known), residuals, the fitted
-    scene, and in words what the measurements cannot tell. `converged` is False where no minimum was found.
+    **Returns** a `Fit`: estimates with covariance and 95 % intervals (sigmas that were given are taken as known), residuals, the fitted
+    scene, and in words what the measurements cannot tell. An unknown at its bound has a one-sided interval, by profile likelihood. `converged` is False
+    where no minimum was found. Runs of equal structure go through one compiled program, whatever their number and lengths; time and memory are
+    proportional to the number of runs.
 
     **Raises** ValueError for names, shapes or numbers that do not fit, no or too many unknowns, and a start that contradicts the
-    constraints.
+    constraints; DifferentiationModeError inside `jit`, `vmap` or a derivative, since steps are chosen outside of compiled code.
 
     **Examples**
 
@@ -96,8 +98,8 @@ def fit_batch(
     """`fit` for many repeats of the same experiment, as one batch.
 
     Every array in the `values` of `data` has a leading axis `repeats`; all else is shared. `free`, `cutoff`, `tolerance`,
-    `max_iterations`, `loss`, `errors` and `simulation` as in `fit`. **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has `converged` False and harms no other.
-    **Raises** as `fit`.
+    `max_iterations`, `loss`, `errors` and `simulation` as in `fit`. **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has
+    `converged` False and harms no other. **Raises** as `fit`.
     """
     return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, repeats=True)
 
@@ -128,7 +130,9 @@ def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:
     if errors not in ("sigmas", "runs"):
         raise ValueError(f'`errors` is {errors!r}, expected "sigmas" or "runs"')
     if errors == "runs" and len(runs) < _FEWEST_RUNS:
-        raise ValueError(f'errors="runs" takes standard errors from how runs differ, but there are {len(runs)}; give {_FEWEST_RUNS} or more, or errors="sigmas"')
+        raise ValueError(
+            f'errors="runs" takes standard errors from how runs differ, but there are {len(runs)}; give {_FEWEST_RUNS} or more, or errors="sigmas"'
+        )
     unknown = sorted({name for run in runs for name in run.unknown_sigma})
     if unknown and loss is not None:
         raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a robust loss needs to know what is far out; give a number")
@@ -234,9 +238,9 @@ def _result(problem: _Problem, found: Minimum, limits: Limits, control: Control,
         reach = students_t_95(len(problem.runs) - 1) * known.standard_errors
     values = one(theta[:, places])
     shared, local = unknowns.split(theta)
-    scene = unknowns.layout.scene(problem.scene, jnp.asarray(one(shared)))
+    scene = unknowns.layout.scene(problem.scene, one(shared))
     if not single:
-        scene = jax.tree.map(lambda x, own: x if x is not own else jnp.broadcast_to(own, (len(theta), *own.shape)), scene, problem.scene)
+        scene = jax.tree.map(lambda x, own: jnp.asarray(x if x is not own else np.broadcast_to(own, (len(theta), *own.shape))), scene, problem.scene)
     return Fit(
         scene=scene,
         starts=tuple(unknowns.layout.start(run.start, one(local[:, i])) for i, run in enumerate(problem.runs)),

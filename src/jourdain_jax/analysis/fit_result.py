@@ -5,16 +5,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.information import Information, hidden_combinations
+from jourdain_jax.analysis.profile import FAR_BEYOND
 from jourdain_jax.analysis.table import table
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
-
 CORRELATED = 0.98
 MOST_COMPARED, MOST_NAMED = 1000, 8  # unknowns; pairs of them in the table
-FAR_BEYOND = 3.0  # standard errors: an estimate that is held at its bound by more is no chance
 
 
 class Estimate(eqx.Module):
@@ -136,7 +135,9 @@ class Fit(Printed, eqx.Module):
             return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`",)
         found = []
         if self.stuck:
-            found.append("no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere")
+            found.append(
+                "no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere"
+            )
         elif not self.converged:
             found.append("no minimum was found; raise `max_iterations`, or start nearer to it")
         if np.any(self.beyond > FAR_BEYOND):

@@ -46,7 +46,6 @@ class Information(eqx.Module):
         both = self.identifiable[..., :, None] & self.identifiable[..., None, :]
         return np.where(both, found, np.nan)
 
-
     def times(self, factor: Float[np.ndarray, "*members"]) -> "Information":
         """With all covariances multiplied by this factor."""
         f = factor[..., None]
@@ -58,7 +57,7 @@ class Information(eqx.Module):
 
         Own unknowns follow the shared ones; the spread of their own noise stays as it is. Source: K.-Y. Liang and S. L. Zeger, Biometrika 73 (1986) 13.
         """
-        runs, p = scores.shape[-2:]
+        runs = scores.shape[-2]
         shared = self.shared @ (np.swapaxes(scores, -1, -2) @ scores) @ self.shared * runs / (runs - 1)
         of_shared = np.diagonal(shared, axis1=-2, axis2=-1)
         of_own = np.diagonal(self.own, axis1=-2, axis2=-1) + np.einsum("...kij,...jl,...kil->...ki", self.follow, shared, self.follow)

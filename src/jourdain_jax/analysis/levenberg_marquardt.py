@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from jourdain_jax.analysis.arrow import Arrow
 
 FIRST, LEAST, MOST = 1e-3, 1e-9, 1e9  # damping lambda: at first, at least, and where no step is found
+FASTEST = 10.0  # factor by which damping falls after a good step
 RELEASES = 8  # times that unknowns which would pass a bound are put there and the others solved for again
 
 
@@ -60,11 +61,13 @@ class Minimum:
     steps: Int[np.ndarray, "members"]  # tried
 
 
-def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Float[np.ndarray, "members unknowns"], limits: Limits, control: Control) -> Minimum:
+def minimise(
+    evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Float[np.ndarray, "members unknowns"], limits: Limits, control: Control
+) -> Minimum:
     """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers."""
     theta, members = theta.copy(), np.arange(len(theta))
     at = evaluate(theta, members)
-    damping, growth = np.full(len(theta), FIRST), np.full(len(theta), 4.0)
+    damping, growth, fall = (np.full(len(theta), x) for x in (FIRST, 4.0, FASTEST))
     converged, stuck, steps = np.zeros(len(theta), bool), np.zeros(len(theta), bool), np.zeros(len(theta), int)
     going = np.isfinite(at.cost)
     for _ in range(control.most_steps):
@@ -73,11 +76,14 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Fl
             break
         arrow, x = at.arrow.at(here), theta[here]
         d = _step(arrow, x, damping[here], limits, control.cutoff)
-        done = _is_small(arrow, x, d, limits, control) & _is_small(arrow, x, _step(arrow, x, np.full(len(here), LEAST), limits, control.cutoff), limits, control)
-        converged[here[done]], going[here[done]] = True, False
-        here, d, x, arrow = here[~done], d[~done], x[~done], arrow.at(~done)
-        if not here.size:
-            break
+        done = _is_small(arrow, x, d, limits, control)
+        if np.any(done & (damping[here] > LEAST)):
+            done &= _is_small(arrow, x, _step(arrow, x, np.full(len(here), LEAST), limits, control.cutoff), limits, control)
+        if np.any(done):
+            converged[here[done]], going[here[done]] = True, False
+            here, d, x, arrow = here[~done], d[~done], x[~done], arrow.at(~done)
+            if not here.size:
+                break
         steps[here] += 1
         promised = -np.sum(arrow.gradient() * d, axis=1) - 0.5 * arrow.change(d)
         trial = evaluate(x + d, here)
@@ -92,9 +98,12 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Fl
         at.residual[rising], at.sigma[rising] = trial.residual[better], trial.sigma[better]
         for kept, new in zip(at.arrow.arrays, trial.arrow.arrays, strict=True):
             kept[rising] = new[better]
-        damping[here] = np.where(better, np.where(ratio > 0.75, damping[here] / 10, np.where(ratio < 0.25, damping[here] * 3, damping[here])), damping[here] * growth[here])
+        # after a step that failed, damping falls slowly: in a curved valley every other step would fail
+        change = np.where(ratio > 0.75, 1 / fall[here], np.where(ratio < 0.25, 3.0, 1.0))
+        damping[here] *= np.where(better, change, growth[here])
         damping[here] = np.where(better & level, LEAST, np.maximum(damping[here], LEAST))
         growth[here] = np.where(better, 4.0, growth[here] * 2)
+        fall[here] = np.where(better, np.minimum(1.5 * fall[here], FASTEST), 2.0)
         lost = damping[here] > MOST
         stuck[here[lost]], going[here[lost]] = True, False
     return Minimum(theta, at, converged, stuck, steps)
@@ -102,8 +111,8 @@ def minimise(evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Fl
 
 def _step(arrow: Arrow, theta, damping, limits: Limits, cutoff: float) -> np.ndarray:
     """The damped step within the bounds."""
-    norms = arrow.column_norms()
-    D = np.maximum(norms, 1e-8 * np.max(norms * limits.size(theta), axis=1, keepdims=True) / limits.size(theta))
+    norms, size = arrow.column_norms(), limits.size(theta)
+    D = np.maximum(norms, 1e-8 * np.max(norms * size, axis=1, keepdims=True) / size)
     D = np.where(D > 0, D, 1.0)
     g = arrow.gradient()
     held = limits.fixed | ((theta <= limits.low) & (g >= 0)) | ((theta >= limits.high) & (g <= 0))

@@ -28,7 +28,9 @@ class Loss:
         k, size = self.parameter, np.abs(r)
         if self.kind == "student-t" and np.isfinite(k):
             return np.sum((k + 1) / 2 * np.log1p(r**2 / k), axis=-1)
-        return np.sum(np.where(size <= k, 0.5 * r**2, k * np.minimum(size, np.finfo(float).max / max(k, 1.0)) - 0.5 * k**2) if np.isfinite(k) else 0.5 * r**2, axis=-1)
+        return np.sum(
+            np.where(size <= k, 0.5 * r**2, k * np.minimum(size, np.finfo(float).max / max(k, 1.0)) - 0.5 * k**2) if np.isfinite(k) else 0.5 * r**2, axis=-1
+        )
 
     def weight(self, r: Float[np.ndarray, "*samples"]) -> Float[np.ndarray, "*samples"]:
         """w(r)."""

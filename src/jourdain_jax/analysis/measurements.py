@@ -9,14 +9,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.channels import channel
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.calculus.reals import Number
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
-from jourdain_jax.scene.numbers import checked_real, described
+from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.scene import Scene
 
 
@@ -107,13 +107,14 @@ class Measurements(eqx.Module):
             if not _holds(lambda x: x > 0, value):
                 raise ValueError(f"sigma of channel `{name}` must be above zero (and not NaN); give the standard deviation of its noise")
 
-    def sigma_of(self, name: str, repeats: bool = False) -> Float[Array, "..."]:
+    def sigma_of(self, name: str, repeats: bool = False) -> Float[Array | np.ndarray, "..."]:
         """Sigma of each measured value of the channel `name`, in its unit; `repeats`: the values have a leading axis of repeats."""
         sigma, values = self.sigma[name], self.values[name]
         # one sigma per time acts on all components of the channel
         dimensions = values.ndim - int(repeats)
-        aligned = sigma.reshape(sigma.shape + (1,) * (dimensions - sigma.ndim)) if sigma.ndim else sigma
-        return jnp.broadcast_to(aligned, values.shape)
+        xp = jnp if is_traced(sigma) else np
+        aligned = xp.reshape(sigma, sigma.shape + (1,) * (dimensions - sigma.ndim)) if sigma.ndim else sigma
+        return xp.broadcast_to(aligned, values.shape)
 
 
 def _holds(condition: Callable, x) -> bool:

@@ -39,7 +39,7 @@ class Run(eqx.Module):
     values: dict[str, Float[Array | np.ndarray, "..."]]
     weights: dict[str, Float[Array | np.ndarray, "..."]]
     start: dict[str, Float[Array | np.ndarray, "..."]]
-    inputs: Inputs
+    inputs: dict | Inputs | None
     functions: dict[str, Callable]
 
     def residuals(self, scene: Scene, simulate: Callable, simulation: dict) -> dict[str, Float[Array | np.ndarray, "..."]]:
@@ -57,9 +57,9 @@ def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
     """A run with weights; `xp`: NumPy, or `jax.numpy` where numbers are traced; `repeats`: values have a leading axis."""
     weights = {}
     for name, values in data.values.items():
-        sigma, known = data.sigma_of(name, repeats), xp.isfinite(values)
+        sigma, known = data.sigma_of(name, repeats), xp.isfinite(xp.asarray(values))
         weights[name] = xp.where(known & xp.isfinite(sigma), 1.0 / sigma, 0.0)
-    measured = {name: xp.where(xp.isfinite(values), values, 0.0) for name, values in data.values.items()}
+    measured = {name: xp.where(weights[name] > 0, xp.asarray(values), 0.0) for name, values in data.values.items()}
     return Run(data.t0, data.ts, measured, weights, data.start, data.inputs, data.functions)
 
 
@@ -70,8 +70,10 @@ def equal_runs(data: Sequence[Measurements]) -> list[Run]:
         for i in indices:
             run = run_of(data[i], jnp)
             groups.setdefault((indices[0], *(x.shape for x in jax.tree.leaves(eqx.filter(run, _is_array)))), []).append(run)
-    return [eqx.combine(jax.tree.map(lambda *xs: jnp.stack(xs), *(eqx.filter(run, _is_array) for run in runs)), eqx.filter(runs[0], _is_array, inverse=True))
-            for runs in groups.values()]
+    return [
+        eqx.combine(jax.tree.map(lambda *xs: jnp.stack(xs), *(eqx.filter(run, _is_array) for run in runs)), eqx.filter(runs[0], _is_array, inverse=True))
+        for runs in groups.values()
+    ]
 
 
 class Lanes:
@@ -79,7 +81,9 @@ class Lanes:
 
     def __init__(self, scene: Scene, data: Sequence[Measurements], layout: Layout, simulation: dict, members: int | None):
         self.members, self._scene, self._layout = members, scene, layout
-        self._groups = [_Group(scene, indices, [run_of(data[i], repeats=members is not None) for i in indices], layout, simulation, members) for indices in _alike(data)]
+        self._groups = [
+            _Group(scene, indices, [run_of(data[i], repeats=members is not None) for i in indices], layout, simulation, members) for indices in _alike(data)
+        ]
         self.lengths = [run.ts.shape[0] for run in data]
 
     def evaluate(self, shared: Float[np.ndarray, "members shared"], local: Float[np.ndarray, "members runs local"], members: np.ndarray):
@@ -119,7 +123,9 @@ class _Group:
         times, knots = max(run.ts.shape[0] for run in runs), _most_knots(runs)
         filled = [_filled(run, times, knots, 0 if members is None else 1) for run in runs]
         self._arrays = jax.tree.map(lambda *xs: np.stack(xs), *[eqx.partition(run, _is_array)[0] for run in filled])
-        self._repeated = eqx.tree_at(lambda r: (r.values, r.weights), jax.tree.map(lambda _: False, self._arrays), ({n: members is not None for n in filled[0].values},) * 2)
+        self._repeated = eqx.tree_at(
+            lambda r: (r.values, r.weights), jax.tree.map(lambda _: False, self._arrays), (dict.fromkeys(filled[0].values, members is not None),) * 2
+        )
         self._common, rest = eqx.partition((scene, simulation), _is_array)
         static = jax.tree.flatten((rest, eqx.partition(filled[0], _is_array)[1], layout))
         self._run = _program(static[1], tuple(static[0]))

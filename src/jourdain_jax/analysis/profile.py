@@ -15,6 +15,7 @@ from jourdain_jax.analysis.information import information
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, minimise
 
 ONE_SIDED = 2.7055434540954146 / 2  # of F
+FAR_BEYOND = 3.0  # standard errors: an estimate that is held at its bound by more is no chance
 CLOSE, MOST = 0.02, 8  # relative error of p; evaluations of it
 
 
@@ -35,6 +36,9 @@ def limits_at_bounds(evaluate: Callable, found: Minimum, limits: Limits, control
         slope = abs(float(found.at.arrow.at([b]).gradient()[0, place]))
         beyond[b, place] = slope * error
         inward = 1.0 if one[0, place] <= limits.low[place] else -1.0
+        if beyond[b, place] > FAR_BEYOND:  # the bound decides: the slope alone gives the limit
+            limit[b, place] = _root(slope, 1 / error**2) * inward + one[0, place]
+            continue
         limit[b, place] = _limit(lambda d, b=b, place=place, inward=inward: _profile(evaluate, found, b, place, inward * d, limits, control), slope, error)
         limit[b, place] = np.clip(one[0, place] + inward * limit[b, place], limits.low[place], limits.high[place])
     return limit, beyond

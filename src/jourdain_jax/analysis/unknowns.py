@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -51,7 +52,8 @@ class Layout:
     def scene(self, scene: Scene, shared: Float[Array | np.ndarray, "*members shared"]) -> Scene:
         """The scene with these shared unknowns."""
         names = [place.name for place in self.shared]
-        return eqx.tree_at(lambda s: [getattr(s, name) for name in names], scene, [place.of(shared) for place in self.shared]) if names else scene
+        values = [jnp.asarray(place.of(shared)) for place in self.shared]
+        return eqx.tree_at(lambda s: [getattr(s, name) for name in names], scene, values) if names else scene
 
     def start(self, start: dict, local: Float[Array | np.ndarray, "*members local"]) -> dict:
         """The start of a run with these unknowns of its own."""
