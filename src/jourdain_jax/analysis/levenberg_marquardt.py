@@ -98,8 +98,9 @@ def minimise(
         at.residual[rising], at.sigma[rising] = trial.residual[better], trial.sigma[better]
         for kept, new in zip(at.arrow.arrays, trial.arrow.arrays, strict=True):
             kept[rising] = new[better]
-        # after a step that failed, damping falls slowly: in a curved valley every other step would fail
-        change = np.where(ratio > 0.75, 1 / fall[here], np.where(ratio < 0.25, 3.0, 1.0))
+        # after a step that failed, damping falls slowly: in a curved valley every other step would fail. It rises where steps overshoot: where residuals
+        # stay large, undamped ones go to and fro along what shows least
+        change = np.where(ratio > 0.9, 1 / fall[here], np.where(ratio < 0.6, 3.0, 1.0))
         damping[here] *= np.where(better, change, growth[here])
         damping[here] = np.where(better & level, LEAST, np.maximum(damping[here], LEAST))
         growth[here] = np.where(better, 4.0, growth[here] * 2)
