@@ -24,14 +24,15 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
 
 from jourdain_jax import models
-from jourdain_jax.analysis.bijections import bounds, positive, unbounded
 from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
 from jourdain_jax.analysis.fit import fit, fit_batch
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.gradients import derivative_exists
 from jourdain_jax.analysis.likelihood import log_likelihood
 from jourdain_jax.analysis.linearize import Linearization, linearize
+from jourdain_jax.analysis.losses import huber, student_t
 from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.ranges import bounds, positive, unbounded
 from jourdain_jax.analysis.report import Report, report
 from jourdain_jax.analysis.steady import SteadyMotion, steady
 from jourdain_jax.analysis.verification import Verification
@@ -179,6 +180,7 @@ __all__ = [
     "gibbs_equations",
     "gibbs_function",
     "gravity",
+    "huber",
     "inputs",
     "kinetic_energy",
     "knife_edge",
@@ -221,6 +223,7 @@ __all__ = [
     "start",
     "steady",
     "structure_of",
+    "student_t",
     "torque",
     "unbounded",
     "unconstrained_equations",

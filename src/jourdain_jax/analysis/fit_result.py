@@ -5,19 +5,24 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.information import Information, hidden_combinations
+from jourdain_jax.analysis.profile import FAR_BEYOND
 from jourdain_jax.analysis.table import table
+from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
+
+CORRELATED = 0.98
+MOST_COMPARED, MOST_NAMED = 1000, 8  # unknowns; pairs of them in the table
 
 
 class Estimate(eqx.Module):
     """One unknown, in its unit; NaN for what the measurements cannot tell."""
 
-    value: Float[Array, "*repeats"]
-    standard_error: Float[Array, "*repeats"]
-    low: Float[Array, "*repeats"]  # ends of the 95 % interval
-    high: Float[Array, "*repeats"]
+    value: Float[np.ndarray, "*repeats"]
+    standard_error: Float[np.ndarray, "*repeats"]
+    low: Float[np.ndarray, "*repeats"]  # ends of the 95 % interval
+    high: Float[np.ndarray, "*repeats"]
     unit: str = eqx.field(static=True)
 
 
@@ -39,22 +44,26 @@ class Fit(Printed, eqx.Module):
     """
 
     scene: Scene  # with the estimates
-    starts: tuple[dict[str, Float[Array, "..."]], ...]  # initial values of each run, with the estimates
-    values: Float[Array, "unknowns"]
-    sizes: Float[Array, "unknowns"]  # against which the rank is judged
-    standard_errors: Float[Array, "unknowns"]  # NaN where not identifiable
-    low: Float[Array, "unknowns"]  # ends of the 95 % intervals; NaN where not identifiable
-    high: Float[Array, "unknowns"]
-    at_bound: Bool[Array, "unknowns"]  # estimates that a bound decides; they have no interval
+    starts: tuple[dict[str, Float[Array | np.ndarray, "..."]], ...]  # initial values of each run, with the estimates
+    values: Float[np.ndarray, "*repeats unknowns"]
+    sizes: Float[np.ndarray, "*repeats unknowns"]  # against which the rank is judged
+    standard_errors: Float[np.ndarray, "*repeats unknowns"]  # NaN where not identifiable
+    low: Float[np.ndarray, "*repeats unknowns"]  # ends of the 95 % intervals; NaN where not identifiable
+    high: Float[np.ndarray, "*repeats unknowns"]
+    at_bound: Bool[np.ndarray, "*repeats unknowns"]  # estimates at a bound: no standard error, and a one-sided interval
+    beyond: Float[np.ndarray, "*repeats unknowns"]  # of these, by how many standard errors the data would put them beyond; NaN elsewhere
     information: Information
-    residuals: tuple[dict[str, Float[Array, "..."]], ...]  # (times, *channel): (prediction - value) / sigma; NaN where missing
-    chi_square: Float[Array, ""]
-    samples: Int[Array, ""]  # with a finite sigma
-    converged: Bool[Array, ""]
-    steps: Int[Array, ""]  # tried
+    residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # (times, *channel): (prediction - value) / sigma; NaN where missing
+    sigma: dict[str, Float[np.ndarray, "*repeats"]]  # of channels whose noise was estimated
+    chi_square: Float[np.ndarray, "*repeats"]
+    samples: Int[np.ndarray, "*repeats"]  # with a finite sigma
+    converged: Bool[np.ndarray, "*repeats"]
+    stuck: Bool[np.ndarray, "*repeats"]  # no step lowers the sum of squares, however short, and this is no minimum
+    steps: Int[np.ndarray, "*repeats"]  # tried
     labels: tuple[str, ...] = eqx.field(static=True)  # names of the unknowns
     units: tuple[str, ...] = eqx.field(static=True)
     cutoff: float = eqx.field(static=True)
+    errors: str = eqx.field(static=True)  # whence standard errors come: "sigmas" or "runs"
 
     def __getitem__(self, name: str) -> Estimate:
         if name not in self.labels:
@@ -68,24 +77,24 @@ class Fit(Printed, eqx.Module):
         return {name: self[name] for name in self.labels}
 
     @property
-    def covariance(self) -> Float[Array, "*repeats unknowns unknowns"]:
+    def covariance(self) -> Float[np.ndarray, "*repeats unknowns unknowns"]:
         """Covariance of the estimates in the order of `labels`, to first order; NaN where not identifiable."""
         return self.information.covariance
 
     @property
-    def correlation(self) -> Float[Array, "*repeats unknowns unknowns"]:
+    def correlation(self) -> Float[np.ndarray, "*repeats unknowns unknowns"]:
         """Correlation of the estimates."""
         return self.covariance / (self.standard_errors[..., :, None] * self.standard_errors[..., None, :])
 
     @property
-    def degrees_of_freedom(self) -> Int[Array, "*repeats"]:
+    def degrees_of_freedom(self) -> Int[np.ndarray, "*repeats"]:
         """Samples less the directions that were determined."""
-        return self.samples - self.information.rank
+        return np.asarray(self.samples - self.information.rank)
 
     @property
-    def reduced_chi_square(self) -> Float[Array, "*repeats"]:
+    def reduced_chi_square(self) -> Float[np.ndarray, "*repeats"]:
         """Sum of squared residuals per degree of freedom: near 1 where scene and sigmas are right."""
-        return self.chi_square / self.degrees_of_freedom
+        return np.asarray(self.chi_square / self.degrees_of_freedom)
 
     # Of one fit, not of a batch. -----------------------------------------------------------------------------------
 
@@ -94,23 +103,73 @@ class Fit(Printed, eqx.Module):
         """What the measurements cannot tell, one sentence per combination of unknowns."""
         if not np.isfinite(self.chi_square):
             return ()
-        hidden = np.asarray(self.information.directions)[int(self.information.rank) :]
-        return hidden_combinations(hidden, np.asarray(self.sizes), np.asarray(self.values), self.labels)
+        return hidden_combinations(self.information.hidden[0], self.sizes, self.values, self.labels)
+
+    @property
+    def correlated(self) -> tuple[str, ...]:
+        """Pairs of unknowns whose estimates correlate by `CORRELATED` or more in magnitude, strongest first, one sentence each."""
+        some = np.flatnonzero(np.isfinite(self.standard_errors))[:MOST_COMPARED]
+        found = np.triu(self.correlation[np.ix_(some, some)], 1)
+        pairs = sorted(zip(*np.nonzero(np.abs(found) >= CORRELATED), strict=True), key=lambda ij: -abs(found[ij]))
+        return tuple(
+            f"`{self.labels[some[i]]}` and `{self.labels[some[j]]}` correlate at {np.sign(found[i, j]) * min(abs(found[i, j]), 0.9999):.4g}: "
+            "the data tell a combination of them far better than either"
+            for i, j in pairs
+        )
+
+    @property
+    def impossible(self) -> tuple[str, ...]:
+        """Bodies of the fitted scene that no distribution of mass can make, one sentence each."""
+        q, _, _ = self.scene.named(**self.starts[0])
+        return impossible_bodies(self.scene, q)
 
     @property
     def warning(self) -> str:
-        """Why the estimates should not be relied on, in one sentence; empty where nothing speaks against them."""
+        """Why the estimates should not be relied on, the first reason in one sentence; empty where nothing speaks against them."""
+        return next(iter(self.warnings), "")
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why estimates or intervals should not be relied on, the most serious reason first, one sentence each."""
         if not np.isfinite(self.chi_square):
-            return "the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`"
-        if np.any(self.at_bound):
-            names = ", ".join(f"`{name}`" for name, at in zip(self.labels, np.asarray(self.at_bound), strict=True) if at)
-            return f"{names} lies at a bound, which decides its value; all standard errors lose their meaning: widen the bounds"
-        if not self.converged:
-            return "no minimum was found; raise `max_iterations`, or start nearer to it"
+            return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`",)
+        found = []
+        if self.stuck:
+            found.append(
+                "no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere"
+            )
+        elif not self.converged:
+            found.append("no minimum was found; raise `max_iterations`, or start nearer to it")
+        if np.any(self.beyond > FAR_BEYOND):
+            names = ", ".join(f"`{name}`" for name, far in zip(self.labels, self.beyond, strict=True) if far > FAR_BEYOND)
+            found.append(f"{names} lies at a bound, which decides its value; all standard errors lose their meaning: widen the bounds")
+        found += self.impossible
         # chi-square has mean n and variance 2 n
         if self.reduced_chi_square > 1 + 5 * np.sqrt(2 / max(int(self.degrees_of_freedom), 1)):
-            return "the residuals are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, or sigmas that are too small"
-        return ""
+            found.append(
+                "the residuals are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, or sigmas that are too small"
+            )
+        if self.errors == "sigmas":
+            coloured = [f"`{name}` ({rho:.2f})" for name, (rho, limit) in self.autocorrelation.items() if abs(rho) > limit]
+            if coloured:
+                found.append(
+                    f"residuals of {', '.join(coloured)} are not white (in brackets: correlation of neighbouring ones), which makes intervals too narrow: the "
+                    'scene, a sensor or the noise is not right; with five runs or more, errors="runs" gives intervals that allow for it'
+                )
+        return tuple(found)
+
+    @property
+    def autocorrelation(self) -> dict[str, tuple[float, float]]:
+        """Of each channel, the correlation of neighbouring residuals over all runs, and what white residuals hardly exceed (3.5 / sqrt(pairs))."""
+        found = {}
+        for name in dict.fromkeys(name for run in self.residuals for name in run):
+            runs = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in self.residuals if name in run]
+            products = np.concatenate([np.ravel(r[1:] * r[:-1]) for r in runs])
+            squares = np.concatenate([np.ravel(r) ** 2 for r in runs])
+            pairs, size = np.isfinite(products).sum(), np.nanmean(squares) if np.isfinite(squares).any() else 0.0
+            if pairs and size > 0:
+                found[name] = float(np.nanmean(products) / size), 3.5 / float(np.sqrt(pairs))
+        return found
 
     def residual_summary(self) -> tuple[ChannelResiduals, ...]:
         """Count, mean, rms and largest residual per run and channel."""
@@ -131,16 +190,22 @@ def _text(fit: Fit) -> str:
         f"Fit of {type(fit.scene).__name__}: {'converged' if fit.converged else 'NOT CONVERGED'} in {int(fit.steps)} steps; "
         f"{int(fit.samples)} samples, {len(fit.labels)} unknowns, reduced chi-square {float(fit.reduced_chi_square):.4g}"
     ]
-    lines += [f"WARNING: {fit.warning}"] if fit.warning else []
+    lines += [f"WARNING: {sentence}" for sentence in fit.warnings]
+    if fit.errors == "runs":
+        lines.append(f"standard errors from how much the {len(fit.residuals)} runs differ")
+    lines += [f"sigma of `{name}`, estimated: {float(sigma):.4g}" for name, sigma in fit.sigma.items()]
     rows = [("unknown", "unit", "estimate", "std. error", "95 % interval")]
     for name, e in fit.estimates.items():
         error = f"{e.standard_error:.2g}" if np.isfinite(e.standard_error) else "-"
-        interval = f"[{e.low:.6g}, {e.high:.6g}]" if np.isfinite(e.low) else "none"
+        interval = f"[{e.low:.6g}, {e.high:.6g}]" if not np.isnan(e.low + e.high) else "none"
+        interval += " (one-sided, at its bound)" if fit.at_bound[fit.labels.index(name)] else ""
         rows.append((name, e.unit, f"{e.value:.6g}", error, interval))
     lines += table(rows)
     if fit.not_identifiable:
         lines.append(f"singular values below {fit.cutoff:g} of the largest count as zero:")
         lines += [f"  {sentence}" for sentence in fit.not_identifiable]
+    lines += [f"  {sentence}" for sentence in fit.correlated[:MOST_NAMED]]
+    lines += [f"  and {len(fit.correlated) - MOST_NAMED} more pairs"] if len(fit.correlated) > MOST_NAMED else []
     rows = [("run", "channel", "samples", "mean", "rms", "largest residual (in sigmas)")]
     for s in fit.residual_summary():
         rows.append((str(s.run), s.channel, str(s.samples), f"{s.mean:.2g}", f"{s.rms:.3g}", f"{s.largest:.3g}"))

@@ -1,45 +1,144 @@
 """What measurements tell about the unknowns: covariance where they do, and the combinations that they leave open.
 
-    J_s = d r / d (theta / size) = U S V'          residuals r in units of sigma, unknowns in units of their own size
-    rank: number of singular values above cutoff * (the largest)
-    covariance = size V_1 S_1^-2 V_1' size          over the directions V_1 that show
+    J_s = d r / d (theta / size),  an arrow of own unknowns x_i of each run and shared ones s      residuals r in units of sigma
+    own        U S V' of a run's own columns; directions V_0 with S <= cutoff (the largest) do not show even where s is known
+    shared     U S V' of the columns of s with those of all x_i projected out; rank: singular values above cutoff (the largest)
+    covariance of s          size V_1 S_1^-2 V_1' size                    over the directions V_1 that show
+               of x_i, x_j   delta_ij (T_i' T_i)^+ + G_i cov(s) G_j',     x_i = - G_i s where the run's own columns are fitted
 
 An unknown with a part in the remaining directions V_0 has no standard error and no interval.
-Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), sections 2.1 and 3.4.
+Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), sections 2.1 and 3.4; G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1.
 """
 
+from functools import cached_property
+
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
+
+from jourdain_jax.analysis.arrow import Arrow
 
 
 class Information(eqx.Module):
-    """Singular values of the scaled Jacobian and what follows."""
+    """Covariance in blocks, and directions (changes of theta / size) that do not show. A batch of fits has a leading axis `members` in all arrays."""
 
-    singular_values: Float[Array, "unknowns"]  # largest first
-    directions: Float[Array, "unknowns unknowns"]  # rows: V', changes of theta / size
-    rank: Int[Array, ""]
-    identifiable: Bool[Array, "unknowns"]
-    covariance: Float[Array, "unknowns unknowns"]  # units of the unknowns; NaN where not identifiable
+    singular_values: Float[np.ndarray, "*members shared"]  # of the shared unknowns, largest first
+    hidden: tuple[Float[np.ndarray, "_ unknowns"], ...]  # of each member, orthonormal
+    rank: Int[np.ndarray, "*members"]  # directions that show
+    identifiable: Bool[np.ndarray, "*members unknowns"]
+    standard_errors: Float[np.ndarray, "*members unknowns"]  # NaN where not identifiable
+    shared: Float[np.ndarray, "*members shared shared"]
+    own: Float[np.ndarray, "*members runs own own"]  # covariance where the shared unknowns are known
+    follow: Float[np.ndarray, "*members runs own shared"]  # G
+    estimated: tuple[int, ...] = eqx.field(static=True)  # places of the unknowns among those of all runs
+
+    @cached_property
+    def covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
+        """Of all unknowns, in their units; NaN where not identifiable."""
+        runs, m, p = self.follow.shape[-3:]
+        G = np.concatenate([np.broadcast_to(np.eye(p), (*self.shared.shape[:-2], p, p)), -self.follow.reshape(*self.follow.shape[:-3], runs * m, p)], axis=-2)
+        whole = G @ self.shared @ np.swapaxes(G, -1, -2)
+        for i in range(runs):
+            block = slice(p + i * m, p + (i + 1) * m)
+            whole[..., block, block] += self.own[..., i, :, :]
+        places = np.array(self.estimated, int)
+        found = whole[..., places[:, None], places]
+        both = self.identifiable[..., :, None] & self.identifiable[..., None, :]
+        return np.where(both, found, np.nan)
+
+    def times(self, factor: Float[np.ndarray, "*members"]) -> "Information":
+        """With all covariances multiplied by this factor."""
+        f = factor[..., None]
+        changed = self.standard_errors * np.sqrt(f), self.shared * f[..., None], self.own * f[..., None, None]
+        return eqx.tree_at(lambda i: (i.standard_errors, i.shared, i.own), self, changed)
+
+    def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
+        """With the covariance of the shared unknowns from how much runs differ: C (sum g g') C n / (n - 1), g: scores of n runs, C: the covariance so far.
+
+        Own unknowns follow the shared ones; the spread of their own noise stays as it is. Source: K.-Y. Liang and S. L. Zeger, Biometrika 73 (1986) 13.
+        """
+        runs = scores.shape[-2]
+        shared = self.shared @ (np.swapaxes(scores, -1, -2) @ scores) @ self.shared * runs / (runs - 1)
+        of_shared = np.diagonal(shared, axis1=-2, axis2=-1)
+        of_own = np.diagonal(self.own, axis1=-2, axis2=-1) + np.einsum("...kij,...jl,...kil->...ki", self.follow, shared, self.follow)
+        variance = np.concatenate([of_shared, of_own.reshape(*of_own.shape[:-2], -1)], axis=-1)[..., np.array(self.estimated, int)]
+        errors = np.where(self.identifiable, np.sqrt(variance), np.nan)
+        return eqx.tree_at(lambda i: (i.standard_errors, i.shared), self, (errors, shared))
 
 
-def information(jacobian: Float[Array, "samples unknowns"], size: Float[Array, "unknowns"], cutoff: float) -> Information:
-    """Information in residuals (units of sigma) with this Jacobian `d r / d theta`.
+def students_t_95(degrees: int) -> float:
+    """97.5 % quantile of Student's t, to 0.1 % from four degrees of freedom on: M. Abramowitz and I. A. Stegun, Handbook (1964), 26.7.5."""
+    z, n = 1.959963984540054, degrees
+    terms = z**3 + z, 5 * z**5 + 16 * z**3 + 3 * z, 3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z, 79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z
+    return z + sum(term / (scale * n ** (k + 1)) for k, (term, scale) in enumerate(zip(terms, (4, 96, 384, 92160), strict=True)))
 
-    `size`: magnitude of each unknown, in its unit; `cutoff`: singular values below this fraction of the largest count as zero.
-    Unknowns whose part in the directions that do not show exceeds the square root of the cut-off are not identifiable.
+
+def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimated: np.ndarray, bound, fails, cutoff: float, single: bool) -> Information:
+    """Information of an arrow in units of sigma.
+
+    `size`: magnitude of each unknown, in its unit; `estimated`: places of unknowns; `bound`: (members, places), which lie at a bound, and are held there;
+    `fails`: (members,), of which nothing is known; `cutoff`: singular values below this fraction of the largest count as zero. Unknowns whose part in the
+    directions that do not show exceeds the square root of the cut-off are not identifiable. `single`: without the axis of members.
     """
-    scaled = jacobian * size
-    usable = jnp.all(jnp.isfinite(scaled))
-    _, S, Vt = jnp.linalg.svd(jnp.where(usable, scaled, 0.0), full_matrices=False)
-    shows = cutoff * S[0] < S
-    V = Vt.T * size[:, None]
-    covariance = (V * jnp.where(shows, 1 / jnp.where(shows, S, 1.0) ** 2, 0.0)) @ V.T
-    hidden = jnp.sqrt(jnp.sum(jnp.where(shows[:, None], 0.0, Vt) ** 2, axis=0))
-    identifiable = hidden < jnp.sqrt(cutoff)
-    both = identifiable[:, None] & identifiable[None, :]
-    return Information(S, Vt, jnp.sum(shows), identifiable, jnp.where(both, covariance, jnp.nan))
+    found = [_information(arrow.at([b]), size[b], estimated, bound[b], not fails[b], cutoff) for b in range(len(size))]
+    if single:
+        return found[0]
+    names = ("singular_values", "rank", "identifiable", "standard_errors", "shared", "own", "follow")
+    stacked = {name: np.stack([getattr(one, name) for one in found]) for name in names}
+    return Information(**stacked, hidden=tuple(one.hidden[0] for one in found), estimated=tuple(estimated.tolist()))
+
+
+def _information(arrow: Arrow, size: Float[np.ndarray, "places"], estimated: np.ndarray, bound, usable, cutoff: float) -> Information:
+    runs, m, p = arrow.counts
+    held = np.ones(len(size), bool)
+    held[estimated] = bound[estimated]
+    scaled = arrow.scaled(np.where(held, 0.0, size)[None])
+    local, shared = scaled.local[0], scaled.shared[0]
+    U, S, Vt = np.linalg.svd(local[..., :m])  # (runs, m, m)
+    shows = np.max(S, axis=1, keepdims=True, initial=0.0) * cutoff < S
+    inverse = np.where(shows, 1 / np.where(shows, S, 1.0), 0.0)
+    turned = np.swapaxes(U, 1, 2) @ local[..., m:-1]
+    follow = np.swapaxes(Vt, 1, 2) @ (inverse[..., None] * turned)  # G: x = - G s
+    own = np.swapaxes(Vt, 1, 2) @ (inverse[..., None] ** 2 * Vt)
+    # what the run's own unknowns cannot take up
+    left = np.concatenate([np.where(shows[..., None], 0.0, turned).reshape(runs * m, p), shared[:, :-1]])
+    _, S_s, Vt_s = np.linalg.svd(left, full_matrices=left.shape[0] < p)
+    S_s = np.concatenate([S_s, np.zeros(p - S_s.size)])
+    largest = max(np.max(S_s, initial=0.0), np.max(S, initial=0.0) if not p else 0.0)
+    shows_s = cutoff * largest < S_s
+    covariance = Vt_s.T @ (np.where(shows_s, 1 / np.where(shows_s, S_s, 1.0) ** 2, 0.0)[:, None] * Vt_s)
+    hidden = _hidden_directions(Vt[~shows], np.nonzero(~shows)[0], Vt_s[~shows_s], follow, held)
+    part = np.linalg.norm(hidden, axis=0)
+    identifiable = (part < np.sqrt(cutoff))[estimated] & ~bound[estimated] & usable
+    variance = np.concatenate([np.diagonal(covariance), (np.diagonal(own, axis1=1, axis2=2) + np.einsum("kij,jl,kil->ki", follow, covariance, follow)).ravel()])
+    size_s, size_l = size[:p], size[p:].reshape(runs, m)
+    return Information(
+        singular_values=S_s,
+        hidden=(hidden[:, estimated],),
+        rank=np.asarray(int(np.sum(~held)) - len(hidden) if usable else 0),
+        identifiable=identifiable,
+        standard_errors=np.where(identifiable, (np.sqrt(variance) * size)[estimated], np.nan),
+        shared=covariance * size_s[:, None] * size_s,
+        own=own * size_l[:, :, None] * size_l[:, None, :],
+        follow=follow * size_l[:, :, None] / size_s,
+        estimated=tuple(estimated.tolist()),
+    )
+
+
+def _hidden_directions(own: np.ndarray, runs: np.ndarray, shared: np.ndarray, follow: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Orthonormal directions of all places that do not show and move no place that is held."""
+    count, m, p = follow.shape
+    rows = np.zeros((len(own) + len(shared), p + count * m))
+    for row, (run, direction) in enumerate(zip(runs, own, strict=True)):
+        rows[row, p + run * m : p + (run + 1) * m] = direction
+    if len(shared):
+        rows[len(own) :, :p] = shared
+        rows[len(own) :, p:] = -np.einsum("kij,nj->nki", follow, shared).reshape(len(shared), -1)
+    rows = np.where(held, 0.0, rows)
+    if not len(rows):
+        return rows
+    _, S, Vt = np.linalg.svd(rows, full_matrices=False)
+    return Vt[S > 1e-6]  # directions of held places alone are none
 
 
 def hidden_combinations(directions, size, values, labels: tuple[str, ...]) -> tuple[str, ...]:

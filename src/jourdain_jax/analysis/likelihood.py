@@ -3,14 +3,14 @@
 r = (channel(motion) - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi))
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.measurements import Measurements, checked
+from jourdain_jax.analysis.predictions import Run, equal_runs
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.numbers import described
@@ -32,53 +32,26 @@ def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **
     """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
     Differentiable in scene, start values, measured values and sigmas (reverse mode, unless `adjoint` says otherwise); -inf where
-    the motion fails. `simulation`: options of `simulate`. Samples with an infinite sigma do not count.
+    the motion fails. `simulation`: options of `simulate`. Missing samples (NaN, or an infinite sigma) do not count.
 
         jax.grad(lambda a: jj.log_likelihood(sleigh.replace(offset=a), data))(0.25)
 
     **Raises** ValueError for measurements that do not fit the scene.
     """
     runs = as_runs(scene, data)
+    if unknown := sorted({name for run in runs for name in run.unknown_sigma}):
+        raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a likelihood needs the standard deviation of its noise; give a number")
     total = jnp.zeros(())
-    for run, weighted in zip(runs, residuals(scene, runs, simulate, simulation), strict=True):
-        for name, r in weighted.items():
-            sigma = run.sigma_of(name)
-            counted = jnp.isfinite(sigma)
-            total = total - jnp.sum(jnp.where(counted, 0.5 * r**2 + jnp.log(jnp.where(counted, sigma, 1.0) * jnp.sqrt(2 * jnp.pi)), 0.0))
+    for alike in equal_runs(runs):  # one batch
+
+        def one(run: Run) -> Float[Array, ""]:
+            found = jnp.zeros(())
+            for name, r in run.residuals(scene, simulate, simulation).items():
+                counted = run.weights[name] > 0
+                # log sigma = - log weight
+                logs = jnp.log(jnp.where(counted, run.weights[name], 1.0) / jnp.sqrt(2 * jnp.pi))
+                found = found + jnp.sum(jnp.where(counted, logs - 0.5 * r**2, 0.0))
+            return found
+
+        total = total + jnp.sum(eqx.filter_vmap(one)(alike))
     return jnp.where(jnp.isfinite(total), total, -jnp.inf)
-
-
-def residuals(scene: Scene, runs: Sequence[Measurements], simulate: Callable, simulation: dict) -> list[dict[str, Float[Array, "..."]]]:
-    """`(prediction - value) / sigma`, shape (times, *channel), by run and channel; runs of equal shapes are one batch."""
-    found: dict[int, dict] = {}
-    for group in _alike(runs):
-        if len(group) == 1:
-            found[group[0]] = _residuals(scene, runs[group[0]], simulate, simulation)
-            continue
-        parts = [eqx.partition(runs[i], eqx.is_array) for i in group]
-        stacked = jax.tree.map(lambda *xs: jnp.stack(xs), *(arrays for arrays, _ in parts))
-        together = jax.vmap(lambda arrays, rest=parts[0][1]: _residuals(scene, eqx.combine(arrays, rest), simulate, simulation))(stacked)
-        found |= {i: {name: r[k] for name, r in together.items()} for k, i in enumerate(group)}
-    return [found[i] for i in range(len(runs))]
-
-
-def _alike(runs: Sequence[Measurements]) -> list[list[int]]:
-    """Indices of the runs, grouped by equal structure, shapes and functions."""
-    groups: list[tuple[tuple, list[int]]] = []
-    for index, run in enumerate(runs):
-        arrays, rest = eqx.partition(run, eqx.is_array)
-        kind = (jax.tree.structure(run), [x.shape for x in jax.tree.leaves(arrays)], jax.tree.leaves(rest))
-        for known, members in groups:
-            if known == kind:
-                members.append(index)
-                break
-        else:
-            groups.append((kind, [index]))
-    return [members for _, members in groups]
-
-
-def _residuals(scene: Scene, run: Measurements, simulate: Callable, simulation: dict) -> dict[str, Float[Array, "..."]]:
-    motion = simulate(scene, run.start, t0=run.t0, ts=run.ts, inputs=run.inputs, events=False, work=False, **simulation)
-    states = motion.motions() if run.functions else None
-    predicted = {name: jax.vmap(run.functions[name])(states) if name in run.functions else motion[name] for name in run.values}
-    return {name: (predicted[name] - value) / run.sigma_of(name) for name, value in run.values.items()}

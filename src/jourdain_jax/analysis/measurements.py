@@ -9,14 +9,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.bijections import Bijection
+from jourdain_jax.analysis.channels import channel
+from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.calculus.reals import Number
-from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
-from jourdain_jax.scene.numbers import checked_real, described
+from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.scene import Scene
 
 
@@ -29,7 +29,8 @@ class Measurements(eqx.Module):
     - `ts`: times in s, strictly increasing.
     - `values`: channel -> measured values, shape (times, *channel). A channel is a coordinate, a speed, or a name in `functions`.
     - `sigma`: standard deviation of the noise, in the unit of the channel: channel -> number, (times,) or the shape of its
-      values; or one number for all channels. An infinite sigma marks a sample that is missing (give any finite value there).
+      values; or one number for all channels. None: not known; one sigma for all samples of the channel in all runs is estimated.
+      NaN in `values`, or an infinite sigma, marks a sample that is missing.
     - `start`: coordinate or speed -> value at `t0`. These are held; what is not given is solved for, as by `jj.start`.
     - `unknown_start`: names in `start` whose values are first guesses, to be estimated; or name -> `bounds(...)`, `positive()`,
       `unbounded()` (None: unbounded).
@@ -38,7 +39,7 @@ class Measurements(eqx.Module):
       `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`.
     - `t0`: time of the start in s; default: the first of `ts`.
 
-    **Raises** ValueError for times that do not increase, values that are not finite, sigmas that are not positive, and names
+    **Raises** ValueError for times that do not increase, values that are infinite, channels without any value, sigmas that are not positive, and names
     that do not match.
     """
 
@@ -46,10 +47,11 @@ class Measurements(eqx.Module):
     values: dict[str, Float[Array, "..."]]
     sigma: dict[str, Float[Array, "..."]]
     start: dict[str, Float[Array, "..."]]
-    unknown_start: dict[str, Bijection | None]
+    unknown_start: dict[str, Range | None]
     inputs: dict | Inputs | None
     functions: dict[str, Callable]
     t0: Float[Array, ""]  # s
+    unknown_sigma: tuple[str, ...] = eqx.field(static=True)  # channels; their sigma here is 1
 
     def __init__(
         self,
@@ -71,7 +73,8 @@ class Measurements(eqx.Module):
                 raise ValueError(f'`{what}` of `Measurements` is {described(part)}, expected a dictionary by name, such as {{"x": ...}}')
         self.values = _reals("values of channel", values)
         given = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.values, sigma)
-        self.sigma = _reals("sigma of channel", given)
+        self.unknown_sigma = tuple(sorted(name for name, value in given.items() if value is None))
+        self.sigma = _reals("sigma of channel", {name: 1.0 if value is None else value for name, value in given.items()})
         self.start = _reals("start value", start)
         self.unknown_start = dict(unknown_start) if isinstance(unknown_start, Mapping) else dict.fromkeys(as_names(unknown_start))
         self.inputs = inputs
@@ -93,25 +96,25 @@ class Measurements(eqx.Module):
             if name not in self.start:
                 raise ValueError(f"unknown start value `{name}` has no first guess; give one in `start`. {nearest(name, self.start)}")
         for name, value in self.values.items():
-            if not _holds(np.isfinite, value):
+            if not _holds(lambda x: ~np.isinf(x), value):
                 raise ValueError(
-                    f"channel `{name}` holds values that are not finite, the first at sample {_first_bad(value)}; leave these "
-                    "samples out, or give them any finite value and an infinite sigma"
+                    f"channel `{name}` holds values that are infinite, the first at sample {int(np.argwhere(np.isinf(np.asarray(value)))[0][0])}; "
+                    "give NaN for samples that are missing"
                 )
+            if not _holds(lambda x: ~np.all(np.isnan(x)), value):
+                raise ValueError(f"channel `{name}` holds no value at all, only NaN; leave the channel out")
         for name, value in self.sigma.items():
             if not _holds(lambda x: x > 0, value):
                 raise ValueError(f"sigma of channel `{name}` must be above zero (and not NaN); give the standard deviation of its noise")
 
-    def counted(self) -> Int[Array, ""]:
-        """Number of samples with a finite sigma, each component of a channel counted by itself."""
-        return sum(jnp.sum(jnp.isfinite(self.sigma_of(name))) for name in self.values)
-
-    def sigma_of(self, name: str) -> Float[Array, "times *channel"]:
-        """Sigma of each measured value of the channel `name`, in its unit, shape (times, *channel)."""
+    def sigma_of(self, name: str, repeats: bool = False) -> Float[Array | np.ndarray, "..."]:
+        """Sigma of each measured value of the channel `name`, in its unit; `repeats`: the values have a leading axis of repeats."""
         sigma, values = self.sigma[name], self.values[name]
         # one sigma per time acts on all components of the channel
-        aligned = sigma.reshape(sigma.shape + (1,) * (values.ndim - sigma.ndim)) if sigma.ndim else sigma
-        return jnp.broadcast_to(aligned, values.shape)
+        dimensions = values.ndim - int(repeats)
+        xp = jnp if is_traced(sigma) else np
+        aligned = xp.reshape(sigma, sigma.shape + (1,) * (dimensions - sigma.ndim)) if sigma.ndim else sigma
+        return xp.broadcast_to(aligned, values.shape)
 
 
 def _holds(condition: Callable, x) -> bool:
@@ -130,10 +133,6 @@ def _check_times(ts) -> None:
         raise ValueError("`ts` must be finite and strictly increasing; sort the samples by time and merge repeated ones")
 
 
-def _first_bad(x) -> int:
-    return int(np.argwhere(~np.isfinite(np.asarray(x)))[0][0])
-
-
 def _check_same_names(what: str, names, expected) -> None:
     for name in names:
         if name not in expected:
@@ -144,16 +143,16 @@ def _check_same_names(what: str, names, expected) -> None:
 
 
 def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measurements:
-    """The run with its inputs made ready, after its channels and shapes were compared with the scene.
+    """The run with its inputs and functions made ready, after its channels and shapes were compared with the scene.
 
     `repeats`: values have a leading axis. Raises ValueError for an unknown channel, start value or input, and for wrong shapes.
     """
     where = f"run {index} of `{type(scene).__name__}`"
-    q, u, _ = scene.named(**run.start)
-    motion = jax.eval_shape(lambda s: motion_at(s, 0.0, q, u), scene)
+    scene.named(**run.start)
+    channels = {name: channel(function, scene) for name, function in run.functions.items()}
     times = run.ts.shape[0]
     for name, values in run.values.items():
-        shape = (times, *_channel_shape(run, name, motion, where))
+        shape = (times, *(channels[name].shape if name in channels else _named_shape(scene, run, name, where)))
         found = values.shape[1:] if repeats else values.shape
         if found != shape:
             expected = f"(repeats, {', '.join(map(str, shape))})" if repeats else f"{shape}"
@@ -161,16 +160,17 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
             raise ValueError(f"channel `{name}` of {where} has shape {values.shape}, expected {expected} for {times} times{hint}")
         if run.sigma[name].shape not in ((), (times,), shape):
             raise ValueError(f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, expected (), {(times,)} or {shape}")
-    return eqx.tree_at(lambda r: r.inputs, run, as_inputs(scene, run.inputs), is_leaf=lambda x: x is None)
+    ready = as_inputs(scene, run.inputs), channels
+    return eqx.tree_at(lambda r: (r.inputs, r.functions), run, ready, is_leaf=lambda x: x is None or x is run.functions)
 
 
-def _channel_shape(run: Measurements, name: str, motion, where: str) -> tuple[int, ...]:
-    if name in run.functions:
-        return jax.eval_shape(run.functions[name], motion).shape
-    lengths = {slot: length for slot, _, length in motion.q.slots + motion.u.slots}
-    if name not in lengths:
+def _named_shape(scene: Scene, run: Measurements, name: str, where: str) -> tuple[int, ...]:
+    """The shape of a coordinate or speed: of a quaternion (4,), of its rates (3,)."""
+    groups = {group: length for names in (scene.coordinate_names, scene.speed_names) for group, _, length in names.groups}
+    entries = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    if name not in groups and name not in entries:
         raise ValueError(
-            f"{where} has unknown channel `{name}`; {nearest(name, (*lengths, *run.functions))} "
+            f"{where} has unknown channel `{name}`; {nearest(name, (*groups, *entries, *run.functions))} "
             "For other quantities give a function of the motion in `functions`."
         )
-    return (lengths[name],) if lengths[name] else ()
+    return (groups[name],) if name in groups else ()

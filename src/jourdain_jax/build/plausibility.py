@@ -85,6 +85,26 @@ def body_faults(scene: Scene, t, q) -> dict[str, Bool[Array, ""]]:
     return {name: (body.mass < 0) | (_is_negative(body.inertia) if isinstance(body, RigidBody) else False) for name, body in bodies.items()}
 
 
+def impossible_bodies(scene: Scene, q) -> tuple[str, ...]:
+    """Bodies that no distribution of mass can make, one sentence each; bodies without thickness whose other moments are zero are passed over.
+
+    m >= 0,   0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2
+    """
+    found = []
+    for name, placed in pose_at(scene, 0.0, q).bodies.items():
+        body, what = placed.body, f"body `{name}` of `{type(scene).__name__}`"
+        found.append(_of_mass(what, np.atleast_1d(body.mass)))
+        if isinstance(body, RigidBody):
+            found.append(_of_inertia(what, np.asarray(body.inertia)[None]))
+            least, middle, largest = np.linalg.eigvalsh(np.asarray(body.inertia))
+            if least > _TOLERANCE * largest and largest > (1 + _TOLERANCE) * (least + middle):
+                found.append(
+                    f"{what} has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, the last above the sum of the others: no "
+                    "distribution of mass has them; bound the parameters of its inertia, or free fewer"
+                )
+    return tuple(sentence for sentence in found if sentence)
+
+
 def _is_negative(I) -> Bool[Array, ""]:
     """Whether a symmetric matrix has an eigenvalue below zero: by its principal minors."""
     I = jax.lax.stop_gradient(I)

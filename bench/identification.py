@@ -1,0 +1,295 @@
+"""Identification: how fast, how large, how right; figures of fits in one run.
+
+    python bench/identification.py [--quick] [--only NAME ...] [--json FILE]
+
+Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), coverage, windows (57 runs of the steer-by-wire
+bicycle with an unknown start each; the data are in `data/sbw_bicycle`). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick`
+leaves out windows and takes fewer repeats. Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh
+process.
+"""
+
+import argparse
+import csv
+import gzip
+import json
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jourdain_jax as jj
+from jourdain_jax.models.whipple_bicycle import WhippleBicycle
+
+WINDOWS = Path(__file__).parent / "data" / "sbw_bicycle" / "windows.csv.gz"
+START = {"lean": 0.3, "spin_rate": -3.0}
+SIGMA = {"lean": 0.005, "x": 0.005}
+Figure = dict
+
+
+def figure(name: str, model: str, value: float, required: float | None = None, at_least: bool = False) -> Figure:
+    """One entry of the result."""
+    met = required is None or (value >= required if at_least else value <= required)
+    print(f"  {name}, {model}: {value:.4g}" + ("" if required is None else f" (required: {'>=' if at_least else '<='} {required:g})"), flush=True)
+    return {"figure": name, "model": model, "value": value, "required": required, "met": bool(met)}
+
+
+def processor_times(runs: dict, repeats: int) -> dict[str, float]:
+    """Processor time of each run, s: the least of some repeats, in turn, after a first one that compiles."""
+    laps = {name: [] for name in runs}
+    for run in runs.values():
+        run()
+    for _ in range(repeats):
+        for name, run in runs.items():
+            begin = time.process_time()
+            run()
+            laps[name].append(time.process_time() - begin)
+    return {name: min(lap) for name, lap in laps.items()}
+
+
+# The disc: radius and gravity, and two unknown initial values. ------------------------------------------------------------
+
+
+def disc_data(seed: int, ts=None, outlier: float = 0.0, repeats: tuple[int, ...] = ()) -> jj.Measurements:
+    """Lean and place of a rolling disc at 61 times over 2 s."""
+    ts = jnp.linspace(0.0, 2.0, 61) if ts is None else ts
+    motion, noise = jj.simulate(jj.models.TiltingDisc(), START, ts=ts), np.random.default_rng(seed)
+    values = {name: np.asarray(motion[name]) + s * noise.normal(size=(*repeats, len(ts))) for name, s in SIGMA.items()}
+    values["lean"][..., 17] += outlier * SIGMA["lean"]
+    return jj.Measurements(ts, values, SIGMA, start={"lean": 0.31, "spin_rate": -2.9}, unknown_start=("lean", "spin_rate"))
+
+
+def disc(repeats: int) -> list[Figure]:
+    """A warm fit against SciPy's least squares on the same compiled simulation."""
+    import scipy.optimize
+
+    data, guess, free = disc_data(0), jj.models.TiltingDisc(radius=0.55, gravity=10.8), ("radius", "gravity")
+
+    def residual(theta, adjoint=None):
+        scene = jj.models.TiltingDisc(radius=theta[0], gravity=theta[1])
+        motion = jj.simulate(scene, {"lean": theta[2], "spin_rate": theta[3]}, ts=data.ts, events=False, work=False, adjoint=adjoint)
+        return jnp.concatenate([(motion[name] - data.values[name]) / SIGMA[name] for name in SIGMA])
+
+    compiled, first = jax.jit(residual), np.array([0.55, 10.8, 0.31, -2.9])
+    slopes = jax.jit(jax.jacfwd(lambda theta: residual(theta, diffrax.ForwardMode())))
+    numbers = lambda f: lambda theta: np.asarray(f(jnp.asarray(theta)))  # noqa: E731
+    found = {}
+
+    def ours():
+        found["fit"] = jj.fit(guess, data, free)
+
+    def differences():
+        found["scipy"] = scipy.optimize.least_squares(numbers(compiled), first, x_scale=np.abs(first))
+
+    def forward():
+        found["jacfwd"] = scipy.optimize.least_squares(numbers(compiled), first, jac=numbers(slopes), x_scale=np.abs(first))
+
+    times = processor_times({"fit": ours, "differences": differences, "jacfwd": forward}, repeats)
+    apart = np.max(np.abs(found["fit"].values - found["scipy"].x) / found["fit"].standard_errors)
+    print(
+        f"  fit {1e3 * times['fit']:.1f} ms ({int(found['fit'].steps)} steps), SciPy with differences {1e3 * times['differences']:.1f} ms "
+        f"({found['scipy'].nfev} steps), with jacfwd {1e3 * times['jacfwd']:.1f} ms ({found['jacfwd'].nfev} steps)"
+    )
+    return [
+        figure("warm fit over SciPy with differences", "tilting-disc", times["fit"] / times["differences"], 0.5),
+        figure("warm fit over SciPy with jacfwd", "tilting-disc", times["fit"] / times["jacfwd"], 0.6),
+        figure("estimates apart from SciPy's, standard errors", "tilting-disc", float(apart), 0.01),
+    ]
+
+
+def outlier() -> list[Figure]:
+    """One of 122 samples is 60 sigmas out."""
+    guess, free, found = jj.models.TiltingDisc(radius=0.55, gravity=10.8), ("radius", "gravity"), []
+    for name, loss in (("least squares", None), ("Huber", jj.huber()), ("Student-t", jj.student_t())):
+        clean, spoilt = (jj.fit(guess, disc_data(0, outlier=far), free, loss=loss) for far in (0.0, 60.0))
+        moved = float(np.max(np.abs(clean.values - spoilt.values) / clean.standard_errors))
+        found.append(figure(f"an outlier of 60 sigmas moves estimates by, standard errors, {name}", "tilting-disc", moved, None if loss is None else 0.3))
+    return found
+
+
+class Oscillator(jj.Scene):
+    """`m x'' = - c x' - k x`."""
+
+    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
+    damping: jnp.ndarray = jj.parameter(0.3, non_negative=True)
+    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x),)
+
+
+def bound() -> list[Figure]:
+    """A damping that is zero, from ten sets of noise."""
+    ts, steps, converged = np.linspace(0.0, 10.0, 101), [], []
+    for seed in range(10):
+        x = 0.3 * np.cos(np.sqrt(2.5) * ts) + 0.01 * np.random.default_rng(seed).normal(size=101)
+        found = jj.fit(Oscillator(), jj.Measurements(ts, {"x": x}, 0.01, start={"x": 0.3}), ("damping", "stiffness"))
+        steps.append(int(found.steps))
+        converged.append(bool(found.converged) and np.isfinite(found["damping"].high))
+    return [
+        figure("steps to a damping of zero, the most of ten", "oscillator", max(steps), 14),
+        figure("such fits converged, with a limit, of ten", "oscillator", sum(converged), 10, at_least=True),
+    ]
+
+
+def starts() -> list[Figure]:
+    """Thirty first guesses of radius, gravity, lean and spin, each within a factor of 5 of the truth."""
+    generator, data, best = np.random.default_rng(4), disc_data(0), []
+    truth = jj.fit(jj.models.TiltingDisc(), data, ("radius", "gravity"))
+    false = 0
+    for factors in np.exp(generator.uniform(-np.log(5), np.log(5), (30, 4))):
+        begin = {"lean": jnp.asarray(0.3 * min(factors[2], 1.4 / 0.3)), "spin_rate": jnp.asarray(-3.0 * factors[3])}
+        run = jj.Measurements(data.ts, data.values, SIGMA, start=begin, unknown_start=("lean", "spin_rate"))
+        found = jj.fit(jj.models.TiltingDisc(radius=0.5 * factors[0], gravity=9.81 * factors[1]), run, ("radius", "gravity"))
+        same = bool(found.chi_square < truth.chi_square + 0.1)
+        best.append(same)
+        false += not same and not found.warning
+    return [
+        figure("first guesses within a factor of 5 from which the minimum is found, of 30", "tilting-disc", sum(best), 27, at_least=True),
+        figure("of the others, without a warning", "tilting-disc", false, 0),
+    ]
+
+
+def coverage(repeats: int) -> list[Figure]:
+    """How often the 95 % interval holds the truth: disc with unknown starts; and with sigmas that are not known."""
+    found = []
+    for name, sigma in (("sigmas known", SIGMA), ("sigmas estimated", None)):
+        data = disc_data(1, repeats=(repeats,))
+        data = jj.Measurements(data.ts, data.values, sigma, start=data.start, unknown_start=("lean", "spin_rate"))
+        fits = jj.fit_batch(jj.models.TiltingDisc(radius=0.51, gravity=10.0), data, ("radius", "gravity"))
+        truth = np.array([0.5, 9.81, 0.3, -3.0])
+        share = np.mean((fits.low < truth) & (truth < fits.high), axis=0)
+        found += [
+            figure(f"intervals that hold the truth, %, {label}, {name}", "tilting-disc", 100 * float(s)) for label, s in zip(fits.labels, share, strict=True)
+        ]
+        for entry in found[-4:]:
+            entry |= {"required": [93, 97], "met": 93 <= entry["value"] <= 97}
+    return found
+
+
+# The steer-by-wire bicycle. ---------------------------------------------------------------------------------------------------
+
+
+class SteerByWire(WhippleBicycle):
+    """A Whipple bicycle whose steer motor gives `gain` times what is commanded, with damping of steer and lean."""
+
+    steer_damping: jnp.ndarray = jj.parameter(0.3, unit="N m s/rad", non_negative=True)
+    lean_damping: jnp.ndarray = jj.parameter(1.0, unit="N m s/rad", non_negative=True)
+    gain: jnp.ndarray = jj.parameter(1.0)
+
+    def loads(self, motion):
+        lean = motion.inputs.lean_torque - self.lean_damping * motion.u.lean_rate
+        steer = self.gain * motion.inputs.steer_torque - self.steer_damping * motion.u.steer_rate
+        return jj.gravity(motion, self.g), jj.generalized_force(motion, lean_rate=lean, steer_rate=steer)
+
+
+# nominal parameters of the authors' models; the front frame turns the motor with it, whose inertia is a first guess
+NOMINAL = {
+    "w": 1.036, "c": 0.0803, "lam": float(np.deg2rad(18.2)), "rR": 0.3498, "mR": 10.12, "IRxx": 0.1040, "IRyy": 0.1641, "xB": 0.462, "zB": -0.698, "mB": 20.9,
+    "IBxx": 1.64, "IByy": 2.0, "IBzz": 1.94, "IBxz": 0.654, "xH": 0.944, "zH": -0.595, "mH": 0.6, "IHxx": 0.1, "IHyy": 0.1, "IHzz": 0.1, "IHxz": -0.00044,
+    "rF": 0.3498, "mF": 1.780, "IFxx": 0.0644, "IFyy": 0.1289,
+}  # fmt: skip
+FREE = dict.fromkeys(("gain", "steer_damping", "lean_damping", "IBxz", "zB", "c")) | {
+    "IBxx": jj.bounds(0.2, 8.0),
+    "IBzz": jj.bounds(0.2, 8.0),
+    "IHzz": jj.bounds(0.001, 1.0),
+}
+
+
+def windows() -> list[jj.Measurements]:
+    """The 57 windows: lean rate and steer rate, the command as input, and an unknown start each."""
+    with gzip.open(WINDOWS, "rt") as file:
+        rows = list(csv.DictReader(file))
+    runs, ts, scale = [], 0.01 * np.arange(100), {"lean": 0.1, "lean_rate": 0.3, "steer": 0.1, "steer_rate": 0.5}
+    for k in range(0, len(rows), 100):
+        column = {name: np.array([float(row[name]) for row in rows[k : k + 100]]) for name in rows[0] if name != "log"}
+        first = {"lean": "lean_angle", "lean_rate": "lean_rate", "steer": "fork_angle", "steer_rate": "fork_rate"}
+        start = {name: column[source][0] for name, source in first.items()} | {"rear_spin_rate": column["speed"].mean() / NOMINAL["rR"]}
+        values = {"lean_rate": column["lean_rate"], "steer_rate": column["fork_rate"]}
+        unknown = {name: jj.unbounded(s) for name, s in scale.items()}
+        torque = jj.Sampled(ts, column["command_fork"])
+        runs.append(jj.Measurements(ts, values, {"lean_rate": 0.03, "steer_rate": 0.1}, start=start, unknown_start=unknown, inputs={"steer_torque": torque}))
+    return runs
+
+
+def fit_windows(count: int, **options) -> tuple[jj.Fit, float]:
+    """A fit of the first runs, and its wall time."""
+    begin = time.perf_counter()
+    found = jj.fit(SteerByWire(**NOMINAL), windows()[:count], FREE, rtol=1e-6, atol=1e-6, **options)
+    return found, time.perf_counter() - begin
+
+
+def report_windows() -> None:
+    """For a process of its own: prints numbers as JSON in the last line."""
+    begin = time.perf_counter()
+    found, _ = fit_windows(57)
+    cold = time.perf_counter() - begin + START_UP
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    again, warm = fit_windows(57)
+    print("\n".join(line for line in str(found).split("\n") if "run " not in line and not line.strip()[:2].isdigit()))
+    small = processor_times({count: lambda count=count: fit_windows(count, max_iterations=2) for count in (8, 32)}, 2)
+    print(
+        json.dumps({"cold": cold, "warm": warm, "memory": memory, "steps": int(found.steps), "converged": bool(again.converged), "ratio": small[32] / small[8]})
+    )
+
+
+START_UP = 3.0  # s, to import all; counted in
+
+
+def of_windows() -> list[Figure]:
+    """57 runs with 9 + 228 unknowns, in a fresh process."""
+    done = subprocess.run([sys.executable, __file__, "--windows"], capture_output=True, text=True, check=False)
+    print(done.stdout, done.stderr[-2000:])
+    if done.returncode:
+        return [figure("57 windows: fit fails", "steer-by-wire bicycle", 1.0, 0.0)]
+    told = json.loads(done.stdout.strip().split("\n")[-1])
+    model = "steer-by-wire bicycle"
+    return [
+        figure("57 windows, cold, s", model, told["cold"], 60),
+        figure("57 windows, warm, s", model, told["warm"], 40),
+        figure("57 windows, memory, GiB", model, told["memory"], 3),
+        figure("57 windows, converged", model, float(told["converged"]), 1, at_least=True),
+        figure("57 windows, steps", model, told["steps"]),
+        figure("two steps at 32 runs over 8", model, told["ratio"], 4.5),
+    ]
+
+
+def main() -> None:
+    """Run, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--only", nargs="*", default=[])
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--windows", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.windows:
+        report_windows()
+        return
+    parts = {
+        "disc": lambda: disc(3 if options.quick else 15),
+        "outlier": outlier,
+        "bound": bound,
+        "starts": starts,
+        "coverage": lambda: coverage(50 if options.quick else 500),
+        "windows": of_windows,
+    }
+    chosen = options.only or [name for name in parts if not (options.quick and name == "windows")]
+    figures = []
+    for name in chosen:
+        print(name, flush=True)
+        figures += parts[name]()
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,133 @@
+"""Least squares with unknowns that all runs share and unknowns of one run each: an arrow-shaped problem, kept as one small triangle per run.
+
+minimise sum_i |r_i + J_i dx_i + S_i ds|^2 + lambda |D d|^2          run i: its own unknowns x_i, the shared ones s
+
+    [J_i S_i r_i] = Q_i [ T_i ; 0 ]          one QR factorisation per run: T_i is all that is kept of its samples
+    x_i goes out by a QR factorisation of the first columns of T_i, below them sqrt(lambda) D_i: the Schur complement, without squaring anything
+    s by the singular values of what is left of all runs; directions whose singular value is below a cut-off stay as they are
+
+Time and memory grow linearly with the number of runs. A leading axis `members` holds problems of equal shape. All on NumPy.
+Source: G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105 (the scaling D).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+
+def triangle(residual: Float[np.ndarray, "*batch samples"], jacobian: Float[np.ndarray, "*batch samples unknowns"]) -> np.ndarray:
+    """T of [J r], shape (*batch, unknowns + 1, unknowns + 1); NaN where something is not finite."""
+    whole = np.concatenate([jacobian, residual[..., None]], axis=-1)
+    good = np.all(np.isfinite(whole), axis=(-2, -1), keepdims=True)
+    found = np.linalg.qr(np.where(good, whole, 0.0), mode="r")
+    width = whole.shape[-1]
+    square = np.zeros((*found.shape[:-2], width, width))
+    square[..., : found.shape[-2], :] = found
+    return np.where(good, square, np.nan)
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """A linearised problem: of each run the rows of T that hold its own unknowns, and of all runs together the rest as one triangle."""
+
+    local: Float[np.ndarray, "members runs local width"]
+    shared: Float[np.ndarray, "members rows columns"]
+    scores: Float[np.ndarray, "members runs _"]  # of each run: gradient in the shared unknowns, its own ones being fitted
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, ...]:
+        """All that it holds, with the axis of members first."""
+        return self.local, self.shared, self.scores
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Numbers of runs, of unknowns of each run, and of shared unknowns."""
+        runs, local = self.local.shape[1:3]
+        return runs, local, self.shared.shape[-1] - 1
+
+    def at(self, members) -> "Arrow":
+        """That of some members."""
+        return Arrow(*(x[members] for x in self.arrays))
+
+    def scaled(self, size: Float[np.ndarray, "members unknowns"]) -> "Arrow":
+        """In unknowns divided by `size`."""
+        shared, local = self.split(size)
+        whole = np.concatenate([local, np.broadcast_to(shared[:, None], (*local.shape[:2], shared.shape[1])), np.ones((*local.shape[:2], 1))], axis=-1)
+        return Arrow(
+            self.local * whole[:, :, None],
+            self.shared * np.concatenate([shared, np.ones((len(shared), 1))], axis=-1)[:, None],
+            self.scores * shared[:, None],
+        )
+
+    def split(self, x: Shaped[np.ndarray, "members unknowns"]) -> tuple[np.ndarray, np.ndarray]:
+        """Shared unknowns (members, shared), and those of the runs (members, runs, local)."""
+        runs, local, shared = self.counts
+        return x[:, :shared], x[:, shared:].reshape(len(x), runs, local)
+
+    def column_norms(self) -> Float[np.ndarray, "members unknowns"]:
+        """Length of each column of the Jacobian."""
+        _, local, shared = self.counts
+        own = np.linalg.norm(self.local[..., :local], axis=2).reshape(len(self.local), -1)
+        squares = np.sum(self.local[..., local : local + shared] ** 2, axis=(1, 2)) + np.sum(self.shared[..., :shared] ** 2, axis=1)
+        return np.concatenate([np.sqrt(squares), own], axis=1)
+
+    def gradient(self) -> Float[np.ndarray, "members unknowns"]:
+        """`J' r`."""
+        _, local, shared = self.counts
+        own = np.einsum("bkij,bki->bkj", self.local[..., :-1], self.local[..., -1])
+        of_shared = np.sum(own[..., local : local + shared], axis=1) + np.einsum("bij,bi->bj", self.shared[..., :-1], self.shared[..., -1])
+        return np.concatenate([of_shared, own[..., :local].reshape(len(own), -1)], axis=1)
+
+    def change(self, d: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members"]:
+        """`|J d|^2`."""
+        shared, own = self.split(d)
+        _, m, _ = self.counts
+        of_runs = np.einsum("bkij,bkj->bki", self.local[..., :m], own) + np.einsum("bkij,bj->bki", self.local[..., m:-1], shared)
+        return np.sum(of_runs**2, axis=(1, 2)) + np.sum(np.einsum("bij,bj->bi", self.shared[..., :-1], shared) ** 2, axis=1)
+
+    def step(self, damping: Float[np.ndarray, "members"], D, held, moved, cutoff) -> Float[np.ndarray, "members unknowns"]:
+        """The damped step; unknowns that are `held` move by `moved`. D: (members, unknowns), positive."""
+        _, m, _ = self.counts
+        local, shared = self.local.copy(), self.shared.copy()
+        (held_s, held_l), (moved_s, moved_l) = (self.split(x) for x in (held, np.where(held, moved, 0.0)))
+        local[..., -1] += np.einsum("bkij,bkj->bki", local[..., :m], moved_l) + np.einsum("bkij,bj->bki", local[..., m:-1], moved_s)
+        shared[..., -1] += np.einsum("bij,bj->bi", shared[..., :-1], moved_s)
+        local[..., :m] *= ~held_l[:, :, None]
+        local[..., m:-1] *= ~held_s[:, None, None]
+        shared[..., :-1] *= ~held_s[:, None]
+        D_s, D_l = self.split(D)
+        root = np.sqrt(damping)
+        upper, rest = eliminated(local, root[:, None, None] * D_l)
+        stack = np.concatenate([shared, rest], axis=1)
+        # in unknowns times D, by singular values: (S^2 + lambda) ds = - S U' c
+        U, S, Vt = np.linalg.svd(stack[..., :-1] / D_s[:, None], full_matrices=False)
+        shows = np.max(S, axis=1, initial=0.0, keepdims=True) * cutoff < S
+        weight = np.where(shows, S / (S**2 + damping[:, None] + np.where(shows, 0.0, 1.0)), 0.0)
+        ds = -np.einsum("bji,bj->bi", Vt, weight * np.einsum("bji,bj->bi", U, stack[..., -1])) / D_s
+        right = -(upper[..., -1] + np.einsum("bkij,bj->bki", upper[..., m:-1], ds))
+        dx = np.linalg.solve(upper[..., :m], right[..., None])[..., 0] if m else right
+        d = np.concatenate([ds, dx.reshape(len(dx), -1)], axis=1)
+        return np.where(held, moved, d)
+
+
+def eliminated(local: np.ndarray, below: Float[np.ndarray, "members runs local"]) -> tuple[np.ndarray, np.ndarray]:
+    """The rows that give a run's own unknowns in terms of the shared ones, and those that are left for the latter, all runs one after another.
+
+    `below`: the diagonal of the rows that are added.
+    """
+    members, runs, m, width = local.shape
+    if not m:
+        return local, np.zeros((members, 0, width))
+    added = np.concatenate([below[..., None] * np.eye(m), np.zeros((members, runs, m, width - m))], axis=-1)
+    R = np.linalg.qr(np.concatenate([local, added], axis=2), mode="r")
+    return R[:, :, :m], R[:, :, m:, m:].reshape(members, -1, width - m)
+
+
+def arrow(triangles: Float[np.ndarray, "members runs width width"], local: int) -> Arrow:
+    """From the triangles of all runs, with `local` unknowns of their own in the first columns."""
+    members, runs, width, _ = triangles.shape
+    rest = triangles[:, :, local:, local:]
+    scores = np.einsum("bkij,bki->bkj", rest[..., :-1], rest[..., -1])
+    together = rest.reshape(members, runs * (width - local), width - local)
+    return Arrow(triangles[:, :, :local], np.linalg.qr(together, mode="r") if runs > 1 else together, scores)

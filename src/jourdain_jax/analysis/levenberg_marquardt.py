@@ -1,0 +1,132 @@
+"""Levenberg-Marquardt within bounds, for residuals that are expensive: one simulation with all its derivatives per step tried.
+
+minimise F(theta), low <= theta <= high;      near theta   F + g' d + |J d|^2 / 2
+step       (J'J + lambda D^2) d = - g          D: lengths of the columns of J;  unknowns that would pass a bound end there, and the others are solved for again
+converged  the undamped step is at most `tolerance` standard errors long, |J d|, and moves no unknown by more than that fraction of its size
+
+Several problems of one shape (`members`) go side by side; those that have ended cost nothing.
+Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jourdain_jax.analysis.arrow import Arrow
+
+FIRST, LEAST, MOST = 1e-3, 1e-9, 1e9  # damping lambda: at first, at least, and where no step is found
+FASTEST = 10.0  # factor by which damping falls after a good step
+RELEASES = 8  # times that unknowns which would pass a bound are put there and the others solved for again
+
+
+@dataclass
+class Linearised:
+    """Value and slopes at some theta, of each member."""
+
+    cost: Float[np.ndarray, "members"]  # F; not finite where the motion fails
+    arrow: Arrow  # J and residuals with J'r = dF/dtheta
+    residual: np.ndarray  # (members, runs) of vectors
+    sigma: Float[np.ndarray, "members channels"]  # of channels whose noise is estimated
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What steps may do; all of shape (unknowns,)."""
+
+    low: Float[np.ndarray, "unknowns"]
+    high: Float[np.ndarray, "unknowns"]
+    fixed: Bool[np.ndarray, "unknowns"]
+    size: Callable  # theta -> magnitude of each unknown
+
+
+@dataclass(frozen=True)
+class Control:
+    """When to stop."""
+
+    tolerance: float
+    most_steps: int
+    cutoff: float
+
+
+@dataclass
+class Minimum:
+    """Where the minimisation of each member ended."""
+
+    theta: Float[np.ndarray, "members unknowns"]
+    at: Linearised
+    converged: Bool[np.ndarray, "members"]
+    stuck: Bool[np.ndarray, "members"]  # no step lowers F, however short, and this is no minimum
+    steps: Int[np.ndarray, "members"]  # tried
+
+
+def minimise(
+    evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Float[np.ndarray, "members unknowns"], limits: Limits, control: Control
+) -> Minimum:
+    """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers."""
+    theta, members = theta.copy(), np.arange(len(theta))
+    at = evaluate(theta, members)
+    damping, growth, fall = (np.full(len(theta), x) for x in (FIRST, 4.0, FASTEST))
+    converged, stuck, steps = np.zeros(len(theta), bool), np.zeros(len(theta), bool), np.zeros(len(theta), int)
+    going = np.isfinite(at.cost)
+    for _ in range(control.most_steps):
+        here = members[going]
+        if not here.size:
+            break
+        arrow, x = at.arrow.at(here), theta[here]
+        d = _step(arrow, x, damping[here], limits, control.cutoff)
+        done = _is_small(arrow, x, d, limits, control)
+        if np.any(done & (damping[here] > LEAST)):
+            done &= _is_small(arrow, x, _step(arrow, x, np.full(len(here), LEAST), limits, control.cutoff), limits, control)
+        if np.any(done):
+            converged[here[done]], going[here[done]] = True, False
+            here, d, x, arrow = here[~done], d[~done], x[~done], arrow.at(~done)
+            if not here.size:
+                break
+        steps[here] += 1
+        promised = -np.sum(arrow.gradient() * d, axis=1) - 0.5 * arrow.change(d)
+        trial = evaluate(x + d, here)
+        with np.errstate(invalid="ignore"):
+            found = at.cost[here] - trial.cost
+            # near the minimum the simulation's own error decides whether F falls
+            level = (promised < 100 * control.tolerance**2) & (np.abs(found) < control.tolerance)
+            better = np.isfinite(trial.cost) & ((found > 1e-4 * promised) | level)
+            ratio = np.where(np.isfinite(found), found / np.maximum(promised, np.finfo(float).tiny), -1.0)
+        rising = here[better]
+        theta[rising], at.cost[rising] = (x + d)[better], trial.cost[better]
+        at.residual[rising], at.sigma[rising] = trial.residual[better], trial.sigma[better]
+        for kept, new in zip(at.arrow.arrays, trial.arrow.arrays, strict=True):
+            kept[rising] = new[better]
+        # after a step that failed, damping falls slowly: in a curved valley every other step would fail. It rises where steps overshoot: where residuals
+        # stay large, undamped ones go to and fro along what shows least
+        change = np.where(ratio > 0.9, 1 / fall[here], np.where(ratio < 0.6, 3.0, 1.0))
+        damping[here] *= np.where(better, change, growth[here])
+        damping[here] = np.where(better & level, LEAST, np.maximum(damping[here], LEAST))
+        growth[here] = np.where(better, 4.0, growth[here] * 2)
+        fall[here] = np.where(better, np.minimum(1.5 * fall[here], FASTEST), 2.0)
+        lost = damping[here] > MOST
+        stuck[here[lost]], going[here[lost]] = True, False
+    return Minimum(theta, at, converged, stuck, steps)
+
+
+def _step(arrow: Arrow, theta, damping, limits: Limits, cutoff: float) -> np.ndarray:
+    """The damped step within the bounds."""
+    norms, size = arrow.column_norms(), limits.size(theta)
+    D = np.maximum(norms, 1e-8 * np.max(norms * size, axis=1, keepdims=True) / size)
+    D = np.where(D > 0, D, 1.0)
+    g = arrow.gradient()
+    held = limits.fixed | ((theta <= limits.low) & (g >= 0)) | ((theta >= limits.high) & (g <= 0))
+    moved = np.zeros_like(theta)
+    for _ in range(RELEASES):
+        d = arrow.step(damping, D, held, moved, cutoff)
+        within = np.clip(theta + d, limits.low, limits.high) - theta
+        over = ~held & (within != d) & ((theta + d < limits.low) | (theta + d > limits.high))
+        if not np.any(over):
+            return d
+        held, moved = held | over, np.where(over, within, moved)
+    return np.clip(theta + d, limits.low, limits.high) - theta
+
+
+def _is_small(arrow: Arrow, theta, d, limits: Limits, control: Control) -> Bool[np.ndarray, "members"]:
+    return (arrow.change(d) <= control.tolerance**2) & np.all(np.abs(d) <= control.tolerance * limits.size(theta), axis=1)

@@ -1,0 +1,266 @@
+"""What a scene predicts for the measurements of a run, against what was measured; and the same with derivatives for many runs, in one compiled program.
+
+r = (channel(motion) - value) / sigma, zero where a sample is missing
+
+A lane is one run of one member (a repeat of the experiment, or a first guess of its own). Some lanes at a time go through one program, which is
+compiled once for runs of equal structure, whatever their number: memory does not grow with it. Short runs are filled up to the length of the longest.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache
+from itertools import islice
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.unknowns import Layout
+from jourdain_jax.motion.inputs import Inputs, Sampled
+from jourdain_jax.motion.integrators.forward_mode import simulate_forward
+from jourdain_jax.motion.quick_compilation import quickly_compiled
+from jourdain_jax.scene.scene import Scene
+
+TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
+MOST_LANES = 64
+AHEAD = 4  # groups of lanes that are begun before the first is read
+FILLED = 1e-6  # of a run's span: between the times that fill up a short one
+
+
+class Run(eqx.Module):
+    """A run made ready: its measurements with weights 1 / sigma, zero where a sample is missing."""
+
+    t0: Float[Array | np.ndarray, ""]
+    ts: Float[Array | np.ndarray, "times"]
+    values: dict[str, Float[Array | np.ndarray, "..."]]
+    weights: dict[str, Float[Array | np.ndarray, "..."]]
+    start: dict[str, Float[Array | np.ndarray, "..."]]
+    inputs: dict | Inputs | None
+    functions: dict[str, Callable]
+
+    def residuals(self, scene: Scene, simulate: Callable, simulation: dict) -> dict[str, Float[Array | np.ndarray, "..."]]:
+        """`(prediction - value) / sigma` by channel."""
+        motion = simulate(scene, self.start, t0=self.t0, ts=self.ts, inputs=self.inputs, events=False, work=False, **simulation)
+        states = motion.motions() if self.functions else None
+        found = {}
+        for name, weight in self.weights.items():
+            predicted = jax.vmap(self.functions[name])(states) if name in self.functions else motion[name]
+            found[name] = jnp.where(weight > 0, (predicted - self.values[name]) * weight, 0.0)
+        return found
+
+
+def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
+    """A run with weights; `xp`: NumPy, or `jax.numpy` where numbers are traced; `repeats`: values have a leading axis."""
+    weights = {}
+    for name, values in data.values.items():
+        sigma, known = data.sigma_of(name, repeats), xp.isfinite(xp.asarray(values))
+        weights[name] = xp.where(known & xp.isfinite(sigma), 1.0 / sigma, 0.0)
+    measured = {name: xp.where(weights[name] > 0, xp.asarray(values), 0.0) for name, values in data.values.items()}
+    return Run(data.t0, data.ts, measured, weights, data.start, data.inputs, data.functions)
+
+
+def equal_runs(data: Sequence[Measurements]) -> list[Run]:
+    """Runs of equal structure and shapes stacked, for use where numbers may be traced."""
+    groups: dict[tuple, list[Run]] = {}
+    for indices in _alike(data):
+        for i in indices:
+            run = run_of(data[i], jnp)
+            groups.setdefault((indices[0], *(x.shape for x in jax.tree.leaves(eqx.filter(run, _is_array)))), []).append(run)
+    return [
+        eqx.combine(jax.tree.map(lambda *xs: jnp.stack(xs), *(eqx.filter(run, _is_array) for run in runs)), eqx.filter(runs[0], _is_array, inverse=True))
+        for runs in groups.values()
+    ]
+
+
+class Lanes:
+    """All lanes of a problem; `evaluate` gives their weighted residuals with derivatives."""
+
+    def __init__(self, scene: Scene, data: Sequence[Measurements], layout: Layout, simulation: dict, members: int | None):
+        self.members, self._scene, self._layout = members, scene, layout
+        self._groups = [
+            _Group(scene, indices, [run_of(data[i], repeats=members is not None) for i in indices], layout, simulation, members) for indices in _alike(data)
+        ]
+        self.lengths = [run.ts.shape[0] for run in data]
+
+    def evaluate(self, shared: Float[np.ndarray, "members shared"], local: Float[np.ndarray, "members runs local"], members: np.ndarray):
+        """Yields, some lanes at a time: numbers of members (among those given) and of runs, residuals by lane, and Jacobians (own unknowns first)."""
+        for group in self._groups:
+            yield from group.evaluate(shared, local, members)
+
+    def counted(self, names: Sequence[str], members: np.ndarray) -> Float[np.ndarray, "members names"]:
+        """Samples of each of these channels that are not missing, in all runs."""
+        found = np.zeros((len(members), len(names)))
+        for k, name in enumerate(names):
+            for group in self._groups:
+                weights = group.weights.get(name)
+                if weights is not None:
+                    here = np.count_nonzero(weights, axis=tuple(range(2, weights.ndim))) if self.members is not None else np.count_nonzero(weights)
+                    found[:, k] += here.sum(axis=0)[members] if self.members is not None else here
+        return found
+
+    def channels(self, run: int) -> dict[str, slice]:
+        """Where the samples of each channel are in the residuals of a run."""
+        return self._group_of(run).channels
+
+    def by_channel(self, run: int, flat: Float[np.ndarray, "*members samples"]) -> dict[str, np.ndarray]:
+        """Weighted residuals of a run by channel, NaN where a sample is missing."""
+        group = self._group_of(run)
+        return group.by_channel(group.indices.index(run), flat, self.lengths[run])
+
+    def _group_of(self, run: int) -> "_Group":
+        return next(g for g in self._groups if run in g.indices)
+
+
+class _Group:
+    """Runs of equal structure, filled up to one length."""
+
+    def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None):
+        self.indices, self._members, self._counts = indices, members, layout.sizes
+        times, knots = max(run.ts.shape[0] for run in runs), _most_knots(runs)
+        filled = [_filled(run, times, knots, 0 if members is None else 1) for run in runs]
+        self._arrays = jax.tree.map(lambda *xs: np.stack(xs), *[eqx.partition(run, _is_array)[0] for run in filled])
+        self._repeated = eqx.tree_at(
+            lambda r: (r.values, r.weights), jax.tree.map(lambda _: False, self._arrays), (dict.fromkeys(filled[0].values, members is not None),) * 2
+        )
+        self._common, rest = eqx.partition((scene, simulation), _is_array)
+        static = jax.tree.flatten((rest, eqx.partition(filled[0], _is_array)[1], layout))
+        self._run = _program(static[1], tuple(static[0]))
+        sizes = {name: int(np.prod(w.shape[0 if members is None else 1 :])) for name, w in sorted(filled[0].weights.items())}
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        self.channels = {name: slice(begin, end) for name, begin, end in zip(sizes, ends[:-1], ends[1:], strict=True)}
+        states = times * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
+        self._width = int(min(MOST_LANES, max(1, TOUCHED // states)))
+        self._kept: tuple = ((), [])
+
+    def evaluate(self, shared, local, members):
+        chunks = self._chunks(members)
+        yield self._ended(self._begin(shared, local, *chunks[0]))  # compiles, where that is needed
+        waiting: list[Future] = []
+        try:
+            for chunk in chunks[1:]:
+                waiting.append(_threads().submit(lambda chunk=chunk: self._ended(self._begin(shared, local, *chunk))))
+                if len(waiting) == AHEAD:
+                    yield waiting.pop(0).result()
+            while waiting:
+                yield waiting.pop(0).result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+    def _chunks(self, members):
+        """Positions of members and runs of some lanes, filled up with copies of the last, and their arrays."""
+        key = members.tobytes()
+        if self._kept[0] != key:
+            lanes = [(b, j) for b in range(len(members)) for j in range(len(self.indices))]
+            width = min(self._width, 1 << (len(lanes) - 1).bit_length())
+            chunks, rest = [], iter(lanes)
+            while some := list(islice(rest, width)):
+                b, j = np.array(some + some[-1:] * (width - len(some))).T
+                take = lambda x, repeated, b=b, j=j: jnp.asarray(x[j, members[b]] if repeated else x[j])  # noqa: E731
+                chunks.append((len(some), b, j, jax.tree.map(take, self._arrays, self._repeated)))
+            self._kept = key, chunks if len(chunks) * width <= 4096 else []
+            return chunks
+        return self._kept[1]
+
+    def _begin(self, shared, local, kept, b, j, arrays):
+        runs = np.array(self.indices)[j]
+        return kept, b, runs, self._run(self._common, arrays, shared[b], local[b, runs])
+
+    def _ended(self, begun):
+        kept, b, runs, found = begun
+        r, J = (np.asarray(x)[:kept] for x in found)
+        return b[:kept], runs[:kept], r, J
+
+    @property
+    def weights(self) -> dict[str, np.ndarray]:
+        """Weights by channel, shape (runs, *members, times, *channel)."""
+        return self._arrays.weights
+
+    def by_channel(self, place: int, flat, times: int) -> dict[str, np.ndarray]:
+        """Residuals of the run at this place by channel; all NaN where `flat` is empty, since they were not worked out."""
+        found = {}
+        for name, where in self.channels.items():
+            weight = self._arrays.weights[name][place]
+            shape = weight.shape if self._members is None else weight.shape[1:]
+            part = flat[..., where].reshape((*flat.shape[:-1], *shape)) if flat.shape[-1] else np.full((*flat.shape[:-1], *shape), np.nan)
+            found[name] = np.where(weight > 0, part, np.nan)[(slice(None),) * (flat.ndim - 1) + (slice(times),)]
+        return found
+
+
+@lru_cache(maxsize=1)
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="jourdain_fit")
+
+
+@lru_cache(maxsize=16)
+def _program(treedef, leaves: tuple) -> Callable:
+    """Residuals (lanes, samples) and Jacobians (lanes, samples, local + shared) of lanes; compiled once for what is no array."""
+    rest, run_rest, layout = jax.tree.unflatten(treedef, leaves)
+    local_count = layout.sizes[1]
+
+    def lane(common, arrays, shared, local):
+        (scene, simulation), run = eqx.combine(common, rest), eqx.combine(arrays, run_rest)
+
+        def flat(x):
+            at = eqx.tree_at(lambda r: r.start, run, layout.start(run.start, x[:local_count]))
+            found = at.residuals(layout.scene(scene, x[local_count:]), simulate_forward, simulation)
+            r = jnp.concatenate([jnp.ravel(found[name]) for name in sorted(found)])
+            return r, r
+
+        J, r = jax.jacfwd(flat, has_aux=True)(jnp.concatenate([local, shared]))
+        return r, J
+
+    return quickly_compiled(jax.vmap(lane, (None, 0, 0, 0)), jax.jit)
+
+
+def _alike(data: Sequence[Measurements]) -> list[list[int]]:
+    """Indices of the runs, grouped by equal structure: names, functions, kinds of inputs, shapes but for the number of times."""
+    groups: dict[tuple, list[int]] = {}
+    for index, run in enumerate(data):
+        arrays, rest = eqx.partition((run.start, run.functions, _without_knots(run.inputs)), _is_array)
+        kind = (jax.tree.structure((run.start, run.functions, run.inputs, dict.fromkeys(run.values, 0))), tuple(jax.tree.leaves(rest)))
+        groups.setdefault((*kind, tuple(x.shape for x in jax.tree.leaves(arrays))), []).append(index)
+    return list(groups.values())
+
+
+def _is_array(x) -> bool:
+    return isinstance(x, np.ndarray | jax.Array)
+
+
+def _is_sampled(x) -> bool:
+    return isinstance(x, Sampled)
+
+
+def _without_knots(inputs):
+    return jax.tree.map(lambda x: None if _is_sampled(x) else x, inputs, is_leaf=_is_sampled)
+
+
+def _most_knots(runs: Sequence[Run]) -> list[int]:
+    counts = [[x.ts.shape[0] for x in jax.tree.leaves(run.inputs, is_leaf=_is_sampled) if _is_sampled(x)] for run in runs]
+    return [max(column) for column in zip(*counts, strict=True)]
+
+
+def _filled(run: Run, times: int, knots: list[int], axis: int) -> Run:
+    """The run with as many times and knots as these; what is added is close behind its end, and does not count."""
+    more = times - run.ts.shape[0]
+    counts = iter(knots)
+
+    def longer(x):
+        if not _is_sampled(x):
+            return x
+        extra = next(counts) - x.ts.shape[0]
+        span = np.asarray(x.ts[-1] - x.ts[0] + 1.0)
+        ts = np.concatenate([x.ts, max(x.ts[-1], run.ts[-1]) + span * np.arange(1, extra + 1)])
+        return eqx.tree_at(lambda s: (s.ts, s.values), x, (ts, np.concatenate([x.values, np.full(extra, x.values[-1])])))
+
+    inputs = jax.tree.map(longer, run.inputs, is_leaf=_is_sampled)
+    if not more:
+        return eqx.tree_at(lambda r: r.inputs, run, inputs)
+    pad = lambda x: np.concatenate([x, np.zeros((*x.shape[:axis], more, *x.shape[axis + 1 :]))], axis=axis)  # noqa: E731
+    ts = np.concatenate([run.ts, run.ts[-1] + FILLED * (run.ts[-1] - run.t0) * np.arange(1, more + 1)])
+    changed = ts, inputs, {n: pad(x) for n, x in run.values.items()}, {n: pad(x) for n, x in run.weights.items()}
+    return eqx.tree_at(lambda r: (r.ts, r.inputs, r.values, r.weights), run, changed)

@@ -1,0 +1,67 @@
+"""The numbers that an unknown may take: low <= theta <= high, and what counts as a large change of it.
+
+Steps are taken in theta itself and end at a bound, so that an unknown can lie at its bound exactly.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from jourdain_jax.calculus.reals import Number, checked_real
+
+
+@dataclass(frozen=True)
+class Range:
+    """Bounds of an unknown (infinite where there is none), and a typical change of it."""
+
+    kind: Literal["bounds", "positive", "unbounded"]
+    low: float = -np.inf
+    high: float = np.inf
+    scale: float | None = None
+
+    def size(self, value, guess) -> Float[np.ndarray, "*shape"]:
+        """What counts as a large change of the unknown: its own magnitude; near zero the typical change, or a hundredth of the first guess or of the width."""
+        if self.kind == "unbounded":
+            least = np.where(guess == 0, 1.0, np.abs(guess)) if self.scale is None else self.scale
+        else:
+            least = 0.01 * (self.high - self.low) if self.kind == "bounds" else 0.01 * np.abs(guess)
+        return np.maximum(np.abs(value), least)
+
+    def refusal(self, guess: np.ndarray) -> str:
+        """Why a first guess cannot be taken; empty where it can."""
+        if np.all((guess > self.low) & (guess < self.high)):
+            return ""
+        if self.kind == "positive":
+            return "expected a first guess above zero; or leave it free to change sign with `unbounded()`"
+        return f"expected a first guess between its bounds {self.low} and {self.high}; move the guess or widen the bounds"
+
+
+def positive() -> Range:
+    """The unknown is not below zero: `free={"mass": jj.positive()}`. The default of parameters declared positive or non-negative."""
+    return Range("positive", low=0.0)
+
+
+def bounds(low: Number, high: Number) -> Range:
+    """The unknown stays between `low` and `high`, in its own unit: `free={"mass": jj.bounds(0.1, 10)}`.
+
+    Raises ValueError unless both are finite and low < high.
+    """
+    for name, end in (("low end", low), ("high end", high)):
+        checked_real(end, f"{name} of `bounds`", ())
+    if not (np.isfinite(low) and np.isfinite(high) and low < high):
+        raise ValueError(f"bounds({low}, {high}): expected finite numbers low < high; for one bound at zero use `positive()`, for none `unbounded()`")
+    return Range("bounds", float(low), float(high))
+
+
+def unbounded(scale: Number | None = None) -> Range:
+    """The unknown may be any number; `scale`, in its unit, is a typical change: state it where the first guess is zero.
+
+    Raises ValueError unless the scale is positive and finite.
+    """
+    if scale is not None:
+        checked_real(scale, "`scale` of `unbounded`", ())
+    if scale is not None and not (np.isfinite(scale) and scale > 0):
+        raise ValueError(f"unbounded({scale}): expected a positive scale, a typical change in the unit of the unknown")
+    return Range("unbounded", scale=None if scale is None else float(scale))
