@@ -125,7 +125,7 @@ def _in_space(body, k: int, thickness: float) -> list[Part]:
     return [[type(face)(face.corners @ turned.T + place, face.dark) for face in part] for part in parts]
 
 
-def _lit(part: Part, colour: str, strength: float, camera: Camera, clear: bool) -> _Painted:
+def _lit(part: Part, colour: str | tuple, strength: float, camera: Camera, clear: bool) -> _Painted:
     """The faces of a part that look at the eye, in the light."""
     from matplotlib.colors import to_rgb
 
@@ -164,7 +164,7 @@ def _fill(axes, camera: Camera, painted: list[_Painted]) -> None:
     axes.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=colours, linewidths=widths, closed=False, zorder=3))
 
 
-def _legend(figure, plt, colours: dict[str, str], paths: int) -> None:
+def _legend(figure, plt, colours: dict, paths: int) -> None:
     """Names of the bodies in a row above the picture: of many the first, the second and the last."""
     names = list(colours)
     names = names if len(names) <= 4 else [*names[:2], names[-1]]
