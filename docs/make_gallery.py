@@ -3,7 +3,8 @@
     python docs/make_gallery.py [--out DIR] [NAME ...]
 
 A page shows a picture, the lines that draw it (they are what this script runs), what to look at, and the source. Pages are MyST Markdown for Sphinx with
-sphinx-design; nothing is fetched. Without names all pages are written (about 2 minutes on one core), with names those alone; the index lists all pages of the folder.
+sphinx-design; nothing is fetched.
+Without names all pages are written (about 2 minutes on one core), with names those alone; the index lists all pages of the folder.
 """
 
 import argparse

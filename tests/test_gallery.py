@@ -178,7 +178,7 @@ def written(tmp_path, *names: str) -> None:
 
 
 def test_pages_are_written_with_pictures_that_show_something(tmp_path):
-    written(tmp_path, "isokinetic-particle", "heisenberg-particle")
+    written(tmp_path, "isokinetic-particle", "vertical-disc")
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ VIEWS = {"above": (90.0, -90.0), "side": (0.0, -90.0), "space": (28.0, -60.0)}  
 _LINK = "#8a8a86"
 _PATH = (0.27, 0.27, 0.27)  # the colour of paths
 _PATH_WIDTH = 1.3  # points
-Ends = tuple[str, Sequence[float]]
+Ends = tuple[str, Sequence]  # a body and a point (3,) of it, m, body frame
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ def draw_still(
     trajectory: Trajectory,
     path: str | os.PathLike,
     *,
-    at: int | Sequence[float] = 3,
+    at: int | Sequence = 3,
     paths: Sequence[Ends] | None = None,
     links: Sequence[tuple[Ends, Ends]] = (),
     clear: Sequence[str] = (),
-    view: str | tuple[float, float] = "space",
+    view: str | tuple = "space",
     size: tuple[int, int] = (640, 420),
 ) -> None:
     """Draw a motion as one picture: its bodies, solid, at a few times, earlier ones paler, and the paths of points.
@@ -69,7 +69,7 @@ def draw_still(
     palette = plt.rcParams["axes.prop_cycle"].by_key()["color"]
     colours = {name: palette[k % len(palette)] for k, name in enumerate(bodies)}
     painted = [_painted([trace[k : k + 2]], [_PATH], camera, _PATH_WIDTH) for trace in traces for k in range(len(trace) - 1)]
-    for order, k in enumerate(chosen):
+    for order, k in enumerate(chosen.tolist()):
         strength = 1.0 if len(chosen) == 1 else 0.35 + 0.65 * order / (len(chosen) - 1)
         for name, body in bodies.items():
             for part in _in_space(body, k, thickness):
@@ -91,7 +91,7 @@ def draw_still(
     plt.close(figure)
 
 
-def _times(trajectory: Trajectory, at: int | Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+def _times(trajectory: Trajectory, at: int | Sequence) -> tuple[np.ndarray, np.ndarray]:
     """Indices of all saved times that the motion reached, and of those at which bodies are drawn."""
     reached = np.flatnonzero(np.asarray(trajectory.valid))
     if reached.size == 0:
@@ -125,7 +125,7 @@ def _in_space(body, k: int, thickness: float) -> list[Part]:
     return [[type(face)(face.corners @ turned.T + place, face.dark) for face in part] for part in parts]
 
 
-def _lit(part: Part, colour: str, strength: float, camera: Camera, clear: bool) -> _Painted:
+def _lit(part: Part, colour: str | tuple, strength: float, camera: Camera, clear: bool) -> _Painted:
     """The faces of a part that look at the eye, in the light."""
     from matplotlib.colors import to_rgb
 
@@ -164,7 +164,7 @@ def _fill(axes, camera: Camera, painted: list[_Painted]) -> None:
     axes.add_collection(PolyCollection(polygons, facecolors=colours, edgecolors=colours, linewidths=widths, closed=False, zorder=3))
 
 
-def _legend(figure, plt, colours: dict[str, str], paths: int) -> None:
+def _legend(figure, plt, colours: dict, paths: int) -> None:
     """Names of the bodies in a row above the picture: of many the first, the second and the last."""
     names = list(colours)
     names = names if len(names) <= 4 else [*names[:2], names[-1]]

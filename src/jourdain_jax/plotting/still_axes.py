@@ -27,7 +27,7 @@ class Camera:
         return np.stack([points @ self.right, points @ self.up], axis=-1)
 
 
-def camera_at(elevation: float, azimuth: float) -> Camera:
+def camera_at(elevation, azimuth) -> Camera:
     """The camera that looks from this elevation and azimuth (degrees) at the scene."""
     e, a = np.radians(elevation), np.radians(azimuth)
     towards = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
@@ -74,7 +74,7 @@ def draw_floor(axes, camera: Camera, corners: np.ndarray, polygons: list[np.ndar
     _text(axes, "z in m", heights[-1], (0, 6), ha="center", va="bottom")
 
 
-def _ticks(low: float, high: float, least: float, most: int = 5) -> list[float]:
+def _ticks(low, high, least, most: int = 5) -> list[float]:
     """Round numbers that hold the span from `low` to `high` between them, widened to `least`."""
     from matplotlib.ticker import MaxNLocator
 
@@ -96,7 +96,7 @@ def _edge(axes, ticks: list, name: str, middle: np.ndarray) -> None:
     _text(axes, name, (first + last) / 2, (22 * sign, -18), ha=aside, va="top")
 
 
-def _text(axes, text: str, place: np.ndarray, offset: tuple[float, float], ha: str, va: str) -> None:
+def _text(axes, text: str, place: np.ndarray, offset: tuple[int, int], ha: str, va: str) -> None:
     axes.annotate(text, place, xytext=offset, ha=ha, va=va, fontsize=8, color=INK, textcoords="offset points", annotation_clip=False)
 
 
