@@ -1,24 +1,24 @@
 """The verb `sweep`: run a study that a file describes, look at it, go on with it, export it.
 
-    model = "tilting-disc"                       # a name of `jourdain-jax models`
-    t1 = 2.0                                     # s
-    samples = 1000
-    sampler = "sobol"                            # optional, as are `seed`, `save`, `every`, and the tables `set`, `options`, `correlation`
+model = "tilting-disc"                       # a name of `jourdain-jax models`
+t1 = 2.0                                     # s
+samples = 1000
+sampler = "sobol"                            # optional, as are `seed`, `save`, `every`, and the tables `set`, `options`, `correlation`
 
-    [set]                                        # parameters that all lanes share
-    mass = 1.0
-    [vary]                                       # parameters that vary: normal, uniform, log-normal, log-uniform, levels, table
-    radius = { normal = [0.5, 0.01] }
-    [start]                                      # the same of coordinates and speeds, or numbers
-    lean = { uniform = [-0.6, 0.6] }
-    spin_rate = -3.0
-    [outputs]                                    # end, largest, smallest, largest-magnitude, event-time, happened; optional
-    "final lean" = { end = "lean", unit = "rad" }
-    fell = { happened = "fallen" }
-    [options]                                    # of `jj.rollout`
-    rtol = 1e-6
-    [correlation]
-    "radius lean" = 0.5
+[set]                                        # parameters that all lanes share
+mass = 1.0
+[vary]                                       # parameters that vary: normal, uniform, log-normal, log-uniform, levels, table
+radius = { normal = [0.5, 0.01] }
+[start]                                      # the same of coordinates and speeds, or numbers
+lean = { uniform = [-0.6, 0.6] }
+spin_rate = -3.0
+[outputs]                                    # end, largest, smallest, largest-magnitude, event-time, happened; optional
+"final lean" = { end = "lean", unit = "rad" }
+fell = { happened = "fallen" }
+[options]                                    # of `jj.rollout`
+rtol = 1e-6
+[correlation]
+"radius lean" = 0.5
 """
 
 import json

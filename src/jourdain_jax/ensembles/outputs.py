@@ -137,7 +137,7 @@ class Happened(_OfEvent):
 class Quantity(Output):
     """A number that `function` makes of a `Trajectory` by operations of JAX, with its `unit` as a text.
 
-        jj.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m")
+    jj.Quantity(lambda motion: jnp.hypot(motion.q_end[0], motion.q_end[1]), "m")
     """
 
     function: Callable

@@ -253,4 +253,3 @@ def merge_studies(path: str | os.PathLike, shares: Sequence[str | os.PathLike]) 
                     target.take_chunk(other, number)
                     held.add(number)
     return StudyResult(target)
-
