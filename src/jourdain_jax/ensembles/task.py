@@ -33,7 +33,7 @@ LARGEST_BLOCK = 2048  # lanes: enough that few wait for the last one, few enough
 BLOCK_MEMORY = 2**26  # bytes of saved states of a block, at most
 AT_START = "_at_start"  # how columns of start values are called, after the coordinate or speed
 CODES = ("success", "event", "max_steps", "step_too_small", "not_finite", "inconsistent_start", "singular_partition", "bad_parameter", "bad_start",
-         "unsolved_step", "shrank", "stiff", "off_constraints", "bad_times")  # fmt: skip
+         "unsolved_step", "shrank", "stiff", "off_constraints", "bad_times", "energy_lost")  # fmt: skip
 OF_LANES: dict[str, tuple[str, float, dict]] = {
     "result": ("int8", -1, {"long_name": "how the motion ended", "flag_values": list(range(len(CODES))), "flag_meanings": " ".join(CODES)}),
     "event": ("int8", -1, {"long_name": "which stop event ended the motion; -1: none"}),

@@ -73,6 +73,7 @@ class AppellOnGraph:
 
     def __init__(self, traced: TracedScene, structure: Structure, kept: KeptRows | None, probes: Probes, far, reference, quaternions: tuple[int, ...]):
         self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
+        self.rows_work = not (structure.affine and structure.homogeneous)
         every, rows = range(len(traced.u)), [s for s, name in enumerate(structure.row_names) if name not in structure.redundant_rows]
         self.independent = list(every) if kept or not rows else list(structure.independent)
         self.dependent = [k for k in every if k not in self.independent]
@@ -108,7 +109,7 @@ class AppellOnGraph:
             qdot = self.graph.substituted(qdot, kinematics.known)
         true_z = {int(self.traced.u[k]): n for k, n in zip(self.dependent, z, strict=True)}
         *events, T, V = self.graph.substituted([*self.traced.at.events.tolist(), *self.traced.at.energies.tolist()], true_z)
-        if self.structure.homogeneous:
+        if not self.rows_work:
             (power,) = self.graph.substituted([int(self.traced.at.power)], true_z)
         elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
@@ -139,12 +140,12 @@ class AppellOnGraph:
         return Projection(moved, self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms))
 
     def _power(self, k: "_Kinematics", ydot: list[int]) -> int:
-        """Power of loads without a potential and of potentials in time, and `(A' lambda).u` where rows are not homogeneous.
+        """Power of loads without a potential and of potentials in time, and `(A' lambda).u` where rows do work.
 
         `(A' lambda).u = sum (m a - F).(v - v_0) + (I alpha + omega x I omega - L).(omega - omega_0) - Q_direct.u`, v_0, omega_0: at u = 0.
         """
         g, at = self.graph, k.at
-        if self.structure.homogeneous:
+        if not self.rows_work:
             return int(at.power)
         still = dict.fromkeys(self.traced.u.tolist(), g.zero)
         v_0, omega_0 = (g.substituted(g.substituted(x.ravel().tolist(), still), k.held) for x in (self.traced.at.v, self.traced.at.omega))

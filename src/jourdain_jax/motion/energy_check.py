@@ -26,18 +26,21 @@ def has_balance(setup: Setup) -> bool:
     return by_tolerance and (setup.field.with_work or not needs_work(setup.scene, structure_of(setup.scene)))
 
 
-def energies_near(setup: Setup, args, t, y: Integrated) -> Float[Array, "2 2"]:
-    """T and V (J) at a state, and both where each number is larger by the error that a step may leave in it."""
+def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -> Float[Array, "2 times 2"]:
+    """T and V (J) at states, and both where each number is larger by the error that a step may leave in it."""
     field, scene, inputs, fixed, _ = args
     rtol, atol = setup.options.tolerances
     off = jax.tree.map(lambda x: x + jnp.where(x < 0, -1.0, 1.0) * (atol + rtol * jnp.abs(x)), y)
-    both = jax.tree.map(lambda a, b: jnp.stack([a, b]), *jax.lax.stop_gradient((y, off)))
-    return jax.vmap(lambda y: field.energies(scene, fixed, t, y, inputs(t)))(both)
+    every = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *jax.lax.stop_gradient(((t, y), (t, off))))
+    at = lambda state: field.energies(scene, fixed, state[0], state[1], inputs(state[0]))  # noqa: E731
+    # loads by matrices may be callbacks, which need not know batches
+    found = jax.lax.map(at, every) if field.lowered is None else jax.vmap(at)(every)
+    return found.reshape(2, -1, 2)
 
 
-def energy_lost(energies: Float[Array, "times 2 2"], work: Float[Array, "times"] | None, steps) -> Bool[Array, ""]:
+def energy_lost(energies: Float[Array, "2 times 2"], work: Float[Array, "times"] | None, steps) -> Bool[Array, ""]:
     """Whether T + V - W changed by more than N `steps` explain; NaN at times that were not reached."""
-    (T, V), off = energies[:, 0].T, energies[:, 1].T
+    (T, V), off = energies[0].T, energies[1].T
     balance = T + V if work is None else T + V - work
     error = jnp.abs(off[0] - T) + jnp.abs(off[1] - V) + jnp.finfo(T.dtype).eps * (T + jnp.abs(V))
     moved = jnp.nanmax(T) + jnp.nanmax(V) - jnp.nanmin(V)

@@ -71,7 +71,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     start, args = begun.start, begun.args
     _, scene, inputs, fixed, origin = args
     solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, marked_outputs(adjoint, (solved.ys, solved.y_end)))
-    moving, balanced = field.projects, has_balance(setup)
+    moving = field.projects
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
     direction = jnp.sign(setup.t1 - t0)
     valid = solved.reached & (solved.ts * direction <= solved.t_end * direction) & begun.timely
@@ -81,18 +81,18 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
         y = integrands.project(tau, y, args) if moving and not options.by_own_steps else y
         t = origin + tau
-        seen, energies = field.observed(scene, fixed, t, y, inputs(t)), energies_near(setup, args, t, y) if balanced else None
+        seen = field.observed(scene, fixed, t, y, inputs(t))
         work = None if y.work is None else y.work + field.stored(scene, t, seen.q, inputs(t)) - stored_first
-        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (seen.q, seen.u, work, energies)), seen.pivot
+        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (seen.q, seen.u, work)), seen.pivot, (t, y)
 
     # start and end as two more saved states, so that all this is compiled once
     start_and_end = (jnp.zeros_like(solved.t_end), begun.y0, begun.timely), (solved.t_end, solved.y_end, begun.timely)
     all_states = jax.tree.map(lambda saved, first, last: jnp.concatenate([first[None], saved, last[None]]), (solved.ts, solved.ys, valid), *start_and_end)
-    (q, u, work, energies), pivots = jax.vmap(saved_state)(*all_states)
+    (q, u, work), pivots, states = jax.vmap(saved_state)(*all_states)
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
-    lost = energy_lost(energies, jax.lax.stop_gradient(work), solved.accepted) if balanced else False
+    lost = energy_lost(energies_near(setup, args, *states), jax.lax.stop_gradient(work), solved.accepted) if has_balance(setup) else False
     code = jnp.where(results.is_success(solved.code) & lost, results.ENERGY_LOST, solved.code)
     return Trajectory(
         scene=setup.scene,
