@@ -1,6 +1,7 @@
 """How the documentation is built: `python -m sphinx -W -b html docs docs/_build/html`. Nothing is fetched while it is built or read."""
 
 import shutil
+import subprocess
 import sys
 from importlib.metadata import version as installed
 from pathlib import Path
@@ -49,4 +50,11 @@ def _notebooks_in_place() -> None:
         shutil.copyfile(notebook, target / notebook.name)
 
 
+def _gallery_in_place() -> None:
+    """The pages of the gallery, where they were not written yet (two minutes)."""
+    if not (HERE / "gallery" / "pages" / "index.md").exists():
+        subprocess.run([sys.executable, str(HERE / "make_gallery.py")], check=True)
+
+
 _notebooks_in_place()
+_gallery_in_place()

@@ -475,6 +475,7 @@ def test_a_body_that_cannot_be_is_named():
             return {"top": jj.RigidBody(jnp.asarray(1.0), jnp.diag(self.moments), jnp.zeros(3), jj.rot_z(q.turn))}
 
     assert impossible_bodies(Top(), jnp.zeros(1)) == ()
+    assert impossible_bodies(Top(moments=jnp.array([0.0644, 0.0644, 0.1289])), jnp.zeros(1)) == ()  # a wheel, rounded
     (sentence,) = impossible_bodies(Top(moments=jnp.array([1.0, 1.0, 3.0])), jnp.zeros(1))
     assert "body `top` of `Top` has principal moments of inertia 1, 1 and 3" in sentence
 
