@@ -83,6 +83,22 @@ def test_errors_that_the_tolerance_allows_are_not_told(amplitude, level, toleran
         assert int(motion.result) == results.SUCCESS
 
 
+class Damped(Spring):
+    """Overdamped: large powers, and little work in the end."""
+
+    def potential(self, pose):
+        return None
+
+    def loads(self, motion):
+        q, u = motion.q, motion.u
+        return (jj.generalized_force(motion, x_rate=-self.k * q.x - 5.0 * jnp.sqrt(self.k) * u.x_rate),)
+
+
+@pytest.mark.parametrize("k", [1e4, 1e7])
+def test_where_work_is_integrated_nothing_is_told(k):
+    assert int(jj.simulate(Damped(k), {"x": 0.7}, ts=[2.0, 6.0]).result) == results.SUCCESS
+
+
 def test_steps_without_control_are_taken_as_they_are():
     motion = jj.simulate(Spring(), {"x": 1.0}, ts=[40.0], solver=jj.ImplicitMidpoint(), dt0=0.5)
     assert int(motion.result) == results.SUCCESS

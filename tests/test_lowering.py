@@ -202,12 +202,11 @@ class MistakenRow(jj.models.ChaplyginSleigh):
         return {"blade": row + 0.1 * _wrong_slope(motion.q.heading)}
 
 
-@pytest.mark.parametrize(("scene", "code"), [(Mistaken(), results.SUCCESS), (MistakenRow(), results.ENERGY_LOST)], ids=["pose", "row"])
-def test_a_derivative_rule_is_believed_as_jax_believes_it(scene, code):
-    """Whatever it says: the program and dense matrices move in the same way. A wrong one of a row shows in the energy."""
+@pytest.mark.parametrize("scene", [Mistaken(), MistakenRow()], ids=["pose", "row"])
+def test_a_derivative_rule_is_believed_as_jax_believes_it(scene):
+    """Whatever it says: the program and dense matrices move in the same way."""
     assert "has a derivative of its own" in jj.lower(scene).calls[0]
-    program, dense = (jj.simulate(scene, t1=0.5, rtol=1e-10, atol=1e-10, lowering=lowering) for lowering in (True, False))
-    assert int(program.result) == int(dense.result) == code
+    program, dense = (jj.simulate(scene, t1=0.5, rtol=1e-10, atol=1e-10, lowering=lowering).raise_if_failed() for lowering in (True, False))
     np.testing.assert_allclose(program.q_end, dense.q_end, rtol=1e-8, atol=1e-9)
 
 

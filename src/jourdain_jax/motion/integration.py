@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.diffrax_steps import solved_by_diffrax
-from jourdain_jax.motion.energy_check import energies_near, energy_lost, has_balance
+from jourdain_jax.motion.energy_check import conserves, energies_near, energy_lost
 from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.solver_choice import marked_inputs, marked_outputs, time_origin
@@ -92,7 +92,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
-    lost = energy_lost(energies_near(setup, args, *states), jax.lax.stop_gradient(work), solved.accepted) if has_balance(setup) else False
+    lost = energy_lost(energies_near(setup, args, *states), solved.accepted) if conserves(setup) else False
     code = jnp.where(results.is_success(solved.code) & lost, results.ENERGY_LOST, solved.code)
     return Trajectory(
         scene=setup.scene,

@@ -26,7 +26,7 @@ MESSAGES = {
     OFF_CONSTRAINTS: "a step of constant length ended so far from the constraints that the projection moved it by more than half of its change: take shorter "
     "steps, step-size control (`stepsize_controller`), or look for rows that lose rank",
     BAD_TIMES: "the times to save at leave the span or are not in order, or the span is empty or not finite; give increasing `ts` between `t0` and `t1`",
-    ENERGY_LOST: "the energy, less the work done, changed by more than the steps' tolerances explain: the motion left its branch at a singular position, "
+    ENERGY_LOST: "the energy, which nothing changes, changed by more than the steps' tolerances explain: the motion left its branch at a singular position, "
     "missed a short feature of a load, or a load's potential is not that of its force (`verify`)",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step (`dt0`), or look for a singularity there",
 }
