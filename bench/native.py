@@ -29,12 +29,12 @@ from jourdain_jax.motion.own_steps import reason_against_machine_code
 from jourdain_jax.motion.simulate import set_up
 
 LANES = 1024
-WAYS = {"native": True, "XLA": False}
+WAYS = {"native": "native", "XLA": "xla"}
 COLD = """
 import time; begin = time.perf_counter()
 import jax, sys; jax.config.update("jax_enable_x64", True)
 import jourdain_jax as jj
-jax.block_until_ready(jj.simulate(jj.models.MODELS[sys.argv[1]](), native=sys.argv[2] == "native").q)
+jax.block_until_ready(jj.simulate(jj.models.MODELS[sys.argv[1]](), backend=sys.argv[2].lower()).q)
 print(time.perf_counter() - begin)
 """
 Figure = dict
@@ -68,15 +68,15 @@ def spread_starts(scene: jj.Scene, lanes: int) -> jj.State:
 def runs_of(scene: jj.Scene, starts: jj.State, span: float, alone: bool, more: dict) -> dict[str, Callable]:
     """Way -> compiled function of a tolerance and starts that returns final states and steps; `more`: options of `simulate`."""
 
-    def run(native, tolerance, starts):
-        options = {"ts": jnp.array([span]), "solver": diffrax.Dopri8(), "rtol": tolerance, "atol": tolerance, "native": native, **more}
+    def run(backend, tolerance, starts):
+        options = {"ts": jnp.array([span]), "solver": diffrax.Dopri8(), "rtol": tolerance, "atol": tolerance, "backend": backend, **more}
         if alone:
             motion = jj.simulate(scene, jax.tree.map(lambda x: x[0], starts), **options)
         else:
             motion = jj.rollout(scene, starts, **options).lanes
         return motion.q_end, motion.accepted, motion.rejected
 
-    return {way: partial(lambda run, tolerance: jax.block_until_ready(run(tolerance, starts)), jax.jit(partial(run, native))) for way, native in WAYS.items()}
+    return {way: partial(lambda run, tolerance: jax.block_until_ready(run(tolerance, starts)), jax.jit(partial(run, backend))) for way, backend in WAYS.items()}
 
 
 def batches(quick: bool) -> Iterator[Figure]:
@@ -110,9 +110,9 @@ def compilation(quick: bool) -> Iterator[Figure]:
         scene = jj.models.MODELS[name]()
         start = jj.start(scene)
         seconds = {}
-        for way, native in WAYS.items():
+        for way, backend in WAYS.items():
             begin = time.perf_counter()
-            jax.jit(lambda start, native=native, scene=scene: jj.simulate(scene, start, native=native, t1=1.01).q).lower(start).compile()
+            jax.jit(lambda start, backend=backend, scene=scene: jj.simulate(scene, start, backend=backend, t1=1.01).q).lower(start).compile()
             seconds[way] = time.perf_counter() - begin
             yield figure(f"trace and compile one motion, {way}, s", name, seconds[way])
         yield figure("trace and compile one motion, native / XLA", name, seconds["native"] / seconds["XLA"], 1.0)

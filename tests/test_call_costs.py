@@ -144,7 +144,7 @@ def test_what_is_compiled_for_functions_is_dropped_when_others_are_used():
 
 LOSSES = {
     "default": {},
-    "dense": {"lowering": False},
+    "dense": {"backend": "dense"},
     "Kvaerno5": {"solver": diffrax.Kvaerno5()},
 }
 

@@ -63,7 +63,7 @@ def motion_and_reference(scene, start, t1, *, traced=(), **options):
         return jj.simulate(scene.replace(**values) if values else scene, start, ts=jnp.linspace(0.0, t1, 9), rtol=1e-10, atol=1e-10, work=False, **options)
 
     values = {name: getattr(scene, name) for name in traced}
-    reference = jj.simulate(scene, start, ts=jnp.array([t1]), state="full", lowering=False, rtol=1e-11, atol=1e-11, work=False)
+    reference = jj.simulate(scene, start, ts=jnp.array([t1]), state="full", backend="dense", rtol=1e-11, atol=1e-11, work=False)
     return jax.jit(run)(values, jj.start(scene, **start)), reference
 
 
@@ -100,7 +100,7 @@ def test_every_lane_of_beads_on_a_ring_arrives():
     lanes = jj.rollout(scene, starts, ts=jnp.array([3.0]), rtol=1e-10, atol=1e-10, work=False)
     assert np.all(np.asarray(lanes.result) == results.SUCCESS)
     assert not np.any(np.asarray(lanes.lanes.fallback))
-    one = jj.simulate(scene, {**scene.start(), "s_rate": speeds[4]}, ts=jnp.array([3.0]), state="full", lowering=False, rtol=1e-11, atol=1e-11, work=False)
+    one = jj.simulate(scene, {**scene.start(), "s_rate": speeds[4]}, ts=jnp.array([3.0]), state="full", backend="dense", rtol=1e-11, atol=1e-11, work=False)
     np.testing.assert_allclose(lanes.lanes.q_end[4], one.q_end, atol=1e-8)
 
 

@@ -48,7 +48,7 @@ class WrongPotential(Spring):
         return (jj.Load(generalized={"x_rate": -self.k * x}, potential=self.k * x**2),)
 
 
-WAYS = ({}, {"native": False}, {"lowering": False})
+WAYS = ({}, {"backend": "xla"}, {"backend": "dense"})
 SPEEDS = np.array([0.5, 3.0, 4.0, -1.0])  # m/s; the first and the last never come to the edge
 
 

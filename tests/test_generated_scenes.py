@@ -120,7 +120,7 @@ def test_halving_the_step_divides_the_error_by_two_to_the_order(number):
 
     def end(h):
         options = {"solver": diffrax.Bosh3(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": h}
-        motion = jj.simulate(scene, start, ts=jnp.array([0.4]), work=False, adjoint=diffrax.ForwardMode(), lowering=False, **options)
+        motion = jj.simulate(scene, start, ts=jnp.array([0.4]), work=False, adjoint=diffrax.ForwardMode(), backend="dense", **options)
         return jnp.concatenate([motion.q_end, motion.u_end])
 
     steps = 0.4 / 2.0 ** np.arange(2, 7)

@@ -46,9 +46,9 @@ def lanes(**options):
     return jj.rollout(Spinning(), {"x_rate": 1.0, "turn_rate": 2.0}, parameters=values, ts=[0.5, 1.0], progress=False, **options)
 
 
-@pytest.mark.parametrize("lowering", [True, False], ids=["lowered", "dense"])
-def test_lanes_whose_bodies_cannot_be_end_with_a_code_and_their_neighbours_move(lowering):
-    found = lanes(lowering=lowering)
+@pytest.mark.parametrize("backend", ["auto", "dense"])
+def test_lanes_whose_bodies_cannot_be_end_with_a_code_and_their_neighbours_move(backend):
+    found = lanes(backend=backend)
     assert found.result.tolist() == [results.SUCCESS if name in SOUND else results.BAD_PARAMETER for name in LANES]
     for i, name in enumerate(LANES):
         if name in SOUND:

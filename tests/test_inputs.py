@@ -140,7 +140,7 @@ def work_by_quadrature():
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"lowering": False}, pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow), {"state": "full"}],
+    [{}, {"backend": "dense"}, pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow), {"state": "full"}],
     ids=["lowered", "dense", "diffrax", "full state"],
 )
 def test_the_work_of_a_sampled_input_in_a_potential_is_that_of_a_quadrature(options):

@@ -230,7 +230,7 @@ OPTIONS = {"ts": np.array([0.5, 1.0]), "rtol": 1e-9, "atol": 1e-9}
 @pytest.mark.parametrize("name", ["iteration", "network", pytest.param("callback", marks=pytest.mark.slow)])
 def test_motions_with_a_call_are_the_dense_ones_alone_and_in_lockstep(name):
     scene = LAWS[name][0]
-    program, dense = (jj.simulate(scene, START, lowering=lowering, **OPTIONS) for lowering in (True, False))
+    program, dense = (jj.simulate(scene, START, backend=backend, **OPTIONS) for backend in ("auto", "dense"))
     assert "lowered" in program.reduction
     np.testing.assert_allclose(program.q, dense.q, atol=1e-8)
     np.testing.assert_allclose(program.work, dense.work, atol=1e-9)
@@ -388,7 +388,7 @@ import jax, numpy as np, test_kept_parts as here
 assert not jax.config.jax_enable_x64
 found = {{}}
 for name in ("network",):
-    both = [here.jj.simulate(here.LAWS[name][0], here.START, ts=here.OPTIONS["ts"], rtol=1e-5, atol=1e-6, lowering=way) for way in (True, False)]
+    both = [here.jj.simulate(here.LAWS[name][0], here.START, ts=here.OPTIONS["ts"], rtol=1e-5, atol=1e-6, backend=backend) for backend in ("auto", "dense")]
     found[name] = [both[0].reduction, str(both[0].q.dtype), *(motion.q.tolist() for motion in both)]
 print(json.dumps(found))
 """

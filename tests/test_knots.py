@@ -31,7 +31,7 @@ LOOPS = {
     "dense output": {"land_on_ts": False},
     "implicit": {"solver": jj.RadauIIA()},
     "equal steps": {"solver": jj.ImplicitMidpoint(), "dt0": 1.0},
-    "dense matrices": {"lowering": False},
+    "dense matrices": {"backend": "dense"},
 }
 
 

@@ -51,17 +51,17 @@ def test_a_disc_held_by_a_quaternion_keeps_its_norm_by_the_program():
 
 
 def test_derivatives_of_the_skate_are_those_of_dense_matrices_at_any_heading():
-    def end(x, lowering):
+    def end(x, backend):
         scene = MODELS["skate"]().replace(slope=x[0], mass=x[1])
         start = {"heading_rate": x[2], "heading": x[3]}
-        return ends(scene, start, 0.5, lowering=lowering, adjoint=diffrax.DirectAdjoint())
+        return ends(scene, start, 0.5, backend=backend, adjoint=diffrax.DirectAdjoint())
 
     direction, weights = jnp.array([0.3, -0.5, 1.0, 0.6]), jnp.cos(jnp.arange(6.0))
     headings = jnp.array([0.0, jnp.pi / 2, 0.7])
     x = jnp.stack([jnp.array([0.3, 1.2, 0.9, heading]) for heading in headings])
-    along = [jax.jit(jax.vmap(lambda x, low=low: jax.jvp(lambda x: end(x, low), (x,), (direction,))[1]))(x) for low in (True, False)]
+    along = [jax.jit(jax.vmap(lambda x, backend=backend: jax.jvp(lambda x: end(x, backend), (x,), (direction,))[1]))(x) for backend in ("auto", "dense")]
     np.testing.assert_allclose(*along, atol=1e-9)
-    back = jax.jit(jax.vmap(jax.grad(lambda x: weights @ end(x, True))))(x)
+    back = jax.jit(jax.vmap(jax.grad(lambda x: weights @ end(x, "auto"))))(x)
     np.testing.assert_allclose(back @ direction, along[0] @ weights, atol=1e-9)
 
 
@@ -72,7 +72,7 @@ def test_a_motion_through_a_loss_of_rank_is_right_or_continued_by_dense_matrices
     start = jj.start(board, steer=0.3, steer_rate=0.5, heading_rate=0.2)
     motion = jj.simulate(board, start, t1=float((angle - 0.3) / 0.5), rtol=1e-9, atol=1e-9)
     beyond = jj.simulate(board, start, t1=float((np.pi - 0.6) / 0.5), rtol=1e-9, atol=1e-9)
-    dense = jj.simulate(board, start, t1=float((np.pi - 0.6) / 0.5), rtol=1e-11, atol=1e-11, lowering=False)
+    dense = jj.simulate(board, start, t1=float((np.pi - 0.6) / 0.5), rtol=1e-11, atol=1e-11, backend="dense")
     assert int(beyond.result) == int(dense.result) == results.SUCCESS
     np.testing.assert_allclose(beyond.u_end, dense.u_end, atol=1e-6)
     assert int(motion.result) in (results.SUCCESS, results.SINGULAR_PARTITION, results.STEP_TOO_SMALL)

@@ -206,7 +206,7 @@ class MistakenRow(jj.models.ChaplyginSleigh):
 def test_a_derivative_rule_is_believed_as_jax_believes_it(scene):
     """Whatever it says: the program and dense matrices move in the same way."""
     assert "has a derivative of its own" in jj.lower(scene).calls[0]
-    program, dense = (jj.simulate(scene, t1=0.5, rtol=1e-10, atol=1e-10, lowering=lowering).raise_if_failed() for lowering in (True, False))
+    program, dense = (jj.simulate(scene, t1=0.5, rtol=1e-10, atol=1e-10, backend=backend).raise_if_failed() for backend in ("auto", "dense"))
     np.testing.assert_allclose(program.q_end, dense.q_end, rtol=1e-8, atol=1e-9)
 
 
@@ -291,7 +291,7 @@ def test_derivatives_through_the_program_agree_with_the_dense_path_in_first_and_
 def test_the_lowered_motion_is_the_dense_one(name):
     scene = MODELS[name]()
     options = {"t1": 2.0, "rtol": 1e-10, "atol": 1e-10}
-    program, dense = jj.simulate(scene, **options), jj.simulate(scene, lowering=False, **options)
+    program, dense = jj.simulate(scene, **options), jj.simulate(scene, backend="dense", **options)
     assert int(program.result) == int(dense.result) == results.SUCCESS
     np.testing.assert_allclose(program.q, dense.q, atol=1e-8)
     np.testing.assert_allclose(program.u, dense.u, atol=1e-7)

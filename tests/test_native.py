@@ -156,7 +156,7 @@ def test_rates_are_those_of_xla_at_random_states(name):
 
 
 def _motions(scene, starts=None, **options):
-    return [jj.simulate(scene, starts, native=native, **options) for native in (True, False)]
+    return [jj.simulate(scene, starts, backend=backend, **options) for backend in ("native", "xla")]
 
 
 @pytest.mark.parametrize(
@@ -259,7 +259,7 @@ def test_no_lanes_and_axes_of_lanes(disc_kernel):
 def test_lanes_of_a_rollout_are_those_of_xla():
     disc = jj.models.TiltingDisc()
     starts = {"lean": jnp.asarray([0.1, 0.3, jnp.nan, 1.2, 0.2, 0.7, 0.0, 0.5, -0.4]), "spin_rate": jnp.linspace(-4.0, 0.0, 9)}
-    ours, theirs = (jj.rollout(disc, starts, ts=[0.5, 1.0], native=native) for native in (True, False))
+    ours, theirs = (jj.rollout(disc, starts, ts=[0.5, 1.0], backend=backend) for backend in ("native", "xla"))
     np.testing.assert_array_equal(ours.result, theirs.result)
     np.testing.assert_array_equal(ours.lanes.accepted, theirs.lanes.accepted)
     np.testing.assert_array_equal(ours.lanes.rejected, theirs.lanes.rejected)
@@ -276,12 +276,12 @@ def test_the_same_call_gives_the_same_bits_eager_or_compiled():
     assert all(np.array_equal(run(), first) for _ in range(5))
 
 
-def _end(native, adjoint=None):
+def _end(backend, adjoint=None):
     rods = jj.models.MODELS["double-pendulum-angles"]()
 
     def end(x):
         start = {"theta1": x[1], "theta2": -0.4, "theta2_rate": x[2]}
-        motion = jj.simulate(rods.replace(length1=x[0]), start, ts=[0.2, 0.4], rtol=1e-5, atol=1e-5, native=native, adjoint=adjoint)
+        motion = jj.simulate(rods.replace(length1=x[0]), start, ts=[0.2, 0.4], rtol=1e-5, atol=1e-5, backend=backend, adjoint=adjoint)
         return jnp.sum(motion.q_end**2) + motion.q[0, 1]
 
     return end
@@ -302,31 +302,31 @@ X = jnp.array([0.5, 0.3, -1.0])
 )
 def test_derivatives_are_those_of_xla(derivative, forward):
     adjoint = diffrax.ForwardMode() if forward else None
-    np.testing.assert_allclose(derivative(_end(True, adjoint)), derivative(_end(False, adjoint)), rtol=1e-12)
+    np.testing.assert_allclose(derivative(_end("native", adjoint)), derivative(_end("xla", adjoint)), rtol=1e-12)
 
 
 def test_derivatives_of_a_rollout_are_those_of_xla():
     rods, rates = jj.models.MODELS["double-pendulum-angles"](), jnp.array([-3.0, -2.0, 1.0])
 
-    def slope(native):
-        options = {"ts": [0.3], "rtol": 1e-5, "native": native}
+    def slope(backend):
+        options = {"ts": [0.3], "rtol": 1e-5, "backend": backend}
         return jax.grad(lambda rate: jnp.sum(jj.rollout(rods, {"theta1": 0.2, "theta1_rate": rate}, **options).lanes.q_end[:, 1]))(rates)
 
-    np.testing.assert_allclose(slope(True), slope(False), rtol=1e-12)
+    np.testing.assert_allclose(slope("native"), slope("xla"), rtol=1e-12)
 
 
 @pytest.mark.parametrize(("adjoint", "mode"), [(None, jax.jacfwd), (diffrax.ForwardMode(), jax.grad), (None, jax.hessian)])
 def test_modes_of_differentiation_that_do_not_work_are_named(adjoint, mode):
     with pytest.raises(jj.DifferentiationModeError):
-        mode(_end(True, adjoint))(X)
+        mode(_end("native", adjoint))(X)
 
 
 def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
     disc, bicycle = jj.models.TiltingDisc(), jj.models.MODELS["whipple-bicycle"]()
     assert reason_against_machine_code(set_up(disc)) == ""
-    assert reason_against_machine_code(set_up(disc, native=False)) == "native=False"
+    assert reason_against_machine_code(set_up(disc, backend="xla")) == "another backend was asked for"
     assert "diffrax" in reason_against_machine_code(set_up(disc, solver=diffrax.Heun()))
-    assert "scalar program" in reason_against_machine_code(set_up(disc, lowering=False))
+    assert "scalar program" in reason_against_machine_code(set_up(disc, reduction="kkt"))
     assert "inputs" in reason_against_machine_code(set_up(bicycle, inputs={"steer_torque": lambda t: jnp.sin(t)}))
     monkeypatch.setattr(host, "reason_against", lambda: "llvmlite is not installed")
     assert reason_against_machine_code(set_up(disc)) == "llvmlite is not installed"
@@ -347,3 +347,36 @@ def test_a_scene_is_integrated_without_llvmlite(monkeypatch):
     monkeypatch.setattr(erk_loop, "_motion", lambda *a, motion=erk_loop._motion: called.append(1) or motion(*a))
     np.testing.assert_allclose(jj.simulate(scene, ts=[1.3, 1.4]).q[0], expected, rtol=1e-7)
     assert called
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"backend": "native", "solver": diffrax.Heun()}, "'native' cannot integrate `TiltingDisc`: a solver"),
+        ({"backend": "native", "reduction": "kkt"}, "'native' cannot integrate `TiltingDisc`: a reduction"),
+        ({"backend": "xla", "reduction": "kkt"}, "'xla' cannot integrate `TiltingDisc`: a reduction"),
+        ({"backend": "nativ"}, "unknown backend `nativ`.*native"),
+    ],
+)
+def test_a_backend_that_cannot_serve_is_refused_with_the_reason(options, said):
+    with pytest.raises(ValueError, match=said):
+        jj.simulate(jj.models.TiltingDisc(), t1=0.1, **options)
+    with pytest.raises(ValueError, match=said):
+        jj.rollout(jj.models.TiltingDisc(), {"lean": np.array([0.1, 0.2])}, t1=0.1, **options)
+
+
+class Stiff(jj.Scene):
+    coordinates = jj.coordinates("x", "y")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        q, u = motion.q, motion.u
+        return (jj.generalized_force(motion, x_rate=-1e6 * (q.x - jnp.sin(q.y)) - 1e6 * u.x_rate, y_rate=-1.0),)
+
+
+def test_a_stiff_motion_stays_with_the_backend_that_was_asked_for():
+    native, default = (jj.simulate(Stiff(), {"y": 1.0, "x": 0.8}, ts=[1.0], max_steps=1000, backend=backend) for backend in ("native", "auto"))
+    assert (native.result, native.fallback) == (results.MAX_STEPS, results.AS_ASKED)
+    assert (default.result, default.fallback) == (results.SUCCESS, results.IMPLICIT)

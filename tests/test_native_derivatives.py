@@ -40,11 +40,11 @@ class Oscillator(jj.Scene):
 X = jnp.array([1.5, 6.0, 0.8, 1.1, 0.7, 0.3])  # mass, stiffness, wall, x, its rate, push
 
 
-def _ends(x, native=True, adjoint=None, events=False, **options):
+def _ends(x, backend="native", adjoint=None, events=False, **options):
     """Two states on the way and at the end, the time of the end."""
     scene = Oscillator(mass=x[0], stiffness=x[1], wall=x[2])
     options = {"ts": jnp.array([0.0, 0.3, 0.9]), "t1": 3.0, "rtol": 1e-11, "atol": 1e-11} | options
-    motion = jj.simulate(scene, {"x": x[3], "x_rate": x[4]}, inputs={"push": x[5]}, native=native, adjoint=adjoint, events=events, **options)
+    motion = jj.simulate(scene, {"x": x[3], "x_rate": x[4]}, inputs={"push": x[5]}, backend=backend, adjoint=adjoint, events=events, **options)
     return jnp.stack([motion.q[1, 0], motion.u[2, 0], motion.q_end[0], motion.u_end[0], motion.t_end])
 
 
@@ -83,7 +83,7 @@ LANES = X * (1 + 0.05 * np.random.default_rng(0).normal(size=(11, 6)))
     ids=["vmap of grad", "grad of vmap", "vmap of jacfwd", "jacfwd of jacfwd", "jvp of vmap"],
 )
 def test_nested_derivatives_up_to_an_event_are_those_of_xla(derivative, adjoint):
-    ours, theirs = (derivative(lambda x, native=native: jnp.sum(_ends(x, native, adjoint, True) ** 2)) for native in (True, False))
+    ours, theirs = (derivative(lambda x, backend=backend: jnp.sum(_ends(x, backend, adjoint, True) ** 2)) for backend in ("native", "xla"))
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
 
@@ -93,12 +93,12 @@ def test_lanes_that_fail_or_are_no_numbers_do_not_touch_others(adjoint):
     x = LANES.at[2, 3].set(jnp.nan).at[5, 4].set(jnp.inf).at[7].set(0.0).at[7, :2].set(1.0)
     mode = jax.grad if adjoint is None else jax.jacfwd
     found = {}
-    for native in (True, False):  # 20 steps are enough for some
-        slope = mode(lambda x, native=native: jnp.sum(_ends(x, native, adjoint, True, max_steps=20)[:4]))
-        found[native] = np.asarray(jax.jit(jax.vmap(slope))(x))
+    for backend in ("native", "xla"):  # 20 steps are enough for some
+        slope = mode(lambda x, backend=backend: jnp.sum(_ends(x, backend, adjoint, True, max_steps=20)[:4]))
+        found[backend] = np.asarray(jax.jit(jax.vmap(slope))(x))
     good = [i for i in range(11) if i not in (2, 5)]
-    np.testing.assert_allclose(found[True][good], found[False][good], rtol=1e-9, atol=1e-9)
-    assert np.isfinite(found[True][good]).all()
+    np.testing.assert_allclose(found["native"][good], found["xla"][good], rtol=1e-9, atol=1e-9)
+    assert np.isfinite(found["native"][good]).all()
 
 
 def test_cotangents_of_a_lane_do_not_depend_on_its_company():
@@ -178,7 +178,7 @@ CASES = {
 }
 
 
-def _slope(name: str, native: bool, adjoint) -> np.ndarray:
+def _slope(name: str, backend: str, adjoint) -> np.ndarray:
     """Of a number made of saved states and the end of a motion, with respect to parameters and two directions of the start."""
     start, options, parameters = CASES[name]
     scene = jj.models.MODELS[name.split(",")[0]]()
@@ -189,7 +189,7 @@ def _slope(name: str, native: bool, adjoint) -> np.ndarray:
     def end(x):
         own = scene.replace(**{p: x[i] for i, p in enumerate(parameters)}) if parameters else scene
         state = jj.State(begun.t, begun.q + x[-2] * q[0], begun.u + x[-1] * u[0], begun.moved_q, begun.moved_u, begun.residual, begun.names, begun.guess)
-        motion = jj.simulate(own, state, rtol=1e-10, atol=1e-10, native=native, adjoint=adjoint, **options)
+        motion = jj.simulate(own, state, rtol=1e-10, atol=1e-10, backend=backend, adjoint=adjoint, **options)
         return q[1] @ motion.q_end + u[1] @ motion.u_end + motion.t_end + jnp.nansum(motion.q[:3] ** 2)
 
     return np.asarray(jax.jit((jax.grad if adjoint is None else jax.jacfwd)(end))(x))
@@ -197,12 +197,12 @@ def _slope(name: str, native: bool, adjoint) -> np.ndarray:
 
 @pytest.mark.parametrize("name", CASES)
 def test_both_modes_of_a_model_agree(name):
-    found, expected = (_slope(name, True, adjoint) for adjoint in (None, FORWARD))
+    found, expected = (_slope(name, "native", adjoint) for adjoint in (None, FORWARD))
     assert np.any(expected != 0)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)))
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_tangents_of_a_model_are_those_of_xla(name):
-    found, expected = (_slope(name, native, FORWARD) for native in (True, False))
+    found, expected = (_slope(name, backend, FORWARD) for backend in ("native", "xla"))
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)))

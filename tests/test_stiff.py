@@ -147,7 +147,7 @@ def test_every_other_way_is_tried_once_and_ways_add_up(damped):
     assert next_retry(form, lost(both), 0.0, {}) == results.AS_ASKED
     assert next_retry(form, lost(results.AS_ASKED, results.SUCCESS), 0.0, {}) == results.AS_ASKED
     assert next_retry(form, lost(results.AS_ASKED), 0.0, {"state": "minimal"}) == results.AS_ASKED
-    assert retry_options(both, 1000) == {"state": "full", "lowering": False, "solver": jj.RadauIIA(), "max_steps": 100}
+    assert retry_options(both, 1000) == {"state": "full", "backend": "dense", "solver": jj.RadauIIA(), "max_steps": 100}
     assert "full state, dense matrices and an implicit solver" in results.FALLBACKS[both]
 
 

@@ -46,7 +46,7 @@ def test_a_pendulum_that_leaves_its_narrow_domain_is_flagged_under_jit():
         {"solver": diffrax.Tsit5(), "stepsize_controller": diffrax.PIDController(rtol=1e-6, atol=1e-6)},
         {"solver": jj.RadauIIA(), "rtol": 1e-6, "atol": 1e-6},
         {"solver": diffrax.Dopri5(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.01},
-        {"lowering": False, "rtol": 1e-6, "atol": 1e-6},
+        {"backend": "dense", "rtol": 1e-6, "atol": 1e-6},
     ],
     ids=["controller", "implicit", "constant steps", "dense"],
 )
@@ -78,7 +78,7 @@ def test_steps_of_constant_length_that_lose_their_rows_are_flagged():
     assert np.all(error[arrived] < 1e-3)
 
 
-@pytest.mark.parametrize("options", [{}, {"lowering": False}], ids=["lowered", "dense"])
+@pytest.mark.parametrize("options", [{}, {"backend": "dense"}], ids=["lowered", "dense"])
 def test_a_slider_crank_of_equal_lengths_passes_the_axis_on_its_branch_or_is_flagged(options):
     count = 64 if not options else 8
     w, ts = np.linspace(0.5, 6.0, count), np.linspace(0.0, 2.0, 41)
@@ -100,11 +100,11 @@ def test_a_loss_of_energy_is_warned_of():
     assert not jj.simulate(pendulum, pendulum.example, t1=1.0).warnings
 
 
-@pytest.mark.parametrize("lowering", [True, False], ids=["lowered", "dense"])
-def test_a_row_is_compared_with_its_usual_length_for_the_parameters_of_the_motion(lowering):
+@pytest.mark.parametrize("backend", ["auto", "dense"])
+def test_a_row_is_compared_with_its_usual_length_for_the_parameters_of_the_motion(backend):
     def motion(scene):
         start = {"a": 0.7, "b": 0.0, "c": 0.7, "a_rate": 1.0, "b_rate": 0.0, "c_rate": 1.0}
-        return jj.simulate(scene, start, ts=jnp.array([1.0]), rtol=1e-6, atol=1e-6, state="full", lowering=lowering)
+        return jj.simulate(scene, start, ts=jnp.array([1.0]), rtol=1e-6, atol=1e-6, state="full", backend=backend)
 
     motion(Parallelogram())  # of ordinary size, first
     for size in (1e-5, 1e5):

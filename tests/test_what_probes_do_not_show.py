@@ -26,7 +26,7 @@ class Plane(jj.Scene):
 
 def ends(scene, start, **options):
     """Of the lowered and of the dense motion."""
-    return [jj.simulate(scene, start, t1=1.0, rtol=1e-9, atol=1e-9, lowering=lowering, **options).q_end for lowering in (True, False)]
+    return [jj.simulate(scene, start, t1=1.0, rtol=1e-9, atol=1e-9, backend=backend, **options).q_end for backend in ("auto", "dense")]
 
 
 class Limited(Plane):
@@ -184,14 +184,14 @@ class Decreed(Plane):
 
 
 def test_derivatives_by_decree_are_those_of_the_dense_path():
-    def slopes(lowering):
+    def slopes(backend):
         def end(stiffness, y):
             scene = Decreed(stiffness=stiffness)
-            return jj.simulate(scene, {"x": 1.0, "y": y}, t1=1.0, lowering=lowering, projection=False, adjoint=diffrax.ForwardMode()).q_end
+            return jj.simulate(scene, {"x": 1.0, "y": y}, t1=1.0, backend=backend, projection=False, adjoint=diffrax.ForwardMode()).q_end
 
         return jax.jacfwd(end, argnums=(0, 1))(2.0, 0.7)
 
-    lowered, dense = slopes(True), slopes(False)
+    lowered, dense = slopes("auto"), slopes("dense")
     np.testing.assert_allclose(lowered[0], 0.0, atol=1e-12)
     np.testing.assert_allclose(lowered[1], dense[1], rtol=1e-6)
     assert "half_as_steep" in jj.report(Decreed()).lowering
@@ -342,8 +342,8 @@ class FastRow(Plane):
 
 
 def test_rows_that_are_nonlinear_at_speeds_beyond_the_probed_ones_hold():
-    for lowering in (True, False):
-        motion = jj.simulate(FastRow(), {"x_rate": 4.0}, t1=2.0, lowering=lowering).raise_if_failed()
+    for backend in ("auto", "dense"):
+        motion = jj.simulate(FastRow(), {"x_rate": 4.0}, t1=2.0, backend=backend).raise_if_failed()
         np.testing.assert_allclose(motion.u_end, [4.0, 1.0], atol=1e-8)  # (1 + 4 (v-3)^2) vdot = 1 - (v-3), at rest where v = 4
 
 

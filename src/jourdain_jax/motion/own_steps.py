@@ -38,7 +38,7 @@ def lanes_solved_by_own_steps(setups: Setup, begun: Begun) -> Solved:
 def reason_against_machine_code(setup: Setup) -> str:
     """Why the loop over steps is one of XLA's and not machine code of our own, in words; empty where it is."""
     if not setup.options.native:
-        return "native=False"
+        return "another backend was asked for"
     if not setup.options.by_own_steps:
         return "a solver, a controller or an adjoint of diffrax was asked for"
     if not setup.inputs.constant:

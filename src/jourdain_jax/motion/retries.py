@@ -26,11 +26,11 @@ def next_retry(field: VectorField, motion: Trajectory, t0, options: dict) -> int
 
     `field`: how it was integrated; `options`: those of `simulate` that were given.
     """
-    tried, solver = int(motion.fallback), options.get("solver")
+    tried, solver, backend = int(motion.fallback), options.get("solver"), options.get("backend", "auto")
     lost = options.get("state", "auto") in may_be_another_form(field) and may_be_full(solver) and int(motion.result) in lost_codes(field)
-    if lost and not tried & results.FULL_STATE:
+    if lost and backend in ("auto", "dense") and not tried & results.FULL_STATE:
         return tried | results.FULL_STATE
-    free = solver is None and options.get("stepsize_controller") is None
+    free = solver is None and backend != "native" and options.get("stepsize_controller") is None
     if free and not tried & results.IMPLICIT and is_stiff(field, motion, t0):
         return tried | results.IMPLICIT
     return results.AS_ASKED
@@ -38,7 +38,7 @@ def next_retry(field: VectorField, motion: Trajectory, t0, options: dict) -> int
 
 def retry_options(retries: int, max_steps: int) -> dict:
     """The options of `simulate` that make these retries; `max_steps`: as was asked for."""
-    full = {"state": "full", "lowering": False} if retries & results.FULL_STATE else {}
+    full = {"state": "full", "backend": "dense"} if retries & results.FULL_STATE else {}
     implicit = {"solver": RadauIIA(), "max_steps": implicit_steps(max_steps)} if retries & results.IMPLICIT else {}
     return full | implicit
 

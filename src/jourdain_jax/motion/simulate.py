@@ -22,6 +22,7 @@ from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
 from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
 from jourdain_jax.motion.marks import marked
+from jourdain_jax.motion.own_steps import reason_against_machine_code
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import Options, Setup
@@ -60,8 +61,7 @@ def simulate(
     events: bool = True,
     work: bool = True,
     land_on_ts: bool = True,
-    lowering: bool = True,
-    native: bool = True,
+    backend: str = "auto",
 ) -> Trajectory:
     """Integrate a scene's equations of motion from `start` over [t0, t1].
 
@@ -81,9 +81,9 @@ def simulate(
     - `stabilisation`: Baumgarte terms, for comparison; `inputs`: name -> number, function of time, or `Sampled`.
     - `land_on_ts`: end a step at every saved time. With False, values between steps come from the solver's dense output: fewer steps, but
       its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
-    - `lowering`: integrate the scene's scalar program (`jj.lower`) where it has one and neither `reduction` nor `stabilisation` is given; with False,
-      the dense matrices. `native`: on CPUs, integrate that program by machine code made for it, where llvmlite is installed and the solver is a default one;
-      with False, by XLA, as `jax.export` needs, and as derivatives of higher order and with respect to times are. Both take the same steps.
+    - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code made for it, on CPUs, where llvmlite is installed and the solver is a
+      default one; "xla", that program compiled by XLA, as `jax.export` needs, and as derivatives of higher order and with respect to times are in any case;
+      "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
 
     Where nothing is traced, a motion that leaves the domain of its privileged speeds is run again with the full state, and a stiff one by an implicit
@@ -130,10 +130,10 @@ def set_up(scene: Scene | BuiltFor, start=None, **options) -> Setup:
 
 def _set_up(
     *, scene, start, t0, t1, ts, saveat, rtol, atol, solver, stepsize_controller, dt0, adjoint, max_steps, state, reduction, stabilisation,
-    projection, inputs, events, work, land_on_ts, lowering, native,
+    projection, inputs, events, work, land_on_ts, backend,
 ) -> Setup:  # fmt: skip
     scene = as_scene(scene)
-    switches = {"projection": projection, "events": events, "work": work, "land_on_ts": land_on_ts, "lowering": lowering, "native": native}
+    switches = {"projection": projection, "events": events, "work": work, "land_on_ts": land_on_ts}
     objects = {"solver": solver, "adjoint": adjoint, "stepsize_controller": stepsize_controller, "saveat": saveat}
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, switches=switches, **objects)
     as_stabilisation(stabilisation)
@@ -142,7 +142,7 @@ def _set_up(
     made_here = not isinstance(start, State)
     inputs = as_inputs(scene, inputs)
     start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs)
-    field = fitted(solver, scene, vector_field(scene, state, reduction, stabilisation, projection, work, lowering, inputs), state)
+    field = fitted(solver, scene, vector_field(scene, state, reduction, stabilisation, projection, work, backend, inputs), state)
     warn_float32(start.q.dtype, rtol)
     options = Options(
         solver=default_solver(rtol) if solver is None else solver,
@@ -154,10 +154,13 @@ def _set_up(
         land=land_on_ts,
         saveat=None if saveat is None else _checked_saveat(saveat),
         event_names=names_of_events(scene) if events else (),
-        native=native,
+        native=backend in ("auto", "native"),
     )
     start = _on_constraints(scene, t0, start, inputs, made_here) if projection else start
-    return Setup(scene, start, inputs, t0, t1, ts, field, options)
+    setup = Setup(scene, start, inputs, t0, t1, ts, field, options)
+    if backend == "native" and (reason := reason_against_machine_code(setup)):
+        raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
+    return setup
 
 
 def _first_step(solver, dt0, t0, t1):

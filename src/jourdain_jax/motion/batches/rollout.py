@@ -221,7 +221,7 @@ def _next_retries(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int
 
 def _form(scene: Scene, options: dict) -> VectorField:
     """How the lanes' state is integrated."""
-    how = {name: options[name] for name in ("state", "reduction", "stabilisation", "projection", "work", "lowering", "inputs") if name in options}
+    how = {name: options[name] for name in ("state", "reduction", "stabilisation", "projection", "work", "backend", "inputs") if name in options}
     return vector_field(scene, **how)
 
 

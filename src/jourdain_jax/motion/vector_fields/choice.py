@@ -22,21 +22,21 @@ from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
 _STATE_FORMS = ("auto", "minimal", "full")
+_BACKENDS = ("auto", "native", "xla", "dense")
 
 
 def vector_field(
-    scene: Scene, state="auto", reduction=None, stabilisation: Baumgarte | None = None, projection=True, work=True, lowering=True, inputs=None
+    scene: Scene, state="auto", reduction=None, stabilisation: Baumgarte | None = None, projection=True, work=True, backend="auto", inputs=None
 ) -> VectorField:
     """What is integrated of a scene; the arguments are those of `simulate`."""
     structure = structure_of(scene)
-    _check(scene, structure, state)
+    _check(scene, structure, state, backend)
     minimal = state == "minimal" or (state == "auto" and structure.has_minimal_state)
     independent = structure.independent if minimal else None
     inputs_in_rows = structure.rows_of_inputs and not as_inputs(scene, inputs).constant
     with_work = work and needs_work(scene, structure)
     dense = inputs_in_rows or (with_work and (structure.driven or structure.varying_inertia))
-    program = lowered(scene, every_speed=not minimal) if lowering and reduction is None and stabilisation is None and not dense else None
-    program = program if isinstance(program, Lowered) else None
+    program = _program(scene, minimal, backend, reduction, stabilisation, dense)
     cutoff = _cutoff(structure) if reduction is None and not minimal else None
     reduction = as_reduction(scene, _default_reduction(structure, independent, program) if reduction is None else reduction)
     common = {
@@ -55,9 +55,28 @@ def vector_field(
     return Full(**common, may_branch=cutoff is not None and isinstance(reduction, NullSpaceQR) and bool(names_of_position_rows(scene)))
 
 
-def _check(scene: Scene, structure: Structure, state) -> None:
-    if state not in _STATE_FORMS:
-        raise ValueError(f"unknown state form `{state}`; {nearest(str(state), _STATE_FORMS)}")
+def _program(scene: Scene, minimal: bool, backend: str, reduction, stabilisation, dense: bool) -> Lowered | None:
+    """The scalar program that is integrated; None: dense matrices are. ValueError where a backend asks for a program and there is none."""
+    reason = ""
+    if reduction is not None or stabilisation is not None:
+        reason = "a reduction or a stabilisation of its own needs dense matrices"
+    elif dense:
+        reason = "velocity rows with inputs that change with time, and work along driven poses, need dense matrices"
+    if backend == "dense" or (backend == "auto" and reason):
+        return None
+    program = reason or lowered(scene, every_speed=not minimal)
+    if isinstance(program, Lowered):
+        return program
+    if backend != "auto":
+        why = reason or f"it has no scalar program ({program})"
+        raise ValueError(f"backend={backend!r} cannot integrate `{type(scene).__name__}`: {why}; use backend='auto' or 'dense'")
+    return None
+
+
+def _check(scene: Scene, structure: Structure, state, backend) -> None:
+    for what, given, known in (("state form", state, _STATE_FORMS), ("backend", backend, _BACKENDS)):
+        if given not in known:
+            raise ValueError(f"unknown {what} `{given}`; {nearest(str(given), known)}")
     if state == "minimal" and not structure.affine:
         raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use state='full'")
     if state == "minimal" and structure.may_set_in:
