@@ -327,7 +327,7 @@ def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
     assert reason_against_machine_code(set_up(disc, backend="xla")) == "another backend was asked for"
     assert "diffrax" in reason_against_machine_code(set_up(disc, solver=diffrax.Heun()))
     assert "scalar program" in reason_against_machine_code(set_up(disc, reduction="kkt"))
-    assert "inputs" in reason_against_machine_code(set_up(bicycle, inputs={"steer_torque": lambda t: jnp.sin(t)}))
+    assert "function of time" in reason_against_machine_code(set_up(bicycle, inputs={"steer_torque": lambda t: jnp.sin(t)}))
     monkeypatch.setattr(host, "reason_against", lambda: "llvmlite is not installed")
     assert reason_against_machine_code(set_up(disc)) == "llvmlite is not installed"
     monkeypatch.setattr(host, "reason_against", lambda: "")

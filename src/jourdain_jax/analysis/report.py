@@ -9,6 +9,7 @@ from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.cyclic import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.lowering.built import Built, build
 from jourdain_jax.motion.arguments import as_state
+from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.vector_fields.choice import vector_field
@@ -201,5 +202,5 @@ def _lowering(built: Built) -> str:
     if found is None:
         return f"not lowered: {built.not_lowered}"
     calls = "".join(f"; {reason} has no scalar form: kept as a call" for reason in found.calls)
-    reason = native_motion.reason_against(vector_field(built.scene), built.scene, bool(built.events))
+    reason = native_motion.reason_against(vector_field(built.scene), built.scene, as_inputs(built.scene, None), bool(built.events))
     return f"a scalar program of {found.operations} operations{calls}; {f'not to machine code: {reason}' if reason else 'to machine code'}"

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
+from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.setup import Begun, Setup, Solved
@@ -41,9 +42,7 @@ def reason_against_machine_code(setup: Setup) -> str:
         return "another backend was asked for"
     if not setup.options.by_own_steps:
         return "a solver, a controller or an adjoint of diffrax was asked for"
-    if not setup.inputs.constant:
-        return "inputs change with time"
-    return native_motion.reason_against(setup.field, setup.scene, bool(setup.options.event_names))
+    return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(setup.options.event_names))
 
 
 def _by_xla(setup: Setup, begun: Begun) -> Solved:
@@ -68,7 +67,7 @@ def _loop(setup: Setup, y0, args, ts, knots) -> Solved:
         rtol=jnp.broadcast_to(options.tolerances[0], setup.t0.shape),
         atol=jnp.broadcast_to(options.tolerances[1], setup.t0.shape),
         shortest=setup.shortest,
-        max_steps=options.max_steps + (0 if knots is None else len(knots)),
+        max_steps=_most_steps(setup, knots),
         knots=knots,
         rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
     )
@@ -82,10 +81,15 @@ def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
 
 
 def _motion(setup: Setup, begun: Begun) -> native_motion.Motion:
-    options = setup.options
+    options, knots = setup.options, setup.knots
     rtol, atol = options.tolerances
-    control = native_motion.Control(rtol, atol, setup.shortest, options.dt0, options.max_steps)
-    return native_motion.Motion(begun.args, type(options.solver), bool(options.event_names), begun.y0, _goals(setup, setup.ts), control)
+    control = native_motion.Control(rtol, atol, setup.shortest, options.dt0, _most_steps(setup, knots))
+    return native_motion.Motion(begun.args, type(options.solver), bool(options.event_names), begun.y0, _goals(setup, setup.ts), knots, control)
+
+
+def _most_steps(setup: Setup, knots) -> int:
+    """Steps that end at knots do not count."""
+    return setup.options.max_steps + (0 if knots is None else len(knots))
 
 
 def _rules(setup: Setup, mapped: Callable) -> Rules:
@@ -93,7 +97,9 @@ def _rules(setup: Setup, mapped: Callable) -> Rules:
 
     def serve(varies: Setup, begun: Begun) -> bool:
         of_times = varies.ts, varies.t0, varies.t1, varies.options.tolerances, varies.options.dt0, begun.args[-1]
-        return not any(jax.tree.leaves(of_times)) and not native_motion.reason_against_derivatives(setup.field, bool(setup.options.event_names))
+        of_samples = [channel for channel in (*varies.inputs.channels, *begun.args[2].channels) if isinstance(channel, Sampled)]
+        reason = native_motion.reason_against_derivatives(setup.field, setup.inputs, bool(setup.options.event_names))
+        return not any(jax.tree.leaves((of_times, of_samples))) and not reason
 
     def push(arguments, along):
         return mapped(_pushed)(*arguments, *along)
@@ -118,16 +124,18 @@ def _pulled(perturbed: tuple, setup: Setup, begun: Begun, g: Solved) -> tuple:
     none_else = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
     field, scene, inputs, fixed, origin = none_else[1].args
     y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)
-    if inputs.channels:
-        inputs = eqx.tree_at(lambda x: [c.value for c in x.channels], inputs, by_known[len(fixed) :], is_leaf=lambda x: x is None)
+    constant = [i for i, channel in enumerate(inputs.channels) if isinstance(channel, Constant)]
+    if constant:
+        given = [by_known[len(fixed) + i] for i in constant]
+        inputs = eqx.tree_at(lambda x: [x.channels[i].value for i in constant], inputs, given, is_leaf=lambda x: x is None)
     args = field, scene, inputs, tuple(by_known[: len(fixed)]), origin
     return none_else[0], eqx.tree_at(lambda b: (b.y0, b.args), none_else[1], (y0, args), is_leaf=lambda x: x is None)
 
 
 def _known(args: tuple) -> list:
-    """Of each number that the rates are given: what depends on parameters alone, and constant inputs."""
+    """Of each number that the rates are given: what depends on parameters alone, and constant inputs; None of those that are given by samples."""
     _, _, inputs, fixed, _ = args
-    return [*fixed, *(channel.value for channel in inputs.channels)]
+    return [*fixed, *(channel.value if isinstance(channel, Constant) else None for channel in inputs.channels)]
 
 
 def _goals(setup: Setup, ts) -> Float[Array, "times *lanes"]:

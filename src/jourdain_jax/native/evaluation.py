@@ -17,8 +17,9 @@ def function(graph: Graph, outputs: Sequence[int], inputs: Sequence[int]) -> Cal
     outputs, inputs = list(outputs), list(inputs)
     w = Writer(host.lanes(), host.fuses())
 
-    def block(pointers: list[Value], found: list[Value], sizes: Value, rank: Value) -> None:
-        count = w.load("i64", sizes)
+    def block(arguments: list[ffi.Given], found: list[Value]) -> None:
+        (points,) = arguments
+        count = w.load("i64", points.sizes)
         given, results = w.room(w.real, len(inputs)), w.room(w.real, len(outputs))
         first = w.room("i64")
         w.store(w.literal(0, "i64"), first)
@@ -29,7 +30,7 @@ def function(graph: Graph, outputs: Sequence[int], inputs: Sequence[int]) -> Cal
                 point = begin + lane
                 inside = w.where(point < count, point, count - 1)  # the last point fills up
                 for k in range(len(inputs)):
-                    w.store(w.load("double", pointers[0], inside * len(inputs) + k), given, k * w.lanes + lane)
+                    w.store(w.load("double", points.data, inside * len(inputs) + k), given, k * w.lanes + lane)
             values = written(w, graph, outputs, {n: w.load(w.real, given, k) for k, n in enumerate(inputs)})
             for k, value in enumerate(values):
                 w.store(as_real(w, value), results, k)

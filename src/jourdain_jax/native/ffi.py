@@ -11,6 +11,7 @@ import re
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 
@@ -57,8 +58,16 @@ def _members(header: str, struct: str) -> str:
     return " ".join(re.findall(r"(\w+);", text))
 
 
-def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[Value], list[Value], Value, Value], None]) -> None:
-    """A handler that calls `body` with pointers to the data of all arguments and results, the pointer to the sizes of the last argument, and its rank."""
+class Given(NamedTuple):
+    """An argument of a handler."""
+
+    data: Value  # pointer
+    sizes: Value  # pointer to the sizes of its axes
+    rank: Value
+
+
+def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Value]], None]) -> None:
+    """A handler that calls `body` with all arguments, and pointers to the data of all results."""
     known = version()
     assert known is not None
     with w.function(HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
@@ -80,9 +89,10 @@ def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[
         given, returned = w.load("ptr", frame, _ARGS), w.load("ptr", frame, _RETS)
         inputs = [w.load("ptr", given, k) for k in range(arguments)]
         outputs = [w.load("ptr", returned, k) for k in range(results)]
-        last = inputs[-1]
-        given_data, returned_data = ([w.load("ptr", buffer, _DATA) for buffer in buffers] for buffers in (inputs, outputs))
-        body(given_data, returned_data, w.load("ptr", last, _DIMS), w.load("i64", last, _RANK))
+        body(
+            [Given(w.load("ptr", x, _DATA), w.load("ptr", x, _DIMS), w.load("i64", x, _RANK)) for x in inputs],
+            [w.load("ptr", x, _DATA) for x in outputs],
+        )
         w.give(nothing)
 
 

@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from functools import partial
 
 from jourdain_jax.motion.integrators.erk_step import LOCATING, RUNNING, Method
-from jourdain_jax.motion.native import search
+from jourdain_jax.motion.native import samples, search
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Lanes
-from jourdain_jax.motion.native.loop import COUNT, FIRST_ARRAY, NEXT, TIMES, write_functions, write_job
+from jourdain_jax.motion.native.loop import COUNT, FIRST_ARRAY, FIRST_OF_SAMPLES, NEXT, TIMES, write_functions, write_job
 from jourdain_jax.motion.native.pulled import write_pulled
 from jourdain_jax.motion.native.step import IDLE, each_row, weighted
 from jourdain_jax.motion.trajectories import results
@@ -72,7 +72,7 @@ def written(form: Form, method: Method, lanes: int, fused: bool, threads: int, a
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         _write_blocks(w, form, method, len(asked), job)
         w.give(Value(w, "ptr", "null"))
-    write_handler(w, 4, 1, lambda arguments, results, sizes, rank: write_job(w, [*arguments, *results], sizes, rank, threads))
+    write_handler(w, 4 + samples.arguments(form.layout), 1, lambda arguments, results: write_job(w, form, arguments, results, threads))
     return w.text
 
 
@@ -207,6 +207,10 @@ def _write_begin(w: Writer, form: Form) -> None:
             lanes.set("goal", lane, w.load("double", w.load("ptr", job, _GOALS), number * w.load("i64", job, TIMES)))
         with w.when(~there):
             lanes.set("code", lane, IDLE)
+        if form.sampled:  # places without a lane are worked out too
+            words = w.at(job, FIRST_OF_SAMPLES, "i64")
+            samples.begin(w, form.layout, words, w.load("i64", job, COUNT), lanes, lane, w.where(there, number, 0))
+            lanes.set("goal", lane, samples.nearer(w, lanes, lane, lanes.of("goal", lane)))
         lanes.set("taken", lane, 0.0)
         if form.has_events:
             lanes.set("search_left", lane, 0.0)
@@ -221,12 +225,20 @@ def _write_note(w: Writer, form: Form) -> None:
             times, number = w.load("i64", job, TIMES), w.load("i64", who, lane)
             with w.repeated() as leave:
                 leave(~(lanes.of("code", lane).equals(float(RUNNING)) & lanes.of("t", lane).equals(lanes.of("goal", lane))))
-                reached = w.converted("fptosi", w.load("double", saved, lane), "i64") + 1
+                before, goals = w.converted("fptosi", w.load("double", saved, lane), "i64"), w.load("ptr", job, _GOALS)
+                if form.sampled:
+                    at_knot = lanes.of("t", lane).differs(w.load("double", goals, number * times + before))
+                    with w.when(at_knot):
+                        samples.pass_knot(w, lanes, lane)
+                    reached = before + w.where(at_knot, w.literal(0, "i64"), 1)
+                else:
+                    reached = before + 1
                 w.store(w.converted("sitofp", reached, "double"), w.at(saved, lane, "double"))
                 with w.when(reached >= times):
                     lanes.set("code", lane, float(results.SUCCESS))
                 with w.when(reached < times):
-                    lanes.set("goal", lane, w.load("double", w.load("ptr", job, _GOALS), number * times + reached))
+                    goal = w.load("double", goals, number * times + reached)
+                    lanes.set("goal", lane, samples.nearer(w, lanes, lane, goal) if form.sampled else goal)
         w.give()
 
 

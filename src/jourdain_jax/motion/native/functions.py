@@ -12,6 +12,7 @@ from typing import NamedTuple
 from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native.layout import Lanes, Layout
+from jourdain_jax.motion.native.samples import looked_up
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.scalar_program import as_real, written
 from jourdain_jax.program.derivative import directional_derivative
@@ -31,6 +32,7 @@ class Form:
     has_events: bool
     has_pivots: bool
     moving: tuple[int, ...] | None = None  # which of the numbers known have a tangent; None: nothing has one
+    sampled: tuple[int, ...] = ()  # which of the inputs are given by samples
 
     @property
     def layout(self) -> Layout:
@@ -44,6 +46,7 @@ class Form:
             known,
             len(program.events) if self.has_events else 0,
             None if self.moving is None else len(self.moving),
+            len(self.sampled),
         )
 
     @property
@@ -106,8 +109,10 @@ def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> d
     """Values of all nodes that are given from outside."""
     program, layout, lanes = form.program, form.layout, Lanes(w, form.layout, state)
     states = [w.load(w.real, y, k) for k in range(layout.coordinates + layout.speeds)]
-    known, fixed = lanes.every("known"), len(program.fixed)
-    return dict(zip(program.variables, [*known[:fixed], lanes["origin"] + tau, *states, *known[fixed:]], strict=True))
+    known, fixed, t = lanes.every("known"), len(program.fixed), lanes["origin"] + tau
+    found = dict(zip(form.sampled, looked_up(w, layout, state, tau), strict=True))
+    inputs = [found.get(i, x) for i, x in enumerate(known[fixed:])]
+    return dict(zip(program.variables, [*known[:fixed], t, *states, *inputs], strict=True))
 
 
 def write_rates(w: Writer, form: Form) -> None:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.motion.integrators.erk_loop import method_of
-from jourdain_jax.motion.native import back, loop
+from jourdain_jax.motion.native import back, loop, samples
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.native import ffi, host
@@ -24,7 +24,7 @@ MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the pro
 
 
 class Kernel(NamedTuple):
-    """`run(starts, goals)` returns states (and their tangents, where the form has some) at the goals, and the rows of the end."""
+    """`run(*samples, starts, goals)` returns states (and their tangents, where the form has some) at the goals, and the rows of the end."""
 
     form: Form
     run: Callable
@@ -40,29 +40,33 @@ def kernel(form: Form, solver: type[diffrax.AbstractERK]) -> Kernel:
     """The kernel for what is integrated, by the tableau of a solver of diffrax."""
     method, layout = method_of(solver()), form.layout
 
-    def shapes(starts, goals):
-        return (goals.shape[-1], layout.integrated), (layout.returned + 1,)
+    def shapes(*arguments):
+        return (arguments[-1].shape[-1], layout.integrated), (layout.returned + 1,)
 
-    def run(starts: Float[Array, "rows"], goals: Float[Array, "times"]) -> tuple[Float[Array, "times y"], Float[Array, "ends"]]:
-        return tuple(called(starts, goals))
+    def run(*arguments: Float[Array, "..."]) -> tuple[Float[Array, "times y"], Float[Array, "ends"]]:
+        return tuple(called(*arguments))
 
-    called = _called(lambda lanes, threads: loop.written(form, method, lanes, host.fuses(), threads), shapes)
+    called = _called(lambda lanes, threads: loop.written(form, method, lanes, host.fuses(), threads), shapes, samples.arguments(layout))
     return Kernel(form, run)
 
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel_back(form: Form, solver: type[diffrax.AbstractERK], asked: tuple[int, ...]) -> Callable:
-    """A function of the rows of a start, cotangents of the states at the goals and of the end (with its time last), and the goals.
+    """A function of samples, the rows of a start, cotangents of the states at the goals and of the end (with its time last), and the goals.
 
     It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given.
     """
     method, count = method_of(solver()), form.layout.y + len(asked)
-    called = _called(lambda lanes, threads: back.written(form, method, lanes, host.fuses(), threads, asked), lambda *_: ((count,),))
+    of_samples = samples.arguments(form.layout)
+    called = _called(lambda lanes, threads: back.written(form, method, lanes, host.fuses(), threads, asked), lambda *_: ((count,),), of_samples)
     return lambda *arguments: called(*arguments)[0]
 
 
-def _called(text: Callable[[int, int], str], shapes: Callable) -> Callable:
-    """A module of LLVM IR, written for so many lanes and threads, as a function of arrays without lanes; `shapes`: of its results, given the arguments."""
+def _called(text: Callable[[int, int], str], shapes: Callable, of_samples: int) -> Callable:
+    """A module of LLVM IR, written for so many lanes and threads, as a function of arrays without lanes; `shapes`: of its results, given the arguments.
+
+    The first arguments are samples, which lanes may share.
+    """
 
     @cache
     def name(lanes: int) -> str:
@@ -78,7 +82,8 @@ def _called(text: Callable[[int, int], str], shapes: Callable) -> Callable:
 
     @run.def_vmap
     def run_many(count: int, batched: list[bool], *arguments):
-        every = [x if has_axis else jnp.broadcast_to(x, (count, *x.shape)) for x, has_axis in zip(arguments, batched, strict=True)]
+        stays = [has_axis or k < of_samples for k, has_axis in enumerate(batched)]
+        every = [x if stay else jnp.broadcast_to(x, (count, *x.shape)) for x, stay in zip(arguments, stays, strict=True)]
         found = call(host.lanes(), *every)
         return found, (True,) * len(found)
 

@@ -1,7 +1,9 @@
 """Where the numbers of a lane are: a lane is a column of rows, one row per number, and a row is one vector for all lanes side by side.
 
 A lane is handed over with all rows of `Layout.given`, its progress at the start among them, and handed back with those of its progress. Where a tangent is
-pushed along, the state is followed by its own, and so are the numbers that the rates are given; `dt` is that of the time of an event.
+pushed along, the state is followed by its own, and so are the numbers that the rates are given; `dt` is that of the time of an event. Where inputs are
+given by samples, rows of pointers and whole numbers say where the samples of a lane are (`table`), how many each input has (`samples`), and where the next
+knot is at which a step must end (`knot`).
 """
 
 from dataclasses import dataclass
@@ -11,6 +13,7 @@ from itertools import pairwise
 from jourdain_jax.native.ir import Value, Writer
 
 PROGRESS = ("t", "h", "code", "accepted", "rejected", "event", "pivot")
+SAMPLES = ("table", "samples", "knot")
 CONTROL = ("direction", "last_goal", "rtol", "atol", "shortest", "max_steps", "origin")
 
 
@@ -24,6 +27,7 @@ class Layout:
     known: int  # numbers that the rates are given: what depends on parameters alone, then the inputs
     events: int
     moving: int | None = None  # of those known, how many have a tangent; None: nothing has one
+    sampled: int = 0  # how many of the inputs are given by samples
 
     @property
     def y(self) -> int:
@@ -47,7 +51,7 @@ class Layout:
         search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1}
         tangents = {"dt": 0 if self.moving is None else 1}, {"dknown": self.moving or 0}
         counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), **tangents[0], **dict.fromkeys(CONTROL, 1), "known": self.known, **tangents[1]}
-        counts |= {"goal": 1, "taken": 1, **(search if self.events else {})}
+        counts |= {"goal": 1, "taken": 1, **(search if self.events else {}), **dict.fromkeys(SAMPLES if self.sampled else (), 1)}
         found, first = {}, 0
         for name, count in counts.items():
             found[name] = range(first, first + count)
@@ -95,9 +99,9 @@ class Lanes:
         """Where the number of one lane is."""
         return self.w.at(self.pointer, row * self.w.lanes + lane if isinstance(row, Value) else lane + row * self.w.lanes, "double")
 
-    def of(self, name: str, lane: Value) -> Value:
+    def of(self, name: str, lane: Value, type: str = "double") -> Value:
         """The number of one lane."""
-        return self.w.load("double", self.place(self.layout.rows[name].start, lane))
+        return self.w.load(type, self.place(self.layout.rows[name].start, lane))
 
     def set(self, name: str, lane: Value, value) -> None:
         """Sets the number of one lane."""

@@ -1,18 +1,21 @@
 """The loop over steps as machine code: lanes of a batch side by side, each replaced by the next one when it has ended, in several threads.
 
 A call is given two arrays with one row per lane: the rows of `Layout.given`, and the times to save at. It returns the states there, and the rows of the
-progress at the end with the number of times that were reached one after the other.
+progress at the end with the number of times that were reached one after the other. Where inputs are given by samples, their tables and knots come first
+(`samples.py`).
 """
 
 from jourdain_jax.motion.integrators.erk_step import LOCATING, RUNNING, Method
+from jourdain_jax.motion.native import samples
 from jourdain_jax.motion.native.functions import Form, write_events, write_projection, write_rates
 from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.motion.native.step import IDLE, write_step
-from jourdain_jax.native.ffi import write_handler
+from jourdain_jax.native.ffi import Given, write_handler
 from jourdain_jax.native.ir import Value, Writer
 
-# words of a job, shared by all threads: the number of lanes, of times, and of the next lane, then pointers to the arrays
-COUNT, TIMES, NEXT, FIRST_ARRAY = range(4)
+# words of a job, shared by all threads: the number of lanes, of times, and of the next lane, those of samples, then pointers to the arrays
+COUNT, TIMES, NEXT, FIRST_OF_SAMPLES = range(4)
+FIRST_ARRAY = FIRST_OF_SAMPLES + samples.WORDS
 _STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
 MANY = 8  # times as many lanes as side by side make it worth while to start another thread, which takes some 30 us
 
@@ -24,12 +27,14 @@ def written(form: Form, method: Method, lanes: int, fused: bool, threads: int) -
     _write_begin(w, form)
     _write_serve(w, form)
     _write_loop(w, form, method)
-    write_handler(w, 2, 2, lambda arguments, results, sizes, rank: write_job(w, [*arguments, *results], sizes, rank, threads))
+    write_handler(w, 2 + samples.arguments(form.layout), 2, lambda arguments, results: write_job(w, form, arguments, results, threads))
     return w.text
 
 
 def write_functions(w: Writer, form: Form, method: Method) -> None:
     """`step`, and what it calls."""
+    if form.sampled:
+        samples.write_inputs(w, form.layout)
     write_rates(w, form)
     if form.projects:
         write_projection(w, form)
@@ -38,18 +43,20 @@ def write_functions(w: Writer, form: Form, method: Method) -> None:
     write_step(w, form, method)
 
 
-def write_job(w: Writer, arrays: list[Value], sizes: Value, rank: Value, threads: int) -> None:
-    """All lanes, by this thread and by others that it starts and waits for; `sizes`: of an array of lanes and times."""
+def write_job(w: Writer, form: Form, arguments: list[Given], results: list[Value], threads: int) -> None:
+    """All lanes, by this thread and by others that it starts and waits for; the last of the arguments is an array of lanes and times."""
+    of_samples, arguments, times = arguments[: samples.arguments(form.layout)], arguments[samples.arguments(form.layout) :], arguments[-1]
+    arrays = [*(x.data for x in arguments), *results]
     job = w.room("i64", FIRST_ARRAY + len(arrays))
     for word, pointer in enumerate(arrays):
         w.store(pointer, job, FIRST_ARRAY + word)
     count = w.room("i64")
-    w.store(w.literal(1, "i64"), count)
-    with w.counted(0, rank - 1) as axis:
-        w.store(w.load("i64", count) * w.load("i64", sizes, axis), count)
+    w.store(samples.product(w, times, 1), count)
     w.store(w.load("i64", count), job, COUNT)
-    w.store(w.load("i64", sizes, rank - 1), job, TIMES)
+    w.store(w.load("i64", times.sizes, times.rank - 1), job, TIMES)
     w.store(w.literal(0, "i64"), job, NEXT)
+    if form.sampled:
+        samples.store_words(w, w.at(job, FIRST_OF_SAMPLES, "i64"), of_samples)
     loop, nothing, others, started = Value(w, "ptr", "@loop"), Value(w, "ptr", "null"), w.room("i64", threads), w.room("i64")
     w.store(w.literal(0, "i64"), started)
     for more in range(1, threads):
@@ -101,39 +108,59 @@ def _write_begin(w: Writer, form: Form) -> None:
             starts = w.load("ptr", job, _STARTS)
             with w.counted(0, given) as row:
                 w.store(w.load("double", starts, number * given + row), lanes.place(row, lane))
-            lanes.set("goal", lane, w.load("double", w.load("ptr", job, _GOALS), number * w.load("i64", job, TIMES)))
+            goal = w.load("double", w.load("ptr", job, _GOALS), number * w.load("i64", job, TIMES))
+            if form.sampled:
+                samples.begin(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load("i64", job, COUNT), lanes, lane, number)
+                goal = samples.nearer(w, lanes, lane, goal)
+            lanes.set("goal", lane, goal)
             if form.has_events:
                 lanes.set("search_left", lane, 0.0)
         with w.when(~there):
             lanes.set("code", lane, IDLE)
             w.store(w.load("i64", who, 2 * w.lanes) - 1, who, 2 * w.lanes)
+            if form.sampled:  # rates are worked out there too
+                samples.begin(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load("i64", job, COUNT), lanes, lane, w.literal(0, "i64"))
         w.give()
 
 
 def _write_serve(w: Writer, form: Form) -> None:
     """`serve(job, state, who, lane)`: saves what is due, and where the lane has ended, hands it back and begins with the next one."""
-    layout = form.layout
     with w.function("serve", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "lane": "i64"}, attributes="noinline") as (job, state, who, lane):
-        lanes = Lanes(w, layout, state)
-        goals, states, ends = (w.load("ptr", job, word) for word in (_GOALS, _STATES, _ENDS))
-        times = w.load("i64", job, TIMES)
+        lanes = Lanes(w, form.layout, state)
         with w.repeated() as leave:
             code, t, goal = (lanes.of(name, lane) for name in ("code", "t", "goal"))
             runs = code.equals(float(RUNNING))
             leave(code.equals(IDLE) | code.equals(float(LOCATING)) | (runs & t.differs(goal)))
-            number, saved = w.load("i64", who, lane), w.load("i64", who, lane + w.lanes)
-            # at a time to save at; or at the end, whose state stands for all that is left
-            last = w.where(runs, saved + 1, times)
-            with w.counted(saved, last) as k, w.counted(0, layout.integrated) as row:
-                w.store(w.load("double", lanes.place(row, lane)), states, (number * times + k) * layout.integrated + row)
-            w.store(last, who, lane + w.lanes)
-            with w.when(last < times):
-                w.store(w.load("double", goals, number * times + last), lanes.place(layout.rows["goal"].start, lane))
-            with w.when(last >= times):
-                each = layout.returned + 1
-                with w.counted(0, layout.returned) as row:
-                    w.store(w.load("double", lanes.place(row, lane)), ends, number * each + row)
-                reached = w.where(runs, times, saved)
-                w.store(w.converted("sitofp", reached, "double"), ends, number * each + layout.returned)
-                w.call("begin", "void", job, state, who, lane)
+            if form.sampled:
+                place = w.load("i64", who, lane) * w.load("i64", job, TIMES) + w.load("i64", who, lane + w.lanes)
+                next_time = w.load("double", w.load("ptr", job, _GOALS), place)
+                at_knot = runs & t.differs(next_time)
+                with w.when(at_knot):
+                    samples.pass_knot(w, lanes, lane)
+                    lanes.set("goal", lane, samples.nearer(w, lanes, lane, next_time))
+                with w.when(~at_knot):
+                    _save(w, form, job, who, lanes, lane, runs)
+            else:
+                _save(w, form, job, who, lanes, lane, runs)
         w.give()
+
+
+def _save(w: Writer, form: Form, job: Value, who: Value, lanes: Lanes, lane: Value, runs: Value) -> None:
+    """The state of a lane at a time to save at; or at the end, where it stands for all that is left, and the next lane begins."""
+    layout, times = form.layout, w.load("i64", job, TIMES)
+    goals, states, ends = (w.load("ptr", job, word) for word in (_GOALS, _STATES, _ENDS))
+    number, saved = w.load("i64", who, lane), w.load("i64", who, lane + w.lanes)
+    last = w.where(runs, saved + 1, times)
+    with w.counted(saved, last) as k, w.counted(0, layout.integrated) as row:
+        w.store(w.load("double", lanes.place(row, lane)), states, (number * times + k) * layout.integrated + row)
+    w.store(last, who, lane + w.lanes)
+    with w.when(last < times):
+        goal = w.load("double", goals, number * times + last)
+        lanes.set("goal", lane, samples.nearer(w, lanes, lane, goal) if form.sampled else goal)
+    with w.when(last >= times):
+        each = layout.returned + 1
+        with w.counted(0, layout.returned) as row:
+            w.store(w.load("double", lanes.place(row, lane)), ends, number * each + row)
+        reached = w.where(runs, times, saved)
+        w.store(w.converted("sitofp", reached, "double"), ends, number * each + layout.returned)
+        w.call("begin", "void", job, lanes.pointer, who, lane)

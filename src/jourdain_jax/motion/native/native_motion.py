@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jourdain_jax.motion.inputs import Sampled
+from jourdain_jax.motion.inputs import Constant, Inputs, Sampled
 from jourdain_jax.motion.integrators.erk_loop import ended
 from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
 from jourdain_jax.motion.native.functions import Form, event_program, outputs_of
@@ -43,10 +43,11 @@ class Motion(NamedTuple):
     has_events: bool
     y0: Integrated
     goals: Float[Array, "times"]
+    knots: Float[Array, "knots"] | None  # times since the start at which steps must end
     control: Control
 
 
-def reason_against(field: VectorField, scene: PyTree, has_events: bool) -> str:
+def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events: bool) -> str:
     """Why machine code cannot integrate a scene, in words; empty where it can."""
     if not isinstance(field, ByProgram):
         return "the scene has no scalar program"
@@ -59,20 +60,26 @@ def reason_against(field: VectorField, scene: PyTree, has_events: bool) -> str:
     if jnp.result_type(float) != jnp.float64:
         return "it is made for double precision alone"
     if any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
-        return "inputs change with time"
+        return "the scene itself holds samples"
+    if not all(isinstance(channel, Constant | Sampled) for channel in inputs.channels):
+        return "an input is a function of time"
     if has_events and not field.lowers_events:
         return "a stop event is no part of the scalar program"
-    return _reason_against_program(_form(field, has_events))
+    return _reason_against_program(_form(field, inputs, has_events))
 
 
 @lru_cache(maxsize=MOST_KERNELS)
 def _reason_against_program(form: Form) -> str:
     """The same, of the program alone."""
-    graph = form.program.graph
+    program, graph = form.program, form.program.graph
     operations = graph.operations(form.nodes)
     if operations > LARGEST_PROGRAM:
         return f"the scalar program has {operations} operations, more than {LARGEST_PROGRAM}"
     reason = unsupported(graph, form.nodes)
+    if not reason and form.has_events and form.sampled:
+        sampled = {program.variables[len(program.variables) - len(program.inputs) + i] for i in form.sampled}
+        if sampled & set(graph.reachable(program.events)):
+            return "a stop event depends on an input that changes with time"
     if not reason and form.has_events:
         try:
             event_program(form)
@@ -81,10 +88,10 @@ def _reason_against_program(form: Form) -> str:
     return reason
 
 
-def reason_against_derivatives(field: VectorField, has_events: bool) -> str:
+def reason_against_derivatives(field: VectorField, inputs: Inputs, has_events: bool) -> str:
     """Why machine code that integrates a scene cannot differentiate it, in words; empty where it can."""
     assert isinstance(field, ByProgram)
-    return _reason_against_derivatives(_form(field, has_events))
+    return _reason_against_derivatives(_form(field, inputs, has_events))
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -100,23 +107,29 @@ def _reason_against_derivatives(form: Form) -> str:
     return ""
 
 
-def _form(field: ByProgram, has_events: bool, moving: tuple[int, ...] | None = None) -> Form:
-    return Form(field.program, field.with_work, field.projects, field.affine, has_events, field.has_pivots, moving)
+def _form(field: ByProgram, inputs: Inputs, has_events: bool, moving: tuple[int, ...] | None = None) -> Form:
+    sampled = tuple(i for i, channel in enumerate(inputs.channels) if isinstance(channel, Sampled))
+    return Form(field.program, field.with_work, field.projects, field.affine, has_events, field.has_pivots, moving, sampled)
+
+
+def _form_of(motion: Motion, moving: tuple[int, ...] | None = None) -> Form:
+    field, _, inputs, *_ = motion.args
+    return _form(field, inputs, motion.has_events, moving)
 
 
 def integrate(motion: Motion) -> tuple[Integrated, Bool[Array, "times"], Progress]:
     """As `erk_loop.integrate`, of one motion from time zero."""
-    own = kernel(_form(motion.args[0], motion.has_events), motion.solver)
-    return _unpacked(own.layout, motion.goals, *own.run(jnp.concatenate([_packed(motion.y0), *_rows(motion)]), motion.goals))
+    own = kernel(_form_of(motion), motion.solver)
+    return _unpacked(own.layout, motion.goals, *own.run(*_samples(motion), jnp.concatenate([_packed(motion.y0), *_rows(motion)]), motion.goals))
 
 
 def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, of: Callable) -> PyTree:
     """The tangents of `of` what `integrate` returns; `dy0`, `dknown`: of the state, and of each of the numbers that the rates are given, None: zero."""
     moving = tuple(i for i, d in enumerate(dknown) if d is not None)
-    own = kernel(_form(motion.args[0], motion.has_events, moving), motion.solver)
+    own = kernel(_form_of(motion, moving), motion.solver)
     layout, (progress, limits, known) = own.layout, _rows(motion)
     more = [jnp.asarray(dknown[i], jnp.float64)[None] for i in moving]
-    states, end = own.run(jnp.concatenate([_packed(motion.y0), _packed(dy0), progress, jnp.zeros(1), limits, known, *more]), motion.goals)
+    states, end = own.run(*_samples(motion), jnp.concatenate([_packed(motion.y0), _packed(dy0), progress, jnp.zeros(1), limits, known, *more]), motion.goals)
     n, plain = layout.y, replace(layout, moving=None)
     primals = states[:, :n], jnp.concatenate([end[:n], end[2 * n : -2], end[-1:]])
     along = jnp.zeros_like(primals[1]).at[:n].set(end[n : 2 * n]).at[plain.rows["t"].start].set(end[layout.rows["dt"].start])
@@ -126,9 +139,9 @@ def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, of: Callable) ->
 def cotangents(motion: Motion, asked: Sequence[bool], ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> tuple[Integrated, list]:
     """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of the states and of the end."""
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
-    form = _form(motion.args[0], motion.has_events)
+    form = _form_of(motion)
     starts, ends = jnp.concatenate([_packed(motion.y0), *_rows(motion)]), jnp.concatenate([_packed(y_end), t_end[None]])
-    found = kernel_back(form, motion.solver, which)(starts, jax.vmap(_packed)(ys), ends, motion.goals)
+    found = kernel_back(form, motion.solver, which)(*_samples(motion), starts, jax.vmap(_packed)(ys), ends, motion.goals)
     known = dict(zip(which, found[form.layout.y :], strict=True))
     return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
 
@@ -142,6 +155,22 @@ def _rows(motion: Motion) -> tuple[Array, Array, Array]:
     limits = [jnp.sign(goals[-1]), goals[-1], control.rtol, control.atol, control.shortest, control.max_steps * one, origin]
     known = [jnp.asarray(x, jnp.float64) for x in (*fixed, *inputs(origin))]
     return jnp.stack(progress), jnp.stack(limits), jnp.stack(known) if known else jnp.zeros(0)
+
+
+def _samples(motion: Motion) -> tuple[Array, ...]:
+    """Tables of the inputs that are given by samples, and the knots, as the kernel takes them; nothing where there are none."""
+    _, _, inputs, _, origin = motion.args
+    channels = [channel for channel in inputs.channels if isinstance(channel, Sampled)]
+    if not channels:
+        return ()
+    count = max(2, *(len(channel.ts) for channel in channels))
+
+    def padded(x: Array, with_what) -> Array:
+        return jnp.concatenate([x, jnp.full(count - len(x), with_what, x.dtype)])
+
+    tables = jnp.stack([jnp.stack([padded(channel.ts - origin, jnp.inf), padded(channel.values, channel.values[-1])]) for channel in channels])
+    never = jnp.sign(motion.goals[-1]) * jnp.inf
+    return tables, jnp.full(1, never) if motion.knots is None else motion.knots
 
 
 def _packed(y: Integrated) -> Float[Array, "y"]:

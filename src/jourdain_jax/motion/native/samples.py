@@ -1,0 +1,102 @@
+"""Inputs that are given by samples, in machine code: straight lines between them, looked up in tables, and knots at which steps end.
+
+    f(t) = f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k),   t_k <= t < t_{k+1};   constant before the first sample and after the last
+
+Tables have the shape (tables, inputs, 2, samples): times since the start, then values, of every input that is given by samples, padded with infinite times. Knots
+(`integrators/knots.py`) have the shape (rows, knots). Lanes that share them have one of each: of T tables, lane i of N has number i T / N.
+"""
+
+from jourdain_jax.motion.native.layout import Lanes, Layout
+from jourdain_jax.native.ffi import Given
+from jourdain_jax.native.ir import Value, Writer
+
+WORDS = 6  # of a job: pointers to the tables and the knots, how many there are of each, samples of a table, knots of a row
+_TABLES, _KNOTS, _TABLE_COUNT, _KNOT_COUNT, _SAMPLES, _KNOTS_EACH = range(WORDS)
+
+
+def arguments(layout: Layout) -> int:
+    """How many arguments of a handler are samples."""
+    return 2 if layout.sampled else 0
+
+
+def product(w: Writer, x: Given, but: int) -> Value:
+    """The product of the sizes of all axes but the last ones."""
+    total = w.room("i64")
+    w.store(w.literal(1, "i64"), total)
+    with w.counted(0, x.rank - but) as axis:
+        w.store(w.load("i64", total) * w.load("i64", x.sizes, axis), total)
+    return w.load("i64", total)
+
+
+def store_words(w: Writer, words: Value, given: list[Given]) -> None:
+    """The words of a job that say where samples are."""
+    tables, knots = given
+    for word, value in (
+        (_TABLES, tables.data),
+        (_KNOTS, knots.data),
+        (_TABLE_COUNT, product(w, tables, 3)),
+        (_KNOT_COUNT, product(w, knots, 1)),
+        (_SAMPLES, w.load("i64", tables.sizes, tables.rank - 1)),
+        (_KNOTS_EACH, w.load("i64", knots.sizes, knots.rank - 1)),
+    ):
+        w.store(value, words, word)
+
+
+def begin(w: Writer, layout: Layout, words: Value, count: Value, lanes: Lanes, lane: Value, number: Value) -> None:
+    """A place takes the table and the knots of the lane with this number, of so many."""
+    size = w.load("i64", words, _SAMPLES)
+
+    def share(of: int) -> Value:
+        return w.binary("sdiv", number * w.load("i64", words, of), count)
+
+    table = w.at(w.load("ptr", words, _TABLES), share(_TABLE_COUNT) * size * (2 * layout.sampled), "double")
+    knot = w.at(w.load("ptr", words, _KNOTS), share(_KNOT_COUNT) * w.load("i64", words, _KNOTS_EACH), "double")
+    for name, value in (("table", table), ("samples", size), ("knot", knot)):
+        lanes.set(name, lane, value)
+
+
+def nearer(w: Writer, lanes: Lanes, lane: Value, goal: Value) -> Value:
+    """The next knot or the goal, whichever comes first."""
+    knot = w.load("double", lanes.of("knot", lane, "ptr"))
+    return w.where((knot - goal) * lanes.of("direction", lane) < 0.0, knot, goal)
+
+
+def pass_knot(w: Writer, lanes: Lanes, lane: Value) -> None:
+    """The next knot is behind."""
+    lanes.set("knot", lane, w.at(lanes.of("knot", lane, "ptr"), 1, "double"))
+
+
+def write_inputs(w: Writer, layout: Layout) -> None:
+    """`sampled_inputs(state, t, values)`: the values of all inputs that are given by samples, at the time t since the start, of each lane."""
+    with w.function("sampled_inputs", "void", {"state": "ptr", "t": w.real, "values": "ptr"}, attributes="noinline") as (state, t, values):
+        lanes, times, low, high = Lanes(w, layout, state), w.room(w.real), w.room("i64"), w.room("i64")
+        w.store(t, times)
+        with w.counted(0, w.lanes) as lane:
+            now, count = w.load("double", times, lane), lanes.of("samples", lane, "i64")
+            for i in range(layout.sampled):
+                ts = w.at(lanes.of("table", lane, "ptr"), count * (2 * i), "double")
+                fs = w.at(ts, count, "double")
+                w.store(w.literal(0, "i64"), low)
+                w.store(count - 1, high)
+                with w.repeated() as leave:
+                    a, b = w.load("i64", low), w.load("i64", high)
+                    leave((b - a) <= 1)
+                    middle = w.binary("sdiv", a + b, 2)
+                    after = w.load("double", ts, middle) <= now
+                    w.store(w.where(after, middle, a), low)
+                    w.store(w.where(after, b, middle), high)
+                k = w.load("i64", low)
+                t_k, f_k = w.load("double", ts, k), w.load("double", fs, k)
+                share = (now - t_k) / (w.load("double", ts, k + 1) - t_k)
+                share = w.smaller(w.larger(share, 0.0), 1.0)
+                w.store(f_k + share * (w.load("double", fs, k + 1) - f_k), w.at(values, i * w.lanes + lane, "double"))
+        w.give()
+
+
+def looked_up(w: Writer, layout: Layout, state: Value, t: Value) -> list[Value]:
+    """The values at the time t since the start of all inputs that are given by samples."""
+    if not layout.sampled:
+        return []
+    values = w.room(w.real, layout.sampled)
+    w.call("sampled_inputs", "void", state, t, values)
+    return [w.load(w.real, values, i) for i in range(layout.sampled)]

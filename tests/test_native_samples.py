@@ -1,0 +1,142 @@
+"""Inputs given by samples, in machine code: against the loop of XLA, which takes the same steps, and against closed forms."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.motion.own_steps import reason_against_machine_code
+from jourdain_jax.motion.simulate import set_up
+from jourdain_jax.motion.trajectories import results
+
+FORWARD = diffrax.ForwardMode()
+
+
+class Pushed(jj.Scene):
+    """An oscillator with two inputs and a wall."""
+
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("push pull")
+    mass: object = jj.parameter(1.5)
+    stiffness: object = jj.parameter(6.0)
+    wall: object = jj.parameter(0.8)
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        f = motion.inputs
+        return (jj.generalized_force(motion, x_rate=f.push * motion.q.x + f.pull - self.stiffness * motion.q.x),)
+
+    def events(self, motion):
+        return {"wall": self.wall - motion.q.x}
+
+
+OPTIONS = {"ts": jnp.array([0.0, 0.25, 0.7, 1.1]), "t1": 1.7, "rtol": 1e-10, "atol": 1e-10}
+TIMES = np.array([-0.3, 0.1, 0.25, 0.4, 0.9, 1.3])
+
+
+def inputs(scale=1.0):
+    """A record with a knot at a saved time, one before the start, and a jump; and a constant."""
+    return {"push": jj.Sampled(TIMES, scale * jnp.array([0.0, 2.0, -3.0, 5.0, 0.5, 1.0])), "pull": jj.Sampled([0.6, 0.601], [0.0, 0.4])}
+
+
+def numbers(motion):
+    return jnp.concatenate([motion.q.ravel(), motion.u_end, motion.t_end[None]])
+
+
+@pytest.mark.parametrize(
+    "more",
+    [{"events": False}, {}, {"t1": -1.7, "ts": -OPTIONS["ts"], "events": False}, {"rtol": 1e-5, "atol": 1e-5}],
+    ids=["plain", "to a wall", "backwards", "loose"],
+)
+def test_steps_are_those_of_xla(more):
+    options = OPTIONS | more
+    ours, theirs = (jj.simulate(Pushed(), {"x": 0.5, "x_rate": 0.2}, inputs=inputs(), backend=backend, **options) for backend in ("native", "xla"))
+    assert (ours.result, ours.accepted, ours.rejected, ours.event) == (theirs.result, theirs.accepted, theirs.rejected, theirs.event)
+    np.testing.assert_allclose(numbers(ours), numbers(theirs), rtol=1e-13, atol=1e-13)
+
+
+def test_a_record_far_from_time_zero_is_followed_as_at_zero():
+    ends = []
+    for t0 in (0.0, 2.0**30):  # a clock with three bits less than a microsecond
+        record = jj.Sampled(t0 + np.arange(9) / 4, np.sin(np.arange(9.0)))
+        motion = jj.simulate(Pushed(), {"x": 0.5}, t0=t0, ts=[t0 + 0.75, t0 + 2.0], inputs={"pull": record}, rtol=1e-10, atol=1e-10, backend="native")
+        ends.append(motion.q)
+    np.testing.assert_array_equal(*ends)
+
+
+def test_lanes_have_records_of_their_own_or_share_one():
+    scales, x = jnp.linspace(-1.0, 1.0, 11), jnp.linspace(-0.3, 0.5, 11)
+
+    def end(backend, scale, x):
+        motion = jj.simulate(Pushed(), {"x": x}, inputs=inputs(scale), backend=backend, **OPTIONS)
+        return numbers(motion), motion.accepted
+
+    for axes in ((0, 0), (None, 0)):
+        given = [a if axis == 0 else a[3] for a, axis in zip((scales, x), axes, strict=True)]
+        ours, theirs = (jax.jit(jax.vmap(lambda *a, backend=backend: end(backend, *a), axes))(*given) for backend in ("native", "xla"))
+        np.testing.assert_allclose(ours[0], theirs[0], rtol=1e-13, atol=1e-13)
+        np.testing.assert_array_equal(ours[1], theirs[1])
+        alone = end("native", *(a if axis is None else a[7] for a, axis in zip(given, axes, strict=True)))
+        np.testing.assert_array_equal(ours[0][7], alone[0])
+    # records of the outer lanes, starts of the inner ones
+    nested = jax.vmap(lambda scale: jax.vmap(lambda x: end("native", scale, x)[0])(x[:3]))(scales[:4])
+    np.testing.assert_array_equal(nested[2, 1], end("native", scales[2], x[1])[0])
+
+
+@pytest.mark.parametrize("adjoint", [None, FORWARD], ids=["reverse", "forward"])
+@pytest.mark.parametrize("events", [False, True], ids=["to the end", "to a wall"])
+def test_derivatives_are_those_of_xla(adjoint, events):
+    mode = jax.grad if adjoint is None else jax.jacfwd
+
+    def end(x, backend):
+        scene, start = Pushed(mass=x[0], stiffness=x[1], wall=x[2]), {"x": x[3], "x_rate": x[4]}
+        given = inputs() | {"pull": x[5]}
+        return jnp.sum(numbers(jj.simulate(scene, start, inputs=given, backend=backend, adjoint=adjoint, events=events, **OPTIONS)) ** 2)
+
+    x = jnp.array([1.5, 6.0, 0.8, 0.5, 0.2, 0.3])
+    ours, theirs = (jax.jit(jax.vmap(lambda x, backend=backend: mode(end)(x, backend)))(jnp.stack([x, 1.01 * x])) for backend in ("native", "xla"))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("adjoint", [None, FORWARD], ids=["reverse", "forward"])
+def test_derivatives_with_respect_to_samples_are_those_of_the_loop_of_xla(adjoint):
+    def end(scale, backend):
+        return numbers(jj.simulate(Pushed(), {"x": 0.5}, inputs=inputs(scale), backend=backend, adjoint=adjoint, events=False, **OPTIONS))[-3]
+
+    ours, theirs = ((jax.grad if adjoint is None else jax.jacfwd)(end)(1.3, backend) for backend in ("native", "xla"))
+    assert ours != 0
+    np.testing.assert_allclose(ours, theirs, rtol=1e-12)
+
+
+def test_a_blow_is_felt_and_one_sample_is_a_constant():
+    blow = {"pull": jj.Sampled([0.5, 0.5005, 0.501], [0.0, 3000.0, 0.0])}  # 1.5 N s
+    motion = jj.simulate(Pushed(), {"x": 0.0}, inputs=blow, t1=0.501, rtol=1e-9, atol=1e-9, backend="native")
+    np.testing.assert_allclose(motion.u_end, 1.0, rtol=1e-5)  # less what the spring has taken within the blow
+    constant, sampled = (jj.simulate(Pushed(), {"x": 0.3}, inputs={"pull": f}, backend="native", **OPTIONS) for f in (0.4, jj.Sampled([3.0], [0.4])))
+    np.testing.assert_array_equal(constant.q, sampled.q)
+
+
+def test_a_record_that_is_no_number_ends_its_lane_alone():
+    values = jnp.ones((3, 6)).at[1, 3].set(jnp.nan)
+    run = jax.vmap(lambda v: jj.simulate(Pushed(), {"x": 0.3}, inputs={"push": jj.Sampled(TIMES, v)}, events=False, backend="native", **OPTIONS))
+    motion = run(values)
+    assert motion.result[1] not in (results.SUCCESS, results.EVENT)
+    np.testing.assert_array_equal(motion.q[0], motion.q[2])
+    assert np.isfinite(motion.q[0]).all()
+
+
+class Until(Pushed):
+    """It ends when the push does."""
+
+    def events(self, motion):
+        return {"released": motion.inputs.push - 0.1}
+
+
+def test_it_is_said_which_inputs_machine_code_does_not_take():
+    assert reason_against_machine_code(set_up(Pushed(), {"x": 0.1}, inputs=inputs())) == ""
+    assert "function of time" in reason_against_machine_code(set_up(Pushed(), {"x": 0.1}, inputs={"pull": jnp.sin}))
+    assert "event" in reason_against_machine_code(set_up(Until(), {"x": 0.1}, inputs=inputs()))
