@@ -1,6 +1,6 @@
 """Motions by machine code of our own against the same motions by XLA, in one run on one core: batches, alone, cold starts.
 
-    taskset -c 0 python bench/native.py [--quick] [--json FILE]
+    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|records|compilation ...]
 
 Writes a list of {"figure", "model", "value", "required", "met"}; `required` is None where a figure is only told. Times of warm motions are processor
 time, the least of some repeats, the two ways in turn; cold ones are wall time of fresh processes.
@@ -104,6 +104,33 @@ def batches(quick: bool) -> Iterator[Figure]:
                 yield figure(f"{who}, {tolerance:.0e}, tried steps, XLA", name, steps["XLA"])
 
 
+def records(quick: bool) -> Iterator[Figure]:
+    """2 s of a bicycle under a record of 201 samples of the steer torque, each lane its own; and its derivatives with respect to four parameters."""
+    scene, name, lanes, scale = jj.models.MODELS["whipple-bicycle"](), "whipple-bicycle", 2 if quick else 8, 1e-8
+    start, times = jj.start(scene, rear_spin_rate=15.0, lean_rate=0.05), np.linspace(0.0, 2.0, 201)
+    torques = jnp.asarray(0.1 * np.random.default_rng(0).normal(size=(lanes, 201)))
+    parameters = jnp.stack([scene.mB, scene.IBxx, scene.zB, scene.mH])
+
+    def rates(backend, parameters, torque):
+        own = scene.replace(**dict(zip(("mB", "IBxx", "zB", "mH"), parameters, strict=True)))
+        options = {"ts": jnp.linspace(0.05, 2.0, 40), "rtol": scale, "atol": scale, "events": False, "adjoint": diffrax.ForwardMode(), "backend": backend}
+        return jj.simulate(own, start, inputs={"steer_torque": jj.Sampled(times, torque)}, **options).u
+
+    for what, function in (("motion", lambda f: f), ("its derivatives", jax.jacfwd)):
+        runs, found = {}, {}
+        for way, backend in WAYS.items():
+            run = jax.jit(jax.vmap(function(partial(rates, backend)), (None, 0)))
+            begin = time.process_time()
+            found[way] = np.asarray(run(parameters, torques))
+            yield figure(f"record, {what}, {way}, trace, compile and run, s", name, time.process_time() - begin)
+            runs[way] = partial(lambda run: jax.block_until_ready(run(parameters, torques)), run)
+        seconds = least_processor_time(runs, 3)
+        for way in WAYS:
+            yield figure(f"record, {what}, {way}, ms per lane", name, 1e3 * seconds[way] / lanes)
+        yield figure(f"record, {what}, native / XLA", name, seconds["native"] / seconds["XLA"], 0.5)
+        yield figure(f"record, {what}, largest difference", name, float(np.max(np.abs(found["native"] - found["XLA"]))))
+
+
 def compilation(quick: bool) -> Iterator[Figure]:
     """The motion alone, lowered and compiled in this process, once the scene is built; fresh processes to the end of a first motion."""
     for name in ("tilting-disc", "whipple-bicycle"):
@@ -130,9 +157,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few lanes, the disc alone")
     parser.add_argument("--json", help="write the figures to this file")
+    parts = {"batches": batches, "records": records, "compilation": compilation}
+    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="these figures")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    figures = [entry for part in (batches, compilation) for entry in part(options.quick)]
+    figures = [entry for part in options.only for entry in parts[part](options.quick)]
     if options.json:
         with open(options.json, "w") as file:
             json.dump(figures, file, indent=1)
