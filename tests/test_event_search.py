@@ -1,11 +1,13 @@
 """Stop events located inside the loop over steps: to round-off, with derivatives up to the third, and never outside of the step they lie in."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop
 from jourdain_jax.motion.trajectories import results
 
@@ -108,3 +110,33 @@ def test_lanes_stop_each_at_its_own_event_and_the_steps_to_it_do_not_count():
     np.testing.assert_array_equal(lanes.accepted, [int(end.accepted) for end in alone])
     few = stopped(y0[:, 1], lambda t, y: y[0], rates=falling, kind="reverse", max_steps=int(alone[1].accepted) + 1)
     np.testing.assert_allclose(few.t, np.sqrt(2 / GRAVITY), rtol=1e-13)
+
+
+class Flat(jj.Scene):
+    """A particle that meets a wall; the value of the event has a root of three fold there, or one of one fold."""
+
+    wall: object = jj.parameter(1.5)
+    order: int = eqx.field(static=True, default=3)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def events(self, motion):
+        return {"wall": (self.wall - motion.q.x) ** self.order}
+
+
+@pytest.mark.parametrize("options", [{"backend": "native"}, {"backend": "xla"}, {"backend": "dense"}, {"solver": jj.RadauIIA()}], ids=str)
+@pytest.mark.parametrize("mode", ["reverse", "forward"])
+def test_the_time_of_an_event_whose_value_has_no_slope_has_no_derivative(options, mode):
+    adjoint = diffrax.ForwardMode() if mode == "forward" else None
+
+    def met(wall, order):
+        motion = jj.simulate(Flat(wall=wall, order=order), {"x": 0.0, "x_rate": 1.0}, t1=4.0, ts=[0.5], adjoint=adjoint, **options)
+        return jnp.stack([motion.t_end, motion.q_end[0], motion.q[0, 0] * wall])
+
+    np.testing.assert_allclose(met(1.5, 3), [1.5, 1.5, 0.75], rtol=1e-7)
+    derivative = jax.jacfwd if mode == "forward" else jax.jacrev
+    np.testing.assert_allclose(derivative(met)(1.5, 1), [1.0, 1.0, 0.5], rtol=1e-9)
+    # what was saved on the way is none of the event's
+    np.testing.assert_allclose(derivative(met)(1.5, 3), [np.nan, np.nan, 0.5], rtol=1e-9)

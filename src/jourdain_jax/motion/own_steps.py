@@ -120,7 +120,8 @@ def _pushed(setup: Setup, begun: Begun, along: Setup, d: Begun) -> PyTree:
 def _pulled(perturbed: tuple, setup: Setup, begun: Begun, g: Solved) -> tuple:
     """Cotangents of what varies, from those of the motion."""
     states = jax.tree.map(lambda g: jnp.concatenate([g, jnp.zeros((1, *g.shape[1:]))]), g.ys)  # nobody asks for the last one: it is that of the end
-    by_start, by_known = native_motion.cotangents(_motion(setup, begun), _known(perturbed[1].args), states, g.y_end, g.t_end)
+    asked = [bool(varies) for varies in _known(perturbed[1].args)]
+    by_start, by_known = native_motion.cotangents(_motion(setup, begun), asked, states, g.y_end, g.t_end)
     none_else = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
     field, scene, inputs, fixed, origin = none_else[1].args
     y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)

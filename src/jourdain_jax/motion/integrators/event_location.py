@@ -118,6 +118,7 @@ def locate(
 
     last = numbers(longest)
     known = bracket(jnp.zeros_like(last), values(fixed[0], fixed[1], fixed[2]), last, values(*numbers((t_f, y_f, args))))
+    slopes = event_search.mean_slope(known)
 
     def not_found(carry):
         known, k, _ = carry
@@ -133,17 +134,19 @@ def locate(
     # a step that is not solved says nothing of events: an event found where such steps begin is none
     known, _, right = jax.lax.while_loop(not_found, search, (known, jnp.zeros((), jnp.int32), jnp.array(True)))
     event = known.first
+    slope = chosen(event, slopes)
 
-    def corrected(h, _):
+    def corrected(h, k):
         def at(h):
             t, (y, _) = t_0 + direction * h, stepped(h, t_0, y_0, args, direction)
             return chosen(event, values(t, y, args)), y
 
         (c, y), (c_dot, f) = jax.jvp(at, (h,), (jnp.ones_like(h),))
         shift = event_search.newton_shift(known, last, c, c_dot, moving)
+        shift = event_search.without_slope(shift, c, moving & (k == _CORRECTIONS - 1) & event_search.is_flat(c_dot, slope))
         return h + shift, jax.tree.map(lambda y, f: y + shift * f, y, f)
 
-    h, ys = jax.lax.scan(corrected, jnp.where(moving, known.t[0], longest), None, length=_CORRECTIONS)
+    h, ys = jax.lax.scan(corrected, jnp.where(moving, known.t[0], longest), jnp.arange(_CORRECTIONS))
     t = jnp.where(moving, t_0 + direction * h, t_f)
     y = jax.tree.map(lambda y, end: jnp.where(moving, y[-1], end), ys, y_f)
     return Located(t, y, jnp.where(happened, event, -1).astype(jnp.int32), right)

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 MOST_STEPS = 72
 DIFFERENTIABLE = 2
+FLAT = 1e-8  # of its mean rate over a step: a value that falls through zero so slowly has a root of several fold, or as good as that
 LATE = 0.98  # of a step: a dip that is later is left to the next one
 
 
@@ -105,6 +106,7 @@ class Search(eqx.Module):
     step: Float[Array, "*lanes"]  # length of the step in which the event lies
     left: Int[Array, "*lanes"]  # steps; 0: found
     shift: Float[Array, "*lanes"]  # the next step, with its sign
+    slope: Float[Array, "events *lanes"]  # magnitude of the mean rate of the values over that step
 
     @property
     def trying(self) -> Bool[Array, "*lanes"]:
@@ -115,7 +117,7 @@ class Search(eqx.Module):
 def none(t: Float[Array, "*lanes"], values: Float[Array, "events *lanes"]) -> Search:
     """Nothing to search for."""
     t, c = jax.lax.stop_gradient((t, values))
-    return Search(bracket(t, c, t, c), jnp.zeros_like(t), jnp.zeros(jnp.shape(t), jnp.int32), jnp.zeros_like(t))
+    return Search(bracket(t, c, t, c), jnp.zeros_like(t), jnp.zeros(jnp.shape(t), jnp.int32), jnp.zeros_like(t), jnp.zeros_like(c))
 
 
 def advanced(search: Search, begins: Bool[Array, "*lanes"], t_0, c_0, c_dot_0, t_1, c_1) -> Search:
@@ -130,8 +132,34 @@ def advanced(search: Search, begins: Bool[Array, "*lanes"], t_0, c_0, c_dot_0, t
     left = jnp.where(trying & trial.near, DIFFERENTIABLE + 1, left).astype(jnp.int32)
     shift = jnp.where(trial.near, 0.0, trial.t - jax.lax.stop_gradient(t_0))
     first = known.first
+    slope = jnp.where(begins, mean_slope(fresh), search.slope)
     newton = newton_shift(known, step, chosen(first, c_1), chosen(first, c_dot_0), search.left > 0)
-    return Search(known, step, left, jnp.where(trying, shift, newton))
+    newton = without_slope(newton, chosen(first, c_1), (search.left == 1) & is_flat(chosen(first, c_dot_0), chosen(first, slope)))
+    return Search(known, step, left, jnp.where(trying, shift, newton), slope)
+
+
+def mean_slope(known: Bracket) -> Float[Array, "events *lanes"]:
+    """The magnitude of the mean rate of the values between the first two times of a bracket; zero where one of them is not finite."""
+    slope = jnp.abs(known.c[0] - known.c[1]) / jnp.abs(known.t[0] - known.t[1])
+    return jnp.where(jnp.isfinite(slope), slope, 0.0)
+
+
+def is_flat(c_dot: Float[Array, "*lanes"], slope: Float[Array, "*lanes"]) -> Bool[Array, "*lanes"]:
+    """Whether a value has no slope where it falls through zero, as far as its digits tell, beside its mean `slope` over the step."""
+    c_dot, slope = jax.lax.stop_gradient((c_dot, slope))
+    return jnp.abs(c_dot) <= FLAT * slope
+
+
+@jax.custom_jvp
+def without_slope(shift, c, flat: Bool[Array, "*lanes"]) -> Float[Array, "*lanes"]:
+    """The shift to c = 0, whose derivative is not a number where the value is flat: the time of such an event has none that could be told."""
+    return shift
+
+
+@without_slope.defjvp
+def _without_slope_jvp(primals, tangents):
+    (shift, _, flat), (d_shift, dc, _) = primals, tangents
+    return shift, jnp.where(flat, 0.0, 1.0) * d_shift + jnp.where(flat, jnp.nan, 0.0) * dc
 
 
 def newton_shift(known: Bracket, step, c, c_dot, searching) -> Float[Array, "*lanes"]:

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.motion.integrators import step_adjoint
 from jourdain_jax.motion.integrators.erk_step import LOCATING, Method, Problem, Progress, advanced, begun, running, standing
-from jourdain_jax.motion.integrators.event_search import MOST_STEPS, chosen
+from jourdain_jax.motion.integrators.event_search import MOST_STEPS, chosen, is_flat
 from jourdain_jax.motion.trajectories import results
 
 STEPS_ALONE, STEPS_TOGETHER = 2048, 512  # of a window: for one motion, for lanes in lockstep
@@ -134,8 +134,9 @@ def _recorded(perturbed, moving, control, forward, method):
 
     (end, _, record), (ys, reached) = jax.lax.scan(to_goal, (start, start, empty), jnp.arange(len(goals), dtype=jnp.int32))
     record = replace(record, window=record.window.towards(jnp.asarray(len(goals), jnp.int32)))
+    slope = None if end.search is None else chosen(end.event, end.search.slope)
     end = replace(end, search=None)
-    return (ys, reached, end), (record, reached, end)
+    return (ys, reached, end), (record, reached, end, slope)
 
 
 def _before_event(p: Progress, kept: Progress) -> Progress:
@@ -148,7 +149,7 @@ def _before_event(p: Progress, kept: Progress) -> Progress:
 
 @_motion.def_bwd
 def _vjp(residuals, cotangents, perturbed, moving, control, forward, method):
-    record, reached, end = residuals
+    record, reached, end, slope = residuals
     shared, events, knots, y0, t0, goals = moving
     problem, direction = _problem(moving, control), jnp.sign(goals[-1] - t0)
     g_ys, _, g_end = cotangents
@@ -163,7 +164,7 @@ def _vjp(residuals, cotangents, perturbed, moving, control, forward, method):
         repeats = located & ~reached
         g = replace(g, y=jax.tree.map(lambda y, at: y + jnp.sum(_on_states(repeats, at), axis=0), g.y, g_ys))
         g_ys = jax.tree.map(lambda at: _on_states(~repeats, at), g_ys)
-        g, g_events = _back_from_event(end, located, g, (differentiable, by_events), (fixed, fixed_events))
+        g, g_events = _back_from_event(end, located, slope, g, (differentiable, by_events), (fixed, fixed_events))
 
     def problem_of(differentiable):
         rates, project, args = eqx.combine(differentiable, fixed)
@@ -238,16 +239,19 @@ def _again(problem: Problem, method: Method, beginnings: _Beginnings, number, wi
     return window, (p.t == target) | ~exists
 
 
-def _back_from_event(end: Progress, located, g: _Cotangents, differentiable, fixed) -> tuple[_Cotangents, PyTree]:
+def _back_from_event(end: Progress, located, slope, g: _Cotangents, differentiable, fixed) -> tuple[_Cotangents, PyTree]:
     """Cotangents of the state at the event at a number for a time, and of the functions of events.
 
-    t = t_e - c(t_e, y)/cdot,   y_e = y - f c(t_e, y)/cdot      zero in value, t_e a number
+    t = t_e - c(t_e, y)/cdot,   y_e = y - f c(t_e, y)/cdot      zero in value, t_e a number;  NaN where c has no slope there
     """
     (rates, _, args), events = eqx.combine(differentiable, fixed)
     f = rates(end.t, end.y, args)
     _, rate = jax.jvp(lambda t, y: chosen(end.event, events(t, y, args)), (end.t, end.y), (jnp.ones_like(end.t), f))
     usable = located & (rate != 0) & jnp.isfinite(rate)
-    by_value = jnp.where(usable, -(g.t + step_adjoint.product(g.y, f, end.t.ndim)) / jnp.where(usable, rate, 1.0), 0.0)
+    asked = g.t + step_adjoint.product(g.y, f, end.t.ndim)
+    by_value = jnp.where(usable, -asked / jnp.where(usable, rate, 1.0), 0.0)
+    flat = located & is_flat(rate, slope)
+    by_value = jnp.where(flat & (asked != 0), jnp.nan, by_value)
 
     def value(y, differentiable):
         (_, _, args), events = eqx.combine(differentiable, fixed)

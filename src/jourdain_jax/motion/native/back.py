@@ -343,7 +343,9 @@ def _write_event_back(w: Writer, form: Form, asked: int) -> None:
             for i in range(count):
                 total = w.fma(w.load(w.real, g, i), w.load(w.real, f, i), total)
             usable = located & rate.differs(0.0) & (w.magnitude(rate) < math.inf)
-            by_value = w.where(usable, -total / rate, 0.0)
+            flat = located & search.is_flat(w, lanes, rate) & total.differs(0.0)
+            by_value = w.where(flat, math.nan, w.where(usable, -total / rate, 0.0))
+            usable = usable | flat
             for i in range(layout.events):
                 w.store(w.where(lanes["event"].equals(float(i)), by_value, 0.0), weights, i)
             each_row(w, range(asked), added, lambda i: w.number(0.0))

@@ -48,7 +48,7 @@ class Layout:
     @cached_property
     def rows(self) -> dict[str, range]:
         """Name -> rows."""
-        search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1}
+        search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1, "search_slope": self.events}
         tangents = {"dt": 0 if self.moving is None else 1}, {"dknown": self.moving or 0}
         counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), **tangents[0], **dict.fromkeys(CONTROL, 1), "known": self.known, **tangents[1]}
         counts |= {"goal": 1, "taken": 1, **(search if self.events else {}), **dict.fromkeys(SAMPLES if self.sampled else (), 1)}

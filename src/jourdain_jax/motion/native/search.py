@@ -2,7 +2,7 @@
 
 import math
 
-from jourdain_jax.motion.integrators.event_search import DIFFERENTIABLE, LATE, MOST_STEPS
+from jourdain_jax.motion.integrators.event_search import DIFFERENTIABLE, FLAT, LATE, MOST_STEPS
 from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.native.ir import Value, Writer
 
@@ -81,9 +81,19 @@ def advance(w: Writer, p: Lanes, begins: Value, trying: Value, locating: Value, 
     shift = w.where(trying, to_trial, newton)
     for name, new in (("search_t", known_t), ("search_c", [x for part in known_c for x in part])):
         p.put(name, [w.where(changes, a, b) for a, b in zip(new, p.every(name), strict=True)])
+    for i, (a, b) in enumerate(zip(c_0, c_1, strict=True)):
+        mean = w.magnitude((b - a) / (t_1 - t_0))
+        slope = w.where(mean < math.inf, mean, 0.0)
+        place = p.layout.rows["search_slope"].start + i
+        w.store(w.where(begins, slope, w.load(w.real, p.pointer, place)), p.pointer, place)
     for name, new in (("search_step", step), ("search_left", now_left), ("search_shift", shift)):
         p[name] = w.where(changes, new, p[name])
     return first
+
+
+def is_flat(w: Writer, p: Lanes, rate: Value) -> Value:
+    """Whether the value of a lane's event has no slope where it falls through zero."""
+    return w.magnitude(rate) <= FLAT * chosen(w, p["event"], p.every("search_slope"))
 
 
 def _same(w: Writer, a: Value, b: Value) -> Value:

@@ -220,7 +220,7 @@ def _watched(w: Writer, form: Form, method: Method, p: Lanes, k: Value, step: Va
 def _tangents_at_event(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Value, rate: list[Value], y1: Value) -> Value:
     """The tangent of the time of an event, zero where none is found; adds to those of the state `y1` there.
 
-    dt = -(dc/dy dy + dc/dp dp)/cdot,   dy <- dy + f dt
+    dt = -(dc/dy dy + dc/dp dp)/cdot,   dy <- dy + f dt;   NaN where c has no slope there
     """
     layout, place = form.layout, w.room(w.real)
     w.store(p["dt"], place)
@@ -230,12 +230,13 @@ def _tangents_at_event(w: Writer, form: Form, p: Lanes, k: Value, found: Value, 
         dc = search.chosen(w, p["event"], [w.load(w.real, values, i) for i in range(layout.events)])
         slope = search.chosen(w, p["event"], rate)
         usable = found & slope.differs(0.0) & (w.magnitude(slope) < math.inf)
-        dt = w.where(usable, -dc / slope, 0.0)
+        flat = found & search.is_flat(w, p, slope)
+        dt = w.where(flat, math.nan, w.where(usable, -dc / slope, 0.0))
         w.store(w.where(found, dt, p["dt"]), place)
 
         def moved(i: int | Value) -> Value:
             before = w.load(w.real, y1, i + layout.y)
-            return w.where(usable, w.fma(w.load(w.real, k, i), dt, before), before)
+            return w.where(usable | flat, w.fma(w.load(w.real, k, i), dt, before), before)
 
         for_rows(w, range(layout.y), lambda i: w.store(moved(i), y1, i + layout.y))
     return w.load(w.real, place)
