@@ -2,6 +2,7 @@
 them and what holds them. Everything else (velocities, partial velocities, mass matrix, rows) comes by automatic differentiation.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -21,6 +22,7 @@ from jourdain_jax.scene.names import Named, nearest
 from jourdain_jax.scene.numbers import checked_real
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
 from jourdain_jax.scene.static_callables import hold_functions
+from jourdain_jax.scene.visuals import Visual
 from jourdain_jax.scene.what_is_read import WhatIsRead, is_read_by
 
 
@@ -136,6 +138,13 @@ class Scene(eqx.Module, metaclass=_SceneClass):
 
     def invariants(self, motion: Motion) -> dict[str, Float[Array, ""]]:
         """Named quantities of a `motion` that this scene is known to conserve, besides its energy; for checks and summaries."""
+        return {}
+
+    def visuals(self, pose: Pose) -> dict[str, Visual | Sequence[Visual]]:
+        """What bodies look like at a `pose`, by name, `""` for what stands in the inertial frame; for pictures only. See `jj.Visual`.
+
+        Bodies that are left out are drawn by their `outline`, what rolls in their contacts, or their inertia.
+        """
         return {}
 
     # What can be asked of any scene. ------------------------------------------------------------------------------
