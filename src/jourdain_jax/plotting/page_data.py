@@ -69,7 +69,7 @@ def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dic
         "ground": 3 * far.longest + 60 * near.longest,
         "tile": tile,
         "thickness": 0.018 * near.longest,
-        "follow": bool(far.longest > _LONG * near.longest) if options["follow"] is None else bool(options["follow"]),
+        "follow": bool(far.longest > _LONG * near.longest and not _at_rest(first)) if options["follow"] is None else bool(options["follow"]),
         "view": list(options["view"]),
         "play": bool(options["play"]),
     }
@@ -166,6 +166,11 @@ def _whole_turns(quaternions: np.ndarray, velocities: np.ndarray, ts: np.ndarray
 def _still(values: np.ndarray) -> np.ndarray:
     """Values at all times; at one time where they stay what they are."""
     return values[:1] if np.ptp(values, axis=0).max(initial=0.0) < 1e-12 * (1 + np.abs(values).max(initial=0.0)) else values
+
+
+def _at_rest(drawn: Drawn) -> bool:
+    """Whether something stands in the inertial frame, such as a table."""
+    return "" in drawn.bodies and any(len(_still(look.positions)) == 1 and look.visual.kind != "line" for look in drawn.bodies[""].looks)
 
 
 def _moves(body: DrawnBody) -> bool:

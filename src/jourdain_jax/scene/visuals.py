@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.scene.bodies import _axis_index, _stack
+from jourdain_jax.scene.grounds import tangents_of
 from jourdain_jax.scene.numbers import checked_real, described, is_traced
 
 
@@ -94,6 +95,19 @@ class Visual(eqx.Module):
         stacked = jnp.stack([checked_real(p, "point of a line to be drawn", (3,), advice="give three components, m").astype(float) for p in points])
         radius = None if radius is None else _lengths(radius, "radius of a line", ())
         return _checked(Visual("line", stacked, jnp.zeros(3), jnp.eye(3), radius, None, colour, opacity))
+
+    @staticmethod
+    def coil(a, b, radius, *, turns: int = 8, colour=None, opacity=1.0) -> "Visual":
+        """A spring between two points `a`, `b` (m, body frame): a wire of so many `turns` of the given `radius` (m); `colour`, `opacity` as for all shapes."""
+        a, b = (checked_real(p, "end of a coil", (3,), advice="give three components, m").astype(float) for p in (a, b))
+        radius, length = _lengths(radius, "radius of a coil", ()), jnp.sqrt(jnp.sum((b - a) ** 2))
+        along = jnp.where(length > 0, (b - a) / jnp.where(length > 0, length, 1.0), jnp.array([0.0, 0.0, 1.0]))
+        share = np.linspace(0.0, 1.0, 12 * turns + 1)[:, None]
+        wide = np.clip(np.minimum(share, 1 - share) * 12, 0.0, 1.0)  # straight at both ends
+        across = tangents_of(along)
+        angle = 2 * np.pi * turns * share
+        points = a + share * (b - a) + radius * wide * (np.cos(angle) * across[0] + np.sin(angle) * across[1])
+        return _checked(Visual("line", points, jnp.zeros(3), jnp.eye(3), radius / 6, None, colour, opacity))
 
     @staticmethod
     def mesh(vertices, faces, *, scale=1.0, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":

@@ -87,9 +87,11 @@ class Motion {
       return line;
     });
     this.arrows = data.forces.map((force) => {
-      const red = new THREE.MeshStandardMaterial({ color: "#c0188a", roughness: 0.6 }), group = new THREE.Group();
+      const red = new THREE.MeshStandardMaterial({ color: "#c0188a", roughness: 0.6, depthTest: false, transparent: true }), group = new THREE.Group();
       const shaft = new THREE.Mesh(new THREE.CylinderGeometry(1, 1, 1, 12).rotateX(Math.PI / 2), red);
       const head = new THREE.Mesh(new THREE.ConeGeometry(1, 1, 20).rotateX(Math.PI / 2), red);
+      shaft.renderOrder = 8; // forces are seen through the bodies they act on
+      head.renderOrder = 9;
       group.add(shaft, head);
       scene.add(group);
       return { group, shaft, head, points: numbers(force.points), vectors: numbers(force.vectors), thick: page.thickness };
@@ -198,8 +200,8 @@ async function main() {
   scene.background = new THREE.Color("#fbfbf9");
   scene.fog = new THREE.Fog("#fbfbf9", 1, 2);
   camera.up.set(0, 0, 1);
-  scene.add(new THREE.HemisphereLight("#ffffff", "#c8c8c0", 2.6));
-  const sun = new THREE.DirectionalLight("#ffffff", 2.0);
+  scene.add(new THREE.HemisphereLight("#ffffff", "#bcbcb4", 2.3));
+  const sun = new THREE.DirectionalLight("#ffffff", 1.9);
   sun.castShadow = true;
   sun.shadow.mapSize.set(2048, 2048);
   sun.shadow.bias = -0.0005;
