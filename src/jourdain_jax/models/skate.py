@@ -7,7 +7,6 @@ Source: J. I. Neimark and N. A. Fufaev, Dynamics of Nonholonomic Systems (1972),
 """
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import rot_z

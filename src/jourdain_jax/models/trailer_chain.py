@@ -12,7 +12,6 @@ Source: J.-P. Laumond, Proc. IEEE Int. Conf. Intelligent Robots and Systems (199
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import rot_z

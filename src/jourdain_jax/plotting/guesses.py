@@ -4,6 +4,8 @@ An outline says what a body is: points at one distance from the mass centre are 
 a line through the mass centre or an open one is a bar along it; other points in space are the corners of a convex body.
 """
 
+from itertools import pairwise
+
 import numpy as np
 
 from jourdain_jax.scene.bodies import Particle, RigidBody
@@ -37,7 +39,7 @@ def _of_outline(points: np.ndarray) -> list[Visual]:
         return [_hull(points)]
     if rank == 2 and np.linalg.norm(points[-1] - points[0]) < _ROUND * size and lengths.min() > _ROUND * size:
         return [_plate(points[:-1], 0.5 * _PLATE * size)]
-    kept = [points[0], *(b for a, b in zip(points[:-1], points[1:], strict=True) if np.linalg.norm(b - a) > _ROUND * size)]
+    kept = [points[0], *(b for a, b in pairwise(points) if np.linalg.norm(b - a) > _ROUND * size)]
     return [Visual.line(*kept)]
 
 

@@ -51,8 +51,10 @@ def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dic
     numbers, first = Numbers(), drawn[0]
     near, far = _near(drawn), _far(drawn)
     colours = {name: body.colour for one in drawn for name, body in one.bodies.items() if name}
-    arrows, strongest = _arrows(motions, drawn, near.longest) if options["forces"] else ([[] for _ in drawn], 0.0)
-    tile = _round_number(near.longest / 4)
+    follow = far.longest > _LONG * near.longest and not _at_rest(first) if options["follow"] is None else options["follow"]
+    shown = near.longest if follow else max(near.longest, far.longest / 3)
+    arrows, strongest = _arrows(motions, drawn, shown) if options["forces"] else ([[] for _ in drawn], 0.0)
+    tile = _round_number(shown / 4)
     notes = [f"squares of the ground: {tile:g} m", f"longest arrow: {strongest:.3g} N" if strongest else ""]
     parts = zip(motions, drawn, arrows, strict=True)
     page = {
@@ -68,8 +70,8 @@ def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dic
         "far": [far.low.tolist(), far.high.tolist()],
         "ground": 3 * far.longest + 60 * near.longest,
         "tile": tile,
-        "thickness": 0.018 * near.longest,
-        "follow": bool(far.longest > _LONG * near.longest and not _at_rest(first)) if options["follow"] is None else bool(options["follow"]),
+        "thickness": 0.018 * shown,
+        "follow": bool(follow),
         "view": list(options["view"]),
         "play": bool(options["play"]),
     }
