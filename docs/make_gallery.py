@@ -239,7 +239,7 @@ def page_of(entry: Entry, out: Path) -> str:
 
 ![{entry.title}: the motion, earlier times paler]({entry.name}.png)
 
-**What to look at.** {entry.look}
+**What to look at.** {entry.look} To turn it and play it, open {{download}}`the 3D view <{entry.name}.html>` in a browser; `jj.show(motion)` makes one.
 
 ## The lines that draw it
 
@@ -279,7 +279,9 @@ Each page has a picture, the lines that draw it, what to look at, and the source
 def write(entry: Entry, out: Path) -> Path:
     """Run the lines of a page in the folder `out`, and write the page beside its picture."""
     with contextlib.chdir(out):
-        exec(compile(code_of(entry), f"{entry.name}.md", "exec"), {})
+        drawn: dict = {}
+        exec(compile(code_of(entry), f"{entry.name}.md", "exec"), drawn)
+        jj.show(drawn["motion"], f"{entry.name}.html", title=entry.title, forces=False)
     page = out / f"{entry.name}.md"
     page.write_text(page_of(entry, out))
     return page

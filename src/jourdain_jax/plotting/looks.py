@@ -132,7 +132,7 @@ def corners_of(visual: Visual) -> np.ndarray:
     if visual.kind == "line":
         return size
     if visual.kind == "mesh":
-        own = visual.faces.corners * size
+        own = visual.faces.corners * size  # type: ignore[union-attr]
     else:
         half = {"ellipsoid": size, "box": size / 2}.get(visual.kind)
         if half is None:

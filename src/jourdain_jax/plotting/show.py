@@ -41,15 +41,15 @@ class View:
 
 
 def show(
-    motion: "Trajectory | Rollout | Sequence[Trajectory | Rollout]",
+    motion,
     path: str | os.PathLike | None = None,
     *,
     title: str | None = None,
     follow: bool | None = None,
-    paths: Sequence[tuple[str, Sequence[float]]] | None = None,
+    paths: Sequence | None = None,
     forces: bool = True,
     colours: Mapping[str, str] | None = None,
-    view: tuple[float, float] = (22.0, -60.0),
+    view: Sequence = (22.0, -60.0),
     height: int = 480,
     play: bool = False,
 ) -> View:

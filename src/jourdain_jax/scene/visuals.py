@@ -129,9 +129,9 @@ class Visual(eqx.Module):
 
     @staticmethod
     def from_file(path: str | os.PathLike, *, scale=1.0, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
-        """The mesh in a file that `trimesh` reads, such as .stl or .obj, times `scale` (0.001 for millimetres); `at`, ... as for all shapes.
+        """The mesh in the file `path` that `trimesh` reads, such as .stl or .obj, times `scale` (0.001 for millimetres).
 
-        ImportError without `trimesh`.
+        `at`, `turn`, `colour`, `opacity` as for all shapes. ImportError without `trimesh`.
         """
         try:
             import trimesh
