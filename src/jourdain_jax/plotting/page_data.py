@@ -11,7 +11,7 @@ from jourdain_jax.scene.visuals import Visual
 
 _FRAMES = 1000  # at most, of one motion
 _LONG = 5.0  # the whole motion is so many times as long as its bodies: the view follows them
-_ARROW = 0.6  # length of the longest arrow, of the bodies
+_ARROW = 0.4  # length of the longest arrow, of the bodies
 
 
 @dataclass
@@ -55,7 +55,9 @@ def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dic
     shown = near.longest if follow else max(near.longest, far.longest / 3)
     arrows, strongest = _arrows(motions, drawn, shown) if options["forces"] else ([[] for _ in drawn], 0.0)
     tile = _round_number(shown / 4)
-    notes = [f"squares of the ground: {tile:g} m", f"longest arrow: {strongest:.3g} N" if strongest else ""]
+    grounds = grounds_of(motions[0], first, far.low, far.high)
+    squares = f"squares of the ground: {tile:g} m" if any(ground["kind"] == "plane" for ground in grounds) else ""
+    notes = [squares, f"longest arrow: {strongest:.3g} N" if strongest else ""]
     parts = zip(motions, drawn, arrows, strict=True)
     page = {
         "title": title,
@@ -63,7 +65,7 @@ def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dic
         "note": "; ".join(note for note in notes if note),
         "span": [float(first.ts[0]), float(first.ts[-1])],
         "motions": [_motion(numbers, motion, one, own, options) for motion, one, own in parts],
-        "grounds": [_ground(numbers, ground) for ground in grounds_of(motions[0], first, far.low, far.high)],
+        "grounds": [_ground(numbers, ground) for ground in grounds],
         "size": near.longest,
         "reach": far.longest,
         "near": [near.low.tolist(), near.high.tolist()],

@@ -28,7 +28,7 @@ function geometryOf(shape, numbers) {
   if (shape.kind === "cylinder") return shade(upright(new THREE.CylinderGeometry(s[0], s[0], s[1], 48)), () => 0);
   if (shape.kind === "capsule") return shade(upright(new THREE.CapsuleGeometry(s[0], s[1], 12, 32)), () => 0);
   if (shape.kind === "wheel") {
-    const tread = ([x, y]) => (Math.hypot(x, y) > 0.9 * s[0] ? 0.55 : x * y > 0 ? 0.3 : 0); // a dark tyre around quarters
+    const tread = ([x, y]) => (Math.hypot(x, y) > 0.9 * s[0] ? 0.4 : x * y > 0 ? 0.25 : 0); // a dark tyre around quarters
     const profile = [[0, -0.35], [0.88, -0.35], [0.9, -0.5], [0.97, -0.5], [1, -0.3], [1, 0.3], [0.97, 0.5], [0.9, 0.5], [0.88, 0.35], [0, 0.35]];
     const lathe = new THREE.LatheGeometry(profile.map(([r, z]) => new THREE.Vector2(r * s[0], z * s[1])), 64).toNonIndexed();
     lathe.computeVertexNormals();
@@ -79,11 +79,14 @@ class Motion {
       }
     }
     this.paths = data.paths.map((path) => {
-      const geometry = new THREE.LineGeometry();
-      geometry.setPositions(numbers(path.points));
-      const line = new THREE.Line2(geometry, new THREE.LineMaterial({ color: path.colour, linewidth: 2.5, transparent: ghost, opacity: ghost ? 0.35 : 1 }));
-      line.frustumCulled = false;
-      scene.add(line);
+      const [line] = [ghost ? 0.35 : 1, 0.2].map((opacity) => { // what was gone through, and all of it, pale
+        const geometry = new THREE.LineGeometry(), look = { color: path.colour, linewidth: 2.5, transparent: true, opacity, depthWrite: false };
+        geometry.setPositions(numbers(path.points));
+        const one = new THREE.Line2(geometry, new THREE.LineMaterial(look));
+        one.frustumCulled = false;
+        scene.add(one);
+        return one;
+      });
       return line;
     });
     this.arrows = data.forces.map((force) => {
@@ -200,13 +203,17 @@ async function main() {
   scene.background = new THREE.Color("#fbfbf9");
   scene.fog = new THREE.Fog("#fbfbf9", 1, 2);
   camera.up.set(0, 0, 1);
-  scene.add(new THREE.HemisphereLight("#ffffff", "#bcbcb4", 2.3));
-  const sun = new THREE.DirectionalLight("#ffffff", 1.9);
+  scene.add(new THREE.HemisphereLight("#ffffff", "#b4b4ac", 2.0));
+  const sun = new THREE.DirectionalLight("#ffffff", 1.6);
   sun.castShadow = true;
   sun.shadow.mapSize.set(2048, 2048);
   sun.shadow.bias = -0.0005;
   sun.shadow.normalBias = 0.02;
   scene.add(sun, sun.target);
+  const lamp = new THREE.DirectionalLight("#ffffff", 0.9); // at the eye
+  camera.add(lamp);
+  lamp.position.set(0, 0, 1);
+  scene.add(camera);
   page.grounds.forEach((ground) => scene.add(groundOf(ground, page, numbers)));
   const motions = page.motions.map((data, k) => new Motion(data, page, numbers, scene, k > 0));
   const controls = new THREE.OrbitControls(camera, canvas);
@@ -238,7 +245,8 @@ async function main() {
     camera.lookAt(middle);
     camera.updateMatrixWorld();
     const right = new THREE.Vector3().setFromMatrixColumn(camera.matrixWorld, 0), up = new THREE.Vector3().setFromMatrixColumn(camera.matrixWorld, 1);
-    const tall = Math.tan((camera.fov * Math.PI) / 360), wide = tall * camera.aspect;
+    const half = Math.tan((camera.fov * Math.PI) / 360), labels = 64 / Math.max($("stage").clientHeight, 200); // the part of the height that they take
+    const tall = half * (1 - labels), wide = half * camera.aspect;
     let distance = 0;
     for (let k = 0; k < 8; k++) {
       const corner = new THREE.Vector3(k & 1 ? high.x : low.x, k & 2 ? high.y : low.y, k & 4 ? high.z : low.z);
@@ -246,6 +254,7 @@ async function main() {
       corner.sub(middle);
       distance = Math.max(distance, Math.abs(corner.dot(right)) / wide + corner.dot(towards), Math.abs(corner.dot(up)) / tall + corner.dot(towards));
     }
+    middle.addScaledVector(up, half * labels * distance);
     camera.position.copy(middle).addScaledVector(towards, 1.1 * distance);
     controls.target.copy(middle);
     last = motions[0].middle();
