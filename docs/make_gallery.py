@@ -41,8 +41,6 @@ class Picture:
     start: str = "**scene.example"
     span: str = "scene.example_span"
     inputs: str = ""
-    links: str = ""
-    clear: str = ""
 
 
 SCENE_PICTURES = {
@@ -52,13 +50,11 @@ SCENE_PICTURES = {
         start="left_rate=4.0, right_rate=6.0",
         span="6.0",
         paths='[("hull", (0, 0, 0)), ("trailer", (0, 0, 0))]',
-        links='[(("hull", (-0.2, 0, 0)), ("trailer", (0, 0, 0)))]',
     ),
     "car_with_trailers": Picture(
         title="Car with Ackermann steering and trailers",
         view='"above"',
         paths='[("car", (-1.3, 0, 0)), ("trailer 2", (0, 0, 0))]',
-        links='[(("car", (-1.3, 0, 0)), ("trailer 1", (0, 0, 0))), (("trailer 1", (0, 0, 0)), ("trailer 2", (0, 0, 0)))]',
     ),
     "tricycle": Picture(title="Tricycle", at="2", span="2.2", paths='[("front", (0, 0, 0)), ("left", (0, 0, 0)), ("right", (0, 0, 0))]'),
     "kick_scooter": Picture(
@@ -77,9 +73,7 @@ SCENE_PICTURES = {
         paths='[("ball", (0, 0, 0))]',
         inputs='{"wanted_x": lambda t: 0.12 * jnp.cos(1.5 * t), "wanted_y": lambda t: 0.12 * jnp.sin(1.5 * t)}',
     ),
-    "spherical_robot": Picture(
-        title="Spherical robot driven by a pendulum", at="3", span="1.2", paths='[("shell", (0, 0, 0))]', clear='("shell",)', inputs='{"drive": 0.2}'
-    ),
+    "spherical_robot": Picture(title="Spherical robot driven by a pendulum", at="3", span="1.2", paths='[("shell", (0, 0, 0))]', inputs='{"drive": 0.2}'),
     "roller_racer": Picture(
         title="Roller racer",
         view='"above"',
@@ -107,11 +101,8 @@ AXLE = Picture(
     at="4",
     span="5.0",
     paths='[("wheel1", (0, 0, 0)), ("wheel2", (0, 0, 0))]',
-    links='[(("wheel1", (0, 0, 0)), ("wheel2", (0, 0, 0)))]',
 )
-PENDULUM = '[(("", (0, 0, 0)), ("first", (0, 0, 0))), (("first", (0, 0, 0)), ("second", (0, 0, 0)))]'
 BOTH = '[("first", (0, 0, 0)), ("second", (0, 0, 0))]'
-CHAIN = '[(("", (0, 0, 0)), ("particle 1", (0, 0, 0))), *((("particle %d" % i, (0, 0, 0)), ("particle %d" % (i + 1), (0, 0, 0))) for i in range(1, 5))]'
 MODEL_PICTURES = {
     "two-wheel-axle-free": AXLE,
     "two-wheel-axle-coordinates": AXLE,
@@ -130,7 +121,7 @@ MODEL_PICTURES = {
     ),
     "ball-on-turntable": Picture("On a turning table the ball goes round in a circle, like a charge in a magnetic field, at 2/7 of the table's rate.", at="4"),
     "suslov": Picture(
-        "It ends in a steady turn about its second axis, whatever the start; the bars are its axes.",
+        "It ends in a steady turn about its second axis, whatever the start.",
         at="(3.0,)",
         span="8.0",
         paths='[("body", (1.0, 0.0, 0.0))]',
@@ -152,19 +143,15 @@ MODEL_PICTURES = {
         span="0.6",
         paths='[("rear wheel", (0, 0, 0)), ("front wheel", (0, 0, 0))]',
     ),
-    "double-pendulum-rods": Picture(
-        "Two rods of fixed length as geometric rows; compare the pendulum in angles.", view='"side"', span="1.2", paths=BOTH, links=PENDULUM
-    ),
-    "double-pendulum-angles": Picture("The same pendulum in angles: no row is left.", view='"side"', span="1.2", paths=BOTH, links=PENDULUM),
+    "double-pendulum-rods": Picture("Two rods of fixed length as geometric rows; compare the pendulum in angles.", view='"side"', span="1.2", paths=BOTH),
+    "double-pendulum-angles": Picture("The same pendulum in angles: no row is left.", view='"side"', span="1.2", paths=BOTH),
     "free-rigid-body": Picture(
-        "The end of an axis runs along a curve that need not close: Euler's equations; the bars are its axes.",
+        "The end of an axis runs along a curve that need not close: Euler's equations.",
         at="(8.0,)",
         span="8.0",
         paths='[("body", (1.0, 0.0, 0.0))]',
     ),
-    "spring-and-rod": Picture(
-        "A rod keeps two particles apart while a spring holds the first to the origin.", view='"side"', span="1.5", paths=BOTH, links=PENDULUM
-    ),
+    "spring-and-rod": Picture("A rod keeps two particles apart while a spring holds the first to the origin.", view='"side"', span="1.5", paths=BOTH),
     "isokinetic-particle": Picture(
         "A row that is quadratic in the speeds keeps the speed: the path bends down along a closed form.", view='"side"', at="5", span="0.6"
     ),
@@ -172,7 +159,7 @@ MODEL_PICTURES = {
         "The trailers follow the car on smaller and smaller circles.", view='"above"', paths='[("car", (0, 0, 0)), ("trailer 3", (0, 0, 0))]'
     ),
     "pendulum-chain": Picture(
-        "Rods alone hold the particles; without damping the energy stays.", view='"side"', span="1.0", paths='[("particle 5", (0, 0, 0))]', links=CHAIN
+        "Rods alone hold the particles; without damping the energy stays.", view='"side"', span="1.0", paths='[("particle 5", (0, 0, 0))]'
     ),
 }
 
@@ -216,7 +203,7 @@ def code_of(entry: Entry) -> str:
     p = entry.picture
     inputs = f", inputs={p.inputs}" if p.inputs else ""
     start = f"jj.start(scene, {p.start})" if p.start else "jj.start(scene)"
-    more = "".join(f",\n    {name}={value}" for name, value in (("paths", p.paths), ("links", p.links), ("clear", p.clear)) if value)
+    more = "".join(f",\n    {name}={value}" for name, value in (("paths", p.paths),) if value)
     lines = [
         "import jax.numpy as jnp\n\n" if "jnp." in inputs else "",
         "import jourdain_jax as jj\nfrom jourdain_jax.plotting.still import draw_still\n",
@@ -252,7 +239,7 @@ def page_of(entry: Entry, out: Path) -> str:
 
 ![{entry.title}: the motion, earlier times paler]({entry.name}.png)
 
-**What to look at.** {entry.look}
+**What to look at.** {entry.look} To turn it and play it, open {{download}}`the 3D view <{entry.name}.html>` in a browser; `jj.show(motion)` makes one.
 
 ## The lines that draw it
 
@@ -292,7 +279,9 @@ Each page has a picture, the lines that draw it, what to look at, and the source
 def write(entry: Entry, out: Path) -> Path:
     """Run the lines of a page in the folder `out`, and write the page beside its picture."""
     with contextlib.chdir(out):
-        exec(compile(code_of(entry), f"{entry.name}.md", "exec"), {})
+        drawn: dict = {}
+        exec(compile(code_of(entry), f"{entry.name}.md", "exec"), drawn)
+        jj.show(drawn["motion"], f"{entry.name}.html", title=entry.title, forces=False)
     page = out / f"{entry.name}.md"
     page.write_text(page_of(entry, out))
     return page

@@ -33,7 +33,19 @@ LAYERS = (
 )
 ENTRY_MODULES = ("__init__", "__main__")  # above every layer
 OWNERS = {"diffrax": ("motion",)}  # third-party packages that only the named layers know
-OPTIONAL = ("matplotlib", "IPython", "tqdm", "scipy", "sympy", "zarr", "google_crc32c", "xarray")  # may be imported inside a function
+OPTIONAL = (
+    "matplotlib",
+    "mpl_toolkits",
+    "IPython",
+    "tqdm",
+    "scipy",
+    "sympy",
+    "zarr",
+    "google_crc32c",
+    "xarray",
+    "pandas",
+    "trimesh",
+)  # may be imported inside a function
 VAGUE_NAMES = ("utils", "util", "misc", "common", "helpers", "helper")
 LONGEST = 400
 

@@ -83,6 +83,7 @@ from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.trajectories.versions import version_of as _version_of
 from jourdain_jax.plotting.animation import animate
 from jourdain_jax.plotting.quantities import plot
+from jourdain_jax.plotting.show import View, show
 from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
 from jourdain_jax.scene.contacts import Contact, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
@@ -93,6 +94,7 @@ from jourdain_jax.scene.motion_state import fixed_point
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.spline import Spline
+from jourdain_jax.scene.visuals import Visual
 
 __version__ = _version_of("jourdain-jax")
 
@@ -156,6 +158,8 @@ __all__ = [
     "UdwadiaKalaba",
     "Uniform",
     "Verification",
+    "View",
+    "Visual",
     "accelerations",
     "animate",
     "ball_contact",
@@ -216,6 +220,7 @@ __all__ = [
     "rot_z",
     "sample_states",
     "save",
+    "show",
     "simulate",
     "sobol_indices",
     "speeds",

@@ -51,6 +51,17 @@ class CarWithTrailers(jj.Scene):
             made[f"trailer {i + 1}"] = jj.RigidBody.box(self.trailer_mass, (2.4, 1.2, 0.8), position=axle, orientation=turned)
         return made
 
+    def visuals(self, pose):
+        up, half = jnp.array([0.0, 0.0, 0.35]), 0.5 * self.wheelbase
+        body = [jj.Visual.box((3.6, 1.2, 0.5), at=(0.0, 0.0, 0.55)), jj.Visual.box((1.6, 1.1, 0.5), at=(-0.3, 0.0, 1.0))]
+        looks = {"car": [*body, *(jj.Visual.wheel(0.35, 0.2, at=up + jnp.stack([-half, side * self.track, 0.0])) for side in (0.5, -0.5))]}
+        looks |= {name: jj.Visual.wheel(0.35, 0.2, at=up) for name in ("left", "right")}
+        for i in range(1, self.trailers + 1):
+            wheels = [jj.Visual.wheel(0.35, 0.2, at=(0.0, side, 0.35)) for side in (0.6, -0.6)]
+            tongue = jj.Visual.line(up, up + jnp.stack([self.length, 0.0, 0.0]), radius=0.06, colour="#8a8a86")
+            looks[f"trailer {i}"] = [jj.Visual.box((2.4, 1.0, 0.6), at=(0.0, 0.0, 0.7)), *wheels, tongue]
+        return looks
+
     def loads(self, motion):
         push = motion.inputs.drive * motion["car"].orientation[:, 0]
         return jj.point_force(motion["car"].point(), push), jj.generalized_force(motion, steer_rate=motion.inputs.steer_torque)

@@ -44,12 +44,8 @@ class KickScooter(jj.models.WhippleBicycle):
     example = {"rear_spin_rate": 30.0, "lean_rate": 0.02}
     example_span = 1.6
 
-    def bodies(self, t, q):
-        made = super().bodies(t, q)
-        for name, outline in (("rear frame", RIDER), ("front frame", FORK)):
-            body = made[name]
-            made[name] = jj.RigidBody(body.mass, body.inertia, body.position, body.orientation, outline)
-        return made
+    def visuals(self, pose):
+        return {"rear frame": jj.Visual.line(*RIDER, radius=0.03), "front frame": jj.Visual.line(*FORK, radius=0.02)}
 
     def loads(self, motion):
         deck = motion["rear frame"]

@@ -42,6 +42,9 @@ class RobotWithTrailer(jj.Scene):
             made[name] = jj.RigidBody.thin_disc(self.wheel_mass, self.radius, axis="y", position=centre, orientation=hull @ jj.rot_y(q[name]))
         return made | {"trailer": jj.RigidBody.box(self.trailer_mass, (0.4, 0.3, 0.16), position=cart, orientation=trailer)}
 
+    def visuals(self, pose):
+        return {"": jj.Visual.line(pose["hull"].place((-self.hitch, 0.0, 0.0)), pose["trailer"].position, radius=0.02)}
+
     def loads(self, motion):
         axle = motion["hull"].orientation[:, 1]
         torques = {"left": motion.inputs.left_torque, "right": motion.inputs.right_torque}

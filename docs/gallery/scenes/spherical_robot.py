@@ -37,6 +37,9 @@ class SphericalRobot(jj.Scene):
             "pendulum": jj.RigidBody(self.bob_mass, self.bob_inertia, centre - self.length * arm[:, 2], arm, rod),
         }
 
+    def visuals(self, pose):
+        return {"shell": jj.Visual.ball(self.radius, opacity=0.3)}
+
     def loads(self, motion):
         drive = motion.inputs.drive * motion["shell"].orientation[:, 1]
         return jj.gravity(motion, self.gravity), jj.torque(motion, "shell", drive, reaction="pendulum")

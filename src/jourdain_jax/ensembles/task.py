@@ -25,6 +25,7 @@ from jourdain_jax.motion.batches.rollout import rollout
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.trajectories.labelled import CODES, OF_LANES
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -32,16 +33,6 @@ from jourdain_jax.scene.scene import Scene
 LARGEST_BLOCK = 2048  # lanes: enough that few wait for the last one, few enough that a chunk is a fraction of a second
 BLOCK_MEMORY = 2**26  # bytes of saved states of a block, at most
 AT_START = "_at_start"  # how columns of start values are called, after the coordinate or speed
-CODES = ("success", "event", "max_steps", "step_too_small", "not_finite", "inconsistent_start", "singular_partition", "bad_parameter", "bad_start",
-         "unsolved_step", "shrank", "stiff", "off_constraints", "bad_times", "energy_lost")  # fmt: skip
-OF_LANES: dict[str, tuple[str, float, dict]] = {
-    "result": ("int8", -1, {"long_name": "how the motion ended", "flag_values": list(range(len(CODES))), "flag_meanings": " ".join(CODES)}),
-    "event": ("int8", -1, {"long_name": "which stop event ended the motion; -1: none"}),
-    "steps": ("int32", -1, {"long_name": "accepted steps"}),
-    "rejected_steps": ("int32", -1, {"long_name": "rejected steps"}),
-    "retries": ("int8", -1, {"long_name": "how it was run again", "flag_masks": [1, 2], "flag_meanings": "full_state implicit_solver"}),
-    "end_time": ("float64", math.nan, {"long_name": "time at which the motion ended", "units": "s"}),
-}
 SAVES = ("statistics", "outputs", "trajectories")
 
 

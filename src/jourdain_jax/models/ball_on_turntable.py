@@ -12,7 +12,7 @@ Source: K. Weltner, Am. J. Phys. 47 (1979) 984.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.rotations import quaternion_rate, quaternion_to_matrix
+from jourdain_jax.calculus.rotations import quaternion_rate, quaternion_to_matrix, rot_z
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import ball_contact
 from jourdain_jax.scene.coordinates import coordinates, quaternion, speeds
@@ -20,6 +20,7 @@ from jourdain_jax.scene.grounds import Plane
 from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 
 class BallOnTurntable(Scene):
@@ -61,6 +62,12 @@ class BallOnTurntable(Scene):
         normal = self._axes()[2]
         table = Plane(tilt=self.tilt, angular_velocity=self.turn_rate * normal)
         return {"table": ball_contact(pose["ball"], self.radius, plane=table)}
+
+    def visuals(self, pose):
+        axes, width = self._axes().T, 0.2 * self.radius
+        turned = axes @ rot_z(self.turn_rate * pose.t)
+        table = Visual.wheel(12 * self.radius, width, axis="z", at=-width / 2 * axes[:, 2], turn=turned, colour="#b9b2a4")
+        return {"": table}
 
     def invariants(self, motion):
         q, u = motion.q, motion.u

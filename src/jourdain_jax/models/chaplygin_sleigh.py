@@ -16,6 +16,7 @@ from jourdain_jax.scene.constraints import knife_edge
 from jourdain_jax.scene.coordinates import coordinates
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 
 class ChaplyginSleigh(Scene):
@@ -37,11 +38,18 @@ class ChaplyginSleigh(Scene):
     def bodies(self, t, q):
         position = jnp.stack([q.x, q.y, jnp.zeros_like(q.x)])
         moments = self.inertia * jnp.ones(3)  # only the one about z matters
-        return {"sleigh": RigidBody(self.mass, moments, position, rot_z(q.heading), self._outline())}
+        return {"sleigh": RigidBody(self.mass, moments, position, rot_z(q.heading))}
 
     def velocity_constraints(self, motion):
         sleigh = motion["sleigh"]
         return {"blade": knife_edge(sleigh, sleigh.place(self._blade()), sleigh.orientation[:, 1])}
+
+    def visuals(self, pose):
+        above = jnp.array([0.0, 0.0, 0.1])
+        corners = [self._blade() + above, jnp.array([0.3, 0.2, 0.1]), jnp.array([0.3, -0.2, 0.1])]
+        feet = [look for corner in corners[1:] for look in (Visual.line(corner, corner - above, radius=0.01), Visual.ball(0.025, at=corner - 0.75 * above))]
+        blade = Visual.box((0.14, 0.006, 0.1), at=self._blade() + 0.5 * above, colour="#8a8a86")
+        return {"sleigh": [Visual.line(*corners, corners[0], radius=0.014), *feet, blade, Visual.ball(0.035, at=above, colour="#444444")]}
 
     def invariants(self, motion):
         q, u = motion.q, motion.u
@@ -53,8 +61,3 @@ class ChaplyginSleigh(Scene):
 
     def _blade(self) -> Float[Array, "3"]:
         return jnp.stack([-self.offset, 0 * self.offset, 0 * self.offset])
-
-    def _outline(self) -> Float[Array, "points 3"]:
-        """A triangle of the blade and two sliding feet, for drawing only."""
-        blade, feet = self._blade()[None], jnp.array([[0.3, 0.2, 0.0], [0.3, -0.2, 0.0]])
-        return jnp.concatenate([blade, feet, blade])

@@ -15,6 +15,7 @@ from jourdain_jax.scene.coordinates import coordinates
 from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 
 class DoublePendulumAngles(Scene):
@@ -41,6 +42,9 @@ class DoublePendulumAngles(Scene):
 
     def loads(self, motion):
         return (gravity(motion, self.gravity),)
+
+    def visuals(self, pose):
+        return {"": Visual.line(jnp.zeros(3), pose["first"].position, pose["second"].position, radius=0.012 * self.length1)}
 
 
 def _along(angle) -> Float[Array, "3"]:

@@ -14,6 +14,7 @@ from jourdain_jax.scene.coordinates import coordinates
 from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 
 class DoublePendulumRods(Scene):
@@ -41,6 +42,9 @@ class DoublePendulumRods(Scene):
 
     def loads(self, motion):
         return (gravity(motion, self.gravity),)
+
+    def visuals(self, pose):
+        return {"": Visual.line(jnp.zeros(3), pose["first"].position, pose["second"].position, radius=0.012 * self.length1)}
 
     def geometric_constraints(self, pose):
         first, second = pose["first"].position, pose["second"].position

@@ -34,7 +34,7 @@ class FreeRigidBody(Scene):
 
     def bodies(self, t, q):
         moments = jnp.stack([self.i1, self.i2, self.i3])
-        return {"body": RigidBody(self.mass, moments, jnp.stack([q.x, q.y, q.z]), quaternion_to_matrix(q.attitude), _AXES)}
+        return {"body": RigidBody(self.mass, moments, jnp.stack([q.x, q.y, q.z]), quaternion_to_matrix(q.attitude))}
 
     def invariants(self, motion):
         body = motion["body"]
@@ -42,6 +42,3 @@ class FreeRigidBody(Scene):
         spin = body.orientation @ (jnp.stack([self.i1, self.i2, self.i3]) * body.angular_velocity_body)
         named = {f"momentum {axis}": momentum[k] for k, axis in enumerate("xyz")}
         return named | {f"angular momentum {axis}": spin[k] for k, axis in enumerate("xyz")}
-
-
-_AXES = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.7, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.4]]  # outline, m

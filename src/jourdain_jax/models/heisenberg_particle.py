@@ -9,8 +9,10 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.scene.bodies import Particle
 from jourdain_jax.scene.coordinates import coordinates
+from jourdain_jax.scene.grounds import tangents_of
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 
 class HeisenbergParticle(Scene):
@@ -33,6 +35,12 @@ class HeisenbergParticle(Scene):
     def velocity_constraints(self, motion):
         q, u = motion.q, motion.u
         return {"contact form": u.z_rate - q.y * u.x_rate + q.x * u.y_rate}
+
+    def visuals(self, pose):
+        normal = jnp.stack([-pose.q.y, pose.q.x, 1.0 + 0.0 * pose.q.x])
+        normal = normal / jnp.sqrt(normal @ normal)
+        turn = jnp.concatenate([tangents_of(normal), normal[None]]).T
+        return {"particle": [Visual.ball(0.05), Visual.box((0.6, 0.6, 0.01), turn=turn, opacity=0.5)]}  # the plane of the velocities that the row allows
 
     def invariants(self, motion):
         return {"x rate": motion.u.x_rate, "y rate": motion.u.y_rate, "z rate": motion.u.z_rate}

@@ -16,6 +16,7 @@ from jourdain_jax.scene.coordinates import coordinates
 from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 
 class PendulumChain(Scene):
@@ -70,6 +71,10 @@ class PendulumChain(Scene):
         lengths = self._per_link(self.length)
         places = [jnp.zeros(3), *(pose[f"particle {i}"].position for i in range(1, self.links + 1))]
         return {f"rod {i + 1}": rod(places[i], places[i + 1], lengths[i]) for i in range(self.links)}
+
+    def visuals(self, pose):
+        places = [jnp.zeros(3), *(pose[f"particle {i}"].position for i in range(1, self.links + 1))]
+        return {"": Visual.line(*places, radius=0.02 * jnp.min(self.length))}
 
     def _per_link(self, value) -> Float[Array, "links"]:
         return jnp.broadcast_to(value, (self.links,))

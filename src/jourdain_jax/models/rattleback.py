@@ -24,6 +24,7 @@ from jourdain_jax.scene.coordinates import coordinates, speeds
 from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 _HALF_TURN = np.diag([1.0, -1.0, -1.0])  # from axes with n3 down to the engine's, z up
 
@@ -68,7 +69,7 @@ class Rattleback(Scene):
         turned = _HALF_TURN @ rot_z(q.gamma) @ rot_x(q.alpha) @ rot_y(q.beta)
         down = -turned[2]  # mu
         height = self.contact_arm(down) @ down
-        return {"stone": RigidBody(self.mass, self._inertia(), jnp.append(level, height), turned, self._outline())}
+        return {"stone": RigidBody(self.mass, self._inertia(), jnp.append(level, height), turned)}
 
     def coordinate_rates(self, t, q, u):
         # body 1-3 components of gammadot n3 + alphadot n1' + betadot b2, solved for the rates
@@ -82,6 +83,10 @@ class Rattleback(Scene):
 
     def contacts(self, pose):
         return {"sole": ellipsoid_contact(pose["stone"], self._semi_axes(), centre=-self._below_centre())}
+
+    def visuals(self, pose):
+        corners, faces = _half_ball()
+        return {"stone": Visual.mesh(corners, faces, scale=self._semi_axes(), at=-self._below_centre())}
 
     def events(self, motion):
         return {"on edge": 1.4 - jnp.abs(motion.q.alpha)}
@@ -101,14 +106,12 @@ class Rattleback(Scene):
         o = jnp.zeros_like(self.A)
         return jnp.stack([jnp.stack([self.A, self.D, o]), jnp.stack([self.D, self.B, o]), jnp.stack([o, o, self.C])])
 
-    def _outline(self) -> Float[Array, "points 3"]:
-        """Half of the ellipsoid that is down: its rim and two arcs."""
-        return self._semi_axes() * _half_sphere() - self._below_centre()
 
-
-def _half_sphere() -> np.ndarray:
-    angle = np.linspace(0, 2 * np.pi, 33)
-    circle, half = np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([np.cos(angle / 2), np.sin(angle / 2)], 1)
-    rim = np.insert(circle, 2, 0.0, axis=1)
-    along, across = np.insert(half, 1, 0.0, axis=1), np.insert(half, 0, 0.0, axis=1)
-    return np.concatenate([rim, along, rim[16:25], across])
+def _half_ball(rings: int = 10, around: int = 40) -> tuple[np.ndarray, list]:
+    """Corners and faces of the half of a ball of radius 1 that is down, along body axis 3."""
+    across, angle = np.linspace(0, np.pi / 2, rings + 1)[1:, None], 2 * np.pi * np.arange(around) / around
+    grid = np.stack([np.sin(across) * np.cos(angle), np.sin(across) * np.sin(angle), np.cos(across) + 0 * angle], axis=-1)
+    at = lambda i, j: 1 + i * around + j % around  # noqa: E731
+    cap = [(0, at(0, j), at(0, j + 1)) for j in range(around)]
+    bands = [(at(i, j), at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)) for i in range(rings - 1) for j in range(around)]
+    return np.concatenate([[[0.0, 0.0, 1.0]], grid.reshape(-1, 3)]), [*cap, *bands, tuple(at(rings - 1, -j) for j in range(around))]

@@ -10,8 +10,10 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.scene.bodies import Particle
 from jourdain_jax.scene.coordinates import coordinates
+from jourdain_jax.scene.grounds import tangents_of
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 
 class RosenbergParticle(Scene):
@@ -33,6 +35,12 @@ class RosenbergParticle(Scene):
 
     def velocity_constraints(self, motion):
         return {"sheet": motion.u.z_rate - motion.q.y * motion.u.x_rate}
+
+    def visuals(self, pose):
+        normal = jnp.stack([-pose.q.y, 0.0 * pose.q.y, 1.0 + 0.0 * pose.q.y])
+        normal = normal / jnp.sqrt(normal @ normal)
+        turn = jnp.concatenate([tangents_of(normal), normal[None]]).T
+        return {"particle": [Visual.ball(0.05), Visual.box((0.6, 0.6, 0.01), turn=turn, opacity=0.5)]}  # the plane of the velocities that the row allows
 
     def invariants(self, motion):
         return {"y rate": motion.u.y_rate, "speed in the sheet": motion.u.x_rate * jnp.sqrt(1 + motion.q.y**2)}

@@ -7,7 +7,6 @@ Source: J. I. Neimark and N. A. Fufaev, Dynamics of Nonholonomic Systems (1972),
 """
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import rot_z
@@ -17,8 +16,7 @@ from jourdain_jax.scene.coordinates import coordinates
 from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
-
-_BLADE = np.array([[-0.15, 0.0, 0.0], [0.15, 0.0, 0.0]])  # m, for drawing only
+from jourdain_jax.scene.visuals import Visual
 
 
 class Skate(Scene):
@@ -41,7 +39,7 @@ class Skate(Scene):
     def bodies(self, t, q):
         position = jnp.stack([q.x, q.y, jnp.zeros_like(q.x)])
         moments = self.inertia * jnp.ones(3)  # only the one about z matters
-        return {"skate": RigidBody(self.mass, moments, position, rot_z(q.heading), _BLADE)}
+        return {"skate": RigidBody(self.mass, moments, position, rot_z(q.heading))}
 
     def loads(self, motion):
         down = jnp.stack([jnp.sin(self.slope), jnp.zeros_like(self.slope), -jnp.cos(self.slope)])
@@ -50,6 +48,10 @@ class Skate(Scene):
     def velocity_constraints(self, motion):
         skate = motion["skate"]
         return {"edge": knife_edge(skate, skate.position, skate.orientation[:, 1])}
+
+    def visuals(self, pose):
+        blade = Visual.box((0.3, 0.008, 0.05), at=(0.0, 0.0, 0.025), colour="#8a8a86")
+        return {"skate": [blade, Visual.box((0.26, 0.09, 0.03), at=(0.0, 0.0, 0.065)), Visual.box((0.12, 0.08, 0.12), at=(-0.06, 0.0, 0.13))]}
 
     def invariants(self, motion):
         q, u = motion.q, motion.u

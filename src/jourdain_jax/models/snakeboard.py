@@ -9,7 +9,6 @@ Source: A. Lewis, J. Ostrowski, R. Murray and J. Burdick, Proc. IEEE Int. Conf. 
 """
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import rot_z
@@ -19,6 +18,7 @@ from jourdain_jax.scene.coordinates import coordinates, inputs
 from jourdain_jax.scene.loads import generalized_force
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 
 class Snakeboard(Scene):
@@ -48,11 +48,20 @@ class Snakeboard(Scene):
         reach = self.half_length * board[:, 0]
         nothing = jnp.zeros_like(self.mass)  # the masses of rotor and wheels count in the board's
         return {
-            "board": RigidBody(self.mass, _about_z(self.board_inertia), middle, board, self.half_length * _BOARD),
-            "rotor": RigidBody(nothing, _about_z(self.rotor_inertia), middle, board @ rot_z(q.rotor), self.half_length * _ROTOR),
-            "front": RigidBody(nothing, _about_z(self.wheel_inertia), middle + reach, board @ rot_z(q.steer), self.half_length * _AXLE),
-            "back": RigidBody(nothing, _about_z(self.wheel_inertia), middle - reach, board @ rot_z(-q.steer), self.half_length * _AXLE),
+            "board": RigidBody(self.mass, _about_z(self.board_inertia), middle, board),
+            "rotor": RigidBody(nothing, _about_z(self.rotor_inertia), middle, board @ rot_z(q.rotor)),
+            "front": RigidBody(nothing, _about_z(self.wheel_inertia), middle + reach, board @ rot_z(q.steer)),
+            "back": RigidBody(nothing, _about_z(self.wheel_inertia), middle - reach, board @ rot_z(-q.steer)),
         }
+
+    def visuals(self, pose):
+        l, wheel = self.half_length, 0.16 * self.half_length
+        deck = Visual.box(l * jnp.array([2.3, 0.3, 0.08]), at=l * jnp.array([0.0, 0.0, 0.42]))
+        plates = [Visual.cylinder(0.32 * l, 0.1 * l, at=l * jnp.array([x, 0.0, 0.48])) for x in (-1.0, 1.0)]
+        rotor = [Visual.box(l * jnp.array([1.3, 0.14, 0.1]), at=l * jnp.array([0.0, 0.0, 0.7])), *_balls(0.14 * l, 0.65 * l, 0.7 * l)]
+        ends = [l * jnp.array([0.0, y, 0.16]) for y in (-0.4, 0.4)]
+        trucks = [Visual.line(*ends, radius=0.05 * l), *(Visual.wheel(wheel, 0.1 * l, at=end) for end in ends)]
+        return {"board": [deck, *plates], "rotor": rotor, "front": trucks, "back": trucks}
 
     def loads(self, motion):
         return (generalized_force(motion, rotor_rate=motion.inputs.rotor_torque, steer_rate=motion.inputs.steer_torque),)
@@ -69,6 +78,5 @@ def _about_z(moment) -> Float[Array, "3"]:
     return moment * jnp.ones(3)  # only the one about z matters
 
 
-_BOARD = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-_ROTOR = np.array([[-0.6, 0.0, 0.0], [0.6, 0.0, 0.0]])
-_AXLE = np.array([[0.0, -0.4, 0.0], [0.0, 0.4, 0.0]])
+def _balls(radius, reach, height) -> list[Visual]:
+    return [Visual.ball(radius, at=jnp.stack([side * reach, 0 * reach, height])) for side in (-1, 1)]

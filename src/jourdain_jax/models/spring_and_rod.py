@@ -15,6 +15,7 @@ from jourdain_jax.scene.loads import damper, gravity, spring
 from jourdain_jax.scene.motion_state import fixed_point
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 
 class SpringAndRod(Scene):
@@ -57,3 +58,7 @@ class SpringAndRod(Scene):
 
     def geometric_constraints(self, pose):
         return {"rod": rod(pose["first"].position, pose["second"].position, self.rod_length)}
+
+    def visuals(self, pose):
+        first, second = pose["first"].position, pose["second"].position
+        return {"": [Visual.coil(jnp.zeros(3), first, 0.06 * self.rod_length), Visual.line(first, second, radius=0.02 * self.rod_length)]}

@@ -39,10 +39,7 @@ class Suslov(Scene):
         inertia = [[self.i11, o, self.i13], [o, self.i22, o], [self.i13, o, self.i33]]
         attitude = quaternion_to_matrix(q.attitude)
         mass = 1.0 + o  # of no account: the mass centre is fixed
-        return {"body": RigidBody(mass, jnp.stack([jnp.stack(row) for row in inertia]), jnp.zeros(3), attitude, _AXES)}
+        return {"body": RigidBody(mass, jnp.stack([jnp.stack(row) for row in inertia]), jnp.zeros(3), attitude)}
 
     def velocity_constraints(self, motion):
         return {"no turn about axis 3": motion["body"].angular_velocity_body[2]}
-
-
-_AXES = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.7, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.4]]  # outline, m

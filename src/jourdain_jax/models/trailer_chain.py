@@ -12,7 +12,6 @@ Source: J.-P. Laumond, Proc. IEEE Int. Conf. Intelligent Robots and Systems (199
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import rot_z
@@ -22,6 +21,7 @@ from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
 from jourdain_jax.scene.loads import generalized_force
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 
 class TrailerChain(Scene):
@@ -82,11 +82,16 @@ class TrailerChain(Scene):
     def bodies(self, t, q):
         masses = jnp.append(self.car_mass, self._per_trailer(self.trailer_mass))
         moments = jnp.append(self.car_inertia, self._per_trailer(self.trailer_inertia))
-        tongues = jnp.append(0.0, self._per_trailer(self.length))
         places = [jnp.stack([q[f"x{i}"], q[f"y{i}"], jnp.zeros_like(q.x0)]) for i in range(self.trailers + 1)]
-        return {
-            _name(i): RigidBody(masses[i], moments[i] * jnp.ones(3), place, rot_z(q[f"heading{i}"]), _outline(tongues[i])) for i, place in enumerate(places)
-        }
+        return {_name(i): RigidBody(masses[i], moments[i] * jnp.ones(3), place, rot_z(q[f"heading{i}"])) for i, place in enumerate(places)}
+
+    def visuals(self, pose):
+        looks = {"car": [*_axle(), Visual.box((0.44, 0.26, 0.12), at=(0.06, 0.0, 0.15)), Visual.box((0.2, 0.22, 0.1), at=(0.0, 0.0, 0.26))]}
+        for i, length in enumerate(self._per_trailer(self.length), 1):
+            level = jnp.array([0.0, 0.0, 0.1])
+            tongue = Visual.line(level, level + length * jnp.array([1.0, 0.0, 0.0]), radius=0.015, colour="#8a8a86")
+            looks[_name(i)] = [*_axle(), Visual.box((0.36, 0.26, 0.14), at=(0.0, 0.0, 0.17)), tongue]
+        return looks
 
     def coordinate_rates(self, t, q, u):
         rates = []
@@ -124,7 +129,5 @@ def _name(i: int) -> str:
     return "car" if i == 0 else f"trailer {i}"
 
 
-def _outline(tongue) -> Float[Array, "points 3"]:
-    """Axle and tongue, for drawing."""
-    axle = np.array([[0.0, 0.2, 0.0], [0.0, -0.2, 0.0], [0.0, 0.0, 0.0]])
-    return jnp.concatenate([axle, jnp.stack([tongue, 0 * tongue, 0 * tongue])[None]])
+def _axle() -> list[Visual]:
+    return [Visual.wheel(0.1, 0.05, at=(0.0, side, 0.1)) for side in (-0.18, 0.18)]

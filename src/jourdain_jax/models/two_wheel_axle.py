@@ -24,6 +24,7 @@ from jourdain_jax.scene.coordinates import coordinates, speeds
 from jourdain_jax.scene.loads import gravity
 from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 _TURN = (-3.2, 3.2)
 _ANGLES = {"psi1": _TURN, "psi2": _TURN}
@@ -48,6 +49,9 @@ class _TwoWheelAxle(Scene):
     def loads(self, motion):
         down = jnp.stack([jnp.sin(self.slope), jnp.zeros_like(self.slope), -jnp.cos(self.slope)])
         return (gravity(motion, self.gravity, down),)
+
+    def visuals(self, pose):
+        return {"": Visual.line(pose["wheel1"].position, pose["wheel2"].position, radius=0.1 * self.radius)}
 
     def _wheel(self, centre, phi, theta, psi) -> RigidBody:
         return RigidBody.thin_disc(

@@ -24,6 +24,7 @@ from jourdain_jax.scene.loads import generalized_force, gravity
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameter, parameters_of
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 
 class WhippleBicycle(Scene):
@@ -113,19 +114,31 @@ class WhippleBicycle(Scene):
         fork_centre = on_steer_axis + front @ _vector(self.xH - self.w - self.c, self.zH)
         frame_inertia = _inertia(self.IBxx, self.IByy, self.IBzz, self.IBxz)
         fork_inertia = _inertia(self.IHxx, self.IHyy, self.IHzz, self.IHxz)
-        frame_lines, fork_lines = self._outlines()
         return {
             "rear wheel": _wheel(self.mR, self.rR, self.IRxx, self.IRyy, rear_centre, rear @ rot_y(q.rear_spin)),
-            "rear frame": RigidBody(self.mB, frame_inertia, frame_centre, rear, frame_lines),
-            "front frame": RigidBody(self.mH, fork_inertia, fork_centre, front, fork_lines),
+            "rear frame": RigidBody(self.mB, frame_inertia, frame_centre, rear),
+            "front frame": RigidBody(self.mH, fork_inertia, fork_centre, front),
             "front wheel": _wheel(self.mF, self.rF, self.IFxx, self.IFyy, front_centre, front @ rot_y(q.front_spin)),
         }
 
-    def _outlines(self) -> tuple[Float[Array, "frame_points 3"], Float[Array, "fork_points 3"]]:
-        """Lines of the two frames for drawing, through mass centre, hub and the steer axis at the height of the front frame."""
-        frame, fork = (self.xB, self.zB), (self.xH, self.zH)
-        head = (self.w + self.c + self.zH * jnp.tan(self.lam), self.zH)
-        return _side_view(frame, frame, (0.0, -self.rR), head, frame), _side_view(fork, fork, head, (self.w, -self.rF))
+    def visuals(self, pose):
+        """Frame, fork, handlebar and saddle as bars from the hubs to the steer axis; of the rider only the mass centre, as a ball."""
+        at_frame = lambda x, z: _vector(x - self.xB, z - self.zB)  # noqa: E731, points of the plane of symmetry in the source's axes
+        at_fork = lambda x, z: _vector(x - self.xH, z - self.zH)  # noqa: E731
+        on_axis = lambda z: (self.w + self.c + z * jnp.tan(self.lam), z)  # noqa: E731
+        head, top, hub, crank = on_axis(-2.1 * self.rF), on_axis(-2.6 * self.rF), (0.0, -self.rR), (0.42 * self.w, -0.85 * self.rR)
+        seat = (0.26 * self.w, -2.5 * self.rR)
+        thin, wide = 0.045 * self.rR, 0.22 * self.w
+        frame = [
+            Visual.line(*(at_frame(*p) for p in points), radius=thin) for points in ((hub, crank, head, (0.3 * self.w, -2.1 * self.rR), hub), (crank, seat))
+        ]
+        saddle = Visual.capsule(0.12 * self.rR, 0.5 * self.rR, axis="x", at=at_frame(*seat), colour="#444444")
+        rider = Visual.ball(0.2 * self.rR, at=jnp.zeros(3), opacity=0.6)
+        grips = [at_fork(top[0] - 0.1 * self.w, top[1]) + jnp.stack([0 * wide, side * wide, 0 * wide]) for side in (1, -1)]
+        fork = [Visual.line(at_fork(self.w, -self.rF), at_fork(*head), at_fork(*top), radius=thin)]
+        fork.append(Visual.line(grips[0], at_fork(*top), grips[1], radius=thin))
+        wheels = {name: Visual.wheel(radius, 0.12 * radius) for name, radius in (("rear wheel", self.rR), ("front wheel", self.rF))}
+        return {"rear frame": [*frame, saddle, rider], "front frame": fork, **wheels}
 
     def loads(self, motion):
         torques = generalized_force(motion, lean_rate=motion.inputs.lean_torque, steer_rate=motion.inputs.steer_torque)
@@ -156,8 +169,3 @@ def _inertia(xx, yy, zz, xz) -> Float[Array, "3 3"]:
 
 def _wheel(mass, radius, diametral, axial, centre, orientation) -> RigidBody:
     return RigidBody.thin_disc(mass, radius, axis="y", position=centre, orientation=orientation, axial=axial, diametral=diametral)
-
-
-def _side_view(centre, *points) -> Float[Array, "points 3"]:
-    """Outline through points (x, z) of the plane of symmetry, relative to a mass centre."""
-    return jnp.stack([_vector(x - centre[0], z - centre[1]) for x, z in points])

@@ -1,4 +1,4 @@
-"""Animations straight from a scene's bodies: outlines of rigid bodies, dots for particles, paths of points, and the ground."""
+"""Animations straight from a scene's bodies: solid bodies, paths of points, and the ground."""
 
 import os
 from collections.abc import Sequence
@@ -7,34 +7,39 @@ import numpy as np
 
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
-from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.plotting.looks import looks_of
+from jourdain_jax.plotting.solids import parts_in_space, shaded
 from jourdain_jax.scene.numbers import described
 
 FRAMES = 60
+_LIGHT = np.array([0.1, -0.6, 0.79])  # unit vector towards the light
 
 
 class _Figure:
-    """What is drawn: world points of every body's outline at every frame (frames, points, 3), and paths of points (frames, 3)."""
+    """What is drawn: faces of all bodies in space with their colours at every frame, boxes that hold them, and paths of points (frames, 3)."""
 
-    def __init__(self, trajectory: Trajectory, frames: int, paths: Sequence[tuple[str, Sequence[float]]]):
-        reached = np.flatnonzero(np.asarray(trajectory.valid))
-        if reached.size == 0:
-            raise ValueError("the motion reached none of its saved times; there is nothing to animate")
-        chosen = reached[np.unique(np.linspace(0, reached.size - 1, min(frames, reached.size)).astype(int))]
-        self.ts = np.asarray(trajectory.ts)[chosen]
-        self.outlines: dict[str, np.ndarray] = {}
-        for name, body in trajectory.motions().bodies.items():
-            centre = np.asarray(body.body.position)[chosen][:, None]
-            self.outlines[name] = centre
-            if isinstance(body.body, RigidBody) and body.body.outline.shape[1] > 0:
-                turned = np.einsum("fij,fpj->fpi", np.asarray(body.body.orientation)[chosen], np.asarray(body.body.outline)[chosen])
-                self.outlines[name] = centre + turned
-        self.paths = [np.asarray(trajectory.point(name, local))[chosen] for name, local in paths]
+    def __init__(self, trajectory: Trajectory, frames: int, paths: Sequence[tuple[str, Sequence[float]]] | None):
+        whole = looks_of(trajectory, "animate")
+        self.drawn = whole.at(np.unique(np.linspace(0, len(whole.ts) - 1, min(frames, len(whole.ts))).astype(int)))
+        self.ts, self.bodies = self.drawn.ts, {name: body for name, body in self.drawn.bodies.items() if name}
+        self.faces, self.colours = zip(*(self._frame(k) for k in range(len(self.ts))), strict=True)
+        self.boxes = [(np.concatenate(faces).min(axis=0), np.concatenate(faces).max(axis=0)) for faces in self.faces]
+        ends = [(name, (0.0, 0.0, 0.0)) for name in self.bodies] if paths is None else list(paths)
+        self.paths = [np.asarray(trajectory.point(name, local))[self.drawn.reached] for name, local in ends]
+
+    def _frame(self, k: int) -> tuple[list[np.ndarray], np.ndarray]:
+        faces, colours = [], []
+        for body in self.drawn.bodies.values():
+            for look, part in parts_in_space(body, k):
+                for face in part:
+                    faces.append(face.corners)
+                    colours.append(shaded(face, look.visual.colour or body.colour, _LIGHT, look.visual.opacity))
+        return faces, np.array(colours)
 
     def extent(self) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the box that holds everything."""
-        points = np.concatenate([outline.reshape(-1, 3) for outline in self.outlines.values()] + self.paths)
-        return points.min(axis=0), points.max(axis=0)
+        lows, highs = zip(*self.boxes, *((path.min(axis=0), path.max(axis=0)) for path in self.paths), strict=True)
+        return np.min(lows, axis=0), np.max(highs, axis=0)
 
 
 def check_suffix(path: str | os.PathLike) -> None:
@@ -70,23 +75,20 @@ def animate(
     check_suffix(path)
     plt = pyplot()
     from matplotlib.animation import FuncAnimation, PillowWriter
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    paths = [(name, (0.0, 0.0, 0.0)) for name in trajectory.motions().bodies] if paths is None else list(paths)
     drawn = _Figure(trajectory, frames, paths)
     figure = plt.figure(figsize=(6.0, 5.0))
     axes = figure.add_axes((0.0, 0.0, 1.0, 0.96), projection="3d")
     axes.set_proj_type("persp")
-    colours = plt.rcParams["axes.prop_cycle"].by_key()["color"]
-    lines = {}
-    for k, (name, outline) in enumerate(drawn.outlines.items()):
-        style = {"marker": "o", "ms": 6} if outline.shape[1] == 1 else {"lw": 1.8}
-        lines[name] = axes.plot([], [], [], color=colours[k % len(colours)], label=name, zorder=5, **style)[0]
+    solid = axes.add_collection3d(Poly3DCollection(drawn.faces[0], zorder=5))
     traces = [axes.plot([], [], [], color="0.45", lw=1.0)[0] for _ in drawn.paths]
     clock = figure.text(0.03, 0.95, "", family="monospace")
     if title:
         figure.text(0.25, 0.95, title)
-    if len(lines) > 1:
-        axes.legend(loc="upper left", bbox_to_anchor=(0.03, 0.97), fontsize=8, frameon=False)
+    if len(drawn.bodies) > 1:
+        handles = [plt.Rectangle((0, 0), 1, 1, color=body.colour, label=name) for name, body in drawn.bodies.items()]
+        axes.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.03, 0.97), fontsize=8, frameon=False)
     axes.view_init(*view)
     _label(axes)
     low, high = drawn.extent()
@@ -94,15 +96,17 @@ def animate(
     grounded = _ground(axes, low, high, radius)
 
     def draw(i):
-        for name, outline in drawn.outlines.items():
-            lines[name].set_data_3d(*outline[i].T)
+        solid.set_verts(drawn.faces[i])
+        solid.set_facecolors(drawn.colours[i])
+        solid.set_edgecolors(drawn.colours[i])
+        solid.set_linewidths(0.3)
         for trace, points in zip(traces, drawn.paths, strict=True):
             trace.set_data_3d(*points[: i + 1].T)
         clock.set_text(f"t = {drawn.ts[i]:6.2f} s")
-        here = np.mean([outline[i].mean(axis=0) for outline in drawn.outlines.values()], axis=0)
+        here = np.mean(drawn.boxes[i], axis=0)
         centre = here if follow else (low + high) / 2
         _frame(axes, np.array([centre[0], centre[1], 0.9 * radius]) if grounded else centre, radius)
-        return [*lines.values(), *traces, clock]
+        return [solid, *traces, clock]
 
     count = len(drawn.ts)
     seconds = float(np.clip(abs(drawn.ts[-1] - drawn.ts[0]), 2.0, 12.0))
@@ -114,8 +118,7 @@ def _radius(drawn: _Figure, follow: bool, low, high) -> float:
     """Half the side of the cube that is shown."""
     if not follow:
         return float(max(np.max(high - low) / 2 * 1.05, 1e-3))
-    spans = [np.ptp(np.concatenate([outline[i] for outline in drawn.outlines.values()]), axis=0).max() for i in range(len(drawn.ts))]
-    return float(max(max(spans) * 0.62, 1e-3))
+    return float(max(max(np.max(high - low) for low, high in drawn.boxes) * 0.62, 1e-3))
 
 
 def _frame(axes, centre, radius: float) -> None:

@@ -30,6 +30,7 @@ class Contact(eqx.Module):
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all of the scene), for the normal
       force where `height="coordinates"`.
     - `distance` (m): the gap, where it is not the point's height above the plane.
+    - `shape`, `ground`: what rolls on what, for pictures; `disc_contact` and its like say it.
 
     Where the point is known in the coordinates, this spares the search for it: `jj.Contact(pose["disc"], p, hill.plane_at(p))`.
     ValueError for an unknown height, or anything of another kind or shape.
@@ -41,8 +42,10 @@ class Contact(eqx.Module):
     height: str = eqx.field(static=True)  # "coordinates" or "row"
     carried: tuple[str, ...] | None = eqx.field(static=True)  # bodies that this contact holds up; None: all of them
     distance: Float[Array, ""] | None  # m; None: the point's height above the plane
+    shape: Shape | None  # what rolls, for pictures
+    ground: Ground | None  # what it rolls on, for pictures; None: the plane
 
-    def __init__(self, body, point, plane=None, height="coordinates", carried=None, distance=None):
+    def __init__(self, body, point, plane=None, height="coordinates", carried=None, distance=None, *, shape=None, ground=None):
         """A contact of the `body` at its `point` with the tangent `plane` of a ground."""
         if not isinstance(body, BodyPose | str):
             raise ValueError(f'the body of a contact is {described(body)}, expected the pose of a body; write pose["name"]')
@@ -55,6 +58,7 @@ class Contact(eqx.Module):
         self.height = _checked_height(height)
         self.carried = _checked_carried(carried, self.body)
         self.distance = None if distance is None else checked_real(distance, f"distance of the contact of `{self.body}`", ())
+        self.shape, self.ground = shape, ground
 
     def gap(self) -> Float[Array, ""]:
         """Signed distance of the contact point from the ground, m."""
@@ -184,7 +188,7 @@ def _wheel(body, radius, tyre, axis, centre, ground, height, carried) -> Contact
 
 def _rolling(body: BodyPose, shape: Shape, ground: Ground, height: str, carried) -> Contact:
     found = touch(shape, ground)
-    return Contact(body, found.point, found.plane, height, carried, found.gap)
+    return Contact(body, found.point, found.plane, height, carried, found.gap, shape=shape, ground=ground)
 
 
 def _centre(body: BodyPose, centre) -> Float[Array, "3"]:

@@ -27,6 +27,7 @@ METHODS = (
     "contacts",
     "events",
     "invariants",
+    "visuals",
 )
 ATTRIBUTES = ("coordinates", "speeds", "inputs", "privileged", "domain", "conventions", "example", "example_span")
 _ALIKE = 0.85  # of two names: `load` and `loads` are, `contact_arm` and `contacts` are not

@@ -5,6 +5,7 @@ import html
 import jax
 
 from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.parameters import parameters_of
 
 
 class Printed:
@@ -21,6 +22,28 @@ class Printed:
 
     def _text(self) -> str:
         raise NotImplementedError(f"`{type(self).__name__}` does not say how it is printed; define `_text(self)`")
+
+
+def scene_html(scene) -> str:
+    """A scene for a notebook: parameters with values and units, names of coordinates, speeds and inputs."""
+    left = "style='text-align:left'"
+    cell = lambda text: f"<td {left}>{html.escape(text)}</td>"  # noqa: E731
+    about = (type(scene).__doc__ or "").strip().split("\n")[0]
+    rows = [
+        f"<tr><th {left}>{html.escape(name)}</th>{cell(_value(value))}{cell(known['unit'])}{cell(known['about'])}</tr>"
+        for name, value, known in parameters_of(scene)
+    ]
+    heads = "".join(f"<th {left}>{head}</th>" for head in ("parameter", "value", "unit", ""))
+    listed = (("coordinates", scene.coordinate_names), ("speeds", scene.speed_names), ("inputs", scene.inputs))
+    names = "".join(f"<div>{what}: {html.escape(', '.join(given.entries))}</div>" for what, given in listed if given.entries)
+    table = f"<table><thead><tr>{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table>" if rows else ""
+    return f"<div><b>{html.escape(type(scene).__name__)}</b> {html.escape(about)}{table}{names}</div>"
+
+
+def _value(value) -> str:
+    if is_traced(value):
+        return "being traced"
+    return f"{float(value):.6g}" if value.ndim == 0 else f"array of shape {value.shape}" if value.size > 6 else ", ".join(f"{x:.6g}" for x in value.ravel())
 
 
 def preformatted(text: str) -> str:

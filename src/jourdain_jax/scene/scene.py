@@ -2,6 +2,7 @@
 them and what holds them. Everything else (velocities, partial velocities, mass matrix, rows) comes by automatic differentiation.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -20,7 +21,9 @@ from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
 from jourdain_jax.scene.numbers import checked_real
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
+from jourdain_jax.scene.printing import scene_html
 from jourdain_jax.scene.static_callables import hold_functions
+from jourdain_jax.scene.visuals import Visual
 from jourdain_jax.scene.what_is_read import WhatIsRead, is_read_by
 
 
@@ -138,6 +141,13 @@ class Scene(eqx.Module, metaclass=_SceneClass):
         """Named quantities of a `motion` that this scene is known to conserve, besides its energy; for checks and summaries."""
         return {}
 
+    def visuals(self, pose: Pose) -> dict[str, Visual | Sequence[Visual]]:
+        """What bodies look like at a `pose`, by name, `""` for what stands in the inertial frame; for pictures only. See `jj.Visual`.
+
+        Bodies that are left out are drawn by their `outline`, what rolls in their contacts, or their inertia.
+        """
+        return {}
+
     # What can be asked of any scene. ------------------------------------------------------------------------------
 
     @property
@@ -149,6 +159,10 @@ class Scene(eqx.Module, metaclass=_SceneClass):
     def speed_names(self) -> Names:
         """Names of the speeds u."""
         return self.coordinates.default_speeds if self.speeds is None else self.speeds
+
+    def _repr_html_(self) -> str:
+        """For notebooks: what it is, its parameters with values and units, its coordinates, speeds and inputs."""
+        return scene_html(self)
 
     def replace(self, **changes) -> "Scene":
         """A copy of this scene with some parameters changed: `changes`, name -> value in the parameter's unit.

@@ -12,9 +12,10 @@ from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
-from jourdain_jax.scene.names import Named
+from jourdain_jax.scene.names import Named, nearest
 from jourdain_jax.scene.numbers import checked_real, described
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
 
 
 def bodies_of(scene: Scene, t, q: Named) -> dict[str, Body]:
@@ -116,6 +117,20 @@ def invariants_of(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
     given = _dictionary(scene, "invariants", scene.invariants(motion), '{"momentum x": body.mass * body.velocity[0]}')
     advice = "give every component a name of its own"
     return {name: checked_real(value, f"invariant `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in given.items()}
+
+
+def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
+    """What the scene itself says of the look of its bodies, `""` for what stands in the inertial frame."""
+    given = _dictionary(scene, "visuals", scene.visuals(pose), '{"ball": jj.Visual.ball(0.1)}')
+    found = {}
+    for name, looks in given.items():
+        if name and name not in pose:
+            raise ValueError(f'`visuals` of `{_name(scene)}` names `{name}`, which is no body, nor "", the inertial frame; {nearest(name, pose.bodies)}')
+        found[name] = (looks,) if isinstance(looks, Visual) else tuple(looks) if isinstance(looks, list | tuple) else (looks,)
+        for look in found[name]:
+            if not isinstance(look, Visual):
+                raise ValueError(f"`visuals` of `{_name(scene)}` gives {described(look)} for `{name}`, expected shapes, such as jj.Visual.ball(0.1)")
+    return found
 
 
 def _dictionary(scene: Scene, method: str, given, example: str) -> dict:

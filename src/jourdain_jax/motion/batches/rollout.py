@@ -24,7 +24,7 @@ from jourdain_jax.motion.retries import lost_codes, mark_retried, next_retry, re
 from jourdain_jax.motion.simulate import MOST_STEPS, TOLERANCE, default_solver, set_up, warn_float32
 from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
 from jourdain_jax.motion.start import State
-from jourdain_jax.motion.trajectories import results
+from jourdain_jax.motion.trajectories import labelled, results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.motion.vector_fields.field import VectorField
@@ -87,6 +87,17 @@ class Rollout(Printed, eqx.Module):
         reached = np.isfinite(values).any(axis=0)
         out[:, reached] = np.nanquantile(values[:, reached], levels, axis=0)
         return out
+
+    def to_xarray(self, units: Mapping[str, str] | None = None):
+        """Coordinates, speeds, result codes and parameters as an `xarray.Dataset` along `lane` and `time` (s).
+
+        `units`: name of a coordinate or speed -> its unit, as in `Trajectory.to_xarray`. ImportError without xarray.
+        """
+        return labelled.dataset(self.lanes, units)
+
+    def to_pandas(self):
+        """Coordinates and speeds as a `pandas.DataFrame`, one row for each lane and time (s). ImportError without pandas."""
+        return labelled.frame(self.lanes)
 
     def _text(self) -> str:
         lines = [f"Rollout of {type(self.lanes.scene).__name__}: {len(self)} lanes"]

@@ -1,5 +1,7 @@
 """A motion in time, with named access and everything needed to trust it."""
 
+from collections.abc import Mapping
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -9,8 +11,9 @@ from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.motion.marks import nan_is_a_mark
-from jourdain_jax.motion.trajectories import over_times, results
+from jourdain_jax.motion.trajectories import labelled, over_times, results
 from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, energies_of, summary, summary_html, warnings_of
+from jourdain_jax.motion.trajectories.sketch import sketch
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.numbers import is_traced
@@ -112,12 +115,23 @@ class Trajectory(eqx.Module):
         """The quantities that the scene states to be conserved, by name at all times; without the energy."""
         return over_times.invariants(self)
 
+    def to_xarray(self, units: Mapping[str, str] | None = None):
+        """Coordinates, speeds, result code and parameters as an `xarray.Dataset` along `time` (s).
+
+        `units`: name of a coordinate or speed -> its unit, kept as `attrs["units"]`: a scene states those of its parameters only. ImportError without xarray.
+        """
+        return labelled.dataset(self, units)
+
+    def to_pandas(self):
+        """Coordinates and speeds as a `pandas.DataFrame`, one row for each time (s). ImportError without pandas."""
+        return labelled.frame(self)
+
     def __str__(self) -> str:
         with nan_is_a_mark():
             return summary(self, self.message) if self._is_known_motion else self._outline
 
     def _repr_html_(self) -> str:
-        return summary_html(self, self.message) if self._is_known_motion else preformatted(self._outline)
+        return summary_html(self, self.message) + sketch(self) if self._is_known_motion else preformatted(self._outline)
 
     @property
     def _is_known_motion(self) -> bool:

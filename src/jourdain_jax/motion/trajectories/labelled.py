@@ -1,0 +1,105 @@
+"""Motions as labelled arrays: an `xarray.Dataset` or a `pandas.DataFrame` with names, times, result codes, parameters, and units where they are known.
+
+A scene states the units of its parameters. Of its coordinates and speeds only those of quaternions and their angular velocities are known; others are given.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from jourdain_jax.motion.trajectories.over_times import Record
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.parameters import parameters_of
+
+CODES = ("success", "event", "max_steps", "step_too_small", "not_finite", "inconsistent_start", "singular_partition", "bad_parameter", "bad_start",
+         "unsolved_step", "shrank", "stiff", "off_constraints", "bad_times", "energy_lost")  # fmt: skip
+OF_LANES: dict[str, tuple[str, float, dict]] = {  # name: type, what stands for nothing, attributes
+    "result": ("int8", -1, {"long_name": "how the motion ended", "flag_values": list(range(len(CODES))), "flag_meanings": " ".join(CODES)}),
+    "event": ("int8", -1, {"long_name": "which stop event ended the motion; -1: none"}),
+    "steps": ("int32", -1, {"long_name": "accepted steps"}),
+    "rejected_steps": ("int32", -1, {"long_name": "rejected steps"}),
+    "retries": ("int8", -1, {"long_name": "how it was run again", "flag_masks": [1, 2], "flag_meanings": "full_state implicit_solver"}),
+    "end_time": ("float64", math.nan, {"long_name": "time at which the motion ended", "units": "s"}),
+}
+_FIELDS = {"result": "result", "event": "event", "steps": "accepted", "rejected_steps": "rejected", "retries": "fallback", "end_time": "t_end"}
+
+
+class WithEvents(Record, Protocol):
+    """A recorded motion that names its stop events."""
+
+    event_names: tuple[str, ...]
+
+
+def dataset(record: WithEvents, units: Mapping[str, str] | None = None):
+    """The motion, or with a leading axis the lanes, as an `xarray.Dataset`; `units`: name of a coordinate or speed -> its unit."""
+    xarray = _package("xarray", "labelled arrays")
+    lanes = _lanes(record)
+    units = _units(record.scene, units)
+    ts = np.asarray(record.ts)
+    shared = not lanes or bool(np.all(ts == ts[:1]))
+    along = (*lanes, "time" if shared else "save")
+    about_time = {"long_name": "time", "units": "s"}
+    found: dict[str, tuple] = {"time": ("time", ts[0] if lanes else ts, about_time) if shared else (along, ts, about_time)}
+    if lanes:
+        found["lane"] = ("lane", np.arange(len(ts)), {"long_name": "number of the motion"})
+    for name, values in _columns(record).items():
+        found[name] = (along, values, {"long_name": name} | ({"units": units[name]} if name in units else {}))
+    for name, (dtype, _, about) in OF_LANES.items():
+        more = {"event_names": list(record.event_names)} if name == "event" else {}
+        found.setdefault(name, (lanes, np.asarray(getattr(record, _FIELDS[name])).astype(dtype), about | more))
+    for name, value, about in parameters_of(record.scene):
+        values = np.asarray(value)
+        axes = tuple(f"{name}_{k}" for k in range(values.ndim - len(lanes)))
+        unit = {"units": about["unit"]} if about["unit"] else {}
+        found.setdefault(name, ((*lanes, *axes), values, {"long_name": about["about"] or name, "role": "parameter"} | unit))
+    held = xarray.Dataset({name: value for name, value in found.items() if name not in ("time", "lane")}, {n: found[n] for n in ("time", "lane") if n in found})
+    return held.assign_attrs(scene=type(record.scene).__name__, conventions=record.scene.conventions, solver=record.solver)
+
+
+def frame(record: Record):
+    """Coordinates and speeds as a `pandas.DataFrame`: one row for each time, or for each lane and time."""
+    pandas = _package("pandas", "a table of a motion")
+    lanes, ts = _lanes(record), np.asarray(record.ts)
+    if not lanes:
+        return pandas.DataFrame(_columns(record), index=pandas.Index(ts, name="time"))
+    numbers = np.repeat(np.arange(len(ts)), ts.shape[1])
+    index = pandas.MultiIndex.from_arrays([numbers, ts.ravel()], names=["lane", "time"])
+    return pandas.DataFrame({name: values.ravel() for name, values in _columns(record).items()}, index=index)
+
+
+def _lanes(record: Record) -> tuple[str, ...]:
+    if is_traced(record.q, record.ts):
+        raise ValueError("a motion is being traced and has no numbers yet; make labelled arrays of it outside of `jax.jit`, `jax.vmap` and derivatives")
+    return ("lane",) * (record.q.ndim - 2)
+
+
+def _columns(record: Record) -> dict[str, np.ndarray]:
+    names = (record.scene.coordinate_names.entries, record.scene.speed_names.entries)
+    return {name: np.asarray(array)[..., k] for entries, array in zip(names, (record.q, record.u), strict=True) for k, name in enumerate(entries)}
+
+
+def _units(scene, given: Mapping[str, str] | None) -> dict[str, str]:
+    """Units of quaternions, their angular velocities, and those that are given."""
+    known: dict[str, str] = {}
+    for names, unit in ((scene.coordinate_names, "1"), *(((scene.speed_names, "rad/s"),) if scene.speeds is None else ())):
+        known |= {name: unit for _, first, length in names.groups for name in names.entries[first : first + length]}
+    valid = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    for name in given or {}:
+        if name not in valid:
+            raise ValueError(f"`units` names `{name}`, which is no coordinate or speed of `{type(scene).__name__}`; {nearest(name, valid)}")
+    return known | dict(given or {})
+
+
+def _package(name: str, purpose: str) -> Any:
+    """An optional package; an ImportError that says how to get it."""
+    try:
+        if name == "xarray":
+            import xarray as package
+        else:
+            import pandas as package
+    except ImportError:
+        raise ImportError(f"{purpose} needs the package `{name}`, which is not installed; install it with: pip install {name}") from None
+    return package

@@ -1,0 +1,151 @@
+"""What there is to draw of a motion: bodies with their looks at all saved times that were reached, and their contacts with the ground."""
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.motion.trajectories.over_times import map_over_times
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.plotting.guesses import guessed
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.contacts import Contact
+from jourdain_jax.scene.grounds import HeightMap, Surface
+from jourdain_jax.scene.validated import contacts_of, visuals_of
+from jourdain_jax.scene.visuals import Visual
+
+PALETTE = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
+PLAIN = "#8a8a86"  # of what belongs to no body
+_THIN = 0.011  # radius of a line, of the size of what is drawn
+_DOT = 0.02  # radius of a particle, of the size of what is drawn
+
+
+@dataclass(frozen=True)
+class Look:
+    """A shape and where it is in the frame of its body, at all times."""
+
+    visual: Visual  # at the first time
+    positions: np.ndarray  # (times, 3), m
+    orientations: np.ndarray  # (times, 3, 3)
+    points: np.ndarray  # (times, points, 3), m: of a line; (times, 0, 3) of others
+    radius: float  # m, of a line
+
+    def at(self, chosen: np.ndarray) -> "Look":
+        """The same at the `chosen` times."""
+        return Look(self.visual, self.positions[chosen], self.orientations[chosen], self.points[chosen], self.radius)
+
+
+@dataclass(frozen=True)
+class DrawnBody:
+    """A body at all times; the inertial frame is one of the name `""`, at rest."""
+
+    name: str
+    colour: str
+    positions: np.ndarray  # (times, 3), m
+    orientations: np.ndarray  # (times, 3, 3)
+    angular_velocities: np.ndarray  # (times, 3), rad/s, inertial frame
+    looks: list[Look]
+
+    def at(self, chosen: np.ndarray) -> "DrawnBody":
+        """The same at the `chosen` times."""
+        looks = [look.at(chosen) for look in self.looks]
+        return DrawnBody(self.name, self.colour, self.positions[chosen], self.orientations[chosen], self.angular_velocities[chosen], looks)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What there is to draw of one motion."""
+
+    ts: np.ndarray  # (times,), s; those that were reached
+    reached: np.ndarray  # their numbers among all saved times
+    bodies: dict[str, DrawnBody]
+    contacts: dict[str, Contact]  # leading axis: times
+    size: float  # m: the longest side of the box that holds all bodies at the first time
+
+    def at(self, chosen: np.ndarray) -> "Drawn":
+        """The same at the `chosen` ones of its times."""
+        bodies = {name: body.at(chosen) for name, body in self.bodies.items()}
+        return Drawn(self.ts[chosen], self.reached[chosen], bodies, _at(self.contacts, chosen), self.size)
+
+
+def looks_of(trajectory: Trajectory, what: str = "draw") -> Drawn:
+    """What there is to draw of a motion; ValueError where it reached none of its times."""
+    reached = np.flatnonzero(np.asarray(trajectory.valid))
+    if reached.size == 0:
+        raise ValueError(f"the motion reached none of its saved times; there is nothing to {what}")
+    bodies, velocities, visuals, contacts = _at(map_over_times(_seen, trajectory), reached)
+    paths = np.concatenate([np.asarray(body.position) for body in bodies.values()])
+    first = {name: _at(body, 0) for name, body in bodies.items()}
+    # a particle that moves far is small in the picture: what has no size is measured by the whole motion, if there is nothing else
+    dot = _DOT * max(float(np.ptp(paths, axis=0).max()), 1e-3)
+    stated = {name: list(looks) for name, looks in visuals.items()}
+    for name, body in first.items():
+        if name not in stated:
+            shapes = [_at(contact.shape, 0) for contact in contacts.values() if contact.body == name and contact.shape is not None]
+            stated[name] = [_same_at_all(look, len(reached)) for look in guessed(body, shapes, dot)]
+    size = _size(first, {name: [_at(look, 0) for look in looks] for name, looks in stated.items()})
+    drawn = {}
+    for k, (name, body) in enumerate(bodies.items()):
+        turned = np.asarray(body.orientation) if isinstance(body, RigidBody) else np.broadcast_to(np.eye(3), (len(reached), 3, 3))
+        drawn[name] = DrawnBody(name, PALETTE[k % len(PALETTE)], np.asarray(body.position), turned, velocities[name], [_look(v, size) for v in stated[name]])
+    if stated.get(""):
+        still = np.zeros((len(reached), 3))
+        drawn[""] = DrawnBody("", PLAIN, still, np.broadcast_to(np.eye(3), (len(reached), 3, 3)), still, [_look(v, size) for v in stated[""]])
+    return Drawn(np.asarray(trajectory.ts)[reached], reached, drawn, contacts, size)
+
+
+def _seen(scene, t, q, u, inputs):
+    motion = motion_at(scene, t, q, u, inputs)
+    pose = motion.pose()
+    contacts = {name: _closed_form(contact) for name, contact in contacts_of(scene, pose).items()}
+    bodies = {name: found.body for name, found in motion.bodies.items()}
+    return bodies, {name: found.angular_velocity for name, found in motion.bodies.items()}, visuals_of(scene, pose), contacts
+
+
+def _closed_form(contact: Contact) -> Contact:
+    """The contact without a ground whose function knows this instant alone."""
+    ground = None if isinstance(contact.ground, Surface | HeightMap) else contact.ground
+    point, plane = contact.point, contact.plane
+    return Contact(contact.body, point, plane, contact.height, contact.carried, contact.distance, shape=contact.shape, ground=ground)
+
+
+def _at(tree, index):
+    return jax.tree.map(lambda x: np.asarray(x)[index], tree)
+
+
+def _same_at_all(visual: Visual, times: int) -> Visual:
+    return jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (times, *np.shape(x))), visual)
+
+
+def _look(visual: Visual, size: float) -> Look:
+    """A shape with a leading axis of times."""
+    first = _at(visual, 0)
+    points = np.asarray(visual.size) if visual.kind == "line" else np.zeros((len(visual.position), 0, 3))
+    radius = 0.0 if visual.kind != "line" else _THIN * size if first.radius is None else float(first.radius)
+    return Look(first, np.asarray(visual.position), np.asarray(visual.orientation), points, radius)
+
+
+def corners_of(visual: Visual) -> np.ndarray:
+    """Points (points, 3) in the frame of its body, m, whose box holds the shape."""
+    size = np.asarray(visual.size)
+    if visual.kind == "line":
+        return size
+    if visual.kind == "mesh":
+        own = visual.faces.corners * size  # type: ignore[union-attr]
+    else:
+        half = {"ellipsoid": size, "box": size / 2}.get(visual.kind)
+        if half is None:
+            half = np.array([size[0], size[0], size[1] / 2 + (size[0] if visual.kind == "capsule" else 0.0)])
+        own = half * np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
+    return own @ np.asarray(visual.orientation).T + np.asarray(visual.position)
+
+
+def _size(bodies: dict, looks: dict[str, list[Visual]]) -> float:
+    points = []
+    for name, shapes in looks.items():
+        body = bodies.get(name)
+        turned = np.asarray(body.orientation) if isinstance(body, RigidBody) else np.eye(3)
+        place = np.zeros(3) if body is None else np.asarray(body.position)
+        points += [corners_of(shape) @ turned.T + place for shape in shapes]
+    return float(max(np.ptp(np.concatenate(points), axis=0).max(), 1e-3))

@@ -1,0 +1,238 @@
+"""Motions as data for the page that shows them: a description in JSON, and one run of 32-bit floats that it points into."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.plotting.grounds_drawn import grounds_of
+from jourdain_jax.plotting.looks import Drawn, DrawnBody, Look, corners_of, looks_of
+from jourdain_jax.scene.visuals import Visual
+
+_FRAMES = 1000  # at most, of one motion
+_LONG = 5.0  # the whole motion is so many times as long as its bodies: the view follows them
+_ARROW = 0.4  # length of the longest arrow, of the bodies
+
+
+@dataclass
+class Numbers:
+    """A run of 32-bit floats, and where in it arrays are: pairs of first and count."""
+
+    parts: list[np.ndarray] = field(default_factory=list)
+    count: int = 0
+
+    def add(self, array) -> tuple[int, int]:
+        """Where the array is kept, flat."""
+        flat = np.asarray(array, np.float32).ravel()
+        self.parts.append(flat)
+        self.count += flat.size
+        return self.count - flat.size, flat.size
+
+    def bytes(self) -> bytes:
+        """All of them, little-endian."""
+        return np.concatenate(self.parts).astype("<f4").tobytes()
+
+
+@dataclass(frozen=True)
+class Box:
+    """Corners (3,) of a box, m."""
+
+    low: np.ndarray
+    high: np.ndarray
+
+    @property
+    def longest(self) -> float:
+        return float(np.max(self.high - self.low))
+
+
+def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dict, Numbers]:
+    """The description of the page, and its numbers."""
+    drawn = [_thinned(looks_of(motion, "show")) for motion in motions]
+    numbers, first = Numbers(), drawn[0]
+    near, far = _near(drawn), _far(drawn)
+    colours = {name: body.colour for one in drawn for name, body in one.bodies.items() if name}
+    follow = far.longest > _LONG * near.longest and not _at_rest(first) if options["follow"] is None else options["follow"]
+    shown = near.longest if follow else max(near.longest, far.longest / 3)
+    arrows, strongest = _arrows(motions, drawn, shown) if options["forces"] else ([[] for _ in drawn], 0.0)
+    tile = _round_number(shown / 4)
+    grounds = grounds_of(motions[0], first, far.low, far.high)
+    squares = f"squares of the ground: {tile:g} m" if any(ground["kind"] == "plane" for ground in grounds) else ""
+    notes = [squares, f"longest arrow: {strongest:.3g} N" if strongest else ""]
+    parts = zip(motions, drawn, arrows, strict=True)
+    page = {
+        "title": title,
+        "names": [{"name": name, "colour": options["colours"].get(name, colour)} for name, colour in colours.items()],
+        "note": "; ".join(note for note in notes if note),
+        "span": [float(first.ts[0]), float(first.ts[-1])],
+        "motions": [_motion(numbers, motion, one, own, options) for motion, one, own in parts],
+        "grounds": [_ground(numbers, ground) for ground in grounds],
+        "size": near.longest,
+        "reach": far.longest,
+        "near": [near.low.tolist(), near.high.tolist()],
+        "far": [far.low.tolist(), far.high.tolist()],
+        "ground": 3 * far.longest + 60 * near.longest,
+        "tile": tile,
+        "thickness": 0.018 * shown,
+        "follow": bool(follow),
+        "view": list(options["view"]),
+        "play": bool(options["play"]),
+    }
+    return page, numbers
+
+
+def _motion(numbers: Numbers, motion: Trajectory, drawn: Drawn, arrows: list, options: dict) -> dict:
+    colour = {name: options["colours"].get(name, body.colour) for name, body in drawn.bodies.items()}
+    ends = options["paths"]
+    if ends is not None:
+        paths = [(colour[name], np.asarray(motion.point(name, local))[drawn.reached]) for name, local in ends]
+    elif drawn.contacts:
+        paths = [(colour[contact.body], np.asarray(contact.point)) for contact in drawn.contacts.values()]
+    else:
+        paths = [(colour[name], body.positions) for name, body in drawn.bodies.items() if _moves(body)]
+    return {
+        "ts": numbers.add(drawn.ts),
+        "bodies": [_body(numbers, body, drawn.ts, colour[name]) for name, body in drawn.bodies.items()],
+        "paths": [{"colour": colour, "points": numbers.add(points)} for colour, points in paths],
+        "forces": [{"name": name, "points": numbers.add(points), "vectors": numbers.add(vectors)} for name, points, vectors in arrows],
+    }
+
+
+def _body(numbers: Numbers, body: DrawnBody, ts, colour: str) -> dict:
+    quaternions = quaternions_of(body.orientations)
+    return {
+        "name": body.name,
+        "moves": bool(body.name) and _moves(body),
+        "p": numbers.add(_still(body.positions)),
+        "q": numbers.add(_still(quaternions)),
+        "turns": numbers.add(_whole_turns(quaternions, body.angular_velocities, ts)),
+        "shapes": [_shape(numbers, look, colour) for look in body.looks],
+    }
+
+
+def _shape(numbers: Numbers, look: Look, colour: str) -> dict:
+    visual = look.visual
+    shape = {"kind": visual.kind, "colour": visual.colour or colour, "opacity": visual.opacity, "size": np.asarray(visual.size).ravel().tolist()}
+    if visual.kind == "line":
+        return shape | {"size": [], "count": look.points.shape[1], "points": numbers.add(_still(look.points)), "radius": look.radius}
+    quaternions = quaternions_of(look.orientations)
+    shape |= {"p": numbers.add(_still(look.positions)), "q": numbers.add(_still(quaternions)), "turns": [0]}
+    return shape | ({"mesh": numbers.add(_triangles(visual))} if visual.kind == "mesh" else {})
+
+
+def _triangles(visual: Visual) -> np.ndarray:
+    """Corners (triangles, 3, 3) of a mesh, m; faces with more corners as fans."""
+    corners = visual.faces.corners * np.asarray(visual.size)  # type: ignore[union-attr]
+    return corners[[(f[0], f[k], f[k + 1]) for f in visual.faces.polygons for k in range(1, len(f) - 1)]]  # type: ignore[union-attr]
+
+
+def _ground(numbers: Numbers, ground: dict) -> dict:
+    if ground["kind"] == "plane":
+        return {"kind": "plane", "p": ground["origin"].tolist(), "q": quaternions_of(ground["axes"][None])[0].tolist()}
+    return {"kind": "mesh", "size": [], "mesh": numbers.add(ground["triangles"])}
+
+
+def quaternions_of(rotations: np.ndarray) -> np.ndarray:
+    """Quaternions (times, 4), x y z w, of rotation matrices (times, 3, 3), each as near to the one before as its sign lets it."""
+    R = np.asarray(rotations, float)
+    trace = np.trace(R, axis1=1, axis2=2)
+    # the largest of 4 w^2, 4 x^2, ... says which entry to divide by
+    fours = np.stack([1 + 2 * R[:, k, k] - trace for k in range(3)] + [1 + trace], axis=1)
+    best, found = fours.argmax(axis=1), np.empty((len(R), 4))
+    for n, k in enumerate(best):
+        if k == 3:
+            raw = [R[n, 2, 1] - R[n, 1, 2], R[n, 0, 2] - R[n, 2, 0], R[n, 1, 0] - R[n, 0, 1], fours[n, 3]]
+        else:
+            i, j = (k + 1) % 3, (k + 2) % 3
+            raw = [0.0] * 4
+            raw[k], raw[i], raw[j], raw[3] = fours[n, k], R[n, i, k] + R[n, k, i], R[n, j, k] + R[n, k, j], R[n, j, i] - R[n, i, j]
+        found[n] = raw
+    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    signs = np.sign(np.sum(found[1:] * found[:-1], axis=1))
+    found[1:] *= np.cumprod(np.where(signs == 0, 1, signs))[:, None]
+    return found
+
+
+def _whole_turns(quaternions: np.ndarray, velocities: np.ndarray, ts: np.ndarray) -> np.ndarray:
+    """How many whole turns a body makes between saved times, beside the shortest way from one attitude to the next: of a wheel that spins fast."""
+    if len(ts) < 2:
+        return np.zeros(1)
+    a, b = quaternions[:-1], quaternions[1:]
+    # the vector part of b a*, half the shortest turn
+    vector = a[:, 3:] * b[:, :3] - b[:, 3:] * a[:, :3] - np.cross(b[:, :3], a[:, :3])
+    sine = np.linalg.norm(vector, axis=1)
+    angle = 2 * np.arctan2(sine, np.sum(a * b, axis=1))
+    axis = vector / np.maximum(sine, 1e-300)[:, None]
+    turned = np.sum((velocities[:-1] + velocities[1:]) / 2 * axis, axis=1) * np.diff(ts)
+    whole = np.where(sine > 1e-9, np.round((turned - angle) / (2 * np.pi)), 0.0)
+    return whole if np.any(whole) else np.zeros(1)
+
+
+def _still(values: np.ndarray) -> np.ndarray:
+    """Values at all times; at one time where they stay what they are."""
+    return values[:1] if np.ptp(values, axis=0).max(initial=0.0) < 1e-12 * (1 + np.abs(values).max(initial=0.0)) else values
+
+
+def _at_rest(drawn: Drawn) -> bool:
+    """Whether something stands in the inertial frame, such as a table."""
+    return "" in drawn.bodies and any(len(_still(look.positions)) == 1 and look.visual.kind != "line" for look in drawn.bodies[""].looks)
+
+
+def _moves(body: DrawnBody) -> bool:
+    return len(_still(body.positions)) > 1
+
+
+def _thinned(drawn: Drawn) -> Drawn:
+    """At most so many times as a screen can show."""
+    if len(drawn.ts) <= _FRAMES:
+        return drawn
+    return drawn.at(np.unique(np.linspace(0, len(drawn.ts) - 1, _FRAMES).astype(int)))
+
+
+def _extents(body: DrawnBody) -> np.ndarray:
+    """Corners (times, points, 3) of a body in space, m."""
+    times = len(body.positions)
+    corners = [np.broadcast_to(corners_of(look.visual), (times, len(corners_of(look.visual)), 3)) for look in body.looks if look.visual.kind != "line"]
+    corners += [look.points for look in body.looks if look.visual.kind == "line"]
+    local = np.concatenate(corners, axis=1)
+    return np.einsum("tij,tpj->tpi", body.orientations, local) + body.positions[:, None]
+
+
+def _far(drawn: list[Drawn]) -> Box:
+    """The box that holds all bodies at all times."""
+    points = np.concatenate([_extents(body).reshape(-1, 3) for one in drawn for body in one.bodies.values()])
+    return Box(points.min(axis=0), points.max(axis=0))
+
+
+def _near(drawn: list[Drawn]) -> Box:
+    """The box around the bodies that holds them at any one time, from their middle."""
+    lows, highs = [], []
+    for one in drawn:
+        moving = [body for name, body in one.bodies.items() if name and _moves(body)]
+        middle = np.mean([body.positions for body in moving], axis=0) if moving else np.zeros((len(one.ts), 3))
+        points = np.concatenate([_extents(body) for body in moving or one.bodies.values()], axis=1) - middle[:, None]
+        lows.append(points.min(axis=(0, 1)))
+        highs.append(points.max(axis=(0, 1)))
+    return Box(np.min(lows, axis=0), np.max(highs, axis=0))
+
+
+def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple[list, float]:
+    """Name, point and scaled force of every contact at all times, of all motions; and the largest force, N."""
+    found = []
+    for motion, one in zip(motions, drawn, strict=True):
+        forces = motion.contact_forces() if one.contacts else {}
+        own = []
+        for name, force in forces.items():
+            plane = one.contacts[name].plane
+            normal, tangential = np.asarray(force.normal)[one.reached], np.asarray(force.tangential)[one.reached]
+            vectors = normal[:, None] * np.asarray(plane.normal) + np.einsum("tk,tkj->tj", tangential, np.asarray(plane.tangents))
+            own.append((name, np.asarray(one.contacts[name].point), np.where(np.isfinite(vectors), vectors, 0.0)))
+        found.append(own)
+    strongest = max((float(np.linalg.norm(vectors, axis=1).max()) for own in found for _, _, vectors in own), default=0.0)
+    scale = _ARROW * size / strongest if strongest else 0.0
+    return [[(name, points, scale * vectors) for name, points, vectors in own] for own in found], strongest
+
+
+def _round_number(length: float) -> float:
+    """The nearest of 1, 2 and 5 times a power of ten below a length."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(power * max(k for k in (1, 2, 5) if k * power <= length * (1 + 1e-9)))

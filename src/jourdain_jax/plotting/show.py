@@ -1,0 +1,137 @@
+"""Motions to be turned, zoomed and played: a page of HTML that holds everything it needs, drawn by three.js in the browser."""
+
+import base64
+import html
+import json
+import os
+import zlib
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib import resources
+
+import numpy as np
+
+from jourdain_jax.motion.batches.rollout import Rollout
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.plotting.page_data import page_data
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import described
+
+LANES = 12  # of a rollout, at most
+
+
+class View:
+    """A page that shows motions, `html`; displays itself in a notebook. `save(path)` writes it to a file."""
+
+    def __init__(self, page: str, title: str, height: int):
+        self.html, self.title, self.height = page, title, height
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the page to `path` (.html), one file that needs no other and no network; ValueError for another suffix."""
+        _check_suffix(path)
+        with open(path, "w", encoding="utf-8") as file:
+            file.write(self.html)
+
+    def _repr_html_(self) -> str:
+        page = html.escape(self.html, quote=True)
+        return f'<iframe srcdoc="{page}" title="{html.escape(self.title)}" style="width:100%;height:{self.height}px;border:1px solid #ddd"></iframe>'
+
+    def __repr__(self) -> str:
+        return f"View of {self.title}, {len(self.html) / 1e6:.2f} MB of HTML; shown in a notebook, or written to a file by .save('view.html')"
+
+
+def show(
+    motion,
+    path: str | os.PathLike | None = None,
+    *,
+    title: str | None = None,
+    follow: bool | None = None,
+    paths: Sequence | None = None,
+    forces: bool = True,
+    colours: Mapping[str, str] | None = None,
+    view: Sequence = (22.0, -60.0),
+    height: int = 480,
+    play: bool = False,
+) -> View:
+    """A 3D view of a `motion` to turn, zoom, play and scrub, in a notebook or any browser.
+
+    - `motion`: from `jj.simulate`; or several in a list, or the lanes of a rollout (at most 12, evenly chosen), drawn one over the other, all but the first
+      translucent.
+    - `path`: a file (.html) to write as well: it holds all it needs. `ride.html#t=2.5` opens at 2.5 s.
+    - `title`: default: the name of the scene. `height`: of the view in a notebook, in pixels. `play`: whether it plays when it opens.
+    - `follow`: the view moves with the bodies (default: where they go far). `view`: elevation and azimuth it starts from, in degrees.
+    - `paths`: (body, body-frame point in m) pairs to trace (default: contact points, or mass centres where there is no contact).
+    - `forces`: arrows of the contact forces. `colours`: name of a body -> "#rrggbb".
+
+    What bodies look like, a scene says in `visuals`, see `jj.Visual`; otherwise it is guessed. Returns a `View`. ValueError for what cannot be shown.
+
+    **Examples**
+
+        motion = jj.simulate(jj.models.TiltingDisc(), {"lean": 0.3, "spin_rate": -3.0}, t1=5.0)
+        jj.show(motion, "disc.html")
+    """
+    if path is not None:
+        _check_suffix(path)
+    motions = _motions(motion)
+    names = list(dict.fromkeys(name for one in motions for name in one.motions().bodies))
+    for name in colours or {}:
+        if name not in names:
+            raise ValueError(f"`colours` names `{name}`, which is no body; {nearest(name, names)}")
+    angles = np.asarray(view, float)
+    if angles.shape != (2,):
+        raise ValueError(f"`view` is {view!r}, expected elevation and azimuth in degrees, such as (22, -60)")
+    title = type(motions[0].scene).__name__ if title is None else title
+    options = {"follow": follow, "paths": paths, "forces": forces, "colours": dict(colours or {}), "view": angles.tolist(), "play": play}
+    description, numbers = page_data(motions, title, options)
+    shown = View(_page(title, description, numbers.bytes()), title, height)
+    if path is not None:
+        shown.save(path)
+    return shown
+
+
+def _motions(given) -> list[Trajectory]:
+    """The single motions in what was given."""
+    if isinstance(given, Rollout):
+        chosen = np.unique(np.linspace(0, len(given) - 1, min(LANES, len(given))).astype(int))
+        lanes = [given.lane(int(k)) for k in chosen]
+        return [lane for lane in lanes if bool(np.any(np.asarray(lane.valid)))] or lanes[:1]
+    if isinstance(given, Trajectory) and given.q.ndim == 2:
+        return [given]
+    if isinstance(given, list | tuple) and given:
+        return [one for several in given for one in _motions(several)]
+    raise ValueError(f"`show` was given {described(given)}, expected a motion from `jj.simulate`, a rollout, or a list of these")
+
+
+def _page(title: str, description: dict, numbers: bytes) -> str:
+    parts = {
+        "TITLE": html.escape(title),
+        "SCENE": json.dumps(description).replace("</", "<\\/"),
+        "NUMBERS": _packed(numbers),
+        "THREE": _viewer(),
+        "PLAYER": _file("player.js"),
+    }
+    page = _file("page.html")
+    for name, text in parts.items():
+        page = page.replace(f"@{name}@", text)
+    return page
+
+
+@cache
+def _viewer() -> str:
+    return _packed(_file("three.bundle.js").encode())
+
+
+def _packed(content: bytes) -> str:
+    return base64.b64encode(zlib.compress(content, 9)).decode()
+
+
+def _file(name: str) -> str:
+    return (resources.files("jourdain_jax") / "plotting" / "viewer" / name).read_text(encoding="utf-8")
+
+
+def _check_suffix(path: str | os.PathLike) -> None:
+    if not str(path).lower().endswith((".html", ".htm")):
+        raise ValueError(f"cannot write `{os.fspath(path)}`: a 3D view is a .html file; for a .gif use `jj.animate`, for figures `jj.plot`")
+    folder = os.path.dirname(os.fspath(path)) or "."
+    if not os.path.isdir(folder):
+        raise ValueError(f"cannot write `{os.fspath(path)}`: there is no folder `{folder}`; make it first")

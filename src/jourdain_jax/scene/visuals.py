@@ -1,0 +1,171 @@
+"""What bodies look like: shapes in the frame of their body, for pictures only; no equation knows of them.
+
+A scene states them in `visuals(self, pose)`; bodies that it leaves out are drawn by what is known of them otherwise: the line that a body was given as its
+`outline`, what rolls in its contacts, its inertia.
+"""
+
+import os
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.scene.bodies import _axis_index, _stack
+from jourdain_jax.scene.grounds import tangents_of
+from jourdain_jax.scene.numbers import checked_real, described, is_traced
+
+
+class Faces:
+    """Corners (points, 3) and faces of a mesh, known numbers; two are the same only if they are one object."""
+
+    def __init__(self, corners: np.ndarray, polygons: tuple[tuple[int, ...], ...]):
+        self.corners, self.polygons = corners, polygons
+
+
+class Visual(eqx.Module):
+    """A shape in the frame of a body, for pictures only. Made by its constructors: `jj.Visual.ball(0.1)`, `wheel`, `box`, `cylinder`, `capsule`, ...
+
+    All of them take
+    - `at`: (3,) in m, where its middle is, in the body frame, from the mass centre (default: there).
+    - `turn`: (3, 3), from its own axes to those of the body (default: the same axes).
+    - `colour`: "#rrggbb" (default: the body's, one of a palette). `opacity`: 0 to 1.
+
+    Under the name `""` in `visuals`, shapes stand in the inertial frame. Sizes are those at the first saved time; places, turns and the points of lines may
+    change with the pose. ValueError for what is no shape.
+
+    **Examples**
+
+        def visuals(self, pose):  # a method of a scene
+            hub, mass = pose["wheel"].position, pose["rider"].position
+            return {"rider": jj.Visual.capsule(0.1, 0.5), "": jj.Visual.line(hub, mass)}
+    """
+
+    kind: str = eqx.field(static=True)  # "ellipsoid", "wheel", "box", "cylinder", "capsule", "line" or "mesh"
+    # m; ellipsoid: semi-axes, box: sides, wheel, cylinder, capsule: radius and length along z (of the capsule without its ends), line: points, mesh: factors
+    size: Float[Array, "*size"]
+    position: Float[Array, "3"]  # m, body frame
+    orientation: Float[Array, "3 3"]  # own components to body components
+    radius: Float[Array, ""] | None = None  # m, of a line; None: thin
+    faces: Faces | None = eqx.field(static=True, default=None)
+    colour: str | None = eqx.field(static=True, default=None)
+    opacity: float = eqx.field(static=True, default=1.0)
+
+    @staticmethod
+    def ball(radius, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
+        """A ball of the given `radius` (m), its octants painted in turn, so that one sees it roll; `at`, `turn`, `colour`, `opacity` as for all shapes."""
+        return _placed("ellipsoid", _lengths(radius, "radius of a ball", ()) * jnp.ones(3), at, turn, colour, opacity)
+
+    @staticmethod
+    def ellipsoid(semi_axes, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
+        """An ellipsoid with three `semi_axes` (m) along its axes; `at`, `turn`, `colour`, `opacity` as for all shapes."""
+        return _placed("ellipsoid", _lengths(semi_axes, "semi-axes of an ellipsoid", (3,)), at, turn, colour, opacity)
+
+    @staticmethod
+    def wheel(radius, width=None, *, axis="y", at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
+        """A wheel or disc of `radius` and `width` (m, default: a sixth of the radius) about `axis` ("x", "y" or "z"), its quarters painted in turn.
+
+        `at`, `turn`, `colour`, `opacity` as for all shapes.
+        """
+        radius = _lengths(radius, "radius of a wheel", ())
+        return _about(axis, "wheel", [radius, radius / 6 if width is None else _lengths(width, "width of a wheel", ())], at, turn, colour, opacity)
+
+    @staticmethod
+    def box(sides, *, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
+        """A box with three `sides` (m) along its axes; `at`, `turn`, `colour`, `opacity` as for all shapes."""
+        return _placed("box", _lengths(sides, "sides of a box", (3,)), at, turn, colour, opacity)
+
+    @staticmethod
+    def cylinder(radius, length, *, axis="z", at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
+        """A cylinder of `radius` and `length` (m) along `axis` ("x", "y" or "z"); `at`, `turn`, `colour`, `opacity` as for all shapes."""
+        sizes = [_lengths(radius, "radius of a cylinder", ()), _lengths(length, "length of a cylinder", ())]
+        return _about(axis, "cylinder", sizes, at, turn, colour, opacity)
+
+    @staticmethod
+    def capsule(radius, length, *, axis="z", at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
+        """A cylinder of `radius` and `length` (m) along `axis` with a half ball at each end; `at`, `turn`, `colour`, `opacity` as for all shapes."""
+        sizes = [_lengths(radius, "radius of a capsule", ()), _lengths(length, "length of a capsule", ())]
+        return _about(axis, "capsule", sizes, at, turn, colour, opacity)
+
+    @staticmethod
+    def line(*points, radius=None, colour=None, opacity=1.0) -> "Visual":
+        """A bar of round section from each of the `points` (m, body frame) to the next; `radius` in m (default: thin); `colour`, `opacity` as for all."""
+        if len(points) < 2:
+            raise ValueError(f"a line to be drawn has {len(points)} points, expected at least two; write jj.Visual.line(a, b)")
+        stacked = jnp.stack([checked_real(p, "point of a line to be drawn", (3,), advice="give three components, m").astype(float) for p in points])
+        radius = None if radius is None else _lengths(radius, "radius of a line", ())
+        return _checked(Visual("line", stacked, jnp.zeros(3), jnp.eye(3), radius, None, colour, opacity))
+
+    @staticmethod
+    def coil(a, b, radius, *, turns: int = 8, colour=None, opacity=1.0) -> "Visual":
+        """A spring between two points `a`, `b` (m, body frame): a wire of so many `turns` of the given `radius` (m); `colour`, `opacity` as for all shapes."""
+        a, b = (checked_real(p, "end of a coil", (3,), advice="give three components, m").astype(float) for p in (a, b))
+        radius, length = _lengths(radius, "radius of a coil", ()), jnp.sqrt(jnp.sum((b - a) ** 2))
+        along = jnp.where(length > 0, (b - a) / jnp.where(length > 0, length, 1.0), jnp.array([0.0, 0.0, 1.0]))
+        share = np.linspace(0.0, 1.0, 12 * turns + 1)[:, None]
+        wide = np.clip(np.minimum(share, 1 - share) * 12, 0.0, 1.0)  # straight at both ends
+        across = tangents_of(along)
+        angle = 2 * np.pi * turns * share
+        points = a + share * (b - a) + radius * wide * (np.cos(angle) * across[0] + np.sin(angle) * across[1])
+        return _checked(Visual("line", points, jnp.zeros(3), jnp.eye(3), radius / 6, None, colour, opacity))
+
+    @staticmethod
+    def mesh(vertices, faces, *, scale=1.0, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
+        """A body of flat faces.
+
+        `vertices` (points, 3) in m and `faces`, one row of numbers of vertices for each, anticlockwise seen from outside, are known numbers; `scale`, one
+        factor or three, may depend on parameters. `at`, `turn`, `colour`, `opacity` as for all shapes.
+        """
+        if is_traced(vertices, faces):
+            raise ValueError("the vertices of a mesh depend on parameters or coordinates, expected known numbers; use `scale`, `at` and `turn`")
+        corners = np.asarray(vertices, float)
+        if corners.ndim != 2 or corners.shape[1] != 3 or not np.all(np.isfinite(corners)):
+            raise ValueError(f"vertices of a mesh have shape {corners.shape}, expected (points, 3), finite, m")
+        polygons = tuple(tuple(int(i) for i in face) for face in faces)
+        if not polygons or any(len(face) < 3 or min(face) < 0 or max(face) >= len(corners) for face in polygons):
+            raise ValueError(f"faces of a mesh: expected for each at least three numbers from 0 to {len(corners) - 1}, of its vertices in order")
+        factors = jnp.broadcast_to(_lengths(scale, "scale of a mesh"), (3,))
+        return _placed("mesh", factors, at, turn, colour, opacity, Faces(corners, polygons))
+
+    @staticmethod
+    def from_file(path: str | os.PathLike, *, scale=1.0, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
+        """The mesh in the file `path` that `trimesh` reads, such as .stl or .obj, times `scale` (0.001 for millimetres).
+
+        `at`, `turn`, `colour`, `opacity` as for all shapes. ImportError without `trimesh`.
+        """
+        try:
+            import trimesh
+        except ImportError:
+            raise ImportError("reading a mesh from a file needs the package `trimesh`; install it with: pip install trimesh") from None
+        read = trimesh.load(os.fspath(path), force="mesh")
+        return Visual.mesh(read.vertices, read.faces, scale=scale, at=at, turn=turn, colour=colour, opacity=opacity)
+
+
+def _lengths(value, what: str, shape=None) -> Float[Array, "*shape"]:
+    value = checked_real(value, what, shape, advice="give it in m").astype(jnp.result_type(float))
+    if not is_traced(value) and not np.all(np.asarray(value) > 0):
+        raise ValueError(f"{what} is {np.asarray(value).tolist()}, expected more than zero; give it in m")
+    return value
+
+
+def _about(axis: str, kind: str, sizes, at, turn, colour, opacity) -> Visual:
+    """A shape whose own z axis lies along `axis`."""
+    k = _axis_index(axis)
+    cyclic = np.eye(3)[:, [(k + 1) % 3, (k + 2) % 3, k]]
+    placed = _placed(kind, _stack(sizes), at, turn, colour, opacity)
+    return eqx.tree_at(lambda v: v.orientation, placed, placed.orientation @ cyclic)
+
+
+def _placed(kind: str, size, at, turn, colour, opacity, faces: Faces | None = None) -> Visual:
+    at = checked_real(at, f"place of a {kind}", (3,), advice="give three components in the body frame, m").astype(jnp.result_type(float))
+    turn = jnp.eye(3) if turn is None else checked_real(turn, f"turn of a {kind}", (3, 3), advice="give a rotation matrix")
+    return _checked(Visual(kind, size, at, turn, None, faces, colour, opacity))
+
+
+def _checked(visual: Visual) -> Visual:
+    colour = visual.colour
+    if colour is not None and not (isinstance(colour, str) and len(colour) == 7 and colour[0] == "#" and set(colour[1:].lower()) <= set("0123456789abcdef")):
+        raise ValueError(f'colour of a {visual.kind} is {described(colour)}, expected six hexadecimal digits, such as "#1f77b4"')
+    if not isinstance(visual.opacity, int | float) or not 0 < visual.opacity <= 1:
+        raise ValueError(f"opacity of a {visual.kind} is {visual.opacity!r}, expected a number above 0 and at most 1")
+    return visual

@@ -1,0 +1,97 @@
+"""Motions as labelled arrays and tables, and how scenes and motions show themselves in notebooks."""
+
+import builtins
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+TIMES = jnp.linspace(0.0, 0.4, 5)
+
+
+@pytest.fixture(scope="module")
+def motion():
+    disc = jj.models.TiltingDiscQuaternion()
+    return jj.simulate(disc, jj.start(disc, **disc.example), ts=TIMES)
+
+
+@pytest.fixture(scope="module")
+def lanes():
+    chain = jj.models.TrailerChain(trailers=1)
+    return jj.rollout(
+        chain, {**chain.towing([0.0, 0.0]), "forward0": np.linspace(0.5, 2.0, 3)}, parameters={"car_mass": np.array([1.0, 2.0, 3.0])}, ts=TIMES, progress=False
+    )
+
+
+def test_a_motion_becomes_a_dataset_with_names_times_and_units(motion):
+    data = motion.to_xarray(units={"x": "m"})
+    np.testing.assert_array_equal(data.time, motion.ts)
+    for name in (*motion.scene.coordinate_names.entries, *motion.scene.speed_names.entries):
+        assert data[name].dims == ("time",)
+        np.testing.assert_array_equal(data[name], motion[name])
+    quaternion = [name for name in motion.scene.coordinate_names.entries if name.startswith("attitude")]
+    assert {data[name].attrs["units"] for name in quaternion} == {"1"}
+    assert (data.time.attrs["units"], data.x.attrs["units"], data.mass.attrs["units"]) == ("s", "m", "kg")
+    assert "units" not in data.y.attrs  # nobody said it
+    assert float(data.mass) == 1.0
+    assert (int(data.result), data.result.attrs["flag_meanings"].split()[int(data.result)]) == (0, "success")
+    assert data.attrs["scene"] == "TiltingDiscQuaternion"
+
+
+def test_a_rollout_has_an_axis_of_lanes_with_their_codes_and_parameters(lanes):
+    data = lanes.to_xarray()
+    assert data.x0.dims == ("lane", "time")
+    np.testing.assert_array_equal(data.x0, lanes["x0"])
+    np.testing.assert_array_equal(data.result, lanes.result)
+    np.testing.assert_array_equal(data.car_mass, [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(data.steps, lanes.lanes.accepted)
+    one = data.sel(lane=1).sel(time=0.2, method="nearest")
+    assert float(one.forward0) == float(lanes.lane(1)["forward0"][2])
+
+
+def test_tables_have_one_row_for_each_time_of_each_lane(motion, lanes):
+    table = motion.to_pandas()
+    np.testing.assert_array_equal(table.index, motion.ts)
+    np.testing.assert_array_equal(table["x"], motion["x"])
+    many = lanes.to_pandas()
+    assert many.index.names == ["lane", "time"]
+    np.testing.assert_array_equal(many.loc[2]["x1"], lanes.lane(2)["x1"])
+
+
+@pytest.mark.parametrize(("package", "ask"), [("xarray", "to_xarray"), ("pandas", "to_pandas")])
+def test_a_missing_package_is_named_with_what_installs_it(motion, monkeypatch, package, ask):
+    found = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.partition(".")[0] == package:
+            raise ImportError(name)
+        return found(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match=f"needs the package `{package}`, .* pip install {package}"):
+        getattr(motion, ask)()
+
+
+def test_wrong_names_and_traced_motions_are_refused(motion):
+    with pytest.raises(ValueError, match="`units` names `xx`, which is no coordinate or speed of `TiltingDiscQuaternion`"):
+        motion.to_xarray(units={"xx": "m"})
+    with pytest.raises(ValueError, match="being traced and has no numbers yet"):
+        jax.jit(lambda m: m.to_xarray() or 0)(motion)
+
+
+def test_a_scene_shows_its_parameters_with_units_in_a_notebook(lanes):
+    shown = jj.models.TiltingDisc(mass=2.5)._repr_html_()
+    for part in ("<b>TiltingDisc</b> A thin disc", ">mass</th>", ">2.5</td>", ">kg</td>", "coordinates: x, y, yaw, lean, spin", "speeds: x_rate"):
+        assert part in shown
+    assert "&lt;" in type("Odd", (jj.models.TiltingDisc,), {"__doc__": "a <b"})()._repr_html_()
+
+
+def test_a_motion_shows_its_coordinates_as_lines_in_a_notebook(motion):
+    shown = motion._repr_html_()
+    assert shown.startswith("<table>")
+    assert shown.count("<svg") == len(motion.scene.coordinate_names.entries)
+    low, high = float(motion["x"].min()), float(motion["x"].max())
+    assert f"x: {low:.3g} to {high:.3g}" in shown

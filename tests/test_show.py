@@ -1,0 +1,275 @@
+"""3D views: what the page says is what the scene says, it needs no network, and a browser draws it."""
+
+import base64
+import json
+import re
+import zlib
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from browser import needs_browser, screenshot
+
+import jourdain_jax as jj
+from jourdain_jax.plotting.guesses import guessed
+from jourdain_jax.plotting.looks import looks_of
+
+RED = "#ff0000"
+
+
+class Rolling(jj.Scene):
+    """A ball that rolls along x on a level table, with a flag on a rope from the origin."""
+
+    radius: object = jj.parameter(0.1, unit="m", positive=True)
+    coordinates = jj.coordinates("x turn")
+    example = {"x": -0.5, "x_rate": 0.5}
+
+    def bodies(self, t, q):
+        place = jnp.stack([q.x, 0.0 * q.x, self.radius])
+        moments = 0.4 * 2.0 * self.radius**2 * jnp.ones(3)
+        return {"ball": jj.RigidBody(2.0, moments, place, jj.rot_y(q.turn))}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, 9.81),)
+
+    def contacts(self, pose):
+        return {"table": jj.ball_contact(pose["ball"], self.radius)}
+
+    def visuals(self, pose):
+        return {"": [jj.Visual.line(jnp.zeros(3), pose["ball"].position, radius=0.01), jj.Visual.box((1.4, 0.5, 0.02), at=(0.0, 0.0, -0.01))]}
+
+
+@pytest.fixture(scope="module")
+def motion():
+    scene = Rolling()
+    return jj.simulate(scene, jj.start(scene, **scene.example), ts=jnp.linspace(0.0, 2.0, 9))
+
+
+@pytest.fixture(scope="module")
+def shown(motion):
+    return jj.show(motion, title="Ball & rope", colours={"ball": RED})
+
+
+def contents(page: str):
+    """Description and numbers of a page."""
+    held = dict(re.findall(r'<script id="(\w+)"[^>]*>(.*?)</script>', page, re.DOTALL))
+    floats = np.frombuffer(zlib.decompress(base64.b64decode(held["numbers"])), "<f4")
+    return json.loads(held["scene"]), lambda at: floats[at[0] : at[0] + at[1]]
+
+
+def matrix(q):
+    x, y, z, w = q
+    return np.asarray(jj.quaternion_to_matrix(jnp.array([w, x, y, z])))
+
+
+def test_a_page_holds_the_poses_that_the_scene_has(motion, shown):
+    page, numbers = contents(shown.html)
+    assert page["title"] == "Ball & rope"
+    assert "<title>Ball &amp; rope</title>" in shown.html
+    assert page["names"] == [{"name": "ball", "colour": RED}]
+    assert page["span"] == [0.0, 2.0]
+    (one,) = page["motions"]
+    np.testing.assert_allclose(numbers(one["ts"]), motion.ts, atol=1e-6)
+    ball, frame = one["bodies"]
+    expected = motion.motions()["ball"]
+    np.testing.assert_allclose(numbers(ball["p"]).reshape(-1, 3), expected.position, atol=1e-6)
+    for q, R in zip(numbers(ball["q"]).reshape(-1, 4), expected.orientation, strict=True):
+        np.testing.assert_allclose(matrix(q), R, atol=1e-6)
+    assert [(shape["kind"], shape["size"]) for shape in ball["shapes"]] == [("ellipsoid", [0.1, 0.1, 0.1])]  # known from its contact
+    rope, table = frame["shapes"]
+    np.testing.assert_allclose(numbers(rope["points"]).reshape(-1, 2, 3)[:, 1], expected.position, atol=1e-6)
+    assert (table["kind"], len(numbers(table["p"]))) == ("box", 3)
+    (path,), (force,) = one["paths"], one["forces"]
+    np.testing.assert_allclose(numbers(path["points"]).reshape(-1, 3), np.asarray(expected.position) - [0, 0, 0.1], atol=1e-6)
+    arrows = numbers(force["vectors"]).reshape(-1, 3)
+    np.testing.assert_allclose(arrows / np.linalg.norm(arrows, axis=1)[:, None], np.tile([0.0, 0.0, 1.0], (9, 1)), atol=1e-6)
+    assert "longest arrow: 19.6 N" in page["note"]  # 2 kg
+    (ground,) = page["grounds"]
+    assert (ground["kind"], ground["p"][2]) == ("plane", 0.0)
+
+
+def test_a_page_asks_for_nothing_beyond_itself_and_is_small(shown):
+    assert len(shown.html) < 1e6
+    code = zlib.decompress(base64.b64decode(re.search(r'id="three" type="text/plain">(.*?)<', shown.html)[1])).decode()
+    assert set(re.findall(r"https?://[^\"'` )]*", shown.html + code)) == {"http://www.w3.org/1999/xhtml"}  # the name of a format, no address
+    assert set(re.findall(r'(?:src|href)="([^"]*)"', shown.html)) == {"data:,"}
+    assert not re.search(r"\bimport\(|XMLHttpRequest|@import", shown.html + code)
+
+
+@pytest.mark.slow
+def test_a_ride_of_ten_seconds_is_one_file_below_a_megabyte(tmp_path):
+    bicycle = jj.models.WhippleBicycle()
+    ride = jj.simulate(bicycle, jj.start(bicycle, **bicycle.upright(4.6), lean_rate=0.3), t1=10.0)
+    path = tmp_path / "ride.html"
+    jj.show(ride, path, forces=False)
+    assert [file.name for file in tmp_path.iterdir()] == ["ride.html"]
+    assert 100_000 < path.stat().st_size < 1_000_000
+    page, numbers = contents(path.read_text())
+    assert page["follow"]
+    wheels = {body["name"]: body for body in page["motions"][0]["bodies"] if "wheel" in body["name"]}
+    assert {shape["kind"] for body in wheels.values() for shape in body["shapes"]} == {"wheel"}
+    expected = ride.motions()
+    for name, body in wheels.items():
+        np.testing.assert_allclose(numbers(body["p"]).reshape(-1, 3), expected[name].position, atol=1e-5)
+
+
+def test_a_notebook_shows_the_page_in_a_frame(shown):
+    frame = shown._repr_html_()
+    assert frame.startswith('<iframe srcdoc="&lt;!doctype html&gt;')
+    assert frame.count('"') == 6  # everything in the page is escaped
+    assert "View of Ball & rope, 0." in repr(shown)
+
+
+def test_whole_turns_between_saved_times_are_kept():
+    turns = np.array([0.1, 0.6, 0.9, 2.7, -1.3])
+    angles, ts = np.concatenate([[0.0], np.cumsum(2 * np.pi * turns)]), np.arange(6.0)
+    from jourdain_jax.plotting.page_data import _whole_turns, quaternions_of
+
+    attitudes = quaternions_of(np.array([jj.rot_y(a) for a in angles]))
+    rates = np.gradient(angles, ts, edge_order=2)
+    exact = np.concatenate([np.diff(angles), [0.0]])
+    velocities = np.zeros((6, 3))
+    velocities[:, 1] = rates
+    for k, turned in enumerate(exact[:-1]):
+        one = _whole_turns(attitudes[k : k + 2], np.array([[0, turned, 0]] * 2), np.array([0.0, 1.0]))[0]
+        a, b = attitudes[k : k + 2]
+        w = a @ b
+        shortest = 2 * np.arctan2(np.linalg.norm(a[3] * b[:3] - b[3] * a[:3] - np.cross(b[:3], a[:3])), w)
+        assert any(abs(sign * shortest + sign * 2 * np.pi * one - turned) < 1e-6 for sign in (1, -1)), (k, one, shortest, turned)
+
+
+def test_lanes_and_lists_lie_over_one_another():
+    lanes = jj.rollout(jj.models.ChaplyginSleigh(), {"heading_rate": np.linspace(0.5, 2.0, 20)}, t1=0.5, ts=np.linspace(0, 0.5, 5), progress=False)
+    page, _ = contents(jj.show(lanes).html)
+    assert len(page["motions"]) == 12
+    page, _ = contents(jj.show([lanes.lane(0), lanes.lane(7)], follow=True).html)
+    assert (len(page["motions"]), page["follow"]) == (2, True)
+    page, _ = contents(jj.show(lanes.lane(3), paths=[("sleigh", (0.1, 0, 0))]).html)
+    assert len(page["motions"][0]["paths"]) == 1
+
+
+def test_bodies_are_guessed_from_contacts_lines_and_inertias():
+    place, turned = jnp.array([1.0, 2.0, 3.0]), jj.rot_z(0.4) @ jj.rot_x(0.3)
+    box = jj.RigidBody.box(2.0, (0.2, 0.3, 0.5), position=place, orientation=turned)
+    bare = eqx.tree_at(lambda b: b.outline, box, jnp.zeros((0, 3)))
+    (by_inertia,) = guessed(bare, [], 0.01)
+    assert by_inertia.kind == "box"
+    np.testing.assert_allclose(np.sort(by_inertia.size), [0.2, 0.3, 0.5], rtol=1e-6)
+    (by_lines,) = guessed(box, [], 0.01)
+    np.testing.assert_allclose(np.ptp(by_lines.faces.corners, axis=0), [0.2, 0.3, 0.5])
+    disc = jj.RigidBody.thin_disc(1.0, 0.4, axis="x", position=place, orientation=turned)
+    (wheel,) = guessed(disc, [], 0.01)
+    assert (wheel.kind, float(wheel.size[0])) == ("wheel", pytest.approx(0.4))
+    np.testing.assert_allclose(np.abs(wheel.orientation[:, 2]), [1, 0, 0], atol=1e-9)
+    pose = jj.pose_at(jj.models.Rattleback(), 0.0, jnp.array([0.0, 0.0, 0.1, 0.2, 0.3]))
+    contact = jj.models.Rattleback().contacts(pose)["sole"]
+    stone = pose["stone"].body
+    (egg,) = guessed(stone, [contact.shape], 0.01)
+    assert egg.kind == "ellipsoid"
+    np.testing.assert_allclose(egg.position, [0, 0, -0.01], atol=1e-12)
+    np.testing.assert_allclose(egg.orientation, np.eye(3), atol=1e-12)
+    (dot,) = guessed(jj.Particle(1.0, place), [], 0.01)
+    assert float(dot.size[0]) == 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", jj.models.MODELS)
+def test_every_model_is_shown_with_shapes_on_its_ground(name):
+    scene = jj.models.model(name)
+    motion = jj.simulate(scene, jj.start(scene, **scene.example), t1=0.2, ts=jnp.linspace(0.0, 0.2, 3))
+    page, _ = contents(jj.show(motion).html)
+    shapes = {body["name"]: len(body["shapes"]) for body in page["motions"][0]["bodies"]}
+    assert all(shapes.values())
+    assert set(motion.motions().bodies) <= set(shapes)
+    drawn = looks_of(motion)
+    assert drawn.size > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ground", "lowest"),
+    [
+        (jj.Sphere(1.0, side="inside", origin=(0.0, 0.0, 1.0)), 0.0),
+        (jj.Cylinder(1.0, (0.0, 1.0, 0.0), side="outside", origin=(0.0, 0.0, -1.0)), -2.0),
+        (jj.HeightMap(lambda x, y: 0.1 * x**2 + 0.2 * y**2), 0.0),
+        (jj.Surface(lambda x, y, z: z - 0.1 * x**2), 0.0),
+    ],
+    ids=["sphere", "cylinder", "height map", "surface"],
+)
+def test_grounds_of_every_kind_are_drawn_where_they_are(ground, lowest):
+    class OnGround(jj.Scene):
+        coordinates = jj.coordinates("x y z", jj.quaternion("attitude"))
+
+        def bodies(self, t, q):
+            return {"ball": jj.RigidBody.ball(1.0, 0.1, position=jnp.stack([q.x, q.y, q.z]), orientation=jj.quaternion_to_matrix(q.attitude))}
+
+        def contacts(self, pose):
+            return {"ground": jj.ball_contact(pose["ball"], 0.1, ground=ground, height="row")}
+
+    scene = OnGround()
+    motion = jj.simulate(scene, jj.start(scene, x=0.05, z=0.11, x_rate=0.1), ts=jnp.linspace(0.0, 0.3, 3))
+    page, numbers = contents(jj.show(motion).html)
+    (drawn,) = page["grounds"]
+    corners = numbers(drawn["mesh"]).reshape(-1, 3)
+    assert corners[:, 2].min() == pytest.approx(lowest, abs=2e-3)
+    np.testing.assert_allclose([float(ground.value(corner)) for corner in corners[:: len(corners) // 20]], 0.0, atol=1e-5)
+
+
+def test_what_cannot_be_shown_is_refused_with_advice(motion, tmp_path):
+    with pytest.raises(ValueError, match=r"`show` was given .*expected a motion from `jj.simulate`"):
+        jj.show(Rolling())
+    with pytest.raises(ValueError, match=r"a 3D view is a .html file; for a .gif use `jj.animate`"):
+        jj.show(motion, "ride.gif")
+    with pytest.raises(ValueError, match="there is no folder"):
+        jj.show(motion, tmp_path / "missing" / "ride.html")
+    with pytest.raises(ValueError, match="`colours` names `bal`, which is no body; did you mean `ball`"):
+        jj.show(motion, colours={"bal": RED})
+    with pytest.raises(ValueError, match="expected elevation and azimuth"):
+        jj.show(motion, view=(1.0, 2.0, 3.0))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: jj.Visual.ball(-1.0), "radius of a ball is -1.0, expected more than zero"),
+        (lambda: jj.Visual.ball(1.0, colour="red"), 'expected six hexadecimal digits, such as "#1f77b4"'),
+        (lambda: jj.Visual.ball(1.0, opacity=2.0), "opacity of a ellipsoid is 2.0"),
+        (lambda: jj.Visual.line((0.0, 0.0, 0.0)), "has 1 points, expected at least two"),
+        (lambda: jj.Visual.wheel(1.0, axis="w"), "body axis `w` is unknown"),
+        (lambda: jj.Visual.mesh(np.zeros((4, 2)), [(0, 1, 2)]), r"expected \(points, 3\)"),
+        (lambda: jj.Visual.mesh(np.zeros((4, 3)), [(0, 1, 4)]), "numbers from 0 to 3"),
+    ],
+)
+def test_a_shape_that_cannot_be_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_looks_of_bodies_that_do_not_exist_are_refused(motion):
+    class Misnamed(Rolling):
+        def visuals(self, pose):
+            return {"bal": jj.Visual.ball(0.1)}
+
+    class Wrong(Rolling):
+        def visuals(self, pose):
+            return {"ball": 0.1}
+
+    for kind, message in ((Misnamed, "names `bal`, which is no body"), (Wrong, "gives .* for `ball`, expected shapes")):
+        with pytest.raises(ValueError, match=message):
+            jj.show(eqx.tree_at(lambda m: m.scene, motion, kind()))
+
+
+@needs_browser
+def test_a_browser_draws_the_ball_where_it_is(shown, motion, tmp_path):
+    # seen along y, the ball goes from left to right through the middle of the picture
+    jj.show(motion, tmp_path / "ball.html", colours={"ball": RED}, view=(30.0, -90.0), forces=False, paths=[])
+    places = []
+    for t in (0.0, 1.0, 2.0):
+        pixels = screenshot(f"file://{tmp_path}/ball.html#t={t}", tmp_path / f"{t}.png")
+        red = (pixels[..., 0] > 0.35) & (pixels[..., 1:].max(axis=-1) < 0.3 * pixels[..., 0])
+        assert 200 < red.sum() < 0.1 * red.size
+        places.append(np.mean(np.nonzero(red)[1]) / pixels.shape[1])
+    assert places[1] == pytest.approx(0.5, abs=0.02)
+    assert places[0] == pytest.approx(1.0 - places[2], abs=0.02)
+    assert places[0] < 0.3
