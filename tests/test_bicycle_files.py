@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jourdain_jax.bicycle.parameter_files import read_bicycle, shipped_bicycles
+import jourdain_jax as jj
+from jourdain_jax.bicycle.parameter_files import measured_bicycle, read_bicycle, shipped_bicycles
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, PARAMETERS
 from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
 
@@ -166,3 +167,17 @@ def test_a_quantity_that_no_sample_has_has_no_limits():
     result = interval(jnp.full(10, jnp.nan), nominal=jnp.nan)
     assert np.isnan([result.value, result.low, result.high]).all()
     assert float(result.fraction) == 0.0
+
+
+def test_a_measured_bicycle_is_a_scene_and_a_prior():
+    bicycle = measured_bicycle("Browser")
+    assert bicycle.values == read_bicycle(shipped_bicycles()["Browser"]).values
+    assert {name: float(getattr(bicycle.scene, name)) for name in bicycle.values} == bicycle.values
+    assert {name: (prior.mean, prior.sigma) for name, prior in bicycle.prior.items()} == {
+        name: (bicycle.values[name], sigma) for name, sigma in bicycle.sigmas.items() if sigma > 0
+    }
+    design = jj.Study(bicycle.scene, vary=bicycle.prior, sampler="sobol", samples=1024).design
+    trail = design.values()["c"]
+    np.testing.assert_allclose([np.mean(trail), np.std(trail)], [bicycle.values["c"], bicycle.sigmas["c"]], rtol=0.01)
+    with pytest.raises(ValueError, match=r"no measured bicycle `Browsr`.*Browser"):
+        measured_bicycle("Browsr")

@@ -2,7 +2,7 @@
 
 from jourdain_jax.bicycle.job import Refused, Study, run, study, table, write_results
 from jourdain_jax.bicycle.linear import linear_matrices, upright_running
-from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, read_bicycle, shipped_bicycles
+from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, measured_bicycle, read_bicycle, shipped_bicycles
 from jourdain_jax.bicycle.stability import StabilitySpeeds, eigenvalues, stability_speeds
 from jourdain_jax.bicycle.uncertainty import Interval, ParameterSamples, interval, sample_parameters
 
@@ -16,6 +16,7 @@ __all__ = [
     "eigenvalues",
     "interval",
     "linear_matrices",
+    "measured_bicycle",
     "read_bicycle",
     "run",
     "sample_parameters",

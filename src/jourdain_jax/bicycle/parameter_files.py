@@ -12,6 +12,10 @@ from pathlib import Path
 
 import equinox as eqx
 
+from jourdain_jax.ensembles.distributions import Normal
+from jourdain_jax.models.whipple_bicycle import WhippleBicycle
+from jourdain_jax.scene.names import nearest
+
 from .parameters import PARAMETER_NAMES, doubts, violations
 
 _LARGEST_FILE = 1_000_000  # bytes; a parameter file has about a thousand
@@ -32,6 +36,27 @@ class MeasuredBicycle(eqx.Module):
     without_sigma: tuple[str, ...] = eqx.field(static=True)  # names whose sigma the file does not give
     ignored: tuple[str, ...] = eqx.field(static=True)  # names in the file that the Whipple bicycle does not use
     warnings: tuple[str, ...] = eqx.field(static=True)  # sentences: odd values, taken as they are
+
+    @property
+    def scene(self) -> WhippleBicycle:
+        """The bicycle as a scene, with the measured values."""
+        return WhippleBicycle(**self.values)
+
+    @property
+    def prior(self) -> dict[str, Normal]:
+        """How the parameters are distributed by their measurement, for `jj.Study(bicycle.scene, vary=bicycle.prior)`: independent, and none without sigma."""
+        return {name: Normal(self.values[name], sigma) for name, sigma in self.sigmas.items() if sigma > 0}
+
+
+def measured_bicycle(name: str) -> MeasuredBicycle:
+    """One of the bicycles that come with the package, by its name: `measured_bicycle("Browser")`.
+
+    **Raises** ValueError: an unknown name, with the nearest known ones; and as `read_bicycle`.
+    """
+    known = shipped_bicycles()
+    if name not in known:
+        raise ValueError(f"there is no measured bicycle `{name}`; {nearest(name, known)}")
+    return read_bicycle(known[name])
 
 
 def shipped_bicycles() -> dict[str, Path]:
