@@ -124,9 +124,9 @@ def memory(lanes: int, folder: Path) -> Iterator[dict]:
 
 
 def processes(lanes: int, folder: Path) -> Iterator[dict]:
-    """Two processes over one, start and compilation included."""
-    one = in_fresh_process(5 * lanes, folder / "processes", threads=1)["wall"]
-    two = in_fresh_process(5 * lanes, folder / "processes", processes=2)["wall"]
+    """Two processes over one, of some minutes: their start and compilation, some ten seconds, are included."""
+    one = in_fresh_process(40 * lanes, folder / "processes", threads=1)["wall"]
+    two = in_fresh_process(40 * lanes, folder / "processes", processes=2)["wall"]
     yield figure("wall time by one process with one thread over that by two processes", one / two, 1.8, at_least=True)
 
 
