@@ -7,6 +7,7 @@ Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +33,8 @@ from jourdain_jax.scene.scene import Scene
 
 _NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
 _LEAST_SIGMA = 1e-12  # of a channel that is met exactly
+_POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
+_SPANS, _STEPS, _ROUGHLY = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2), 12, 0.05  # shares of the span that a fit grows over; steps tried on each, and their tolerance
 _FEWEST_RUNS = 5  # that tell how much runs differ
 
 
@@ -57,11 +60,14 @@ def fit(
     - `cutoff`: singular values of the scaled Jacobian below this fraction of the largest count as zero (`Information`). Keep it
       well above the relative accuracy of the simulation.
     - `tolerance`: the fit has converged when a step changes no residual by more than about this many sigmas, and no unknown by
-      more than about this fraction. `max_iterations`: steps tried at most.
+      more than about this fraction. `max_iterations`: steps tried at most, over each span.
     - `loss`: `huber()` or `student_t()` where some samples are far out (default: least squares).
     - `errors`: whence standard errors and intervals come. "sigmas": from the sigmas, which holds for noise that is white. "runs": from how much runs differ
       (the sandwich of clusters, which needs five runs or more), which holds whatever the noise within a run, also where the scene is not quite right.
     - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events are ignored.
+
+    Where that finds no minimum, or one whose residuals are far beyond their sigmas, the fit is made once more over growing spans: the first 1/32 of each
+    run, then more of it, each from where the shorter one ended. The lower minimum counts, and `Fit.grown` says which one it was.
 
     **Returns** a `Fit`: estimates with covariance and 95 % intervals (sigmas that were given are taken as known), residuals, the fitted
     scene, and in words what the measurements cannot tell. An unknown at its bound has a one-sided interval, by profile likelihood. `converged` is False
@@ -121,7 +127,24 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
         problem = _Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members), loss or LEAST_SQUARES)
         theta = np.broadcast_to(unknowns.guess, (members or 1, unknowns.guess.size))
         limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
-        return _result(problem, minimise(problem.linearised, theta, limits, control), limits, control, errors)
+        return _result(problem, _minimum(problem, theta, limits, control), limits, control, errors)
+
+
+def _minimum(problem: "_Problem", theta: np.ndarray, limits: Limits, control: Control) -> Minimum:
+    """The minimum from `theta`; where none is found, or one that leaves residuals far beyond their sigmas, the lower one of it and that over growing spans.
+
+    Over a short span a motion depends on its unknowns almost linearly; each fit begins where that over the shorter span ended.
+    """
+    found = minimise(problem.linearised, theta, limits, control)
+    poor = np.flatnonzero(~found.converged | (found.at.cost > 0.5 * _POOR * problem.samples))
+    if not poor.size or not problem.samples:
+        return found
+    begin, steps = theta[poor], found.steps[poor]
+    roughly = replace(control, most_steps=min(_STEPS, control.most_steps), tolerance=_ROUGHLY)
+    for problem.share, how in (*((share, roughly) for share in _SPANS), (1.0, control)):
+        grown = minimise(lambda x, here: problem.linearised(x, poor[here]), begin, limits, how)
+        begin, steps = grown.theta, steps + grown.steps
+    return found.lowered(poor, replace(grown, steps=steps))
 
 
 def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:
@@ -162,6 +185,7 @@ class _Problem:
     def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss):
         self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
+        self.share = 1.0  # of each run's span, from its start: samples beyond do not count
 
     def linearised(self, theta: np.ndarray, members: np.ndarray) -> Linearised:
         """What is minimised, with its arrow, of some members: sum of rho(r); for channels whose sigma is not known, n log sigma with sigma^2 = mean r^2."""
@@ -171,6 +195,9 @@ class _Problem:
         cost, squares, samples = np.zeros(count), np.zeros((count, kinds)), self.lanes.counted(self.estimated, members)
         residual = np.empty((count, runs), object)
         for b, j, r, J in self.lanes.evaluate(shared, local, members):
+            if self.share < 1:
+                early = self.lanes.within(j, self.share)
+                r, J = np.where(early, r, 0.0), np.where(early[..., None], J, 0.0)
             with np.errstate(over="ignore", invalid="ignore"):
                 for k, (rows, counted) in enumerate(self._kinds(int(j[0]), r)):
                     root = np.sqrt(self.loss.weight(rows))
@@ -189,6 +216,12 @@ class _Problem:
         scaled = np.where(finite[:, None, None, None, None], triangles, 0.0) / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
         together = scaled[:, :, 0] if kinds == 1 else np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
         return Linearised(np.where(finite, cost, np.inf), arrow(together, m), residual, sigma)
+
+    @property
+    def samples(self) -> int:
+        """How many samples there are of channels whose sigma is known, in one repeat."""
+        channels = [(run, name) for i, run in enumerate(self.runs) for name in run.values if name not in self.estimated]
+        return sum(int(np.prod(np.shape(run.values[name])[int(self.lanes.members is not None) :])) for run, name in channels)
 
     def by_channel(self, run: int, found: Minimum, one: Callable) -> dict[str, np.ndarray]:
         """Residuals of a run in units of sigma by channel; NaN where a sample is missing, or they were not worked out since another run had failed."""
@@ -259,6 +292,7 @@ def _result(problem: _Problem, found: Minimum, limits: Limits, control: Control,
         converged=one(found.converged),
         stuck=one(found.stuck),
         steps=one(found.steps),
+        grown=one(found.grown),
         labels=unknowns.labels,
         units=unknowns.units,
         cutoff=control.cutoff,

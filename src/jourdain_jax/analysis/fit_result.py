@@ -60,6 +60,7 @@ class Fit(Printed, eqx.Module):
     converged: Bool[np.ndarray, "*repeats"]
     stuck: Bool[np.ndarray, "*repeats"]  # no step lowers the sum of squares, however short, and this is no minimum
     steps: Int[np.ndarray, "*repeats"]  # tried
+    grown: Bool[np.ndarray, "*repeats"]  # whether the minimum was found over growing spans, far from where the first guess led to
     labels: tuple[str, ...] = eqx.field(static=True)  # names of the unknowns
     units: tuple[str, ...] = eqx.field(static=True)
     cutoff: float = eqx.field(static=True)
@@ -191,6 +192,8 @@ def _text(fit: Fit) -> str:
         f"{int(fit.samples)} samples, {len(fit.labels)} unknowns, reduced chi-square {float(fit.reduced_chi_square):.4g}"
     ]
     lines += [f"WARNING: {sentence}" for sentence in fit.warnings]
+    if fit.grown:
+        lines.append("found over growing spans: the first guess led elsewhere")
     if fit.errors == "runs":
         lines.append(f"standard errors from how much the {len(fit.residuals)} runs differ")
     lines += [f"sigma of `{name}`, estimated: {float(sigma):.4g}" for name, sigma in fit.sigma.items()]

@@ -59,6 +59,19 @@ class Minimum:
     converged: Bool[np.ndarray, "members"]
     stuck: Bool[np.ndarray, "members"]  # no step lowers F, however short, and this is no minimum
     steps: Int[np.ndarray, "members"]  # tried
+    grown: Bool[np.ndarray, "members"]  # whether it was found over growing spans
+
+    def lowered(self, members: Int[np.ndarray, "some"], grown: "Minimum") -> "Minimum":
+        """With the minima of these members found over growing spans, where they are lower."""
+        lower = grown.at.cost < self.at.cost[members]
+        here = members[lower]
+        for kept, new in ((self.theta, grown.theta), (self.at.cost, grown.at.cost), (self.converged, grown.converged), (self.stuck, grown.stuck)):
+            kept[here] = new[lower]
+        self.steps[members], self.grown[here] = grown.steps, True
+        self.at.residual[here], self.at.sigma[here] = grown.at.residual[lower], grown.at.sigma[lower]
+        for kept, new in zip(self.at.arrow.arrays, grown.at.arrow.arrays, strict=True):
+            kept[here] = new[lower]
+        return self
 
 
 def minimise(
@@ -107,7 +120,7 @@ def minimise(
         fall[here] = np.where(better, np.minimum(1.5 * fall[here], FASTEST), 2.0)
         lost = damping[here] > MOST
         stuck[here[lost]], going[here[lost]] = True, False
-    return Minimum(theta, at, converged, stuck, steps)
+    return Minimum(theta, at, converged, stuck, steps, np.zeros(len(theta), bool))
 
 
 def _step(arrow: Arrow, theta, damping, limits: Limits, cutoff: float) -> np.ndarray:

@@ -106,6 +106,11 @@ class Lanes:
         """Where the samples of each channel are in the residuals of a run."""
         return self._group_of(run).channels
 
+    def within(self, runs: np.ndarray, share: float) -> np.ndarray:
+        """Which samples (lanes, samples) of these runs, of equal structure, lie in the first `share` of a run's span."""
+        group = self._group_of(int(runs[0]))
+        return group.within([group.indices.index(run) for run in runs.tolist()], share)
+
     def by_channel(self, run: int, flat: Float[np.ndarray, "*members samples"]) -> dict[str, np.ndarray]:
         """Weighted residuals of a run by channel, NaN where a sample is missing."""
         group = self._group_of(run)
@@ -179,6 +184,13 @@ class _Group:
     def weights(self) -> dict[str, np.ndarray]:
         """Weights by channel, shape (runs, *members, times, *channel)."""
         return self._arrays.weights
+
+    def within(self, places: list[int], share: float) -> np.ndarray:
+        """Which samples of the runs at these places lie in the first `share` of the span, shape (lanes, samples)."""
+        ts, t0 = (np.asarray(x)[places] for x in (self._arrays.ts, self._arrays.t0))
+        early = np.abs(ts - t0[:, None]) <= share * np.abs(ts[:, -1] - t0)[:, None]
+        counts = [(where.stop - where.start) // early.shape[1] for where in self.channels.values()]
+        return np.concatenate([np.repeat(early, count, axis=1) for count in counts], axis=1)
 
     def by_channel(self, place: int, flat, times: int) -> dict[str, np.ndarray]:
         """Residuals of the run at this place by channel; all NaN where `flat` is empty, since they were not worked out."""

@@ -1,0 +1,65 @@
+"""Fits from first guesses that are far from the minimum: over growing spans."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+TS, SIGMA = np.linspace(0.0, 40.0, 201), 0.01
+
+
+class Oscillator(jj.Scene):
+    mass: object = jj.parameter(2.0, positive=True)
+    damping: object = jj.parameter(0.1, positive=True)
+    stiffness: object = jj.parameter(18.0, positive=True)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-self.stiffness * motion.q.x - self.damping * motion.u.x_rate),)
+
+
+def exact(t):
+    """x of the default oscillator, which begins at 0.5 at rest: decay 0.025/s."""
+    decay, w = 0.025, np.sqrt(9.0 - 0.025**2)
+    return 0.5 * np.exp(-decay * t) * (np.cos(w * t) + decay / w * np.sin(w * t))
+
+
+def data(seed, repeats=(), more=0.0):
+    noise = SIGMA * np.random.default_rng(seed).normal(size=(*repeats, len(TS)))
+    return jj.Measurements(TS, {"x": exact(TS) + more + noise}, SIGMA, start={"x": 0.5})
+
+
+FREE = ("stiffness",)
+
+
+@pytest.mark.parametrize("factor", [0.35, 3.0])
+def test_a_frequency_far_from_the_guess_is_found_over_growing_spans(factor):
+    found = jj.fit(Oscillator(stiffness=18.0 * factor), data(0), FREE)
+    assert found.converged
+    assert found.grown
+    assert not found.warnings
+    assert abs(found["stiffness"].value - 18.0) < 4 * found["stiffness"].standard_error
+    assert "found over growing spans" in str(found)
+    near = jj.fit(Oscillator(stiffness=18.5), data(0), FREE)
+    assert not near.grown
+    np.testing.assert_allclose(found.values, near.values, atol=1e-3 * near.standard_errors.min())
+
+
+def test_repeats_that_end_in_a_local_minimum_are_fitted_again_alone():
+    measured = data(1, (5,), more=3.0 * (np.arange(5) == 3)[:, None])  # no parameters give the fourth
+    found = jj.fit_batch(Oscillator(stiffness=50.0), measured, FREE)
+    assert found.grown[[0, 1, 2, 4]].all()
+    good = [0, 1, 2, 4]
+    np.testing.assert_allclose(found["stiffness"].value[good], 18.0, atol=4 * found["stiffness"].standard_error[good].max())
+    assert found.reduced_chi_square[3] > 100
+    alone = jj.fit(Oscillator(stiffness=50.0), jj.Measurements(TS, {"x": measured.values["x"][2]}, SIGMA, start={"x": 0.5}), FREE)
+    np.testing.assert_allclose(found.values[2], alone.values, rtol=1e-9)
+
+
+def test_a_scene_that_is_not_right_is_warned_of_all_the_same():
+    found = jj.fit(Oscillator(stiffness=50.0), data(2, more=0.3 * np.sin(7.0 * TS)), FREE)
+    assert "larger than the sigmas allow" in " ".join(found.warnings)
