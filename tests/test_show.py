@@ -208,7 +208,7 @@ def test_grounds_of_every_kind_are_drawn_where_they_are(ground, lowest):
             return {"ground": jj.ball_contact(pose["ball"], 0.1, ground=ground, height="row")}
 
     scene = OnGround()
-    motion = jj.simulate(scene, jj.start(scene, x=0.05, z=0.11, x_rate=0.1), ts=jnp.linspace(0.0, 0.3, 3))
+    motion = jj.simulate(scene, jj.start(scene, x=0.05, x_rate=0.1), ts=jnp.linspace(0.0, 0.3, 3))
     page, numbers = contents(jj.show(motion).html)
     (drawn,) = page["grounds"]
     corners = numbers(drawn["mesh"]).reshape(-1, 3)
