@@ -62,11 +62,12 @@ class Drawn:
     bodies: dict[str, DrawnBody]
     contacts: dict[str, Contact]  # leading axis: times
     size: float  # m: the longest side of the box that holds all bodies at the first time
+    dot: float  # m: radius of particles, which have no size
 
     def at(self, chosen: np.ndarray) -> "Drawn":
         """The same at the `chosen` ones of its times."""
         bodies = {name: body.at(chosen) for name, body in self.bodies.items()}
-        return Drawn(self.ts[chosen], self.reached[chosen], bodies, _at(self.contacts, chosen), self.size)
+        return Drawn(self.ts[chosen], self.reached[chosen], bodies, _at(self.contacts, chosen), self.size, self.dot)
 
 
 def looks_of(trajectory: Trajectory, what: str = "draw") -> Drawn:
@@ -92,7 +93,7 @@ def looks_of(trajectory: Trajectory, what: str = "draw") -> Drawn:
     if stated.get(""):
         still = np.zeros((len(reached), 3))
         drawn[""] = DrawnBody("", PLAIN, still, np.broadcast_to(np.eye(3), (len(reached), 3, 3)), still, [_look(v, size) for v in stated[""]])
-    return Drawn(np.asarray(trajectory.ts)[reached], reached, drawn, contacts, size)
+    return Drawn(np.asarray(trajectory.ts)[reached], reached, drawn, contacts, size, dot)
 
 
 def _seen(scene, t, q, u, inputs):
