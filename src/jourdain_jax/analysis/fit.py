@@ -30,6 +30,7 @@ from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
 _LEAST_SIGMA = 1e-12  # of a channel that is met exactly
@@ -38,6 +39,7 @@ _SPANS, _STEPS, _ROUGHLY = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2), 12, 0.05  # sh
 _FEWEST_RUNS = 5  # that tell how much runs differ
 
 
+@shown_from_users_lines
 def fit(
     scene: Scene | BuiltFor,
     data: Measurements | Sequence[Measurements],

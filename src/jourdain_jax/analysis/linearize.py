@@ -32,6 +32,7 @@ from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 
 class Modes(eqx.Module):
@@ -89,6 +90,7 @@ class Linearization(Printed, eqx.Module):
         return jnp.concatenate([jnp.eye(k, 2 * k, k, dtype=lower.dtype), lower])
 
 
+@shown_from_users_lines
 def linearize(
     scene: Scene | BuiltFor,
     state: State | dict | None,

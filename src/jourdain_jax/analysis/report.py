@@ -16,6 +16,7 @@ from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.scene.arguments import BuiltFor
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _LABEL = 26  # width of the first column
 _LINE = 120
@@ -131,6 +132,7 @@ class Report(Printed):
         return f"{worst}, typically {self.typical_pivot:.2g} (1 is best)"
 
 
+@shown_from_users_lines
 def report(scene: Scene | BuiltFor, *, depth: int = 4, start: State | dict | None = None) -> Report:
     """Degrees of freedom, rows, rank, redundancy, integrability, growth vector, cyclic and ignorable coordinates of a scene.
 

@@ -29,6 +29,7 @@ from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _FINAL_STEPS = 3
 _FARTHEST = 0.5  # of the width of the domain: how far a coordinate moves in one step of the search
@@ -53,6 +54,7 @@ class SteadyMotion(Printed, eqx.Module):
         return f"{found}: residual {self.residual:.1e} (accelerations {self.acceleration:.1e})\n{self.state}"
 
 
+@shown_from_users_lines
 def steady(
     scene: Scene | BuiltFor,
     guess: "State | dict",

@@ -39,9 +39,11 @@ from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
 from jourdain_jax.scene.validated import loads_of, potential_of
 
 
+@shown_from_users_lines
 def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: Numbers | dict | None = None, *, seed: int = 0) -> Verification:
     """Check the equations of a scene, and what it states, at a consistent state; a failed check names its culprit.
 

@@ -12,6 +12,7 @@ from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,7 @@ class Built(BuiltFor, Printed):
         return "\n".join(chain(lines, (f"  {name:18s}{text}" for name, text in facts.items()), (f"  WARNING           {text}" for text in self.warnings)))
 
 
+@shown_from_users_lines
 def build(scene: Scene | BuiltFor) -> Built:
     """Everything that is found once about a scene: rank, redundant rows, privileged speeds, what depends on time, what is conserved, the scalar program.
 

@@ -33,11 +33,13 @@ from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 TOLERANCE, MOST_STEPS = 1e-8, 100_000
 _OFF = 1e4  # units of round-off: a residual that is more
 
 
+@shown_from_users_lines
 def simulate(
     scene: Scene | BuiltFor,
     start=None,

@@ -29,6 +29,7 @@ from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 FAR = 10.0  # widths of the domain: a coordinate that Newton's method moves by more has run away
 GUESSES = 8  # of each kind
@@ -190,6 +191,7 @@ _compiled_projection = quickly_compiled(_put_onto_constraints, run_seldom=True) 
 _uncompiled_projection = eval_numpy(_put_onto_constraints)
 
 
+@shown_from_users_lines
 def start(scene: Scene | BuiltFor, *, t0: Number = 0.0, inputs=None, **values) -> State:
     """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`.
 

@@ -1,1 +1,1 @@
-"""Pictures of motions: quantities against time, bodies in space. Needs the extra `plot` (matplotlib)."""
+"""Pictures of motions: quantities against time, bodies in space (by matplotlib, the extra `plot`), and 3D views for a browser."""

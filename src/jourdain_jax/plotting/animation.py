@@ -7,12 +7,23 @@ import numpy as np
 
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
-from jourdain_jax.plotting.looks import looks_of
-from jourdain_jax.plotting.solids import parts_in_space, shaded
+from jourdain_jax.plotting.looks import Look, looks_of
+from jourdain_jax.plotting.solids import parts_of, rgb
 from jourdain_jax.scene.numbers import described
 
 FRAMES = 60
 _LIGHT = np.array([0.1, -0.6, 0.79])  # unit vector towards the light
+
+
+class _Polygons:
+    """The faces of a look in its own axes: all corners (corners, 3), where each but the last face ends, normals (faces, 3), and how bright they are painted."""
+
+    def __init__(self, look: Look, k: int):
+        faces = [face for part in parts_of(look, k) for face in part]
+        self.corners = np.concatenate([face.corners for face in faces])
+        self.ends = np.cumsum([len(face.corners) for face in faces])[:-1]
+        self.normals = np.array([face.normal() for face in faces])
+        self.bright = np.array([1 - face.dark for face in faces])
 
 
 class _Figure:
@@ -22,19 +33,27 @@ class _Figure:
         whole = looks_of(trajectory, "animate")
         self.drawn = whole.at(np.unique(np.linspace(0, len(whole.ts) - 1, min(frames, len(whole.ts))).astype(int)))
         self.ts, self.bodies = self.drawn.ts, {name: body for name, body in self.drawn.bodies.items() if name}
+        self._known: dict = {}  # polygons of the looks that keep their shape
         self.faces, self.colours = zip(*(self._frame(k) for k in range(len(self.ts))), strict=True)
         self.boxes = [(np.concatenate(faces).min(axis=0), np.concatenate(faces).max(axis=0)) for faces in self.faces]
         ends = [(name, (0.0, 0.0, 0.0)) for name in self.bodies] if paths is None else list(paths)
         self.paths = [np.asarray(trajectory.point(name, local))[self.drawn.reached] for name, local in ends]
 
     def _frame(self, k: int) -> tuple[list[np.ndarray], np.ndarray]:
+        """Polygons in space and their colours, in the light."""
         faces, colours = [], []
         for body in self.drawn.bodies.values():
-            for look, part in parts_in_space(body, k):
-                for face in part:
-                    faces.append(face.corners)
-                    colours.append(shaded(face, look.visual.colour or body.colour, _LIGHT, look.visual.opacity))
-        return faces, np.array(colours)
+            for look in body.looks:
+                key = id(look) if look.visual.kind != "line" or len(np.unique(look.points, axis=0)) == 1 else (id(look), k)
+                if key not in self._known:
+                    self._known[key] = _Polygons(look, k)
+                own, turn, at = self._known[key], body.orientations[k], body.positions[k]
+                if look.visual.kind != "line":
+                    turn, at = turn @ look.orientations[k], turn @ look.positions[k] + at
+                faces += np.split(own.corners @ turn.T + at, own.ends)
+                shade = (0.62 + 0.38 * np.maximum(own.normals @ (turn.T @ _LIGHT), 0.0)) * own.bright
+                colours.append(np.column_stack([shade[:, None] * rgb(look.visual.colour or body.colour), np.full(len(shade), look.visual.opacity)]))
+        return faces, np.concatenate(colours)
 
     def extent(self) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the box that holds everything."""

@@ -8,7 +8,7 @@ from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.looks import Drawn
 from jourdain_jax.scene.contacts import Contact
-from jourdain_jax.scene.grounds import Cylinder, HeightMap, Sphere
+from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere
 from jourdain_jax.scene.validated import contacts_of
 
 _CELLS = 48  # of a mesh, along each of its two parameters
@@ -19,6 +19,8 @@ def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.n
     """Planes {kind, origin, axes} and meshes {kind, triangles (n, 3, 3)} within or around the box from `low` to `high`, m, as they are at the first time."""
     found: list[dict] = []
     for name, contact in drawn.contacts.items():
+        if _moves(contact):  # the body that carries it shows it
+            continue
         found += [ground for ground in (_ground(trajectory, drawn, name, contact, low, high),) if not any(_same(ground, other) for other in found)]
     return found or [_floor(low, high)]
 
@@ -38,6 +40,12 @@ def _ground(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, l
     return _plane(np.asarray(plane.origin)[0], np.stack([*np.asarray(plane.tangents)[0], np.asarray(plane.normal)[0]], axis=1), low, high)
 
 
+def _moves(contact: Contact) -> bool:
+    """Whether the contact is with a plane that changes its place."""
+    normals, offsets = np.asarray(contact.plane.normal), np.sum(np.asarray(contact.plane.origin) * np.asarray(contact.plane.normal), axis=1)
+    return isinstance(contact.ground, Plane) and bool(np.ptp(normals, axis=0).max() > 1e-9 or np.ptp(offsets) > 1e-9 * (1 + np.abs(offsets).max()))
+
+
 def _plane(origin, axes, low, high) -> dict:
     """The plane, its middle below the middle of the box."""
     normal, middle = axes[:, 2], (low + high) / 2
@@ -47,7 +55,7 @@ def _plane(origin, axes, low, high) -> dict:
 def _floor(low, high) -> dict:
     """A floor: z = 0 where bodies stand on it, else below them."""
     side = float(max(high - low))
-    base = 0.0 if -0.05 * side < low[2] < 0.2 * side else low[2] - 0.05 * side
+    base = 0.0 if -0.01 * side < low[2] < 0.2 * side else low[2] - 0.05 * side
     return _plane(np.array([0.0, 0.0, base]), np.eye(3), low, high)
 
 

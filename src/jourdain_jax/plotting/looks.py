@@ -62,11 +62,12 @@ class Drawn:
     bodies: dict[str, DrawnBody]
     contacts: dict[str, Contact]  # leading axis: times
     size: float  # m: the longest side of the box that holds all bodies at the first time
+    sized: bool  # whether any body has a size of its own; particles are drawn as large as the picture asks
 
     def at(self, chosen: np.ndarray) -> "Drawn":
         """The same at the `chosen` ones of its times."""
         bodies = {name: body.at(chosen) for name, body in self.bodies.items()}
-        return Drawn(self.ts[chosen], self.reached[chosen], bodies, _at(self.contacts, chosen), self.size)
+        return Drawn(self.ts[chosen], self.reached[chosen], bodies, _at(self.contacts, chosen), self.size, self.sized)
 
 
 def looks_of(trajectory: Trajectory, what: str = "draw") -> Drawn:
@@ -80,6 +81,7 @@ def looks_of(trajectory: Trajectory, what: str = "draw") -> Drawn:
     # a particle that moves far is small in the picture: what has no size is measured by the whole motion, if there is nothing else
     dot = _DOT * max(float(np.ptp(paths, axis=0).max()), 1e-3)
     stated = {name: list(looks) for name, looks in visuals.items()}
+    sized = any(isinstance(body, RigidBody) or name in stated for name, body in first.items())
     for name, body in first.items():
         if name not in stated:
             shapes = [_at(contact.shape, 0) for contact in contacts.values() if contact.body == name and contact.shape is not None]
@@ -92,7 +94,7 @@ def looks_of(trajectory: Trajectory, what: str = "draw") -> Drawn:
     if stated.get(""):
         still = np.zeros((len(reached), 3))
         drawn[""] = DrawnBody("", PLAIN, still, np.broadcast_to(np.eye(3), (len(reached), 3, 3)), still, [_look(v, size) for v in stated[""]])
-    return Drawn(np.asarray(trajectory.ts)[reached], reached, drawn, contacts, size)
+    return Drawn(np.asarray(trajectory.ts)[reached], reached, drawn, contacts, size, sized)
 
 
 def _seen(scene, t, q, u, inputs):

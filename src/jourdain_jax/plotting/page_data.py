@@ -51,7 +51,7 @@ def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dic
     numbers, first = Numbers(), drawn[0]
     near, far = _near(drawn), _far(drawn)
     colours = {name: body.colour for one in drawn for name, body in one.bodies.items() if name}
-    follow = far.longest > _LONG * near.longest and not _at_rest(first) if options["follow"] is None else options["follow"]
+    follow = first.sized and far.longest > _LONG * near.longest and not _at_rest(first) if options["follow"] is None else options["follow"]
     shown = near.longest if follow else max(near.longest, far.longest / 3)
     arrows, strongest = _arrows(motions, drawn, shown) if options["forces"] else ([[] for _ in drawn], 0.0)
     tile = _round_number(shown / 4)
@@ -70,7 +70,7 @@ def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dic
         "reach": far.longest,
         "near": [near.low.tolist(), near.high.tolist()],
         "far": [far.low.tolist(), far.high.tolist()],
-        "ground": 3 * far.longest + 60 * near.longest,
+        "ground": 12 * far.longest + 60 * near.longest,
         "tile": tile,
         "thickness": 0.018 * shown,
         "follow": bool(follow),

@@ -31,22 +31,27 @@ Part = list[Face]  # the faces of one convex piece, or nearly so: what lies befo
 def shaded(face: Face, colour: str, light: np.ndarray, opacity: float = 1.0, strength: float = 1.0) -> tuple[float, ...]:
     """Red, green, blue and opacity of a face of this "#rrggbb" in this `light` (unit vector towards it); `strength` below 1: paler."""
     shade = (0.62 + 0.38 * max(float(face.normal() @ light), 0.0)) * (1 - face.dark)
-    return (*(1 - strength * (1 - shade * np.array([int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]))), opacity)
+    return (*(1 - strength * (1 - shade * rgb(colour))), opacity)
+
+
+def rgb(colour: str) -> np.ndarray:
+    """Red, green and blue, 0 to 1, of a colour "#rrggbb"."""
+    return np.array([int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)])
 
 
 def parts_in_space(body: DrawnBody, k: int) -> list[tuple[Look, Part]]:
     """The parts of a body at the time with number `k`, in space, with the looks that they belong to."""
     found = []
     for look in body.looks:
-        parts, turn, at = _parts(look, k), body.orientations[k], body.positions[k]
+        parts, turn, at = parts_of(look, k), body.orientations[k], body.positions[k]
         if look.visual.kind != "line":
             turn, at = turn @ look.orientations[k], turn @ look.positions[k] + at
         found += [(look, [Face(face.corners @ turn.T + at, face.dark) for face in part]) for part in parts]
     return found
 
 
-def _parts(look: Look, k: int) -> list[Part]:
-    """Parts in the axes of the shape; of a line, in those of its body."""
+def parts_of(look: Look, k: int) -> list[Part]:
+    """Parts of a shape at the time with number `k`, in its own axes; of a line, in those of its body."""
     visual, size = look.visual, np.asarray(look.visual.size)
     if visual.kind == "line":
         return [part for a, b in pairwise(look.points[k]) if np.linalg.norm(b - a) > 0 for part in bar(a, b, look.radius)]

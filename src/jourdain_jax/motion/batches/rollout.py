@@ -34,6 +34,7 @@ from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.parameters import parameter_faults, parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 CHUNK = 512  # lanes whose stages fit the cache of a core
 WAYS = ("state_form", "reduction", "solver", "projected")  # static, of a trajectory
@@ -126,6 +127,7 @@ class Rollout(Printed, eqx.Module):
         return f" ({', '.join(dict.fromkeys(name for i in lanes for name in self.lane(int(i)).faults))})"
 
 
+@shown_from_users_lines
 @with_nan_as_a_mark
 def rollout(
     scene: Scene | BuiltFor,

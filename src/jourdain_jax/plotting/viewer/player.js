@@ -199,7 +199,7 @@ async function main() {
   const canvas = $("view"), renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
   renderer.shadowMap.enabled = true;
   renderer.shadowMap.type = THREE.PCFShadowMap;
-  const scene = new THREE.Scene(), camera = new THREE.PerspectiveCamera(35, 1, page.size / 100, 400 * page.ground);
+  const scene = new THREE.Scene(), camera = new THREE.PerspectiveCamera(35, 1, page.size / 100, 3 * page.ground);
   scene.background = new THREE.Color("#fbfbf9");
   scene.fog = new THREE.Fog("#fbfbf9", 1, 2);
   camera.up.set(0, 0, 1);
