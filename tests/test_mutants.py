@@ -345,7 +345,7 @@ MUTANTS = [
         TIMES,
         "derivative",
     ),
-    Mutant("time of an event forgotten", recorded_adjoint, "_back_from_event", "asked = g.t + step_adjoint", "asked = 0 * g.t + step_adjoint", EVENT, "derivative"),
+    Mutant("time of an event forgotten", recorded_adjoint, "_back_from_event", "= g.t + step_adjoint", "= 0 * g.t + step_adjoint", EVENT, "derivative"),
     Mutant(
         "an event by parameters forgotten",
         recorded_adjoint,

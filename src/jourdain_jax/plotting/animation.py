@@ -100,6 +100,7 @@ def animate(
     figure = plt.figure(figsize=(6.0, 5.0))
     axes = figure.add_axes((0.0, 0.0, 1.0, 0.96), projection="3d")
     axes.set_proj_type("persp")
+    axes.set_autoscale_on(False)  # limits are ours; what Matplotlib finds of a collection without faces is anything
     solid = axes.add_collection3d(Poly3DCollection(drawn.faces[0], zorder=5))
     traces = [axes.plot([], [], [], color="0.45", lw=1.0)[0] for _ in drawn.paths]
     clock = figure.text(0.03, 0.95, "", family="monospace")
