@@ -20,7 +20,7 @@ class Probe(Protocol):
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the atlas. `name` begins with the row of the table of hard cases, E1 to E24."""
+    """One row of the atlas. `name` begins with the row of the table of hard cases, E1 to E36."""
 
     name: str
     title: str

@@ -128,7 +128,7 @@ CASES = (
     Case("E33", "a force with a coefficient of 1e-24 that grows", lambda: of_family("tiny-force", {"x": 5.3, "v": 0.1, "span": 1.0}, 1, NO_ROWS_SKIP),
          1e-6, 1e-2, OF_TOLERANCE, must_be_right=True),
     Case("E34", "a row that sets in after six seconds", row_that_sets_in, 1e-5, 1e-2, OF_TOLERANCE),
-    Case("E35", "a pose given by linear interpolation: no force of inertia", lambda: of_family("wagon-sampled", SAMPLED, 3, NO_ROWS_SKIP), 0.0, 0.0,
+    Case("E35", "a pose by linear interpolation: no inertia", lambda: of_family("wagon-sampled", SAMPLED, 3, NO_ROWS_SKIP), 0.0, 0.0,
          "its accelerations are zero almost everywhere", flag_is_right=True),
     Case("E36", "an edge of a potential, 1e-6 m wide, that steps pass over", steep_edge, 1e-5, 1e-2, OF_TOLERANCE),
 )  # fmt: skip

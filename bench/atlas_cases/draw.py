@@ -31,7 +31,7 @@ WORDS = {
     NOT_APPLICABLE: "not asked",
 }
 GROUP_GAP, CASE_GAP = 0.45, 0.22  # between groups of methods, and between hard cases E1, E2, ...
-CELL, LEFT, RIGHT_MARGIN, TOP, BOTTOM = 0.185, 4.3, 0.15, 0.95, 1.75  # inches
+CELL, LEFT, RIGHT_MARGIN, TOP, BOTTOM = 0.185, 4.3, 0.4, 0.95, 1.75  # inches
 NARROWEST = 9.0  # of the picture, for its title
 
 
