@@ -9,7 +9,7 @@ steps are stored. Every measurement runs in a fresh process, and a program is co
     storage     processor time within the writing of chunks, of that of the whole run
     busy        steps of all lanes over steps for which lanes of a vector are there, if lanes that end are replaced at once; and without replacement
     memory      growth of the largest resident memory from fewer to more lanes
-    processes   wall time by one process with one thread over that by two
+    processes   wall time by one process on one core over that by two processes on two
     bits        arrays and statistics that differ between runs with other chunks, by two processes, interrupted, and the plain one
     kills       lanes computed again, of all lanes, and missing or repeated ones, of a long run that is killed 20 times at random
     indices     largest error of Sobol' indices of Ishigami's function over their stated limits
@@ -73,13 +73,16 @@ def timed(lanes: int, folder: Path, **options) -> dict:
     return found | {"peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
 
 
-def in_fresh_process(lanes: int, folder: Path, threads: int | None = None, **options) -> dict:
-    """`timed` in a process of its own."""
-    environment = os.environ | ({} if threads is None else {"JOURDAIN_JAX_THREADS": str(threads)})
+def in_fresh_process(lanes: int, folder: Path, on_one_core: bool = False, **options) -> dict:
+    """`timed` in a process of its own, on all cores or on one."""
+    environment = os.environ | ({"JOURDAIN_JAX_THREADS": "1"} if on_one_core else {})
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     command = [sys.executable, __file__, "--timed", json.dumps({"lanes": lanes, "folder": str(folder), **options})]
-    return json.loads(subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout.splitlines()[-1])
+    cores = os.sched_getaffinity(0)
+    pinned = {min(cores)} if on_one_core else cores
+    begin = lambda: os.sched_setaffinity(0, pinned)  # noqa: E731
+    return json.loads(subprocess.run(command, env=environment, check=True, stdout=subprocess.PIPE, text=True, preexec_fn=begin).stdout.splitlines()[-1])
 
 
 # Figures. --------------------------------------------------------------------------------------------------------
@@ -124,10 +127,11 @@ def memory(lanes: int, folder: Path) -> Iterator[dict]:
 
 
 def processes(lanes: int, folder: Path) -> Iterator[dict]:
-    """Two processes over one, of some minutes: their start and compilation, some ten seconds, are included."""
-    one = in_fresh_process(40 * lanes, folder / "processes", threads=1)["wall"]
-    two = in_fresh_process(40 * lanes, folder / "processes", processes=2)["wall"]
-    yield figure("wall time by one process with one thread over that by two processes", one / two, 1.8, at_least=True)
+    """Two processes, each on a core, over one on one core: minutes, since the start and compilation of the two, some eight seconds, are included."""
+    one = in_fresh_process(200 * lanes, folder / "processes", on_one_core=True)["wall"]
+    two = in_fresh_process(200 * lanes, folder / "processes", processes=2)["wall"]
+    print(f"  one process {one:.1f} s, two {two:.1f} s", flush=True)
+    yield figure("wall time by one process on one core over that by two processes on two", one / two, 1.8, at_least=True)
 
 
 def bits(lanes: int, folder: Path) -> Iterator[dict]:

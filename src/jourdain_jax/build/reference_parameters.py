@@ -37,8 +37,11 @@ def once_per_values(probe):
 
     @wraps(probe)
     def of(scene: Scene):
-        concrete = with_reference_parameters(scene)
-        leaves, treedef = jax.tree.flatten(concrete)
+        leaves, treedef = jax.tree.flatten(scene)
+        concrete = scene
+        if any(_is_traced(x) for x in leaves):
+            concrete = with_reference_parameters(scene)
+            leaves, treedef = jax.tree.flatten(concrete)
         key = tuple((np.asarray(x).tobytes(), np.shape(x), str(np.asarray(x).dtype)) for x in leaves)
         return cached(_Hashable(concrete, (treedef, key, type(scene))))
 

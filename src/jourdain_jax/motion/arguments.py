@@ -8,7 +8,7 @@ import numpy as np
 
 from jourdain_jax.motion.start import State, named_start
 from jourdain_jax.scene.arguments import as_input_vector
-from jourdain_jax.scene.numbers import checked_real, described, is_traced
+from jourdain_jax.scene.numbers import checked_unless_traced, described, is_traced
 from jourdain_jax.scene.scene import Scene
 
 _KINDS = {
@@ -37,14 +37,14 @@ def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None) -
 def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, switches: dict | None = None, **objects) -> None:
     """ValueError for tolerances that are no positive numbers, and for `solver`, `adjoint`, ... that are no objects of their kind (None is let pass)."""
     for name, value in (("rtol", rtol), ("atol", atol)):
-        number = checked_real(value, f"`{name}`", (), advice="give one number, such as 1e-8")
+        number = checked_unless_traced(value, f"`{name}`", (), advice="give one number, such as 1e-8")
         if not is_traced(number) and not 0 < float(number) < np.inf:
             raise ValueError(f"`{name}` is {float(number):g}, expected a positive finite number; give a tolerance such as 1e-8")
     for name, value in (switches or {}).items():
         if not isinstance(value, bool | np.bool_):
             raise ValueError(f"`{name}` is {described(value)}, expected True or False")
     if dt0 is not None:
-        first = checked_real(dt0, "`dt0`", (), advice="give the first step in s, or None for 1e-4 of the span")
+        first = checked_unless_traced(dt0, "`dt0`", (), advice="give the first step in s, or None for 1e-4 of the span")
         if not is_traced(first) and not 0 < abs(float(first)) < np.inf:
             raise ValueError(f"`dt0` is {float(first):g}, expected a finite first step in s that is not zero; or None for 1e-4 of the span")
     if max_steps is not None and (not isinstance(max_steps, int | np.integer) or isinstance(max_steps, bool) or max_steps < 1):

@@ -10,6 +10,7 @@ from typing import Literal
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.motion.integrators.knots import knots_between
@@ -72,9 +73,9 @@ class Setup(eqx.Module):
     scene: Scene
     start: State
     inputs: PyTree
-    t0: Float[Array, "*lanes"]
-    t1: Float[Array, "*lanes"]
-    ts: Float[Array, "*lanes times"]
+    t0: Float[Array | np.ndarray, "*lanes"]
+    t1: Float[Array | np.ndarray, "*lanes"]
+    ts: Float[Array | np.ndarray, "*lanes times"]
     field: VectorField
     options: Options
 

@@ -12,6 +12,7 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jourdain_jax.build.event_names import names_of_events
 from jourdain_jax.calculus.reals import Number
@@ -149,7 +150,7 @@ def _set_up(
     options = Options(
         solver=default_solver(rtol) if solver is None else solver,
         controller=stepsize_controller,
-        tolerances=(jnp.asarray(rtol, start.q.dtype), jnp.asarray(atol, start.q.dtype)),  # arrays: another tolerance is no other program
+        tolerances=tuple((jnp if is_traced(x) else np).asarray(x, start.q.dtype) for x in (rtol, atol)),  # arrays: another tolerance is no other program
         dt0=_first_step(solver, dt0, t0, t1),  # diffrax's own guess costs two more copies of the vector field to compile
         adjoint=diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         max_steps=max_steps,

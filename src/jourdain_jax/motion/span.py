@@ -36,7 +36,7 @@ def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs):
         ts = t0 + (t1 - t0) * np.linspace(0.0, 1.0, DEFAULT_SAMPLES)  # of known ends: nothing to compile
     elif not is_traced(ts, t0, t1):
         check_times(ts, t0, t1)
-    return start, *(jnp.asarray(x, real) for x in (t0, ts, t1))
+    return start, *((jnp if is_traced(x) else np).asarray(x, real) for x in (t0, ts, t1))
 
 
 def as_end(name: str, value):

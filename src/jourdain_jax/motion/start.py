@@ -96,8 +96,7 @@ def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable
     else:
         found = _compiled_projection(*arguments, None)
         if not found.arrived and _can_search(scene):  # rare, and long to compile
-            found = _uncompiled_projection(*arguments, guesses())
-    found = jax.tree.map(jnp.asarray, found)
+            found = jax.tree.map(jnp.asarray, _uncompiled_projection(*arguments, guesses()))
     return State(
         t, found.q, found.u, found.moved_q, found.moved_u, found.residual, (scene.coordinate_names, scene.speed_names), found.guess.astype(found.q.dtype)
     )
