@@ -1,6 +1,6 @@
 """Motions by machine code of our own against the same motions by XLA, in one run on one core: batches, alone, cold starts.
 
-    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|records|compilation ...]
+    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|records|watching|compilation ...]
 
 Writes a list of {"figure", "model", "value", "required", "met"}; `required` is None where a figure is only told. Times of warm motions are processor
 time, the least of some repeats, the two ways in turn; cold ones are wall time of fresh processes.
@@ -27,6 +27,7 @@ from baselines.timing import least_processor_time
 import jourdain_jax as jj
 from jourdain_jax.motion.own_steps import reason_against_machine_code
 from jourdain_jax.motion.simulate import set_up
+from jourdain_jax.motion.vector_fields.by_program import ByProgram
 
 LANES = 1024
 WAYS = {"native": "native", "XLA": "xla"}
@@ -131,6 +132,29 @@ def records(quick: bool) -> Iterator[Figure]:
         yield figure(f"record, {what}, largest difference", name, float(np.max(np.abs(found["native"] - found["XLA"]))))
 
 
+def watching(quick: bool) -> Iterator[Figure]:
+    """What it costs to judge, at every stage of every step, whether the privileged speeds still determine the others: motions with it over motions without."""
+    scene, name = jj.models.MODELS["whipple-bicycle"](), "whipple-bicycle"
+    speeds, watched = jnp.linspace(-16.0, -15.0, 256), ByProgram.has_pivots
+
+    def last(spin_rate):
+        start = {"rear_spin_rate": spin_rate, "lean_rate": 0.1}
+        return jj.simulate(scene, start, ts=jnp.array([2.0]), work=False, backend="native").q_end
+
+    def compiled(has_pivots) -> Callable:
+        ByProgram.has_pivots = has_pivots
+        try:
+            run = jax.jit(jax.vmap(last))
+            run(speeds).block_until_ready()
+        finally:
+            ByProgram.has_pivots = watched
+        return lambda: run(speeds).block_until_ready()
+
+    runs = {"watched": compiled(watched), "not watched": compiled(property(lambda field: False))}
+    seconds = least_processor_time(runs, 15 if quick else 60)
+    yield figure("motions whose pivots are watched over such whose are not", name, seconds["watched"] / seconds["not watched"], 1.05)
+
+
 def compilation(quick: bool) -> Iterator[Figure]:
     """The motion alone, lowered and compiled in this process, once the scene is built; fresh processes to the end of a first motion."""
     for name in ("tilting-disc", "whipple-bicycle"):
@@ -157,7 +181,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few lanes, the disc alone")
     parser.add_argument("--json", help="write the figures to this file")
-    parts = {"batches": batches, "records": records, "compilation": compilation}
+    parts = {"batches": batches, "records": records, "watching": watching, "compilation": compilation}
     parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="these figures")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
