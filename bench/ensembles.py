@@ -9,7 +9,7 @@ steps are stored. Every measurement runs in a fresh process, and a program is co
     storage     processor time within the writing of chunks, of that of the whole run
     busy        steps of all lanes over steps for which lanes of a vector are there, if lanes that end are replaced at once; and without replacement
     memory      growth of the largest resident memory from fewer to more lanes
-    processes   wall time by one process on one core over that by two processes on two
+    processes   wall time by one process on one core over that by two processes on two, and by two workers of a Dask cluster on this machine
     bits        arrays and statistics that differ between runs with other chunks, by two processes, interrupted, and the plain one
     kills       lanes computed again, of all lanes, and missing or repeated ones, of a long run that is killed 20 times at random
     indices     largest error of Sobol' indices of Ishigami's function over their stated limits
@@ -32,6 +32,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from distributed import Client, LocalCluster
 
 import jourdain_jax as jj
 from jourdain_jax.ensembles.store import Store
@@ -132,6 +133,13 @@ def processes(lanes: int, folder: Path) -> Iterator[dict]:
     two = in_fresh_process(200 * lanes, folder / "processes", processes=2)["wall"]
     print(f"  one process {one:.1f} s, two {two:.1f} s", flush=True)
     yield figure("wall time by one process on one core over that by two processes on two", one / two, 1.8, at_least=True)
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
+        shutil.rmtree(folder / "dask", ignore_errors=True)
+        began = time.perf_counter()
+        run(200 * lanes, folder / "dask", client=client)
+        dask = time.perf_counter() - began
+    print(f"  two workers of Dask {dask:.1f} s", flush=True)
+    yield figure("wall time by one process on one core over that by two workers of Dask", one / dask, 1.7, at_least=True)
 
 
 def bits(lanes: int, folder: Path) -> Iterator[dict]:

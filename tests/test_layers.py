@@ -44,6 +44,7 @@ OPTIONAL = (
     "google_crc32c",
     "xarray",
     "pandas",
+    "distributed",
     "trimesh",
 )  # may be imported inside a function
 VAGUE_NAMES = ("utils", "util", "misc", "common", "helpers", "helper")

@@ -18,6 +18,15 @@ def stored_by():
     return zarr, google_crc32c
 
 
+def cluster_by():
+    """The package `distributed`, of Dask."""
+    try:
+        import distributed
+    except ImportError as error:
+        raise ImportError('a cluster needs Dask, which is not installed; pip install "jourdain-jax[cluster]"') from error
+    return distributed
+
+
 def labelled_by():
     """The package `xarray`."""
     try:

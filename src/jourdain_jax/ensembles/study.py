@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jourdain_jax.ensembles.cluster import on_cluster
 from jourdain_jax.ensembles.design import Design
 from jourdain_jax.ensembles.distributions import Distribution, Levels
 from jourdain_jax.ensembles.outputs import as_outputs
@@ -129,6 +130,7 @@ class Study(Printed):
         chunk: int | None = None,
         progress: bool = True,
         processes: int = 1,
+        client=None,
         shard: tuple[int, int] = (1, 1),
         command: str = "",
         **options,
@@ -147,6 +149,7 @@ class Study(Printed):
         - `chunk`: lanes that are stored together (default: about a thousandth of all); at most one is computed again after a crash.
         - `processes`: how many compute, each on its share of the cores; more than one need a script whose top level is guarded by
           `if __name__ == "__main__":`, and outputs that are no functions within functions.
+        - `client`: a `dask.distributed.Client`, whose workers compute; all of them must reach the folder. One chunk at a time is computed in each worker.
         - `shard`: (k, n): only the k-th of n shares of the chunks, for a folder of its own on one of n machines; `jj.merge_studies` puts them together.
         - `progress`: a bar; `command`: text that is kept with the study; `options`: further ones as in `rollout` (`rtol`, `atol`, `solver`, ...).
 
@@ -159,7 +162,9 @@ class Study(Printed):
             raise ValueError(f"`shard` is {shard}, expected (k, n) with 1 <= k <= n")
         if isinstance(processes, bool) or not isinstance(processes, int) or processes < 1:
             raise ValueError(f"`processes` is {processes!r}, expected a whole number of at least 1")
-        compute = in_this_process if processes == 1 else in_processes(task, processes)
+        if client is not None and processes != 1:
+            raise ValueError("`client` and `processes` are both given; the workers of a cluster compute, or processes of this machine")
+        compute = on_cluster(task, client) if client is not None else in_this_process if processes == 1 else in_processes(task, processes)
         store = run(task, path, chunk=chunk, progress=progress, shard=shards, command=command, workers=compute)
         return StudyResult(store, task)
 

@@ -27,11 +27,7 @@ _runner: list[Runner] = []  # of this worker
 
 def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, int]]]:
     """What `run` takes as its workers; ValueError where the task cannot be sent to another process."""
-    try:
-        sent = pickle.dumps(task)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        text = "define scene and outputs at the top level of a module, not as lambdas or inside functions, or take processes=1"
-        raise ValueError(f"this study cannot be sent to other processes ({error}); {text}") from None
+    sent = sent_to_others(task)
 
     def workers(task: Task, store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
         waiting, bad = list(numbers), []
@@ -45,13 +41,27 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
                     bad.append(number)
             waiting = [number for number in waiting if number not in bad and store.receipt(number) is None]
         if bad:
-            lanes = ", ".join(f"{first} to {last - 1}" for first, last in map(store.span, bad[:5])) + (" ..." if len(bad) > 5 else "")
-            raise RuntimeError(
-                f"workers died {MOST_DEATHS} times on lanes {lanes} of `{store.path}`; all other chunks are kept. Simulate these lanes alone with "
-                "`result.lane(k).simulate()`, in a process of its own, to see which it is"
-            )
+            raise RuntimeError(left_out(store, bad))
 
     return workers
+
+
+def sent_to_others(task: Task) -> bytes:
+    """The task as it is sent to another process; ValueError where it cannot be."""
+    try:
+        return pickle.dumps(task)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        text = "define scene and outputs at the top level of a module, not as lambdas or inside functions, or take processes=1 and no `client`"
+        raise ValueError(f"this study cannot be sent to other processes ({error}); {text}") from None
+
+
+def left_out(store: Store, numbers: list[int]) -> str:
+    """What is said of chunks on which workers died again and again."""
+    lanes = ", ".join(f"{first} to {last - 1}" for first, last in map(store.span, numbers[:5])) + (" ..." if len(numbers) > 5 else "")
+    return (
+        f"workers died {MOST_DEATHS} times on lanes {lanes} of `{store.path}`; all other chunks are kept. Simulate these lanes alone with "
+        "`result.lane(k).simulate()`, in a process of its own, to see which it is"
+    )
 
 
 def _until_a_worker_dies(sent: bytes, store: Store, numbers: list[int], count: int, interrupted) -> Generator[tuple[int, int], None, list[int]]:

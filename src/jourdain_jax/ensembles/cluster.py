@@ -1,0 +1,81 @@
+"""Workers of a Dask cluster that compute the chunks of one study. Its folder must be where all of them, and the process that asks, can reach it.
+
+Dask starts a chunk again where its worker died. A chunk on which workers died again and again is tried once more alone, then left out and named at the end.
+"""
+
+import os
+import pickle
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from jourdain_jax.ensembles.optional import cluster_by
+from jourdain_jax.ensembles.run import Runner
+from jourdain_jax.ensembles.store import Store
+from jourdain_jax.ensembles.task import Task
+from jourdain_jax.ensembles.workers import left_out, sent_to_others
+from jourdain_jax.scene.numbers import described
+
+AHEAD = 2  # chunks per thread of a worker: one under way, one that waits for it
+
+_runners: dict[tuple, Runner] = {}  # of this worker: for the study that it worked on last, in one folder
+_one_at_a_time = threading.Lock()
+
+
+def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
+    """What `run` takes as its workers; ValueError where `client` is no client of Dask, or the task cannot be sent to another process."""
+    distributed = cluster_by()
+    if not isinstance(client, distributed.Client):
+        raise ValueError(f"`client` is {described(client)}, expected a `dask.distributed.Client`")
+    sent = sent_to_others(task)
+
+    def workers(task: Task, store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
+        path = str(store.path.resolve())
+        study = client.submit(bytes, sent, pure=False)  # a task, and no scattered data: the scheduler knows how to have it again when a worker died
+        suspects: list[int] = []
+        yield from _computed(distributed, client, study, path, numbers, interrupted, AHEAD * max(1, sum(client.nthreads().values())), suspects)
+        bad: list[int] = []
+        for number in suspects:  # alone, so that no other chunk is blamed
+            yield from _computed(distributed, client, study, path, [number], interrupted, 1, bad)
+        if bad:
+            raise RuntimeError(left_out(store, bad))
+
+    return workers
+
+
+def _computed(distributed, client, study, path: str, numbers, interrupted, most: int, suspects: list[int]) -> Iterator[tuple[int, int]]:
+    """Lanes and failed lanes, chunk by chunk as they come; numbers of chunks on which workers died go to `suspects`. At most `most` are asked for at a time."""
+    left, running = iter(numbers), {}
+    ended = distributed.as_completed()
+
+    def ask() -> None:
+        if not interrupted() and (number := next(left, None)) is not None:
+            future = client.submit(_chunk, study, path, number, os.getpid(), pure=False)
+            running[future] = number
+            ended.add(future)
+
+    for _ in range(most):
+        ask()
+    for future in ended:
+        number = running.pop(future)
+        try:
+            found = future.result()
+        except distributed.KilledWorker:
+            suspects.append(number)
+        else:
+            yield found
+        ask()
+
+
+def _chunk(sent: bytes, path: str, number: int, asking: int) -> tuple[int, int]:
+    """Compute and keep a chunk in this worker, one at a time; what a worker kept before it died is not computed again. `asking`: the process that asks."""
+    with _one_at_a_time:
+        if os.getpid() != asking:  # a worker that is a process of its own keeps to its share of the cores
+            os.environ.setdefault("JOURDAIN_JAX_THREADS", str(cluster_by().get_worker().state.nthreads))
+        which = sent, path, (Path(path) / "run" / "study.json").stat().st_mtime_ns
+        if which not in _runners:
+            _runners.clear()
+            _runners[which] = Runner(pickle.loads(sent), Store(path))
+        runner = _runners[which]
+        receipt = runner.store.receipt(number)
+        return (receipt.last - receipt.first, receipt.arrays["failed"].size) if receipt else runner.run(number)
