@@ -22,9 +22,9 @@ INDEPENDENT = jj.structure_of(BICYCLE).independent
 
 
 def state(bicycle, lean, steer, lean_rate, steer_rate, speed):
-    """The admissible state with the rear wheel rolling at `speed`; the pitch follows from the front contact."""
+    """The admissible state with the front wheel rolling at `speed`; the pitch follows from the front contact."""
     q = project_positions(bicycle, 0.0, bicycle.named(lean=lean, steer=steer)[0], free=jnp.array([n == "pitch" for n in NAMES]))
-    y = jnp.stack([lean_rate, steer_rate, speed / bicycle.rR])
+    y = jnp.stack([lean_rate, steer_rate, speed / bicycle.rF])
     return q, speeds_from_privileged(bicycle, INDEPENDENT, 0.0, q, y)
 
 

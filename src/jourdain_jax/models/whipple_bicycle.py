@@ -65,7 +65,7 @@ class WhippleBicycle(Scene):
 
     coordinates = coordinates("x y yaw lean pitch steer rear_spin front_spin")
     inputs = inputs("lean_torque steer_torque")
-    privileged = ("lean_rate", "steer_rate", "rear_spin_rate")
+    privileged = ("lean_rate", "steer_rate", "front_spin_rate")  # regular at any steer; the rear wheel stands still at a right angle
     domain = {
         "yaw": (-3.2, 3.2),
         "lean": (-0.8, 0.8),

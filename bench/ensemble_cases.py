@@ -1,0 +1,142 @@
+"""Two studies of bicycles at full size, drawn: which measured quantity deserves a better measurement, and from which starts a bicycle falls.
+
+    python bench/ensemble_cases.py [--quick] [--only NAME ...] [--json FILE] [--out DIR]
+
+    stability   100,000 samples of one bicycle's 25 measured parameters: share of them that is self-stable at each speed, and total Sobol' indices of the
+                weave speed
+    rides       1,000,000 rides of 5 s from random leans and speeds: where the bicycle falls
+
+Writes a list of {"figure", "model", "value", "required", "met"}, and the pictures `docs/bicycle_stability.png` and `docs/bicycle_rides.png` (into DIR where that
+is given). `--quick`: a hundredth of the samples. Needs the extras `ensembles`, `native` and `plot`.
+"""
+
+import argparse
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+
+import jourdain_jax as jj
+from jourdain_jax.bicycle import eigenvalues, linear_matrices, measured_bicycle, stability_speeds
+from jourdain_jax.bicycle.parameters import PARAMETERS
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
+
+BICYCLE = "Browser"
+BLUE, ORANGE = "#1f5fa8", "#b3470f"
+SPEEDS = np.linspace(0.0, 10.0, 101)  # m/s
+
+
+def figure(name: str, value: float, required: float | None = None) -> dict:
+    """One entry of the JSON."""
+    print(f"  {name}: {value:.4g}", flush=True)
+    return {"figure": name, "model": BICYCLE, "value": value, "required": required, "met": None if required is None else bool(value <= required)}
+
+
+def in_parts(function, columns: dict, size: int = 4096) -> np.ndarray:
+    """`function` of one sample, over all samples, some at a time."""
+    run, count = jax.jit(jax.vmap(function)), len(next(iter(columns.values())))
+    parts = []
+    for first in range(0, count, size):
+        part = {name: np.pad(x[first : first + size], (0, max(0, first + size - count)), mode="edge") for name, x in columns.items()}
+        parts.append(np.asarray(run(part))[: count - first])
+    return np.concatenate(parts)
+
+
+def stability(samples: int, out: Path) -> Iterator[dict]:
+    """Self-stability of a measured bicycle, and what its uncertainty comes from."""
+    bicycle = measured_bicycle(BICYCLE)
+    fixed = {name: value for name, value in bicycle.values.items() if name not in bicycle.prior}
+    began = time.perf_counter()
+    drawn = jj.Design(bicycle.prior, sampler="sobol", samples=samples, seed=7).values()
+    stable = in_parts(lambda p: jnp.all(jnp.real(eigenvalues(*linear_matrices(fixed | p), SPEEDS)) < 0, axis=1), drawn).mean(axis=0)
+    group = len(bicycle.prior) + 2
+    design = jj.Design(bicycle.prior, sampler="saltelli", samples=group * max(64, samples // group), seed=7)
+    weave = in_parts(lambda p: stability_speeds(*linear_matrices(fixed | p)).weave_speed, design.values())
+    indices = jj.sobol_indices(weave, design.names)
+    yield figure("seconds for eigenvalues at 101 speeds and weave speeds of as many samples", time.perf_counter() - began)
+    yield figure("largest share of samples that is stable at one speed", float(stable.max()))
+    yield figure("deviation of the weave speed, m/s", float(np.nanstd(weave)))
+    order = np.argsort(-indices.total)[:10]
+    for k in order[:3]:
+        yield figure(f"total Sobol' index of the weave speed, {indices.names[k]}", float(indices.total[k]))
+    yield figure("largest half-width of these indices, at 95 %", float(indices.total_half_width[order[:3]].max()))
+
+    shape, axes = plt.subplots(1, 2, figsize=(11, 4), layout="constrained", width_ratios=(1, 1.25))
+    axes[0].fill_between(SPEEDS, stable, color=BLUE, alpha=0.25)
+    axes[0].plot(SPEEDS, stable, color=BLUE)
+    axes[0].set(xlabel="speed (m/s)", ylabel="share of samples that is self-stable", ylim=(0, 1.02), xlim=(SPEEDS[0], SPEEDS[-1]))
+    axes[0].set_title(f"{BICYCLE} bicycle, {samples:,} samples", fontsize=10)
+    place = np.arange(len(order))[::-1]
+    axes[1].barh(place, indices.total[order], xerr=indices.total_half_width[order], color=ORANGE, capsize=2, height=0.7)
+    axes[1].set_yticks(place, [f"{PARAMETERS[indices.names[k]][0]} ({indices.names[k]})" for k in order], fontsize=8)
+    axes[1].set(xlabel="total Sobol' index of the weave speed")
+    axes[1].set_title("what deserves a better measurement", fontsize=10)
+    for axis in axes:
+        axis.spines[["top", "right"]].set_visible(False)
+    shape.savefig(out / "bicycle_stability.png", dpi=110)
+    plt.close(shape)
+
+
+def rides(samples: int, out: Path) -> Iterator[dict]:
+    """Where a bicycle falls, over the speed and the lean at the start."""
+    bicycle = measured_bicycle(BICYCLE)
+    radius = bicycle.values["rR"]
+    start = {
+        "rear_spin_rate": jj.Uniform(1.0 / radius, 10.0 / radius),
+        "lean": jj.Uniform(-0.6, 0.6),
+        "lean_rate": jj.Normal(0.0, 0.2),
+        "steer_rate": jj.Normal(0.0, 0.2),
+    }
+    study = jj.Study(bicycle.scene, start=start, sampler="sobol", samples=samples, seed=7)
+    outputs = {"fell": jj.Happened("fallen"), "fall time": jj.EventTime("fallen")}
+    folder = Path(tempfile.mkdtemp())
+    began = time.perf_counter()
+    result = study.run(folder / "rides.zarr", t1=5.0, rtol=1e-6, atol=1e-6, outputs=outputs)
+    seconds = time.perf_counter() - began
+    yield figure("rides per second of wall time, storage and compilation included", samples / seconds)
+    yield figure("rides that failed, of all", result.failed.size / samples)
+    yield figure("rides that ended in a fall, of all", float(result.mean("fell")))
+
+    arrays = result.to_xarray().load()
+    speed, lean, fell = arrays["rear_spin_rate_at_start"].values * radius, arrays["lean_at_start"].values, arrays["fell"].values
+    edges, known = (np.linspace(1.0, 10.0, 181), np.linspace(-0.6, 0.6, 121)), np.isfinite(fell)
+    counts, *_ = np.histogram2d(speed[known], lean[known], edges)
+    with np.errstate(invalid="ignore"):
+        share = np.histogram2d(speed[known], lean[known], edges, weights=fell[known])[0] / counts
+    shape, axis = plt.subplots(figsize=(8, 4.4), layout="constrained")
+    mesh = axis.pcolormesh(*edges, share.T, cmap="cividis_r", vmin=0, vmax=1, rasterized=True)
+    shape.colorbar(mesh, ax=axis, label="share that fell within 5 s")
+    axis.set(xlabel="speed at the start (m/s)", ylabel="lean at the start (rad)")
+    axis.set_title(f"{BICYCLE} bicycle without a hand on it, {samples:,} rides", fontsize=10)
+    shape.savefig(out / "bicycle_rides.png", dpi=110)
+    plt.close(shape)
+    shutil.rmtree(folder)
+
+
+def main() -> None:
+    """All figures."""
+    parts = {"stability": (stability, 100_000), "rides": (rides, 1_000_000)}
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="a hundredth of the samples; pictures go to a temporary folder unless --out is given")
+    parser.add_argument("--json", help="write the figures to this file")
+    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="these figures")
+    parser.add_argument("--out", help="folder of the pictures")
+    options = parser.parse_args()
+    home = Path(tempfile.mkdtemp()) if options.quick else Path(__file__).parent.parent / "docs"
+    out = Path(options.out) if options.out else home
+    figures = [entry for name in options.only for entry in parts[name][0](parts[name][1] // (100 if options.quick else 1), out)]
+    if options.json:
+        Path(options.json).write_text(json.dumps(figures, indent=1))
+
+
+if __name__ == "__main__":
+    main()
