@@ -63,6 +63,7 @@ from jourdain_jax.equations.virtual_power import (
     unconstrained_equations,
     virtual_power,
 )
+from jourdain_jax.importers.sympy_scene import from_sympy
 from jourdain_jax.lowering.built import Built, build
 from jourdain_jax.lowering.lower import NotLowered, lower
 from jourdain_jax.lowering.lowered import Lowered
@@ -179,6 +180,7 @@ __all__ = [
     "fit",
     "fit_batch",
     "fixed_point",
+    "from_sympy",
     "generalized_force",
     "generalized_forces",
     "gibbs_equations",

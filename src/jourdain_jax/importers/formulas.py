@@ -64,7 +64,9 @@ def check_functions(expression, leaves) -> None:
         return
     name = type(expression).__name__
     if name not in _KNOWN:
-        raise ValueError(f"the function `{name}` in `{_clipped(expression)}` has no counterpart in JAX; write it by elementary functions, or give it as an input")
+        raise ValueError(
+            f"the function `{name}` in `{_clipped(expression)}` has no counterpart in JAX; write it by elementary functions, or give it as an input"
+        )
     for argument in expression.args:
         check_functions(argument, leaves)
 

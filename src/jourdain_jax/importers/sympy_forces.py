@@ -55,7 +55,7 @@ def velocity_rows(system: MechanicalSystem, states: RandomStates) -> list[Any]:
     if not rows or not rates:
         return rows
     speeds = sympy.Matrix(system.speeds)
-    at_rest = {speed: sympy.S.Zero for speed in system.speeds}
+    at_rest = dict.fromkeys(system.speeds, sympy.S.Zero)
     lists = {}
     for name, values in (("rows", rows), ("rates", rates)):
         lists[name] = list(sympy.Matrix(values).jacobian(speeds).row_join(sympy.Matrix(values).xreplace(at_rest)))

@@ -66,7 +66,9 @@ class RandomStates:
                 found.append(values)
             if len(found) == STATES:
                 return found
-        raise ValueError(f"{what} has no finite value at {_TRIES - STATES + 1} of {_TRIES} random states; check its expressions and the values of its constants")
+        raise ValueError(
+            f"{what} has no finite value at {_TRIES - STATES + 1} of {_TRIES} random states; check its expressions and the values of its constants"
+        )
 
 
 def symbols_in(expressions: Iterable[Any]) -> set[Any]:
@@ -88,6 +90,11 @@ def poses_of(system: MechanicalSystem, states: RandomStates) -> tuple[Mechanical
     return _moved(system, states, poses)
 
 
+def _weighs(body) -> bool:
+    """Whether a body has mass or inertia; SymPy's joints of several axes put bodies without any in between."""
+    return body.mass != 0 or (is_rigid(body) and body.central_inertia != 0)
+
+
 def is_rigid(body) -> bool:
     """Whether SymPy's body is a rigid one; its `Body` may be a particle."""
     mechanics = sympy_package("a scene from SymPy").physics.mechanics
@@ -104,7 +111,7 @@ def _oriented(system: MechanicalSystem, states: RandomStates) -> tuple[Mechanica
     sympy = sympy_package("a scene from SymPy")
     poses: list[Pose] = []
     angles: dict[Any, tuple] = {}  # frame -> its orientation
-    for body in system.bodies:
+    for body in filter(_weighs, system.bodies):
         name = str(getattr(body, "name", body))  # a `Particle` of SymPy 1.12 has its name as its text
         if name in (pose.name for pose in poses):
             raise ValueError(f"two bodies are called `{name}`; give each a name of its own")
@@ -124,12 +131,15 @@ def _oriented(system: MechanicalSystem, states: RandomStates) -> tuple[Mechanica
             position = centre.pos_from(system.origin).to_matrix(system.frame)
         except ValueError:
             position = sympy.zeros(3, 1)
+        position = system.resolved(position)
+        if system.is_constant(position) and (orientation is None or system.is_constant(orientation)):
+            continue  # it does not move
         mass = system.resolved(sympy.sympify(body.mass))
         if not system.is_constant(mass):
             raise ValueError(f"the mass of body `{name}` is `{mass}`, which changes in time; expected constants")
-        poses.append(Pose(name, mass, inertia, system.resolved(position), orientation, centre, frame))
+        poses.append(Pose(name, mass, inertia, position, orientation, centre, frame))
     if not poses:
-        raise ValueError("the system of SymPy has no bodies; give it at least one")
+        raise ValueError("the system of SymPy has no body with a mass that moves; give it at least one")
     return system, poses
 
 
@@ -160,7 +170,7 @@ def _constant(system: MechanicalSystem, states: RandomStates, matrix, what: str)
     matrix = system.resolved(matrix)
     if system.is_constant(matrix):
         return matrix
-    still = matrix.xreplace({x: sympy.S.Zero for x in matrix.atoms(sympy.core.function.AppliedUndef)}).xreplace({system.time: sympy.S.Zero})
+    still = matrix.xreplace(dict.fromkeys(matrix.atoms(sympy.core.function.AppliedUndef), sympy.S.Zero)).xreplace({system.time: sympy.S.Zero})
     for found in states.numbers({"moving": list(matrix), "still": list(still)}, what):
         if np.max(np.abs(found["moving"] - found["still"])) > _SAME * np.max(np.abs(found["still"])):
             raise ValueError(f"{what} changes in time, so that it is no rigid body; state it in the frame of the body")
@@ -169,7 +179,7 @@ def _constant(system: MechanicalSystem, states: RandomStates, matrix, what: str)
 
 def _check_angular_velocity(system: MechanicalSystem, states: RandomStates, pose: Pose) -> None:
     """A ValueError where the stated angular velocity is not the rate of the orientation."""
-    if pose.frame is None:
+    if pose.frame is None or pose.orientation is None:
         return
     stated = list(system.resolved(pose.frame.ang_vel_in(system.frame).to_matrix(system.frame)))
     name = f"the orientation of body `{pose.name}`"
@@ -217,9 +227,8 @@ def _moved(system: MechanicalSystem, states: RandomStates, poses: list[Pose]) ->
     for pose, velocity in zip(poses, stated, strict=True):
         lists = {"r": list(pose.position)}, {"v": list(velocity)}
         values, rates = _along_the_motion(system, states, *lists, f"the position or velocity of body `{pose.name}`")
-        sizes = [1.0 + np.max(np.abs(found["v"])) for found in values]
-        difference = np.array([(found["v"] - rate["r"]) / size for found, rate, size in zip(values, rates, sizes, strict=True)])
-        missing.append(np.where(np.abs(difference) > _SAME, difference, 0.0))
+        difference = np.array([found["v"] - rate["r"] for found, rate in zip(values, rates, strict=True)])
+        missing.append(np.where(np.abs(difference) > _SAME * (1.0 + max(np.max(np.abs(found["v"])) for found in values)), difference, 0.0))
     if not any(np.any(difference) for difference in missing):
         return system, poses
     groups: list[list[int]] = []

@@ -161,7 +161,7 @@ def _scene_class(system: MechanicalSystem, poses: list[Pose], forces: Forces, ro
     bodies: dict[str, list] = {}
     for pose in poses:
         bodies |= {f"{pose.name} mass": [pose.mass], f"{pose.name} position": list(pose.position)}
-        if pose.orientation is not None:
+        if pose.orientation is not None and pose.inertia is not None:
             bodies |= {f"{pose.name} inertia": list(pose.inertia), f"{pose.name} orientation": list(system.resolved(pose.orientation))}
     u_names = identifiers([_name_of(x) for x in system.speeds], "speed")
     loads = {f"{body} {kind}": list(value) for kind in ("weight", "force", "torque") for body, value in getattr(forces, f"{kind}s").items()}

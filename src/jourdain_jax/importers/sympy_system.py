@@ -25,7 +25,7 @@ class MechanicalSystem:
 
     def resolved(self, expression):
         """The expression (or matrix) without rates of coordinates and auxiliary speeds."""
-        zero = {speed: 0 for speed in self.auxiliary} | {speed.diff(self.time): 0 for speed in self.auxiliary}
+        zero = dict.fromkeys(self.auxiliary, 0) | {speed.diff(self.time): 0 for speed in self.auxiliary}
         return expression.xreplace(self.rates).xreplace(zero)
 
     def with_coordinates(self, rates: dict[Any, Any]) -> "MechanicalSystem":
@@ -93,7 +93,7 @@ def _of_system(sympy, system, origin) -> MechanicalSystem:
         raise ValueError(f"the `System` has {len(kinematic)} kinematic equations for {len(q)} coordinates; add the missing ones by `add_kdes`")
     qdot = q.diff(time)
     # kinematic = A qdot + b = 0
-    coefficients, rest = kinematic.jacobian(qdot), kinematic.xreplace({rate: sympy.S.Zero for rate in qdot})
+    coefficients, rest = kinematic.jacobian(qdot), kinematic.xreplace(dict.fromkeys(qdot, sympy.S.Zero))
     solved = -coefficients.LUsolve(rest)
     loads = [*system.loads, *(load for actuator in system.actuators for load in actuator.to_loads())]
     return MechanicalSystem(
