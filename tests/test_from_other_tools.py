@@ -19,4 +19,4 @@ def test_the_code_of_the_page_runs(tmp_path, monkeypatch, capsys):
         exec(compile(block, str(PAGE), "exec"), scope)
     printed = capsys.readouterr().out
     assert printed.count("reached the end of its span") == text.count("print(motion)")
-    assert type(scope["Disc"]()).__name__ == "Disc"
+    assert [scope[name]().coordinate_names.entries[0] for name in ("Disc", "Robot", "Arm")] == ["yaw", "x", "shoulder"]
