@@ -12,7 +12,7 @@ from jourdain_jax.scene.validated import visuals_of
 EVERYTHING = """
 <mujoco model="everything">
   <compiler angle="{angle}" eulerseq="{sequence}"/>
-  <option gravity="0.5 1 -9" timestep="0.001"><flag contact="disable"/></option>
+  <option gravity="0.5 1 -9" timestep="0.001"><flag contact="disable" limit="disable"/></option>
   <default>
     <geom density="700"/>
     <default class="light"><geom density="200" rgba="0.2 0.4 0.6 1"/><joint damping="0.3"/></default>
