@@ -36,7 +36,9 @@ EVERYTHING = """
         </body>
       </body>
     </body>
-    <body name="apart" pos="2 0 0" zaxis="0 -1 0"><joint name="alone" type="hinge" axis="0 0 1"/><geom type="capsule" size="0.1 0.2" pos="0.3 0 0"/></body>
+    <body name="apart" pos="2 0 0" zaxis="0 -1 0">
+      <joint name="al-one" type="hinge" axis="0 0 1" ref="{b}"/><geom type="capsule" size="0.1 0.2" pos="0.3 0 0"/>
+    </body>
   </worldbody>
   <actuator><motor name="pull" joint="reach" gear="3"/><motor joint="elbow"/></actuator>
 </mujoco>
@@ -74,6 +76,7 @@ def test_the_stated_pose_is_the_example():
     poses = jj.pose_at(scene, 0.0, start.q)
     np.testing.assert_allclose(poses["base"].orientation, expected, atol=1e-12)
     assert start["elbow"] == pytest.approx(np.deg2rad(10))
+    assert start["al_one"] == pytest.approx(np.deg2rad(20))
     assert scene.domain["elbow"] == (-np.deg2rad(30), np.deg2rad(30))
     for turn in ("0 1 0 0", "0 0 1 0", "0 0.1 0.2 1", "0.3 -0.5 0.1 0.2"):
         text = f'<mujoco><worldbody><body name="b" quat="{turn}"><freejoint/><geom size="1"/></body></worldbody></mujoco>'
@@ -83,7 +86,8 @@ def test_the_stated_pose_is_the_example():
 
 
 def test_several_geoms_are_one_body():
-    geoms = '<geom type="box" size="0.2 0.1 0.05" pos="0.1 0 0" density="500"/><geom size="0.1" mass="3" pos="-0.3 0.2 0"/><geom size="0.9" mass="0"/><geom size="9" density="0"/>'
+    geoms = '<geom type="box" size="0.2 0.1 0.05" pos="0.1 0 0" density="500"/><geom size="0.1" mass="3" pos="-0.3 0.2 0"/>'
+    geoms += '<geom size="0.9" mass="0"/><geom size="9" density="0"/>'
     scene = jj.from_mjcf(f'<mujoco><worldbody><body name="b"><freejoint/>{geoms}</body></worldbody></mujoco>')()
     box, ball = 500 * 8 * 0.2 * 0.1 * 0.05, 3.0
     centre = (box * np.array([0.1, 0, 0]) + ball * np.array([-0.3, 0.2, 0])) / (box + ball)

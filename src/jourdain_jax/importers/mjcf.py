@@ -8,6 +8,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from jourdain_jax.importers.identifiers import identifier
 from jourdain_jax.importers.mjcf_elements import IDLE_ELEMENTS, Defaults, attributes_of, check_attributes
 from jourdain_jax.importers.placing import about, by_euler_angles, by_quaternion, onto_axis, together
 from jourdain_jax.importers.solids import SIZES, moments, volume
@@ -115,8 +116,9 @@ class _Reader:
             q = np.array([skew[k - 1], *(turn[k - 1] + turn[:, k - 1])])
             q[k] = 1 + 2 * turn[k - 1, k - 1] - w[0]
         q /= np.linalg.norm(q)
-        self.start |= {f"{joint.name}_{axis}": float(x) for axis, x in zip("xyz", position, strict=True)}
-        self.start |= {f"{joint.name}_attitude_{part}": float(x) for part, x in zip("wxyz", q, strict=True)}
+        name = identifier(joint.name)
+        self.start |= {f"{name}_{axis}": float(x) for axis, x in zip("xyz", position, strict=True)}
+        self.start |= {f"{name}_attitude_{part}": float(x) for part, x in zip("wxyz", q, strict=True)}
 
     def _joint(self, element: Element, childclass: str | None, body: str, number: int) -> Joint:
         name = element.get("name") or (f"{body}_joint" if number == 0 else f"{body}_joint{number + 1}")
@@ -138,7 +140,7 @@ class _Reader:
             stiffness = 0.0
         limits = self.file.numbers(given.get("range"), 2, f"range of {what}", [0.0, 0.0]) * unit
         if reference and kind in ("hinge", "slide"):
-            self.start[name] = reference * unit
+            self.start[identifier(name)] = reference * unit
         return Joint(
             name,
             kind,

@@ -157,7 +157,7 @@ def _visual(look: Look, at, turn) -> Visual:
     if look.kind == "mesh":
         mesh = _mesh(look.path)
         return Visual.mesh(mesh.faces.corners, mesh.faces.polygons, scale=np.array(look.size), **options)
-    make = {"ball": Visual.ball, "box": Visual.box, "cylinder": Visual.cylinder, "capsule": Visual.capsule, "ellipsoid": Visual.ellipsoid}[look.kind]
+    make: Any = {"ball": Visual.ball, "box": Visual.box, "cylinder": Visual.cylinder, "capsule": Visual.capsule, "ellipsoid": Visual.ellipsoid}[look.kind]
     return make(np.array(look.size), **options) if look.kind in ("box", "ellipsoid") else make(*look.size, **options)
 
 

@@ -70,7 +70,7 @@ class _Reader:
 
     def tree(self, joints: list[Element], base: str, motors: tuple[str, ...]) -> Tree:
         """The whole mechanism."""
-        holder = {}  # child -> its joint
+        holder: dict[str, Element] = {}  # child -> its joint
         for joint in joints:
             name = self.file.name(joint, "joint")
             child = self._end(joint, "child", name)

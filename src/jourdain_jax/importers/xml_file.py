@@ -47,7 +47,7 @@ class XmlFile:
         """A warning that lists what was left out, apart from what `ignore` names."""
         listed = [f"`{what}`" if count == 1 else f"`{what}` ({count})" for what, count in sorted(self._left_out.items()) if what not in self.ignore]
         if listed:
-            warnings.warn(f"{self.source}: left out {', '.join(listed)}; `ignore` silences this", UserWarning, stacklevel=4)
+            warnings.warn(f"{self.source}: left out {', '.join(listed)}; `ignore` silences this", UserWarning, stacklevel=3)
 
     def fault(self, what: str) -> ValueError:
         """The error of this file."""
