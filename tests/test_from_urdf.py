@@ -107,6 +107,15 @@ def test_numbers_of_the_file_are_parameters():
     with pytest.raises(ValueError, match="`first_mass`"):
         arm.replace(first_mass=-1.0)
     assert not hasattr(arm, "slide_damping")  # zero in the file
+    assert not hasattr(arm, "frame_origin")
+
+
+def test_the_place_of_a_link_is_a_parameter_where_it_is_to_be_one():
+    arm = jj.from_urdf(ARM, free=["frame", "third"])()
+    q = jnp.array([0.3, 0.2, 0.5])
+    slope = jax.jacobian(lambda origin: jj.pose_at(arm.replace(frame_origin=origin), 0.0, q)["third"].position)(arm.frame_origin)
+    np.testing.assert_allclose(slope, jj.pose_at(arm, 0.0, q)["first"].orientation, atol=1e-12)
+    np.testing.assert_allclose(arm.third_origin, [0.3, 0.0, 0.0])
 
 
 class Robot(jj.from_urdf(ROBOT, base="planar", motors=["left", "right"])):
@@ -231,6 +240,7 @@ BAD = {
     "friction": ({"path": _robot(_joint(inside='<dynamics friction="0.1"/>'))}, r'the friction of joint `j` is not read.*ignore=\("friction",\)'),
     "negative-damping": ({"path": _robot(_joint(inside='<dynamics damping="-1"/>'))}, r"damping of joint `j` is -1"),
     "unknown-motor": ({"path": _robot(_joint()), "motors": ["jj"]}, r"`motors` names `jj`, which is no joint of one coordinate"),
+    "unknown-free-link": ({"path": _robot(_joint()), "free": "bb"}, r"`free` names `bb`, which is no link; did you mean `b`"),
     "unknown-leader": ({"path": _robot(_joint(inside='<mimic joint="x"/>'))}, r"`mimic` of joint `j`: `x` is no joint"),
     "nothing-moves": ({"path": _robot(_joint("fixed"))}, r"no joint moves anything"),
     "no-name": ({"path": "<robot><link/></robot>"}, r"a link has no `name`"),

@@ -16,7 +16,7 @@ from jourdain_jax.importers.tree import Joint, Link, Look, Mass, Matrix, Motor, 
 from jourdain_jax.importers.tree_scene import tree_scene
 from jourdain_jax.importers.urdf import colour_of
 from jourdain_jax.importers.xml_file import Element, XmlFile
-from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene
 
 _TYPES = ("free", "ball", "slide", "hinge")
@@ -25,19 +25,20 @@ _LOOKS = {"sphere": "ball", "capsule": "capsule", "cylinder": "cylinder", "box":
 _WATER = 1000.0  # kg/m^3, of geoms that state neither mass nor density
 
 
-def from_mjcf(path, *, ignore: Iterable[str] = ()) -> type[Scene]:
+def from_mjcf(path, *, free: Iterable[str] = (), ignore: Iterable[str] = ()) -> type[Scene]:
     """A class of scenes from an MJCF file: its bodies, joints, inertias, springs, dampers and motors.
 
         Arm = jj.from_mjcf("arm.xml", ignore=("armature",))
         jj.simulate(Arm(), {"elbow": 0.3}, t1=1.0)
 
     - `path`: of the file, or its text.
+    - `free`: names of bodies whose place in the frame of their parent is a parameter.
     - `ignore`: names of elements and attributes that may be left out although they change the motion, such as "armature" or "equality".
 
     **Returns** a class. Hinges and slides are coordinates of their own names, a ball joint is a quaternion of its name, a free one `<joint>_x`, `_y`, `_z` and
     the quaternion `<joint>_attitude`; joints without a name are called `<body>_joint`, with a number from the second on. Speeds are those of MuJoCo. Motors
     are inputs. Fields, as far as they are not zero: `<body>_mass` (kg), `<body>_mass_centre` (m, in the body's frame), `<body>_inertia` (kg m^2, about the
-    mass centre), `<body>_origin` (m, in the frame of its parent), `<joint>_damping`, `<joint>_stiffness` and `gravity` (m/s^2). Inertias of geoms come from
+    mass centre), `<joint>_damping`, `<joint>_stiffness` and `gravity` (m/s^2); and of bodies that `free` names `<body>_origin` (m). Inertias of geoms come from
     their mass or density. The pose that the file states is the `example`.
 
     Geoms are drawn; what they touch is not read: rolling is stated in `contacts` of a subclass. Limits stop nothing; they become the `domain`.
@@ -51,7 +52,7 @@ def from_mjcf(path, *, ignore: Iterable[str] = ()) -> type[Scene]:
             file.leave_out(section.tag)
         elif section.tag not in _SECTIONS:
             file.refuse(section.tag, f"the section `{section.tag}`")
-    tree = _Reader(file).tree()
+    tree = _Reader(file).tree(as_names(free))
     file.warn()
     return tree_scene(tree, file.source)
 
@@ -69,7 +70,7 @@ class _Reader:
         for flag in file.root.findall("option/flag"):
             check_attributes(file, "flag", dict(flag.attrib), "`flag`")
 
-    def tree(self) -> Tree:
+    def tree(self, free: tuple[str, ...]) -> Tree:
         """The whole mechanism."""
         for section in self.file.root.findall("worldbody"):
             looks = self._looks(section, None, "the world")
@@ -77,7 +78,7 @@ class _Reader:
             self._children(section, None, None)
         gravity = self.file.numbers(self.option.get("gravity"), 3, "`gravity`", [0.0, 0.0, -9.81])
         name = self.file.root.get("model") or "Mjcf"
-        return Tree(name, tuple(self.links), gravity, tuple(self._motors()), start=self.start)
+        return Tree(name, tuple(self.links), gravity, tuple(self._motors()), free=free, start=self.start)
 
     def _children(self, holder: Element, parent: str | None, childclass: str | None) -> None:
         for element in holder:

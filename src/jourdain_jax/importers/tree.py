@@ -90,6 +90,7 @@ class Tree:
     gravity: Vector  # m/s^2
     motors: tuple[Motor, ...] = ()
     followers: tuple[Follower, ...] = ()
+    free: tuple[str, ...] = ()  # links whose places are parameters
     start: dict[str, float] = field(default_factory=dict)  # coordinate -> value that the file states
 
     def moving(self) -> set[str]:
@@ -98,12 +99,4 @@ class Tree:
         for link in self.links:
             if link.joints or link.parent in found:
                 found.add(link.name)
-        return found
-
-    def leading_to_motion(self) -> set[str]:
-        """Names of the links that move, and of those that hold one that does."""
-        found = self.moving()
-        for link in reversed(self.links):
-            if link.name in found and link.parent is not None:
-                found.add(link.parent)
         return found

@@ -15,6 +15,7 @@ from jourdain_jax.importers.tree import Joint, Link, Look, Tree
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Quaternion, coordinates, inputs, quaternion
 from jourdain_jax.scene.loads import Load, generalized_force
+from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
@@ -168,10 +169,14 @@ def _mesh(path: str) -> Any:
 
 def tree_scene(tree: Tree, source: str) -> type[Scene]:
     """The class of scenes of a mechanism. ValueError, which names the `source`, where nothing moves or what moves weighs nothing."""
-    moving, leading = tree.moving(), tree.leading_to_motion()
+    moving = tree.moving()
     if not moving:
         raise ValueError(f'{source}: no joint moves anything; expected at least one that does, or a base that moves, such as base="free"')
     _check_masses(tree, source)
+    known = [link.name for link in tree.links]
+    for name in tree.free:
+        if name not in known:
+            raise ValueError(f"`free` names `{name}`, which is no link; {nearest(name, known)}")
     joints = [joint for link in tree.links for joint in link.joints]
     link_names = identifiers([link.name for link in tree.links], "link")
     joint_names = identifiers([joint.name for joint in joints if joint.name], "joint")
@@ -179,7 +184,7 @@ def tree_scene(tree: Tree, source: str) -> type[Scene]:
     parameters: dict[str, Parameter] = {}
     for link in tree.links:
         name = link_names[link.name]
-        if link.name in leading and np.any(link.position):
+        if link.name in tree.free:
             parameters[f"{name}_origin"] = Parameter(link.position, "m", f"of the frame of {link.name}, in that of {link.parent or 'the ground'}")
         if link.name in moving and link.mass is not None:
             parameters |= _mass_parameters(link, name)

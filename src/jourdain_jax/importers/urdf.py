@@ -22,7 +22,9 @@ _READ_IN_JOINT = ("parent", "child", "origin", "axis", "limit", "dynamics", "mim
 _WITHOUT_EFFECT_IN_JOINT = ("calibration", "safety_controller")
 
 
-def from_urdf(path, *, base: str = "fixed", motors: Iterable[str] = (), packages: Mapping[str, str] | None = None, ignore: Iterable[str] = ()) -> type[Scene]:
+def from_urdf(
+    path, *, base: str = "fixed", motors: Iterable[str] = (), free: Iterable[str] = (), packages: Mapping[str, str] | None = None, ignore: Iterable[str] = ()
+) -> type[Scene]:
     """A class of scenes from a URDF file: its links are bodies, its joints coordinates.
 
         class Robot(jj.from_urdf("robot.urdf", base="planar", motors=["left_wheel", "right_wheel"])):
@@ -32,12 +34,13 @@ def from_urdf(path, *, base: str = "fixed", motors: Iterable[str] = (), packages
     - `path`: of the file, or its text.
     - `base`: how the root link moves: "fixed"; "planar", coordinates `x`, `y` (m) and `heading`; "free", `x`, `y`, `z` and the quaternion `attitude`.
     - `motors`: names of revolute, continuous or prismatic joints that an input pushes, `<joint>_motor` in N m or N.
+    - `free`: names of links whose place in the frame of their parent is a parameter.
     - `packages`: name -> folder, for meshes at `package://name/...` (default: folders of that name above the file).
     - `ignore`: what may be left out without a word: names of elements, or "friction".
 
     **Returns** a class. A joint is a coordinate of its own name; a floating one is `<joint>_x`, `_y`, `_z` and the quaternion `<joint>_attitude`, a planar
     one `<joint>_x`, `_y`, `_heading`. Fields, as far as they are not zero in the file: `<link>_mass` (kg), `<link>_mass_centre` (m, in the link's frame),
-    `<link>_inertia` (kg m^2, about the mass centre), `<link>_origin` (m, of its frame in its parent's), `<joint>_damping` and `gravity` (m/s^2). Limits of
+    `<link>_inertia` (kg m^2, about the mass centre), `<joint>_damping` and `gravity` (m/s^2); and of links that `free` names `<link>_origin` (m). Limits of
     joints stop nothing; they become the `domain`. `mimic` is a geometric row. Shapes of `visual` are drawn; `collision` is not read: rolling is stated in
     `contacts` of a subclass.
 
@@ -56,7 +59,7 @@ def from_urdf(path, *, base: str = "fixed", motors: Iterable[str] = (), packages
     joints = file.root.findall("joint")
     if not links:
         raise file.fault("it has no links")
-    tree = _Reader(file, links, packages or {}).tree(joints, base, as_names(motors))
+    tree = _Reader(file, links, packages or {}).tree(joints, base, as_names(motors), as_names(free))
     file.warn()
     return tree_scene(tree, file.source)
 
@@ -68,7 +71,7 @@ class _Reader:
         self.file, self.links, self.packages = file, links, packages
         self.colours = {m.get("name"): m for m in file.root.findall("material")}
 
-    def tree(self, joints: list[Element], base: str, motors: tuple[str, ...]) -> Tree:
+    def tree(self, joints: list[Element], base: str, motors: tuple[str, ...], free: tuple[str, ...]) -> Tree:
         """The whole mechanism."""
         holder: dict[str, Element] = {}  # child -> its joint
         for joint in joints:
@@ -95,7 +98,7 @@ class _Reader:
                 raise ValueError(f"`motors` names `{name}`, which is no joint of one coordinate; {nearest(name, names)}")
         followers = tuple(self._follower(joint, names) for joint in joints if joint.find("mimic") is not None)
         pushed = tuple(Motor(f"{name}_motor", name) for name in motors)
-        return Tree(self.file.root.get("name") or "Robot", tuple(links), np.array([0.0, 0.0, -9.81]), pushed, followers)
+        return Tree(self.file.root.get("name") or "Robot", tuple(links), np.array([0.0, 0.0, -9.81]), pushed, followers, free)
 
     def _end(self, joint: Element, which: str, name: str) -> str:
         found = joint.find(which)
