@@ -125,9 +125,26 @@ def four_bar():
     return KanesMethod(N, q[:1], u[:1], kinematic, bodies=bodies, forcelist=loads, **options), O, of(m, length, g)
 
 
+def sleigh():
+    """A blade with its mass centre ahead, whose velocity is stated without the part that the row holds at zero."""
+    x, y, heading, u1, u2, u3 = dynamicsymbols("x y heading u1 u2 u3")
+    N, O = ReferenceFrame("N"), Point("O")
+    A = N.orientnew("A", "Axis", [heading, N.z])
+    O.set_vel(N, 0)
+    blade = O.locatenew("blade", x * N.x + y * N.y)
+    G = blade.locatenew("G", length * A.x)
+    forward = u1 * cos(heading) + u2 * sin(heading)
+    blade.set_vel(N, forward * A.x)
+    G.set_vel(N, forward * A.x + u3 * length * A.y)
+    body = RigidBody("sleigh", G, A, m, (inertia(A, m, m, m * length**2), G))
+    kinematic = [x.diff() - u1, y.diff() - u2, heading.diff() - u3]
+    options = {"u_dependent": [u2], "velocity_constraints": [u2 * cos(heading) - u1 * sin(heading)], "bodies": [body]}
+    return KanesMethod(N, [x, y, heading], [u1, u3], kinematic, forcelist=[(blade, k * N.x)], **options), O, of(m, length, k)
+
+
 def given_function(q, N):
     """A load by a function that nobody knows."""
     return Function("f")(q) * N.x
 
 
-SYSTEMS = {f.__name__.replace("_", "-"): f for f in (pendulum, double_pendulum, rolling_disc, slipping_disc, four_bar)}
+SYSTEMS = {f.__name__.replace("_", "-"): f for f in (pendulum, double_pendulum, rolling_disc, slipping_disc, sleigh, four_bar)}

@@ -150,6 +150,28 @@ def test_a_wheel_without_an_angle_gets_one():
     np.testing.assert_allclose(motion["disc"].angular_velocity, omega, atol=1e-12)
 
 
+def test_velocities_that_agree_where_rows_are_met_need_no_coordinates():
+    kane, origin, values = systems.sleigh()
+    assert jj.from_sympy(kane, origin, values)().coordinate_names.entries == ("x", "y", "heading")
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of SymPy 1.13
+def test_joints_of_sympy_become_a_scene_when_their_equations_are_formed():
+    m, length, loads = sympy.symbols("m l loads", positive=True)
+    ceiling, first, second = mechanics.Body("ceiling"), mechanics.Body("first", mass=m), mechanics.Body("second", mass=2 * m)
+    joints = mechanics.PinJoint("J1", ceiling, first, child_point=length * first.y), mechanics.PinJoint("J2", first, second, child_point=length * second.y)
+    for body in (first, second):
+        body.apply_force(-loads * ceiling.y)
+    method = mechanics.JointsMethod(ceiling, *joints)
+    with pytest.raises(ValueError, match=r"`system` is a JointsMethod.*after its `form_eoms"):
+        jj.from_sympy(method, ceiling.masscenter, {})
+    method.form_eoms()
+    values = {m: 1.3, length: 0.6, loads: 2.0}
+    scene = jj.from_sympy(method, ceiling.masscenter, values)()
+    assert scene.loads_ == 2.0  # a method of scenes has the name itself
+    assert errors(method.method, scene, values) < tolerance("closed_form")
+
+
 def test_velocity_rows_that_repeat_geometric_ones_are_left_out():
     kane, origin, values = systems.four_bar()
     scene = jj.from_sympy(kane, origin, values)()
@@ -274,5 +296,6 @@ def test_the_bicycle_of_symbrim_moves_as_sympy_says():
     scene = jj.from_sympy(system, values=values)()
     system.form_eoms(constraint_solver="CRAMER")
     kane = system.eom_method
+    assert len(scene.coordinate_names) == len(kane.q)
     symbols = {x for x in kane.mass_matrix_full.free_symbols | kane.forcing_full.free_symbols if str(x) in values}
     assert errors(kane, scene, {x: values[str(x)] for x in symbols}) < tolerance("closed_form")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jourdain_jax.importers.formulas import sympy_package
-from jourdain_jax.importers.sympy_kinematics import Pose, RandomStates
+from jourdain_jax.importers.sympy_kinematics import STATES, AffineRows, Pose, RandomStates
 from jourdain_jax.importers.sympy_system import MechanicalSystem
 
 _IMPLIED = 1e-9  # of a row: what of it the geometric rows leave, relative
@@ -51,17 +51,16 @@ def velocity_rows(system: MechanicalSystem, states: RandomStates) -> list[Any]:
     """The velocity rows that are not the rates of the geometric ones: SymPy wants both."""
     sympy = sympy_package("a scene from SymPy")
     rows = [system.resolved(sympy.sympify(row)) for row in system.velocity]
-    rates = [system.resolved(sympy.sympify(row).diff(system.time)) for row in system.configuration]
-    if not rows or not rates:
+    if not rows or not system.configuration:
         return rows
-    speeds = sympy.Matrix(system.speeds)
-    at_rest = dict.fromkeys(system.speeds, sympy.S.Zero)
-    lists = {}
-    for name, values in (("rows", rows), ("rates", rates)):
-        lists[name] = list(sympy.Matrix(values).jacobian(speeds).row_join(sympy.Matrix(values).xreplace(at_rest)))
-    kept = np.zeros(len(rows), bool)
-    for found in states.numbers(lists, "a row"):
-        given, implied = found["rows"].reshape(len(rows), -1), found["rates"].reshape(len(rates), -1)
-        left = given - given @ np.linalg.pinv(implied) @ implied
-        kept |= np.max(np.abs(left), axis=1) > _IMPLIED * np.max(np.abs(given), axis=1)
-    return [row for row, keep in zip(rows, kept, strict=True) if keep]
+    own, rates = AffineRows(system, rows), AffineRows(system, [sympy.sympify(row).diff(system.time) for row in system.configuration])
+    kept, seen = np.zeros(len(rows), bool), 0
+    for leaves in states.leaves(own.symbols | rates.symbols):
+        given, implied = own.coefficients(leaves), rates.coefficients(leaves)
+        if np.isfinite(given).all() and np.isfinite(implied).all():
+            left = given - given @ np.linalg.pinv(implied) @ implied
+            kept |= np.max(np.abs(left), axis=1) > _IMPLIED * np.max(np.abs(given), axis=1)
+            seen += 1
+        if seen == STATES:
+            return [row for row, keep in zip(rows, kept, strict=True) if keep]
+    raise ValueError("a row has no finite value at random states; check its expressions and the values of its constants")

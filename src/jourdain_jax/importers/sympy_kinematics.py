@@ -5,8 +5,8 @@ velocities are the rates of poses. Where both disagree, coordinates are added wh
 
     r = r(q) + d,   ddot = v(q, u) - dr/dt,
 
-one for each axis of the inertial frame along which there is one, shared by the bodies that it moves alike; and an angle for a frame that has an angular
-velocity about an axis of another frame, but no orientation.
+one for each axis of the inertial frame along which there is one while the rows are met, shared by the bodies that it moves
+alike; and an angle for a frame that has an angular velocity about an axis of another frame, but no orientation.
 """
 
 from collections.abc import Iterable, Mapping
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jourdain_jax.importers.formulas import Formulas, sympy_package
 from jourdain_jax.importers.sympy_system import MechanicalSystem
@@ -69,6 +70,31 @@ class RandomStates:
         raise ValueError(
             f"{what} has no finite value at {_TRIES - STATES + 1} of {_TRIES} random states; check its expressions and the values of its constants"
         )
+
+
+class AffineRows:
+    """Rows `A u + b` as numbers at random states."""
+
+    def __init__(self, system: MechanicalSystem, rows: Iterable[Any]):
+        """The `rows` as expressions."""
+        sympy = sympy_package("a scene from SymPy")
+        expressions = [system.resolved(sympy.sympify(row)) for row in rows]
+        self.speeds, self.symbols = system.speeds, symbols_in(expressions) | set(system.speeds)
+        self._formulas = Formulas({"rows": expressions}, list(self.symbols))
+
+    def coefficients(self, leaves: dict[Any, float]) -> Float[np.ndarray, "rows columns"]:
+        """`[A b]`: the values at rest, and what each speed adds."""
+        at_rest = leaves | dict.fromkeys(self.speeds, 0.0)
+        b = self._formulas.numbers(at_rest)["rows"]
+        return np.stack([*(self._formulas.numbers(at_rest | {speed: 1.0})["rows"] - b for speed in self.speeds), b], axis=1)
+
+    def met(self, leaves: dict[Any, float]) -> dict[Any, float]:
+        """The nearest speeds at which the rows vanish, with all else; NaN where there are no numbers."""
+        both, u = self.coefficients(leaves), np.array([leaves[speed] for speed in self.speeds])
+        if not both.size:
+            return leaves
+        u = u - np.linalg.pinv(both[:, :-1]) @ (both[:, :-1] @ u + both[:, -1]) if np.isfinite(both).all() else u * np.nan
+        return leaves | dict(zip(self.speeds, map(float, u), strict=True))
 
 
 def symbols_in(expressions: Iterable[Any]) -> set[Any]:
@@ -194,14 +220,15 @@ def _check_angular_velocity(system: MechanicalSystem, states: RandomStates, pose
             )
 
 
-def _along_the_motion(system: MechanicalSystem, states: RandomStates, positions: dict, speeds: dict, what: str):
-    """Values of expressions at random states, and the rates of those in `positions` there, by differences."""
+def _along_the_motion(system: MechanicalSystem, states: RandomStates, positions: dict, speeds: dict, what: str, rows: AffineRows | None = None):
+    """Values of expressions at random states that meet the `rows`, and the rates of those in `positions` there, by differences."""
     rates = [system.rates[q.diff(system.time)] for q in system.coordinates]
     lists = positions | speeds | {"rates": rates}
     symbols = symbols_in(e for expressions in lists.values() for e in expressions) | set(system.coordinates)
     formulas = Formulas(lists, list(symbols))
     values, derivatives = [], []
-    for leaves in states.leaves(symbols):
+    known = states.leaves(symbols if rows is None else symbols | rows.symbols)
+    for leaves in known if rows is None else map(rows.met, known):
         here = formulas.numbers(leaves)
         forward, back = (
             formulas.numbers(
@@ -223,10 +250,12 @@ def _moved(system: MechanicalSystem, states: RandomStates, poses: list[Pose]) ->
     """Positions whose rates are the stated velocities, by further coordinates where they are not yet."""
     sympy = sympy_package("a scene from SymPy")
     stated = [system.resolved(pose.centre.vel(system.frame).to_matrix(system.frame)) for pose in poses]
+    rates_of_rows = tuple(sympy.sympify(row).diff(system.time) for row in system.configuration)
+    rows = AffineRows(system, (*system.velocity, *rates_of_rows))
     missing = []  # of each body: stated velocity less rate of the position, at all states
     for pose, velocity in zip(poses, stated, strict=True):
         lists = {"r": list(pose.position)}, {"v": list(velocity)}
-        values, rates = _along_the_motion(system, states, *lists, f"the position or velocity of body `{pose.name}`")
+        values, rates = _along_the_motion(system, states, *lists, f"the position or velocity of body `{pose.name}`", rows)
         difference = np.array([found["v"] - rate["r"] for found, rate in zip(values, rates, strict=True)])
         missing.append(np.where(np.abs(difference) > _SAME * (1.0 + max(np.max(np.abs(found["v"])) for found in values)), difference, 0.0))
     if not any(np.any(difference) for difference in missing):
