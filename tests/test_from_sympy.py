@@ -254,6 +254,7 @@ BAD = {
     "mass-in-time": (lambda: systems.pendulum(mass=2 + sympy.sin(t)), r"mass of body `bob` is `sin\(t\) \+ 2`"),
     "unknown-function": (lambda: systems.pendulum_with(systems.given_function), r"function `f` in `.*` has no counterpart in JAX"),
     "function-not-in-jax": (lambda: systems.pendulum_with(lambda q, N: sympy.besselj(0, q) * N.x), r"function `besselj`"),
+    "imaginary-load": (lambda: systems.pendulum_with(lambda q, N: sympy.I * q * N.x), r"`I` is no real number"),
     "acceleration-in-a-load": (lambda: systems.pendulum_with(lambda q, N: mechanics.dynamicsymbols("u").diff() * N.x), r"not on their rates"),
     "rate-of-an-input": (lambda: systems.pendulum_with(lambda q, N: y.diff() * N.x), r"`Derivative\(y\(t\), t\)` occurs.*make `y\(t\)` a coordinate"),
     "two-angular-velocities": (_angular_velocity_of_its_own, r"another angular velocity than its orientation"),

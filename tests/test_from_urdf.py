@@ -219,6 +219,7 @@ NO_INERTIA = '<link name="c"><inertial><mass value="1"/></inertial></link>'
 WEIGHT = '<link name="c"><inertial><mass value="{}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
 BAD = {
     "no-file": ({"path": "nowhere.urdf"}, r"nowhere.urdf: cannot be read \(No such file"),
+    "no-path": ({"path": None}, r"`path` is `None`, expected the path of a URDF file"),
     "no-xml": ({"path": "<robot"}, r"is no XML"),
     "another-root": ({"path": "<mujoco/>"}, r"its root is `mujoco`, expected `robot`"),
     "xacro": ({"path": '<robot xmlns:xacro="http://ros.org/wiki/xacro"><xacro:property name="x"/></robot>'}, r"elements of xacro"),

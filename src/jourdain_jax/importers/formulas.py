@@ -59,7 +59,9 @@ class Formulas:
 
 
 def check_functions(expression, leaves) -> None:
-    """A ValueError that names a function in the expression, apart from the `leaves`, which JAX does not have."""
+    """A ValueError that names a function in the expression, apart from the `leaves`, which JAX does not have, or what is no real number."""
+    if expression.is_Atom and expression.is_number and not expression.is_extended_real:
+        raise ValueError(f"`{expression}` is no real number; check the expressions that it stands in")
     if expression in leaves or expression.is_Atom:
         return
     name = type(expression).__name__

@@ -1,5 +1,6 @@
 """Reading XML: files, numbers in attributes, and what is left out: refused or listed, never passed over without a word."""
 
+import os
 import warnings
 from collections import Counter
 from collections.abc import Iterable
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.scene.names import as_names
+from jourdain_jax.scene.numbers import described
 
 Element = ElementTree.Element
 
@@ -19,6 +21,8 @@ class XmlFile:
 
     def __init__(self, path, root_tag: str, format_name: str, ignore: Iterable[str]):
         """The file at `path`, or the text itself, whose root is `root_tag`. ValueError where it cannot be read or is another kind of file."""
+        if not isinstance(path, str | os.PathLike):
+            raise ValueError(f"`path` is {described(path)}, expected the path of a {format_name} file, or its text")
         self.ignore = as_names(ignore)
         text = str(path) if isinstance(path, str) and path.lstrip().startswith("<") else None
         self.folder = Path.cwd() if text is not None else Path(path).resolve().parent
