@@ -148,6 +148,11 @@ def test_a_wheel_without_an_angle_gets_one():
     R = np.asarray(motion["disc"].orientation)
     omega = np.array([0.0, 0.0, 0.5]) + jj.rot_z(0.3) @ np.array([-0.4, 0.0, 0.0]) + 2.0 * R[:, 1]
     np.testing.assert_allclose(motion["disc"].angular_velocity, omega, atol=1e-12)
+    disc = kane.bodies[0]
+    own = mechanics.inertia(disc.frame, *(systems.m * systems.r**2 / n for n in (4, 2, 4)))
+    disc.inertia = (own, disc.masscenter)
+    stated = jj.pose_at(jj.from_sympy(kane, origin, values)(), 0.0, [0.3, 0.2, 1.0, 0.0, 0.0])["disc"]
+    np.testing.assert_allclose(stated.body.inertia, motion["disc"].body.inertia, atol=1e-12)
 
 
 def test_velocities_that_agree_where_rows_are_met_need_no_coordinates():
@@ -229,6 +234,13 @@ def _inertia_in_another_frame():
     return kane, origin, values
 
 
+def _inertia_in_a_loose_frame():
+    kane, origin, values = systems.double_pendulum()
+    rod = kane.bodies[1]
+    rod.inertia = (mechanics.inertia(mechanics.ReferenceFrame("loose"), 1, 2, 3), rod.masscenter)
+    return kane, origin, values
+
+
 def _called_alike():
     kane, origin, values = systems.double_pendulum()
     kane._bodylist = [kane.bodies[0]] * 2
@@ -260,6 +272,7 @@ BAD = {
     "two-angular-velocities": (_angular_velocity_of_its_own, r"another angular velocity than its orientation"),
     "no-orientation": (_without_orientation, r"frame `loose` has no orientation in `N`"),
     "inertia-that-changes": (_inertia_in_another_frame, r"inertia of body `rod 2` in its own frame `B` changes in time"),
+    "inertia-in-a-loose-frame": (_inertia_in_a_loose_frame, r"inertia of body `rod 2` is stated in a frame that has no orientation"),
     "two-bodies-of-a-name": (_called_alike, r"two bodies are called `rod 1`"),
 }
 

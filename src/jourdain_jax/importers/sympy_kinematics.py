@@ -146,12 +146,12 @@ def _oriented(system: MechanicalSystem, states: RandomStates) -> tuple[Mechanica
         if is_rigid(body):
             frame = body.frame
             try:
-                orientation, inertia = system.frame.dcm(frame), body.central_inertia.to_matrix(frame)
-            except ValueError:  # no orientation, or an inertia in a frame whose orientation to this one is not known
+                orientation = system.frame.dcm(frame)
+            except ValueError:
                 if frame not in angles:
                     system, angles[frame] = _by_an_angle(system, frame)
-                orientation, parent, turn = angles[frame]
-                inertia = turn.T * body.central_inertia.to_matrix(parent) * turn
+                orientation = angles[frame][0]
+            inertia = _in_own_frame(body, angles.get(frame))
             inertia = _constant(system, states, inertia, f"the inertia of body `{name}` in its own frame `{frame}`")
         try:
             position = centre.pos_from(system.origin).to_matrix(system.frame)
@@ -167,6 +167,19 @@ def _oriented(system: MechanicalSystem, states: RandomStates) -> tuple[Mechanica
     if not poses:
         raise ValueError("the system of SymPy has no body with a mass that moves; give it at least one")
     return system, poses
+
+
+def _in_own_frame(body, angle: tuple | None):
+    """The central inertia along the axes of the body."""
+    ways = [(body.frame, None)] if angle is None else [(body.frame, None), angle[1:]]
+    for frame, turn in ways:
+        try:
+            matrix = body.central_inertia.to_matrix(frame)
+        except ValueError:  # SymPy knows no orientation between the frames
+            continue
+        return matrix if turn is None else turn.T * matrix * turn
+    stated = f"the inertia of body `{getattr(body, 'name', body)}` is stated in a frame that has no orientation in its own frame `{body.frame}`"
+    raise ValueError(f"{stated}; orient that frame, or state the inertia in `{body.frame}`")
 
 
 def _by_an_angle(system: MechanicalSystem, frame) -> tuple[MechanicalSystem, tuple]:
