@@ -19,6 +19,7 @@ ROOMS = (
     ("cli", "the shell command jourdain-jax", False),
     ("plotting", "pictures and animations of motions", False),
     ("bicycle", "measured bicycles: files, stability, uncertainty", False),
+    ("importers", "scenes from SymPy, URDF and MJCF", False),
     ("models", "textbook scenes, to be read as examples", False),
     ("ensembles", "studies of many motions: designs, storage", False),
     ("analysis", "report, verify, linearize, steady, fit", False),

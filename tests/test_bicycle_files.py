@@ -181,3 +181,33 @@ def test_a_measured_bicycle_is_a_scene_and_a_prior():
     np.testing.assert_allclose([np.mean(trail), np.std(trail)], [bicycle.values["c"], bicycle.sigmas["c"]], rtol=0.01)
     with pytest.raises(ValueError, match=r"no measured bicycle `Browsr`.*Browser"):
         measured_bicycle("Browsr")
+
+
+FLAT = "# a set of parameters\n---\n" + "".join(f"{name}: {value!r}\n" for name, value in read_bicycle(shipped_bicycles()["Browser"]).values.items())
+HEADED = "parameterization: benchmark\nrider: False\ndescription: |\n  A bicycle: with c: 3.\nvalues:\n"
+SECTION = HEADED + "".join(f"  {line}  # measured\n" for line in FLAT.splitlines()[2:]) + "note: c\n"
+
+
+@pytest.mark.parametrize("text", [FLAT + "v: 5.0\n", SECTION])
+@pytest.mark.parametrize("ending", ["yml", "yaml"])
+def test_a_set_in_yaml_is_read(tmp_path, text, ending):
+    bicycle = read_bicycle(_written(tmp_path, text, f"benchmark-browser.{ending}"))
+    assert bicycle.values == read_bicycle(shipped_bicycles()["Browser"]).values
+    assert bicycle.without_sigma == PARAMETER_NAMES
+    assert bicycle.name == "benchmark-browser"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("parameterization: benchmark", "parameterization: principal", "line 1: parameterization `principal`, expected that of the benchmark"),
+        ("  c: ", "  cc: ", "unknown parameter `cc`; the nearest valid name is `c`"),
+        ("  c: ", "  c = ", "expected `name: value`"),
+        ("values:\n", "values:\n  c: 0.1\n", "`c` was already given in line 6"),
+        ("  w: 1.121", "  w: wide", "value of `w` is `wide`, expected a number"),
+        ("  w: 1.121", "  w:", "got `w:`, expected `name: value`"),
+    ],
+)
+def test_a_bad_line_in_yaml_is_refused_with_its_number(tmp_path, old, new, expected):
+    assert SECTION.count(old) == 1
+    assert expected in _refusal(_written(tmp_path, SECTION.replace(old, new), "set.yml"))

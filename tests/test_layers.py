@@ -1,7 +1,7 @@
 """The layer table of the package, held by reading every import in `src` (no import is executed).
 
-Bottom to top: calculus < eager < program < native < scene < equations < build < dynamics < lowering < motion < analysis < ensembles < models < bicycle <
-plotting < cli.
+Bottom to top: calculus < eager < program < native < scene < equations < build < dynamics < lowering < motion < analysis < ensembles < models <
+importers < bicycle < plotting < cli.
 A layer imports itself and what lies below it; only the package's `__init__` sees everything.
 """
 
@@ -27,6 +27,7 @@ LAYERS = (
     "analysis",
     "ensembles",
     "models",
+    "importers",
     "bicycle",
     "plotting",
     "cli",

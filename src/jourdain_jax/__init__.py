@@ -63,6 +63,9 @@ from jourdain_jax.equations.virtual_power import (
     unconstrained_equations,
     virtual_power,
 )
+from jourdain_jax.importers.mjcf import from_mjcf
+from jourdain_jax.importers.sympy_scene import from_sympy
+from jourdain_jax.importers.urdf import from_urdf
 from jourdain_jax.lowering.built import Built, build
 from jourdain_jax.lowering.lower import NotLowered, lower
 from jourdain_jax.lowering.lowered import Lowered
@@ -179,6 +182,9 @@ __all__ = [
     "fit",
     "fit_batch",
     "fixed_point",
+    "from_mjcf",
+    "from_sympy",
+    "from_urdf",
     "generalized_force",
     "generalized_forces",
     "gibbs_equations",

@@ -1,12 +1,14 @@
 """Measured bicycle parameter files, `name = value+/-sigma` per line, read into values, sigmas and remarks.
 
 Format of BicycleParameters (Moore, Hubbard & Kooijman): SI units, the names of Meijaard et al. 2007, `#` comments.
-A missing sigma counts as zero. The files carry no covariance: sigmas are those of independent errors.
+Its sets in YAML, `name: value`, with or without a section `values`, are read as well. A missing sigma counts as zero. The
+files carry no covariance: sigmas are those of independent errors.
 """
 
 import difflib
 import math
 import re
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 
@@ -24,6 +26,7 @@ _HANDLEBAR_FORK_SPLIT = re.compile(r"m[GS]|[xyz][GS]|I[GS](xx|yy|zz|xz)")  # bod
 _REPEATED = {"IRzz": "IRxx", "IFzz": "IFxx"}  # a wheel is symmetric
 _OUT_OF_PLANE = ("yB", "yH")  # a Whipple bicycle is symmetric: zero
 _NOT_OF_THE_BICYCLE = ("v",)
+_PARAMETERIZATIONS = ("benchmark", "Meijaard2007")
 
 
 class MeasuredBicycle(eqx.Module):
@@ -66,7 +69,7 @@ def shipped_bicycles() -> dict[str, Path]:
 
 
 def read_bicycle(path: str | Path) -> MeasuredBicycle:
-    """Read one parameter file.
+    """Read one parameter file: text, or YAML by the ending of `path`.
 
         bicycle = read_bicycle(shipped_bicycles()["Browser"])
         bicycle.values["c"], bicycle.sigmas["c"]  # trail and its standard deviation, m
@@ -79,10 +82,8 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
     values: dict[str, float] = {}
     sigmas: dict[str, float] = {}
     lines: dict[str, int] = {}
-    for number, line in enumerate(_read_text(path).splitlines(), start=1):
-        line = line.partition("#")[0].strip()
-        if not line:
-            continue
+    lines_of = _yaml_lines if path.suffix.lower() in (".yml", ".yaml") else _text_lines
+    for number, line in lines_of(_read_text(path), str(path)):
         where = f"{path}, line {number}"
         name, value, sigma = _read_line(line, where)
         if name in lines:
@@ -140,6 +141,34 @@ def _read_text(path: Path) -> str:
     if not text.strip():
         raise ValueError(f"{path}: the file is empty. Expected lines {_FORMAT}.")
     return text
+
+
+def _text_lines(text: str, _: str) -> Iterator[tuple[int, str]]:
+    """Number and content of the lines that hold a parameter, without comments."""
+    for number, line in enumerate(text.splitlines(), start=1):
+        content = line.partition("#")[0].strip()
+        if content:
+            yield number, content
+
+
+def _yaml_lines(text: str, path: str) -> Iterator[tuple[int, str]]:
+    """The same of a set in YAML, written as in a text file: those of the section `values`, or all where there is none."""
+    lines = [(number, line.partition("#")[0].rstrip()) for number, line in enumerate(text.splitlines(), start=1)]
+    has_section = any(line.partition(":")[0] == "values" for _, line in lines)
+    inside = not has_section
+    for number, line in lines:
+        name, _, value = (part.strip() for part in line.partition(":"))
+        is_indented = line[:1].isspace()
+        if not line.strip() or name in ("---", "..."):
+            continue
+        if has_section and not is_indented:
+            inside = name == "values"
+            if name == "parameterization" and value.strip("\"'") not in _PARAMETERIZATIONS:
+                raise ValueError(f"{path}, line {number}: parameterization {_clipped(value)}, expected that of the benchmark: {' '.join(PARAMETER_NAMES)}")
+        elif inside and not value:
+            raise ValueError(f"{path}, line {number}: got {_clipped(line.strip())}, expected `name: value`, for example `rF: 0.35`")
+        elif inside:
+            yield number, f"{name} = {value}"
 
 
 def _read_line(line: str, where: str) -> tuple[str, float, float | None]:

@@ -1,0 +1,124 @@
+"""Values of SymPy expressions on JAX or NumPy: each common subexpression once, each function by its counterpart there."""
+
+from collections.abc import Mapping, Sequence
+from functools import reduce
+from operator import add, mul
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+_FUNCTIONS = {
+    **{name: name for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sign", "floor", "sinc")},
+    **{f"a{name}": f"arc{name}" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
+    **{"Abs": "abs", "atan2": "arctan2", "ceiling": "ceil"},
+}
+_RELATIONS = {"Equality": "equal", "Unequality": "not_equal", "StrictLessThan": "less", "LessThan": "less_equal"}
+_RELATIONS |= {"StrictGreaterThan": "greater", "GreaterThan": "greater_equal", "And": "logical_and", "Or": "logical_or", "Not": "logical_not"}
+_KNOWN = {*_FUNCTIONS, *_RELATIONS, "Add", "Mul", "Pow", "Min", "Max", "Heaviside", "Piecewise", "ExprCondPair", "erf", "BooleanTrue", "BooleanFalse"}
+
+
+def sympy_package(purpose: str) -> Any:
+    """The package `sympy`; an ImportError that says how to get it where it is missing."""
+    try:
+        import sympy
+        import sympy.physics.mechanics
+    except ImportError:
+        raise ImportError(f"{purpose} needs the package `sympy`; install it with: pip install sympy") from None
+    return sympy
+
+
+class Formulas:
+    """Several lists of expressions, evaluated together: a function of the values of their symbols."""
+
+    def __init__(self, lists: Mapping[str, Sequence[Any]], leaves: Sequence[Any]):
+        """The `lists` of expressions, by name, in what is called `leaves`. ValueError for a function that JAX does not have."""
+        sympy = sympy_package("a scene from SymPy")
+        self._lengths = {name: len(expressions) for name, expressions in lists.items()}
+        flat = [sympy.sympify(e) for expressions in lists.values() for e in expressions]
+        known = set(leaves)
+        for expression in flat:
+            check_functions(expression, known)
+        self._steps, self._results = sympy.cse(flat, symbols=sympy.numbered_symbols("s", cls=sympy.Dummy))
+
+    def values(self, leaves: Mapping[Any, Any], on: ModuleType = jnp) -> dict[str, list]:
+        """The values of all lists where the `leaves` have these, worked out by the functions of `on`: `jax.numpy` or `numpy`."""
+        known = dict(leaves)
+        for symbol, expression in self._steps:
+            known[symbol] = _value(expression, known, on)
+        flat = iter([_value(expression, known, on) for expression in self._results])
+        return {name: [next(flat) for _ in range(length)] for name, length in self._lengths.items()}
+
+    def numbers(self, leaves: Mapping[Any, float]) -> dict[str, np.ndarray]:
+        """The values of all lists as known numbers, in double precision."""
+        with np.errstate(all="ignore"):
+            found = self.values({symbol: np.float64(x) for symbol, x in leaves.items()}, np)
+        return {name: np.array(values, np.float64) for name, values in found.items()}
+
+
+def check_functions(expression, leaves) -> None:
+    """A ValueError that names a function in the expression, apart from the `leaves`, which JAX does not have, or what is no real number."""
+    if expression.is_Atom and expression.is_number and not expression.is_extended_real:
+        raise ValueError(f"`{expression}` is no real number; check the expressions that it stands in")
+    if expression in leaves or expression.is_Atom:
+        return
+    name = type(expression).__name__
+    if name not in _KNOWN:
+        raise ValueError(
+            f"the function `{name}` in `{_clipped(expression)}` has no counterpart in JAX; write it by elementary functions, or give it as an input"
+        )
+    for argument in expression.args:
+        check_functions(argument, leaves)
+
+
+def _clipped(expression) -> str:
+    text = str(expression)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _value(expression, known: dict, on: ModuleType):
+    """The value of one expression."""
+    if expression in known:
+        return known[expression]
+    name = type(expression).__name__
+    if name in ("BooleanTrue", "BooleanFalse"):
+        return name == "BooleanTrue"
+    if expression.is_Atom:
+        return float(expression)
+    if name == "Pow":
+        return _power(expression, known, on)
+    values = [_value(argument, known, on) for argument in expression.args]
+    if name in ("Add", "Mul"):
+        return reduce(add if name == "Add" else mul, values)
+    if name in ("Min", "Max"):
+        return reduce(on.minimum if name == "Min" else on.maximum, values)
+    if name == "ExprCondPair":
+        return tuple(values)
+    if name == "Piecewise":
+        otherwise = on.nan
+        for value, condition in reversed(values):
+            otherwise = on.where(condition, value, otherwise)
+        return otherwise
+    if name == "Heaviside":
+        return on.heaviside(*values)
+    if name == "sinc":
+        return on.sinc(values[0] / on.pi)  # SymPy's is sin(x)/x
+    if name == "erf":
+        return jax.scipy.special.erf(values[0])
+    if name in ("And", "Or"):
+        return reduce(getattr(on, _RELATIONS[name]), values)
+    return getattr(on, _FUNCTIONS.get(name) or _RELATIONS[name])(*values)
+
+
+def _power(expression, known: dict, on: ModuleType):
+    base, exponent = expression.args
+    if base.is_NumberSymbol and str(base) == "E":
+        return on.exp(_value(exponent, known, on))
+    value = _value(base, known, on)
+    if exponent.is_Integer:
+        return value ** int(exponent)
+    if exponent.is_Rational and exponent.q == 2:
+        return on.sqrt(value) ** int(exponent.p)
+    return value ** _value(exponent, known, on)

@@ -1,0 +1,34 @@
+"""Names of other tools as names of Python, for fields, coordinates, speeds and inputs."""
+
+import keyword
+import re
+from collections.abc import Iterable
+
+_TAKEN = ("t", "array", "slots", "keys")  # by the time and by the container of named values
+
+
+def identifier(name: str) -> str:
+    """The name as one of Python: what is no letter, digit or underscore becomes an underscore, `left-wheel` is `left_wheel`."""
+    plain = re.sub(r"\W+", "_", name).strip("_") or "unnamed"
+    plain = f"_{plain}" if plain[0].isdigit() else plain
+    return f"{plain}_" if keyword.iskeyword(plain) or plain in _TAKEN else plain
+
+
+def identifiers(names: Iterable[str], kind: str, taken: Iterable[str] = ()) -> dict[str, str]:
+    """Name -> its identifier, with an underscore at its end where that is among the `taken` ones; ValueError where two names become one."""
+    found: dict[str, str] = {}
+    taken = set(taken)
+    for name in names:
+        new = identifier(name)
+        new = f"{new}_" if new in taken else new
+        twin = next((other for other, known in found.items() if known == new and other != name), None)
+        if twin is not None:
+            raise ValueError(f"{kind}s `{twin}` and `{name}` would both be called `{new}`; rename one of them")
+        found[name] = new
+    return found
+
+
+def class_name(name: str) -> str:
+    """A name for a class of scenes: `my-robot` is `MyRobot`."""
+    words = [word for word in re.split(r"[\W_]+", name) if word]
+    return identifier("".join(word[0].upper() + word[1:] for word in words) or "Scene")

@@ -1,0 +1,102 @@
+"""Links and joints as files of robots describe them: a tree of frames, each placed in that of its parent and moved by its joints.
+
+All numbers are known ones, in SI units and radians; rotation matrices take components in the link's frame to those in its parent's.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+Vector = Float[np.ndarray, "3"]
+Matrix = Float[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True)
+class Joint:
+    """How a link moves from where it is placed; `name` "" for the base."""
+
+    name: str
+    kind: str  # "hinge", "slide", "ball", "free" or "planar"
+    axis: Vector = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # unit vector; of a planar joint the normal
+    anchor: Vector = field(default_factory=lambda: np.zeros(3))  # m, the point of the link that a hinge or ball holds
+    reference: float = 0.0  # the coordinate where the link is as it is placed
+    damping: float = 0.0  # N s/m or N m s
+    stiffness: float = 0.0  # N/m or N m
+    rest: float = 0.0  # the coordinate where the spring is free
+    limits: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Mass:
+    """What a link weighs."""
+
+    mass: float  # kg
+    centre: Vector  # m, mass centre in the link's frame
+    inertia: Matrix  # kg m^2, about the mass centre, axes of the link
+
+
+@dataclass(frozen=True)
+class Look:
+    """A shape of a link, for pictures."""
+
+    kind: str  # "ball", "box", "cylinder", "capsule", "ellipsoid" or "mesh"
+    size: tuple[float, ...]  # m, as `jj.Visual` takes it; of a mesh its factors
+    position: Vector  # m, in the link's frame
+    turn: Matrix
+    colour: str | None = None
+    opacity: float = 1.0
+    path: str | None = None  # of the file of a mesh
+
+
+@dataclass(frozen=True)
+class Link:
+    """One link; several joints act one after the other, none leaves it fixed to its parent."""
+
+    name: str
+    parent: str | None  # None: the inertial frame
+    position: Vector  # m, of its frame in that of the parent
+    turn: Matrix
+    joints: tuple[Joint, ...] = ()
+    mass: Mass | None = None
+    looks: tuple[Look, ...] = ()
+
+
+@dataclass(frozen=True)
+class Follower:
+    """A joint whose coordinate follows that of another: `q = factor q_leader + offset`."""
+
+    joint: str
+    leader: str
+    factor: float
+    offset: float
+
+
+@dataclass(frozen=True)
+class Motor:
+    """An input that pushes a hinge or slide with `gear` times its value."""
+
+    name: str
+    joint: str
+    gear: float = 1.0
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A mechanism, parents before their children."""
+
+    name: str
+    links: tuple[Link, ...]
+    gravity: Vector  # m/s^2
+    motors: tuple[Motor, ...] = ()
+    followers: tuple[Follower, ...] = ()
+    free: tuple[str, ...] = ()  # links whose places are parameters
+    start: dict[str, float] = field(default_factory=dict)  # coordinate -> value that the file states
+
+    def moving(self) -> set[str]:
+        """Names of the links that any joint moves."""
+        found: set[str] = set()
+        for link in self.links:
+            if link.joints or link.parent in found:
+                found.add(link.name)
+        return found

@@ -1,0 +1,232 @@
+"""Scenes of links and joints: poses by going through the tree, gravity, springs, dampers and motors of joints, looks."""
+
+from functools import lru_cache
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.calculus.rotations import quaternion_to_matrix
+from jourdain_jax.importers.identifiers import class_name, identifiers
+from jourdain_jax.importers.placing import cross_matrix, onto_axis
+from jourdain_jax.importers.scene_class import Parameter, scene_class
+from jourdain_jax.importers.tree import Joint, Link, Look, Tree
+from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.coordinates import Quaternion, coordinates, inputs, quaternion
+from jourdain_jax.scene.loads import Load, generalized_force
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.visuals import Visual
+
+Frame = tuple[Float[Array, "3 3"], Float[Array, "3"]]  # orientation and origin in the inertial frame
+
+
+class TreeScene(Scene):
+    """Base of the scenes that `from_urdf` and `from_mjcf` make."""
+
+    _tree: ClassVar[Tree]
+    _names: ClassVar[dict[str, str]]  # of links and joints -> identifiers
+
+    def bodies(self, t, q):
+        """Links that move and have a mass."""
+        moving = self._tree.moving()
+        frames = self._frames(q)
+        found = {}
+        for link in self._tree.links:
+            if link.name in moving and link.mass is not None:
+                R, origin = frames[link.name]
+                name = self._names[link.name]
+                mass, inertia = getattr(self, f"{name}_mass"), getattr(self, f"{name}_inertia")
+                found[link.name] = RigidBody(mass, inertia, _array(origin + R @ self._centre(link)), _array(R))
+        return found
+
+    def loads(self, motion):
+        """Gravity, and the springs, dampers and motors of the joints."""
+        found = list(self._weights(motion))
+        for link in self._tree.links:
+            for joint in link.joints:
+                found += self._of_joint(motion, joint)
+        for motor in self._tree.motors:
+            push = motor.gear * motion.inputs[self._names[motor.name]]
+            found.append(generalized_force(motion, **{f"{self._names[motor.joint]}_rate": push}))
+        return tuple(found)
+
+    def geometric_constraints(self, pose):
+        """Joints that follow others."""
+        return {
+            f"{one.joint} follows {one.leader}": pose.q[self._names[one.joint]] - one.factor * pose.q[self._names[one.leader]] - one.offset
+            for one in self._tree.followers
+        }
+
+    def visuals(self, pose):
+        """Shapes of the file; those of links without a body stand in the inertial frame."""
+        frames = self._frames(pose.q)
+        found: dict[str, list[Visual]] = {}
+        for link in self._tree.links:
+            for look in link.looks:
+                if link.name in pose:
+                    found.setdefault(link.name, []).append(_visual(look, look.position - self._centre(link), look.turn))
+                else:
+                    R, origin = frames[link.name]
+                    found.setdefault("", []).append(_visual(look, origin + R @ look.position, R @ look.turn))
+        return found
+
+    def _frames(self, q) -> dict[str, Frame]:
+        """Orientation and origin of every link."""
+        found: dict[str | None, Frame] = {None: (np.eye(3), np.zeros(3))}
+        for link in self._tree.links:
+            R, origin = found[link.parent]
+            field = f"{self._names[link.name]}_origin"
+            R, origin = R @ link.turn, origin + R @ getattr(self, field, link.position)
+            for joint in link.joints:
+                R, origin = _moved(joint, self._names[joint.name], R, origin, q)
+            found[link.name] = R, origin
+        return {name: frame for name, frame in found.items() if name is not None}
+
+    def _centre(self, link: Link):
+        """Mass centre in the frame of the link, m."""
+        return getattr(self, f"{self._names[link.name]}_mass_centre", np.zeros(3))
+
+    def _weights(self, motion):
+        size = float(np.linalg.norm(self._tree.gravity))
+        if size == 0:
+            return
+        g = self.gravity * (self._tree.gravity / size)
+        forces = {name: body.mass * g for name, body in motion.bodies.items()}
+        yield Load(forces=forces, potential=-sum(body.mass * (g @ body.position) for body in motion.bodies.values()))
+
+    def _of_joint(self, motion, joint: Joint):
+        name = self._names[joint.name]
+        if joint.stiffness:
+            k, stretch = getattr(self, f"{name}_stiffness"), motion.q[name] - joint.rest
+            yield Load(generalized={f"{name}_rate": -k * stretch}, potential=0.5 * k * stretch**2)
+        if joint.damping:
+            c = getattr(self, f"{name}_damping")
+            yield generalized_force(motion, **{speed: -c * motion.u[speed] for speed in coordinates(*parts_of(joint, name)).default_speeds})
+
+
+def _array(x) -> Float[Array, "*shape"]:
+    return jnp.asarray(x, jnp.result_type(float))
+
+
+def parts_of(joint: Joint, name: str) -> tuple[str | Quaternion, ...]:
+    """The coordinates of a joint, as `coordinates` takes them; without a prefix for the base."""
+    label = f"{name}_" if joint.name else ""
+    if joint.kind == "ball":
+        return (quaternion(name),)
+    if joint.kind == "free":
+        return (f"{label}x {label}y {label}z", quaternion(f"{label}attitude"))
+    if joint.kind == "planar":
+        return (f"{label}x {label}y {label}heading",)
+    return (name,)
+
+
+def _moved(joint: Joint, name: str, R, origin, q) -> Frame:
+    """The frame after a joint has moved it."""
+    label = f"{name}_" if joint.name else ""
+    if joint.kind == "slide":
+        return R, origin + R @ joint.axis * (q[name] - joint.reference)
+    if joint.kind == "free":
+        shift = jnp.stack([q[f"{label}{axis}"] for axis in "xyz"])
+        return R @ quaternion_to_matrix(q[f"{label}attitude"]), origin + R @ shift
+    if joint.kind == "planar":
+        across = _in_plane(joint.axis)
+        return R @ _about(joint.axis, q[f"{label}heading"]), origin + R @ (across[0] * q[f"{label}x"] + across[1] * q[f"{label}y"])
+    turn = quaternion_to_matrix(q[name]) if joint.kind == "ball" else _about(joint.axis, q[name] - joint.reference)
+    held = origin + R @ joint.anchor
+    R = R @ turn
+    return R, held - R @ joint.anchor
+
+
+def _about(axis, angle) -> Float[Array, "3 3"]:
+    """Rotation by an angle that JAX may trace about a known axis."""
+    along = np.outer(axis, axis)
+    return along + jnp.cos(angle) * (np.eye(3) - along) + jnp.sin(angle) * cross_matrix(axis)
+
+
+def _in_plane(normal) -> Float[np.ndarray, "2 3"]:
+    """Two unit vectors in a plane: x and y where its normal is z, y and z where it is x, z and x where it is y."""
+    k = int(np.argmax(np.abs(normal)))
+    if np.isclose(normal[k], 1.0):
+        return np.eye(3)[[(k + 1) % 3, (k + 2) % 3]]
+    return onto_axis(normal)[:, :2].T
+
+
+def _visual(look: Look, at, turn) -> Visual:
+    options: dict[str, Any] = {"at": _array(at), "turn": _array(turn), "colour": look.colour, "opacity": look.opacity}
+    if look.kind == "mesh":
+        mesh = _mesh(look.path)
+        return Visual.mesh(mesh.faces.corners, mesh.faces.polygons, scale=np.array(look.size), **options)
+    make: Any = {"ball": Visual.ball, "box": Visual.box, "cylinder": Visual.cylinder, "capsule": Visual.capsule, "ellipsoid": Visual.ellipsoid}[look.kind]
+    return make(np.array(look.size), **options) if look.kind in ("box", "ellipsoid") else make(*look.size, **options)
+
+
+@lru_cache(maxsize=256)
+def _mesh(path: str) -> Any:
+    return Visual.from_file(path)
+
+
+def tree_scene(tree: Tree, source: str) -> type[Scene]:
+    """The class of scenes of a mechanism. ValueError, which names the `source`, where nothing moves or what moves weighs nothing."""
+    moving = tree.moving()
+    if not moving:
+        raise ValueError(f'{source}: no joint moves anything; expected at least one that does, or a base that moves, such as base="free"')
+    _check_masses(tree, source)
+    known = [link.name for link in tree.links]
+    for name in tree.free:
+        if name not in known:
+            raise ValueError(f"`free` names `{name}`, which is no link; {nearest(name, known)}")
+    joints = [joint for link in tree.links for joint in link.joints]
+    link_names = identifiers([link.name for link in tree.links], "link")
+    joint_names = identifiers([joint.name for joint in joints if joint.name], "joint")
+    names = {"": ""} | link_names | joint_names | identifiers([motor.name for motor in tree.motors], "motor")
+    parameters: dict[str, Parameter] = {}
+    for link in tree.links:
+        name = link_names[link.name]
+        if link.name in tree.free:
+            parameters[f"{name}_origin"] = Parameter(link.position, "m", f"of the frame of {link.name}, in that of {link.parent or 'the ground'}")
+        if link.name in moving and link.mass is not None:
+            parameters |= _mass_parameters(link, name)
+    for joint in joints:
+        turns = joint.kind == "hinge"
+        for what, unit in (("damping", "N m s" if turns else "N s/m"), ("stiffness", "N m" if turns else "N/m")):
+            if getattr(joint, what):
+                parameters[f"{names[joint.name]}_{what}"] = Parameter(getattr(joint, what), unit, f"of {joint.name}")
+    if np.any(tree.gravity):
+        parameters["gravity"] = Parameter(float(np.linalg.norm(tree.gravity)), "m/s^2")
+    limits = {names[joint.name]: joint.limits for joint in joints if joint.limits is not None and joint.kind in ("hinge", "slide")}
+    attributes = {
+        "coordinates": coordinates(*(part for joint in joints for part in parts_of(joint, names[joint.name]))),
+        "inputs": inputs(" ".join(names[motor.name] for motor in tree.motors)),
+        "domain": limits,
+        "example": dict(tree.start),
+        "_tree": tree,
+        "_names": names,
+    }
+    about = f"{tree.name}, from {source}: {', '.join(link.name for link in tree.links if link.name in moving and link.mass is not None)}."
+    return scene_class(TreeScene, class_name(tree.name), about, parameters, attributes)
+
+
+def _mass_parameters(link: Link, name: str) -> dict[str, Parameter]:
+    assert link.mass is not None
+    inertia = link.mass.inertia
+    is_diagonal = not np.any(inertia - np.diag(np.diag(inertia)))
+    found = {
+        f"{name}_mass": Parameter(link.mass.mass, "kg", positive=True),
+        f"{name}_inertia": Parameter(np.diag(inertia) if is_diagonal else inertia, "kg m^2", "about its mass centre, along its axes"),
+    }
+    if np.any(link.mass.centre):
+        found[f"{name}_mass_centre"] = Parameter(link.mass.centre, "m", f"in the frame of {link.name}")
+    return found
+
+
+def _check_masses(tree: Tree, source: str) -> None:
+    """A ValueError for a joint beyond which nothing has a mass."""
+    heavy: set[str] = set()
+    for link in reversed(tree.links):
+        if (link.mass is not None or link.name in heavy) and link.parent is not None:
+            heavy.add(link.parent)
+        if link.joints and link.mass is None and link.name not in heavy:
+            joint = link.joints[0].name or "the base"
+            raise ValueError(f"{source}: link `{link.name}`, which `{joint}` moves, has no mass, nor has any that it carries; give it an `inertial`")

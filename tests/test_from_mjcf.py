@@ -1,0 +1,239 @@
+"""Scenes from MJCF files: mass matrix, bias forces and accelerations are those of MuJoCo, and of a scene written by hand where MuJoCo is missing."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tolerances import relative_error, tolerance
+
+import jourdain_jax as jj
+from jourdain_jax.scene.validated import visuals_of
+
+# every body has one geom, or principal moments: MuJoCo diagonalises the inertia of several with an error of 1e-10
+EVERYTHING = """
+<mujoco model="everything">
+  <compiler angle="{angle}" eulerseq="{sequence}"/>
+  <option gravity="0.5 1 -9" timestep="0.001"><flag contact="disable" limit="disable"/></option>
+  <default>
+    <geom density="700"/>
+    <default class="light"><geom density="200" rgba="0.2 0.4 0.6 1"/><joint damping="0.3"/></default>
+  </default>
+  <worldbody>
+    <body name="base" pos="0.1 0.2 0.3" euler="{a} {b} {c}">
+      <freejoint name="root"/>
+      <geom type="box" size="0.2 0.1 0.05" pos="0.02 0 0" quat="1 0.2 0.1 0"/>
+      <body name="upper" pos="0 0 0.2" axisangle="1 1 0 {a}" childclass="light">
+        <joint name="shoulder" type="ball" pos="0.01 0 0"/>
+        <geom type="capsule" fromto="0 0 0 0.1 0.2 0.4" size="0.03"/>
+        <body name="fore-arm" pos="0.1 0.2 0.4" xyaxes="1 0.2 0 0 1 0.1">
+          <joint name="elbow" axis="0 1 0.3" stiffness="4" springref="{b}" ref="{a}" range="-{c} {c}"/>
+          <joint name="reach" type="slide" axis="1 0 0" pos="0.3 0 0" stiffness="9" springref="0.1" damping="0.2" ref="0.05"/>
+          <geom class="main" type="cylinder" size="0.02 0.15" zaxis="1 1 1"/>
+          <body name="tip" pos="0.2 0 0"><inertial pos="0.01 0.02 0" mass="0.3" diaginertia="0.01 0.012 0.014" quat="1 1 0 0.5"/></body>
+          <body pos="0 0.1 0" euler="0 {a} 0">
+            <joint axis="0 0 -1" pos="0.1 0 0"/><joint axis="1 0 0"/>
+            <geom type="ellipsoid" size="0.03 0.05 0.07" pos="0.1 0.1 0"/>
+          </body>
+        </body>
+      </body>
+    </body>
+    <body name="apart" pos="2 0 0" zaxis="0 -1 0">
+      <joint name="al-one" type="hinge" axis="0 0 1" ref="{b}"/><geom type="capsule" size="0.1 0.2" pos="0.3 0 0"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="pull" joint="reach" gear="3"/><motor joint="elbow"/></actuator>
+</mujoco>
+"""
+DEGREES = EVERYTHING.format(angle="degree", sequence="xyz", a=10, b=20, c=30)
+RADIANS = EVERYTHING.format(angle="radian", sequence="ZYx", a=0.2, b=-0.3, c=0.5)
+TEXTS = {"degrees": DEGREES, "radians": RADIANS, "no-gravity": DEGREES.replace('gravity="0.5 1 -9"', 'gravity="0 0 0"')}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_the_equations_are_those_of_mujoco(name):
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_string(TEXTS[name])
+    data, scene = mujoco.MjData(model), jj.from_mjcf(TEXTS[name])()
+    pushes = {"pull": 0.7, "elbow_motor": -0.4}
+    generator = np.random.default_rng(0)
+    for _ in range(3):
+        q, u = generator.normal(size=model.nq), generator.normal(size=model.nv)
+        for first in (3, 7):
+            q[first : first + 4] /= np.linalg.norm(q[first : first + 4])
+        data.qpos[:], data.qvel[:], data.ctrl[:] = q, u, list(pushes.values())
+        mujoco.mj_forward(model, data)
+        M = np.zeros((model.nv, model.nv))
+        mujoco.mj_fullM(model, M, data.qM)
+        own = jj.unconstrained_equations(scene, 0.0, q, u, pushes)
+        assert relative_error(own.M, M) < tolerance("closed_form")
+        assert relative_error(own.h - own.Q, data.qfrc_bias - data.qfrc_passive - data.qfrc_actuator) < tolerance("closed_form")
+        assert relative_error(jj.accelerations(scene, 0.0, q, u, pushes).udot, data.qacc) < tolerance("closed_form")
+
+
+def test_the_stated_pose_is_the_example():
+    scene = jj.from_mjcf(DEGREES)()
+    start = jj.start(scene, **scene.example)
+    expected = jj.rot_x(np.deg2rad(10)) @ jj.rot_y(np.deg2rad(20)) @ jj.rot_z(np.deg2rad(30))
+    poses = jj.pose_at(scene, 0.0, start.q)
+    np.testing.assert_allclose(poses["base"].orientation, expected, atol=1e-12)
+    assert start["elbow"] == pytest.approx(np.deg2rad(10))
+    assert start["al_one"] == pytest.approx(np.deg2rad(20))
+    assert scene.domain["elbow"] == (-np.deg2rad(30), np.deg2rad(30))
+    for turn in ("0 1 0 0", "0 0 1 0", "0 0.1 0.2 1", "0.3 -0.5 0.1 0.2"):
+        text = f'<mujoco><worldbody><body name="b" quat="{turn}"><freejoint/><geom size="1"/></body></worldbody></mujoco>'
+        q = np.array([jj.from_mjcf(text)().example[f"b_joint_attitude_{part}"] for part in "wxyz"])
+        stated = np.array(turn.split(), float)
+        np.testing.assert_allclose(abs(q @ stated), np.linalg.norm(stated), rtol=1e-12)
+
+
+def test_several_geoms_are_one_body():
+    geoms = '<geom type="box" size="0.2 0.1 0.05" pos="0.1 0 0" density="500"/><geom size="0.1" mass="3" pos="-0.3 0.2 0"/>'
+    geoms += '<geom size="0.9" mass="0"/><geom size="9" density="0"/>'
+    scene = jj.from_mjcf(f'<mujoco><worldbody><body name="b"><freejoint/>{geoms}</body></worldbody></mujoco>')()
+    box, ball = 500 * 8 * 0.2 * 0.1 * 0.05, 3.0
+    centre = (box * np.array([0.1, 0, 0]) + ball * np.array([-0.3, 0.2, 0])) / (box + ball)
+    apart = np.array([0.4, -0.2, 0.0])
+    moved = box * ball / (box + ball) * (apart @ apart * np.eye(3) - np.outer(apart, apart))
+    own = np.diag(box / 3 * np.array([0.1**2 + 0.05**2, 0.2**2 + 0.05**2, 0.2**2 + 0.1**2])) + 0.4 * ball * 0.1**2 * np.eye(3)
+    assert scene.b_mass == pytest.approx(box + ball, rel=1e-12)
+    np.testing.assert_allclose(scene.b_mass_centre, centre, atol=1e-12)
+    np.testing.assert_allclose(scene.b_inertia, own + moved, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("geom", "mass", "moments"),
+    [
+        ('type="sphere" size="0.2"', 4 / 3 * np.pi * 8, (3.2, 3.2, 3.2)),
+        ('type="cylinder" size="0.1 0.2"', np.pi * 4, (4.75 / 3, 4.75 / 3, 0.5)),
+        ('type="ellipsoid" size="0.1 0.2 0.3"', 4 / 3 * np.pi * 6, (2.6, 2.0, 1.0)),
+        ('type="box" size="0.1 0.2 0.3"', 48.0, (13 / 3, 10 / 3, 5 / 3)),
+    ],
+)
+def test_solids_have_the_moments_of_the_textbook(geom, mass, moments):
+    # lengths in 0.1 m, of water: mass in kg; moments per mass in 0.01 m^2
+    scene = jj.from_mjcf(f'<mujoco><worldbody><body name="b"><freejoint/><geom {geom}/></body></worldbody></mujoco>')()
+    factor = {"sphere": 0.5, "cylinder": 1.0, "ellipsoid": 1.0, "box": 1.0}[geom.split('"')[1]]
+    assert scene.b_mass == pytest.approx(mass, rel=1e-12)
+    np.testing.assert_allclose(scene.b_inertia, 0.01 * factor * mass * np.array(moments), rtol=1e-12)
+
+
+def test_a_capsule_is_a_cylinder_with_two_half_balls():
+    scene = jj.from_mjcf('<mujoco><worldbody><body name="b"><freejoint/><geom type="capsule" size="0.1 0.2"/></body></worldbody></mujoco>')()
+    z = np.linspace(-0.3, 0.3, 600_001)
+    z = (z[1:] + z[:-1]) / 2
+    squared = 0.01 - np.maximum(np.abs(z) - 0.2, 0) ** 2  # of the radius
+    slice_ = 1000 * np.pi * squared * 0.6 / len(z)
+    across = np.sum(slice_ * (squared / 4 + z**2))
+    np.testing.assert_allclose(scene.b_mass, np.sum(slice_), rtol=1e-9)
+    np.testing.assert_allclose(scene.b_inertia, [across, across, np.sum(slice_ * squared / 2)], rtol=1e-9)
+
+
+class TwoRods(jj.Scene):
+    """Two uniform rods on hinges, with a spring and a damper, written by hand."""
+
+    coordinates = jj.coordinates("first second")
+
+    def bodies(self, t, q):
+        A = jj.rot_y(q.first)
+        B = A @ jj.rot_y(q.second)
+        middle = jnp.array([0.0, 0.0, -0.4])
+        end = A @ (2 * middle)
+        return {"a": jj.RigidBody(2.0, jnp.array([0.1, 0.1, 0.01]), A @ middle, A), "b": jj.RigidBody(1.0, jnp.array([0.1, 0.1, 0.01]), end + B @ middle, B)}
+
+    def loads(self, motion):
+        stretch = motion.q.second - 0.3
+        return (
+            jj.gravity(motion, 9.81),
+            jj.generalized_force(motion, first_rate=-0.2 * motion.u.first_rate),
+            jj.Load(generalized={"second_rate": -5.0 * stretch}, potential=2.5 * stretch**2),
+        )
+
+
+RODS = """
+<mujoco model="rods"><compiler angle="radian"/><worldbody>
+  <body name="a"><joint name="first" axis="0 1 0" damping="0.2"/><inertial mass="2" pos="0 0 -0.4" diaginertia="0.1 0.1 0.01"/>
+    <body name="b" pos="0 0 -0.8"><joint name="second" axis="0 1 0" stiffness="5" springref="0.3"/>
+      <inertial mass="1" pos="0 0 -0.4" fullinertia="0.1 0.1 0.01 0 0 0"/></body></body>
+</worldbody></mujoco>
+"""
+
+
+def test_two_rods_move_as_those_that_are_written_by_hand():
+    rods, by_hand = jj.from_mjcf(RODS)(), TwoRods()
+    for t, q, u in zip(*jj.sample_states(by_hand, 3), strict=True):
+        own, expected = (jj.accelerations(scene, t, q, u).udot for scene in (rods, by_hand))
+        assert relative_error(own, expected) < tolerance("round_off")
+        own, expected = (float(jj.energy(scene, t, q, u).total) for scene in (rods, by_hand))
+        assert own == pytest.approx(expected, rel=1e-12)
+
+
+def test_geoms_are_drawn():
+    scene = jj.from_mjcf(DEGREES)()
+    looks = visuals_of(scene, jj.pose_at(scene, 0.0, jj.start(scene, **scene.example).q))
+    assert {name: [look.kind for look in found] for name, found in looks.items()} == {
+        "base": ["box"],
+        "upper": ["capsule"],
+        "fore-arm": ["cylinder"],
+        "body5": ["ellipsoid"],
+        "apart": ["capsule"],
+    }
+    np.testing.assert_allclose(looks["base"][0].size, [0.4, 0.2, 0.1])
+    np.testing.assert_allclose(looks["apart"][0].size, [0.1, 0.4])
+    assert looks["upper"][0].colour == "#336699"
+
+
+def test_what_moves_nothing_is_listed():
+    idle = '<camera name="eye"/><light/><light/><geom type="plane" size="1 1 1"/>'
+    text = RODS.replace("<worldbody>", f"<sensor/><worldbody>{idle}")
+    with pytest.warns(UserWarning, match=r"left out `camera`, `geom of type plane`, `light` \(2\), `sensor`;"):
+        jj.from_mjcf(text)
+
+
+def _body(inside, outside="", compiler=""):
+    return f'<mujoco>{compiler}<worldbody><body name="b"><geom size="0.1"/>{inside}</body></worldbody>{outside}</mujoco>'
+
+
+HINGE = '<joint name="j"/>'
+BAD = {
+    "no-file": ("nowhere.xml", r"nowhere.xml: cannot be read"),
+    "another-root": ("<robot/>", r"its root is `robot`, expected `mujoco`"),
+    "nothing-moves": (_body(""), r"no joint moves anything"),
+    "unknown-joint": (_body('<joint name="j" type="hing"/>'), r"joint `j` is of the type `hing`; did you mean `hinge`"),
+    "armature": (_body('<joint name="j" armature="0.1"/>'), r'`armature="0.1"` of joint `j` is not read.*ignore=\("armature",\)'),
+    "friction-loss": (_body('<joint name="j" frictionloss="0.1"/>'), r"`frictionloss=\"0.1\"` of joint `j`"),
+    "unknown-attribute": (_body('<joint name="j" dampin="0.1"/>'), r"`dampin=\"0.1\"` of joint `j` is not read"),
+    "ball-spring": (_body('<joint name="j" type="ball" stiffness="1"/>'), r"the stiffness of the ball joint `j` is not read"),
+    "equality": (_body(HINGE, "<equality/>"), r"the section `equality` is not read"),
+    "tendon": (_body(HINGE, "<tendon/>"), r"the section `tendon` is not read"),
+    "include": (_body(HINGE, '<include file="x.xml"/>'), r"the section `include` is not read"),
+    "composite": (_body(f"{HINGE}<composite/>"), r"`composite` in body `b` is not read"),
+    "mocap": (_body(HINGE).replace('name="b"', 'name="b" mocap="true"'), r'`mocap="true"` of body `b`'),
+    "servo": (_body(HINGE, '<actuator><position name="p" joint="j"/></actuator>'), r"the actuator `position` `p` is not read"),
+    "motor-of-nothing": (_body(HINGE, '<actuator><motor name="p" joint="k"/></actuator>'), r"motor `p` pushes `k`, which is no hinge or slide"),
+    "no-gravity-flag": (_body(HINGE, '<option><flag gravity="disable"/></option>'), r'`gravity="disable"` of `flag`'),
+    "viscosity": (_body(HINGE, '<option viscosity="1"/>'), r'`viscosity="1"` of `option`'),
+    "total-mass": (_body(HINGE, compiler='<compiler settotalmass="3"/>'), r'`settotalmass="3"` of `compiler`'),
+    "massless": (f'<mujoco><worldbody><body name="b">{HINGE}</body></worldbody></mujoco>', r"link `b`, which `j` moves, has no mass"),
+    "mesh-of-unknown-mass": (_body(f'{HINGE}<geom type="mesh" mesh="m"/>'), r"the mass of a geom of body `b`, of the type `mesh`, is not read"),
+    "no-inertia": (_body(f'{HINGE}<inertial pos="0 0 0" mass="1"/>'), r"`inertial` of body `b` has neither `diaginertia` nor `fullinertia`"),
+    "negative-mass": (_body(f'{HINGE}<inertial pos="0 0 0" mass="-1" diaginertia="1 1 1"/>'), r"mass in `inertial` of body `b` is -1"),
+    "no-size": (_body(f'{HINGE}<geom name="g" type="box" size="1 1"/>'), r"size of geom `g` of body `b` is `1 1`, expected 3 lengths"),
+    "no-class": (_body('<joint name="j" class="heavy"/>'), r"joint `j` is of the class `heavy`, which no `default` states"),
+    "default-without-class": (_body(HINGE, compiler="<default><default/></default>"), r"a `default` inside the class `main` has no `class`"),
+    "free-below": (_body(f'{HINGE}<body name="c"><freejoint/><geom size="1"/></body>'), r"body `c` has a free joint and a parent"),
+    "two-of-a-name": (_body(f'{HINGE}<body name="b"><geom size="1"/></body>'), r"two bodies are called `b`"),
+    "quaternion-zero": (_body(f'{HINGE}<body name="c" quat="0 0 0 0"/>'), r"quat of body `c` is zero"),
+    "axis-zero": (_body('<joint name="j" axis="0 0 0"/>'), r"axis of joint `j` is zero"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_cannot_become_a_scene_is_refused_by_name(case):
+    text, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        jj.from_mjcf(text)
+
+
+@pytest.mark.parametrize("case", ["armature", "equality", "servo", "ball-spring"])
+def test_what_is_ignored_on_purpose_is_left_out(case):
+    keys = {"armature": "armature", "equality": "equality", "servo": "position", "ball-spring": "stiffness"}
+    assert jj.from_mjcf(BAD[case][0], ignore=keys[case])().b_mass == pytest.approx(4000 / 3 * np.pi * 0.1**3)
