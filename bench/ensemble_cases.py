@@ -6,8 +6,8 @@
                 weave speed
     rides       1,000,000 rides of 5 s from random leans and speeds: where the bicycle falls
 
-Writes a list of {"figure", "model", "value", "required", "met"}, and the pictures `docs/bicycle_stability.png` and `docs/bicycle_rides.png` (into DIR where that
-is given). `--quick`: a hundredth of the samples. Needs the extras `ensembles`, `native` and `plot`.
+Writes a list of {"figure", "model", "value", "required", "met"}, and the pictures `docs/bicycle_stability.png` and `docs/bicycle_rides.png` (into DIR where
+that is given). `--quick`: a hundredth of the samples. Needs the extras `ensembles`, `native` and `plot`.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from jourdain_jax.bicycle import eigenvalues, linear_matrices, measured_bicycle,
 from jourdain_jax.bicycle.parameters import PARAMETERS
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.pyplot as plt
 
 BICYCLE = "Browser"
 BLUE, ORANGE = "#1f5fa8", "#b3470f"
