@@ -20,6 +20,7 @@ from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS
 from jourdain_jax.motion.marks import with_nan_as_a_mark
+from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.retries import lost_codes, mark_retried, next_retry, retry_options
 from jourdain_jax.motion.simulate import MOST_STEPS, TOLERANCE, default_solver, set_up, warn_float32
 from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
@@ -254,7 +255,8 @@ def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajec
 
 def _together(scene, fixed, options, varied, parameters) -> Trajectory:
     """All given lanes in lockstep; compiled once for scenes and lanes of one shape."""
-    return _compiled(options["inputs"].programs)(scene, fixed, options, varied, parameters)
+    compiled = _compiled_dense if _form(scene, options).lowered is None else _compiled_lowered
+    return compiled(options["inputs"].programs)(scene, fixed, options, varied, parameters)
 
 
 def _lanes_in_lockstep(scene, fixed, options, varied, parameters) -> Trajectory:
@@ -266,7 +268,7 @@ def _lanes_in_lockstep(scene, fixed, options, varied, parameters) -> Trajectory:
     return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
 
 
-_compiled = for_programs(_lanes_in_lockstep, by_itself)
+_compiled_dense, _compiled_lowered = (for_programs(_lanes_in_lockstep, compiled_by) for compiled_by in (by_itself, quickly_compiled))
 
 
 def _with_arrays(options: dict) -> dict:
