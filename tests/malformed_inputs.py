@@ -548,7 +548,7 @@ MEASURED: dict[str, Case] = {
     "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start=None)": ("ValueError", "`start` of `Measurements` is `None`, expected a dictionary by name"),
     "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, t0=0.5)": ("ValueError", "the start at t0 = 0.5 s comes after the first sample (0.0 s)"),
     "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, unknown_start=('x',))": ("ValueError", "unknown start value `x` has no first guess"),
-    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, functions={'nose': len})": ("ValueError", "function `nose` has no measured values"),
+    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, sensors={'nose': len})": ("ValueError", "sensor `nose` has no measured values"),
     "jj.bounds(1.0, 0.0)": ("ValueError", "expected finite numbers low < high; for one bound at zero use `positive()`, for none `unbounded()`"),
     "jj.bounds('a', 1.0)": ("ValueError", "low end of `bounds` is the text 'a', expected real numbers"),
     "jj.unbounded(-1.0)": ("ValueError", "expected a positive scale, a typical change in the unit of the unknown"),

@@ -16,7 +16,7 @@ CORRELATED = 0.98
 MOST_COMPARED, MOST_NAMED = 1000, 8  # unknowns; pairs of them in the table
 
 
-class Estimate(eqx.Module):
+class Estimated(eqx.Module):
     """One unknown, in its unit; NaN for what the measurements cannot tell."""
 
     value: Float[np.ndarray, "*repeats"]
@@ -66,14 +66,14 @@ class Fit(Printed, eqx.Module):
     cutoff: float = eqx.field(static=True)
     errors: str = eqx.field(static=True)  # whence standard errors come: "sigmas" or "runs"
 
-    def __getitem__(self, name: str) -> Estimate:
+    def __getitem__(self, name: str) -> Estimated:
         if name not in self.labels:
             raise UnknownNameError(f"`{name}` was not estimated; {nearest(name, self.labels)}")
         i = self.labels.index(name)
-        return Estimate(self.values[..., i], self.standard_errors[..., i], self.low[..., i], self.high[..., i], self.units[i])
+        return Estimated(self.values[..., i], self.standard_errors[..., i], self.low[..., i], self.high[..., i], self.units[i])
 
     @property
-    def estimates(self) -> dict[str, Estimate]:
+    def estimates(self) -> dict[str, Estimated]:
         """All estimates by name."""
         return {name: self[name] for name in self.labels}
 
