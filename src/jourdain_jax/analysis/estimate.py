@@ -28,10 +28,10 @@ class Estimate:
     Raises ValueError for numbers that are not finite, and for a prior that is none or has no spread.
     """
 
-    guess: Any = None
-    range: Range | None = None
-    per_run: bool = False
-    prior: Any = None
+    guess: Any = None  # a number, or several
+    range: Any = None  # Range
+    per_run: Any = False  # bool
+    prior: Any = None  # Normal
 
     def __post_init__(self):
         if self.guess is not None:

@@ -26,7 +26,7 @@ _NODES = _NODES + 0.5
 
 
 def read(
-    values: Float[Array, "grid *channel"],
+    values: Float[Array | np.ndarray, "grid *channel"],
     grid: Float[Array | np.ndarray, "grid"],
     ts: Float[Array | np.ndarray, "times"],
     delay,
@@ -91,7 +91,7 @@ def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channe
 def filtered(ts: Float[Array, "knots"], values: Float[Array, "knots"], lag) -> Float[Array, "knots"]:
     """What the same filter gives at the knots of samples that are linear in between: exactly there.
 
-        y_k+1 = x_k+1 - lag m + (y_k - x_k + lag m) exp(-h / lag),     m = (x_k+1 - x_k) / h
+    y_k+1 = x_k+1 - lag m + (y_k - x_k + lag m) exp(-h / lag),     m = (x_k+1 - x_k) / h
     """
     steps = jnp.diff(ts)
     decay = jnp.exp(-steps / jnp.maximum(lag, _LEAST * steps))

@@ -66,7 +66,7 @@ class Measurements(eqx.Module):
         start: Mapping,
         unknown_start: Mapping | Iterable[str] = (),
         inputs: "dict | Inputs | None" = None,
-        sensors: Mapping[str, Sensor | str | Callable] | None = None,
+        sensors: "Mapping[str, Sensor | str | Callable] | None" = None,
         t0: Number | None = None,
     ):
         real = jnp.result_type(float)
@@ -227,8 +227,8 @@ def _inputs(scene: Scene, run: Measurements, where: str, estimates: dict) -> tup
             estimates[f"{name}.{number}"] = getattr(actuator, number)
         if "lag" in used and not is_traced((actuator.command.ts, run.ts)) and actuator.command.ts[-1] < run.ts[-1]:
             raise ValueError(
-                f"the command of input `{name}` of {where} ends at {float(actuator.command.ts[-1]):g} s, before the last sample at {float(run.ts[-1]):g} s, and "
-                "its lag does not go on after it; repeat the last value at a later time"
+                f"the command of input `{name}` of {where} ends at {float(actuator.command.ts[-1]):g} s, before the last sample at {float(run.ts[-1]):g} s, "
+                "and its lag does not go on after it; repeat the last value at a later time"
             )
         inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
         if unknown:
@@ -242,7 +242,5 @@ def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> tupl
     entries = (*scene.coordinate_names.entries, *scene.speed_names.entries)
     if name not in groups and name not in entries:
         unknown = f"unknown channel `{name}`" if name == channel_name else f"channel `{channel_name}`, whose sensor measures an unknown quantity `{name}`"
-        raise ValueError(
-            f"{where} has {unknown}; {nearest(name, (*groups, *entries))} For other quantities give a function of the motion in `sensors`."
-        )
+        raise ValueError(f"{where} has {unknown}; {nearest(name, (*groups, *entries))} For other quantities give a function of the motion in `sensors`.")
     return (groups[name],) if name in groups else ()

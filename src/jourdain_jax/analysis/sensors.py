@@ -17,7 +17,6 @@ from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.lagged import filtered, read
 from jourdain_jax.analysis.ranges import positive, unbounded
-from jourdain_jax.calculus.reals import Number
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.scene.numbers import checked_real, described, is_traced
 
@@ -51,15 +50,7 @@ class Sensor(eqx.Module):
     delay: Float[Array, ""] | Estimate  # s
     lag: Float[Array, ""] | Estimate  # s
 
-    def __init__(
-        self,
-        quantity: str | Callable | None = None,
-        *,
-        gain: Number | Estimate = 1.0,
-        bias: Number | Estimate = 0.0,
-        delay: Number | Estimate = 0.0,
-        lag: Number | Estimate = 0.0,
-    ):
+    def __init__(self, quantity=None, *, gain=1.0, bias=0.0, delay=0.0, lag=0.0):
         if not (quantity is None or isinstance(quantity, str) or callable(quantity)):
             raise ValueError(f"`quantity` of `Sensor` is {described(quantity)}, expected a coordinate, a speed, or a function of a motion")
         self.quantity = quantity
@@ -85,15 +76,7 @@ class Actuator(eqx.Module):
     delay: Float[Array, ""] | Estimate  # s
     lag: Float[Array, ""] | Estimate  # s
 
-    def __init__(
-        self,
-        command: Sampled,
-        *,
-        gain: Number | Estimate = 1.0,
-        bias: Number | Estimate = 0.0,
-        delay: Number | Estimate = 0.0,
-        lag: Number | Estimate = 0.0,
-    ):
+    def __init__(self, command, *, gain=1.0, bias=0.0, delay=0.0, lag=0.0):
         if not isinstance(command, Sampled):
             raise ValueError(f"`command` of `Actuator` is {described(command)}, expected `jj.Sampled(ts, values)`")
         self.command = command
