@@ -3,6 +3,9 @@
 A cart with a spring and a damper is linear, so that its readings are sums of exponentials, also through a delay and a low-pass.
 """
 
+import re
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -359,6 +362,16 @@ def test_log_likelihood_knows_sensors_and_is_differentiable_in_them():
         step = 1e-4
         expected = (by_hand(TRUTH | {name: TRUTH[name] + step}) - by_hand(TRUTH | {name: TRUTH[name] - step})) / (2 * step)
         assert float(slopes[name]) == pytest.approx(expected, rel=1e-3, abs=1e-2), name
+
+
+def test_the_page_on_identification_runs(capsys):
+    page = (Path(__file__).parents[1] / "docs" / "howto" / "identification.md").read_text(encoding="utf-8")
+    names = {"jj": jj, "jnp": jnp, "np": np}
+    exec("\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), names)
+    found = names["found"]
+    assert found.converged
+    for name, value in (("gyro.gain", 1.1), ("gyro.delay", 0.05), ("run 0: gyro.bias", 0.02), ("offset", 0.25)):
+        assert abs(found[name].value - value) < 4 * found[name].standard_error + 1e-3, name
 
 
 # Bad input. -----------------------------------------------------------------------------------------------------------------

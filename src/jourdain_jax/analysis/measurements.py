@@ -51,9 +51,10 @@ class Measurements(eqx.Module):
     start: dict[str, Float[Array, "..."]]
     unknown_start: dict[str, Range | None]
     inputs: dict | Inputs | None
-    sensors: dict[str, Sensor | Reading]
-    drives: dict[str, Drive]  # actuators with numbers to be estimated, by input; none before the run is `checked`
-    estimates: dict[str, Estimate]  # of sensors and actuators, as "gyro.gain"; none before
+    sensors: dict[str, Sensor]
+    readings: dict[str, Reading]  # the sensors made ready; none before the run is `checked`, as of the next two
+    drives: dict[str, Drive]  # actuators with numbers to be estimated, by input
+    estimates: dict[str, Estimate]  # of sensors and actuators, as "gyro.gain"
     t0: Float[Array, ""]  # s
     unknown_sigma: tuple[str, ...] = eqx.field(static=True)  # channels; their sigma here is 1
 
@@ -83,7 +84,7 @@ class Measurements(eqx.Module):
         self.unknown_start = dict(unknown_start) if isinstance(unknown_start, Mapping) else dict.fromkeys(as_names(unknown_start))
         self.inputs = inputs
         self.sensors = {name: one if isinstance(one, Sensor) else Sensor(one) for name, one in (sensors or {}).items()}
-        self.drives, self.estimates = {}, {}
+        self.readings, self.drives, self.estimates = {}, {}, {}
         self.t0 = self.ts[0] if t0 is None else jnp.asarray(t0, real)
 
     def __check_init__(self):
@@ -155,12 +156,13 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
     """
     where = f"run {index} of `{type(scene).__name__}`"
     scene.named(**run.start)
-    times, estimates = run.ts.shape[0], {}
-    sensors = {}
+    times = run.ts.shape[0]
+    readings: dict[str, Reading] = {}
+    estimates: dict[str, Estimate] = {}
     for name, values in run.values.items():
         quantity, shape = _quantity(scene, run.sensors.get(name, Sensor(name)), name, where)
         if name in run.sensors:
-            sensors[name] = _reading(run.sensors[name], name, where, quantity, shape, estimates)
+            readings[name] = _reading(run.sensors[name], name, where, quantity, shape, estimates)
             _check_begin(run, name, where, repeats)
         shape = (times, *shape)
         found = values.shape[1:] if repeats else values.shape
@@ -171,7 +173,7 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
         if run.sigma[name].shape not in ((), (times,), shape):
             raise ValueError(f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, expected (), {(times,)} or {shape}")
     inputs, drives = _inputs(scene, run, where, estimates)
-    ready, of = (inputs, sensors, drives, estimates), lambda r: (r.inputs, r.sensors, r.drives, r.estimates)
+    ready, of = (inputs, readings, drives, estimates), lambda r: (r.inputs, r.readings, r.drives, r.estimates)
     return eqx.tree_at(of, run, ready, is_leaf=lambda x: x is None or any(x is part for part in of(run)))
 
 
@@ -212,11 +214,11 @@ def _check_begin(run: Measurements, name: str, where: str, repeats: bool) -> Non
 
 def _inputs(scene: Scene, run: Measurements, where: str, estimates: dict) -> tuple[Inputs, dict[str, Drive]]:
     """All inputs, at the first guess of what is to be estimated; and the actuators that have such numbers."""
-    given = run.inputs
-    actuators = {name: one for name, one in given.items() if isinstance(one, Actuator)} if isinstance(given, Mapping) else {}
+    given = run.inputs if isinstance(run.inputs, Mapping) else {}
+    actuators = {name: one for name, one in given.items() if isinstance(one, Actuator)}
     if not actuators:
-        return as_inputs(scene, given), {}
-    inputs = as_inputs(scene, given | {name: one.command for name, one in actuators.items()})
+        return as_inputs(scene, run.inputs), {}
+    inputs = as_inputs(scene, {**given} | {name: one.command for name, one in actuators.items()})
     drives = {}
     for name, actuator in actuators.items():
         numbers, unknown, used = numbers_of(actuator)

@@ -78,8 +78,8 @@ def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
         sigma, known = data.sigma_of(name, repeats), xp.isfinite(xp.asarray(values))
         weights[name] = xp.where(known & xp.isfinite(sigma), 1.0 / sigma, 0.0)
     measured = {name: xp.where(weights[name] > 0, xp.asarray(values), 0.0) for name, values in data.values.items()}
-    grid = _grid(data.t0, data.ts) if any(sensor.is_late for sensor in data.sensors.values()) else None
-    return Run(data.t0, data.ts, grid, measured, weights, data.start, data.inputs, data.sensors, data.drives)
+    grid = _grid(data.t0, data.ts) if any(sensor.is_late for sensor in data.readings.values()) else None
+    return Run(data.t0, data.ts, grid, measured, weights, data.start, data.inputs, data.readings, data.drives)
 
 
 def _grid(t0, ts) -> Float[Array | np.ndarray, "grid"]:
@@ -269,7 +269,7 @@ def _alike(data: Sequence[Measurements]) -> list[list[int]]:
     """Indices of the runs, grouped by equal structure: names, sensors, kinds of inputs, shapes but for the number of times."""
     groups: dict[tuple, list[int]] = {}
     for index, run in enumerate(data):
-        parts = run.start, run.sensors, run.inputs, run.drives
+        parts = run.start, run.readings, run.inputs, run.drives
         arrays, rest = eqx.partition((*parts[:2], _without_knots(parts[2:])), _is_array)
         kind = (jax.tree.structure((*parts, dict.fromkeys(run.values, 0))), tuple(jax.tree.leaves(rest)))
         groups.setdefault((*kind, tuple(x.shape for x in jax.tree.leaves(arrays))), []).append(index)

@@ -185,4 +185,4 @@ def with_numbers(parts: Mapping[str, "Reading | Drive"], known: Mapping[str, Arr
 
 def latest(delay: Array | Estimate) -> float:
     """The largest delay that a sensor may have, s."""
-    return float(delay.range.high) if isinstance(delay, Estimate) and delay.range is not None else float(delay)
+    return float(delay.range.high if isinstance(delay, Estimate) else delay)
