@@ -160,7 +160,7 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
     readings: dict[str, Reading] = {}
     estimates: dict[str, Estimate] = {}
     for name, values in run.values.items():
-        quantity, shape = _quantity(scene, run.sensors.get(name, Sensor(name)), name, where)
+        quantity, shape = _quantity(scene, run.sensors[name].quantity if name in run.sensors else None, name, where)
         if name in run.sensors:
             readings[name] = _reading(run.sensors[name], name, where, quantity, shape, estimates)
             _check_begin(run, name, where, repeats)
@@ -177,12 +177,12 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
     return eqx.tree_at(of, run, ready, is_leaf=lambda x: x is None or any(x is part for part in of(run)))
 
 
-def _quantity(scene: Scene, sensor: Sensor, channel_name: str, where: str):
+def _quantity(scene: Scene, given: str | Callable | None, channel_name: str, where: str):
     """What a sensor measures: a function made ready, or a name; and its shape."""
-    if callable(sensor.quantity):
-        operation = channel(sensor.quantity, scene)
+    if callable(given):
+        operation = channel(given, scene)
         return operation, operation.shape
-    name = channel_name if sensor.quantity is None else sensor.quantity
+    name = channel_name if given is None else given
     return name, _named_shape(scene, name, channel_name, where)
 
 
