@@ -3,9 +3,9 @@
     python bench/identification.py [--quick] [--only NAME ...] [--json FILE]
 
 Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), coverage, windows (57 runs of the steer-by-wire
-bicycle with an unknown start each; the data are in `data/sbw_bicycle`). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick`
-leaves out windows and takes fewer repeats. Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh
-process.
+bicycle with an unknown start each; the data are in `data/sbw_bicycle`), logs (what halves of these runs say of each other, with and without delays of the
+sensors). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs and takes fewer repeats. Times are
+processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
 """
 
 import argparse
@@ -265,6 +265,63 @@ def of_windows() -> list[Figure]:
     ]
 
 
+# IByy does not enter the equations of an upright bicycle; the nominal one rules out frames that the others allow
+FLAT = NOMINAL | {"IByy": 4.0}
+MOST_DELAY = 0.1  # s: no sample is used that is earlier
+
+
+def with_sensors(run: jj.Measurements, sensors: dict, actuator: dict) -> jj.Measurements:
+    """A window with these numbers of its sensors and of the steer motor, less its first samples."""
+    values = {name: np.where(np.asarray(run.ts) < MOST_DELAY - 1e-9, np.nan, np.asarray(x)) for name, x in run.values.items()}
+    inputs = {"steer_torque": jj.Actuator(run.inputs["steer_torque"], **actuator)}
+    made = {name: jj.Sensor(**numbers) for name, numbers in sensors.items()}
+    return jj.Measurements(run.ts, values, dict(run.sigma), start=run.start, unknown_start=run.unknown_start, inputs=inputs, sensors=made)
+
+
+def rms(found: jj.Fit, channel: str, sigma: float) -> float:
+    """Of all residuals of a channel, in its unit."""
+    r = np.concatenate([run[channel] for run in found.residuals])
+    return sigma * float(np.sqrt(np.nanmean(r**2)))
+
+
+def held_out(half: jj.Fit, runs: list[jj.Measurements], sensors: dict, actuator: dict) -> float:
+    """Lean-rate rms of runs that had no part in a fit: of them the starts alone are estimated."""
+    value = lambda name: float(half[name].value)  # noqa: E731
+    known = {c: {n: value(f"{c}.{n}") if isinstance(x, jj.Estimate) else x for n, x in numbers.items()} for c, numbers in sensors.items()}
+    motor = {n: value(f"steer_torque.{n}") if isinstance(x, jj.Estimate) else x for n, x in actuator.items()}
+    found = jj.fit(half.scene, [with_sensors(run, known, motor) for run in runs], (), rtol=1e-6, atol=1e-6)
+    return rms(found, "lean_rate", 0.03)
+
+
+def logs() -> list[Figure]:
+    """Odd and even windows, each half by itself: how far apart, how well each predicts the other, and whether its bodies can be."""
+    delay = jj.Estimate(0.01, range=jj.bounds(0.0, MOST_DELAY))
+    late = {"lean_rate": {"delay": delay}, "steer_rate": {"delay": delay}}
+    runs, found = windows(), []
+    for what, sensors, actuator in (("ideal sensors", {}, {}), ("delays of both sensors", late, {})):
+        halves = []
+        for half in (runs[::2], runs[1::2]):
+            data = [with_sensors(run, sensors, actuator) for run in half]
+            halves.append(jj.fit(SteerByWire(**FLAT), data, FREE, rtol=1e-6, atol=1e-6, errors="runs"))
+        shared = [label for label in halves[0].labels if not label.startswith("run ")]
+        for half in halves:
+            print("  " + "; ".join(f"{name} {float(half[name].value):.4g} +- {float(half[name].standard_error):.2g}" for name in shared))
+            print("\n".join(f"  {warning}" for warning in half.warnings))
+        apart = {n: abs(float(halves[0][n].value - halves[1][n].value)) / np.hypot(*(float(h[n].standard_error) for h in halves)) for n in shared}
+        print("  apart, standard errors: " + ", ".join(f"{name} {x:.1f}" for name, x in apart.items()))
+        out = max(held_out(a, b, sensors, actuator) for a, b in ((halves[0], runs[1::2]), (halves[1], runs[::2])))
+        model = f"steer-by-wire bicycle, {what}"
+        found += [
+            figure("lean-rate rms on held-out windows, rad/s", model, out, 0.027),
+            figure("bodies that cannot be, of both halves", model, sum(len(half.impossible) for half in halves), 0),
+            figure("halves differ by, standard errors (from how runs differ)", model, float(np.nanmax(list(apart.values()))), 3),
+            figure("estimates that have no standard error in one half", model, float(sum(not np.isfinite(x) for x in apart.values()))),
+            figure("largest correlation of neighbouring residuals", model, max(rho for half in halves for rho, _ in half.autocorrelation.values())),
+            figure("halves converged, of two", model, sum(bool(half.converged) for half in halves), 2, at_least=True),
+        ]
+    return found
+
+
 def main() -> None:
     """Run, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -283,8 +340,9 @@ def main() -> None:
         "starts": starts,
         "coverage": lambda: coverage(50 if options.quick else 500),
         "windows": of_windows,
+        "logs": logs,
     }
-    chosen = options.only or [name for name in parts if not (options.quick and name == "windows")]
+    chosen = options.only or [name for name in parts if not (options.quick and name in ("windows", "logs"))]
     figures = []
     for name in chosen:
         print(name, flush=True)

@@ -216,6 +216,39 @@ def test_a_sensor_shows_functions_and_coordinates_under_other_names():
     assert {"`place.gain[1]` does not show in any channel", "`place.gain[2]` does not show in any channel"} == set(found.not_identifiable)
 
 
+class Swing(jj.Scene):
+    """An arm on an axle along z with a torsional spring: `I turn'' = - k turn`."""
+
+    inertia: jnp.ndarray = jj.parameter(0.5, unit="kg m^2", positive=True)
+    stiffness: jnp.ndarray = jj.parameter(8.0, unit="N m/rad", positive=True)
+    coordinates = jj.coordinates("turn")
+
+    def bodies(self, t, q):
+        return {"arm": jj.RigidBody(jnp.asarray(1.0), self.inertia * jnp.ones(3), jnp.zeros(3), jj.rot_z(q.turn))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, turn_rate=-self.stiffness * motion.q.turn),)
+
+
+def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_gravity():
+    # turn = 0.7 cos(4 t), at 0.2 m: f = (- turn'^2 r, turn'' r, g) in the axes of the arm
+    turn, rate = 0.7 * np.cos(4 * TS), -2.8 * np.sin(4 * TS)
+    felt = np.stack([-0.2 * rate**2, -16 * 0.2 * turn, 9.81 + 0 * TS], axis=1)
+    seen = jj.Accelerometer("arm", (0.2, 0.0, 0.1))
+    motion = jj.simulate(Swing(), {"turn": 0.7}, ts=TS, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(seen.over_times(motion), felt, atol=1e-7)
+    late = (4 * 0.05) ** 6 / 50  # of the reading between times, relative
+    for sensor, missing in ((seen, TS < 0), (jj.Sensor(seen, delay=jj.Estimate(0.03, range=jj.bounds(0.0, 0.1))), TS < 0.1)):
+        shown = felt if sensor is seen else np.stack([np.interp(TS - 0.05, TS, felt[:, i]) for i in range(3)], axis=1)
+        data = jj.Measurements(TS, {"imu": np.where(missing[:, None], np.nan, shown)}, 0.01, start={"turn": 0.7}, sensors={"imu": sensor})
+        found = jj.fit(Swing(stiffness=7.5), data, ("stiffness",))
+        assert found["stiffness"].value == pytest.approx(8.0, rel=1e-5 + late)
+    assert found["imu.delay"].value == pytest.approx(0.05, abs=1e-5)
+    bad = jj.Measurements(TS, {"imu": felt}, 0.01, start={"turn": 0.7}, sensors={"imu": jj.Accelerometer("arn")})
+    with pytest.raises(ValueError, match="the accelerometer `imu` of run 0 of `Swing` sits on body `arn`, which is not there; did you mean `arm`"):
+        jj.fit(Swing(), bad, ("stiffness",))
+
+
 def test_a_delay_that_is_not_there_is_at_its_bound():
     found = jj.fit(Cart(mass=1.9), run(3, truth=IDEAL, delay=DELAY), ("mass",))
     assert found.converged

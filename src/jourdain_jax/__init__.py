@@ -24,6 +24,7 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
 
 from jourdain_jax import models
+from jourdain_jax.analysis.accelerometer import Accelerometer
 from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit import fit, fit_batch
@@ -102,6 +103,7 @@ __version__ = _version_of("jourdain-jax")
 
 __all__ = [
     "Accelerations",
+    "Accelerometer",
     "Actuator",
     "Baumgarte",
     "Built",

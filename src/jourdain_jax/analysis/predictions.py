@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
 from jourdain_jax.analysis.unknowns import Layout
@@ -53,12 +54,11 @@ class Run(eqx.Module):
         for drive in self.drives.values():
             inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
         motion = simulate(scene, self.start, t0=self.t0, ts=self.ts if self.grid is None else self.grid, inputs=inputs, events=False, work=False, **simulation)
-        states = motion.motions() if any(sensor.operation is not None for sensor in self.sensors.values()) else None
+        states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
         found = {}
         for name, weight in self.weights.items():
             sensor = self.sensors.get(name, ideal(name))
-            x = motion[sensor.name] if sensor.operation is None else jax.vmap(sensor.operation)(states)
-            found[name] = jnp.where(weight > 0, (sensor.shown(x, self.grid, self.ts) - self.values[name]) * weight, 0.0)
+            found[name] = jnp.where(weight > 0, (sensor.shown(sensor.quantity(motion, states), self.grid, self.ts) - self.values[name]) * weight, 0.0)
         return found
 
     def at(self, layout: Layout, shared, local) -> "Run":
