@@ -220,7 +220,8 @@ def _batch_text(fit: Fit) -> str:
     rows = [("unknown", "unit", "mean", "std. deviation", "mean std. error")]
     for name, e in fit.estimates.items():
         values, errors = np.asarray(e.value)[good], np.asarray(e.standard_error)[good]
-        some = good.sum() > 1
-        numbers = (f"{values.mean():.6g}", f"{values.std(ddof=1):.2g}", f"{errors.mean():.2g}") if some else ("-", "-", "-")
+        errors = errors[np.isfinite(errors)]  # an estimate at its bound has none
+        some, error = good.sum() > 1, f"{errors.mean():.2g}" if errors.size else "-"
+        numbers = (f"{values.mean():.6g}", f"{values.std(ddof=1):.2g}", error) if some else ("-", "-", "-")
         rows.append((name, e.unit, *numbers))
     return "\n".join([f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} converged", *table(rows)])
