@@ -4,7 +4,7 @@
 
 Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), coverage, windows (57 runs of the steer-by-wire
 bicycle with an unknown start each; the data are in `data/sbw_bicycle`), logs (what halves of these runs say of each other, with and without delays of the
-sensors). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs and takes fewer repeats. Times are
+sensors and a lag of the motor). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs and takes fewer repeats. Times are
 processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
 """
 
@@ -282,6 +282,7 @@ class FlatFrame(SteerByWire):
 
 # every fit puts the damping of lean at its bound, zero: it is left out
 FOR_LOGS = {name: kind for name, kind in FREE.items() if name != "lean_damping"}
+MOTOR_LAG = 0.05  # s, of the steer motor behind its command: by hand, from these logs
 MOST_DELAY = 0.1  # s: no sample is used that is earlier
 
 
@@ -313,7 +314,8 @@ def logs() -> list[Figure]:
     delay = jj.Estimate(0.01, range=jj.bounds(0.0, MOST_DELAY))
     late = {"lean_rate": {"delay": delay}, "steer_rate": {"delay": delay}}
     runs, found = windows(), []
-    for what, sensors, actuator in (("ideal sensors", {}, {}), ("delays of both sensors", late, {})):
+    cases = (("ideal sensors", {}, {}), ("delays of both sensors", late, {}), ("delays of both sensors, motor lag", late, {"lag": MOTOR_LAG}))
+    for what, sensors, actuator in cases:
         halves = []
         for half in (runs[::2], runs[1::2]):
             data = [with_sensors(run, sensors, actuator) for run in half]
