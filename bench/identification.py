@@ -4,7 +4,7 @@
 
 Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), coverage, windows (57 runs of the steer-by-wire
 bicycle with an unknown start each; the data are in `data/sbw_bicycle`), logs (what halves of these runs say of each other, with and without delays of the
-sensors and a lag of the motor). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs and takes fewer repeats.
+sensors and a lag of the motor). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs, with fewer repeats.
 Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
 """
 
