@@ -237,7 +237,7 @@ def test_runs_of_equal_shape_are_traced_once_and_repeated_fits_not_at_all():
     def run(x0):
         x, _ = cart_motion(TS, x0, 0.0, 0.0)
         path = np.stack([x, 0 * x, 0 * x], axis=1)
-        return Measurements(TS, {"cart": path}, 0.01, start={"x": x0, "x_rate": 0.0}, functions={"cart": position})
+        return Measurements(TS, {"cart": path}, 0.01, start={"x": x0, "x_rate": 0.0}, sensors={"cart": position})
 
     first = fit(Cart(mass=1.5), [run(0.3)], ("mass",))
     alone = len(traces)
@@ -365,7 +365,7 @@ def test_no_number_of_the_method_recompiles_and_a_new_lambda_per_run_is_one_chan
         x, _ = cart_motion(TS, x0, 0.0, 0.0)
         path = np.stack([x, 0 * x, 0 * x], axis=1)
         scale = jnp.asarray(2.0)
-        return Measurements(TS, {"cart": 2 * path}, 0.01, start={"x": x0, "x_rate": 0.0}, functions={"cart": lambda motion: scale * motion["cart"].position})
+        return Measurements(TS, {"cart": 2 * path}, 0.01, start={"x": x0, "x_rate": 0.0}, sensors={"cart": lambda motion: scale * motion["cart"].position})
 
     first = fit(Cart(mass=1.5), [run(0.3), run(-0.5)], ("mass",))
     assert len(traces) == 1  # two lambdas, one program
@@ -617,7 +617,7 @@ def test_two_hidden_directions_and_a_parameter_that_does_nothing():
         (lambda: Measurements(TS[:0], {"x": TS}, 1.0, start={}), "expected a vector of at least one time"),
         (lambda: cart_run(t0=1.0), "the start at t0 = 1.0 s comes after the first sample"),
         (lambda: cart_run(unknown_start=("y",)), "unknown start value `y` has no first guess"),
-        (lambda: cart_run(functions={"place": lambda motion: motion.q.x}), "function `place` has no measured values"),
+        (lambda: cart_run(sensors={"place": lambda motion: motion.q.x}), "sensor `place` has no measured values"),
         (lambda: bounds(2.0, 1.0), "expected finite numbers low < high"),
         (lambda: bounds(0.0, np.inf), "for one bound at zero use `positive"),
         (lambda: unbounded(0.0), "expected a positive scale"),

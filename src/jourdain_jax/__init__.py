@@ -24,7 +24,9 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
 
 from jourdain_jax import models
+from jourdain_jax.analysis.accelerometer import Accelerometer
 from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
+from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit import fit, fit_batch
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.gradients import derivative_exists
@@ -34,6 +36,7 @@ from jourdain_jax.analysis.losses import huber, student_t
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.ranges import bounds, positive, unbounded
 from jourdain_jax.analysis.report import Report, report
+from jourdain_jax.analysis.sensors import Actuator, Sensor
 from jourdain_jax.analysis.steady import SteadyMotion, steady
 from jourdain_jax.analysis.verification import Verification
 from jourdain_jax.analysis.verify import verify
@@ -103,6 +106,8 @@ __version__ = _version_of("jourdain-jax")
 
 __all__ = [
     "Accelerations",
+    "Accelerometer",
+    "Actuator",
     "Baumgarte",
     "Built",
     "Contact",
@@ -114,6 +119,7 @@ __all__ = [
     "End",
     "Energy",
     "EnergyBalance",
+    "Estimate",
     "EventTime",
     "Fit",
     "GibbsAppell",
@@ -147,6 +153,7 @@ __all__ = [
     "Sampled",
     "Scene",
     "SensitivityWarning",
+    "Sensor",
     "SimulationError",
     "Smallest",
     "SobolIndices",

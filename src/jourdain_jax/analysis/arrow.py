@@ -111,6 +111,19 @@ class Arrow:
         return np.where(held, moved, d)
 
 
+def with_prior(arrow: Arrow, theta: Float[np.ndarray, "members unknowns"], mean: np.ndarray, sigma: np.ndarray) -> Arrow:
+    """With one residual (theta - mean) / sigma more for each unknown that has a mean (not NaN). The scores stay those of the runs."""
+    residual = np.where(np.isnan(mean), 0.0, (theta - mean) / sigma)
+    slope = np.broadcast_to(np.where(np.isnan(mean), 0.0, 1 / sigma), theta.shape)
+    (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(slope)
+    members, runs, m = r_l.shape
+    rows = np.zeros((members, runs, m, arrow.local.shape[-1]))
+    rows[..., range(m), range(m)], rows[..., -1] = J_l, r_l
+    R = np.linalg.qr(np.concatenate([arrow.local, rows], axis=2), mode="r") if m else arrow.local
+    below = [R[:, :, m:, m:].reshape(members, -1, arrow.shared.shape[-1]), np.concatenate([J_s[..., None] * np.eye(J_s.shape[1]), r_s[..., None]], axis=-1)]
+    return Arrow(R[:, :, :m], np.linalg.qr(np.concatenate([arrow.shared, *below], axis=1), mode="r"), arrow.scores)
+
+
 def eliminated(local: np.ndarray, below: Float[np.ndarray, "members runs local"]) -> tuple[np.ndarray, np.ndarray]:
     """The rows that give a run's own unknowns in terms of the shared ones, and those that are left for the latter, all runs one after another.
 

@@ -77,7 +77,7 @@ def _kept(function: Callable) -> dict:
 def _traced(function: Callable, scene: Scene) -> Channel:
     closed, shape = jax.make_jaxpr(lambda motion: function(motion), return_shape=True)(motion_shape(scene))
     if not hasattr(shape, "shape"):
-        raise ValueError(f"a function of `functions` returned {type(shape).__name__}, expected an array of numbers; return one array")
+        raise ValueError(f"a function of `sensors` returned {type(shape).__name__}, expected an array of numbers; return one array")
     return Channel(_one_of_equals(Operations(closed)), tuple(jnp.asarray(x) for x in closed.consts), shape.shape)
 
 

@@ -1,6 +1,6 @@
 """Identification: parameters and initial values of a scene from measured motions, by nonlinear least squares.
 
-    minimise sum r(theta)^2,   r = (prediction - value) / sigma,   theta within its bounds
+    minimise sum r(theta)^2 + sum ((theta - mean) / s)^2,   r = (prediction - value) / sigma,   theta within its bounds;   mean, s: of priors
 
 by Levenberg-Marquardt. Jacobians come by forward mode through the simulation, run by run; initial values of the runs are eliminated run by run.
 Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), chapter 3.
@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.analysis.arrow import arrow, triangle
+from jourdain_jax.analysis.arrow import arrow, triangle, with_prior
+from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.information import information, students_t_95
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised, Minimum, minimise
@@ -43,7 +44,7 @@ _FEWEST_RUNS = 5  # that tell how much runs differ
 def fit(
     scene: Scene | BuiltFor,
     data: Measurements | Sequence[Measurements],
-    free: "Mapping[str, Range | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | None] | Iterable[str]" = (),
     *,
     cutoff: float = 1e-6,
     tolerance: float = 1e-4,
@@ -52,13 +53,13 @@ def fit(
     errors: str = "sigmas",
     **simulation,
 ) -> Fit:
-    """Estimate the `free` parameters of a scene, and unknown initial values of its runs, from measurements.
+    """Estimate the `free` parameters of a scene, unknown initial values of its runs and numbers of their sensors, from measurements.
 
     **Arguments**
     - `scene`: its parameters are fixed, or first guesses where they are free.
     - `data`: one run or several, each with its own times, channels, start and inputs.
     - `free`: parameter names, or name -> `bounds(low, high)`, `positive()`, `unbounded()` or None (positive where the parameter
-      is declared so).
+      is declared so), or an `Estimate` with a prior. What `unknown_start`, sensors and actuators of the runs name is free as well.
     - `cutoff`: singular values of the scaled Jacobian below this fraction of the largest count as zero (`Information`). Keep it
       well above the relative accuracy of the simulation.
     - `tolerance`: the fit has converged when a step changes no residual by more than about this many sigmas, and no unknown by
@@ -94,7 +95,7 @@ def fit(
 def fit_batch(
     scene: Scene | BuiltFor,
     data: Measurements | Sequence[Measurements],
-    free: "Mapping[str, Range | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | None] | Iterable[str]" = (),
     *,
     cutoff: float = 1e-6,
     tolerance: float = 1e-4,
@@ -174,7 +175,7 @@ def _repeats(runs: Sequence[Measurements]) -> int:
 
 
 def _check_enough(runs: Sequence[Measurements], unknowns: Unknowns, repeats: bool) -> None:
-    samples = sum(int(np.prod(values.shape[int(repeats) :])) for run in runs for values in run.values.values())
+    samples = sum(int(np.prod(values.shape[int(repeats) :])) for run in runs for values in run.values.values()) + len(unknowns.with_prior)
     if samples < len(unknowns.labels):
         raise ValueError(
             f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns; measure more, or free fewer of {', '.join(unknowns.labels)}"
@@ -214,10 +215,13 @@ class _Problem:
                 break
         sigma = np.sqrt(np.maximum(squares[:, 1:] / samples, _LEAST_SIGMA**2))
         cost = cost + np.sum(samples * np.log(sigma), axis=1)
+        places, mean, spread = self.unknowns.with_prior, self.unknowns.prior_mean, self.unknowns.prior_sigma
+        cost = cost + 0.5 * np.sum(((theta[:, places] - mean[places]) / spread[places]) ** 2, axis=1)
         finite = np.isfinite(triangles).all(axis=(1, 2, 3, 4)) & np.isfinite(cost)
         scaled = np.where(finite[:, None, None, None, None], triangles, 0.0) / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
         together = scaled[:, :, 0] if kinds == 1 else np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
-        return Linearised(np.where(finite, cost, np.inf), arrow(together, m), residual, sigma)
+        whole = arrow(together, m)
+        return Linearised(np.where(finite, cost, np.inf), with_prior(whole, theta, mean, spread) if places.size else whole, residual, sigma)
 
     @property
     def samples(self) -> int:

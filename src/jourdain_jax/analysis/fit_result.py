@@ -16,7 +16,7 @@ CORRELATED = 0.98
 MOST_COMPARED, MOST_NAMED = 1000, 8  # unknowns; pairs of them in the table
 
 
-class Estimate(eqx.Module):
+class Estimated(eqx.Module):
     """One unknown, in its unit; NaN for what the measurements cannot tell."""
 
     value: Float[np.ndarray, "*repeats"]
@@ -66,14 +66,14 @@ class Fit(Printed, eqx.Module):
     cutoff: float = eqx.field(static=True)
     errors: str = eqx.field(static=True)  # whence standard errors come: "sigmas" or "runs"
 
-    def __getitem__(self, name: str) -> Estimate:
+    def __getitem__(self, name: str) -> Estimated:
         if name not in self.labels:
             raise UnknownNameError(f"`{name}` was not estimated; {nearest(name, self.labels)}")
         i = self.labels.index(name)
-        return Estimate(self.values[..., i], self.standard_errors[..., i], self.low[..., i], self.high[..., i], self.units[i])
+        return Estimated(self.values[..., i], self.standard_errors[..., i], self.low[..., i], self.high[..., i], self.units[i])
 
     @property
-    def estimates(self) -> dict[str, Estimate]:
+    def estimates(self) -> dict[str, Estimated]:
         """All estimates by name."""
         return {name: self[name] for name in self.labels}
 
@@ -220,7 +220,8 @@ def _batch_text(fit: Fit) -> str:
     rows = [("unknown", "unit", "mean", "std. deviation", "mean std. error")]
     for name, e in fit.estimates.items():
         values, errors = np.asarray(e.value)[good], np.asarray(e.standard_error)[good]
-        some = good.sum() > 1
-        numbers = (f"{values.mean():.6g}", f"{values.std(ddof=1):.2g}", f"{errors.mean():.2g}") if some else ("-", "-", "-")
+        errors = errors[np.isfinite(errors)]  # an estimate at its bound has none
+        some, error = good.sum() > 1, f"{errors.mean():.2g}" if errors.size else "-"
+        numbers = (f"{values.mean():.6g}", f"{values.std(ddof=1):.2g}", error) if some else ("-", "-", "-")
         rows.append((name, e.unit, *numbers))
     return "\n".join([f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} converged", *table(rows)])

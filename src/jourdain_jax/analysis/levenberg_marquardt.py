@@ -100,7 +100,7 @@ def minimise(
         steps[here] += 1
         promised = -np.sum(arrow.gradient() * d, axis=1) - 0.5 * arrow.change(d)
         trial = evaluate(x + d, here)
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):
             found = at.cost[here] - trial.cost
             # near the minimum the simulation's own error decides whether F falls
             level = (promised < 100 * control.tolerance**2) & (np.abs(found) < control.tolerance)

@@ -1,6 +1,6 @@
 """What a scene predicts for measurements, and how likely it makes them.
 
-r = (channel(motion) - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi))
+r = (reading - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi))
 """
 
 from collections.abc import Iterable, Sequence
@@ -31,8 +31,8 @@ def as_runs(scene: Scene, data: Measurements | Sequence[Measurements], *, repeat
 def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **simulation) -> Float[Array, ""]:
     """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
-    Differentiable in scene, start values, measured values and sigmas (reverse mode, unless `adjoint` says otherwise); -inf where
-    the motion fails. `simulation`: options of `simulate`. Missing samples (NaN, or an infinite sigma) do not count.
+    Differentiable in scene, start values, measured values, sigmas and numbers of sensors and actuators (reverse mode, unless `adjoint` says
+    otherwise); -inf where the motion fails. `simulation`: options of `simulate`. Missing samples (NaN, or an infinite sigma) do not count.
 
         jax.grad(lambda a: jj.log_likelihood(sleigh.replace(offset=a), data))(0.25)
 
@@ -41,6 +41,8 @@ def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **
     runs = as_runs(scene, data)
     if unknown := sorted({name for run in runs for name in run.unknown_sigma}):
         raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a likelihood needs the standard deviation of its noise; give a number")
+    if label := next((label for run in runs for label in run.estimates), None):
+        raise ValueError(f"`{label}` is to be estimated, but a likelihood needs its value; give a number, which may be traced, in place of the `Estimate`")
     total = jnp.zeros(())
     for alike in equal_runs(runs):  # one batch
 

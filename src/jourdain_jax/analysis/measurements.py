@@ -1,6 +1,6 @@
-"""Measurements of one run of a scene: times, named channels with a sigma each, the start, sampled inputs.
+"""Measurements of one run of a scene: times, named channels with a sigma and a sensor each, the start, sampled inputs.
 
-value_k = channel(motion at t_k) + sigma_k e_k,   e_k independent, standard normal
+value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -11,8 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.channels import channel
+from jourdain_jax.analysis.accelerometer import Accelerometer
+from jourdain_jax.analysis.channels import channel, motion_shape
+from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.ranges import Range
+from jourdain_jax.analysis.sensors import Actuator, Drive, Reading, Sensor, latest, numbers_of
 from jourdain_jax.calculus.reals import Number
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
@@ -23,24 +26,24 @@ from jourdain_jax.scene.scene import Scene
 class Measurements(eqx.Module):
     """One run.
 
-        Measurements(ts, {"x": x, "nose": path}, {"x": 0.01, "nose": 0.02}, start={"x_rate": 0.6}, functions={"nose": ...})
+        Measurements(ts, {"x": x, "gyro": w}, {"x": 0.01, "gyro": 0.02}, start={"x_rate": 0.6}, sensors={"gyro": jj.Sensor("heading_rate", lag=0.01)})
 
     **Arguments**
     - `ts`: times in s, strictly increasing.
-    - `values`: channel -> measured values, shape (times, *channel). A channel is a coordinate, a speed, or a name in `functions`.
+    - `values`: channel -> measured values, shape (times, *channel). A channel is a coordinate, a speed, or a name in `sensors`.
     - `sigma`: standard deviation of the noise, in the unit of the channel: channel -> number, (times,) or the shape of its
       values; or one number for all channels. None: not known; one sigma for all samples of the channel in all runs is estimated.
       NaN in `values`, or an infinite sigma, marks a sample that is missing.
     - `start`: coordinate or speed -> value at `t0`. These are held; what is not given is solved for, as by `jj.start`.
     - `unknown_start`: names in `start` whose values are first guesses, to be estimated; or name -> `bounds(...)`, `positive()`,
-      `unbounded()` (None: unbounded).
-    - `inputs`: as in `simulate`: name -> number, function of time, or `Sampled`.
-    - `functions`: channel -> function of a `Motion` (one instant), such as
+      `unbounded()` (None: unbounded), or an `Estimate` with a prior.
+    - `inputs`: as in `simulate`: name -> number, function of time, or `Sampled`; or an `Actuator`.
+    - `sensors`: channel -> `Sensor`; or what an ideal one shows: a coordinate, a speed, an `Accelerometer`, or a function of a `Motion` (one instant), such as
       `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`.
     - `t0`: time of the start in s; default: the first of `ts`.
 
-    **Raises** ValueError for times that do not increase, values that are infinite, channels without any value, sigmas that are not positive, and names
-    that do not match.
+    **Raises** ValueError for times that do not increase, values that are infinite, channels without any value, sigmas that are not positive, names
+    that do not match, and samples that may show what was before the start.
     """
 
     ts: Float[Array, "times"]  # s
@@ -49,7 +52,10 @@ class Measurements(eqx.Module):
     start: dict[str, Float[Array, "..."]]
     unknown_start: dict[str, Range | None]
     inputs: dict | Inputs | None
-    functions: dict[str, Callable]
+    sensors: dict[str, Sensor]
+    readings: dict[str, Reading]  # the sensors made ready; none before the run is `checked`, as of the next two
+    drives: dict[str, Drive]  # actuators with numbers to be estimated, by input
+    estimates: dict[str, Estimate]  # of sensors and actuators, as "gyro.gain"
     t0: Float[Array, ""]  # s
     unknown_sigma: tuple[str, ...] = eqx.field(static=True)  # channels; their sigma here is 1
 
@@ -62,13 +68,13 @@ class Measurements(eqx.Module):
         start: Mapping,
         unknown_start: Mapping | Iterable[str] = (),
         inputs: "dict | Inputs | None" = None,
-        functions: Mapping[str, Callable] | None = None,
+        sensors: "Mapping[str, Sensor | str | Callable | Accelerometer] | None" = None,
         t0: Number | None = None,
     ):
         real = jnp.result_type(float)
         self.ts = checked_real(ts, "`ts`", advice="give times in s").astype(real)
         _check_times(self.ts)
-        for what, part in (("values", values), ("start", start)):
+        for what, part in (("values", values), ("start", start), ("sensors", {} if sensors is None else sensors)):
             if not isinstance(part, Mapping):
                 raise ValueError(f'`{what}` of `Measurements` is {described(part)}, expected a dictionary by name, such as {{"x": ...}}')
         self.values = _reals("values of channel", values)
@@ -78,7 +84,8 @@ class Measurements(eqx.Module):
         self.start = _reals("start value", start)
         self.unknown_start = dict(unknown_start) if isinstance(unknown_start, Mapping) else dict.fromkeys(as_names(unknown_start))
         self.inputs = inputs
-        self.functions = dict(functions or {})
+        self.sensors = {name: one if isinstance(one, Sensor) else Sensor(one) for name, one in (sensors or {}).items()}
+        self.readings, self.drives, self.estimates = {}, {}, {}
         self.t0 = self.ts[0] if t0 is None else jnp.asarray(t0, real)
 
     def __check_init__(self):
@@ -89,9 +96,9 @@ class Measurements(eqx.Module):
         if not self.values:
             raise ValueError("`values` is empty; give at least one channel: name -> measured values")
         _check_same_names("sigma", self.sigma, self.values)
-        for name in self.functions:
+        for name in self.sensors:
             if name not in self.values:
-                raise ValueError(f"function `{name}` has no measured values; {nearest(name, self.values)}")
+                raise ValueError(f"sensor `{name}` has no measured values; {nearest(name, self.values)}")
         for name in self.unknown_start:
             if name not in self.start:
                 raise ValueError(f"unknown start value `{name}` has no first guess; give one in `start`. {nearest(name, self.start)}")
@@ -143,16 +150,22 @@ def _check_same_names(what: str, names, expected) -> None:
 
 
 def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measurements:
-    """The run with its inputs and functions made ready, after its channels and shapes were compared with the scene.
+    """The run with its inputs and sensors made ready, after its channels and shapes were compared with the scene.
 
-    `repeats`: values have a leading axis. Raises ValueError for an unknown channel, start value or input, and for wrong shapes.
+    `repeats`: values have a leading axis. Raises ValueError for an unknown channel, start value or input, for wrong shapes, and for samples that may show
+    what was before the start.
     """
     where = f"run {index} of `{type(scene).__name__}`"
     scene.named(**run.start)
-    channels = {name: channel(function, scene) for name, function in run.functions.items()}
     times = run.ts.shape[0]
+    readings: dict[str, Reading] = {}
+    estimates: dict[str, Estimate] = {}
     for name, values in run.values.items():
-        shape = (times, *(channels[name].shape if name in channels else _named_shape(scene, run, name, where)))
+        quantity, shape = _quantity(scene, run.sensors[name].quantity if name in run.sensors else None, name, where)
+        if name in run.sensors:
+            readings[name] = _reading(run.sensors[name], name, where, quantity, shape, estimates)
+            _check_begin(run, name, where, repeats)
+        shape = (times, *shape)
         found = values.shape[1:] if repeats else values.shape
         if found != shape:
             expected = f"(repeats, {', '.join(map(str, shape))})" if repeats else f"{shape}"
@@ -160,17 +173,82 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
             raise ValueError(f"channel `{name}` of {where} has shape {values.shape}, expected {expected} for {times} times{hint}")
         if run.sigma[name].shape not in ((), (times,), shape):
             raise ValueError(f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, expected (), {(times,)} or {shape}")
-    ready = as_inputs(scene, run.inputs), channels
-    return eqx.tree_at(lambda r: (r.inputs, r.functions), run, ready, is_leaf=lambda x: x is None or x is run.functions)
+    inputs, drives = _inputs(scene, run, where, estimates)
+    ready, of = (inputs, readings, drives, estimates), lambda r: (r.inputs, r.readings, r.drives, r.estimates)
+    return eqx.tree_at(of, run, ready, is_leaf=lambda x: x is None or any(x is part for part in of(run)))
 
 
-def _named_shape(scene: Scene, run: Measurements, name: str, where: str) -> tuple[int, ...]:
+def _quantity(scene: Scene, given: str | Callable | Accelerometer | None, channel_name: str, where: str):
+    """What a sensor measures: a function made ready, an accelerometer, or a name; and its shape."""
+    if isinstance(given, Accelerometer):
+        bodies = motion_shape(scene).bodies
+        if given.body not in bodies:
+            raise ValueError(f"the accelerometer `{channel_name}` of {where} sits on body `{given.body}`, which is not there; {nearest(given.body, bodies)}")
+        return given, (3,)
+    if callable(given):
+        operation = channel(given, scene)
+        return operation, operation.shape
+    name = channel_name if given is None else given
+    return name, _named_shape(scene, name, channel_name, where)
+
+
+def _reading(sensor: Sensor, name: str, where: str, quantity, shape: tuple[int, ...], estimates: dict) -> Reading:
+    numbers, unknown, used = numbers_of(sensor)
+    for number in ("gain", "bias"):
+        if numbers[number].shape not in ((), shape):
+            raise ValueError(f"`{number}` of sensor `{name}` of {where} has shape {numbers[number].shape}, expected () or {shape}")
+    estimates |= {f"{name}.{number}": getattr(sensor, number) for number in unknown}
+    named = isinstance(quantity, str)
+    return Reading(None if named else quantity, quantity if named else "", numbers, unknown, used)
+
+
+def _check_begin(run: Measurements, name: str, where: str, repeats: bool) -> None:
+    """ValueError where a sample that counts may show a time before the start."""
+    delay, values = run.sensors[name].delay, run.values[name]
+    if is_traced((delay, run.ts, run.t0, values, run.sigma[name])) or latest(delay) == 0:
+        return
+    counts = np.isfinite(np.asarray(values)) & np.isfinite(np.asarray(run.sigma_of(name, repeats)))
+    axis = int(repeats)
+    at_times = counts.any(axis=tuple(i for i in range(counts.ndim) if i != axis))
+    first, t0 = float(run.ts[np.argmax(at_times)]), float(run.t0)
+    if first - latest(delay) < t0 - 1e-9 * (float(run.ts[-1]) - t0):
+        raise ValueError(
+            f"channel `{name}` of {where} begins at {first:g} s, and less its delay of up to {latest(delay):g} s that is before the start at t0 = {t0:g} s, "
+            "where the motion is not known; give an earlier `t0` with the start there, or NaN for the first samples"
+        )
+
+
+def _inputs(scene: Scene, run: Measurements, where: str, estimates: dict) -> tuple[Inputs, dict[str, Drive]]:
+    """All inputs, at the first guess of what is to be estimated; and the actuators that have such numbers."""
+    given = run.inputs if isinstance(run.inputs, Mapping) else {}
+    actuators = {name: one for name, one in given.items() if isinstance(one, Actuator)}
+    if not actuators:
+        return as_inputs(scene, run.inputs), {}
+    inputs = as_inputs(scene, {**given} | {name: one.command for name, one in actuators.items()})
+    drives = {}
+    for name, actuator in actuators.items():
+        numbers, unknown, used = numbers_of(actuator)
+        drive = Drive(actuator.command, list(scene.inputs.entries).index(name), numbers, unknown, used)
+        for number in unknown:
+            if f"{name}.{number}" in estimates:
+                raise ValueError(f"{where} has a channel and an input `{name}`, both with an estimated {number}; give the channel another name")
+            estimates[f"{name}.{number}"] = getattr(actuator, number)
+        if "lag" in used and not is_traced((actuator.command.ts, run.ts)) and actuator.command.ts[-1] < run.ts[-1]:
+            raise ValueError(
+                f"the command of input `{name}` of {where} ends at {float(actuator.command.ts[-1]):g} s, before the last sample at {float(run.ts[-1]):g} s, "
+                "and its lag does not go on after it; repeat the last value at a later time"
+            )
+        inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
+        if unknown:
+            drives[name] = drive
+    return inputs, drives
+
+
+def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> tuple[int, ...]:
     """The shape of a coordinate or speed: of a quaternion (4,), of its rates (3,)."""
     groups = {group: length for names in (scene.coordinate_names, scene.speed_names) for group, _, length in names.groups}
     entries = (*scene.coordinate_names.entries, *scene.speed_names.entries)
     if name not in groups and name not in entries:
-        raise ValueError(
-            f"{where} has unknown channel `{name}`; {nearest(name, (*groups, *entries, *run.functions))} "
-            "For other quantities give a function of the motion in `functions`."
-        )
+        unknown = f"unknown channel `{name}`" if name == channel_name else f"channel `{channel_name}`, whose sensor measures an unknown quantity `{name}`"
+        raise ValueError(f"{where} has {unknown}; {nearest(name, (*groups, *entries))} For other quantities give a function of the motion in `sensors`.")
     return (groups[name],) if name in groups else ()

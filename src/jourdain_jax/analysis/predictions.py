@@ -1,6 +1,6 @@
 """What a scene predicts for the measurements of a run, against what was measured; and the same with derivatives for many runs, in one compiled program.
 
-r = (channel(motion) - value) / sigma, zero where a sample is missing
+r = (reading - value) / sigma, zero where a sample is missing
 
 A lane is one run of one member (a repeat of the experiment, or a first guess of its own). Some lanes at a time go through one program, which is
 compiled once for runs of equal structure, whatever their number: memory does not grow with it. Short runs are filled up to the length of the longest.
@@ -18,16 +18,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
 from jourdain_jax.analysis.unknowns import Layout
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.integrators.forward_mode import simulate_forward
 from jourdain_jax.motion.quick_compilation import quickly_compiled
+from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 
 TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
 MOST_LANES = 64
 AHEAD = 4  # groups of lanes that are begun before the first is read
+FEWEST_INTERVALS = 64  # of a motion that is read between its times
 FILLED = 1e-6  # of a run's span: between the times that fill up a short one
 
 
@@ -36,21 +40,35 @@ class Run(eqx.Module):
 
     t0: Float[Array | np.ndarray, ""]
     ts: Float[Array | np.ndarray, "times"]
+    grid: Float[Array | np.ndarray, "grid"] | None  # s, at equal intervals: where sensors are late, the motion is worked out there
     values: dict[str, Float[Array | np.ndarray, "..."]]
     weights: dict[str, Float[Array | np.ndarray, "..."]]
     start: dict[str, Float[Array | np.ndarray, "..."]]
     inputs: dict | Inputs | None
-    functions: dict[str, Callable]
+    sensors: dict[str, Reading]
+    drives: dict[str, Drive]
 
     def residuals(self, scene: Scene, simulate: Callable, simulation: dict) -> dict[str, Float[Array | np.ndarray, "..."]]:
-        """`(prediction - value) / sigma` by channel."""
-        motion = simulate(scene, self.start, t0=self.t0, ts=self.ts, inputs=self.inputs, events=False, work=False, **simulation)
-        states = motion.motions() if self.functions else None
+        """`(reading - value) / sigma` by channel."""
+        inputs = self.inputs
+        for drive in self.drives.values():
+            inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
+        motion = simulate(scene, self.start, t0=self.t0, ts=self.ts if self.grid is None else self.grid, inputs=inputs, events=False, work=False, **simulation)
+        states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
         found = {}
         for name, weight in self.weights.items():
-            predicted = jax.vmap(self.functions[name])(states) if name in self.functions else motion[name]
-            found[name] = jnp.where(weight > 0, (predicted - self.values[name]) * weight, 0.0)
+            sensor = self.sensors.get(name, ideal(name))
+            found[name] = jnp.where(weight > 0, (sensor.shown(sensor.quantity(motion, states), self.grid, self.ts) - self.values[name]) * weight, 0.0)
         return found
+
+    def at(self, layout: Layout, shared, local) -> "Run":
+        """The run with these unknowns."""
+        changed = layout.start(self.start, local)
+        if not layout.numbers:
+            return eqx.tree_at(lambda r: r.start, self, changed)
+        known = layout.known(shared, local)
+        parts = changed, with_numbers(self.sensors, known), with_numbers(self.drives, known)
+        return Run(self.t0, self.ts, self.grid, self.values, self.weights, parts[0], self.inputs, parts[1], parts[2])
 
 
 def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
@@ -60,7 +78,25 @@ def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
         sigma, known = data.sigma_of(name, repeats), xp.isfinite(xp.asarray(values))
         weights[name] = xp.where(known & xp.isfinite(sigma), 1.0 / sigma, 0.0)
     measured = {name: xp.where(weights[name] > 0, xp.asarray(values), 0.0) for name, values in data.values.items()}
-    return Run(data.t0, data.ts, measured, weights, data.start, data.inputs, data.functions)
+    grid = _grid(data.t0, data.ts) if any(sensor.is_late for sensor in data.readings.values()) else None
+    return Run(data.t0, data.ts, grid, measured, weights, data.start, data.inputs, data.readings, data.drives)
+
+
+def _grid(t0, ts) -> Float[Array | np.ndarray, "grid"]:
+    """Times at equal intervals from the start to the last sample: the samples' own where these are equal, too, and never longer."""
+    count = FEWEST_INTERVALS
+    if not is_traced((t0, ts)):
+        span, steps = float(ts[-1] - t0), np.diff(np.asarray(ts, float))
+        needed = span / np.median(steps) if steps.size else 1.0
+        count = round(needed) if abs(needed - round(needed)) < 1e-6 * needed else int(np.ceil(needed))
+        count *= -(-FEWEST_INTERVALS // count)
+    return _equal_intervals(t0, ts[-1], count)
+
+
+def _equal_intervals(t0, t1, count: int) -> Float[Array | np.ndarray, "grid"]:
+    xp = jnp if is_traced((t0, t1)) else np
+    found = xp.asarray(t0 + (t1 - t0) * xp.arange(count + 1) / count, jnp.result_type(float))
+    return xp.concatenate([found[:-1], xp.asarray(t1)[None]])  # the last one without round-off
 
 
 def equal_runs(data: Sequence[Measurements]) -> list[Run]:
@@ -126,7 +162,7 @@ class _Group:
     def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None):
         self.indices, self._members, self._counts = indices, members, layout.sizes
         times, knots = max(run.ts.shape[0] for run in runs), _most_knots(runs)
-        filled = [_filled(run, times, knots, 0 if members is None else 1) for run in runs]
+        filled = [_filled(run, times, knots, 0 if members is None else 1) for run in _on_equal_grids(runs)]
         self._arrays = jax.tree.map(lambda *xs: np.stack(xs), *[eqx.partition(run, _is_array)[0] for run in filled])
         self._repeated = eqx.tree_at(
             lambda r: (r.values, r.weights), jax.tree.map(lambda _: False, self._arrays), (dict.fromkeys(filled[0].values, members is not None),) * 2
@@ -137,7 +173,8 @@ class _Group:
         sizes = {name: int(np.prod(w.shape[0 if members is None else 1 :])) for name, w in sorted(filled[0].weights.items())}
         ends = np.cumsum([0, *sizes.values()]).tolist()
         self.channels = {name: slice(begin, end) for name, begin, end in zip(sizes, ends[:-1], ends[1:], strict=True)}
-        states = times * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
+        saved = times if filled[0].grid is None else filled[0].grid.shape[0]
+        states = saved * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
         self._width = int(min(MOST_LANES, max(1, TOUCHED // states)))
         self._kept: tuple = ((), [])
 
@@ -218,8 +255,7 @@ def _program(treedef, leaves: tuple) -> Callable:
         (scene, simulation), run = eqx.combine(common, rest), eqx.combine(arrays, run_rest)
 
         def flat(x):
-            at = eqx.tree_at(lambda r: r.start, run, layout.start(run.start, x[:local_count]))
-            found = at.residuals(layout.scene(scene, x[local_count:]), simulate_forward, simulation)
+            found = run.at(layout, x[local_count:], x[:local_count]).residuals(layout.scene(scene, x[local_count:]), simulate_forward, simulation)
             r = jnp.concatenate([jnp.ravel(found[name]) for name in sorted(found)])
             return r, r
 
@@ -230,11 +266,12 @@ def _program(treedef, leaves: tuple) -> Callable:
 
 
 def _alike(data: Sequence[Measurements]) -> list[list[int]]:
-    """Indices of the runs, grouped by equal structure: names, functions, kinds of inputs, shapes but for the number of times."""
+    """Indices of the runs, grouped by equal structure: names, sensors, kinds of inputs, shapes but for the number of times."""
     groups: dict[tuple, list[int]] = {}
     for index, run in enumerate(data):
-        arrays, rest = eqx.partition((run.start, run.functions, _without_knots(run.inputs)), _is_array)
-        kind = (jax.tree.structure((run.start, run.functions, run.inputs, dict.fromkeys(run.values, 0))), tuple(jax.tree.leaves(rest)))
+        parts = run.start, run.readings, run.inputs, run.drives
+        arrays, rest = eqx.partition((*parts[:2], _without_knots(parts[2:])), _is_array)
+        kind = (jax.tree.structure((*parts, dict.fromkeys(run.values, 0))), tuple(jax.tree.leaves(rest)))
         groups.setdefault((*kind, tuple(x.shape for x in jax.tree.leaves(arrays))), []).append(index)
     return list(groups.values())
 
@@ -252,8 +289,16 @@ def _without_knots(inputs):
 
 
 def _most_knots(runs: Sequence[Run]) -> list[int]:
-    counts = [[x.ts.shape[0] for x in jax.tree.leaves(run.inputs, is_leaf=_is_sampled) if _is_sampled(x)] for run in runs]
+    counts = [[x.ts.shape[0] for x in jax.tree.leaves((run.inputs, run.drives), is_leaf=_is_sampled) if _is_sampled(x)] for run in runs]
     return [max(column) for column in zip(*counts, strict=True)]
+
+
+def _on_equal_grids(runs: Sequence[Run]) -> Sequence[Run]:
+    """The runs with as many intervals in all grids as the longest has."""
+    if runs[0].grid is None:
+        return runs
+    count = max(run.grid.shape[0] for run in runs if run.grid is not None) - 1
+    return [eqx.tree_at(lambda r: r.grid, run, _equal_intervals(run.t0, run.ts[-1], count)) for run in runs]
 
 
 def _filled(run: Run, times: int, knots: list[int], axis: int) -> Run:
@@ -269,10 +314,11 @@ def _filled(run: Run, times: int, knots: list[int], axis: int) -> Run:
         ts = np.concatenate([x.ts, max(x.ts[-1], run.ts[-1]) + span * np.arange(1, extra + 1)])
         return eqx.tree_at(lambda s: (s.ts, s.values), x, (ts, np.concatenate([x.values, np.full(extra, x.values[-1])])))
 
-    inputs = jax.tree.map(longer, run.inputs, is_leaf=_is_sampled)
+    inputs, drives = jax.tree.map(longer, (run.inputs, run.drives), is_leaf=_is_sampled)
+    run = eqx.tree_at(lambda r: (r.inputs, r.drives), run, (inputs, drives), is_leaf=lambda x: x is run.inputs or x is run.drives)
     if not more:
-        return eqx.tree_at(lambda r: r.inputs, run, inputs)
+        return run
     pad = lambda x: np.concatenate([x, np.zeros((*x.shape[:axis], more, *x.shape[axis + 1 :]))], axis=axis)  # noqa: E731
     ts = np.concatenate([run.ts, run.ts[-1] + FILLED * (run.ts[-1] - run.t0) * np.arange(1, more + 1)])
-    changed = ts, inputs, {n: pad(x) for n, x in run.values.items()}, {n: pad(x) for n, x in run.weights.items()}
-    return eqx.tree_at(lambda r: (r.ts, r.inputs, r.values, r.weights), run, changed)
+    changed = ts, {n: pad(x) for n, x in run.values.items()}, {n: pad(x) for n, x in run.weights.items()}
+    return eqx.tree_at(lambda r: (r.ts, r.values, r.weights), run, changed)

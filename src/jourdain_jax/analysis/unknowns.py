@@ -1,4 +1,4 @@
-"""The unknowns of a fit: parameters of the scene, which all runs share, and initial values of single runs.
+"""The unknowns of a fit: parameters of the scene, which all runs share, initial values of single runs, and numbers of sensors and actuators of both kinds.
 
 theta = (shared, own of run 0, own of run 1, ...), every run with a place for each initial value that is unknown in any; where it is known, it is held.
 """
@@ -12,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.ranges import Range, positive, unbounded
+from jourdain_jax.analysis.sensors import UNITS, default_range
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -21,11 +23,12 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True)
 class Place:
-    """Where the entries of a parameter, or of an initial value, are in a vector of such."""
+    """Where the entries of a parameter, of an initial value, or of a number of a sensor or actuator, are in a vector of such."""
 
-    name: str
+    name: str  # of a sensor's or actuator's: "gyro.gain"
     shape: tuple[int, ...]
     begin: int
+    of_sensor: bool = False  # or of an actuator
 
     @property
     def end(self) -> int:
@@ -51,13 +54,22 @@ class Layout:
 
     def scene(self, scene: Scene, shared: Float[Array | np.ndarray, "*members shared"]) -> Scene:
         """The scene with these shared unknowns."""
-        names = [place.name for place in self.shared]
-        values = [jnp.asarray(place.of(shared)) for place in self.shared]
+        places = [place for place in self.shared if not place.of_sensor]
+        names, values = [place.name for place in places], [jnp.asarray(place.of(shared)) for place in places]
         return eqx.tree_at(lambda s: [getattr(s, name) for name in names], scene, values) if names else scene
 
     def start(self, start: dict, local: Float[Array | np.ndarray, "*members local"]) -> dict:
         """The start of a run with these unknowns of its own."""
         return start | {place.name: place.of(local) for place in self.local if place.name in start}
+
+    @property
+    def numbers(self) -> bool:
+        """Whether sensors or actuators have any."""
+        return any(place.of_sensor for place in (*self.shared, *self.local))
+
+    def known(self, shared, local) -> dict[str, Array]:
+        """Numbers of sensors and actuators by name, of one run."""
+        return {place.name: place.of(vector) for places, vector in ((self.shared, shared), (self.local, local)) for place in places if place.of_sensor}
 
 
 @dataclass(frozen=True)
@@ -71,6 +83,13 @@ class Unknowns:
     ranges: tuple[Range, ...]
     labels: tuple[str, ...]  # of those that are not fixed
     units: tuple[str, ...]
+    prior_mean: Float[np.ndarray, "places"]  # NaN where nothing is known beforehand
+    prior_sigma: Float[np.ndarray, "places"]
+
+    @cached_property
+    def with_prior(self) -> np.ndarray:
+        """Places of those of which something is known beforehand."""
+        return np.flatnonzero(np.isfinite(self.prior_mean))
 
     @cached_property
     def estimated(self) -> np.ndarray:
@@ -99,52 +118,111 @@ class Unknowns:
         return theta[..., :shared], theta[..., shared:].reshape(*theta.shape[:-1], self.runs, local)
 
 
-def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, Range | None] | Iterable[str]") -> Unknowns:
-    """The unknowns that `free` and the runs' `unknown_start` name.
+@dataclass(frozen=True)
+class _Entry:
+    """One unknown of one or more numbers."""
 
-    Raises ValueError for unknown names, for guesses outside their bounds, and where nothing is free.
+    label: str
+    unit: str
+    guess: np.ndarray
+    range: Range
+    fixed: bool = False
+    prior: tuple[float, float] | None = None
+
+
+def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, Range | Estimate | None] | Iterable[str]") -> Unknowns:
+    """The unknowns that `free`, the runs' `unknown_start` and their sensors and actuators name.
+
+    Raises ValueError for unknown names, for guesses outside their bounds, for an estimate that runs share but state differently, and where nothing is free.
     """
     parameters = {name: (value, about) for name, value, about in parameters_of(scene)}
-    entries: list[tuple[str, str, np.ndarray, Range, bool]] = []  # label, unit, guess, range, fixed
-    shared: list[Place] = []
+    entries: list[_Entry] = []
+    shared, local = _Places(), _Places()
     for name, given in (free if isinstance(free, Mapping) else dict.fromkeys(as_names(free))).items():
         if name not in parameters:
             raise ValueError(f"`free` names `{name}`, which is no parameter of `{type(scene).__name__}`; {nearest(name, parameters)}")
         value, about = parameters[name]
         default = positive() if about["positive"] or about["non_negative"] else unbounded()
-        guess = np.asarray(value)
-        entries.append((name, about["unit"], guess, _chosen(name, given, default, guess), False))
-        shared.append(Place(name, guess.shape, shared[-1].end if shared else 0))
-    local: list[Place] = []
+        entries.append(_entry(name, about["unit"], given, default, np.asarray(value)))
+        shared.add(name, entries[-1].guess.shape)
+    for label, estimate in _of_all_runs(runs).items():
+        if not estimate.per_run:
+            entries.append(_of_sensor(label, label, estimate))
+            shared.add(label, entries[-1].guess.shape, of_sensor=True)
     for name in dict.fromkeys(name for run in runs for name in run.unknown_start):
-        shape = next(run.start[name].shape for run in runs if name in run.unknown_start)
-        local.append(Place(name, shape, local[-1].end if local else 0))
+        local.add(name, next(run.start[name].shape for run in runs if name in run.unknown_start))
+    for label, estimate in _of_all_runs(runs).items():
+        if estimate.per_run:
+            local.add(label, np.shape(estimate.guess), of_sensor=True)
     for index, run in enumerate(runs):
-        for place in local:
-            label, free_here = f"run {index}: {place.name}", place.name in run.unknown_start
-            guess = np.asarray(run.start.get(place.name, np.zeros(place.shape)))
-            kind = _chosen(label, run.unknown_start[place.name], unbounded(), guess) if free_here else unbounded()
-            entries.append((label, "", guess, kind, not free_here))
-    if all(entry[-1] for entry in entries):
+        for place in local.found:
+            entries.append(_of_run(f"run {index}: {place.name}", place, run))
+    if all(entry.fixed for entry in entries):
         raise ValueError(f"nothing is free; name parameters in `free` ({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
-    free_ones = [(label, unit, guess.shape) for label, unit, guess, _, fixed in entries if not fixed]
+    free_ones = [entry for entry in entries if not entry.fixed]
+    each = lambda of: np.concatenate([np.full(entry.guess.size, of(entry)) for entry in entries])  # noqa: E731
     return Unknowns(
-        layout=Layout(tuple(shared), tuple(local)),
+        layout=Layout(tuple(shared.found), tuple(local.found)),
         runs=len(runs),
-        guess=np.concatenate([np.ravel(guess) for _, _, guess, _, _ in entries]).astype(float),
-        fixed=np.concatenate([np.full(guess.size, fixed) for _, _, guess, _, fixed in entries]),
-        ranges=tuple(kind for _, _, guess, kind, _ in entries for _ in range(guess.size)),
-        labels=tuple(label + "".join(f"[{i}]" for i in index) for label, _, shape in free_ones for index in np.ndindex(shape)),
-        units=tuple(unit for _, unit, shape in free_ones for _ in np.ndindex(shape)),
+        guess=np.concatenate([np.ravel(entry.guess) for entry in entries]).astype(float),
+        fixed=each(lambda entry: entry.fixed),
+        ranges=tuple(entry.range for entry in entries for _ in range(entry.guess.size)),
+        labels=tuple(entry.label + "".join(f"[{i}]" for i in index) for entry in free_ones for index in np.ndindex(entry.guess.shape)),
+        units=tuple(entry.unit for entry in free_ones for _ in np.ndindex(entry.guess.shape)),
+        prior_mean=each(lambda entry: entry.prior[0] if entry.prior else np.nan),
+        prior_sigma=each(lambda entry: entry.prior[1] if entry.prior else np.nan),
     )
 
 
-def _chosen(label: str, given, default: Range, guess: np.ndarray) -> Range:
-    """The range of an unknown, after a look at its first guess."""
-    found = default if given is None else given
-    if not isinstance(found, Range):
-        raise ValueError(f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, or None")
-    refusal = found.refusal(guess)
-    if refusal:
+class _Places:
+    """Places one after another."""
+
+    def __init__(self) -> None:
+        self.found: list[Place] = []
+
+    def add(self, name: str, shape: tuple[int, ...], of_sensor: bool = False) -> None:
+        self.found.append(Place(name, shape, self.found[-1].end if self.found else 0, of_sensor))
+
+
+def _of_all_runs(runs: Sequence[Measurements]) -> dict[str, Estimate]:
+    """Estimates of sensors and actuators by name; ValueError where runs state one differently."""
+    found: dict[str, tuple[int, Estimate]] = {}
+    for index, run in enumerate(runs):
+        for label, estimate in run.estimates.items():
+            first, known = found.setdefault(label, (index, estimate))
+            same = estimate.per_run and known.per_run and np.shape(estimate.guess) == np.shape(known.guess)
+            if estimate != known and not same:
+                raise ValueError(
+                    f"run {first} and run {index} state `{label}` differently, but share it ({known} and {estimate}); give both the same, or `per_run=True`"
+                )
+    return {label: estimate for label, (_, estimate) in found.items()}
+
+
+def _of_run(label: str, place: Place, run: Measurements) -> _Entry:
+    """An unknown of one run; where it is known there, or does not exist, it is held."""
+    if place.of_sensor:
+        estimate = run.estimates.get(place.name)
+        return _Entry(label, "", np.zeros(place.shape), unbounded(), fixed=True) if estimate is None else _of_sensor(label, place.name, estimate)
+    guess = np.asarray(run.start.get(place.name, np.zeros(place.shape)))
+    if place.name not in run.unknown_start:
+        return _Entry(label, "", guess, unbounded(), fixed=True)
+    return _entry(label, "", run.unknown_start[place.name], unbounded(), guess)
+
+
+def _of_sensor(label: str, name: str, estimate: Estimate) -> _Entry:
+    number = name.rpartition(".")[2]
+    return _entry(label, UNITS[number], estimate, default_range(number), np.asarray(estimate.guess, float))
+
+
+def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _Entry:
+    """An unknown from what was given for it: an `Estimate`, a range or None; after a look at its first guess."""
+    estimate = given if isinstance(given, Estimate) else Estimate(range=given) if given is None or isinstance(given, Range) else None
+    if estimate is None:
+        raise ValueError(f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, `Estimate(...)` or None")
+    guess = value if estimate.guess is None else np.asarray(estimate.guess, float)
+    if guess.shape != value.shape:
+        raise ValueError(f"first guess of `{label}` has shape {guess.shape}, expected {value.shape}; leave it out for the value that is there")
+    found = default if estimate.range is None else estimate.range
+    if refusal := found.refusal(guess):
         raise ValueError(f"first guess of `{label}` is {guess}; {refusal}")
-    return found
+    return _Entry(label, unit, guess, found, prior=estimate.known_before)

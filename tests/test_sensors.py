@@ -1,0 +1,479 @@
+"""Sensors and actuators in the identification: gain, bias, delay and lag against closed forms, estimates with coverage, what cannot be told, bad input.
+
+A cart with a spring and a damper is linear, so that its readings are sums of exponentials, also through a delay and a low-pass.
+"""
+
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.analysis import predictions
+from jourdain_jax.analysis.lagged import filtered, read
+from jourdain_jax.motion.integrators.forward_mode import simulate_forward
+from jourdain_jax.native import host
+
+REPEATS = 200
+MASS, DAMPING, STIFFNESS = 2.0, 0.6, 5.0
+TS = np.linspace(0.0, 4.0, 81)
+SEEN = 0.2  # s: no sample is earlier
+TRUTH = {"gain": 1.2, "bias": 0.05, "delay": 0.07, "lag": 0.1}
+IDEAL = {"gain": 1.0, "bias": 0.0, "delay": 0.0, "lag": 0.0}
+
+
+class Cart(jj.Scene):
+    """`m x'' = push - c x' - k x`."""
+
+    mass: jnp.ndarray = jj.parameter(MASS, unit="kg", positive=True)
+    damping: jnp.ndarray = jj.parameter(DAMPING, unit="N s/m", non_negative=True)
+    stiffness: jnp.ndarray = jj.parameter(STIFFNESS, unit="N/m")
+
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("push")
+
+    def bodies(self, t, q):
+        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        force = motion.inputs.push - self.damping * motion.u.x_rate - self.stiffness * motion.q.x
+        return (jj.generalized_force(motion, x_rate=force),)
+
+
+def shown(ts, mass=MASS, damping=DAMPING, *, gain=1.0, bias=0.0, delay=0.0, lag=0.0, order=1, x0=0.3):
+    """What a sensor shows of x (order 0) or v (order 1) of the cart let go at x0: x = Re(C exp(s t)), through `lag y' + y = x` from rest."""
+    rate = damping / (2 * mass)
+    s = -rate + 1j * np.sqrt(STIFFNESS / mass - rate**2)
+    C = x0 * (1 - 1j * rate / s.imag) * s**order
+    t = ts - delay
+    lagged = (C / (1 + lag * s) * np.exp(s * t)).real
+    rest = (C.real - (C / (1 + lag * s)).real) * np.exp(-t / lag) if lag else 0.0
+    return gain * (lagged + rest) + bias
+
+
+def run(seed=None, repeats=(), truth=TRUTH, ts=TS, x0=0.3, sigma=0.005, unknown_start=(), **numbers) -> jj.Measurements:
+    """Place by an ideal sensor and speed by one with these `numbers`, in truth `truth`; samples before `SEEN` are missing from the latter."""
+    noise = np.random.default_rng(seed)
+    since = ts - ts[0]
+    values = {"x": shown(since, order=0, x0=x0), "gyro": np.where(since < SEEN, np.nan, shown(since, x0=x0, **truth))}
+    if seed is not None:
+        values = {name: x + s * noise.normal(size=(*repeats, len(ts))) for (name, x), s in zip(values.items(), (0.002, sigma), strict=True)}
+    sensors = {"gyro": jj.Sensor("x_rate", **(truth | numbers))}
+    return jj.Measurements(ts, values, {"x": 0.002, "gyro": sigma}, start={"x": x0, "x_rate": 0.0}, sensors=sensors, unknown_start=unknown_start)
+
+
+GAIN = jj.Estimate(1.0)
+BIAS = jj.Estimate(0.0, per_run=True)
+DELAY = jj.Estimate(0.05, range=jj.bounds(0.0, SEEN))
+LAG = jj.Estimate(0.05)
+
+
+# Readings of known quantities. ------------------------------------------------------------------------------------------
+
+
+def wave(t, w=3.0):
+    return np.sin(w * t + 0.4)
+
+
+def lagged_wave(ts, delay, lag, w=3.0):
+    """The wave through a low-pass that starts at rest at time zero."""
+    steady = lambda t: (np.sin(w * t + 0.4) - w * lag * np.cos(w * t + 0.4)) / (1 + (w * lag) ** 2)  # noqa: E731
+    t = ts - delay
+    return steady(t) + ((wave(0.0) - steady(0.0)) * np.exp(-t / lag) if lag else 0.0)
+
+
+LAGS = (0.0, 1e-6, 1e-3, 0.009, 0.0099, 0.0101, 0.1, 3.0)  # s; of the coarser grid below, 0.01 s is where the formula changes
+
+
+@pytest.mark.parametrize("lag", LAGS)
+def test_a_reading_through_delay_and_lag_is_the_closed_form(lag):
+    ts = np.linspace(0.3, 4.0, 173)
+    for count in (81, 401):
+        grid = np.linspace(0.0, 4.0, count)
+        error = np.abs(read(wave(grid), grid, ts, 0.123, lag) - lagged_wave(ts, 0.123, lag)).max()
+        assert error < 0.02 * (3.0 * grid[1]) ** 6 + 1e-12, (count, error)
+    inside = ts[(ts > 0.6) & (ts < 3.5)]
+    grid = np.linspace(0.0, 4.0, 81)
+    assert np.abs(read(wave(grid), grid, inside, 0.123) - wave(inside - 0.123)).max() < 0.005 * (3.0 * grid[1]) ** 6
+
+
+@pytest.mark.parametrize("lag", [0.0, 1e-5, 0.004, 0.0101, 0.3])
+def test_derivatives_of_a_reading_are_those_of_the_closed_form(lag):
+    ts, grid = np.linspace(0.3, 4.0, 173), np.linspace(0.0, 4.0, 1601)
+    by_delay, by_lag = jax.jacfwd(lambda d, l: read(wave(grid), grid, ts, d, l), (0, 1))(0.123, lag)
+    step = 1e-5
+    expected = (lagged_wave(ts, 0.123 + step, lag) - lagged_wave(ts, 0.123 - step, lag)) / (2 * step)
+    np.testing.assert_allclose(by_delay, expected, atol=1e-8)
+    lags = [lag + step, lag + 2 * step] if lag < step else [lag + step, lag - step]
+    found = [lagged_wave(ts, 0.123, one) for one in lags]
+    # forward where there is no lag below: -3 f(0) + 4 f(1) - f(2)
+    expected = (4 * found[0] - found[1] - 3 * lagged_wave(ts, 0.123, lag)) / (2 * step) if lag < step else (found[0] - found[1]) / (2 * step)
+    np.testing.assert_allclose(by_lag, expected, atol=2e-8)
+
+
+def test_the_low_pass_of_a_reading_starts_at_rest():
+    grid = np.linspace(0.0, 1.0, 101)
+    ramp = read(2.0 + 3.0 * grid, grid, grid, 0.0, 0.2)
+    np.testing.assert_allclose(ramp, 2.0 + 3.0 * (grid - 0.2 * (1 - np.exp(-grid / 0.2))), atol=1e-13)
+
+
+def test_vectors_are_read_component_by_component_and_single_precision_stays():
+    grid, ts = np.linspace(0.0, 4.0, 81), np.linspace(0.3, 4.0, 20)
+    both = np.stack([wave(grid), 2.0 - wave(grid)], axis=1)
+    found = read(both, grid, ts, 0.1, 0.05)
+    np.testing.assert_allclose(found[:, 1], 2.0 - found[:, 0], atol=1e-14)
+    short = [jnp.asarray(x, jnp.float32) for x in (both, grid, ts, 0.1, 0.05)]
+    single = read(*short)
+    assert single.dtype == jnp.float32
+    np.testing.assert_allclose(single, found, atol=5e-6)
+
+
+@pytest.mark.parametrize("lag", [0.0, 1e-4, 0.05, 2.0])
+def test_a_command_through_a_low_pass_is_exact_at_its_samples(lag):
+    ts = np.array([0.0, 0.3, 0.4, 1.0, 1.7])
+    values = np.array([0.0, 0.0, 1.0, 1.0, -0.4])
+    found, fine = filtered(jnp.asarray(ts), jnp.asarray(values), lag), np.linspace(0.0, 1.7, 17001)
+    y, x = np.zeros(len(fine)), np.interp(fine, ts, values)
+    for k, h in enumerate(np.diff(fine)):  # linear in each of these intervals: their integral in closed form
+        slope, decay = (x[k + 1] - x[k]) / h, np.exp(-h / lag) if lag else 0.0
+        y[k + 1] = x[k + 1] - lag * slope + (y[k] - x[k] + lag * slope) * decay
+    np.testing.assert_allclose(found, np.interp(ts, fine, y), atol=1e-12)
+
+
+# Estimates. -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("names", [("gain", "bias"), ("delay",), ("lag",), ("gain", "bias", "delay", "lag")])
+def test_numbers_of_a_sensor_are_found_with_the_parameters(names):
+    asked = {"gain": GAIN, "bias": jj.Estimate(0.0), "delay": DELAY, "lag": LAG}
+    found = jj.fit(Cart(mass=1.8), run(**{name: asked[name] for name in names}), ("mass", "damping"), rtol=1e-10, atol=1e-10)
+    assert found.converged
+    assert found.labels == ("mass", "damping", *(f"gyro.{name}" for name in sorted(names)))
+    expected = [MASS, DAMPING, *(TRUTH[name] for name in sorted(names))]
+    np.testing.assert_allclose(found.values, expected, rtol=1e-5)
+    assert found.chi_square < 1e-8  # the square of the tolerance
+    # covariance: from differences of the closed form
+    counted = np.isfinite(run().values["gyro"])
+
+    def residual(theta):
+        numbers = TRUTH | dict(zip(sorted(names), theta[2:], strict=True))
+        return np.concatenate([shown(TS, *theta[:2], order=0) / 0.002, shown(TS, *theta[:2], **numbers)[counted] / 0.005])
+
+    J = np.stack([(residual(expected + h) - residual(expected - h)) / 2e-5 for h in 1e-5 * np.eye(len(expected))], axis=1)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(J.T @ J), rtol=1e-3)
+
+
+def test_intervals_cover_gain_bias_and_delay():
+    found = jj.fit_batch(Cart(mass=1.8), run(1, (REPEATS,), gain=GAIN, bias=BIAS, delay=DELAY), ("mass", "damping"))
+    assert found.converged.all()
+    truth = {"mass": MASS, "damping": DAMPING, "gyro.gain": TRUTH["gain"], "run 0: gyro.bias": TRUTH["bias"], "gyro.delay": TRUTH["delay"]}
+    assert set(found.labels) == set(truth)
+    # binomial, 95 % of 200: 3.3 standard deviations (one case in a thousand) are 5 %
+    share = 3.3 * np.sqrt(0.95 * 0.05 / REPEATS)
+    for name, value in truth.items():
+        estimate = found[name]
+        covered = np.mean((estimate.low < value) & (value < estimate.high))
+        assert 0.95 - share <= covered <= 0.95 + share, (name, covered)
+        assert float(np.std(estimate.value)) == pytest.approx(float(np.mean(estimate.standard_error)), rel=0.2)
+
+
+def test_a_bias_of_each_run_and_a_delay_that_all_share():
+    biases, ts = (0.05, -0.02, 0.3), np.linspace(1.0, 4.0, 61)
+    runs = [
+        run(k, truth=TRUTH | {"bias": bias}, ts=ts[: 61 - 7 * k], x0=0.3 - 0.1 * k, sigma=1e-4, gain=GAIN, bias=BIAS, delay=DELAY)
+        for k, bias in enumerate(biases)
+    ]
+    found = jj.fit(Cart(), runs, ("damping",))
+    assert found.labels == ("damping", "gyro.delay", "gyro.gain", *(f"run {k}: gyro.bias" for k in range(3)))
+    assert found.converged
+    for name, value in [("gyro.delay", 0.07), ("gyro.gain", 1.2), *((f"run {k}: gyro.bias", bias) for k, bias in enumerate(biases))]:
+        assert abs(found[name].value - value) < 4 * found[name].standard_error, name
+        assert found[name].standard_error < 0.02
+
+
+def test_runs_with_other_sensors_of_one_channel_share_what_they_estimate():
+    runs = [run(gain=GAIN), run(truth=TRUTH | {"gain": 2.0}), run(truth=IDEAL | {"gain": 1.2}, gain=GAIN)]
+    found = jj.fit(Cart(mass=1.9), runs, ("mass",))
+    assert found.labels == ("mass", "gyro.gain")
+    np.testing.assert_allclose(found.values, [MASS, 1.2], rtol=1e-5)
+
+
+def test_a_sensor_shows_functions_and_coordinates_under_other_names():
+    seen = {"place": lambda motion: motion["cart"].position, "encoder": "x", "x_rate": jj.Sensor(gain=jj.Estimate(1.0))}
+    x, v = shown(TS, order=0), shown(TS, gain=1.3)
+    values = {"place": np.stack([x, 0 * x, 0 * x], axis=1), "encoder": x, "x_rate": v}
+    found = jj.fit(Cart(mass=1.8), jj.Measurements(TS, values, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors=seen), ("mass",))
+    np.testing.assert_allclose(found.values, [MASS, 1.3], rtol=1e-6)
+    # a gain and a bias for each component
+    each = jj.Sensor(lambda motion: motion["cart"].position, gain=jj.Estimate((1.0, 1.0, 1.0)), bias=jj.Estimate((0.0, 0.0, 0.0)), delay=0.0)
+    bent = jj.Measurements(TS, {"place": values["place"] * 0.9 + np.array([0.1, 0.2, 0.3])}, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors={"place": each})
+    found = jj.fit(Cart(), bent, ())
+    np.testing.assert_allclose([found[f"place.bias[{i}]"].value for i in range(3)], [0.1, 0.2, 0.3], atol=1e-6)
+    assert found["place.gain[0]"].value == pytest.approx(0.9, rel=1e-6)
+    assert {"`place.gain[1]` does not show in any channel", "`place.gain[2]` does not show in any channel"} == set(found.not_identifiable)
+
+
+class Swing(jj.Scene):
+    """An arm on an axle along z with a torsional spring: `I turn'' = - k turn`."""
+
+    inertia: jnp.ndarray = jj.parameter(0.5, unit="kg m^2", positive=True)
+    stiffness: jnp.ndarray = jj.parameter(8.0, unit="N m/rad", positive=True)
+    coordinates = jj.coordinates("turn")
+
+    def bodies(self, t, q):
+        return {"arm": jj.RigidBody(jnp.asarray(1.0), self.inertia * jnp.ones(3), jnp.zeros(3), jj.rot_z(q.turn))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, turn_rate=-self.stiffness * motion.q.turn),)
+
+
+def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_gravity():
+    # turn = 0.7 cos(4 t), at 0.2 m: f = (- turn'^2 r, turn'' r, g) in the axes of the arm
+    turn, rate = 0.7 * np.cos(4 * TS), -2.8 * np.sin(4 * TS)
+    felt = np.stack([-0.2 * rate**2, -16 * 0.2 * turn, 9.81 + 0 * TS], axis=1)
+    seen = jj.Accelerometer("arm", (0.2, 0.0, 0.1))
+    motion = jj.simulate(Swing(), {"turn": 0.7}, ts=TS, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(seen.over_times(motion), felt, atol=1e-7)
+    late = (4 * 0.05) ** 6 / 50  # of the reading between times, relative
+    for sensor, missing in ((seen, TS < 0), (jj.Sensor(seen, delay=jj.Estimate(0.03, range=jj.bounds(0.0, 0.1))), TS < 0.1)):
+        shown = felt if sensor is seen else np.stack([np.interp(TS - 0.05, TS, felt[:, i]) for i in range(3)], axis=1)
+        data = jj.Measurements(TS, {"imu": np.where(missing[:, None], np.nan, shown)}, 0.01, start={"turn": 0.7}, sensors={"imu": sensor})
+        found = jj.fit(Swing(stiffness=7.5), data, ("stiffness",))
+        assert found["stiffness"].value == pytest.approx(8.0, rel=1e-5 + late)
+    assert found["imu.delay"].value == pytest.approx(0.05, abs=1e-5)
+    bad = jj.Measurements(TS, {"imu": felt}, 0.01, start={"turn": 0.7}, sensors={"imu": jj.Accelerometer("arn")})
+    with pytest.raises(ValueError, match="the accelerometer `imu` of run 0 of `Swing` sits on body `arn`, which is not there; did you mean `arm`"):
+        jj.fit(Swing(), bad, ("stiffness",))
+
+
+def test_a_delay_that_is_not_there_is_at_its_bound():
+    found = jj.fit(Cart(mass=1.9), run(3, truth=IDEAL, delay=DELAY), ("mass",))
+    assert found.converged
+    assert found["gyro.delay"].low == 0.0
+    assert 0.0 < found["gyro.delay"].high < 0.02
+
+
+@pytest.mark.skipif(bool(host.reason_against()), reason="needs llvmlite")
+def test_machine_code_serves_sensors_and_gives_what_xla_gives():
+    data = run(4, gain=GAIN, delay=DELAY)
+    native, xla = (jj.fit(Cart(mass=1.8), data, ("mass",), backend=backend) for backend in ("native", "xla"))
+    np.testing.assert_allclose(native.values, xla.values, rtol=1e-6)
+    np.testing.assert_allclose(native.standard_errors, xla.standard_errors, rtol=1e-5)
+
+
+def test_other_numbers_of_a_sensor_compile_nothing(monkeypatch):
+    traces = []
+    monkeypatch.setattr(predictions, "simulate_forward", lambda *a, **k: traces.append(1) or simulate_forward(*a, **k))
+    for seed, delay in ((5, 0.05), (6, 0.03)):
+        found = jj.fit(Cart(mass=1.8), [run(seed, delay=jj.Estimate(delay, range=jj.bounds(0.0, 0.15)), gain=1.0 + 0.1 * seed)], ("mass",))
+        assert found.converged
+    assert len(traces) == 1
+
+
+# What is known beforehand. ------------------------------------------------------------------------------------------------
+
+
+def test_a_prior_counts_as_a_measurement():
+    data = run(7)
+    free, known = jj.fit(Cart(), data, ("mass",)), jj.fit(Cart(), data, {"mass": jj.Estimate(prior=jj.Normal(2.005, 0.003))})
+    value, error = float(free["mass"].value), float(free["mass"].standard_error)
+    weights = np.array([error**-2, 0.003**-2])
+    assert known["mass"].standard_error == pytest.approx(weights.sum() ** -0.5, rel=1e-2)
+    assert known["mass"].value == pytest.approx(weights @ [value, 2.005] / weights.sum(), abs=0.05 * error)
+    assert known.samples == free.samples
+
+
+def test_priors_of_starts_and_of_numbers_of_single_runs():
+    def one(k, prior):
+        start = {"x": jj.Estimate(prior=jj.Normal(0.3, prior))}
+        return run(10 + k, sigma=0.01, unknown_start=start, bias=jj.Estimate(0.0, per_run=True, prior=jj.Normal(0.05, prior)))
+
+    loose, tight = (jj.fit(Cart(mass=1.9), [one(k, prior) for k in range(3)], ("mass",)) for prior in (1e3, 1e-6))
+    assert loose.labels == tight.labels
+    for k in range(3):
+        assert tight[f"run {k}: gyro.bias"].value == pytest.approx(0.05, abs=1e-6)
+        assert tight[f"run {k}: x"].value == pytest.approx(0.3, abs=1e-6)
+        assert tight[f"run {k}: x"].standard_error == pytest.approx(1e-6, rel=1e-3)
+        assert loose[f"run {k}: x"].standard_error > 1e-4
+    fixed = jj.fit(Cart(mass=1.9), [run(10 + k, sigma=0.01) for k in range(3)], ("mass",))
+    np.testing.assert_allclose(tight["mass"].value, fixed["mass"].value, rtol=1e-5)
+    np.testing.assert_allclose(tight["mass"].standard_error, fixed["mass"].standard_error, rtol=1e-3)
+
+
+# What cannot be told. -----------------------------------------------------------------------------------------------------
+
+
+def pushed(sensor: dict, actuator: dict, ts=TS) -> jj.Measurements:
+    """The cart at rest, pushed: place and speed as simulated."""
+    knots = np.linspace(0.0, 4.0, 41)
+    command = np.sin(2 * knots) + np.where(knots > 1, 0.3, 0.0)
+    motion = jj.simulate(Cart(), {"x": 0.0, "x_rate": 0.0}, ts=ts, inputs={"push": jj.Sampled(knots, 1.5 * command)}, rtol=1e-10, atol=1e-10)
+    inputs = {"push": jj.Actuator(jj.Sampled(knots, command), **actuator)}
+    return jj.Measurements(ts, {"x": motion["x"]}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs=inputs, sensors={"x": jj.Sensor(**sensor)})
+
+
+def test_gains_that_show_as_a_product_are_named():
+    found = jj.fit(Cart(), pushed({"gain": jj.Estimate(1.1)}, {"gain": jj.Estimate(1.2)}), ())
+    (sentence,) = found.not_identifiable
+    assert "`x.gain` and `push.gain` do not show separately" in sentence or "`push.gain` and `x.gain` do not show separately" in sentence
+    assert "what shows is x.gain push.gain" in sentence or "what shows is push.gain x.gain" in sentence
+    assert np.isnan(found["x.gain"].standard_error)
+    assert float(found["x.gain"].value * found["push.gain"].value) == pytest.approx(1.5, rel=1e-5)
+
+
+def test_a_gain_and_the_parameters_that_scale_alike_are_named_and_a_prior_tells_them():
+    # under a known push only ratios to the sensor's gain show: gain/mass, gain/damping, gain/stiffness
+    names = ("mass", "damping", "stiffness")
+    found = jj.fit(Cart(), pushed({"gain": jj.Estimate(1.1)}, {"gain": 1.5}), names)
+    (sentence,) = found.not_identifiable
+    assert all(f"`{name}`" in sentence for name in (*names, "x.gain"))
+    assert "d mass/mass : d damping/damping : d stiffness/stiffness : d x.gain/x.gain = 1 : 1 : 1 : 1" in sentence
+    known = jj.fit(Cart(), pushed({"gain": jj.Estimate(1.1, prior=jj.Normal(1.0, 0.02))}, {"gain": 1.5}), names)
+    assert known.not_identifiable == ()
+    assert known["x.gain"].standard_error == pytest.approx(0.02, rel=1e-3)
+    assert known["mass"].standard_error / known["mass"].value == pytest.approx(0.02, rel=0.05)
+
+
+# Actuators. ---------------------------------------------------------------------------------------------------------------
+
+
+def driven(truth: dict, **asked) -> jj.Measurements:
+    """The cart under a command through an actuator with the numbers `truth`, of which some are asked for."""
+    knots = np.linspace(0.0, 4.0, 41)
+    command = jj.Sampled(knots, np.sin(2 * knots) + np.where(knots > 1, 0.3, 0.0))
+    late = np.asarray(knots) + truth["delay"]
+    signal = jj.Sampled(late, truth["gain"] * filtered(command.ts, command.values, truth["lag"]) + truth["bias"])
+    motion = jj.simulate(Cart(), {"x": 0.3, "x_rate": 0.0}, ts=TS, inputs={"push": signal}, rtol=1e-10, atol=1e-10)
+    inputs = {"push": jj.Actuator(command, **(truth | asked))}
+    return jj.Measurements(TS, {"x": motion["x"], "x_rate": motion["x_rate"]}, 0.001, start={"x": 0.3, "x_rate": 0.0}, inputs=inputs)
+
+
+def test_numbers_of_an_actuator_are_found():
+    asked = {"gain": GAIN, "bias": jj.Estimate(0.0), "delay": DELAY, "lag": LAG}
+    data = driven(TRUTH, **asked)
+    found = jj.fit(Cart(mass=1.9), data, ("mass",), rtol=1e-10, atol=1e-10)
+    assert found.labels == ("mass", "push.bias", "push.delay", "push.gain", "push.lag")
+    np.testing.assert_allclose(found.values, [MASS, *(TRUTH[name] for name in sorted(TRUTH))], rtol=1e-4)
+    # slopes: the curvature of log-likelihoods, by differences of simulations
+    step = 1e-4
+
+    def states(**changed):
+        data = driven(TRUTH | changed)
+        return np.concatenate([data.values["x"], data.values["x_rate"]]) / 0.001
+
+    J = np.stack([(states(**{n: TRUTH[n] + step}) - states(**{n: TRUTH[n] - step})) / (2 * step) for n in sorted(TRUTH)], axis=1)
+    alone = jj.fit(Cart(), data, (), rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(alone.covariance, np.linalg.inv(J.T @ J), rtol=2e-3)
+
+
+def test_an_actuator_with_known_numbers_is_an_input_like_any_other():
+    found = jj.fit(Cart(mass=1.9), driven(TRUTH), ("mass",))
+    assert found["mass"].value == pytest.approx(MASS, rel=1e-6)
+
+
+# Likelihood. --------------------------------------------------------------------------------------------------------------
+
+
+def test_log_likelihood_knows_sensors_and_is_differentiable_in_them():
+    def value(numbers):
+        return jj.log_likelihood(Cart(), run(8, **numbers))
+
+    numbers = {name: jnp.asarray(x) for name, x in TRUTH.items()}
+    slopes = jax.grad(value)(numbers)
+    counted = np.isfinite(run(8).values["gyro"])
+
+    def by_hand(numbers):
+        data = run(8)
+        r = np.concatenate([(shown(TS, order=0) - data.values["x"]) / 0.002, (shown(TS, **numbers) - data.values["gyro"])[counted] / 0.005])
+        return -0.5 * np.sum(r**2) - 81 * np.log(0.002) - counted.sum() * np.log(0.005) - 0.5 * len(r) * np.log(2 * np.pi)
+
+    assert float(value(numbers)) == pytest.approx(by_hand(TRUTH), rel=1e-5)
+    for name in TRUTH:
+        step = 1e-4
+        expected = (by_hand(TRUTH | {name: TRUTH[name] + step}) - by_hand(TRUTH | {name: TRUTH[name] - step})) / (2 * step)
+        assert float(slopes[name]) == pytest.approx(expected, rel=1e-3, abs=1e-2), name
+
+
+def test_the_page_on_identification_runs(capsys):
+    page = (Path(__file__).parents[1] / "docs" / "howto" / "identification.md").read_text(encoding="utf-8")
+    names = {"jj": jj, "jnp": jnp, "np": np}
+    exec("\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), names)
+    found = names["found"]
+    assert found.converged
+    for name, value in (("gyro.gain", 1.1), ("gyro.delay", 0.05), ("run 0: gyro.bias", 0.02), ("offset", 0.25)):
+        assert abs(found[name].value - value) < 4 * found[name].standard_error + 1e-3, name
+
+
+# Bad input. -----------------------------------------------------------------------------------------------------------------
+
+
+def fitted(**numbers):
+    return jj.fit(Cart(), run(**numbers), ("mass",))
+
+
+COMMAND = jj.Sampled([0.0, 4.0], [1.0, 1.0])
+
+
+def with_input(push) -> jj.Fit:
+    return jj.fit(Cart(), jj.Measurements(TS, {"x": TS}, 1.0, start={"x": 0.0}, inputs={"push": push}), ("mass",))
+
+
+@pytest.mark.parametrize(
+    ("call", "advice"),
+    [
+        (lambda: jj.Sensor(3), "`quantity` of `Sensor` is an int, expected a coordinate, a speed"),
+        (lambda: jj.Sensor(lag=-0.1), "`lag` of `Sensor` is -0.1 s, expected zero or more"),
+        (lambda: jj.Sensor(delay=-0.1), "`delay` of `Sensor` is -0.1 s, expected zero or more; where the clock of a channel is ahead, shift its times"),
+        (lambda: jj.Sensor(gain=np.nan), "`gain` of `Sensor` is nan, expected a finite number"),
+        (lambda: jj.Sensor(gain="one"), "`gain` of `Sensor` is the text 'one', expected real numbers; give a number, or an `Estimate`"),
+        (lambda: jj.Sensor(lag=[0.1, 0.2]), r"`lag` of `Sensor` has shape \(2,\), expected one number"),
+        (lambda: jj.Sensor(gain=jj.Estimate()), r"`gain` of `Sensor` is to be estimated, but has no first guess; give one: `jj.Estimate\(1.0\)`"),
+        (lambda: jj.Sensor(delay=jj.Estimate(0.1)), "`delay` of `Sensor` is to be estimated, but nothing says how long it may be; give `range=jj.bounds"),
+        (lambda: jj.Sensor(delay=jj.Estimate(0.1, range=jj.bounds(-1.0, 1.0))), "`delay` of `Sensor` may fall to -1 s, expected a range from zero"),
+        (lambda: jj.Sensor(lag=jj.Estimate((0.1, 0.2))), "`lag` of `Sensor` is to be estimated from 2 guesses, expected one number"),
+        (lambda: jj.Estimate(np.inf), "`guess` of `Estimate` is inf, expected a finite number"),
+        (lambda: jj.Estimate(1.0, range=(0.0, 1.0)), "`range` of `Estimate` is a tuple, expected `bounds"),
+        (lambda: jj.Estimate(1.0, per_run=1), "`per_run` of `Estimate` is an int, expected True or False"),
+        (lambda: jj.Estimate(1.0, prior=0.1), r"`prior` of `Estimate` is a float, expected `jj.Normal\(mean, sigma\)`"),
+        (lambda: jj.Estimate(1.0, prior=jj.Normal(1.0, 0.0)), "expected a standard deviation above zero; a number that is known needs no estimate"),
+        (lambda: jj.Actuator(1.0), "`command` of `Actuator` is a float, expected `jj.Sampled"),
+        (lambda: jj.Actuator(COMMAND, gain=[1.0, 2.0]), r"`gain` of `Actuator` has shape \(2,\), expected one number"),
+        (lambda: jj.Measurements(TS, {"x": TS}, 1.0, start={}, sensors={"y": "x"}), "sensor `y` has no measured values; Valid names: `x`"),
+        (
+            lambda: jj.fit(Cart(), jj.Measurements(TS, {"gyro": TS}, 1.0, start={"x": 0.0}, sensors={"gyro": "x_rte"}), ("mass",)),
+            "run 0 of `Cart` has channel `gyro`, whose sensor measures an unknown quantity `x_rte`; did you mean `x_rate`",
+        ),
+        (lambda: fitted(delay=0.3), "`gyro` of run 0 of `Cart` begins at 0.2 s, and less its delay of up to 0.3 s that is before the start at t0 = 0 s"),
+        (lambda: fitted(delay=jj.Estimate(0.1, range=jj.bounds(0.0, 0.5))), "give an earlier `t0` with the start there, or NaN for the first samples"),
+        (lambda: fitted(gain=jj.Estimate(3.0, range=jj.bounds(0.0, 2.0))), r"first guess of `gyro.gain` is 3.0; expected a first guess between its bounds"),
+        (lambda: fitted(gain=[1.0, 2.0]), r"`gain` of sensor `gyro` of run 0 of `Cart` has shape \(2,\), expected \(\) or \(\)"),
+        (lambda: fitted(lag=jj.Estimate(0.0)), "first guess of `gyro.lag` is 0.0; expected a first guess above zero"),
+        (
+            lambda: jj.fit(Cart(), [run(gain=GAIN), run(gain=jj.Estimate(2.0))], ("mass",)),
+            "run 0 and run 1 state `gyro.gain` differently, but share it .*; give both the same, or `per_run=True`",
+        ),
+        (lambda: jj.log_likelihood(Cart(), run(gain=GAIN)), "`gyro.gain` is to be estimated, but a likelihood needs its value"),
+        (lambda: with_input(jj.Actuator(jj.Sampled([0.0, 1.0], [0.0, 1.0]), lag=0.1)), "command of input `push` of run 0 of `Cart` ends at 1 s, before"),
+        (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate((1.0, 2.0))}), r"first guess of `mass` has shape \(2,\), expected \(\)"),
+        (
+            lambda: jj.fit(
+                Cart(),
+                jj.Measurements(
+                    TS,
+                    {"push": TS},
+                    1.0,
+                    start={"x": 0.0},
+                    sensors={"push": jj.Sensor("x", gain=GAIN)},
+                    inputs={"push": jj.Actuator(COMMAND, gain=GAIN)},
+                ),
+            ),
+            "has a channel and an input `push`, both with an estimated gain; give the channel another name",
+        ),
+    ],
+)
+def test_bad_input_gets_advice(call, advice):
+    with pytest.raises(ValueError, match=advice):
+        call()
