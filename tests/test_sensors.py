@@ -457,6 +457,7 @@ def with_input(push) -> jj.Fit:
         ),
         (lambda: jj.log_likelihood(Cart(), run(gain=GAIN)), "`gyro.gain` is to be estimated, but a likelihood needs its value"),
         (lambda: with_input(jj.Actuator(jj.Sampled([0.0, 1.0], [0.0, 1.0]), lag=0.1)), "command of input `push` of run 0 of `Cart` ends at 1 s, before"),
+        (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate(per_run=True)}), "`free` asks for a `mass` of each run, but all runs share the scene"),
         (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate((1.0, 2.0))}), r"first guess of `mass` has shape \(2,\), expected \(\)"),
         (
             lambda: jj.fit(
