@@ -120,6 +120,19 @@ def test_the_low_pass_of_a_reading_starts_at_rest():
     np.testing.assert_allclose(ramp, 2.0 + 3.0 * (grid - 0.2 * (1 - np.exp(-grid / 0.2))), atol=1e-13)
 
 
+@pytest.mark.parametrize(("order", "inside", "at_the_ends"), [(1, 0.18, 0.26), (2, 0.032, 0.075)])
+def test_near_a_jump_of_a_derivative_a_reading_has_the_stated_error(order, inside, at_the_ends):
+    h = 0.1
+    grid, ts = h * np.arange(41.0), h * np.linspace(0.0, 40.0, 2001)
+    reading = jax.jit(lambda values: read(values, grid, ts, 0.0))
+    # max(t - c, 0)^order / order!: the derivative of this order jumps by one at c
+    errors = {
+        c: np.abs(reading(np.maximum(grid - h * c, 0) ** order / order) - np.maximum(ts - h * c, 0) ** order / order).max() for c in np.arange(0, 20, 0.05)
+    }
+    assert max(error for c, error in errors.items() if c > 3) == pytest.approx(inside * h**order, rel=0.03)
+    assert max(errors.values()) == pytest.approx(at_the_ends * h**order, rel=0.03)
+
+
 def test_vectors_are_read_component_by_component_and_single_precision_stays():
     grid, ts = np.linspace(0.0, 4.0, 81), np.linspace(0.3, 4.0, 20)
     both = np.stack([wave(grid), 2.0 - wave(grid)], axis=1)
@@ -397,6 +410,20 @@ def test_log_likelihood_knows_sensors_and_is_differentiable_in_them():
         assert float(slopes[name]) == pytest.approx(expected, rel=1e-3, abs=1e-2), name
 
 
+def test_a_likelihood_of_measurements_that_are_made_inside_jit_is_the_same():
+    # 21 samples a cycle over 57 cycles: 64 intervals would be about one a cycle
+    ts = np.linspace(0.0, 60.0, 1201)
+    scene, late = Cart(stiffness=STIFFNESS * 14), jj.Sensor("x_rate", delay=0.07)
+    motion = jj.simulate(scene, {"x": 0.3, "x_rate": 0.0}, ts=ts, rtol=1e-9, atol=1e-9)
+    seen = np.where(ts < SEEN, np.nan, np.asarray(motion["x_rate"]))
+
+    def value(stiffness):
+        data = jj.Measurements(ts, {"gyro": seen}, 0.05, start={"x": 0.3, "x_rate": 0.0}, sensors={"gyro": late})
+        return jj.log_likelihood(scene.replace(stiffness=stiffness), data, rtol=1e-9, atol=1e-9)
+
+    assert float(jax.jit(value)(scene.stiffness)) == pytest.approx(float(value(scene.stiffness)), rel=1e-3)
+
+
 def test_the_page_on_identification_runs(capsys):
     page = (Path(__file__).parents[1] / "docs" / "howto" / "identification.md").read_text(encoding="utf-8")
     names = {"jj": jj, "jnp": jnp, "np": np}
@@ -457,6 +484,7 @@ def with_input(push) -> jj.Fit:
         ),
         (lambda: jj.log_likelihood(Cart(), run(gain=GAIN)), "`gyro.gain` is to be estimated, but a likelihood needs its value"),
         (lambda: with_input(jj.Actuator(jj.Sampled([0.0, 1.0], [0.0, 1.0]), lag=0.1)), "command of input `push` of run 0 of `Cart` ends at 1 s, before"),
+        (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate(per_run=True)}), "`free` asks for a `mass` of each run, but all runs share the scene"),
         (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate((1.0, 2.0))}), r"first guess of `mass` has shape \(2,\), expected \(\)"),
         (
             lambda: jj.fit(

@@ -83,8 +83,11 @@ def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
 
 
 def _grid(t0, ts) -> Float[Array | np.ndarray, "grid"]:
-    """Times at equal intervals from the start to the last sample: the samples' own where these are equal, too, and never longer."""
-    count = FEWEST_INTERVALS
+    """Times at equal intervals from the start to the last sample: the samples' own where these are equal, too; else none longer than their median.
+
+    Of traced times only their number is known: there are two intervals for each of theirs, as if the first sample were at the start.
+    """
+    count = max(FEWEST_INTERVALS, 2 * (ts.shape[0] - 1))
     if not is_traced((t0, ts)):
         span, steps = float(ts[-1] - t0), np.diff(np.asarray(ts, float))
         needed = span / np.median(steps) if steps.size else 1.0

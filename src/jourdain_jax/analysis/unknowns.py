@@ -133,7 +133,8 @@ class _Entry:
 def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, Range | Estimate | None] | Iterable[str]") -> Unknowns:
     """The unknowns that `free`, the runs' `unknown_start` and their sensors and actuators name.
 
-    Raises ValueError for unknown names, for guesses outside their bounds, for an estimate that runs share but state differently, and where nothing is free.
+    Raises ValueError for unknown names, for guesses outside their bounds, for a parameter of each run, for an estimate that runs share but state differently,
+    and where nothing is free.
     """
     parameters = {name: (value, about) for name, value, about in parameters_of(scene)}
     entries: list[_Entry] = []
@@ -141,6 +142,8 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
     for name, given in (free if isinstance(free, Mapping) else dict.fromkeys(as_names(free))).items():
         if name not in parameters:
             raise ValueError(f"`free` names `{name}`, which is no parameter of `{type(scene).__name__}`; {nearest(name, parameters)}")
+        if isinstance(given, Estimate) and given.per_run:
+            raise ValueError(f"`free` asks for a `{name}` of each run, but all runs share the scene; leave out `per_run`, or fit the runs one by one")
         value, about = parameters[name]
         default = positive() if about["positive"] or about["non_negative"] else unbounded()
         entries.append(_entry(name, about["unit"], given, default, np.asarray(value)))
