@@ -37,6 +37,7 @@ _NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distrib
 _LEAST_SIGMA = 1e-12  # of a channel that is met exactly
 _POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
 _SPANS, _STEPS, _ROUGHLY = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2), 12, 0.05  # shares of the span that a fit grows over; steps tried on each, and their tolerance
+_SAME = 0.05  # of half the sum of squares, by which the same minimum is found lower from elsewhere
 _FEWEST_RUNS = 5  # that tell how much runs differ
 
 
@@ -51,6 +52,7 @@ def fit(
     max_iterations: int = 50,
     loss: Loss | None = None,
     errors: str = "sigmas",
+    guesses: int = 1,
     **simulation,
 ) -> Fit:
     """Estimate the `free` parameters of a scene, unknown initial values of its runs and numbers of their sensors, from measurements.
@@ -67,6 +69,8 @@ def fit(
     - `loss`: `huber()` or `student_t()` where some samples are far out (default: least squares).
     - `errors`: whence standard errors and intervals come. "sigmas": from the sigmas, which holds for noise that is white. "runs": from how much runs differ
       (the sandwich of clusters, which needs five runs or more), which holds whatever the noise within a run, also where the scene is not quite right.
+    - `guesses`: how many first guesses are tried side by side: that of the scene and the runs, and others on a Latin hypercube over the bounds of all
+      unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` says how many led to it.
     - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events are ignored.
 
     Where that finds no minimum, or one whose residuals are far beyond their sigmas, the fit is made once more over growing spans: the first 1/32 of each
@@ -89,7 +93,9 @@ def fit(
         print(found)                                              # estimates with 95 % intervals, and what the data cannot tell
         found["offset"].value, found.scene.offset                 # near 0.25 m
     """
-    return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, repeats=False)
+    if isinstance(guesses, bool) or not isinstance(guesses, int | np.integer) or guesses < 1:
+        raise ValueError(f"`guesses` is {guesses!r}, expected a whole number of at least 1: how many first guesses to begin from")
+    return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, repeats=False, guesses=int(guesses))
 
 
 def fit_batch(
@@ -113,7 +119,7 @@ def fit_batch(
     return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, repeats=True)
 
 
-def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | None, errors: str, repeats: bool) -> Fit:
+def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | None, errors: str, repeats: bool, guesses: int = 1) -> Fit:
     scene = as_scene(scene)
     if is_traced((scene, data, control.tolerance, control.cutoff, simulation)):
         raise DifferentiationModeError(
@@ -128,19 +134,23 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
         members = _repeats(runs) if repeats else None
         _check_enough(runs, unknowns, repeats)
         problem = _Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members), loss or LEAST_SQUARES)
-        theta = np.broadcast_to(unknowns.guess, (members or 1, unknowns.guess.size))
+        theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
         limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
-        return _result(problem, _minimum(problem, theta, limits, control), limits, control, errors)
+        found = _minimum(problem, theta, limits, control, one_will_do=members is None)
+        same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
+        return _result(problem, found if members else found.lowest(), limits, control, errors, guesses, same)
 
 
-def _minimum(problem: "_Problem", theta: np.ndarray, limits: Limits, control: Control) -> Minimum:
-    """The minimum from `theta`; where none is found, or one that leaves residuals far beyond their sigmas, the lower one of it and that over growing spans.
+def _minimum(problem: "_Problem", theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
+    """The minimum from each `theta`; where none is found, or residuals are far beyond their sigmas, the lower one of it and that over growing spans.
 
-    Over a short span a motion depends on its unknowns almost linearly; each fit begins where that over the shorter span ended.
+    Over a short span a motion depends on its unknowns almost linearly; each fit begins where that over the shorter span ended. `one_will_do`: spans grow
+    only where no theta led to a minimum with small residuals.
     """
     found = minimise(problem.linearised, theta, limits, control)
-    poor = np.flatnonzero(~found.converged | (found.at.cost > 0.5 * _POOR * problem.samples))
-    if not poor.size or not problem.samples:
+    is_poor = ~found.converged | (found.at.cost > 0.5 * _POOR * problem.samples)
+    poor = np.flatnonzero(is_poor)
+    if not poor.size or not problem.samples or (one_will_do and not is_poor[np.argmin(found.at.cost)]):
         return found
     begin, steps = theta[poor], found.steps[poor]
     roughly = replace(control, most_steps=min(_STEPS, control.most_steps), tolerance=_ROUGHLY)
@@ -260,7 +270,7 @@ class _Problem:
             yield r[:, counted], counted
 
 
-def _result(problem: _Problem, found: Minimum, limits: Limits, control: Control, errors: str) -> Fit:
+def _result(problem: _Problem, found: Minimum, limits: Limits, control: Control, errors: str, guesses: int, agreeing: np.ndarray) -> Fit:
     unknowns, theta, single = problem.unknowns, found.theta, problem.lanes.members is None
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
@@ -299,6 +309,8 @@ def _result(problem: _Problem, found: Minimum, limits: Limits, control: Control,
         stuck=one(found.stuck),
         steps=one(found.steps),
         grown=one(found.grown),
+        guesses=guesses,
+        agreeing=agreeing,
         labels=unknowns.labels,
         units=unknowns.units,
         cutoff=control.cutoff,

@@ -61,6 +61,8 @@ class Fit(Printed, eqx.Module):
     stuck: Bool[np.ndarray, "*repeats"]  # no step lowers the sum of squares, however short, and this is no minimum
     steps: Int[np.ndarray, "*repeats"]  # tried
     grown: Bool[np.ndarray, "*repeats"]  # whether the minimum was found over growing spans, far from where the first guess led to
+    agreeing: Int[np.ndarray, "*repeats"]  # first guesses that led to this minimum, of those tried; of a batch, which has one for each repeat, zero
+    guesses: int = eqx.field(static=True)  # first guesses tried
     labels: tuple[str, ...] = eqx.field(static=True)  # names of the unknowns
     units: tuple[str, ...] = eqx.field(static=True)
     cutoff: float = eqx.field(static=True)
@@ -145,6 +147,8 @@ class Fit(Printed, eqx.Module):
             names = ", ".join(f"`{name}`" for name, far in zip(self.labels, self.beyond, strict=True) if far > FAR_BEYOND)
             found.append(f"{names} lies at a bound, which decides its value; all standard errors lose their meaning: widen the bounds")
         found += self.impossible
+        if self.guesses > 1 and self.converged and self.agreeing == 1:
+            found.append(f"only one of {self.guesses} first guesses led to this minimum, so there may be a lower one; try more `guesses`, or narrower bounds")
         # chi-square has mean n and variance 2 n
         if self.reduced_chi_square > 1 + 5 * np.sqrt(2 / max(int(self.degrees_of_freedom), 1)):
             found.append(
@@ -194,6 +198,8 @@ def _text(fit: Fit) -> str:
     lines += [f"WARNING: {sentence}" for sentence in fit.warnings]
     if fit.grown:
         lines.append("found over growing spans: the first guess led elsewhere")
+    if fit.guesses > 1:
+        lines.append(f"{int(fit.agreeing)} of {fit.guesses} first guesses led to this minimum")
     if fit.errors == "runs":
         lines.append(f"standard errors from how much the {len(fit.residuals)} runs differ")
     lines += [f"sigma of `{name}`, estimated: {float(sigma):.4g}" for name, sigma in fit.sigma.items()]

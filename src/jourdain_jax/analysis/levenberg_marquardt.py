@@ -61,6 +61,16 @@ class Minimum:
     steps: Int[np.ndarray, "members"]  # tried
     grown: Bool[np.ndarray, "members"]  # whether it was found over growing spans
 
+    def lowest(self) -> "Minimum":
+        """That of the member with the lowest value."""
+        best = [int(np.argmin(self.at.cost))]
+        at = Linearised(self.at.cost[best], self.at.arrow.at(best), self.at.residual[best], self.at.sigma[best])
+        return Minimum(self.theta[best], at, self.converged[best], self.stuck[best], self.steps[best], self.grown[best])
+
+    def agreeing(self, apart: float) -> int:
+        """How many members converged to a value at most so far `apart` from the lowest one."""
+        return int(np.sum(self.converged & (self.at.cost <= np.min(self.at.cost) + apart)))
+
     def lowered(self, members: Int[np.ndarray, "some"], grown: "Minimum") -> "Minimum":
         """With the minima of these members found over growing spans, where they are lower."""
         lower = grown.at.cost < self.at.cost[members]

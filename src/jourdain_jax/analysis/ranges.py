@@ -11,6 +11,8 @@ from jaxtyping import Float
 
 from jourdain_jax.calculus.reals import Number, checked_real
 
+_FAR = 5.0  # a factor by which a first guess may be off
+
 
 @dataclass(frozen=True)
 class Range:
@@ -27,7 +29,15 @@ class Range:
             least = np.where(guess == 0, 1.0, np.abs(guess)) if self.scale is None else self.scale
         else:
             least = 0.01 * (self.high - self.low) if self.kind == "bounds" else 0.01 * np.abs(guess)
-        return np.maximum(np.abs(value), least)
+        return np.asarray(np.maximum(np.abs(value), least))
+
+    def spread(self, guess, share) -> Float[np.ndarray, "*shape"]:
+        """Other first guesses: for `share` from 0 to 1 all numbers between the bounds; without bounds a factor of five to either side, or a typical change."""
+        if self.kind == "bounds":
+            return np.asarray(self.low + share * (self.high - self.low))
+        if self.kind == "positive":
+            return guess * _FAR ** (2 * share - 1)
+        return guess + (2 * share - 1) * self.size(guess, guess)
 
     def refusal(self, guess: np.ndarray) -> str:
         """Why a first guess cannot be taken; empty where it can."""

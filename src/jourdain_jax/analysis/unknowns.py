@@ -112,6 +112,14 @@ class Unknowns:
             found[..., where] = kind.size(theta[..., where], self.guess[where])
         return found
 
+    def first_guesses(self, count: int) -> Float[np.ndarray, "guesses places"]:
+        """The first guess, and others on a Latin hypercube over the ranges; always the same ones."""
+        generator, theta = np.random.default_rng(0), np.tile(self.guess, (count, 1))
+        for place in self.estimated:
+            share = (generator.permutation(count - 1) + generator.uniform(size=count - 1)) / max(count - 1, 1)
+            theta[1:, place] = self.ranges[place].spread(self.guess[place], share)
+        return theta
+
     def split(self, theta: Float[np.ndarray, "*members places"]) -> tuple[np.ndarray, np.ndarray]:
         """Shared unknowns (*members, shared), and those of the runs (*members, runs, local)."""
         shared, local = self.layout.sizes
