@@ -31,6 +31,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import dask
 import numpy as np
 from distributed import Client, LocalCluster
 
@@ -133,6 +134,7 @@ def processes(lanes: int, folder: Path) -> Iterator[dict]:
     two = in_fresh_process(200 * lanes, folder / "processes", processes=2)["wall"]
     print(f"  one process {one:.1f} s, two {two:.1f} s", flush=True)
     yield figure("wall time by one process on one core over that by two processes on two", one / two, 1.8, at_least=True)
+    dask.config.set({"distributed.nanny.pre-spawn-environ": {"OMP_NUM_THREADS": 1}})  # as docs/ensembles.md advises: no early return of memory
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
         shutil.rmtree(folder / "dask", ignore_errors=True)
         began = time.perf_counter()

@@ -13,7 +13,7 @@ from jourdain_jax.ensembles.optional import cluster_by
 from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
-from jourdain_jax.ensembles.workers import left_out, sent_to_others
+from jourdain_jax.ensembles.workers import keep_to_share, left_out, sent_to_others
 from jourdain_jax.scene.numbers import described
 
 AHEAD = 2  # chunks per thread of a worker: one under way, one that waits for it
@@ -32,25 +32,35 @@ def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
     def workers(task: Task, store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
         path = str(store.path.resolve())
         study = client.submit(bytes, sent, pure=False)  # a task, and no scattered data: the scheduler knows how to have it again when a worker died
+        asked = study, path, os.getpid(), _places(distributed, client)
         suspects: list[int] = []
-        yield from _computed(distributed, client, study, path, numbers, interrupted, AHEAD * max(1, sum(client.nthreads().values())), suspects)
+        yield from _computed(distributed, client, asked, numbers, interrupted, AHEAD * max(1, sum(client.nthreads().values())), suspects)
         bad: list[int] = []
         for number in suspects:  # alone, so that no other chunk is blamed
-            yield from _computed(distributed, client, study, path, [number], interrupted, 1, bad)
+            yield from _computed(distributed, client, asked, [number], interrupted, 1, bad)
         if bad:
             raise RuntimeError(left_out(store, bad))
 
     return workers
 
 
-def _computed(distributed, client, study, path: str, numbers, interrupted, most: int, suspects: list[int]) -> Iterator[tuple[int, int]]:
+def _places(distributed, client) -> dict[object, int] | None:
+    """Number of each worker by its name, where all workers are of one thread, of this machine and of this process; None otherwise."""
+    cluster = client.cluster
+    threads = client.nthreads().values()
+    if type(cluster) is not distributed.LocalCluster or not cluster.processes or set(threads) != {1}:
+        return None
+    return {name: place for place, name in enumerate(sorted(cluster.workers))}
+
+
+def _computed(distributed, client, asked: tuple, numbers, interrupted, most: int, suspects: list[int]) -> Iterator[tuple[int, int]]:
     """Lanes and failed lanes, chunk by chunk as they come; numbers of chunks on which workers died go to `suspects`. At most `most` are asked for at a time."""
     left, running = iter(numbers), {}
     ended = distributed.as_completed()
 
     def ask() -> None:
         if not interrupted() and (number := next(left, None)) is not None:
-            future = client.submit(_chunk, study, path, number, os.getpid(), pure=False)
+            future = client.submit(_chunk, number, *asked, pure=False)
             running[future] = number
             ended.add(future)
 
@@ -67,11 +77,17 @@ def _computed(distributed, client, study, path: str, numbers, interrupted, most:
         ask()
 
 
-def _chunk(sent: bytes, path: str, number: int, asking: int) -> tuple[int, int]:
-    """Compute and keep a chunk in this worker, one at a time; what a worker kept before it died is not computed again. `asking`: the process that asks."""
+def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None) -> tuple[int, int]:
+    """Compute and keep a chunk in this worker, one at a time; what a worker kept before it died is not computed again.
+
+    `asking`: the process that asks; `places`: as `_places` says.
+    """
     with _one_at_a_time:
-        if os.getpid() != asking:  # a worker that is a process of its own keeps to its share of the cores
-            os.environ.setdefault("JOURDAIN_JAX_THREADS", str(cluster_by().get_worker().state.nthreads))
+        if os.getpid() != asking and "JOURDAIN_JAX_THREADS" not in os.environ:  # a worker that is a process of its own keeps to its share of the cores
+            worker = cluster_by().get_worker()
+            os.environ["JOURDAIN_JAX_THREADS"] = str(worker.state.nthreads)
+            if places and worker.name in places:
+                keep_to_share(places[worker.name], len(places))
         which = sent, path, (Path(path) / "run" / "study.json").stat().st_mtime_ns
         if which not in _runners:
             _runners.clear()

@@ -96,14 +96,18 @@ def _until_a_worker_dies(sent: bytes, store: Store, numbers: list[int], count: i
 def _begin(sent: bytes, path: str, places) -> None:
     """Start a worker: its cores, no Ctrl-C (which is for the parent), an end with the parent's."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    place, count = places.get()
+    keep_to_share(*places.get())
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    _runner.append(Runner(pickle.loads(sent), Store(path)))
+
+
+def keep_to_share(place: int, count: int) -> None:
+    """Keep this thread, and all that it starts, to the cores of process number `place` of `count`; before JAX begins, for its threads are then one per core."""
     with contextlib.suppress(AttributeError, OSError):  # not every system knows cores
         cores = sorted(os.sched_getaffinity(0))
         own = cores[place::count] or cores
         os.sched_setaffinity(0, own)
         os.environ["JOURDAIN_JAX_THREADS"] = str(len(own))
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    _runner.append(Runner(pickle.loads(sent), Store(path)))
 
 
 def _end_with(parent: int) -> None:
