@@ -8,7 +8,7 @@ steps are stored. Every measurement runs in a fresh process, and a program is co
     rate        discs per second, storage included (wall time; and per second of processor time, where other programs share the machine)
     storage     processor time within the writing of chunks, of that of the whole run
     busy        steps of all lanes over steps for which lanes of a vector are there, if lanes that end are replaced at once; and without replacement
-    memory      growth of the largest resident memory from fewer to more lanes
+    memory      growth of the largest resident memory from fewer to more lanes; and the largest under a stated bound
     processes   wall time by one process on one core over that by two processes on two, and by two workers of a Dask cluster on this machine
     bits        arrays and statistics that differ between runs with other chunks, by two processes, interrupted, and the plain one
     kills       lanes computed again, of all lanes, and missing or repeated ones, of a long run that is killed 20 times at random
@@ -126,6 +126,10 @@ def memory(lanes: int, folder: Path) -> Iterator[dict]:
     """Resident memory."""
     few, many = (in_fresh_process(count, folder / "memory")["peak"] for count in (lanes, 10 * lanes))
     yield figure(f"growth of resident memory from {lanes} to {10 * lanes} lanes, MB", many - few, 300)
+    bound = 1000  # MB
+    kept = {"save": "trajectories", "ts": np.linspace(0.0, SPAN, 201).tolist(), "memory": f"{bound}MB"}
+    peak = in_fresh_process(lanes, folder / "memory", **kept)["peak"] * 2**20 / 1e6
+    yield figure("largest resident memory, MB, of a study that keeps trajectories under memory='1000MB'", peak, bound)
 
 
 def processes(lanes: int, folder: Path) -> Iterator[dict]:

@@ -48,6 +48,7 @@ def add(verbs) -> None:
     sweep.add_argument("words", nargs="+", metavar="FILE | ACTION FOLDER", help="a TOML file; or one of " + ", ".join(ACTIONS) + ", and folders of studies")
     sweep.add_argument("--out", help="folder of the study to make or go on with; of `export`, the file to write (.nc)")
     sweep.add_argument("--workers", type=int, default=1, help="processes that compute (default 1)")
+    sweep.add_argument("--memory", help="what all of them may hold together, such as 2GB")
     sweep.add_argument("--shard", default="1/1", metavar="K/N", help="compute the K-th of N shares only, for `sweep merge` later")
     sweep.add_argument("--quiet", action="store_true", help="no bar")
     sweep.add_argument("--json", action="store_true", help="machine-readable")
@@ -88,7 +89,8 @@ def _run(text: str, out: str, options) -> bool:
         raise ValueError(f"the file is no TOML: {error}") from None
     study, how = described_study(asked)
     try:
-        found = study.run(out, processes=options.workers, shard=_shard(options.shard), progress=not options.quiet, command=text, **how)
+        asked_here = {"processes": options.workers, "memory": options.memory, "shard": _shard(options.shard), "progress": not options.quiet}
+        found = study.run(out, command=text, **asked_here, **how)
     except KeyboardInterrupt as stopped:
         print(f"jourdain-jax: {stopped or 'interrupted'}; or: jourdain-jax sweep resume {out}", file=sys.stderr)
         return False

@@ -11,6 +11,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from platform import python_version
 
@@ -19,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from jourdain_jax.ensembles import memory
 from jourdain_jax.ensembles.statistics import Grid
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Lanes, Task, receipt_of
@@ -37,7 +39,9 @@ class Runner:
 
     def __init__(self, task: Task, store: Store):
         self.task, self.store = task, store
-        self._first = task.run_block(0)
+        if task.memory:
+            memory.give_back_at_once()
+        self._first = self._run_block(0)
         found, kept = Grid.of(self._first.outputs).as_dict(), store.read_grid()
         if kept is None:
             store.write_grid(kept := found)
@@ -54,11 +58,42 @@ class Runner:
         first, last = self.store.span(number)
         blocks: dict[int, Lanes] = {}
         for block in range(first // self.task.block, -(-last // self.task.block)):
-            blocks[block] = self._first if block == 0 else self.task.run_block(block)
+            blocks[block] = self._first if block == 0 else self._run_block(block)
         values = {name: np.concatenate([lanes.columns[name] for lanes in blocks.values()]) for name in self.store.columns}
         receipt = receipt_of(self.task, self.grid, blocks)
         self.store.write(number, values, receipt)
         return last - first, receipt["failed"].size
+
+    def _run_block(self, number: int) -> Lanes:
+        found = self.task.run_block(number)
+        if self.task.memory:
+            memory.check(self.task.memory)
+        return found
+
+
+def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: bool) -> tuple[Task, int | None]:
+    """The task with blocks of the size with which its folder was begun, and otherwise of a size that keeps a process below `allowed` bytes; its chunk.
+
+    `here`: whether this process computes. ValueError where blocks or chunks would need more.
+    """
+    begun = Store(path) if Store.is_taken(path) else None
+    if begun:
+        task = replace(task, largest_block=begun.study["block"])
+    if allowed is None:
+        return task, chunk
+    room = memory.room(allowed, here=here)
+    if not begun:
+        while task.block > 8 and memory.BLOCKS * task.block * task.bytes_of_lane > 0.5 * room:
+            task = replace(task, largest_block=task.block // 2)
+        if chunk is None:
+            unit = int(np.lcm(task.block, task.every))
+            most = int(0.5 * room / (memory.CHUNKS * max(task.bytes_of_kept_lane, 1.0)))
+            chunk = min(_chunk(task, None), max(unit, most // unit * unit))
+    lanes = begun.chunk if begun else _chunk(task, chunk)
+    if (need := memory.BLOCKS * task.block * task.bytes_of_lane + memory.CHUNKS * lanes * task.bytes_of_kept_lane) > room:
+        text = f"blocks of {task.block} lanes and chunks of {lanes} take up to {need / 1e6:.0f} MB, and `memory` leaves {room / 1e6:.0f} MB to each process"
+        raise ValueError(f"{text}: give more, fewer processes, a smaller `chunk`, fewer times `ts`, or trajectories of fewer lanes by `every`")
+    return replace(task, memory=allowed), chunk
 
 
 def opened(task: Task, path, chunk: int | None, command: str) -> Store:

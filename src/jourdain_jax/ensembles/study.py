@@ -11,9 +11,10 @@ import numpy as np
 from jourdain_jax.ensembles.cluster import on_cluster
 from jourdain_jax.ensembles.design import Design
 from jourdain_jax.ensembles.distributions import Distribution, Levels
+from jourdain_jax.ensembles.memory import of_each
 from jourdain_jax.ensembles.outputs import as_outputs
 from jourdain_jax.ensembles.result import StudyResult
-from jourdain_jax.ensembles.run import in_this_process, run
+from jourdain_jax.ensembles.run import bounded, in_this_process, run
 from jourdain_jax.ensembles.task import AT_START, SAVES, Task
 from jourdain_jax.ensembles.workers import in_processes
 from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
@@ -131,6 +132,7 @@ class Study(Printed):
         progress: bool = True,
         processes: int = 1,
         client=None,
+        memory: int | str | None = None,
         shard: tuple[int, int] = (1, 1),
         command: str = "",
         **options,
@@ -150,10 +152,14 @@ class Study(Printed):
         - `processes`: how many compute, each on its share of the cores; more than one need a script whose top level is guarded by
           `if __name__ == "__main__":`, and outputs that are no functions within functions.
         - `client`: a `dask.distributed.Client`, whose workers compute; all of them must reach the folder. One chunk at a time is computed in each worker.
+        - `memory`: bytes, or a text such as "2GB": what the processes of this machine that compute may hold together, the present one with all that is in it
+          included; with `client`, what each worker may hold. Blocks and chunks are made small enough. It is held on Linux. Means and covariances of studies with
+          other blocks differ in their last digits.
         - `shard`: (k, n): only the k-th of n shares of the chunks, for a folder of its own on one of n machines; `jj.merge_studies` puts them together.
         - `progress`: a bar; `command`: text that is kept with the study; `options`: further ones as in `rollout` (`rtol`, `atol`, `solver`, ...).
 
-        Raises ValueError where the folder holds another study, `InUseError` where another process runs it, OSError where it cannot be written.
+        Raises ValueError where the folder holds another study or `memory` is too little, MemoryError where it turned out to be, `InUseError` where another
+        process runs it, OSError where it cannot be written.
         Ctrl-C: the chunk under way ends, all is kept, and KeyboardInterrupt says so.
         """
         task = self.task(t1=t1, ts=ts, t0=t0, outputs=outputs, save=save, every=every, **options)
@@ -164,7 +170,9 @@ class Study(Printed):
             raise ValueError(f"`processes` is {processes!r}, expected a whole number of at least 1")
         if client is not None and processes != 1:
             raise ValueError("`client` and `processes` are both given; the workers of a cluster compute, or processes of this machine")
-        compute = on_cluster(task, client) if client is not None else in_this_process if processes == 1 else in_processes(task, processes)
+        here = client is None and processes == 1
+        task, chunk = bounded(task, path, chunk, None if memory is None else of_each(memory, processes), here=here)
+        compute = in_this_process if here else on_cluster(task, client) if client is not None else in_processes(task, processes)
         store = run(task, path, chunk=chunk, progress=progress, shard=shards, command=command, workers=compute)
         return StudyResult(store, task)
 

@@ -55,15 +55,26 @@ class Task:
     options: Mapping[str, Any]  # of `rollout`, `ts` among them
     save: str
     every: int
+    largest_block: int | None = None  # lanes; default: LARGEST_BLOCK
+    memory: int | None = None  # bytes that each process which computes may hold
 
     @property
     def block(self) -> int:
         """Lanes of a block."""
-        width = len(self.scene.coordinate_names) + len(self.scene.speed_names) + 2
-        block = min(LARGEST_BLOCK, max(8, 1 << (len(self.design) - 1).bit_length()))
-        while block > 8 and 8 * block * width * len(self.ts) > BLOCK_MEMORY:
+        block = min(self.largest_block or LARGEST_BLOCK, max(8, 1 << (len(self.design) - 1).bit_length()))
+        while block > 8 and block * self.bytes_of_lane > BLOCK_MEMORY:
             block //= 2
         return block
+
+    @property
+    def bytes_of_lane(self) -> int:
+        """Bytes of the saved states of a lane while it is computed."""
+        return 8 * (len(self.scene.coordinate_names) + len(self.scene.speed_names) + 2) * len(self.ts)
+
+    @property
+    def bytes_of_kept_lane(self) -> float:
+        """Bytes that are kept of a lane, of all lanes on average."""
+        return sum(np.dtype(column.dtype).itemsize * math.prod(length for _, length in column.more) / column.every for column in self.columns().values())
 
     @property
     def blocks(self) -> int:
