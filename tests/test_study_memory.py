@@ -21,7 +21,7 @@ def test_an_amount_is_read(text, count):
 
 @pytest.mark.parametrize("wrong", ["much", "2 XB", "-1GB", True, "nan GB", float("inf"), float("nan"), "0.GBs"])
 def test_what_is_no_amount_is_refused(wrong):
-    with pytest.raises(ValueError, match="`memory` is .*, expected a number of bytes, or a text such as '2GB'"):
+    with pytest.raises(ValueError, match=r"`memory` is .*, expected a number of bytes, or a text such as '2GB'"):
         memory.bytes_of(wrong)
 
 

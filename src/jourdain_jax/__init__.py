@@ -48,6 +48,7 @@ from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accele
 from jourdain_jax.ensembles.design import Design
 from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
 from jourdain_jax.ensembles.files import InUseError
+from jourdain_jax.ensembles.mean_gradients import MeanGradients
 from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Largest, LargestMagnitude, Quantity, Smallest
 from jourdain_jax.ensembles.result import StudyResult, load_study, merge_studies
 from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
@@ -135,6 +136,7 @@ __all__ = [
     "LogNormal",
     "LogUniform",
     "Lowered",
+    "MeanGradients",
     "Measurements",
     "Multipliers",
     "MuntheKaas",

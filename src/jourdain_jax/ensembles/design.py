@@ -136,12 +136,19 @@ class Design(Printed):
             shape = [len(levels.levels) for levels in self.variables.values()]
             places = np.unravel_index(np.arange(first, last), shape)
             return {name: np.asarray(levels.levels)[place] for (name, levels), place in zip(self.variables.items(), places, strict=True)}
-        u = SAMPLERS[self.sampler](int(self.seed), first, last, len(self.variables), len(self))
-        if self._factor is not None:
-            special = special_functions()
-            # row by row: a product of matrices may round differently with the number of rows
-            u = special.ndtr(np.einsum("ij,kj->ki", self._factor, special.ndtri(u)))
+        u = self.probabilities(first, last)
         return {name: distribution.values(u[:, i]) for i, (name, distribution) in enumerate(self.variables.items())}
+
+    def probabilities(self, first: int, last: int) -> np.ndarray:
+        """The probabilities at which the distributions are taken, of samples `first` to `last` - 1, shape (last - first, variables); NaN of grids and tables."""
+        if self.sampler in (TABLE, GRID):
+            return np.full((last - first, len(self.variables)), np.nan)
+        u = SAMPLERS[self.sampler](int(self.seed), first, last, len(self.variables), len(self))
+        if self._factor is None:
+            return u
+        special = special_functions()
+        # row by row: a product of matrices may round differently with the number of rows
+        return special.ndtr(np.einsum("ij,kj->ki", self._factor, special.ndtri(u)))
 
     def _text(self) -> str:
         lines = [f"Design: {len(self)} samples, {self.sampler}" + ("" if self.sampler in (GRID, TABLE) else f", seed {self.seed}")]

@@ -22,6 +22,10 @@ class Distribution:
     def values(self, u: np.ndarray) -> np.ndarray:
         """The values at the probabilities `u`, which lie between 0 and 1."""
 
+    @abstractmethod
+    def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
+        """Derivatives of `values(u)` with respect to the numbers of the distribution, by their names."""
+
 
 def _check(owner, **numbers: Any) -> None:
     for name, value in numbers.items():
@@ -51,6 +55,10 @@ class Normal(Distribution):
         """The values at the probabilities `u`: mean + sigma Phi^-1(u)."""
         return self.mean + self.sigma * special_functions().ndtri(u)
 
+    def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
+        """1 with respect to the mean, Phi^-1(u) with respect to sigma."""
+        return {"mean": np.ones_like(u), "sigma": special_functions().ndtri(u)}
+
 
 @dataclass(frozen=True)
 class Uniform(Distribution):
@@ -66,6 +74,10 @@ class Uniform(Distribution):
     def values(self, u: np.ndarray) -> np.ndarray:
         """The values at the probabilities `u`: low + (high - low) u."""
         return self.low + (self.high - self.low) * u
+
+    def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
+        """1 - u with respect to `low`, u with respect to `high`."""
+        return {"low": 1 - u, "high": u}
 
 
 @dataclass(frozen=True)
@@ -84,6 +96,11 @@ class LogNormal(Distribution):
         """The values at the probabilities `u`: median exp(sigma Phi^-1(u))."""
         return self.median * np.exp(self.sigma * special_functions().ndtri(u))
 
+    def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
+        """With x the value: x / median with respect to the median, x Phi^-1(u) with respect to sigma."""
+        x = self.values(u)
+        return {"median": x / self.median, "sigma": x * special_functions().ndtri(u)}
+
 
 @dataclass(frozen=True)
 class LogUniform(Distribution):
@@ -101,6 +118,11 @@ class LogUniform(Distribution):
     def values(self, u: np.ndarray) -> np.ndarray:
         """The values at the probabilities `u`: low (high / low)^u."""
         return self.low * (self.high / self.low) ** u
+
+    def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
+        """With x the value: (1 - u) x / low with respect to `low`, u x / high with respect to `high`."""
+        x = self.values(u)
+        return {"low": (1 - u) * x / self.low, "high": u * x / self.high}
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,9 @@ What a process needs is estimated before it compiles anything, and looked at aft
 
     resident now + COMPILED + BLOCKS (bytes of a block's saved states) + CHUNKS (bytes of a chunk's arrays)
 
-Blocks are chosen so that this is within the bound, and a study whose process is seen beyond it stops. The allocator of glibc keeps freed arrays for later ones, and grows by hundreds of megabytes as sizes change; where a bound is stated, large arrays are given
-back at once, which costs a tenth of the time of studies that keep trajectories.
+Blocks are chosen so that this is within the bound, and a study whose process is seen beyond it stops. The allocator of glibc keeps freed arrays for later
+ones, and grows by hundreds of megabytes as sizes change; where a bound is stated, large arrays are given back at once, which costs a tenth of the time of
+studies that keep trajectories.
 """
 
 import ctypes

@@ -95,7 +95,7 @@ class LargestMagnitude(_OfQuantity):
 
 
 @dataclass(frozen=True)
-class _OfEvent(Output):
+class OfEvent(Output):
     """Of a stop event, by `event`, its name; of any where that is None."""
 
     event: str | None = None
@@ -114,7 +114,7 @@ class _OfEvent(Output):
 
 
 @dataclass(frozen=True)
-class EventTime(_OfEvent):
+class EventTime(OfEvent):
     """The time (s) at which the stop event `event` ended the motion (default: any event); NaN where it did not."""
 
     unit = "s"
@@ -125,7 +125,7 @@ class EventTime(_OfEvent):
 
 
 @dataclass(frozen=True)
-class Happened(_OfEvent):
+class Happened(OfEvent):
     """1 where the stop event `event` ended the motion (default: any event), otherwise 0: its mean is the fraction of lanes."""
 
     def of(self, motion: Trajectory) -> Float[Array, ""]:

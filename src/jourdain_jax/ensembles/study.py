@@ -1,7 +1,7 @@
 """A study: what varies over many motions of one scene, and how they are run."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from jourdain_jax.ensembles.cluster import on_cluster
 from jourdain_jax.ensembles.design import Design
 from jourdain_jax.ensembles.distributions import Distribution, Levels
+from jourdain_jax.ensembles.mean_gradients import MeanGradients, mean_gradients
 from jourdain_jax.ensembles.memory import of_each
 from jourdain_jax.ensembles.outputs import as_outputs
 from jourdain_jax.ensembles.result import StudyResult
@@ -152,9 +153,9 @@ class Study(Printed):
         - `processes`: how many compute, each on its share of the cores; more than one need a script whose top level is guarded by
           `if __name__ == "__main__":`, and outputs that are no functions within functions.
         - `client`: a `dask.distributed.Client`, whose workers compute; all of them must reach the folder. One chunk at a time is computed in each worker.
-        - `memory`: bytes, or a text such as "2GB": what the processes of this machine that compute may hold together, the present one with all that is in it
-          included; with `client`, what each worker may hold. Blocks and chunks are made small enough. It is held on Linux. Means and covariances of studies with
-          other blocks differ in their last digits.
+        - `memory`: bytes, or a text such as "2GB": what the processes of this machine that compute may hold together, the present one with all that is in
+          it included; with `client`, what each worker may hold. Blocks and chunks are made small enough. It is held on Linux. Means and covariances of
+          studies with other blocks differ in their last digits.
         - `shard`: (k, n): only the k-th of n shares of the chunks, for a folder of its own on one of n machines; `jj.merge_studies` puts them together.
         - `progress`: a bar; `command`: text that is kept with the study; `options`: further ones as in `rollout` (`rtol`, `atol`, `solver`, ...).
 
@@ -175,6 +176,23 @@ class Study(Printed):
         compute = in_this_process if here else on_cluster(task, client) if client is not None else in_processes(task, processes)
         store = run(task, path, chunk=chunk, progress=progress, shard=shards, command=command, workers=compute)
         return StudyResult(store, task)
+
+    def mean_gradients(
+        self, *, parameters: Sequence[str] = (), t1=None, ts=None, t0=None, outputs: Mapping | None = None, **options
+    ) -> MeanGradients:
+        """Derivatives of the means of all outputs with respect to the numbers of the distributions, and to the `parameters` that all lanes share.
+
+        They are pathwise derivatives: the mean over lanes of exact derivatives of their motions, in forward mode, for the samples of this study. Where lanes
+        end at events, a `SensitivityWarning`, also among `warnings` of the result, says what they may miss. All is computed at once in this process; nothing is stored.
+
+        - `t0`, `t1`, `ts`, `outputs`, `options`: as in `run`.
+
+            found = study.mean_gradients(t1=2.0, outputs={"final lean": jj.End("lean", "rad")}, parameters=("gravity",))
+            found.of("final lean", "radius.sigma")
+
+        Raises ValueError for unknown names.
+        """
+        return mean_gradients(self.task(t1=t1, ts=ts, t0=t0, outputs=outputs, **options), tuple(parameters))
 
     def _text(self) -> str:
         constants = ", ".join(f"{name} = {np.asarray(value).tolist()}" for name, value in self._named[1].items())

@@ -14,6 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jourdain_jax.build.event_names import names_of_events
 from jourdain_jax.ensembles.design import Design
@@ -127,15 +128,14 @@ class Task:
         found = (rolled.result, rolled.event, rolled.accepted, rolled.rejected, rolled.fallback, rolled.t_end)
         return {name: np.asarray(x)[:count].astype(dtype) for (name, (dtype, _, _)), x in zip(OF_LANES.items(), found, strict=True)}
 
+    def outputs_of_lane(self, motion: Trajectory) -> Float[Array, "outputs"]:
+        """The outputs of one motion; NaN where it failed."""
+        sound = motion.nan_if_failed()
+        return jnp.stack([jnp.where(motion.succeeded, output.of(sound), jnp.nan) for output in self.outputs.values()])
+
     @cached_property
     def _outputs_of(self):
-        outputs = tuple(self.outputs.values())
-
-        def of_lane(motion: Trajectory):
-            sound = motion.nan_if_failed()
-            return jnp.stack([jnp.where(motion.succeeded, output.of(sound), jnp.nan) for output in outputs])
-
-        return eqx.filter_jit(eqx.filter_vmap(of_lane))
+        return eqx.filter_jit(eqx.filter_vmap(self.outputs_of_lane))
 
     def __getstate__(self):
         return {name: value for name, value in vars(self).items() if name != "_outputs_of"}  # what was compiled stays in its process

@@ -1,0 +1,163 @@
+"""Gradients of the means of a study's outputs, by the pathwise derivative.
+
+Sample k takes the probabilities u_k, whatever the distributions are; x_k(theta) is what varies, and f the output as a function of it. Then
+
+    d mean / d theta = (1 / n) sum_k  df/dx (x_k)  dx_k / d theta
+
+and df/dx of a lane is the exact derivative of its motion, in forward mode. This is the derivative of the mean where f is continuous. Where lanes that pass from
+one end to another (from an event to none) let f jump, their share is missing: it is named, and outputs that say which event happened have no such derivative.
+"""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.ensembles.distributions import Distribution
+from jourdain_jax.ensembles.outputs import OfEvent
+from jourdain_jax.ensembles.task import AT_START, Task
+from jourdain_jax.motion.batches.rollout import rollout
+from jourdain_jax.motion.marks import nan_is_a_mark
+from jourdain_jax.motion.sensitivity import SensitivityWarning
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.parameters import parameters_of
+from jourdain_jax.scene.printing import Printed
+
+LANES = 2048  # with their tangents, at once
+SHIFT = "shift"  # of all values of a column of a table, or of all levels of a grid
+
+
+@dataclass(frozen=True, repr=False)
+class MeanGradients(Printed):
+    """Means of outputs and their derivatives.
+
+    - `outputs`, `names`: rows and columns of `gradient`; a column is a parameter of the scene that all lanes share, or a number of a distribution, such as
+      "radius.sigma", or "radius.shift", which moves all values of a table or grid alike.
+    - `mean`: shape (outputs,); `gradient`, `standard_error`: shape (outputs, names), in the unit of the output over that of the number; standard errors are
+      those of independent samples (those of a Sobol sequence or a Latin hypercube are smaller). NaN where the derivative does not exist.
+    - `lanes`: how many lanes each output has; `failed`: how many motions failed and are left out; `warnings`: what may be wrong with the numbers.
+    """
+
+    outputs: tuple[str, ...]
+    names: tuple[str, ...]
+    mean: np.ndarray
+    gradient: np.ndarray
+    standard_error: np.ndarray
+    lanes: np.ndarray
+    failed: int
+    warnings: tuple[str, ...]
+
+    def of(self, output: str, name: str) -> float:
+        """The derivative of the mean of `output` with respect to `name`; ValueError for unknown names."""
+        for given, known in ((output, self.outputs), (name, self.names)):
+            if given not in known:
+                raise ValueError(f"there is no `{given}`; {nearest(given, known)}")
+        return float(self.gradient[self.outputs.index(output), self.names.index(name)])
+
+    def _text(self) -> str:
+        lines = [f"Gradients of means over {int(self.lanes.max(initial=0))} lanes" + (f"; {self.failed} failed and are left out" if self.failed else "")]
+        for i, output in enumerate(self.outputs):
+            lines.append(f"  {output}: mean {self.mean[i]:.6g}")
+            lines += [f"    by {name}: {self.gradient[i, j]:.6g} +- {self.standard_error[i, j]:.2g}" for j, name in enumerate(self.names)]
+        return "\n".join([*lines, *(f"  warning: {text}" for text in self.warnings)])
+
+
+def mean_gradients(task: Task, shared: Sequence[str]) -> MeanGradients:
+    """The gradients of the means of all outputs of a task, also with respect to the parameters `shared` by all lanes."""
+    _check_shared(task, shared)
+    columns = (*task.design.names, *shared)
+    size = max(8, min(task.block, LANES // (1 + len(columns))))
+    common = {name: np.asarray(value, float) for name, value, _ in parameters_of(task.scene) if name in shared}
+    of_block = _of_block(task, columns)
+    values, weighted, ends = [], [], []
+    for first in range(0, len(task.design), size):
+        last = min(first + size, len(task.design))
+        drawn = task.design.values(first, last) | {name: np.full(last - first, value) for name, value in common.items()}
+        drawn = {name: np.pad(column, (0, size - (last - first)), mode="edge") for name, column in drawn.items()}
+        with nan_is_a_mark():
+            found, derivative, end = jax.tree.map(lambda x: np.asarray(x), of_block(drawn))
+        by_column = {name: derivative[i, : last - first] for i, name in enumerate(columns)}
+        by_number = [by_column[name] * factor[:, None] for name, factor in _factors(task, first, last)] + [by_column[name] for name in shared]
+        values.append(found[: last - first])
+        weighted.append(np.stack(by_number, axis=-1))
+        ends.append(end[: last - first])
+    return _gathered(task, _names(task, shared), np.concatenate(values), np.concatenate(weighted), np.concatenate(ends))
+
+
+def _check_shared(task: Task, shared: Sequence[str]) -> None:
+    known = {name: np.ndim(value) for name, value, _ in parameters_of(task.scene)}
+    for name in shared:
+        if name not in known or name in task.design.names:
+            said = "varies over the lanes, and has its derivatives without being named" if name in known else "is no parameter of the scene"
+            raise ValueError(f"`{name}` {said}; {nearest(name, [one for one in known if one not in task.design.names])}")
+        if known[name]:
+            raise ValueError(f"parameter `{name}` is an array; give parameters that are one number")
+
+
+def _of_block(task: Task, columns: Sequence[str]):
+    """Columns by name -> outputs (lanes, outputs), their derivatives by each column (columns, lanes, outputs), and how lanes ended (lanes,)."""
+
+    def outputs(drawn: Mapping):
+        parameters = {name: column for name, column in drawn.items() if not name.endswith(AT_START)}
+        starts = {name.removesuffix(AT_START): column for name, column in drawn.items() if name.endswith(AT_START)}
+        rolled = rollout(task.scene, dict(task.constants) | starts, parameters=parameters or None, adjoint=diffrax.ForwardMode(), **task.options).lanes
+        found = eqx.filter_vmap(task.outputs_of_lane)(rolled)
+        return found, jnp.where(rolled.result == results.EVENT, rolled.event, jnp.where(rolled.succeeded, -1, -2))
+
+    def of_block(drawn):
+        along = {name: jnp.stack([jnp.full_like(drawn[name], float(name == column)) for column in columns]) for name in columns}
+        return jax.vmap(lambda tangent: jax.jvp(outputs, (drawn,), (tangent,), has_aux=True), out_axes=(None, 0, None))(along)
+
+    return eqx.filter_jit(of_block)
+
+
+def _factors(task: Task, first: int, last: int):
+    """Column and dx/dtheta (lanes,), of every number of every distribution."""
+    u = task.design.probabilities(first, last)
+    for i, (name, how) in enumerate(task.design.variables.items()):
+        if isinstance(how, Distribution):
+            for derivative in how.derivatives(u[:, i]).values():
+                yield name, np.broadcast_to(derivative, (last - first,))
+        else:
+            yield name, np.ones(last - first)
+
+
+def _names(task: Task, shared: Sequence[str]) -> tuple[str, ...]:
+    numbers = {name: how.derivatives(np.array([0.5])) if isinstance(how, Distribution) else (SHIFT,) for name, how in task.design.variables.items()}
+    return (*(f"{name}.{number}" for name, known in numbers.items() for number in known), *shared)
+
+
+def _gathered(task: Task, names, values: np.ndarray, derivatives: np.ndarray, ends: np.ndarray) -> MeanGradients:
+    """Means over the lanes that have an output; `values` (lanes, outputs), `derivatives` (lanes, outputs, names)."""
+    there = np.isfinite(values)
+    count = there.sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(there, values, 0.0).sum(axis=0) / count
+        kept = np.where(there[:, :, None], derivatives, 0.0)
+        gradient = kept.sum(axis=0) / count[:, None]
+        spread = np.where(there[:, :, None], derivatives - gradient, 0.0)
+        error = np.sqrt((spread**2).sum(axis=0) / (count * (count - 1.0))[:, None])
+    warned = []
+    failed = int(np.sum(ends == -2))
+    if failed:
+        warned.append(f"{failed} of {len(values)} motions failed without being tried in another way, as `run` would, and are left out")
+    if np.unique(ends[ends != -2]).size > 1:
+        none = [name for name, output in task.outputs.items() if isinstance(output, OfEvent)]
+        for name in none:
+            gradient[list(task.outputs).index(name)] = error[list(task.outputs).index(name)] = np.nan
+        if none:
+            warned.append(f"which lanes end at an event depends on what varies: the means of {', '.join(none)} have no pathwise derivative; take differences")
+        if len(none) < len(task.outputs):
+            warned.append(
+                f"{int(np.sum(ends >= 0))} of {len(values)} lanes end at an event, others do not, or at another one: where an output jumps from one "
+                "end to another, the share of lanes that pass between them is missing; compare with differences of the mean"
+            )
+    for text in warned:
+        warnings.warn(text, SensitivityWarning, stacklevel=4)
+    return MeanGradients(tuple(task.outputs), tuple(names), mean, gradient, error, count, failed, tuple(warned))
