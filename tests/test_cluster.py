@@ -51,7 +51,7 @@ def test_a_cluster_computes_what_one_process_computes(client, tmp_path):
 def test_an_error_of_a_chunk_is_that_of_the_study_and_what_is_kept_stays(client, tmp_path, monkeypatch):
     before = task.Task.run_block
 
-    def failing(self, number):
+    def failing(self, number, skipped=()):
         if number == 3:
             raise OSError("no block 3")
         return before(self, number)
@@ -92,19 +92,41 @@ def deadly(motion):
     return jax.pure_callback(lean, jax.ShapeDtypeStruct((), last.dtype), motion.scene.radius, last, vmap_method="sequential")
 
 
+def study_with_deadly_lanes(*deadly_lanes):
+    radius = np.full(LANES, 0.5)
+    radius[list(deadly_lanes)] = NUMBER
+    return jj.Study(jj.models.TiltingDisc(), vary={"radius": radius}, start={"lean": 0.3, "spin_rate": -3.0})
+
+
+def assert_skipped(found, *lanes):
+    assert found.complete
+    assert found.failed.tolist() == sorted(lanes)
+    assert found.counts == {"success": LANES - len(lanes), "process_died": len(lanes)}
+    arrays = found.to_xarray()
+    assert np.isnan(arrays["lean"].values[list(lanes)]).all()
+    assert (arrays["radius"].values[list(lanes)] == NUMBER).all()
+    assert np.isfinite(np.delete(arrays["lean"].values, lanes)).all()
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_chunk_on_which_workers_die_is_left_out_and_named(tmp_path, monkeypatch):
+def test_a_lane_on_which_workers_die_is_named_and_skipped(tmp_path, monkeypatch):
     monkeypatch.undo()  # workers are processes of their own
-    radius = np.full(LANES, 0.5)
-    radius[DEADLY] = NUMBER
-    study = jj.Study(jj.models.TiltingDisc(), vary={"radius": radius}, start={"lean": 0.3, "spin_rate": -3.0})
-    outputs = {"lean": deadly}
+    study = study_with_deadly_lanes(DEADLY)
     with (
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster,
         distributed.Client(cluster) as client,
-        pytest.raises(RuntimeError, match="workers died 3 times on lanes 6144 to 8191 of"),
     ):
-        study.run(tmp_path / "discs.zarr", t1=1.0, rtol=1e-6, atol=1e-6, progress=False, outputs=outputs, client=client)
-    found = jj.load_study(tmp_path / "discs.zarr")
-    assert [found.store.receipt(number) is not None for number in range(5)] == [True, True, True, False, True]
+        options = {"t1": 1.0, "rtol": 1e-6, "atol": 1e-6, "progress": False, "outputs": {"lean": deadly}, "client": client}
+        with pytest.warns(UserWarning, match="processes died again and again on the lanes 7000 of"):
+            found = study.run(tmp_path / "discs.zarr", **options)
+    assert_skipped(found, DEADLY)
+
+
+@pytest.mark.slow
+def test_lanes_on_which_processes_die_are_named_and_skipped_also_in_the_first_block(tmp_path, monkeypatch):
+    monkeypatch.undo()
+    study = study_with_deadly_lanes(5, DEADLY)
+    with pytest.warns(UserWarning, match="processes died again and again on the lanes 5, 7000 of"):
+        found = study.run(tmp_path / "discs.zarr", t1=1.0, rtol=1e-6, atol=1e-6, progress=False, outputs={"lean": deadly}, processes=2)
+    assert_skipped(found, 5, DEADLY)

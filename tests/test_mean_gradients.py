@@ -29,7 +29,10 @@ OUTPUTS = {"height": jj.End("z", "m"), "landed": jj.Happened("ground"), "square"
 HOW = {"t1": TIME, "outputs": OUTPUTS, "rtol": 1e-10, "atol": 1e-10}
 
 
-def thrown(z=jj.Normal(20.0, 0.5), v=jj.Uniform(1.0, 3.0), **more):
+HEIGHT, SPEED = jj.Normal(20.0, 0.5), jj.Uniform(1.0, 3.0)
+
+
+def thrown(z=HEIGHT, v=SPEED, **more):
     return jj.Study(Thrown(), start={"z": z, "z_rate": v}, **({"sampler": "sobol", "samples": COUNT, "seed": 3} | more))
 
 
@@ -61,7 +64,7 @@ def test_gradients_are_those_of_the_closed_form():
 @pytest.mark.parametrize("how", [jj.LogNormal(20.0, 0.1), jj.LogUniform(18.0, 22.0), jj.Normal(20.0, 0.0), jj.Uniform(18.0, 22.0)])
 def test_values_of_distributions_have_their_derivatives(how):
     u = np.linspace(0.05, 0.95, 7)
-    names = [name for name in vars(how)]
+    names = list(vars(how))
     assert list(how.derivatives(u)) == names
     for name in names:
         step = 1e-6
@@ -101,11 +104,11 @@ def test_lanes_that_fail_are_left_out_and_named():
 
 
 def test_unknown_names_are_named():
-    with pytest.raises(ValueError, match="`gravty` is no parameter of the scene; .*`gravity`"):
+    with pytest.raises(ValueError, match=r"`gravty` is no parameter of the scene; .*`gravity`"):
         thrown().mean_gradients(parameters=("gravty",), **HOW)
     varied = jj.Study(Thrown(), vary={"gravity": jj.Normal(9.0, 0.1)}, samples=8)
     with pytest.raises(ValueError, match="`gravity` varies over the lanes"):
         varied.mean_gradients(parameters=("gravity",), **HOW)
     found = thrown(samples=8).mean_gradients(**HOW)
-    with pytest.raises(ValueError, match="there is no `hight`; .*`height`"):
+    with pytest.raises(ValueError, match=r"there is no `hight`; .*`height`"):
         found.of("hight", "z_at_start.mean")

@@ -48,7 +48,7 @@ def whole(tmp_path_factory):
 def computed(monkeypatch):
     """Numbers of the blocks that are computed, in order."""
     numbers, before = [], task.Task.run_block
-    monkeypatch.setattr(task.Task, "run_block", lambda self, number: numbers.append(number) or before(self, number))
+    monkeypatch.setattr(task.Task, "run_block", lambda self, number, skipped=(): numbers.append(number) or before(self, number, skipped))
     return numbers
 
 

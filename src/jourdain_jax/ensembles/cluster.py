@@ -1,19 +1,21 @@
 """Workers of a Dask cluster that compute the chunks of one study. Its folder must be where all of them, and the process that asks, can reach it.
 
-Dask starts a chunk again where its worker died. A chunk on which workers died again and again is tried once more alone, then left out and named at the end.
+Dask starts a chunk again where its worker died. A chunk on which workers died again and again is tried once more alone, then searched for the lane that is the
+cause.
 """
 
 import os
 import pickle
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
+from jourdain_jax.ensembles.deadly_lanes import without_deadly_lanes
 from jourdain_jax.ensembles.optional import cluster_by
 from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
-from jourdain_jax.ensembles.workers import keep_to_share, left_out, sent_to_others
+from jourdain_jax.ensembles.workers import keep_to_share, sent_to_others
 from jourdain_jax.scene.numbers import described
 
 AHEAD = 2  # chunks per thread of a worker: one under way, one that waits for it
@@ -33,13 +35,19 @@ def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
         path = str(store.path.resolve())
         study = client.submit(bytes, sent, pure=False)  # a task, and no scattered data: the scheduler knows how to have it again when a worker died
         asked = study, path, os.getpid(), _places(distributed, client)
-        suspects: list[int] = []
-        yield from _computed(distributed, client, asked, numbers, interrupted, AHEAD * max(1, sum(client.nthreads().values())), suspects)
-        bad: list[int] = []
-        for number in suspects:  # alone, so that no other chunk is blamed
-            yield from _computed(distributed, client, asked, [number], interrupted, 1, bad)
-        if bad:
-            raise RuntimeError(left_out(store, bad))
+        most = AHEAD * max(1, sum(client.nthreads().values()))
+
+        def compute(numbers: list[int], alone: bool):
+            return _computed(distributed, client, asked, numbers, interrupted, 1 if alone else most)
+
+        def survives(first: int, last: int) -> bool:
+            try:
+                client.submit(_try, study, first, last, pure=False).result()
+            except distributed.KilledWorker:
+                return False
+            return True
+
+        return without_deadly_lanes(store, numbers, interrupted, compute, survives, 1)
 
     return workers
 
@@ -53,13 +61,13 @@ def _places(distributed, client) -> dict[object, int] | None:
     return {name: place for place, name in enumerate(sorted(cluster.workers))}
 
 
-def _computed(distributed, client, asked: tuple, numbers, interrupted, most: int, suspects: list[int]) -> Iterator[tuple[int, int]]:
-    """Lanes and failed lanes, chunk by chunk as they come; numbers of chunks on which workers died go to `suspects`. At most `most` are asked for at a time."""
-    left, running = iter(numbers), {}
+def _computed(distributed, client, asked: tuple, numbers, interrupted, most: int) -> Generator[tuple[int, int], None, list[int]]:
+    """Lanes and failed lanes, chunk by chunk as they come; returns the numbers of chunks on which workers died. At most `most` are asked for at a time."""
+    left, running, suspects = iter(numbers), {}, []
     ended = distributed.as_completed()
 
     def ask() -> None:
-        if not interrupted() and (number := next(left, None)) is not None:
+        if not suspects and not interrupted() and (number := next(left, None)) is not None:
             future = client.submit(_chunk, number, *asked, pure=False)
             running[future] = number
             ended.add(future)
@@ -75,6 +83,12 @@ def _computed(distributed, client, asked: tuple, numbers, interrupted, most: int
         else:
             yield found
         ask()
+    return suspects
+
+
+def _try(sent: bytes, first: int, last: int) -> None:
+    with _one_at_a_time:
+        pickle.loads(sent).run_lanes(first, last)
 
 
 def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None) -> tuple[int, int]:

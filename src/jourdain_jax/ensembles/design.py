@@ -140,7 +140,7 @@ class Design(Printed):
         return {name: distribution.values(u[:, i]) for i, (name, distribution) in enumerate(self.variables.items())}
 
     def probabilities(self, first: int, last: int) -> np.ndarray:
-        """The probabilities at which the distributions are taken, of samples `first` to `last` - 1, shape (last - first, variables); NaN of grids and tables."""
+        """The probabilities at which the distributions are taken, of samples `first` to `last` - 1, shape (last - first, variables); NaN for grids, tables."""
         if self.sampler in (TABLE, GRID):
             return np.full((last - first, len(self.variables)), np.nan)
         u = SAMPLERS[self.sampler](int(self.seed), first, last, len(self.variables), len(self))

@@ -65,7 +65,7 @@ class Runner:
         return last - first, receipt["failed"].size
 
     def _run_block(self, number: int) -> Lanes:
-        found = self.task.run_block(number)
+        found = self.task.run_block(number, self.store.skipped())
         if self.task.memory:
             memory.check(self.task.memory)
         return found

@@ -4,6 +4,7 @@
     run/study.json                   what study this is: format, digests, settings, versions; written once
     run/grid.json                    the grid of the statistics
     run/chunks/K                     receipt of chunk K: written when all its arrays are, with their checksums, its counts and its sums
+    run/skipped.json                 lanes that are not computed, since processes died on them
     run/lock                         held by the process that runs the study
 
 A chunk counts as done if its receipt is whole and its arrays are there with the checksums of the receipt; otherwise it is computed again.
@@ -227,6 +228,19 @@ class Store:
     def write_grid(self, grid: dict) -> None:
         """Keep the grid."""
         write_whole(self.path / "run" / "grid.json", json.dumps(grid).encode(), wait=True)
+
+    # Lanes on which processes died. ---------------------------------------------------------------------------------
+
+    def skipped(self) -> tuple[int, ...]:
+        """Numbers of the lanes that `skip` noted."""
+        try:
+            return tuple(json.loads((self.path / "run" / "skipped.json").read_bytes()))
+        except (FileNotFoundError, ValueError):
+            return ()
+
+    def skip(self, lane: int) -> None:
+        """Note that a lane is not to be computed."""
+        write_whole(self.path / "run" / "skipped.json", json.dumps(sorted({*self.skipped(), lane})).encode(), wait=True)
 
     def take_chunk(self, other: "Store", number: int) -> None:
         """Copy a chunk that another folder of the same study holds."""

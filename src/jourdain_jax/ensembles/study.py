@@ -177,13 +177,12 @@ class Study(Printed):
         store = run(task, path, chunk=chunk, progress=progress, shard=shards, command=command, workers=compute)
         return StudyResult(store, task)
 
-    def mean_gradients(
-        self, *, parameters: Sequence[str] = (), t1=None, ts=None, t0=None, outputs: Mapping | None = None, **options
-    ) -> MeanGradients:
+    def mean_gradients(self, *, parameters: Sequence[str] = (), t1=None, ts=None, t0=None, outputs: Mapping | None = None, **options) -> MeanGradients:
         """Derivatives of the means of all outputs with respect to the numbers of the distributions, and to the `parameters` that all lanes share.
 
         They are pathwise derivatives: the mean over lanes of exact derivatives of their motions, in forward mode, for the samples of this study. Where lanes
-        end at events, a `SensitivityWarning`, also among `warnings` of the result, says what they may miss. All is computed at once in this process; nothing is stored.
+        end at events, a `SensitivityWarning`, also among `warnings` of the result, says what they may miss. This process computes it; nothing is
+        stored.
 
         - `t0`, `t1`, `ts`, `outputs`, `options`: as in `run`.
 

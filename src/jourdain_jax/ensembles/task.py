@@ -5,7 +5,7 @@ run the same compiled programs on arrays of the same shapes, so a lane's numbers
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -34,6 +34,7 @@ from jourdain_jax.scene.scene import Scene
 LARGEST_BLOCK = 2048  # lanes: enough that few wait for the last one, few enough that a chunk is a fraction of a second
 BLOCK_MEMORY = 2**26  # bytes of saved states of a block, at most
 AT_START = "_at_start"  # how columns of start values are called, after the coordinate or speed
+SKIPPED = {"result": results.PROCESS_DIED, "event": -1, "steps": 0, "rejected_steps": 0, "retries": 0}  # columns of a lane that is skipped; others are NaN
 SAVES = ("statistics", "outputs", "trajectories")
 
 
@@ -89,11 +90,11 @@ class Task:
 
     # Lanes. --------------------------------------------------------------------------------------------------------
 
-    def arguments(self, first: int, last: int, fill_to: int | None = None) -> tuple[dict, dict]:
-        """Start values and parameters of some lanes; the last repeated up to `fill_to` lanes."""
+    def arguments(self, first: int, last: int, places: np.ndarray | None = None) -> tuple[dict, dict]:
+        """Start values and parameters of some lanes, counted from `first`: those at `places`, or all."""
         values = self.design.values(first, last)
-        if fill_to is not None:
-            values = {name: np.pad(column, (0, fill_to - len(column)), mode="edge") for name, column in values.items()}
+        if places is not None:
+            values = {name: column[places] for name, column in values.items()}
         parameters = {name: column for name, column in values.items() if not name.endswith(AT_START)}
         starts = {name.removesuffix(AT_START): column for name, column in values.items() if name.endswith(AT_START)}
         return dict(self.constants) | starts, parameters
@@ -105,14 +106,37 @@ class Task:
         first = {name: value if name in self.constants else value[0] for name, value in starts.items()}
         return simulate(own, first, **(dict(self.options) | options))
 
-    def run_block(self, number: int) -> Lanes:
-        """All lanes of a block."""
+    def run_block(self, number: int, skipped: Sequence[int] = ()) -> Lanes:
+        """All lanes of a block; lanes that are `skipped` have no values."""
         first = number * self.block
         last = min(first + self.block, len(self.design))
-        starts, parameters = self.arguments(first, last, self.block)
+        places = np.minimum(np.arange(self.block), last - first - 1)
+        here = np.array([lane - first for lane in skipped if first <= lane < last], int)
+        if not here.size:
+            return self._computed(first, last, places)
+        places[np.isin(places, here)] = np.setdiff1d(places, here)[0]
+        found = self._computed(first, last, places)
+        found.outputs[here] = math.nan
+        first_saved = -first % self.every
+        saved = (here[(first + here) % self.every == 0] - first_saved) // self.every
+        columns = {name: np.array(column) for name, column in found.columns.items()}
+        for name in columns.keys() - set(self.design.names):
+            columns[name][saved if name in self._along else here] = SKIPPED.get(name, math.nan)
+        return Lanes(columns, found.outputs)
+
+    def run_lanes(self, first: int, last: int) -> None:
+        """Compute lanes `first` to `last` - 1 and no others, for nothing but to see whether this process survives it."""
+        for number in range(first // self.block, -(-last // self.block)):
+            begin = number * self.block
+            places = np.clip(np.arange(self.block), max(first - begin, 0), min(last - begin, self.block) - 1)
+            self._computed(begin, min(begin + self.block, len(self.design)), places)
+
+    def _computed(self, first: int, last: int, places: np.ndarray) -> Lanes:
+        """Lanes `first` to `last` - 1; in place of each the one at `places`, counted from `first`, is computed."""
+        starts, parameters = self.arguments(first, last, places)
         rolled = rollout(self.scene, starts, parameters=parameters or None, chunk=self.block, progress=False, **self.options).lanes
         with nan_is_a_mark():
-            outputs = np.asarray(self._outputs_of(rolled))[: last - first]
+            outputs = np.array(self._outputs_of(rolled))[: last - first]
         if self.save == "statistics":
             return Lanes({**self._of_lanes(rolled, last - first)}, outputs)
         columns = self.design.values(first, last) | self._of_lanes(rolled, last - first) | dict(zip(self.outputs, outputs.T, strict=True))
@@ -156,15 +180,18 @@ class Task:
             found[name] = Column(dtype, fill, about | (events if name == "event" else {}))
         for name, output in self.outputs.items():
             found[name] = Column("float64", math.nan, {"long_name": name, "role": "output"} | _unit(output.unit))
-        if self.save == "trajectories":
-            for name in (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries):
-                found[name] = Column("float64", math.nan, {"long_name": f"{name} along the motion"}, (("time", len(self.ts)),), self.every)
+        for name in self._along:
+            found[name] = Column("float64", math.nan, {"long_name": f"{name} along the motion"}, (("time", len(self.ts)),), self.every)
         return found
+
+    @property
+    def _along(self) -> tuple[str, ...]:
+        """Names of the columns that hold states along the motions."""
+        return (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries) if self.save == "trajectories" else ()
 
     def column_names(self) -> list[str]:
         """Names of all arrays, in order; a name may occur twice."""
-        along = [*self.scene.coordinate_names.entries, *self.scene.speed_names.entries, "time"] if self.save == "trajectories" else []
-        return [*self.design.names, *OF_LANES, *self.outputs, *along]
+        return [*self.design.names, *OF_LANES, *self.outputs, *self._along, *(("time",) if self._along else ())]
 
     def identity(self) -> dict[str, str]:
         """Digests of all that decides the numbers, by what a user would call it."""

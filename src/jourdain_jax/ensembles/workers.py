@@ -1,7 +1,7 @@
 """Several processes that compute the chunks of one study; each is started afresh (never forked from one in which JAX runs) and has its share of the cores.
 
-A worker that dies takes nothing with it: chunks that were under way are given to a new worker, one at a time. A chunk on which workers died three times is left
-out, and named at the end, when all others are done.
+A worker that dies takes nothing with it: chunks that were under way are given to a new worker, one at a time. A chunk on which workers died three times is
+searched for the lane that is the cause.
 """
 
 import contextlib
@@ -15,14 +15,15 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 
+from jourdain_jax.ensembles.deadly_lanes import MOST_DEATHS, without_deadly_lanes
 from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
 
-MOST_DEATHS = 3  # of workers on one chunk
 _LOOK = 2.0  # s, between two looks whether the parent lives
 
-_runner: list[Runner] = []  # of this worker
+_asked: list[tuple[Task, Store]] = []  # of this worker, one
+_runner: list[Runner] = []  # made for its first chunk
 
 
 def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, int]]]:
@@ -30,20 +31,30 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
     sent = sent_to_others(task)
 
     def workers(task: Task, store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
-        waiting, bad = list(numbers), []
-        while waiting and not interrupted():
-            suspects = yield from _until_a_worker_dies(sent, store, waiting, count, interrupted)
-            for number in suspects:
-                for _ in range(MOST_DEATHS - 1):  # alone, so that no other chunk is blamed
-                    if interrupted() or not (yield from _until_a_worker_dies(sent, store, [number], 1, interrupted)):
-                        break
-                else:
-                    bad.append(number)
-            waiting = [number for number in waiting if number not in bad and store.receipt(number) is None]
-        if bad:
-            raise RuntimeError(left_out(store, bad))
+        def compute(numbers: list[int], alone: bool):
+            return _until_a_worker_dies(sent, store, numbers, 1 if alone else count, interrupted)
+
+        with contextlib.ExitStack() as stack:
+            yield from without_deadly_lanes(store, numbers, interrupted, compute, _Survives(sent, store, stack), MOST_DEATHS - 1)
 
     return workers
+
+
+class _Survives:
+    """Whether a worker survives lanes `first` to `last` - 1; one that did is asked again."""
+
+    def __init__(self, sent: bytes, store: Store, stack: contextlib.ExitStack):
+        self.sent, self.store, self.stack = sent, store, stack
+        self.pool: ProcessPoolExecutor | None = None
+
+    def __call__(self, first: int, last: int) -> bool:
+        self.pool = self.pool or self.stack.enter_context(_pool(self.sent, self.store, 1))
+        try:
+            self.pool.submit(_try, first, last).result()
+        except BrokenProcessPool:
+            self.pool = None
+            return False
+        return True
 
 
 def sent_to_others(task: Task) -> bytes:
@@ -55,24 +66,11 @@ def sent_to_others(task: Task) -> bytes:
         raise ValueError(f"this study cannot be sent to other processes ({error}); {text}") from None
 
 
-def left_out(store: Store, numbers: list[int]) -> str:
-    """What is said of chunks on which workers died again and again."""
-    lanes = ", ".join(f"{first} to {last - 1}" for first, last in map(store.span, numbers[:5])) + (" ..." if len(numbers) > 5 else "")
-    return (
-        f"workers died {MOST_DEATHS} times on lanes {lanes} of `{store.path}`; all other chunks are kept. Simulate these lanes alone with "
-        "`result.lane(k).simulate()`, in a process of its own, to see which it is"
-    )
-
-
 def _until_a_worker_dies(sent: bytes, store: Store, numbers: list[int], count: int, interrupted) -> Generator[tuple[int, int], None, list[int]]:
     """Run chunks; returns the numbers of those that were under way when a worker died, empty where none did."""
-    context = get_context("spawn")
-    places = context.Queue()
-    for place in range(count):
-        places.put((place, count))
     left = iter(numbers)
     running: dict[Future, int] = {}
-    with ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(sent, str(store.path), places)) as pool:
+    with _pool(sent, store, count) as pool:
         try:
             while True:
                 while len(running) < count and not interrupted() and (number := next(left, None)) is not None:
@@ -93,12 +91,20 @@ def _until_a_worker_dies(sent: bytes, store: Store, numbers: list[int], count: i
             return suspects
 
 
+def _pool(sent: bytes, store: Store, count: int) -> ProcessPoolExecutor:
+    context = get_context("spawn")
+    places = context.Queue()
+    for place in range(count):
+        places.put((place, count))
+    return ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(sent, str(store.path), places))
+
+
 def _begin(sent: bytes, path: str, places) -> None:
     """Start a worker: its cores, no Ctrl-C (which is for the parent), an end with the parent's."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     keep_to_share(*places.get())
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
-    _runner.append(Runner(pickle.loads(sent), Store(path)))
+    _asked.append((pickle.loads(sent), Store(path)))
 
 
 def keep_to_share(place: int, count: int) -> None:
@@ -117,4 +123,10 @@ def _end_with(parent: int) -> None:
 
 
 def _chunk(number: int) -> tuple[int, int]:
+    if not _runner:
+        _runner.append(Runner(*_asked[0]))
     return _runner[0].run(number)
+
+
+def _try(first: int, last: int) -> None:
+    _asked[0][0].run_lanes(first, last)
