@@ -5,6 +5,7 @@ are waited for until they are on the disk.
 """
 
 import contextlib
+import itertools
 import json
 import os
 import secrets
@@ -17,20 +18,26 @@ try:
 except ImportError:  # not on this system: no lock is held there
     fcntl = None  # type: ignore[assignment]
 
+_OURS, _count = secrets.token_hex(4), itertools.count()  # in names of files, other than those of all processes
+
 
 def write_whole(path: Path, content: bytes, *, wait: bool = False) -> None:
     """Put a file in its place; `wait`: until it is on the disk."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(3)}")
+    beside = f"{path.parent}/.{path.name}.{os.getpid()}.{_OURS}.{next(_count)}"
     try:
-        with open(beside, "wb") as file:
-            file.write(content)
+        file = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        try:
+            written = 0
+            while written < len(content):
+                written += os.write(file, content[written:] if written else content)
             if wait:
-                file.flush()
-                os.fsync(file.fileno())
+                os.fsync(file)
+        finally:
+            os.close(file)
         os.replace(beside, path)
     except BaseException:
         with contextlib.suppress(OSError):
-            beside.unlink()
+            os.unlink(beside)
         raise
 
 
