@@ -138,8 +138,8 @@ figure.colorbar(mesh, ax=axis, label="share that fell within 5 s")
 axis.set(xlabel="speed at the start (m/s)", ylabel="lean at the start (rad)")
 
 # %% [markdown]
-# Below 3 m/s it falls from any start. Beyond, the lean from which it recovers grows with the speed. The border has steps: a fall lasts longer with each swing of
-# the weave, and what has not fallen by five seconds counts as standing.
+# Below 3 m/s it falls from any start. Beyond, the lean from which it recovers grows with the speed. The border has steps: a fall lasts longer with each swing
+# of the weave, and what has not fallen by five seconds counts as standing.
 #
 # ## Which measurement deserves to be made again?
 #

@@ -63,7 +63,8 @@ def _places(distributed, client) -> dict[object, int] | None:
 
 def _computed(distributed, client, asked: tuple, numbers, interrupted, most: int) -> Generator[tuple[int, int], None, list[int]]:
     """Lanes and failed lanes, chunk by chunk as they come; returns the numbers of chunks on which workers died. At most `most` are asked for at a time."""
-    left, running, suspects = iter(numbers), {}, []
+    left, running = iter(numbers), {}
+    suspects: list[int] = []
     ended = distributed.as_completed()
 
     def ask() -> None:

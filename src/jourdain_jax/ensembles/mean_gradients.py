@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,7 +20,7 @@ import numpy as np
 from jourdain_jax.ensembles.distributions import Distribution
 from jourdain_jax.ensembles.outputs import OfEvent
 from jourdain_jax.ensembles.task import AT_START, Task
-from jourdain_jax.motion.batches.rollout import rollout
+from jourdain_jax.motion.integrators.forward_mode import rollout_forward
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.trajectories import results
@@ -106,7 +105,7 @@ def _of_block(task: Task, columns: Sequence[str]):
     def outputs(drawn: Mapping):
         parameters = {name: column for name, column in drawn.items() if not name.endswith(AT_START)}
         starts = {name.removesuffix(AT_START): column for name, column in drawn.items() if name.endswith(AT_START)}
-        rolled = rollout(task.scene, dict(task.constants) | starts, parameters=parameters or None, adjoint=diffrax.ForwardMode(), **task.options).lanes
+        rolled = rollout_forward(task.scene, dict(task.constants) | starts, parameters=parameters or None, **task.options).lanes
         found = eqx.filter_vmap(task.outputs_of_lane)(rolled)
         return found, jnp.where(rolled.result == results.EVENT, rolled.event, jnp.where(rolled.succeeded, -1, -2))
 

@@ -2,6 +2,7 @@
 
 import diffrax
 
+from jourdain_jax.motion.batches.rollout import Rollout, rollout
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
@@ -10,3 +11,8 @@ from jourdain_jax.scene.scene import Scene
 def simulate_forward(scene: Scene, start=None, **options) -> Trajectory:
     """`simulate` with `adjoint=diffrax.ForwardMode()`: differentiable by jvp and jacfwd, to any order."""
     return simulate(scene, start, adjoint=diffrax.ForwardMode(), **options)
+
+
+def rollout_forward(scene: Scene, starts=None, **options) -> Rollout:
+    """`rollout` with `adjoint=diffrax.ForwardMode()`: differentiable by jvp and jacfwd, to any order."""
+    return rollout(scene, starts, adjoint=diffrax.ForwardMode(), **options)
