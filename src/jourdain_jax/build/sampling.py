@@ -18,7 +18,7 @@ NEARLY_INSIDE = 0.05  # of the width of the domain
 
 
 class NoStateFoundError(ValueError):
-    """No state of a scene's domain was found on its geometric rows."""
+    """No state of a scene's domain was found that is on its geometric rows and at which its rows are numbers."""
 
 
 _seen: dict[type, np.ndarray] = {}  # configurations on the rows that were given for scenes of a class in whose domain none was found
@@ -42,7 +42,7 @@ def states_near_what_was_seen(scene: Scene, count: int, generator: np.random.Gen
 def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """At most `count` random admissible states (t, q, u) from the scene's domain, on the rows, each with a leading axis of states.
 
-    `seed`: of the generator. Scene parameters must be concrete. ValueError where no state meets the geometric rows.
+    `seed`: of the generator. Scene parameters must be concrete. ValueError where no state meets the geometric rows, or rows are numbers at none.
     """
     if not isinstance(count, int | np.integer) or count < 1:
         raise ValueError(f"`count` is {count!r}, expected a whole number of states, at least 1")
@@ -51,12 +51,31 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
     t, q, u = random_states(scene, drawn, np.random.default_rng(seed))
     q, u, found = sampled_on_graph(scene, t, q, u)
-    near = None if np.isfinite(found.error).any() else states_near_what_was_seen(scene, drawn, np.random.default_rng(seed))
+    near = None if (found.on_rows & _are_numbers(u)).any() else states_near_what_was_seen(scene, drawn, np.random.default_rng(seed))
     if near is not None:
         t, q, u = near
         q, u, found = sampled_on_graph(scene, t, q, u)
-    good = np.flatnonzero(usable_states(scene, found, np.ones(drawn, bool)))[:count]
+    good = np.flatnonzero(usable_states(scene, found, np.ones(drawn, bool)) & _are_numbers(u))[:count]
+    if not good.size:
+        raise no_numbers(scene, drawn)
     return t[good], q[good], u[good]
+
+
+def _are_numbers(u: np.ndarray) -> np.ndarray:
+    """At which states the speeds are numbers, (states,); put on rows that are none, they are none."""
+    return np.all(np.isfinite(u), axis=1)
+
+
+def no_numbers(scene: Scene, count: int) -> NoStateFoundError:
+    """The error of a scene whose rows are numbers at none of `count` random states."""
+    low, high = coordinate_bounds(scene)
+    attitude = {first + k for first, _ in scene.coordinates.quaternions for k in range(4)}
+    spans = [f"`{name}` from {low[i]:.4g} to {high[i]:.4g}" for i, name in enumerate(scene.coordinate_names.entries) if i not in attitude]
+    return NoStateFoundError(
+        f"the rows of `{type(scene).__name__}` are numbers at none of {count} random states, with {', '.join(spans)}: a pose, a contact or a row is no number "
+        "there, such as the square root of a negative number; state a `domain` inside which they are numbers, "
+        'as in `domain = {"x": (-0.1, 0.1)}`'
+    )
 
 
 def random_states(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -19,7 +19,7 @@ from jourdain_jax.build.probed_on_graph import follow_from_others, probed_on_gra
 from jourdain_jax.build.rank import Scaled, rank_of, redundant_rows, scaled_states
 from jourdain_jax.build.reference_parameters import once_per_values, without_collecting
 from jourdain_jax.build.row_lengths import speed_scales, typical_row_lengths
-from jourdain_jax.build.sampling import random_states, states_near_what_was_seen, symmetric_configurations, usable_states
+from jourdain_jax.build.sampling import no_numbers, random_states, states_near_what_was_seen, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import check_smoothness
 from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, names_of_rows
 from jourdain_jax.program.graph import Unsupported
@@ -196,7 +196,8 @@ def _probed_structure(scene: Scene) -> Structure:
     generator = np.random.default_rng(0)
     drawn = random_states(scene, RANDOM_PROBES, generator)
     t, u, generic, found = _at_probes(scene, *drawn)
-    near = None if np.isfinite(found.error[generic]).any() else states_near_what_was_seen(scene, RANDOM_PROBES, generator)
+    serves = np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2))
+    near = None if serves[generic].any() else states_near_what_was_seen(scene, RANDOM_PROBES, generator)
     if near is not None:
         drawn = near
         t, u, generic, found = _at_probes(scene, *near)
@@ -209,6 +210,8 @@ def _probed_structure(scene: Scene) -> Structure:
         finite = np.isfinite(A).all(axis=2)[on_rows].any(axis=0)
         named = ", ".join(f"`{name}`" for name, good in zip(names, finite, strict=True) if not good) or "the rows together"
         faults = (f"rows {named} of `{type(scene).__name__}` are not finite at any probed state, expected numbers; check how they are computed",)
+    if usable.any() and not usable[generic].any():
+        raise no_numbers(scene, RANDOM_PROBES)  # symmetric states alone tell no rank
     typical = typical_row_lengths(A[usable & generic], (found.A_beyond * speed_scales(found.M)[:, None])[generic])
     beyond = found.A_beyond[generic]
     t, u, generic, found = jax.tree.map(lambda x: x[usable], (t, u, generic, found))
