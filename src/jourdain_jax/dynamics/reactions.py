@@ -63,6 +63,7 @@ class ContactForce(eqx.Module):
     friction_needed: Float[Array, ""]  # |tangential| / normal; infinite where the contact would have to pull, zero where it bears nothing
     pulls: Bool[Array, ""]  # whether the normal force is negative beyond round-off: the body would lift off
     determined: Bool[Array, ""]  # whether the rows at hand determine these numbers
+    normal_determined: Bool[Array, ""]  # whether they determine the normal force, though two wheels of one axle may share the tangential one
 
 
 class _PerMultiplier(eqx.Module):
@@ -157,7 +158,7 @@ def contact_forces(scene: Scene, t, q, u, accelerations: Accelerations, inputs=N
             normal, known = rows.multipliers[height], rows.determined[height]
         else:
             normal, known = built_in[name].normal, built_in[name].determined
-        forces[name] = _contact_force(normal, tangential, determined & known, margin)
+        forces[name] = _contact_force(normal, tangential, determined & known, known, margin)
     return forces
 
 
@@ -169,10 +170,10 @@ def _size_of_forces(scene: Scene, motion: Motion, total) -> Float[Array, ""]:
     return jax.lax.stop_gradient(size)
 
 
-def _contact_force(normal, tangential, determined, margin) -> ContactForce:
+def _contact_force(normal, tangential, determined, normal_determined, margin) -> ContactForce:
     squared = tangential @ tangential
     sliding = squared > 0
     size = jnp.where(sliding, jnp.sqrt(jnp.where(sliding, squared, 1.0)), 0.0)
     pushes, idle = normal > margin, (jnp.abs(normal) <= margin) & (size <= margin)
     friction = jnp.where(pushes, size / jnp.where(pushes, normal, 1.0), jnp.where(idle, 0.0, jnp.inf))
-    return ContactForce(normal, tangential, friction, normal < -margin, determined)
+    return ContactForce(normal, tangential, friction, normal < -margin, determined, normal_determined)

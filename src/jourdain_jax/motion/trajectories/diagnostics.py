@@ -61,6 +61,7 @@ class ContactExtremes(eqx.Module):
     friction_needed: Float[Array, ""]  # largest |tangential| / normal
     pulls: Array  # whether it would have had to pull at any time, beyond round-off
     determined: Array  # whether the rows determine these forces all along
+    normal_determined: Array  # whether they determine the normal force all along
 
     @property
     def honest(self) -> bool:
@@ -113,7 +114,8 @@ _uncompiled = eval_numpy(_diagnosed)
 
 def _extremes(force: ContactForce) -> ContactExtremes:
     friction = jnp.where(jnp.isnan(force.normal), 0.0, force.friction_needed)
-    return ContactExtremes(jnp.nanmin(force.normal), jnp.nanmax(force.normal), jnp.max(friction), jnp.any(force.pulls), jnp.all(force.determined))
+    known = jnp.all(force.determined), jnp.all(force.normal_determined)
+    return ContactExtremes(jnp.nanmin(force.normal), jnp.nanmax(force.normal), jnp.max(friction), jnp.any(force.pulls), *known)
 
 
 def _span(values) -> Float[Array, ""]:
@@ -186,7 +188,12 @@ def _contact_text(contact: ContactExtremes) -> str:
     text += f", friction coefficient needed {float(contact.friction_needed):.3g}"
     if not contact.honest:
         text += "; WOULD HAVE TO PULL: a real contact lifts off"
-    return text if bool(contact.determined) else f"{text}; not determined by the rows (minimum norm)"
+    if bool(contact.determined):
+        return text
+    if bool(contact.normal_determined):
+        return f"{text}; the tangential force is not determined by the rows (minimum norm)"
+    hint = "" if contact.honest else "; if this contact does not hold up all bodies, name those that it does in `carried=`"
+    return f"{text}; not determined by the rows (minimum norm){hint}"
 
 
 def summary(trajectory: Record, message: str) -> str:

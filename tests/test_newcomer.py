@@ -1,0 +1,229 @@
+"""Four scenes as someone writes them who has read nothing but the pages of the site; and the slips that cost this reader time."""
+
+import re
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.motion.trajectories import results
+
+G = 9.81
+
+
+class RobotWithTrailer(jj.Scene):
+    """A robot with two driven wheels that pulls a trailer."""
+
+    radius: object = jj.parameter(0.08, unit="m", positive=True)
+    half_track: object = jj.parameter(0.15, unit="m", positive=True)
+    hitch: object = jj.parameter(0.12, unit="m", positive=True)
+    bar: object = jj.parameter(0.5, unit="m", positive=True)
+
+    coordinates = jj.coordinates("x y heading left right angle")
+    inputs = jj.inputs("left_torque right_torque")
+    domain = {"angle": (-1.5, 1.5)}
+    carried = ("robot", "left wheel", "right wheel")
+
+    def bodies(self, t, q):
+        R, Rt = jj.rot_z(q.heading), jj.rot_z(q.heading + q.angle)
+        centre = jnp.stack([q.x, q.y, self.radius])
+        trailer = centre - self.hitch * R[:, 0] - self.bar * Rt[:, 0]
+        made = {
+            "robot": jj.RigidBody.box(5.0, (0.3, 0.2, 0.1), position=centre, orientation=R),
+            "trailer": jj.RigidBody.box(3.0, (0.3, 0.2, 0.1), position=trailer, orientation=Rt),
+        }
+        for side, sign in (("left", 1.0), ("right", -1.0)):
+            place = centre + sign * self.half_track * R[:, 1]
+            made[f"{side} wheel"] = jj.RigidBody.thin_disc(0.3, self.radius, axis="y", position=place, orientation=R @ jj.rot_y(q[side]))
+        return made
+
+    def contacts(self, pose):
+        return {side: jj.disc_contact(pose[f"{side} wheel"], self.radius, carried=self.carried) for side in ("left", "right")}
+
+    def velocity_constraints(self, motion):
+        trailer = motion["trailer"]
+        return {"trailer wheels": jj.knife_edge(trailer, trailer.position, trailer.orientation[:, 1])}
+
+    def loads(self, motion):
+        axle = motion["robot"].orientation[:, 1]
+        left, right = motion.inputs.left_torque, motion.inputs.right_torque
+        motors = [jj.torque(motion, f"{side} wheel", value * axle, reaction="robot") for side, value in (("left", left), ("right", right))]
+        return jj.gravity(motion, G), *motors
+
+
+class Tricycle(jj.Scene):
+    """Two wheels behind, one in front that is steered and driven."""
+
+    wheelbase: object = jj.parameter(1.0, unit="m", positive=True)
+    half_track: object = jj.parameter(0.35, unit="m", positive=True)
+    radius: object = jj.parameter(0.25, unit="m", positive=True)
+
+    coordinates = jj.coordinates("x y heading steer front left right")
+    inputs = jj.inputs("pedals handlebar")
+    domain = {"steer": (-0.8, 0.8)}
+
+    def bodies(self, t, q):
+        R = jj.rot_z(q.heading)
+        rear = jnp.stack([q.x, q.y, self.radius])
+
+        def disc(place, turned, angle):
+            return jj.RigidBody.thin_disc(1.5, self.radius, axis="y", position=place, orientation=turned @ jj.rot_y(angle))
+
+        return {
+            "frame": jj.RigidBody.box(20.0, (1.0, 0.3, 0.4), position=rear + 0.4 * R[:, 0] + jnp.array([0.0, 0.0, 0.3]), orientation=R),
+            "front wheel": disc(rear + self.wheelbase * R[:, 0], R @ jj.rot_z(q.steer), q.front),
+            "left wheel": disc(rear + self.half_track * R[:, 1], R, q.left),
+            "right wheel": disc(rear - self.half_track * R[:, 1], R, q.right),
+        }
+
+    def contacts(self, pose):
+        return {wheel: jj.disc_contact(pose[wheel], self.radius) for wheel in ("front wheel", "left wheel", "right wheel")}
+
+    def loads(self, motion):
+        servo = 50.0 * (motion.inputs.handlebar - motion.q.steer) - 5.0 * motion.u.steer_rate
+        return jj.gravity(motion, G), jj.generalized_force(motion, steer_rate=servo, front_rate=motion.inputs.pedals)
+
+
+class Bowl(jj.Scene):
+    """The page on contacts: a ball in a bowl; without a `domain`, as who has not read on writes it."""
+
+    coordinates = jj.coordinates("x y", jj.quaternion("attitude"))
+
+    def bodies(self, t, q):
+        z = 0.4 - jnp.sqrt(0.35**2 - q.x**2 - q.y**2)
+        centre, turned = jnp.stack([q.x, q.y, z]), jj.quaternion_to_matrix(q.attitude)
+        return {"ball": jj.RigidBody.ball(0.7, 0.05, position=centre, orientation=turned)}
+
+    def loads(self, motion):
+        return (jj.gravity(motion, G),)
+
+    def contacts(self, pose):
+        return {"bowl": jj.ball_contact(pose["ball"], 0.05, ground=jj.Sphere(0.4, side="inside", origin=(0.0, 0.0, 0.4)))}
+
+
+class BowlInItsDomain(Bowl):
+    """The same, with the domain that the page states."""
+
+    domain = {"x": (-0.15, 0.15), "y": (-0.15, 0.15)}
+
+
+class Scooter(jj.Scene):
+    """A kick scooter and a rider who stands on it; both wheels are kept on the ground by rows."""
+
+    radius: object = jj.parameter(0.1, unit="m", positive=True)
+    wheelbase: object = jj.parameter(0.85, unit="m", positive=True)
+    tilt: object = jj.parameter(0.2, unit="rad")
+
+    coordinates = jj.coordinates("x y z yaw lean pitch steer rear front")
+    inputs = jj.inputs("steer_torque")
+    domain = {"lean": (-0.6, 0.6), "pitch": (-0.3, 0.3), "steer": (-0.6, 0.6), "z": (0.05, 0.15)}
+
+    def bodies(self, t, q):
+        R = jj.rot_z(q.yaw) @ jj.rot_x(q.lean) @ jj.rot_y(q.pitch)
+        F = R @ jj.rot_y(-self.tilt) @ jj.rot_z(q.steer)
+        rear = jnp.stack([q.x, q.y, q.z])
+        front = rear + self.wheelbase * R[:, 0]
+        return {
+            "deck": jj.RigidBody.box(4.0, (0.6, 0.15, 0.05), position=rear + 0.4 * R[:, 0], orientation=R),
+            "rider": jj.RigidBody.box(70.0, (0.3, 0.4, 1.7), position=rear + 0.35 * R[:, 0] + R[:, 2], orientation=R),
+            "fork": jj.RigidBody.box(2.0, (0.1, 0.4, 0.9), position=front + 0.45 * F[:, 2], orientation=F),
+            "rear wheel": jj.RigidBody.thin_disc(0.5, self.radius, axis="y", position=rear, orientation=R @ jj.rot_y(q.rear)),
+            "front wheel": jj.RigidBody.thin_disc(0.5, self.radius, axis="y", position=front, orientation=F @ jj.rot_y(q.front)),
+        }
+
+    def contacts(self, pose):
+        return {wheel: jj.disc_contact(pose[wheel], self.radius, height="row") for wheel in ("rear wheel", "front wheel")}
+
+    def loads(self, motion):
+        return jj.gravity(motion, G), jj.generalized_force(motion, steer_rate=motion.inputs.steer_torque - 8.0 * motion.u.steer_rate)
+
+    def events(self, motion):
+        return {"fallen": 0.7 - jnp.abs(motion.q.lean)}
+
+
+def test_code_on_the_page_about_contacts_runs():
+    page = (Path(__file__).parents[1] / "docs" / "contacts.md").read_text(encoding="utf-8")
+    made = {"jj": jj, "jnp": jnp}
+    for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(code, made)
+    scenes = {name: kind for name, kind in made.items() if isinstance(kind, type)}
+    freedoms = {name: jj.build(kind()).freedoms.count for name, kind in scenes.items()}
+    assert freedoms == {"Bowl": 3, "RobotWithTrailer": 2, "DiscOnHill": 3}
+    assert made["motion"].q_end[2] > 0  # the right wheel is driven harder: it turns to the left
+
+
+def test_a_robot_pulls_its_trailer_straight_ahead():
+    torque, robot = 0.2, RobotWithTrailer()
+    motion = jj.simulate(robot, t1=2.0, ts=jnp.linspace(0.0, 2.0, 5), inputs={"left_torque": torque, "right_torque": torque}).raise_if_failed()
+    moved = 5.0 + 3.0 + 2 * 0.3 * (1 + 0.5)  # kg; a disc that rolls counts one and a half times
+    acceleration = 2 * torque / float(robot.radius) / moved
+    np.testing.assert_allclose(motion["x"], acceleration * motion.ts**2 / 2, atol=1e-9)
+    for force in motion.contact_forces().values():
+        np.testing.assert_allclose(force.normal, (5.0 + 2 * 0.3) * G / 2, rtol=1e-9)  # the trailer stands on its own wheels
+        assert not np.any(force.pulls)
+
+
+def test_a_trailer_that_is_carried_by_the_robot_lifts_a_wheel_and_the_summary_says_what_to_do():
+    class Whole(RobotWithTrailer):
+        carried = None
+
+    asked = {"start": {"left_rate": 2.0, "right_rate": 3.0, "angle": 1.2}, "t1": 0.1, "ts": jnp.linspace(0.0, 0.1, 3)}
+    lifted, right = (str(jj.simulate(kind(), **asked)) for kind in (Whole, RobotWithTrailer))
+    assert "WOULD HAVE TO PULL" in lifted
+    assert "name those that it does in `carried=`" in lifted
+    assert "PULL" not in right
+    assert "carried" not in right
+
+
+def test_a_tricycle_turns_as_its_front_wheel_says():
+    tricycle = Tricycle()
+    motion = jj.simulate(tricycle, {"front_rate": 4.0, "steer": 0.2}, ts=jnp.linspace(0.0, 2.0, 5), inputs={"pedals": 2.0, "handlebar": 0.3}).raise_if_failed()
+    ahead = motion["x_rate"] * jnp.cos(motion["heading"]) + motion["y_rate"] * jnp.sin(motion["heading"])
+    np.testing.assert_allclose(motion["heading_rate"], ahead * jnp.tan(motion["steer"]) / tricycle.wheelbase, rtol=1e-9)
+    forces = motion.contact_forces()
+    np.testing.assert_allclose(sum(force.normal for force in forces.values()), (20.0 + 3 * 1.5) * G, rtol=1e-9)
+    # three wheels tell their normal forces; how the two behind share the sideways force is nobody's to know
+    assert all(np.all(force.normal_determined) for force in forces.values())
+    assert np.all(forces["front wheel"].determined)
+    assert not np.any(forces["left wheel"].determined)
+    assert str(motion).count("; the tangential force is not determined by the rows (minimum norm)") == 2
+
+
+def test_a_ball_swings_in_a_bowl_as_fast_as_the_page_says():
+    swings = np.sort(np.abs(jj.linearize(BowlInItsDomain(), {}).state_eigenvalues().imag))[-4:]
+    np.testing.assert_allclose(swings, np.sqrt(5 * G / (7 * 0.35)), rtol=1e-9)
+
+
+class Fresh(Bowl):
+    """Of a class of its own: where a class has started once is remembered."""
+
+
+def test_a_scene_that_is_a_number_in_a_small_part_of_space_asks_for_a_domain():
+    with pytest.raises(ValueError, match=r"the rows of `Bowl` are numbers at none of .*`x` from -3.2 to 3.2.* state a `domain`"):
+        jj.build(Bowl())
+    with pytest.raises(ValueError, match=r"the rows of `Bowl` are numbers at none of .* state a `domain`"):
+        jj.sample_states(Bowl(), 4)
+
+
+def test_a_scene_without_a_domain_starts_where_it_is_told():
+    start = {"x": 0.12, "attitude_omega_x": -8.0, "attitude_omega_y": 0.5, "attitude_omega_z": 0.0}
+    told, stated = (jj.simulate(kind(), start, ts=jnp.array([0.0, 1.0])) for kind in (Fresh, BowlInItsDomain))
+    np.testing.assert_allclose(told.q_end, stated.q_end, atol=1e-8)
+    t, q, u = jj.sample_states(Fresh(), 4)
+    assert np.all(np.isfinite(u))
+    assert np.all(q[:, 0] ** 2 + q[:, 1] ** 2 < 0.35**2)
+
+
+def test_a_scooter_that_nobody_steers_falls():
+    scooter = Scooter()
+    start = jj.start(scooter, x_rate=4.0, lean_rate=0.1)
+    assert float(start["rear_rate"]) == pytest.approx(4.0 / 0.1)
+    motion = jj.simulate(scooter, start, ts=jnp.linspace(0.0, 5.0, 11))
+    assert int(motion.result) == results.EVENT
+    assert motion.event_names[int(motion.event)] == "fallen"
+    assert abs(float(motion.q_end[4])) == pytest.approx(0.7, abs=1e-8)
+    upright = jj.simulate(scooter, {"x_rate": 4.0}, ts=jnp.array([0.0, 0.1]))
+    pressed = sum(float(force.normal[0]) for force in upright.contact_forces().values())
+    assert pressed == pytest.approx((70.0 + 4.0 + 2.0 + 2 * 0.5) * G, rel=1e-9)
