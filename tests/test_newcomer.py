@@ -211,7 +211,7 @@ def test_a_scene_without_a_domain_starts_where_it_is_told():
     start = {"x": 0.12, "attitude_omega_x": -8.0, "attitude_omega_y": 0.5, "attitude_omega_z": 0.0}
     told, stated = (jj.simulate(kind(), start, ts=jnp.array([0.0, 1.0])) for kind in (Fresh, BowlInItsDomain))
     np.testing.assert_allclose(told.q_end, stated.q_end, atol=1e-8)
-    t, q, u = jj.sample_states(Fresh(), 4)
+    _, q, u = jj.sample_states(Fresh(), 4)
     assert np.all(np.isfinite(u))
     assert np.all(q[:, 0] ** 2 + q[:, 1] ** 2 < 0.35**2)
 
