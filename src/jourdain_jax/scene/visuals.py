@@ -131,13 +131,21 @@ class Visual(eqx.Module):
     def from_file(path: str | os.PathLike, *, scale=1.0, at=(0.0, 0.0, 0.0), turn=None, colour=None, opacity=1.0) -> "Visual":
         """The mesh in the file `path` that `trimesh` reads, such as .stl or .obj, times `scale` (0.001 for millimetres).
 
-        `at`, `turn`, `colour`, `opacity` as for all shapes. ImportError without `trimesh`.
+        `at`, `turn`, `colour`, `opacity` as for all shapes. ImportError without `trimesh`; ValueError for a file that is missing, of an unknown format, or
+        without faces.
         """
         try:
             import trimesh
         except ImportError:
             raise ImportError("reading a mesh from a file needs the package `trimesh`; install it with: pip install trimesh") from None
-        read = trimesh.load(os.fspath(path), force="mesh")
+        if not os.path.isfile(path):
+            raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: there is no such file; relative paths begin at `{os.getcwd()}`")
+        try:
+            read = trimesh.load(os.fspath(path), force="mesh")
+        except (NotImplementedError, ValueError, IndexError, KeyError) as reason:
+            raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: {reason}; give a file such as .stl or .obj") from None
+        if not len(read.faces):
+            raise ValueError(f"the file `{os.fspath(path)}` holds no faces, expected a mesh")
         return Visual.mesh(read.vertices, read.faces, scale=scale, at=at, turn=turn, colour=colour, opacity=opacity)
 
 
