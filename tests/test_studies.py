@@ -1,5 +1,7 @@
 """Studies: every lane is the motion that `simulate` gives, and its bits do not depend on chunks, shares or what else is kept."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -160,7 +162,6 @@ def test_a_study_is_opened_without_its_scene(whole):
 
 def test_results_print_and_draw_themselves(whole, tmp_path):
     assert f"{COUNT} of {COUNT} lanes" in str(whole)
-    assert "final lean" in whole._repr_html_()
     whole.plot("final lean", "distance", path=tmp_path / "discs.png")
     assert (tmp_path / "discs.png").stat().st_size > 5000
     counts, edges = whole.histogram("distance", cells=20)
@@ -168,6 +169,19 @@ def test_results_print_and_draw_themselves(whole, tmp_path):
     assert len(counts) <= 20
     assert len(edges) == len(counts) + 1
     assert "radius" in str(discs())
+
+
+def test_a_study_shows_its_table_and_a_histogram_of_each_output_in_a_notebook(whole):
+    shown = whole._repr_html_()
+    assert shown.startswith(f"<pre>Study in {whole.store.path}: {COUNT} of {COUNT} lanes")
+    assert shown.count("<svg") == len(OUTPUTS)
+    assert f"final lean in rad, mean {whole.mean('final lean'):.3g}" in shown
+    picture = shown[shown.index("distance in m, mean") :]
+    picture = picture[: picture.index("</svg>")]
+    counts, edges = whole.histogram("distance", cells=40)
+    heights = np.array([float(h) for h in re.findall(r"<rect [^>]* height='([\d.]+)'", picture)])
+    np.testing.assert_allclose(heights / heights.max(), counts[counts > 0] / counts.max(), atol=0.01)
+    assert re.findall(r"<text [^>]*>([^<]*)<", picture) == [f"{edges[0]:.3g}", f"{edges[-1]:.3g}"]
 
 
 @pytest.mark.parametrize(

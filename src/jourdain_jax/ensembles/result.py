@@ -8,6 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
+from jourdain_jax.ensembles.histograms import CELLS as BARS
+from jourdain_jax.ensembles.histograms import Histogram, pictures
 from jourdain_jax.ensembles.optional import draws_with, labelled_by
 from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
 from jourdain_jax.ensembles.statistics import CELLS, Grid, Statistics, combined
@@ -199,13 +201,22 @@ class StudyResult(Printed):
             counts, edges = self.histogram(name)
             axis.stairs(counts, edges, fill=True, color="#1f5fa8", alpha=0.8)
             axis.axvline(self.mean(name), color="#b3470f", lw=1.2)
-            unit = self.store.columns[name].attributes.get("units", "") if name in self.store.columns else ""
+            unit = self._unit(name)
             axis.set_xlabel(f"{name} ({unit})" if unit else name)
             axis.spines[["top", "right"]].set_visible(False)
         axes[0, 0].set_ylabel("lanes")
         if path is not None:
             figure.savefig(path, dpi=150)
         return figure
+
+    def _repr_html_(self) -> str:
+        if not self._gathered["chunks"]:
+            return super()._repr_html_()
+        drawn = [Histogram(name, self._unit(name), *self.histogram(name, cells=BARS), self.mean(name)) for name in self.outputs]
+        return super()._repr_html_() + pictures(drawn)
+
+    def _unit(self, output: str) -> str:
+        return self.store.columns[output].attributes.get("units", "") if output in self.store.columns else ""
 
     def _text(self) -> str:
         found = self._gathered
