@@ -1,6 +1,7 @@
 """The documentation names what is there: public names, pages, files; and reads docstrings as they are meant."""
 
 import importlib.util
+import json
 import re
 from pathlib import Path
 
@@ -11,12 +12,23 @@ import jourdain_jax as jj
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted(page for page in DOCS.rglob("*.md") if not {"_build", "pages", "notebooks"} & set(page.relative_to(DOCS).parts))
+SEARCHED = DOCS / "_build" / "html" / "searchindex.js"
 WRITTEN_BY_THE_BUILD = ("gallery/pages/", "tutorials/notebooks/", "notebooks/")
 
 
 def test_every_public_name_stands_once_in_the_reference():
     named = [name for page in (DOCS / "reference").glob("*.md") for name in re.findall(r"auto\w+:: jourdain_jax\.(\w+)$", page.read_text(), re.MULTILINE)]
     assert sorted(named) == sorted(set(jj.__all__) - {"models"})
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not SEARCHED.exists(), reason="the site is not built; see README")
+def test_the_search_of_the_built_site_finds_every_public_name():
+    written = re.fullmatch(r"Search\.setIndex\((.*)\)\s*", SEARCHED.read_text(encoding="utf-8"), re.DOTALL)
+    index = json.loads(written[1])
+    found = {entry[-1]: index["docnames"][entry[0]] for entry in index["objects"]["jourdain_jax"]}
+    assert sorted(set(jj.__all__) - {"models"} - set(found)) == []
+    assert {page.partition("/")[0] for page in found.values()} == {"reference"}
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=lambda page: str(page.relative_to(ROOT)))
