@@ -272,5 +272,5 @@ def _check_residual(scene: Scene, state: State, inputs, given: tuple[str, ...]) 
     held = ", ".join(f"`{name}`" for name in given) or "none"
     raise ValueError(
         f"the start of `{type(scene).__name__}` contradicts row `{names[worst]}`: residual {np.concatenate([g, phi])[worst]:.3g} is left with the given values "
-        f"held ({held}); give fewer values and let the constraints decide the rest, or use `consistent(scene, t, q, u)` to move all of them"
+        f"held ({held}); give fewer values and let the constraints decide the rest, or use `jj.consistent(scene, t, q, u)` to move all of them"
     )
