@@ -95,3 +95,13 @@ def test_a_motion_shows_its_coordinates_as_lines_in_a_notebook(motion):
     assert shown.count("<svg") == len(motion.scene.coordinate_names.entries)
     low, high = float(motion["x"].min()), float(motion["x"].max())
     assert f"x: {low:.3g} to {high:.3g}" in shown
+
+
+def test_a_rollout_shows_medians_and_bands_of_its_coordinates_in_a_notebook(lanes):
+    shown = lanes._repr_html_()
+    names = lanes.lanes.scene.coordinate_names.entries
+    assert shown.startswith("<pre>Rollout of TrailerChain: 3 lanes")
+    assert shown.count("<svg") == shown.count("<polyline") == len(names)
+    assert shown.count("<polygon") == 2 * len(names)
+    low, high = (float(x) for x in (lanes.quantiles("x0", [0.025]).min(), lanes.quantiles("x0", [0.975]).max()))
+    assert f"x0: {low:.3g} to {high:.3g}" in shown

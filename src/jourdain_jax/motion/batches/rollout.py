@@ -26,6 +26,7 @@ from jourdain_jax.motion.simulate import MOST_STEPS, TOLERANCE, default_solver, 
 from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.trajectories import labelled, results
+from jourdain_jax.motion.trajectories.sketch import sketch_of_lanes
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.motion.vector_fields.field import VectorField
@@ -100,6 +101,9 @@ class Rollout(Printed, eqx.Module):
     def to_pandas(self):
         """Coordinates and speeds as a `pandas.DataFrame`, one row for each lane and time (s). ImportError without pandas."""
         return labelled.frame(self.lanes)
+
+    def _repr_html_(self) -> str:
+        return super()._repr_html_() + ("" if is_traced(self) else sketch_of_lanes(self.lanes))
 
     def _text(self) -> str:
         lines = [f"Rollout of {type(self.lanes.scene).__name__}: {len(self)} lanes"]
