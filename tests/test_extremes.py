@@ -1,4 +1,4 @@
-"""The largest value of a quantity between the times at which it is saved."""
+"""The largest value of a quantity between the times at which it is saved, and its integral."""
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +7,11 @@ import pytest
 from test_mean_gradients import Thrown
 
 import jourdain_jax as jj
-from jourdain_jax.ensembles.extremes import largest
+from jourdain_jax.ensembles.along import integral, largest
 
+ALL = jnp.asarray(41)
 TIMES = jnp.linspace(0.0, 2.0, 41)
 PHASES = jnp.linspace(0.0, 2 * jnp.pi, 97)
-ALL = jnp.ones(41, bool)
 
 
 def wave(phase, frequency=3.0):
@@ -20,7 +20,7 @@ def wave(phase, frequency=3.0):
 
 def test_the_largest_value_is_found_to_the_fifth_order_wherever_it_lies():
     """Over 2 s a sine of 3 rad/s takes the value 1 at any phase, or is largest at an end."""
-    found = jax.vmap(lambda phase: largest(TIMES, wave(phase), ALL, wave(phase)[-1]))(PHASES)
+    found = jax.vmap(lambda phase: largest(TIMES, wave(phase), ALL))(PHASES)
     inside = (jnp.pi / 2 - PHASES) % (2 * jnp.pi) / 3.0 <= 2.0
     exact = jnp.where(inside, 1.0, jnp.maximum(jnp.sin(PHASES), jnp.sin(6.0 + PHASES)))
     coarse = jax.vmap(lambda phase: jnp.max(wave(phase)))(PHASES)
@@ -28,25 +28,48 @@ def test_the_largest_value_is_found_to_the_fifth_order_wherever_it_lies():
     assert float(jnp.max(jnp.abs(coarse - exact))) > 2e-3  # what saved values alone give
 
 
-def test_values_that_were_not_reached_do_not_count():
-    reached = TIMES < 0.8  # the wave is largest at 0.5 s, and after the end again
-    found = largest(TIMES, jnp.where(reached, wave(0.07), 0.0), reached, jnp.array(-0.2))
-    assert float(found) == pytest.approx(1.0, abs=1e-6)
-    few = TIMES < 0.12
-    assert float(largest(TIMES, jnp.where(few, wave(0.0), 0.0), few, jnp.array(0.5))) == 0.5
+def test_the_integral_is_found_to_the_fourth_order():
+    found = jax.vmap(lambda phase: integral(TIMES, wave(phase), ALL))(PHASES)
+    exact = (jnp.cos(PHASES) - jnp.cos(6.0 + PHASES)) / 3.0
+    assert float(jnp.max(jnp.abs(found - exact))) < 3e-6
+    assert float(jnp.max(jnp.abs(jax.vmap(lambda phase: jnp.trapezoid(wave(phase), TIMES))(PHASES) - exact))) > 1e-4  # of the trapezoidal rule
+    uneven = jnp.sort(jnp.concatenate([TIMES, TIMES[1:30] - 0.02]))
+    cubic = 1.0 + uneven - 2.0 * uneven**2 + 3.0 * uneven**3
+    assert float(integral(uneven, cubic, jnp.asarray(70))) == pytest.approx(2.0 + 2.0 - 16.0 / 3.0 + 12.0, rel=1e-13)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 16])
+def test_values_that_were_not_reached_do_not_count(count):
+    """A motion that ended at value number `count` - 1; all later ones repeat the end, as `sampled` has them."""
+    kept = jnp.arange(41) < count
+    times, values = jnp.where(kept, TIMES, TIMES[count - 1]), jnp.where(kept, wave(0.07), wave(0.07)[count - 1])
+    exact = 1.0 if 3.0 * TIMES[count - 1] + 0.07 > np.pi / 2 else float(values[count - 1])
+    found, by = jax.value_and_grad(lambda values: largest(times, values, jnp.asarray(count)))(values)
+    assert float(found) == pytest.approx(exact, abs=1e-6)
+    assert np.isfinite(by).all()
+    total, by = jax.value_and_grad(lambda values: integral(times, values, jnp.asarray(count)))(values)
+    exact = (np.cos(0.07) - np.cos(3.0 * float(TIMES[count - 1]) + 0.07)) / 3.0
+    assert float(total) == pytest.approx(exact, abs=5e-6 if count > 3 else 1e-4)
+    assert np.isfinite(by).all()
 
 
 def test_the_derivative_is_that_of_the_largest_value():
     """Of a sin(3 t + phase): 1 by the amplitude, 0 by the phase."""
-    by = jax.grad(lambda a, phase: largest(TIMES, a * wave(phase), ALL, a * wave(phase)[-1]), argnums=(0, 1))(1.3, 0.4)
+    by = jax.grad(lambda a, phase: largest(TIMES, a * wave(phase), ALL), argnums=(0, 1))(1.3, 0.4)
     np.testing.assert_allclose(by, [1.0, 0.0], atol=2e-5)
 
 
-def test_outputs_of_a_motion_find_its_turning_point():
-    """A particle thrown upwards turns at v^2 / (2 g), between two saved times."""
+def test_outputs_of_a_motion_find_its_turning_point_and_what_adds_up():
+    """A particle thrown upwards turns at v^2 / (2 g), between two saved times, and lands between two others."""
     motion = jj.simulate(Thrown(), {"z": 1.0, "z_rate": 2.0}, t1=0.9, ts=np.linspace(0.0, 0.9, 8), rtol=1e-10, atol=1e-10)
-    top = 1.0 + 4.0 / 18.0
+    top, landed = 1.0 + 4.0 / 18.0, (2.0 + np.sqrt(22.0)) / 9.0
     assert float(jnp.nanmax(motion["z"])) < top - 1e-3
     assert float(jj.Largest("z").of(motion)) == pytest.approx(top, abs=1e-9)
-    assert float(jj.Smallest("z").of(motion)) == pytest.approx(0.0, abs=1e-9)  # it lands
+    assert float(jj.Smallest("z").of(motion)) == pytest.approx(0.0, abs=1e-9)
     assert float(jj.LargestMagnitude("z_rate").of(motion)) == pytest.approx(np.sqrt(4.0 + 18.0), rel=1e-8)
+    assert float(jj.Largest(lambda motion: motion["z"] - motion.ts).of(motion)) == pytest.approx(1.0 + 1.0 / 18.0, abs=1e-9)
+    height = landed + landed**2 - 1.5 * landed**3
+    assert float(jj.Integral("z", "m s").of(motion)) == pytest.approx(height, rel=1e-9)
+    assert float(jj.Integral(lambda motion: jnp.ones_like(motion.ts), "s").of(motion)) == pytest.approx(landed, rel=1e-9)
+    with pytest.raises(ValueError, match=r"the quantity of an output is .*, expected its values at all 9 times of the motion"):
+        jj.Integral(lambda motion: motion.t_end).of(motion)

@@ -1,5 +1,7 @@
 """Fits from first guesses that are far from the minimum: over growing spans."""
 
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -101,3 +103,19 @@ def test_first_guesses_fill_the_ranges_of_all_unknowns():
 def test_a_number_of_guesses_that_is_none_is_refused(guesses):
     with pytest.raises(ValueError, match=r"`guesses` is .*, expected a whole number of at least 1"):
         jj.fit(Oscillator(), data(0), FREE, guesses=guesses)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 4, 12])
+def test_an_unstable_motion_is_fitted_over_growing_spans(seed, monkeypatch):
+    """A bicycle below its weave speed, whose motion grows a hundredfold: single shooting from these first guesses finds no minimum."""
+    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "bench")
+    from identification import unstable_run
+
+    found = jj.fit(*unstable_run(seed), ("IBxx", "c", "mB"), rtol=1e-8, atol=1e-8)
+    assert found.converged
+    assert found.grown
+    assert found.chi_square < 250  # of 202 samples
+    exact = jj.models.WhippleBicycle()
+    for name in ("IBxx", "c", "mB"):
+        assert abs(found[name].value - float(getattr(exact, name))) < 4 * found[name].standard_error

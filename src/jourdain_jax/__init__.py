@@ -49,7 +49,7 @@ from jourdain_jax.ensembles.design import Design
 from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
 from jourdain_jax.ensembles.files import InUseError
 from jourdain_jax.ensembles.mean_gradients import MeanGradients
-from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Largest, LargestMagnitude, Quantity, Smallest
+from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Quantity, Smallest
 from jourdain_jax.ensembles.result import StudyResult, load_study, merge_studies
 from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
 from jourdain_jax.ensembles.study import Study
@@ -128,6 +128,7 @@ __all__ = [
     "HeightMap",
     "ImplicitMidpoint",
     "InUseError",
+    "Integral",
     "Largest",
     "LargestMagnitude",
     "Levels",

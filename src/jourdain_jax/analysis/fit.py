@@ -36,7 +36,8 @@ from jourdain_jax.scene.tracebacks import shown_from_users_lines
 _NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
 _LEAST_SIGMA = 1e-12  # of a channel that is met exactly
 _POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
-_SPANS, _STEPS, _ROUGHLY = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2), 12, 0.05  # shares of the span that a fit grows over; steps tried on each, and their tolerance
+_SPANS = (1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4)  # shares of the span that a fit grows over
+_STEPS, _ROUGHLY = 12, 0.05  # tried on each of them, and their tolerance
 _SAME = 0.05  # of half the sum of squares, by which the same minimum is found lower from elsewhere
 _FEWEST_RUNS = 5  # that tell how much runs differ
 
@@ -74,7 +75,8 @@ def fit(
     - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events are ignored.
 
     Where that finds no minimum, or one whose residuals are far beyond their sigmas, the fit is made once more over growing spans: the first 1/32 of each
-    run, then more of it, each from where the shorter one ended. The lower minimum counts, and `Fit.grown` says which one it was.
+    run, then more of it, each from where the shorter one ended, with the first guess as a weak prior (known to its own size). So unstable motions are fitted
+    that no first guess would follow to their end. The lower minimum counts, and `Fit.grown` says which one it was.
 
     **Returns** a `Fit`: estimates with covariance and 95 % intervals (sigmas that were given are taken as known), residuals, the fitted
     scene, and in words what the measurements cannot tell. An unknown at its bound has a one-sided interval, by profile likelihood. `converged` is False
@@ -144,7 +146,8 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
 def _minimum(problem: "_Problem", theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
     """The minimum from each `theta`; where none is found, or residuals are far beyond their sigmas, the lower one of it and that over growing spans.
 
-    Over a short span a motion depends on its unknowns almost linearly; each fit begins where that over the shorter span ended. `one_will_do`: spans grow
+    Over a short span a motion depends on its unknowns almost linearly, also an unstable one; each fit begins where that over the shorter span ended, and what
+    a short span does not tell stays near the first guess. `one_will_do`: spans grow
     only where no theta led to a minimum with small residuals.
     """
     found = minimise(problem.linearised, theta, limits, control)
@@ -152,7 +155,7 @@ def _minimum(problem: "_Problem", theta: np.ndarray, limits: Limits, control: Co
     poor = np.flatnonzero(is_poor)
     if not poor.size or not problem.samples or (one_will_do and not is_poor[np.argmin(found.at.cost)]):
         return found
-    begin, steps = theta[poor], found.steps[poor]
+    begin, steps, problem.begun = theta[poor], found.steps[poor], theta
     roughly = replace(control, most_steps=min(_STEPS, control.most_steps), tolerance=_ROUGHLY)
     for problem.share, how in (*((share, roughly) for share in _SPANS), (1.0, control)):
         grown = minimise(lambda x, here: problem.linearised(x, poor[here]), begin, limits, how)
@@ -199,6 +202,7 @@ class _Problem:
         self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
         self.share = 1.0  # of each run's span, from its start: samples beyond do not count
+        self.begun = np.zeros((0, 0))  # first guesses of the members, where spans grow
 
     def linearised(self, theta: np.ndarray, members: np.ndarray) -> Linearised:
         """What is minimised, with its arrow, of some members: sum of rho(r); for channels whose sigma is not known, n log sigma with sigma^2 = mean r^2."""
@@ -225,13 +229,26 @@ class _Problem:
                 break
         sigma = np.sqrt(np.maximum(squares[:, 1:] / samples, _LEAST_SIGMA**2))
         cost = cost + np.sum(samples * np.log(sigma), axis=1)
-        places, mean, spread = self.unknowns.with_prior, self.unknowns.prior_mean, self.unknowns.prior_sigma
-        cost = cost + 0.5 * np.sum(((theta[:, places] - mean[places]) / spread[places]) ** 2, axis=1)
+        mean, spread = self._known_before(theta, members)
+        with_mean = np.isfinite(mean)
+        cost = cost + 0.5 * np.sum(np.where(with_mean, (theta - np.where(with_mean, mean, 0.0)) / spread, 0.0) ** 2, axis=1)
         finite = np.isfinite(triangles).all(axis=(1, 2, 3, 4)) & np.isfinite(cost)
         scaled = np.where(finite[:, None, None, None, None], triangles, 0.0) / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
         together = scaled[:, :, 0] if kinds == 1 else np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
         whole = arrow(together, m)
-        return Linearised(np.where(finite, cost, np.inf), with_prior(whole, theta, mean, spread) if places.size else whole, residual, sigma)
+        return Linearised(np.where(finite, cost, np.inf), with_prior(whole, theta, mean, spread) if with_mean.any() else whole, residual, sigma)
+
+    def _known_before(self, theta: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and standard deviation of priors, (members, unknowns); NaN where there is none.
+
+        Over part of the span the first guess is a weak prior, known to its own size: what so few samples do not tell stays there.
+        """
+        mean, spread = (np.broadcast_to(x, theta.shape) for x in (self.unknowns.prior_mean, self.unknowns.prior_sigma))
+        if self.share == 1:
+            return mean, spread
+        begun = self.begun[members]
+        none = ~np.isfinite(mean) & ~self.unknowns.fixed
+        return np.where(none, begun, mean), np.where(none, self.unknowns.sizes(begun), spread)
 
     @property
     def samples(self) -> int:

@@ -12,7 +12,7 @@ radius = { normal = [0.5, 0.01] }
 [start]                                      # the same of coordinates and speeds, or numbers
 lean = { uniform = [-0.6, 0.6] }
 spin_rate = -3.0
-[outputs]                                    # end, largest, smallest, largest-magnitude, event-time, happened; optional
+[outputs]                                    # end, largest, smallest, largest-magnitude, integral, event-time, happened; optional
 "final lean" = { end = "lean", unit = "rad" }
 fell = { happened = "fallen" }
 [options]                                    # of `jj.rollout`
@@ -29,7 +29,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
-from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Largest, LargestMagnitude, Smallest
+from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Smallest
 from jourdain_jax.ensembles.result import StudyResult, load_study, merge_studies
 from jourdain_jax.ensembles.study import Study
 from jourdain_jax.models.registry import model
@@ -38,7 +38,15 @@ from jourdain_jax.scene.numbers import described
 
 ACTIONS = ("status", "resume", "export", "merge")
 VARYING: dict[str, Callable] = {"normal": Normal, "uniform": Uniform, "log-normal": LogNormal, "log-uniform": LogUniform}
-OUTPUTS = {"end": End, "largest": Largest, "smallest": Smallest, "largest-magnitude": LargestMagnitude, "event-time": EventTime, "happened": Happened}
+OUTPUTS = {
+    "end": End,
+    "largest": Largest,
+    "smallest": Smallest,
+    "largest-magnitude": LargestMagnitude,
+    "integral": Integral,
+    "event-time": EventTime,
+    "happened": Happened,
+}
 KEYS = ("model", "t1", "samples", "sampler", "seed", "save", "every", "chunk", "set", "vary", "start", "outputs", "options", "correlation")
 
 

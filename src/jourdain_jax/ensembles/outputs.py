@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.event_names import names_of_events
-from jourdain_jax.ensembles.extremes import largest
+from jourdain_jax.ensembles.along import integral, largest, sampled
 from jourdain_jax.motion.trajectories.results import EVENT
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.names import nearest
@@ -33,70 +33,90 @@ class Output:
         """ValueError where the scene has not what the output names."""
 
 
+def _check_name(output: Output, name, scene: Scene) -> None:
+    valid = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    if name not in valid:
+        raise ValueError(f"{type(output).__name__}({name!r}): `{type(scene).__name__}` has no such coordinate or speed; {nearest(str(name), valid)}")
+
+
 @dataclass(frozen=True)
-class _OfQuantity(Output):
-    """Of a coordinate or speed, by `name`; its `unit` is written beside the numbers."""
+class End(Output):
+    """The value of the coordinate or speed `name` where the motion ended: at its last time, or at an event. `unit`: text that is kept with it."""
 
     name: str
     unit: str = ""
+    over_times = False
 
     def check(self, scene: Scene) -> None:
-        valid = (*scene.coordinate_names.entries, *scene.speed_names.entries)
-        if self.name not in valid:
-            raise ValueError(f"{type(self).__name__}({self.name!r}): `{type(scene).__name__}` has no such coordinate or speed; {nearest(self.name, valid)}")
+        """ValueError where the scene has no such coordinate or speed."""
+        _check_name(self, self.name, scene)
 
-    def _at_end(self, motion: Trajectory) -> Float[Array, ""]:
+    def of(self, motion: Trajectory) -> Float[Array, ""]:
+        """The last value of the `motion`."""
         names = motion.scene.coordinate_names
         if self.name in names.entries:
             return motion.q_end[names.entries.index(self.name)]
         return motion.u_end[motion.scene.speed_names.entries.index(self.name)]
 
-    def _largest(self, motion: Trajectory, sign: float) -> Float[Array, ""]:
-        """The largest value of `sign` times the quantity."""
-        values, end = sign * motion[self.name], sign * self._at_end(motion)
-        reached = jnp.isfinite(values)
-        return largest(motion.ts, jnp.where(reached, values, 0.0), reached, end)
+
+@dataclass(frozen=True)
+class _Along(Output):
+    """Of a `quantity` along the motion: the name of a coordinate or speed, or a function of a trajectory that gives its values at all times, such as
+    `lambda motion: jnp.hypot(motion["x"], motion["y"])`. Between saved times it is a polynomial: a smooth quantity of which values are saved every h seconds
+    is found to the fifth order of h, its integral to the fourth.
+    """
+
+    quantity: str | Callable
+    unit: str = ""
+
+    def check(self, scene: Scene) -> None:
+        """ValueError where the scene has no such coordinate or speed."""
+        if not callable(self.quantity):
+            _check_name(self, self.quantity, scene)
 
 
 @dataclass(frozen=True)
-class End(_OfQuantity):
-    """The value of the coordinate or speed `name` where the motion ended: at its last time, or at an event. `unit`: text that is kept with it."""
+class Largest(_Along):
+    """The largest value of a `quantity` at the saved times, between them, and at the end. `unit`: text that is kept with it.
 
-    over_times = False
-
-    def of(self, motion: Trajectory) -> Float[Array, ""]:
-        """The last value of the `motion`."""
-        return self._at_end(motion)
-
-
-@dataclass(frozen=True)
-class Largest(_OfQuantity):
-    """The largest value of the coordinate or speed `name` at the saved times, between them, and at the end. `unit`: text that is kept with it.
-
-    Between saved times it is that of a polynomial of fourth degree through five saved values: exact to the fifth order of the time between them.
+    `quantity`: the name of a coordinate or speed, or a function of a trajectory that gives its values at all times.
     """
 
     def of(self, motion: Trajectory) -> Float[Array, ""]:
         """The largest value along the `motion`."""
-        return self._largest(motion, 1.0)
+        return largest(*sampled(motion, self.quantity))
 
 
 @dataclass(frozen=True)
-class Smallest(_OfQuantity):
-    """The smallest value of the coordinate or speed `name`, found as `Largest` finds the largest. `unit`: text that is kept with it."""
+class Smallest(_Along):
+    """The smallest value of a `quantity`, found as `Largest` finds the largest. `unit`: text that is kept with it."""
 
     def of(self, motion: Trajectory) -> Float[Array, ""]:
         """The smallest value along the `motion`."""
-        return -self._largest(motion, -1.0)
+        times, values, count = sampled(motion, self.quantity)
+        return -largest(times, -values, count)
 
 
 @dataclass(frozen=True)
-class LargestMagnitude(_OfQuantity):
-    """The largest magnitude of the coordinate or speed `name`, found as `Largest` finds the largest. `unit`: text that is kept with it."""
+class LargestMagnitude(_Along):
+    """The largest magnitude of a `quantity`, found as `Largest` finds the largest. `unit`: text that is kept with it."""
 
     def of(self, motion: Trajectory) -> Float[Array, ""]:
         """The largest magnitude along the `motion`."""
-        return jnp.maximum(self._largest(motion, 1.0), self._largest(motion, -1.0))
+        times, values, count = sampled(motion, self.quantity)
+        return jnp.maximum(largest(times, values, count), largest(times, -values, count))
+
+
+@dataclass(frozen=True)
+class Integral(_Along):
+    """The integral of a `quantity` over time, from the start to the end of the motion. `unit`: text that is kept with it, of the quantity times s.
+
+    `quantity`: as of `Largest`.
+    """
+
+    def of(self, motion: Trajectory) -> Float[Array, ""]:
+        """The integral along the `motion`."""
+        return integral(*sampled(motion, self.quantity))
 
 
 @dataclass(frozen=True)

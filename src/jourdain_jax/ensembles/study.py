@@ -145,8 +145,8 @@ class Study(Printed):
 
         - `t0`, `t1`: span (s; default: 0 and the scene's `example_span`); `ts`: times (s) that outputs look at (default: 201 even ones; the end alone where
           all outputs look at the end).
-        - `outputs`: name -> `jj.End`, `jj.Largest`, `jj.Smallest`, `jj.LargestMagnitude`, `jj.EventTime`, `jj.Happened`, `jj.Quantity`, or a function of a
-          trajectory; default: the end values of all coordinates and speeds. NaN where a motion failed.
+        - `outputs`: name -> `jj.End`, `jj.Largest`, `jj.Smallest`, `jj.LargestMagnitude`, `jj.Integral`, `jj.EventTime`, `jj.Happened`, `jj.Quantity`, or a
+          function of a trajectory; default: the end values of all coordinates and speeds. NaN where a motion failed.
         - `save`: "outputs": parameters, starts, outputs, result code and steps of every lane; "trajectories": these, and states at `ts` of `every` so-many-th
           lane; "statistics": counts, sums and histograms alone, nothing per lane.
         - `chunk`: lanes that are stored together (default: about a thousandth of all); at most one is computed again after a crash.

@@ -1,0 +1,95 @@
+"""A quantity along a motion, from its values at saved times and at the end: its largest value, also between them, and its integral.
+
+Between them it is the polynomial through its values nearby: for the largest value one of fourth degree through the five around the largest of them, whose
+largest value is looked for on a fine grid, then by one step of Newton's method for p'(s) = 0; for the integral one of third degree through the four around
+each interval, which Simpson's rule integrates exactly. With h the time between values, a smooth quantity is found to the fifth order of h, and its integral to
+the fourth; of the saved values alone both would be of the second.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.scene.numbers import described
+
+FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # values that a polynomial goes through
+FINE = 33  # places at which the polynomial is looked at
+
+
+def sampled(motion: Trajectory, quantity: str | Callable) -> tuple[Float[Array, "more"], Float[Array, "more"], Int[Array, ""]]:
+    """Times and values of a quantity (a name, or a function of a trajectory that gives its values at all times), and how many of them count.
+
+    These are the saved times that were reached, and the end where it is later; all others repeat the end.
+    """
+    reached = motion.valid
+
+    def with_end(values, end):
+        kept = jnp.where(reached.reshape(-1, *[1] * end.ndim), values, end)
+        return jnp.concatenate([kept, end[None]])
+
+    work = None if motion.work is None else with_end(motion.work, jnp.full_like(motion.t_end, jnp.nan))
+    times = with_end(motion.ts, motion.t_end)
+    whole = dataclasses.replace(motion, ts=times, q=with_end(motion.q, motion.q_end), u=with_end(motion.u, motion.u_end), work=work)
+    values = whole[quantity] if isinstance(quantity, str) else quantity(whole)
+    if getattr(values, "shape", None) != times.shape:
+        raise ValueError(f"the quantity of an output is {described(values)}, expected its values at all {times.shape[0]} times of the motion")
+    count = jnp.sum(reached)
+    return times, values, count + (motion.t_end > times[jnp.maximum(count - 1, 0)])
+
+
+def largest(times: Float[Array, "times"], values: Float[Array, "times"], count: Int[Array, ""]) -> Float[Array, ""]:
+    """The largest of the first `count` of `values`, and between them. Its derivative is that of the quantity at the time of the largest value."""
+    k = jnp.argmax(jnp.where(jnp.arange(times.shape[0]) < count, values, -jnp.inf))
+    if times.shape[0] < FOR_EXTREMES:
+        return values[k]
+    first, s, y = _window(times, values, count, k - FOR_EXTREMES // 2, k, FOR_EXTREMES)
+    low, high = s[jnp.clip(k - 1 - first, 0, FOR_EXTREMES - 1)], s[jnp.clip(k + 1 - first, 0, FOR_EXTREMES - 1)]
+    places = jnp.linspace(low, high, FINE)
+    near = places[jnp.argmax(jax.vmap(lambda place: _polynomial(s, y, place))(places))]
+    slope = jax.grad(lambda place: _polynomial(s, y, place))
+    bend = jax.grad(slope)(near)
+    at = jnp.clip(near - jnp.where(bend < 0, slope(near) / jnp.where(bend < 0, bend, -1.0), 0.0), low, high)
+    return jnp.where(count >= FOR_EXTREMES, jnp.maximum(values[k], _polynomial(s, y, jax.lax.stop_gradient(at))), values[k])
+
+
+def integral(times: Float[Array, "times"], values: Float[Array, "times"], count: Int[Array, ""]) -> Float[Array, ""]:
+    """The integral over time of the first `count` of `values`."""
+
+    def over(i):
+        """From time i to the next: h (y_i + 4 p(middle) + y_next) / 6; the trapezoid of fewer values than a polynomial needs."""
+        even = 0.5 * (values[i] + values[i + 1])
+        middle = even
+        if times.shape[0] >= FOR_INTEGRALS:
+            first, s, y = _window(times, values, count, i - 1, i, FOR_INTEGRALS)
+            at = 0.5 * s[jnp.minimum(i + 1 - first, FOR_INTEGRALS - 1)]
+            middle = jnp.where(count >= FOR_INTEGRALS, _polynomial(s, y, at), even)
+        return jnp.where(i + 1 < count, (times[i + 1] - times[i]) * (2.0 * even + 4.0 * middle) / 6.0, 0.0)
+
+    return jnp.sum(jax.vmap(over)(jnp.arange(times.shape[0] - 1)))
+
+
+def _window(times, values, count, first, zero, points: int):
+    """Number of the first of so many neighbouring values, if possible the one asked for; their times from the time `zero` on, in units of the window; values.
+
+    Of fewer values than `points`: times that differ, so that nothing divides by zero.
+    """
+    first = jnp.clip(first, 0, jnp.maximum(count - points, 0))
+    some = first + jnp.arange(points)
+    enough = count >= points
+    since = jnp.where(enough, times[some] - times[zero], jnp.arange(points, dtype=times.dtype))
+    return first, since / (since[-1] - since[0]), jnp.where(enough, values[some], 0.0)
+
+
+def _polynomial(s: Float[Array, "points"], y: Float[Array, "points"], place: Float[Array, ""]) -> Float[Array, ""]:
+    """The value at `place` of the polynomial through (s, y), by Lagrange's formula."""
+    total = jnp.zeros_like(place)
+    for i in range(s.shape[0]):
+        factor = y[i]
+        for j in range(s.shape[0]):
+            factor = factor if i == j else factor * (place - s[j]) / (s[i] - s[j])
+        total = total + factor
+    return total
