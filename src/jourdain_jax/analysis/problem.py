@@ -1,0 +1,141 @@
+"""What a fit minimises: residuals of all runs with their derivatives, whitened and weighted, at any numbers.
+
+F = sum rho(w) + sum n log sigma + sum ((theta - mean) / s)^2 / 2        w: whitened residuals (see `correlated_noise`); sigma^2 = mean w^2 where it is not known
+"""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from jaxtyping import Float
+
+from jourdain_jax.analysis.arrow import arrow, triangle, with_prior
+from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
+from jourdain_jax.analysis.levenberg_marquardt import Linearised, Minimum
+from jourdain_jax.analysis.losses import Loss
+from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.predictions import Lanes
+from jourdain_jax.analysis.unknowns import Unknowns
+from jourdain_jax.scene.scene import Scene
+
+_LEAST_SIGMA = 1e-12  # of a channel that is met exactly
+
+
+class Problem:
+    """Residuals with their derivatives, of any members at any numbers."""
+
+    def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss):
+        self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
+        self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
+        self.share = 1.0  # of each run's span, from its start: samples beyond do not count
+        self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
+        self.tau = np.zeros((lanes.members or 1, len(self.with_memory)))  # s, of these: at first as if their noise were white
+
+    def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
+        """Correlation times of some members, by channel, s."""
+        found = self.tau[members if self.lanes.members else np.zeros(len(members), int)]
+        return dict(zip(self.with_memory, found.T, strict=True))
+
+    def linearised(self, theta: np.ndarray, members: np.ndarray) -> Linearised:
+        """What is minimised, with its arrow, of some members."""
+        return self._assembled(theta, members, self.lanes.evaluate(*self.unknowns.split(theta), members), self.taus(members))
+
+    def _assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable, taus: dict[str, np.ndarray]) -> Linearised:
+        """The same from what was evaluated; `taus`: correlation times by channel, of these members."""
+        shared, local = self.unknowns.split(theta)
+        (count, runs, m), p, kinds = local.shape, shared.shape[1], 1 + len(self.estimated)
+        triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
+        cost, squares, samples = np.zeros(count), np.zeros((count, kinds)), self.lanes.counted(self.estimated, members)
+        residual = np.empty((count, runs), object)
+        for b, j, plain, plain_J in evaluated:
+            r, J = self.lanes.whitened(j, members[b], plain, plain_J, {name: tau[b] for name, tau in taus.items()})
+            if self.share < 1:
+                early = self.lanes.within(j, self.share)
+                r, J = np.where(early, r, 0.0), np.where(early[..., None], J, 0.0)
+            with np.errstate(over="ignore", invalid="ignore"):
+                for k, (rows, counted) in enumerate(self._kinds(int(j[0]), r)):
+                    root = np.sqrt(self.loss.weight(rows))
+                    triangles[b, j, k] = triangle(root * rows, root[..., None] * J[:, counted])
+                    np.add.at(squares, (b, k), np.sum(rows**2, axis=1))
+                    if k == 0:
+                        np.add.at(cost, b, self.loss.value(rows))
+            for place, one in zip(zip(b, j, strict=True), plain, strict=True):
+                residual[place] = one
+            if count == 1 and not np.all(np.isfinite(triangles[b, j])):  # whatever the other runs say
+                triangles.fill(np.nan)
+                break
+        sigma = np.sqrt(np.maximum(squares[:, 1:] / samples, _LEAST_SIGMA**2))
+        cost = cost + np.sum(samples * np.log(sigma), axis=1)
+        places, mean, spread = self.unknowns.with_prior, self.unknowns.prior_mean, self.unknowns.prior_sigma
+        cost = cost + 0.5 * np.sum(((theta[:, places] - mean[places]) / spread[places]) ** 2, axis=1)
+        finite = np.isfinite(triangles).all(axis=(1, 2, 3, 4)) & np.isfinite(cost)
+        scaled = np.where(finite[:, None, None, None, None], triangles, 0.0) / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
+        together = scaled[:, :, 0] if kinds == 1 else np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
+        whole = arrow(together, m)
+        return Linearised(np.where(finite, cost, np.inf), with_prior(whole, theta, mean, spread) if places.size else whole, residual, sigma)
+
+    def restrict(self, theta: np.ndarray, members: np.ndarray) -> np.ndarray:
+        """Puts correlation times that are not known to where the restricted likelihood is largest; by how much rho over one shortest interval changed."""
+        shared, local = self.unknowns.split(theta)
+        evaluated, size = list(self.lanes.evaluate(shared, local, members)), self.unknowns.sizes(theta)
+        ends = {name: correlation_limits([np.asarray(run.ts) for run in self.runs if name in run.values]) for name in self.with_memory}
+        taus = {name: np.maximum(tau, ends[name][0]) for name, tau in self.taus(members).items()}
+
+        def criterion(name: str, log_tau: np.ndarray) -> np.ndarray:
+            tried = taus | {name: np.exp(log_tau)}
+            at = self._assembled(theta, members, evaluated, tried)
+            logs = np.zeros(len(members))
+            for b, j, _, _ in evaluated:
+                np.add.at(logs, b, self.lanes.log_widths(j, members[b], {n: tau[b] for n, tau in tried.items()}))
+            return at.cost + logs + half_log_determinant(at.arrow, size)
+
+        changed = np.zeros(len(members))
+        for name, (low, high) in ends.items():
+            edges = (np.full(len(members), np.log(x)) for x in (low, high))
+            found, interval = np.exp(lowest(lambda x, name=name: criterion(name, x), *edges)), low / SHORTEST
+            changed = np.maximum(changed, np.abs(np.exp(-interval / found) - np.exp(-interval / taus[name])))
+            taus[name] = found
+        self.tau[members if self.lanes.members else np.zeros(len(members), int)] = np.stack(list(taus.values()), axis=1)
+        return changed
+
+    @property
+    def samples(self) -> int:
+        """How many samples there are of channels whose sigma is known, in one repeat."""
+        channels = [(run, name) for i, run in enumerate(self.runs) for name in run.values if name not in self.estimated]
+        return sum(int(np.prod(np.shape(run.values[name])[int(self.lanes.members is not None) :])) for run, name in channels)
+
+    def by_channel(self, run: int, found: Minimum, one: Callable, white: bool = False) -> dict[str, np.ndarray]:
+        """Residuals of a run in units of sigma by channel; NaN where a sample is missing, or they were not worked out since another run had failed.
+
+        `white`: whitened ones.
+        """
+        flat = [np.zeros(0) if r is None else r for r in found.at.residual[:, run]]
+        longest = max(map(len, flat))
+        whole = np.stack([np.full(longest, np.nan) if len(r) < longest else r for r in flat])
+        members = np.arange(len(whole))
+        if white and longest:
+            whole, _ = self.lanes.whitened(np.full(len(whole), run), members, whole, None, self.taus(members))
+        parts = self.lanes.by_channel(run, one(whole))
+        for k, name in enumerate(self.estimated):
+            if name in parts:
+                sigma = one(found.at.sigma[:, k])
+                parts[name] = parts[name] / sigma.reshape(sigma.shape + (1,) * (parts[name].ndim - sigma.ndim))
+        return parts
+
+    def inflation(self, residuals, samples, rank) -> np.ndarray:
+        """By what the covariance of each member is to be multiplied: for the loss, and for sigmas that are estimated."""
+        members = self.lanes.members or 1
+        by_member = [np.concatenate([r.reshape(members, -1)[b] for run in residuals for r in run.values()]) for b in range(members)]
+        of_loss = np.array([self.loss.inflation(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in by_member])
+        every = bool(self.estimated) and all(set(run.values) <= set(self.estimated) for run in self.runs)
+        left = np.maximum(samples - rank, 1)
+        return of_loss * np.broadcast_to(samples / left if every else 1.0, (members,))
+
+    def _kinds(self, run: int, r: np.ndarray):
+        """Residuals and their places: those of channels whose sigma is known, then those of each other channel."""
+        if not self.estimated:
+            yield r, slice(None)
+            return
+        channels = self.lanes.channels(run)
+        known = [np.arange(r.shape[1])[where] for name, where in channels.items() if name not in self.estimated]
+        for counted in (np.concatenate([np.zeros(0, int), *known]), *(np.arange(r.shape[1])[channels.get(name, slice(0))] for name in self.estimated)):
+            yield r[:, counted], counted
