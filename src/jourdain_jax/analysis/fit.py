@@ -38,6 +38,7 @@ _POOR = 10.0  # times the sum of squares that noise alone leaves, one for each s
 _SPANS, _STEPS, _ROUGHLY = (1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2), 12, 0.05  # shares of the span that a fit grows over; steps tried on each, and their tolerance
 _SAME = 0.05  # of half the sum of squares, by which the same minimum is found lower from elsewhere
 _FEWEST_RUNS = 5  # that tell how much runs differ
+_FEWEST_DEGREES = 4  # of freedom
 _TURNS, _SETTLED = 20, 1e-3  # of correlation times and unknowns at most; change of the correlation of neighbouring samples that ends them
 
 
@@ -224,8 +225,10 @@ def _result(problem: Problem, found: Minimum, limits: Limits, control: Control, 
     white = tuple(problem.by_channel(run, found, one, white=True) for run in range(len(problem.runs)))
     samples = sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())
     known = information(found.at.arrow, size, places, bound, fails, control.cutoff, single)
+    errors_of = lambda arrow: information(arrow, size, places, bound, fails, control.cutoff, False).standard_errors  # noqa: E731
+    reach = _normal_or_t(one(problem.doubt(theta, errors_of)), (samples - known.rank)[..., None] if problem.all_estimated else np.inf)
     known = known.times(one(problem.inflation(residuals, samples, known.rank)))
-    reach = _NORMAL_95 * known.standard_errors
+    reach = reach * known.standard_errors
     if errors == "runs":
         known = known.between_runs(one(found.at.arrow.scores))
         reach = students_t_95(len(problem.runs) - 1) * known.standard_errors
@@ -262,6 +265,16 @@ def _result(problem: Problem, found: Minimum, limits: Limits, control: Control, 
         cutoff=control.cutoff,
         errors=errors,
     )
+
+
+def _normal_or_t(doubt: np.ndarray, left) -> np.ndarray:
+    """97.5 % quantile by which a standard error is multiplied: normal where correlation times are known, else Student's t.
+
+    Its degrees of freedom are 2 / var(log C): F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110. `left`: samples less unknowns, where sigmas are estimated.
+    """
+    if not np.any(doubt > 0):
+        return np.asarray(_NORMAL_95)
+    return students_t_95(np.maximum(2 / (np.maximum(doubt, 1e-12) + 2 / left), _FEWEST_DEGREES))
 
 
 def _sum_of_squares(r: np.ndarray, single: bool) -> np.ndarray:

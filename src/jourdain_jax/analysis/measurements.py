@@ -74,7 +74,7 @@ class Measurements(eqx.Module):
         inputs: "dict | Inputs | None" = None,
         sensors: "Mapping[str, Sensor | str | Callable | Accelerometer] | None" = None,
         t0: Number | None = None,
-        correlation_time: "Mapping[str, Number | None] | Number | None" = 0.0,
+        correlation_time: "Mapping | Number | None" = 0.0,
     ):
         real = jnp.result_type(float)
         self.ts = checked_real(ts, "`ts`", advice="give times in s").astype(real)

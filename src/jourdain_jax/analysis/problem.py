@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.analysis.arrow import arrow, triangle, with_prior
+from jourdain_jax.analysis.arrow import Arrow, arrow, triangle, with_prior
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
 from jourdain_jax.analysis.levenberg_marquardt import Linearised, Minimum
 from jourdain_jax.analysis.losses import Loss
@@ -18,6 +18,7 @@ from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
 
 _LEAST_SIGMA = 1e-12  # of a channel that is met exactly
+_STEP, _MOST_VARIANCE = 0.3, 4.0  # of differences in the logarithm of a correlation time; variance of that which is counted at most
 
 
 class Problem:
@@ -75,27 +76,41 @@ class Problem:
 
     def restrict(self, theta: np.ndarray, members: np.ndarray) -> np.ndarray:
         """Puts correlation times that are not known to where the restricted likelihood is largest; by how much rho over one shortest interval changed."""
-        shared, local = self.unknowns.split(theta)
-        evaluated, size = list(self.lanes.evaluate(shared, local, members)), self.unknowns.sizes(theta)
+        evaluated = list(self.lanes.evaluate(*self.unknowns.split(theta), members))
         ends = {name: correlation_limits([np.asarray(run.ts) for run in self.runs if name in run.values]) for name in self.with_memory}
-        taus = {name: np.maximum(tau, ends[name][0]) for name, tau in self.taus(members).items()}
-
-        def criterion(name: str, log_tau: np.ndarray) -> np.ndarray:
-            tried = taus | {name: np.exp(log_tau)}
-            at = self._assembled(theta, members, evaluated, tried)
-            logs = np.zeros(len(members))
-            for b, j, _, _ in evaluated:
-                np.add.at(logs, b, self.lanes.log_widths(j, members[b], {n: tau[b] for n, tau in tried.items()}))
-            return at.cost + logs + half_log_determinant(at.arrow, size)
-
-        changed = np.zeros(len(members))
+        taus, changed = {name: np.maximum(tau, ends[name][0]) for name, tau in self.taus(members).items()}, np.zeros(len(members))
         for name, (low, high) in ends.items():
             edges = (np.full(len(members), np.log(x)) for x in (low, high))
-            found, interval = np.exp(lowest(lambda x, name=name: criterion(name, x), *edges)), low / SHORTEST
+            tried = lambda x, name=name: self._restricted(theta, members, evaluated, taus | {name: np.exp(x)})[0]  # noqa: E731
+            found, interval = np.exp(lowest(tried, *edges)), low / SHORTEST
             changed = np.maximum(changed, np.abs(np.exp(-interval / found) - np.exp(-interval / taus[name])))
             taus[name] = found
         self.tau[members if self.lanes.members else np.zeros(len(members), int)] = np.stack(list(taus.values()), axis=1)
         return changed
+
+    def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: dict[str, np.ndarray]) -> tuple[np.ndarray, Linearised]:
+        """What the restricted likelihood is made of, to be as low as possible."""
+        at, logs = self._assembled(theta, members, evaluated, taus), np.zeros(len(members))
+        for b, j, _, _ in evaluated:
+            np.add.at(logs, b, self.lanes.log_widths(j, members[b], {n: tau[b] for n, tau in taus.items()}))
+        return at.cost + logs + half_log_determinant(at.arrow, self.unknowns.sizes(theta)), at
+
+    def doubt(self, theta: np.ndarray, errors: Callable[[Arrow], np.ndarray]) -> np.ndarray:
+        """Variance of the logarithm of each squared standard error that comes from correlation times which are estimated: `sum (d log C / d log tau)^2 / F''`.
+
+        `errors`: standard errors (members, unknowns) of an arrow. Zero where no correlation time is estimated.
+        """
+        if not self.with_memory:
+            return np.zeros(1)
+        members, found = np.arange(len(theta)), np.zeros(1)
+        evaluated, taus = list(self.lanes.evaluate(*self.unknowns.split(theta), members)), self.taus(members)
+        for name in self.with_memory:
+            left, middle, right = (self._restricted(theta, members, evaluated, taus | {name: np.exp(k * _STEP) * taus[name]}) for k in (-1, 0, 1))
+            curvature = np.maximum((left[0] - 2 * middle[0] + right[0]) / _STEP**2, 1 / _MOST_VARIANCE)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                slope = np.log(errors(right[1].arrow) / errors(left[1].arrow)) / _STEP
+            found = found + np.where(np.isfinite(slope), slope, 0.0) ** 2 / curvature[:, None]
+        return found
 
     @property
     def samples(self) -> int:
@@ -126,9 +141,13 @@ class Problem:
         members = self.lanes.members or 1
         by_member = [np.concatenate([r.reshape(members, -1)[b] for run in residuals for r in run.values()]) for b in range(members)]
         of_loss = np.array([self.loss.inflation(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in by_member])
-        every = bool(self.estimated) and all(set(run.values) <= set(self.estimated) for run in self.runs)
         left = np.maximum(samples - rank, 1)
-        return of_loss * np.broadcast_to(samples / left if every else 1.0, (members,))
+        return of_loss * np.broadcast_to(samples / left if self.all_estimated else 1.0, (members,))
+
+    @property
+    def all_estimated(self) -> bool:
+        """Whether no sigma is known."""
+        return bool(self.estimated) and all(set(run.values) <= set(self.estimated) for run in self.runs)
 
     def _kinds(self, run: int, r: np.ndarray):
         """Residuals and their places: those of channels whose sigma is known, then those of each other channel."""
