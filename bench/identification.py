@@ -3,10 +3,10 @@
     python bench/identification.py [--quick] [--only NAME ...] [--json FILE]
 
 Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), unstable (100 first guesses of a bicycle below its weave
-speed), coverage, windows (57 runs of the steer-by-wire bicycle with an unknown start each; the data are in `data/sbw_bicycle`), logs (what halves of these
-runs say of each other, with and without delays of the sensors and a lag of the motor). Writes a list of
-{"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs, with fewer repeats. Times are processor time, the least of some
-repeats, in turn; those of the windows are wall time of a fresh process.
+speed), coverage, three (coverage of three models, unknown starts and sigmas, white noise and AR(1) noise), windows (57 runs of the steer-by-wire bicycle with
+an unknown start each; the data are in `data/sbw_bicycle`), logs (what halves of these runs say of each other, with and without delays of the sensors, a lag
+of the motor and a memory of the noise). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs, with fewer
+repeats. Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
 """
 
 import argparse
@@ -199,6 +199,67 @@ def coverage(repeats: int) -> list[Figure]:
     return found
 
 
+CORRELATION = 0.8  # of neighbouring samples, where noise has a memory
+# of each model: the scene, first guesses of its free parameters, two starts (all of whose values are not known), sigma of each channel, and times
+THREE = {
+    "tilting-disc": (
+        jj.models.TiltingDisc(),
+        {"radius": 0.51, "gravity": 10.0},
+        ({"lean": 0.3, "spin_rate": -3.0}, {"lean": 0.2, "spin_rate": -4.0}),
+        {"lean": 0.005, "x": 0.005},
+        np.linspace(0.0, 2.0, 101),
+    ),
+    "chaplygin-sleigh": (
+        jj.models.ChaplyginSleigh(),
+        {"inertia": 0.42, "offset": 0.26},
+        ({"x_rate": -0.6, "heading_rate": 0.9}, {"x_rate": -0.8, "heading_rate": 0.4}),
+        {"x": 0.01, "heading": 0.01},
+        np.linspace(0.0, 8.0, 101),
+    ),
+    "double-pendulum": (
+        jj.models.DoublePendulumAngles(),
+        {"mass2": 0.75, "length2": 0.82},
+        ({"theta1": 0.6, "theta2": 0.2}, {"theta1": -0.2, "theta2": 0.5}),
+        {"theta1": 0.01, "theta2": 0.01},
+        np.linspace(0.0, 4.0, 101),
+    ),
+}
+
+
+def noisy(generator: np.random.Generator, shape: tuple[int, ...], rho: float) -> np.ndarray:
+    """Noise of variance one whose neighbouring samples correlate by rho."""
+    e = generator.normal(size=shape)
+    for k in range(1, shape[-1]):
+        e[..., k] = rho * e[..., k - 1] + np.sqrt(1 - rho**2) * e[..., k]
+    return e
+
+
+def three(repeats: int) -> list[Figure]:
+    """How often the 95 % interval holds the truth: three models, two runs each with unknown starts, two channels with unknown sigmas; and noise of 0.8."""
+    found = []
+    for model, (scene, guesses, starts, sigma, ts) in THREE.items():
+        for kind, rho in (("white noise", 0.0), ("AR(1) noise of 0.8", CORRELATION)):
+            generator, runs = np.random.default_rng(7), []
+            truth = {name: float(getattr(scene, name)) for name in guesses}
+            for i, start in enumerate(starts):
+                motion = jj.simulate(scene, start, ts=ts)
+                values = {name: np.asarray(motion[name]) + s * noisy(generator, (repeats, len(ts)), rho) for name, s in sigma.items()}
+                begin = {name: x + 0.01 for name, x in start.items()}
+                runs.append(jj.Measurements(ts, values, None, start=begin, unknown_start=tuple(start), correlation_time=None if rho else 0.0))
+                truth |= {f"run {i}: {name}": x for name, x in start.items()}
+            clock = time.process_time()
+            fits = jj.fit_batch(scene.replace(**guesses), runs, tuple(guesses))
+            spent, inside = time.process_time() - clock, []
+            for label in fits.labels:
+                inside.append(100 * float(np.mean((fits[label].low < truth[label]) & (truth[label] < fits[label].high))))
+            print(f"  {model}, {kind}: {spent:.0f} s of processor time; " + ", ".join(f"{n} {x:.1f}" for n, x in zip(fits.labels, inside, strict=True)))
+            what = f"intervals that hold the truth, %, unknown starts and sigmas, {kind}"
+            for which, share in (("fewest", min(inside)), ("most", max(inside))):
+                found.append(figure(f"{what}, {which}", model, share) | {"required": [93, 97], "met": 93 <= share <= 97})
+            found.append(figure(f"fits converged, %, {kind}", model, 100 * float(np.mean(fits.converged)), 99, at_least=True))
+    return found
+
+
 # The steer-by-wire bicycle. ---------------------------------------------------------------------------------------------------
 
 
@@ -296,15 +357,21 @@ class FlatFrame(SteerByWire):
 # every fit puts the damping of lean at its bound, zero: it is left out
 FOR_LOGS = {name: kind for name, kind in FREE.items() if name != "lean_damping"}
 MOTOR_LAG = 0.05  # s, of the steer motor behind its command: by hand, from these logs
+# what these runs hardly tell has a prior about the nominal value, whose width is a guess: 10 % for the gain and the trail, 30 % for the moments of inertia
+WITH_PRIORS = FOR_LOGS | {
+    name: jj.Estimate(range=FOR_LOGS[name], prior=jj.Normal({"gain": 1.0}.get(name, NOMINAL.get(name)), share * abs(NOMINAL.get(name, 1.0))))
+    for name, share in {"gain": 0.1, "c": 0.1, "zB": 0.1, "IBxx": 0.3, "IBzz": 0.3, "IBxz": 0.3, "IHzz": 0.3}.items()
+}
 MOST_DELAY = 0.1  # s: no sample is used that is earlier
 
 
-def with_sensors(run: jj.Measurements, sensors: dict, actuator: dict) -> jj.Measurements:
+def with_sensors(run: jj.Measurements, sensors: dict, actuator: dict, correlation_time: float | None = 0.0) -> jj.Measurements:
     """A window with these numbers of its sensors and of the steer motor, less its first samples."""
     values = {name: np.where(np.asarray(run.ts) < MOST_DELAY - 1e-9, np.nan, np.asarray(x)) for name, x in run.values.items()}
     inputs = {"steer_torque": jj.Actuator(run.inputs["steer_torque"], **actuator)}
     made = {name: jj.Sensor(**numbers) for name, numbers in sensors.items()}
-    return jj.Measurements(run.ts, values, dict(run.sigma), start=run.start, unknown_start=run.unknown_start, inputs=inputs, sensors=made)
+    known = {"start": run.start, "unknown_start": run.unknown_start, "inputs": inputs, "sensors": made}
+    return jj.Measurements(run.ts, values, dict(run.sigma), **known, correlation_time=correlation_time)
 
 
 def rms(found: jj.Fit, channel: str, sigma: float) -> float:
@@ -322,21 +389,28 @@ def held_out(half: jj.Fit, runs: list[jj.Measurements], sensors: dict, actuator:
     return rms(found, "lean_rate", 0.03)
 
 
-def logs() -> list[Figure]:
+def logs(first: int = 0) -> list[Figure]:
     """Odd and even windows, each half by itself: how far apart, how well each predicts the other, and whether its bodies can be."""
     delay = jj.Estimate(0.01, range=jj.bounds(0.0, MOST_DELAY))
     late = {"lean_rate": {"delay": delay}, "steer_rate": {"delay": delay}}
     runs, found = windows(), []
-    cases = (("ideal sensors", {}, {}), ("delays of both sensors", late, {}), ("delays of both sensors, motor lag", late, {"lag": MOTOR_LAG}))
-    for what, sensors, actuator in cases:
+    lag = {"lag": jj.Estimate(MOTOR_LAG, range=jj.bounds(0.005, 0.3))}
+    cases = (
+        ("ideal sensors", {}, {}, 0.0, FOR_LOGS),
+        ("delays of both sensors", late, {}, 0.0, FOR_LOGS),
+        ("delays of both sensors, motor lag", late, {"lag": MOTOR_LAG}, 0.0, FOR_LOGS),
+        ("delays of both sensors, motor lag estimated, noise with a memory, priors", late, lag, None, WITH_PRIORS),
+    )
+    for what, sensors, actuator, memory, free in cases[first:]:
         halves = []
         for half in (runs[::2], runs[1::2]):
-            data = [with_sensors(run, sensors, actuator) for run in half]
-            halves.append(jj.fit(FlatFrame(**NOMINAL, lean_damping=0.0), data, FOR_LOGS, rtol=1e-6, atol=1e-6, errors="runs"))
+            data = [with_sensors(run, sensors, actuator, memory) for run in half]
+            halves.append(jj.fit(FlatFrame(**NOMINAL, lean_damping=0.0), data, free, rtol=1e-6, atol=1e-6, errors="runs"))
         shared = [label for label in halves[0].labels if not label.startswith("run ")]
         for half in halves:
             print("  " + "; ".join(f"{name} {float(half[name].value):.4g} +- {float(half[name].standard_error):.2g}" for name in shared))
             print("\n".join(f"  {warning}" for warning in half.warnings))
+            print("  correlation times, s: " + (", ".join(f"{name} {float(tau):.3g}" for name, tau in half.correlation_time.items()) or "none"), flush=True)
         apart = {n: abs(float(halves[0][n].value - halves[1][n].value)) / np.hypot(*(float(h[n].standard_error) for h in halves)) for n in shared}
         print("  apart, standard errors: " + ", ".join(f"{name} {x:.1f}" for name, x in apart.items()))
         out = max(held_out(a, b, sensors, actuator) for a, b in ((halves[0], runs[1::2]), (halves[1], runs[::2])))
@@ -346,7 +420,11 @@ def logs() -> list[Figure]:
             figure("bodies that cannot be, of both halves", model, sum(len(half.impossible) for half in halves), 0),
             figure("halves differ by, standard errors (from how runs differ)", model, float(np.nanmax(list(apart.values()))), 3),
             figure("estimates that have no standard error in one half", model, float(sum(not np.isfinite(x) for x in apart.values()))),
-            figure("largest correlation of neighbouring residuals", model, max(rho for half in halves for rho, _ in half.autocorrelation.values())),
+            figure(
+                "largest correlation of neighbouring residuals, whitened where their noise has a memory",
+                model,
+                max(rho for half in halves for rho, _ in half.autocorrelation.values()),
+            ),
             figure("halves converged, of two", model, sum(bool(half.converged) for half in halves), 2, at_least=True),
         ]
     return found
@@ -402,6 +480,7 @@ def main() -> None:
         "starts": starts,
         "unstable": lambda: unstable(20 if options.quick else 100),
         "coverage": lambda: coverage(50 if options.quick else 500),
+        "three": lambda: three(50 if options.quick else 500),
         "windows": of_windows,
         "logs": logs,
     }

@@ -6,22 +6,22 @@ by Levenberg-Marquardt. Jacobians come by forward mode through the simulation, r
 Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), chapter 3.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.analysis.arrow import arrow, triangle, with_prior
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.information import information, students_t_95
-from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised, Minimum, minimise
+from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, minimise
 from jourdain_jax.analysis.likelihood import as_runs
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.predictions import Lanes
+from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.profile import limits_at_bounds
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.starts import check_starts
@@ -34,12 +34,13 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
-_LEAST_SIGMA = 1e-12  # of a channel that is met exactly
 _POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
 _SPANS = (1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4)  # shares of the span that a fit grows over
 _STEPS, _ROUGHLY = 12, 0.05  # tried on each of them, and their tolerance
 _SAME = 0.05  # of half the sum of squares, by which the same minimum is found lower from elsewhere
 _FEWEST_RUNS = 5  # that tell how much runs differ
+_FEWEST_DEGREES = 4  # of freedom
+_TURNS, _SETTLED = 20, 1e-3  # of correlation times and unknowns at most; change of the correlation of neighbouring samples that ends them
 
 
 @shown_from_users_lines
@@ -135,15 +136,16 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
         check_starts(scene, runs, unknowns)
         members = _repeats(runs) if repeats else None
         _check_enough(runs, unknowns, repeats)
-        problem = _Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members), loss or LEAST_SQUARES)
+        problem = Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members), loss or LEAST_SQUARES)
         theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
         limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
         found = _minimum(problem, theta, limits, control, one_will_do=members is None)
         same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
-        return _result(problem, found if members else found.lowest(), limits, control, errors, guesses, same)
+        found = _with_memory(problem, found if members else found.lowest(), limits, control)
+        return _result(problem, found, limits, control, errors, guesses, same)
 
 
-def _minimum(problem: "_Problem", theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
+def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
     """The minimum from each `theta`; where none is found, or residuals are far beyond their sigmas, the lower one of it and that over growing spans.
 
     Over a short span a motion depends on its unknowns almost linearly, also an unstable one; each fit begins where that over the shorter span ended, and what
@@ -163,6 +165,20 @@ def _minimum(problem: "_Problem", theta: np.ndarray, limits: Limits, control: Co
     return found.lowered(poor, replace(grown, steps=steps))
 
 
+def _with_memory(problem: Problem, found: Minimum, limits: Limits, control: Control) -> Minimum:
+    """The minimum with the correlation times of the noise estimated: these and the unknowns take turns, from a minimum as if the noise were white."""
+    going = np.flatnonzero(found.converged) if problem.with_memory else np.zeros(0, int)
+    for _ in range(_TURNS):
+        if not going.size:
+            break
+        changed = problem.restrict(found.theta[going], going)
+        again = minimise(lambda x, here, going=going: problem.linearised(x, going[here]), found.theta[going], limits, control)
+        found = found.replaced(going, again)
+        going = going[(changed > _SETTLED) & again.converged]
+    found.converged[going] = False
+    return found
+
+
 def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:
     if loss is not None and not isinstance(loss, Loss):
         raise ValueError(f"`loss` is {loss!r}, expected `huber()`, `student_t()`, or None for least squares")
@@ -178,6 +194,14 @@ def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:
     for name in unknown:
         if any(name in run.values and name not in run.unknown_sigma for run in runs):
             raise ValueError(f"sigma of channel `{name}` is None in one run and given in another; give it in all runs, or in none")
+    coloured = sorted({name for run in runs for name in run.correlation_time})
+    if coloured and loss is not None:
+        raise ValueError(
+            f"the noise of channel `{coloured[0]}` has a correlation time, but a robust loss takes samples as independent; leave out one of the two"
+        )
+    for name in sorted({name for run in runs for name in run.unknown_correlation}):
+        if any(name in run.values and name not in run.unknown_correlation for run in runs):
+            raise ValueError(f"the correlation time of channel `{name}` is None in one run and given in another; give it in all runs, or in none")
 
 
 def _repeats(runs: Sequence[Measurements]) -> int:
@@ -195,99 +219,7 @@ def _check_enough(runs: Sequence[Measurements], unknowns: Unknowns, repeats: boo
         )
 
 
-class _Problem:
-    """Residuals with their derivatives, of any members at any numbers."""
-
-    def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss):
-        self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
-        self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
-        self.share = 1.0  # of each run's span, from its start: samples beyond do not count
-        self.begun = np.zeros((0, 0))  # first guesses of the members, where spans grow
-
-    def linearised(self, theta: np.ndarray, members: np.ndarray) -> Linearised:
-        """What is minimised, with its arrow, of some members: sum of rho(r); for channels whose sigma is not known, n log sigma with sigma^2 = mean r^2."""
-        shared, local = self.unknowns.split(theta)
-        (count, runs, m), p, kinds = local.shape, shared.shape[1], 1 + len(self.estimated)
-        triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
-        cost, squares, samples = np.zeros(count), np.zeros((count, kinds)), self.lanes.counted(self.estimated, members)
-        residual = np.empty((count, runs), object)
-        for b, j, r, J in self.lanes.evaluate(shared, local, members):
-            if self.share < 1:
-                early = self.lanes.within(j, self.share)
-                r, J = np.where(early, r, 0.0), np.where(early[..., None], J, 0.0)
-            with np.errstate(over="ignore", invalid="ignore"):
-                for k, (rows, counted) in enumerate(self._kinds(int(j[0]), r)):
-                    root = np.sqrt(self.loss.weight(rows))
-                    triangles[b, j, k] = triangle(root * rows, root[..., None] * J[:, counted])
-                    np.add.at(squares, (b, k), np.sum(rows**2, axis=1))
-                    if k == 0:
-                        np.add.at(cost, b, self.loss.value(rows))
-            for place, one in zip(zip(b, j, strict=True), r, strict=True):
-                residual[place] = one
-            if count == 1 and not np.all(np.isfinite(triangles[b, j])):  # whatever the other runs say
-                triangles.fill(np.nan)
-                break
-        sigma = np.sqrt(np.maximum(squares[:, 1:] / samples, _LEAST_SIGMA**2))
-        cost = cost + np.sum(samples * np.log(sigma), axis=1)
-        mean, spread = self._known_before(theta, members)
-        with_mean = np.isfinite(mean)
-        cost = cost + 0.5 * np.sum(np.where(with_mean, (theta - np.where(with_mean, mean, 0.0)) / spread, 0.0) ** 2, axis=1)
-        finite = np.isfinite(triangles).all(axis=(1, 2, 3, 4)) & np.isfinite(cost)
-        scaled = np.where(finite[:, None, None, None, None], triangles, 0.0) / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
-        together = scaled[:, :, 0] if kinds == 1 else np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
-        whole = arrow(together, m)
-        return Linearised(np.where(finite, cost, np.inf), with_prior(whole, theta, mean, spread) if with_mean.any() else whole, residual, sigma)
-
-    def _known_before(self, theta: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and standard deviation of priors, (members, unknowns); NaN where there is none.
-
-        Over part of the span the first guess is a weak prior, known to its own size: what so few samples do not tell stays there.
-        """
-        mean, spread = (np.broadcast_to(x, theta.shape) for x in (self.unknowns.prior_mean, self.unknowns.prior_sigma))
-        if self.share == 1:
-            return mean, spread
-        begun = self.begun[members]
-        none = ~np.isfinite(mean) & ~self.unknowns.fixed
-        return np.where(none, begun, mean), np.where(none, self.unknowns.sizes(begun), spread)
-
-    @property
-    def samples(self) -> int:
-        """How many samples there are of channels whose sigma is known, in one repeat."""
-        channels = [(run, name) for i, run in enumerate(self.runs) for name in run.values if name not in self.estimated]
-        return sum(int(np.prod(np.shape(run.values[name])[int(self.lanes.members is not None) :])) for run, name in channels)
-
-    def by_channel(self, run: int, found: Minimum, one: Callable) -> dict[str, np.ndarray]:
-        """Residuals of a run in units of sigma by channel; NaN where a sample is missing, or they were not worked out since another run had failed."""
-        flat = [np.zeros(0) if r is None else r for r in found.at.residual[:, run]]
-        longest = max(map(len, flat))
-        parts = self.lanes.by_channel(run, one(np.stack([np.full(longest, np.nan) if len(r) < longest else r for r in flat])))
-        for k, name in enumerate(self.estimated):
-            if name in parts:
-                sigma = one(found.at.sigma[:, k])
-                parts[name] = parts[name] / sigma.reshape(sigma.shape + (1,) * (parts[name].ndim - sigma.ndim))
-        return parts
-
-    def inflation(self, residuals, samples, rank) -> np.ndarray:
-        """By what the covariance of each member is to be multiplied: for the loss, and for sigmas that are estimated."""
-        members = self.lanes.members or 1
-        by_member = [np.concatenate([r.reshape(members, -1)[b] for run in residuals for r in run.values()]) for b in range(members)]
-        of_loss = np.array([self.loss.inflation(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in by_member])
-        every = bool(self.estimated) and all(set(run.values) <= set(self.estimated) for run in self.runs)
-        left = np.maximum(samples - rank, 1)
-        return of_loss * np.broadcast_to(samples / left if every else 1.0, (members,))
-
-    def _kinds(self, run: int, r: np.ndarray):
-        """Residuals and their places: those of channels whose sigma is known, then those of each other channel."""
-        if not self.estimated:
-            yield r, slice(None)
-            return
-        channels = self.lanes.channels(run)
-        known = [np.arange(r.shape[1])[where] for name, where in channels.items() if name not in self.estimated]
-        for counted in (np.concatenate([np.zeros(0, int), *known]), *(np.arange(r.shape[1])[channels.get(name, slice(0))] for name in self.estimated)):
-            yield r[:, counted], counted
-
-
-def _result(problem: _Problem, found: Minimum, limits: Limits, control: Control, errors: str, guesses: int, agreeing: np.ndarray) -> Fit:
+def _result(problem: Problem, found: Minimum, limits: Limits, control: Control, errors: str, guesses: int, agreeing: np.ndarray) -> Fit:
     unknowns, theta, single = problem.unknowns, found.theta, problem.lanes.members is None
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
@@ -295,10 +227,13 @@ def _result(problem: _Problem, found: Minimum, limits: Limits, control: Control,
     bound = (theta <= limits.low) | (theta >= limits.high)
     limit, beyond = (one(x[:, places]) for x in limits_at_bounds(problem.linearised, found, limits, control))
     residuals = tuple(problem.by_channel(run, found, one) for run in range(len(problem.runs)))
+    white = tuple(problem.by_channel(run, found, one, white=True) for run in range(len(problem.runs)))
     samples = sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())
     known = information(found.at.arrow, size, places, bound, fails, control.cutoff, single)
+    errors_of = lambda arrow: information(arrow, size, places, bound, fails, control.cutoff, False).standard_errors  # noqa: E731
+    reach = _normal_or_t(one(problem.doubt(theta, errors_of)), (samples - known.rank)[..., None] if problem.all_estimated else np.inf)
     known = known.times(one(problem.inflation(residuals, samples, known.rank)))
-    reach = _NORMAL_95 * known.standard_errors
+    reach = reach * known.standard_errors
     if errors == "runs":
         known = known.between_runs(one(found.at.arrow.scores))
         reach = students_t_95(len(problem.runs) - 1) * known.standard_errors
@@ -319,8 +254,10 @@ def _result(problem: _Problem, found: Minimum, limits: Limits, control: Control,
         beyond=beyond,
         information=known,
         residuals=residuals,
+        whitened=white,
         sigma={name: one(found.at.sigma[:, k]) for k, name in enumerate(problem.estimated)},
-        chi_square=np.where(one(fails), np.nan, sum(_sum_of_squares(r, single) for run in residuals for r in run.values())),
+        correlation_time={name: one(problem.tau[:, k]) for k, name in enumerate(problem.with_memory)},
+        chi_square=np.where(one(fails), np.nan, sum(_sum_of_squares(r, single) for run in white for r in run.values())),
         samples=np.asarray(samples),
         converged=one(found.converged),
         stuck=one(found.stuck),
@@ -333,6 +270,16 @@ def _result(problem: _Problem, found: Minimum, limits: Limits, control: Control,
         cutoff=control.cutoff,
         errors=errors,
     )
+
+
+def _normal_or_t(doubt: np.ndarray, left) -> np.ndarray:
+    """97.5 % quantile by which a standard error is multiplied: normal where correlation times are known, else Student's t.
+
+    Its degrees of freedom are 2 / var(log C): F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110. `left`: samples less unknowns, where sigmas are estimated.
+    """
+    if not np.any(doubt > 0):
+        return np.asarray(_NORMAL_95)
+    return students_t_95(np.maximum(2 / (np.maximum(doubt, 1e-12) + 2 / left), _FEWEST_DEGREES))
 
 
 def _sum_of_squares(r: np.ndarray, single: bool) -> np.ndarray:

@@ -54,7 +54,9 @@ class Fit(Printed, eqx.Module):
     beyond: Float[np.ndarray, "*repeats unknowns"]  # of these, by how many standard errors the data would put them beyond; NaN elsewhere
     information: Information
     residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # (times, *channel): (prediction - value) / sigma; NaN where missing
+    whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # the same where noise is white; where it has a memory, less what the sample before foretells
     sigma: dict[str, Float[np.ndarray, "*repeats"]]  # of channels whose noise was estimated
+    correlation_time: dict[str, Float[np.ndarray, "*repeats"]]  # s, of channels where it was estimated; near zero: white
     chi_square: Float[np.ndarray, "*repeats"]
     samples: Int[np.ndarray, "*repeats"]  # with a finite sigma
     converged: Bool[np.ndarray, "*repeats"]
@@ -159,16 +161,17 @@ class Fit(Printed, eqx.Module):
             if coloured:
                 found.append(
                     f"residuals of {', '.join(coloured)} are not white (in brackets: correlation of neighbouring ones), which makes intervals too narrow: the "
-                    'scene, a sensor or the noise is not right; with five runs or more, errors="runs" gives intervals that allow for it'
+                    "scene, a sensor or the noise is not right; `correlation_time=None` estimates a memory of the noise, and with five runs or more, "
+                    'errors="runs" gives intervals that allow for it'
                 )
         return tuple(found)
 
     @property
     def autocorrelation(self) -> dict[str, tuple[float, float]]:
-        """Of each channel, the correlation of neighbouring residuals over all runs, and what white residuals hardly exceed (3.5 / sqrt(pairs))."""
+        """Of each channel, the correlation of neighbouring whitened residuals over all runs, and what white ones hardly exceed (3.5 / sqrt(pairs))."""
         found = {}
-        for name in dict.fromkeys(name for run in self.residuals for name in run):
-            runs = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in self.residuals if name in run]
+        for name in dict.fromkeys(name for run in self.whitened for name in run):
+            runs = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in self.whitened if name in run]
             products = np.concatenate([np.ravel(r[1:] * r[:-1]) for r in runs])
             squares = np.concatenate([np.ravel(r) ** 2 for r in runs])
             pairs, size = np.isfinite(products).sum(), np.nanmean(squares) if np.isfinite(squares).any() else 0.0
@@ -203,6 +206,7 @@ def _text(fit: Fit) -> str:
     if fit.errors == "runs":
         lines.append(f"standard errors from how much the {len(fit.residuals)} runs differ")
     lines += [f"sigma of `{name}`, estimated: {float(sigma):.4g}" for name, sigma in fit.sigma.items()]
+    lines += [f"correlation time of the noise of `{name}`, estimated: {float(tau):.4g} s" for name, tau in fit.correlation_time.items()]
     rows = [("unknown", "unit", "estimate", "std. error", "95 % interval")]
     for name, e in fit.estimates.items():
         error = f"{e.standard_error:.2g}" if np.isfinite(e.standard_error) else "-"

@@ -66,7 +66,7 @@ class Information(eqx.Module):
         return eqx.tree_at(lambda i: (i.standard_errors, i.shared), self, (errors, shared))
 
 
-def students_t_95(degrees: int) -> float:
+def students_t_95(degrees):
     """97.5 % quantile of Student's t, to 0.1 % from four degrees of freedom on: M. Abramowitz and I. A. Stegun, Handbook (1964), 26.7.5."""
     z, n = 1.959963984540054, degrees
     terms = z**3 + z, 5 * z**5 + 16 * z**3 + 3 * z, 3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z, 79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z

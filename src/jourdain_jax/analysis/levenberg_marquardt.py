@@ -83,6 +83,15 @@ class Minimum:
             kept[here] = new[lower]
         return self
 
+    def replaced(self, members: Int[np.ndarray, "some"], new: "Minimum") -> "Minimum":
+        """With what was found for these members once more; steps add up."""
+        kept_ones = (self.theta, self.at.cost, self.at.residual, self.at.sigma, self.converged, self.stuck, *self.at.arrow.arrays)
+        new_ones = (new.theta, new.at.cost, new.at.residual, new.at.sigma, new.converged, new.stuck, *new.at.arrow.arrays)
+        for kept, one in zip(kept_ones, new_ones, strict=True):
+            kept[members] = one
+        self.steps[members] += new.steps
+        return self
+
 
 def minimise(
     evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Float[np.ndarray, "members unknowns"], limits: Limits, control: Control

@@ -1,6 +1,6 @@
 """What a scene predicts for measurements, and how likely it makes them.
 
-r = (reading - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi))
+r = (reading - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi));      where noise has a memory, as in `correlated_noise`
 """
 
 from collections.abc import Iterable, Sequence
@@ -9,6 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.analysis.correlated_noise import log_density
 from jourdain_jax.analysis.measurements import Measurements, checked
 from jourdain_jax.analysis.predictions import Run, equal_runs
 from jourdain_jax.motion.simulate import simulate
@@ -32,7 +33,7 @@ def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **
     """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
     Differentiable in scene, start values, measured values, sigmas and numbers of sensors and actuators (reverse mode, unless `adjoint` says
-    otherwise); -inf where the motion fails. `simulation`: options of `simulate`. Missing samples (NaN, or an infinite sigma) do not count.
+    otherwise) and in known correlation times of the noise; -inf where the motion fails. `simulation`: options of `simulate`. Missing samples (NaN, or an infinite sigma) do not count.
 
         jax.grad(lambda a: jj.log_likelihood(sleigh.replace(offset=a), data))(0.25)
 
@@ -41,6 +42,8 @@ def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **
     runs = as_runs(scene, data)
     if unknown := sorted({name for run in runs for name in run.unknown_sigma}):
         raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a likelihood needs the standard deviation of its noise; give a number")
+    if unknown := sorted({name for run in runs for name in run.unknown_correlation}):
+        raise ValueError(f"the correlation time of channel `{unknown[0]}` is None, but a likelihood needs to know it; give a number in s, or 0 for white noise")
     if label := next((label for run in runs for label in run.estimates), None):
         raise ValueError(f"`{label}` is to be estimated, but a likelihood needs its value; give a number, which may be traced, in place of the `Estimate`")
     total = jnp.zeros(())
@@ -52,7 +55,9 @@ def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **
                 counted = run.weights[name] > 0
                 # log sigma = - log weight
                 logs = jnp.log(jnp.where(counted, run.weights[name], 1.0) / jnp.sqrt(2 * jnp.pi))
-                found = found + jnp.sum(jnp.where(counted, logs - 0.5 * r**2, 0.0))
+                tau = run.correlation_time.get(name)
+                of_r = jnp.sum(-0.5 * r**2) if tau is None else log_density(r, run.weights[name], run.ts, tau)
+                found = found + jnp.sum(jnp.where(counted, logs, 0.0)) + of_r
             return found
 
         total = total + jnp.sum(eqx.filter_vmap(one)(alike))

@@ -34,6 +34,8 @@ class Measurements(eqx.Module):
     - `sigma`: standard deviation of the noise, in the unit of the channel: channel -> number, (times,) or the shape of its
       values; or one number for all channels. None: not known; one sigma for all samples of the channel in all runs is estimated.
       NaN in `values`, or an infinite sigma, marks a sample that is missing.
+    - `correlation_time`: s, of noise with a memory, whose correlation falls as exp(-|t - t'| / correlation time): channel -> number, or one number for all;
+      channels that are not named have white noise, as with zero. None: not known; one for all components of the channel in all runs is estimated.
     - `start`: coordinate or speed -> value at `t0`. These are held; what is not given is solved for, as by `jj.start`.
     - `unknown_start`: names in `start` whose values are first guesses, to be estimated; or name -> `bounds(...)`, `positive()`,
       `unbounded()` (None: unbounded), or an `Estimate` with a prior.
@@ -57,7 +59,9 @@ class Measurements(eqx.Module):
     drives: dict[str, Drive]  # actuators with numbers to be estimated, by input
     estimates: dict[str, Estimate]  # of sensors and actuators, as "gyro.gain"
     t0: Float[Array, ""]  # s
+    correlation_time: dict[str, Float[Array, ""]]  # s, of channels whose noise has a memory; zero where it is to be estimated
     unknown_sigma: tuple[str, ...] = eqx.field(static=True)  # channels; their sigma here is 1
+    unknown_correlation: tuple[str, ...] = eqx.field(static=True)  # channels
 
     def __init__(
         self,
@@ -70,6 +74,7 @@ class Measurements(eqx.Module):
         inputs: "dict | Inputs | None" = None,
         sensors: "Mapping[str, Sensor | str | Callable | Accelerometer] | None" = None,
         t0: Number | None = None,
+        correlation_time: "Mapping | Number | None" = 0.0,
     ):
         real = jnp.result_type(float)
         self.ts = checked_real(ts, "`ts`", advice="give times in s").astype(real)
@@ -81,6 +86,9 @@ class Measurements(eqx.Module):
         given = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.values, sigma)
         self.unknown_sigma = tuple(sorted(name for name, value in given.items() if value is None))
         self.sigma = _reals("sigma of channel", {name: 1.0 if value is None else value for name, value in given.items()})
+        memory = correlation_time if isinstance(correlation_time, Mapping) else dict.fromkeys(self.values, correlation_time)
+        self.unknown_correlation = tuple(sorted(name for name, value in memory.items() if value is None))
+        self.correlation_time = _correlation_times(memory)
         self.start = _reals("start value", start)
         self.unknown_start = dict(unknown_start) if isinstance(unknown_start, Mapping) else dict.fromkeys(as_names(unknown_start))
         self.inputs = inputs
@@ -96,6 +104,9 @@ class Measurements(eqx.Module):
         if not self.values:
             raise ValueError("`values` is empty; give at least one channel: name -> measured values")
         _check_same_names("sigma", self.sigma, self.values)
+        for name in self.correlation_time:
+            if name not in self.values:
+                raise ValueError(f"`correlation_time` names channel `{name}`, which has no values; {nearest(name, self.values)}")
         for name in self.sensors:
             if name not in self.values:
                 raise ValueError(f"sensor `{name}` has no measured values; {nearest(name, self.values)}")
@@ -131,6 +142,21 @@ def _holds(condition: Callable, x) -> bool:
 
 def _reals(what: str, given: Mapping) -> dict[str, Array]:
     return {name: checked_real(value, f"{what} `{name}`").astype(jnp.result_type(float)) for name, value in given.items()}
+
+
+def _correlation_times(given: Mapping) -> dict[str, Array]:
+    """Those that are not zero; zero where it is not known."""
+    found = {}
+    for name, value in given.items():
+        if value is None:
+            found[name] = jnp.zeros((), jnp.result_type(float))
+            continue
+        time = checked_real(value, f"correlation time of channel `{name}`", (), advice="give a time in s, or None where it is not known")
+        if not _holds(lambda x: np.isfinite(x) & (x >= 0), time):
+            raise ValueError(f"the correlation time of channel `{name}` is {float(time):g} s, expected zero or more; None where it is not known")
+        if is_traced(time) or time != 0:
+            found[name] = time.astype(jnp.result_type(float))
+    return found
 
 
 def _check_times(ts) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.channels import Channel
+from jourdain_jax.analysis.correlated_noise import Chains, whitened
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
 from jourdain_jax.analysis.unknowns import Layout
@@ -47,6 +48,7 @@ class Run(eqx.Module):
     inputs: dict | Inputs | None
     sensors: dict[str, Reading]
     drives: dict[str, Drive]
+    correlation_time: dict[str, Float[Array | np.ndarray, ""]]  # s, of channels whose noise has a memory
 
     def residuals(self, scene: Scene, simulate: Callable, simulation: dict) -> dict[str, Float[Array | np.ndarray, "..."]]:
         """`(reading - value) / sigma` by channel."""
@@ -68,7 +70,7 @@ class Run(eqx.Module):
             return eqx.tree_at(lambda r: r.start, self, changed)
         known = layout.known(shared, local)
         parts = changed, with_numbers(self.sensors, known), with_numbers(self.drives, known)
-        return Run(self.t0, self.ts, self.grid, self.values, self.weights, parts[0], self.inputs, parts[1], parts[2])
+        return Run(self.t0, self.ts, self.grid, self.values, self.weights, parts[0], self.inputs, parts[1], parts[2], self.correlation_time)
 
 
 def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
@@ -79,7 +81,7 @@ def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
         weights[name] = xp.where(known & xp.isfinite(sigma), 1.0 / sigma, 0.0)
     measured = {name: xp.where(weights[name] > 0, xp.asarray(values), 0.0) for name, values in data.values.items()}
     grid = _grid(data.t0, data.ts) if any(sensor.is_late for sensor in data.readings.values()) else None
-    return Run(data.t0, data.ts, grid, measured, weights, data.start, data.inputs, data.readings, data.drives)
+    return Run(data.t0, data.ts, grid, measured, weights, data.start, data.inputs, data.readings, data.drives, data.correlation_time)
 
 
 def _grid(t0, ts) -> Float[Array | np.ndarray, "grid"]:
@@ -150,6 +152,20 @@ class Lanes:
         group = self._group_of(int(runs[0]))
         return group.within([group.indices.index(run) for run in runs.tolist()], share)
 
+    def whitened(self, runs: np.ndarray, members: np.ndarray, r, J, taus: dict[str, np.ndarray]) -> tuple:
+        """Residuals and Jacobians (None: none) of lanes of equal structure, whitened; `taus`: correlation times (lanes,) that are estimated, s."""
+        group = self._group_of(int(runs[0]))
+        if group.chains is None:
+            return r, J
+        before, rho = group.chained(runs, members, taus)
+        w = whitened(r, np.take_along_axis(r, before, axis=1), rho)
+        return w, None if J is None else whitened(J, np.take_along_axis(J, before[..., None], axis=1), rho[..., None])
+
+    def log_widths(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> Float[np.ndarray, "lanes"]:
+        """`sum log sqrt(1 - rho^2)` of lanes of equal structure."""
+        group = self._group_of(int(runs[0]))
+        return np.zeros(len(runs)) if group.chains is None else 0.5 * np.sum(np.log1p(-(group.chained(runs, members, taus)[1] ** 2)), axis=1)
+
     def by_channel(self, run: int, flat: Float[np.ndarray, "*members samples"]) -> dict[str, np.ndarray]:
         """Weighted residuals of a run by channel, NaN where a sample is missing."""
         group = self._group_of(run)
@@ -176,6 +192,8 @@ class _Group:
         sizes = {name: int(np.prod(w.shape[0 if members is None else 1 :])) for name, w in sorted(filled[0].weights.items())}
         ends = np.cumsum([0, *sizes.values()]).tolist()
         self.channels = {name: slice(begin, end) for name, begin, end in zip(sizes, ends[:-1], ends[1:], strict=True)}
+        taus, arrays = self._arrays.correlation_time, self._arrays
+        self.chains = Chains.of(arrays.weights, arrays.ts, taus, self.channels, members is not None) if taus else None
         saved = times if filled[0].grid is None else filled[0].grid.shape[0]
         states = saved * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
         self._width = int(min(MOST_LANES, max(1, TOUCHED // states)))
@@ -225,6 +243,11 @@ class _Group:
         """Weights by channel, shape (runs, *members, times, *channel)."""
         return self._arrays.weights
 
+    def chained(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Of each sample of lanes, the place of the one before it and their correlation."""
+        places = [self.indices.index(run) for run in runs.tolist()]
+        return self.chains.at(places, None if self._members is None else members, taus)
+
     def within(self, places: list[int], share: float) -> np.ndarray:
         """Which samples of the runs at these places lie in the first `share` of the span, shape (lanes, samples)."""
         ts, t0 = (np.asarray(x)[places] for x in (self._arrays.ts, self._arrays.t0))
@@ -272,8 +295,8 @@ def _alike(data: Sequence[Measurements]) -> list[list[int]]:
     """Indices of the runs, grouped by equal structure: names, sensors, kinds of inputs, shapes but for the number of times."""
     groups: dict[tuple, list[int]] = {}
     for index, run in enumerate(data):
-        parts = run.start, run.readings, run.inputs, run.drives
-        arrays, rest = eqx.partition((*parts[:2], _without_knots(parts[2:])), _is_array)
+        parts = run.start, run.readings, run.inputs, run.drives, run.correlation_time
+        arrays, rest = eqx.partition((*parts[:2], _without_knots(parts[2:4])), _is_array)
         kind = (jax.tree.structure((*parts, dict.fromkeys(run.values, 0))), tuple(jax.tree.leaves(rest)))
         groups.setdefault((*kind, tuple(x.shape for x in jax.tree.leaves(arrays))), []).append(index)
     return list(groups.values())

@@ -1,0 +1,126 @@
+"""Noise with a memory: an Ornstein-Uhlenbeck process in each channel, which at equal intervals is an AR(1) process.
+
+    E e(t) e(t') = sigma^2 exp(-|t - t'| / tau),        rho_k = exp(-(t_k - t_j) / tau),      j: the last sample before k that is not missing
+    whitened     w_k = (r_k - rho_k r_j) / sqrt(1 - rho_k^2),      w = r at the first sample:  independent, of variance one where r = e / sigma
+
+This is exact at uneven times and across samples that are missing. A correlation time tau that is not known is where, at the estimates of all else,
+
+    sum w^2 / 2 + sum log sqrt(1 - rho_k^2) + log det(J_w' J_w) / 2
+
+is lowest (restricted likelihood): without its last term, which stands for the unknowns, tau would come out too short. tau and the unknowns take turns.
+Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; R. H. Jones, Longitudinal Data with Serial Correlation (1993), chapter 3.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jourdain_jax.analysis.arrow import Arrow, eliminated
+
+SHORTEST, LONGEST = 0.1, 10.0  # of tau: of the shortest interval (the noise is white), and of the longest span (hardly to be told from a bias)
+SECTIONS = 20  # of the interval in log tau, each 0.618 of the one before
+_GOLDEN = (np.sqrt(5) - 1) / 2
+_TINY = 1e-7  # of the length of a column: what does not show adds a constant to log det
+
+
+def chain(weight: Float[Array | np.ndarray, "times *channel"], ts: Float[Array | np.ndarray, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+    """Of each sample of a channel, the time index of the last one before it that is not missing (itself where there is none), and the time between, s.
+
+    That time is infinite where there is none, and for samples that are missing. `weight` is zero where a sample is missing. Both have its shape.
+    """
+    index = xp.reshape(xp.arange(ts.shape[0]), (-1,) + (1,) * (weight.ndim - 1))
+    last = xp.maximum.accumulate(xp.where(weight > 0, index, -1), axis=0)
+    before = xp.concatenate([xp.full_like(last[:1], -1), last[:-1]])
+    linked = (before >= 0) & (weight > 0)
+    before = xp.where(linked, before, index)
+    return before, xp.where(linked, xp.broadcast_to(xp.reshape(ts, index.shape), before.shape) - ts[before], xp.inf)
+
+
+def memory(gap, tau, xp=np):
+    """`rho = exp(-gap / tau)`, smooth in tau; zero where the gap is infinite or tau is zero."""
+    counts = xp.isfinite(gap) & (tau > 0)
+    return xp.where(counts, xp.exp(-xp.where(counts, gap, 1.0) / xp.where(counts, tau, 1.0)), 0.0)
+
+
+def whitened(r, previous, rho):
+    """`(r - rho r_before) / sqrt(1 - rho^2)`, where `previous` is r at the sample before."""
+    return (r - rho * previous) / (1 - rho**2) ** 0.5
+
+
+@dataclass(frozen=True)
+class Chains:
+    """Which sample goes before which in the residuals of runs of equal structure; a leading axis `runs`, and `members` where samples differ by member."""
+
+    before: Int[np.ndarray, "runs *members samples"]
+    gap: Float[np.ndarray, "runs *members samples"]  # s
+    known: Float[np.ndarray, "runs samples"]  # tau, s; zero where the noise is white or tau is not known
+    channels: Mapping[str, slice]
+
+    @staticmethod
+    def of(weights: Mapping[str, np.ndarray], ts: np.ndarray, taus: Mapping[str, np.ndarray], channels: Mapping[str, slice], has_members: bool) -> "Chains":
+        """From weights (runs, *members, times, *channel), times (runs, times) and correlation times (runs,) of some channels."""
+        before, gap, known, (runs, times) = [], [], [], ts.shape
+        for name, where in channels.items():
+            weight = weights[name]
+            lead, count = weight.shape[1 : 1 + has_members], (where.stop - where.start) // times
+            links = [chain(np.moveaxis(one.reshape(-1, times, count), 1, 0), t) for one, t in zip(weight, ts, strict=True)]
+            back = lambda x, lead=lead: np.moveaxis(x, 1, 2).reshape(len(x), *lead, -1)  # noqa: E731
+            before.append(where.start + back(np.stack([place for place, _ in links]) * count + np.arange(count)))
+            gap.append(back(np.stack([g for _, g in links])))
+            known.append(np.repeat(np.asarray(taus.get(name, np.zeros(runs)))[:, None], times * count, axis=1))
+        return Chains(np.concatenate(before, axis=-1), np.concatenate(gap, axis=-1), np.concatenate(known, axis=-1), channels)
+
+    def at(self, places, members, unknown: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Places before, and rho, of lanes: runs at these places, of these members (None: all alike), with correlation times (lanes,) of some channels."""
+        index = (places,) if members is None else (places, members)
+        tau = self.known[places].copy()
+        for name, value in unknown.items():
+            if name in self.channels:
+                tau[:, self.channels[name]] = value[:, None]
+        return self.before[index], memory(self.gap[index], tau)
+
+
+def half_log_determinant(arrow: Arrow, size: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members"]:
+    """`log det(J'J) / 2` in unknowns divided by `size`, with a constant for what does not show."""
+    scaled = arrow.scaled(size)
+    _, m, p = arrow.counts
+    members, runs = scaled.local.shape[:2]
+    upper, rest = eliminated(scaled.local, np.full((members, runs, m), _TINY))
+    whole = np.concatenate([scaled.shared[..., :p], rest[..., :p], np.broadcast_to(_TINY * np.eye(p), (members, p, p))], axis=1)
+    diagonals = np.einsum("bkii->bki", upper[..., :m]).reshape(members, -1), np.einsum("bii->bi", np.linalg.qr(whole, mode="r"))
+    return sum((np.sum(np.log(np.abs(d)), axis=1) for d in diagonals), np.zeros(members))
+
+
+def lowest(f: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Where f, of each member, is lowest between low and high, by golden section."""
+    a, b = low.copy(), high.copy()
+    c, d = b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)
+    fc, fd = f(c), f(d)
+    for _ in range(SECTIONS):
+        left = fc < fd
+        a, b = np.where(left, a, c), np.where(left, d, b)
+        kept, kept_f = np.where(left, c, d), np.where(left, fc, fd)
+        new = np.where(left, b - _GOLDEN * (b - a), a + _GOLDEN * (b - a))
+        of_new = f(new)
+        c, d = np.where(left, new, kept), np.where(left, kept, new)
+        fc, fd = np.where(left, of_new, kept_f), np.where(left, kept_f, of_new)
+    return np.asarray((a + b) / 2)
+
+
+def correlation_limits(ts: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Shortest and longest correlation time that is looked for, s."""
+    return SHORTEST * min(float(np.min(np.diff(t))) for t in ts if len(t) > 1), LONGEST * max(float(t[-1] - t[0]) for t in ts)
+
+
+def log_density(r, weight, ts, tau) -> Float[Array, ""]:
+    """Logarithm of the density of `r` in units of sigma, `- sum w^2 / 2 - sum log sqrt(1 - rho^2)`, without `log(sigma sqrt(2 pi))`; on JAX arrays.
+
+    r, weight: (times, *channel); a weight of zero marks a sample that is missing.
+    """
+    before, gap = chain(weight, ts, jnp)
+    rho = memory(gap, tau, jnp)
+    w = whitened(r, jnp.take_along_axis(r, before, axis=0), rho)
+    return -0.5 * jnp.sum(jnp.where(weight > 0, w**2 + jnp.log1p(-(rho**2)), 0.0))

@@ -1,0 +1,174 @@
+"""What a fit minimises: residuals of all runs with their derivatives, whitened and weighted, at any numbers.
+
+F = sum rho(w) + sum n log sigma + sum ((theta - mean) / s)^2 / 2        w: whitened residuals (see `correlated_noise`); sigma^2 = mean w^2 where it is not known
+"""
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from jaxtyping import Float
+
+from jourdain_jax.analysis.arrow import Arrow, arrow, triangle, with_prior
+from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
+from jourdain_jax.analysis.levenberg_marquardt import Linearised, Minimum
+from jourdain_jax.analysis.losses import Loss
+from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.predictions import Lanes
+from jourdain_jax.analysis.unknowns import Unknowns
+from jourdain_jax.scene.scene import Scene
+
+_LEAST_SIGMA = 1e-12  # of a channel that is met exactly
+_STEP, _MOST_VARIANCE = 0.3, 4.0  # of differences in the logarithm of a correlation time; variance of that which is counted at most
+
+
+class Problem:
+    """Residuals with their derivatives, of any members at any numbers."""
+
+    def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss):
+        self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
+        self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
+        self.share = 1.0  # of each run's span, from its start: samples beyond do not count
+        self.begun = np.zeros((0, 0))  # first guesses of the members, where spans grow
+        self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
+        self.tau = np.zeros((lanes.members or 1, len(self.with_memory)))  # s, of these: at first as if their noise were white
+
+    def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
+        """Correlation times of some members, by channel, s."""
+        found = self.tau[members if self.lanes.members else np.zeros(len(members), int)]
+        return dict(zip(self.with_memory, found.T, strict=True))
+
+    def linearised(self, theta: np.ndarray, members: np.ndarray) -> Linearised:
+        """What is minimised, with its arrow, of some members."""
+        return self._assembled(theta, members, self.lanes.evaluate(*self.unknowns.split(theta), members), self.taus(members))
+
+    def _assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable, taus: dict[str, np.ndarray]) -> Linearised:
+        """The same from what was evaluated; `taus`: correlation times by channel, of these members."""
+        shared, local = self.unknowns.split(theta)
+        (count, runs, m), p, kinds = local.shape, shared.shape[1], 1 + len(self.estimated)
+        triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
+        cost, squares, samples = np.zeros(count), np.zeros((count, kinds)), self.lanes.counted(self.estimated, members)
+        residual = np.empty((count, runs), object)
+        for b, j, plain, plain_J in evaluated:
+            r, J = self.lanes.whitened(j, members[b], plain, plain_J, {name: tau[b] for name, tau in taus.items()})
+            if self.share < 1:
+                early = self.lanes.within(j, self.share)
+                r, J = np.where(early, r, 0.0), np.where(early[..., None], J, 0.0)
+            with np.errstate(over="ignore", invalid="ignore"):
+                for k, (rows, counted) in enumerate(self._kinds(int(j[0]), r)):
+                    root = np.sqrt(self.loss.weight(rows))
+                    triangles[b, j, k] = triangle(root * rows, root[..., None] * J[:, counted])
+                    np.add.at(squares, (b, k), np.sum(rows**2, axis=1))
+                    if k == 0:
+                        np.add.at(cost, b, self.loss.value(rows))
+            for place, one in zip(zip(b, j, strict=True), plain, strict=True):
+                residual[place] = one
+            if count == 1 and not np.all(np.isfinite(triangles[b, j])):  # whatever the other runs say
+                triangles.fill(np.nan)
+                break
+        sigma = np.sqrt(np.maximum(squares[:, 1:] / samples, _LEAST_SIGMA**2))
+        cost = cost + np.sum(samples * np.log(sigma), axis=1)
+        mean, spread = self._known_before(theta, members)
+        with_mean = np.isfinite(mean)
+        cost = cost + 0.5 * np.sum(np.where(with_mean, (theta - np.where(with_mean, mean, 0.0)) / spread, 0.0) ** 2, axis=1)
+        finite = np.isfinite(triangles).all(axis=(1, 2, 3, 4)) & np.isfinite(cost)
+        scaled = np.where(finite[:, None, None, None, None], triangles, 0.0) / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
+        together = scaled[:, :, 0] if kinds == 1 else np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
+        whole = arrow(together, m)
+        return Linearised(np.where(finite, cost, np.inf), with_prior(whole, theta, mean, spread) if with_mean.any() else whole, residual, sigma)
+
+    def _known_before(self, theta: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and standard deviation of priors, (members, unknowns); NaN where there is none.
+
+        Over part of the span the first guess is a weak prior, known to its own size: what so few samples do not tell stays there.
+        """
+        mean, spread = (np.broadcast_to(x, theta.shape) for x in (self.unknowns.prior_mean, self.unknowns.prior_sigma))
+        if self.share == 1:
+            return mean, spread
+        begun = self.begun[members]
+        none = ~np.isfinite(mean) & ~self.unknowns.fixed
+        return np.where(none, begun, mean), np.where(none, self.unknowns.sizes(begun), spread)
+
+    def restrict(self, theta: np.ndarray, members: np.ndarray) -> np.ndarray:
+        """Puts correlation times that are not known to where the restricted likelihood is largest; by how much rho over one shortest interval changed."""
+        evaluated = list(self.lanes.evaluate(*self.unknowns.split(theta), members))
+        ends = {name: correlation_limits([np.asarray(run.ts) for run in self.runs if name in run.values]) for name in self.with_memory}
+        taus, changed = {name: np.maximum(tau, ends[name][0]) for name, tau in self.taus(members).items()}, np.zeros(len(members))
+        for name, (low, high) in ends.items():
+            edges = (np.full(len(members), np.log(x)) for x in (low, high))
+            tried = lambda x, name=name: self._restricted(theta, members, evaluated, taus | {name: np.exp(x)})[0]  # noqa: E731
+            found, interval = np.exp(lowest(tried, *edges)), low / SHORTEST
+            changed = np.maximum(changed, np.abs(np.exp(-interval / found) - np.exp(-interval / taus[name])))
+            taus[name] = found
+        self.tau[members if self.lanes.members else np.zeros(len(members), int)] = np.stack(list(taus.values()), axis=1)
+        return changed
+
+    def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: dict[str, np.ndarray]) -> tuple[np.ndarray, Linearised]:
+        """What the restricted likelihood is made of, to be as low as possible."""
+        at, logs = self._assembled(theta, members, evaluated, taus), np.zeros(len(members))
+        for b, j, _, _ in evaluated:
+            np.add.at(logs, b, self.lanes.log_widths(j, members[b], {n: tau[b] for n, tau in taus.items()}))
+        return at.cost + logs + half_log_determinant(at.arrow, self.unknowns.sizes(theta)), at
+
+    def doubt(self, theta: np.ndarray, errors: Callable[[Arrow], np.ndarray]) -> np.ndarray:
+        """Variance of the logarithm of each squared standard error that comes from correlation times which are estimated: `sum (d log C / d log tau)^2 / F''`.
+
+        `errors`: standard errors (members, unknowns) of an arrow. Zero where no correlation time is estimated.
+        """
+        if not self.with_memory:
+            return np.zeros(1)
+        members, found = np.arange(len(theta)), np.zeros(1)
+        evaluated, taus = list(self.lanes.evaluate(*self.unknowns.split(theta), members)), self.taus(members)
+        for name in self.with_memory:
+            left, middle, right = (self._restricted(theta, members, evaluated, taus | {name: np.exp(k * _STEP) * taus[name]}) for k in (-1, 0, 1))
+            curvature = np.maximum((left[0] - 2 * middle[0] + right[0]) / _STEP**2, 1 / _MOST_VARIANCE)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                slope = np.log(errors(right[1].arrow) / errors(left[1].arrow)) / _STEP
+            found = found + np.where(np.isfinite(slope), slope, 0.0) ** 2 / curvature[:, None]
+        return found
+
+    @property
+    def samples(self) -> int:
+        """How many samples there are of channels whose sigma is known, in one repeat."""
+        channels = [(run, name) for i, run in enumerate(self.runs) for name in run.values if name not in self.estimated]
+        return sum(int(np.prod(np.shape(run.values[name])[int(self.lanes.members is not None) :])) for run, name in channels)
+
+    def by_channel(self, run: int, found: Minimum, one: Callable, white: bool = False) -> dict[str, np.ndarray]:
+        """Residuals of a run in units of sigma by channel; NaN where a sample is missing, or they were not worked out since another run had failed.
+
+        `white`: whitened ones.
+        """
+        flat = [np.zeros(0) if r is None else r for r in found.at.residual[:, run]]
+        longest = max(map(len, flat))
+        whole = np.stack([np.full(longest, np.nan) if len(r) < longest else r for r in flat])
+        members = np.arange(len(whole))
+        if white and longest:
+            whole, _ = self.lanes.whitened(np.full(len(whole), run), members, whole, None, self.taus(members))
+        parts = self.lanes.by_channel(run, one(whole))
+        for k, name in enumerate(self.estimated):
+            if name in parts:
+                sigma = one(found.at.sigma[:, k])
+                parts[name] = parts[name] / sigma.reshape(sigma.shape + (1,) * (parts[name].ndim - sigma.ndim))
+        return parts
+
+    def inflation(self, residuals, samples, rank) -> np.ndarray:
+        """By what the covariance of each member is to be multiplied: for the loss, and for sigmas that are estimated."""
+        members = self.lanes.members or 1
+        by_member = [np.concatenate([r.reshape(members, -1)[b] for run in residuals for r in run.values()]) for b in range(members)]
+        of_loss = np.array([self.loss.inflation(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in by_member])
+        left = np.maximum(samples - rank, 1)
+        return of_loss * np.broadcast_to(samples / left if self.all_estimated else 1.0, (members,))
+
+    @property
+    def all_estimated(self) -> bool:
+        """Whether no sigma is known."""
+        return bool(self.estimated) and all(set(run.values) <= set(self.estimated) for run in self.runs)
+
+    def _kinds(self, run: int, r: np.ndarray):
+        """Residuals and their places: those of channels whose sigma is known, then those of each other channel."""
+        if not self.estimated:
+            yield r, slice(None)
+            return
+        channels = self.lanes.channels(run)
+        known = [np.arange(r.shape[1])[where] for name, where in channels.items() if name not in self.estimated]
+        for counted in (np.concatenate([np.zeros(0, int), *known]), *(np.arange(r.shape[1])[channels.get(name, slice(0))] for name in self.estimated)):
+            yield r[:, counted], counted

@@ -1,0 +1,147 @@
+"""Noise with a memory: whitening against the dense covariance, correlation times known and estimated, and advice on bad input."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import chaplygin_sleigh as sleigh_oracle
+
+import jourdain_jax as jj
+from jourdain_jax.analysis.correlated_noise import lowest
+
+SIGMA, TAU = 0.02, 0.4  # m, rad; s: neighbours at 0.1 s correlate at 0.78
+TS = np.linspace(0.0, 8.0, 41)
+GUESS = jj.models.ChaplyginSleigh(inertia=0.45, offset=0.28)
+START = {"x_rate": -0.6, "heading_rate": 0.9}
+TRUTH = {"inertia": 0.4, "offset": 0.25}
+
+
+def coloured(generator, ts, tau, shape=()) -> np.ndarray:
+    """Draws of a process of variance one with covariance exp(-|t - t'| / tau), by a Cholesky factor."""
+    factor = np.linalg.cholesky(np.exp(-np.abs(ts[:, None] - ts) / tau))
+    return generator.normal(size=(*shape, len(ts))) @ factor.T
+
+
+def sleigh_run(seed: int, correlation_time, sigma=SIGMA, ts=TS, repeats=(), missing=()) -> jj.Measurements:
+    motion = sleigh_oracle.motion(ts, mass=1.3, inertia=0.4, a=0.25, v0=-0.6, w0=0.9)
+    generator = np.random.default_rng(seed)
+    values = {name: motion[key] + SIGMA * coloured(generator, ts, TAU, repeats) for name, key in (("x", "x"), ("y", "y"), ("heading", "th"))}
+    values["x"][..., list(missing)] = np.nan
+    return jj.Measurements(ts, values, sigma, start=START, correlation_time=correlation_time)
+
+
+UNEVEN = np.cumsum(np.random.default_rng(3).uniform(0.02, 0.5, 30))
+
+
+@pytest.mark.parametrize("tau", [0.05, 0.9, 30.0])
+def test_the_likelihood_is_the_dense_normal_one_at_uneven_times_and_across_gaps(tau):
+    motion = sleigh_oracle.motion(UNEVEN - UNEVEN[0], mass=1.3, inertia=0.4, a=0.25, v0=-0.6, w0=0.9)
+    e = SIGMA * coloured(np.random.default_rng(0), UNEVEN, 0.9)
+    known = np.ones(30, bool)
+    known[[0, 7, 8, 20]] = False
+    data = jj.Measurements(UNEVEN, {"x": np.where(known, motion["x"] + e, np.nan)}, SIGMA, start=START, correlation_time=tau)
+    truth = jj.models.ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)
+    ts, r = UNEVEN[known], e[known]
+    V = SIGMA**2 * np.exp(-np.abs(ts[:, None] - ts) / tau)
+    expected = -0.5 * r @ np.linalg.solve(V, r) - 0.5 * np.linalg.slogdet(2 * np.pi * V)[1]
+    # the simulation's error of 1e-8 m is multiplied where neighbours nearly agree
+    assert float(jj.log_likelihood(truth, data, rtol=1e-10, atol=1e-10)) == pytest.approx(expected, abs=1e-4 * abs(expected))
+
+
+def test_the_likelihood_has_finite_derivatives_in_a_correlation_time_with_missing_samples():
+    values = sleigh_run(0, 0.0, missing=(0, 5, 6)).values
+
+    def density(tau):
+        return jj.log_likelihood(GUESS, jj.Measurements(TS, values, SIGMA, start=START, correlation_time={"x": tau, "heading": 0.5}))
+
+    slope = float(jax.grad(density)(0.7))
+    assert slope == pytest.approx(float(density(0.7 + 1e-4) - density(0.7 - 1e-4)) / 2e-4, rel=1e-5)
+    assert np.isfinite(float(jax.grad(density)(0.0)))
+
+
+def test_a_known_correlation_time_gives_the_generalised_least_squares_of_the_dense_covariance():
+    data = sleigh_run(1, TAU, missing=(3, 4, 17))
+    found = jj.fit(GUESS, data, ("inertia", "offset"))
+
+    def predicted(theta):
+        motion = jj.simulate(GUESS.replace(inertia=theta[0], offset=theta[1]), START, ts=TS)
+        return jnp.stack([motion[name] for name in ("x", "y", "heading")])
+
+    h = 1e-5
+    slopes = [(predicted(found.values + h * d) - predicted(found.values - h * d)) / (2 * h) for d in np.eye(2)]
+    information, gradient, chi_square = np.zeros((2, 2)), np.zeros(2), 0.0
+    at = np.asarray(predicted(found.values))
+    for k, name in enumerate(("x", "y", "heading")):
+        known = np.isfinite(np.asarray(data.values[name]))
+        V = SIGMA**2 * np.exp(-np.abs(TS[known][:, None] - TS[known]) / TAU)
+        J, r = np.stack([np.asarray(s)[k][known] for s in slopes], axis=1), at[k][known] - np.asarray(data.values[name])[known]
+        information += J.T @ np.linalg.solve(V, J)
+        gradient += J.T @ np.linalg.solve(V, r)
+        chi_square += r @ np.linalg.solve(V, r)
+    np.testing.assert_allclose(found.covariance, np.linalg.inv(information), rtol=1e-3)
+    np.testing.assert_allclose(float(found.chi_square), chi_square, rtol=1e-4)
+    assert np.all(np.abs(np.linalg.solve(information, gradient)) < 1e-3 * found.standard_errors)
+
+
+@pytest.mark.parametrize("sigma", [SIGMA, None], ids=["sigmas known", "sigmas estimated"])
+def test_a_memory_of_the_noise_is_found_and_the_warning_goes(sigma):
+    ts = np.linspace(0.0, 8.0, 161)
+    white = jj.fit(GUESS, sleigh_run(2, 0.0, sigma, ts), ("inertia", "offset"))
+    found = jj.fit(GUESS, sleigh_run(2, None, sigma, ts, missing=(7, 8, 9)), ("inertia", "offset"))
+    assert "not white" in white.warning and "correlation_time" in white.warning
+    assert found.converged and not found.warning
+    for name, tau in found.correlation_time.items():
+        assert TAU / 3 < float(tau) < 3 * TAU, name
+    assert "correlation time of the noise of `x`, estimated" in str(found)
+    for name, truth in TRUTH.items():
+        assert found[name].low < truth < found[name].high
+        assert found[name].standard_error > 1.5 * white[name].standard_error
+    assert np.isnan(found.whitened[0]["x"][7:10]).all() and np.isfinite(found.whitened[0]["x"][10])
+
+
+def test_white_noise_gets_a_correlation_time_far_below_the_intervals():
+    generator = np.random.default_rng(5)
+    ts = np.linspace(0.0, 8.0, 161)
+    motion = sleigh_oracle.motion(ts, mass=1.3, inertia=0.4, a=0.25, v0=-0.6, w0=0.9)
+    values = {"x": motion["x"] + SIGMA * generator.normal(size=161), "heading": motion["th"] + SIGMA * generator.normal(size=161)}
+    fits = [jj.fit(GUESS, jj.Measurements(ts, values, SIGMA, start=START, correlation_time=tau), ("inertia", "offset")) for tau in (0.0, None)]
+    assert max(float(tau) for tau in fits[1].correlation_time.values()) < 0.036  # neighbours at 0.05 s: a correlation of 0.25, three standard deviations
+    np.testing.assert_allclose(fits[1].values, fits[0].values, atol=0.5 * float(np.min(fits[0].standard_errors)))
+
+
+def test_intervals_cover_the_truth_where_noise_has_a_memory():
+    data = sleigh_run(6, None, None, ts=np.linspace(0.0, 16.0, 161), repeats=(150,))
+    found = jj.fit_batch(GUESS, data, ("inertia", "offset"))
+    assert np.mean(found.converged) > 0.98
+    for name, truth in TRUTH.items():
+        share = np.mean((found[name].low < truth) & (truth < found[name].high))
+        assert 0.89 <= share <= 0.995, name  # of 150, three standard deviations about 95 %
+    one = jj.Measurements(data.ts, {name: x[4] for name, x in data.values.items()}, None, start=START, correlation_time=None)
+    single = jj.fit(GUESS, one, ("inertia", "offset"))
+    assert np.all(np.abs(single.values - found.values[4]) < 0.02 * single.standard_errors)
+
+
+def test_golden_section_finds_the_lowest_of_each():
+    at = np.array([0.3, -1.2, 4.0])
+    np.testing.assert_allclose(lowest(lambda x: (x - at) ** 2, np.full(3, -5.0), np.full(3, 5.0)), at, atol=1e-3)
+
+
+def one(correlation_time) -> jj.Measurements:
+    return jj.Measurements(TS, {"x": np.zeros(41)}, SIGMA, start=START, correlation_time=correlation_time)
+
+
+@pytest.mark.parametrize(
+    ("call", "advice"),
+    [
+        (lambda: one({"y": 0.1}), "`correlation_time` names channel `y`, which has no values"),
+        (lambda: one(-0.1), "the correlation time of channel `x` is -0.1 s, expected zero or more"),
+        (lambda: one(np.inf), "the correlation time of channel `x` is inf s"),
+        (lambda: one(np.ones(41)), "correlation time of channel `x`"),
+        (lambda: jj.fit(GUESS, [one(None), one(0.1)], "offset"), "correlation time of channel `x` is None in one run and given in another"),
+        (lambda: jj.fit(GUESS, one(0.1), "offset", loss=jj.huber()), "a robust loss takes samples as independent"),
+        (lambda: jj.log_likelihood(GUESS, one(None)), "the correlation time of channel `x` is None, but a likelihood needs to know it"),
+    ],
+)
+def test_bad_input_gets_advice(call, advice):
+    with pytest.raises(ValueError, match=advice.replace("(", r"\(")):
+        call()
