@@ -394,12 +394,11 @@ def logs(first: int = 0) -> list[Figure]:
     delay = jj.Estimate(0.01, range=jj.bounds(0.0, MOST_DELAY))
     late = {"lean_rate": {"delay": delay}, "steer_rate": {"delay": delay}}
     runs, found = windows(), []
-    lag = {"lag": jj.Estimate(MOTOR_LAG, range=jj.bounds(0.005, 0.3))}
     cases = (
         ("ideal sensors", {}, {}, 0.0, FOR_LOGS),
         ("delays of both sensors", late, {}, 0.0, FOR_LOGS),
         ("delays of both sensors, motor lag", late, {"lag": MOTOR_LAG}, 0.0, FOR_LOGS),
-        ("delays of both sensors, motor lag estimated, noise with a memory, priors", late, lag, None, WITH_PRIORS),
+        ("delays of both sensors, motor lag, noise with a memory, priors", late, {"lag": MOTOR_LAG}, None, WITH_PRIORS),
     )
     for what, sensors, actuator, memory, free in cases[first:]:
         halves = []

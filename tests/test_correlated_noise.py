@@ -88,15 +88,18 @@ def test_a_memory_of_the_noise_is_found_and_the_warning_goes(sigma):
     ts = np.linspace(0.0, 8.0, 161)
     white = jj.fit(GUESS, sleigh_run(2, 0.0, sigma, ts), ("inertia", "offset"))
     found = jj.fit(GUESS, sleigh_run(2, None, sigma, ts, missing=(7, 8, 9)), ("inertia", "offset"))
-    assert "not white" in white.warning and "correlation_time" in white.warning
-    assert found.converged and not found.warning
+    assert "not white" in white.warning
+    assert "correlation_time" in white.warning
+    assert found.converged
+    assert not found.warning
     for name, tau in found.correlation_time.items():
         assert TAU / 3 < float(tau) < 3 * TAU, name
     assert "correlation time of the noise of `x`, estimated" in str(found)
     for name, truth in TRUTH.items():
         assert found[name].low < truth < found[name].high
         assert found[name].standard_error > 1.5 * white[name].standard_error
-    assert np.isnan(found.whitened[0]["x"][7:10]).all() and np.isfinite(found.whitened[0]["x"][10])
+    assert np.isnan(found.whitened[0]["x"][7:10]).all()
+    assert np.isfinite(found.whitened[0]["x"][10])
 
 
 def test_white_noise_gets_a_correlation_time_far_below_the_intervals():

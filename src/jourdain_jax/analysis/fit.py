@@ -166,15 +166,16 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
 
 
 def _with_memory(problem: Problem, found: Minimum, limits: Limits, control: Control) -> Minimum:
-    """The minimum with the correlation times of the noise estimated: these and the unknowns take turns, from a minimum as if the noise were white."""
-    going = np.flatnonzero(found.converged) if problem.with_memory else np.zeros(0, int)
+    """The minimum with the correlation times of the noise estimated: these and the unknowns take turns, from what was found as if the noise were white."""
+    going = np.flatnonzero(np.isfinite(found.at.cost)) if problem.with_memory else np.zeros(0, int)
+    some = replace(control, most_steps=min(_STEPS, control.most_steps))
     for _ in range(_TURNS):
         if not going.size:
             break
         changed = problem.restrict(found.theta[going], going)
-        again = minimise(lambda x, here, going=going: problem.linearised(x, going[here]), found.theta[going], limits, control)
+        again = minimise(lambda x, here, going=going: problem.linearised(x, going[here]), found.theta[going], limits, some)
         found = found.replaced(going, again)
-        going = going[(changed > _SETTLED) & again.converged]
+        going = going[(changed > _SETTLED) | ~again.converged]
     found.converged[going] = False
     return found
 
@@ -196,9 +197,7 @@ def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:
             raise ValueError(f"sigma of channel `{name}` is None in one run and given in another; give it in all runs, or in none")
     coloured = sorted({name for run in runs for name in run.correlation_time})
     if coloured and loss is not None:
-        raise ValueError(
-            f"the noise of channel `{coloured[0]}` has a correlation time, but a robust loss takes samples as independent; leave out one of the two"
-        )
+        raise ValueError(f"the noise of channel `{coloured[0]}` has a correlation time, but a robust loss takes samples as independent; leave out either")
     for name in sorted({name for run in runs for name in run.unknown_correlation}):
         if any(name in run.values and name not in run.unknown_correlation for run in runs):
             raise ValueError(f"the correlation time of channel `{name}` is None in one run and given in another; give it in all runs, or in none")

@@ -33,7 +33,8 @@ def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **
     """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
     Differentiable in scene, start values, measured values, sigmas and numbers of sensors and actuators (reverse mode, unless `adjoint` says
-    otherwise) and in known correlation times of the noise; -inf where the motion fails. `simulation`: options of `simulate`. Missing samples (NaN, or an infinite sigma) do not count.
+    otherwise) and in known correlation times of the noise;
+    -inf where the motion fails. `simulation`: options of `simulate`. Missing samples (NaN, or an infinite sigma) do not count.
 
         jax.grad(lambda a: jj.log_likelihood(sleigh.replace(offset=a), data))(0.25)
 

@@ -154,17 +154,16 @@ class Lanes:
 
     def whitened(self, runs: np.ndarray, members: np.ndarray, r, J, taus: dict[str, np.ndarray]) -> tuple:
         """Residuals and Jacobians (None: none) of lanes of equal structure, whitened; `taus`: correlation times (lanes,) that are estimated, s."""
-        group = self._group_of(int(runs[0]))
-        if group.chains is None:
+        before, rho = self._group_of(int(runs[0])).chained(runs, members, taus)
+        if before is None:
             return r, J
-        before, rho = group.chained(runs, members, taus)
         w = whitened(r, np.take_along_axis(r, before, axis=1), rho)
         return w, None if J is None else whitened(J, np.take_along_axis(J, before[..., None], axis=1), rho[..., None])
 
     def log_widths(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> Float[np.ndarray, "lanes"]:
         """`sum log sqrt(1 - rho^2)` of lanes of equal structure."""
-        group = self._group_of(int(runs[0]))
-        return np.zeros(len(runs)) if group.chains is None else 0.5 * np.sum(np.log1p(-(group.chained(runs, members, taus)[1] ** 2)), axis=1)
+        _, rho = self._group_of(int(runs[0])).chained(runs, members, taus)
+        return 0.5 * np.sum(np.log1p(-(rho**2)), axis=1)
 
     def by_channel(self, run: int, flat: Float[np.ndarray, "*members samples"]) -> dict[str, np.ndarray]:
         """Weighted residuals of a run by channel, NaN where a sample is missing."""
@@ -243,8 +242,10 @@ class _Group:
         """Weights by channel, shape (runs, *members, times, *channel)."""
         return self._arrays.weights
 
-    def chained(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Of each sample of lanes, the place of the one before it and their correlation."""
+    def chained(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> tuple[np.ndarray | None, np.ndarray]:
+        """Of each sample of lanes, the place of the one before it (None: all noise is white) and their correlation."""
+        if self.chains is None:
+            return None, np.zeros((len(runs), 1))
         places = [self.indices.index(run) for run in runs.tolist()]
         return self.chains.at(places, None if self._members is None else members, taus)
 

@@ -1,12 +1,13 @@
 """What a fit minimises: residuals of all runs with their derivatives, whitened and weighted, at any numbers.
 
-F = sum rho(w) + sum n log sigma + sum ((theta - mean) / s)^2 / 2        w: whitened residuals (see `correlated_noise`); sigma^2 = mean w^2 where it is not known
+F = sum rho(w) + sum n log sigma + sum ((theta - mean) / s)^2 / 2        w: whitened residuals (see `correlated_noise`)
+
+sigma^2 = mean w^2 of each channel whose sigma is not known; mean, s: of priors
 """
 
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from jaxtyping import Float
 
 from jourdain_jax.analysis.arrow import Arrow, arrow, triangle, with_prior
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
