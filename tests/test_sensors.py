@@ -432,6 +432,7 @@ def test_the_page_on_identification_runs(capsys):
     assert found.converged
     for name, value in (("gyro.gain", 1.1), ("gyro.delay", 0.05), ("run 0: gyro.bias", 0.02), ("offset", 0.25)):
         assert abs(found[name].value - value) < 4 * found[name].standard_error + 1e-3, name
+    assert 0.05 < names["wider"].correlation_time["x"] < 0.9  # s; 0.22 s is true
 
 
 # Bad input. -----------------------------------------------------------------------------------------------------------------
