@@ -348,7 +348,7 @@ def of_windows() -> list[Figure]:
 
 
 class FlatFrame(SteerByWire):
-    """The same with a rear frame that is nearly flat: IByy, which does not enter the equations of an upright bicycle, follows IBxx and IBzz."""
+    """A bicycle with a rear frame that is nearly flat: IByy, which does not enter the equations of an upright bicycle, follows IBxx and IBzz."""
 
     def bodies(self, t, q):
         return SteerByWire.bodies(self.replace(IByy=0.95 * (self.IBxx + self.IBzz)), t, q)

@@ -248,7 +248,7 @@ def residuals(recipe: Recipe, found: dict) -> dict[str, np.ndarray]:
 
 
 def _of_views(found: dict) -> dict[str, np.ndarray]:
-    """The same motion, seen differently, by every reduction."""
+    """One motion, seen differently, by every reduction."""
     seen = found["seen"]
     names, _ = views(1, 1)
     out = {}

@@ -297,7 +297,7 @@ class Generated(jj.Scene):
 
 
 class GeneratedWithOwnSpeeds(Generated):
-    """The same with quasi-velocities: rates `w = W(q) u (+ w_0(t, q))`, W unit lower triangular."""
+    """A generated scene with quasi-velocities: rates `w = W(q) u (+ w_0(t, q))`, W unit lower triangular."""
 
     @property
     def speeds(self):

@@ -85,7 +85,7 @@ def rolling_disc():
 
 
 def slipping_disc():
-    """The same with two dependent speeds of the contact point, held at zero by rows; its spin has a speed and no angle."""
+    """A disc with two dependent speeds of the contact point, held at zero by rows; its spin has a speed and no angle."""
     q1, q2, u1, u2, u3, u4, u5 = dynamicsymbols("q1 q2 u1 u2 u3 u4 u5")
     N, Y, L = _leaning(q1, q2)
     R = ReferenceFrame("R")

@@ -3,6 +3,7 @@
 import inspect
 import re
 import textwrap
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -96,6 +97,12 @@ def test_an_undocumented_argument_would_be_seen():
         """A function of a `scene`."""
 
     assert _unsaid(wanting) == ["stiffness"]
+
+
+def test_no_docstring_leaves_its_subject_to_the_one_above():
+    root = Path(__file__).parents[1]
+    begins = re.compile('""' + '"The same')
+    assert [str(path) for folder in ("src", "bench", "tests") for path in (root / folder).rglob("*.py") if begins.search(path.read_text())] == []
 
 
 def test_the_package_lists_every_public_name_once():

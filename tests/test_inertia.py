@@ -24,7 +24,7 @@ class Weightless(jj.Scene):
 
 
 class Geared(Weightless):
-    """The same with y geared to x by a row: `y_rate = 2 x_rate`."""
+    """A bead whose y is geared to x by a row: `y_rate = 2 x_rate`."""
 
     def velocity_constraints(self, motion):
         return {"gear": motion.u.y_rate - 2.0 * motion.u.x_rate}

@@ -37,7 +37,7 @@ class BodyPendulum(jj.Scene):
 
 
 class PendulumInAngle(jj.Scene):
-    """The same in its one angle."""
+    """A pendulum in its one angle."""
 
     mass: jnp.ndarray = jj.parameter(1.2, unit="kg", positive=True)
     length: jnp.ndarray = jj.parameter(0.8, unit="m", positive=True)

@@ -77,7 +77,7 @@ _asked.defjvp(lambda x, dx: (_asked(*x), -jnp.cos(x[0]) * dx[0]))
 
 
 def by_asking_with_rule(x, numbers):
-    """The same with its derivative, to any order."""
+    """A function in Python with its derivative, to any order."""
     return numbers[0] * _asked(x)
 
 

@@ -104,7 +104,7 @@ class Bowl(jj.Scene):
 
 
 class BowlInItsDomain(Bowl):
-    """The same, with the domain that the page states."""
+    """The ball in a bowl with the domain that the page states."""
 
     domain = {"x": (-0.15, 0.15), "y": (-0.15, 0.15)}
 

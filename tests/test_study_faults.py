@@ -294,6 +294,24 @@ def _wait_for(process, path, count):
         time.sleep(1e-3)
 
 
+def _workers(process):
+    return [other for other in psutil.Process(process.pid).children() if "spawn_main" in " ".join(other.cmdline())]
+
+
+@pytest.mark.slow
+def test_workers_end_with_a_run_that_is_killed_while_they_start(tmp_path):
+    process = _started(tmp_path, "discs.zarr", 2)
+    workers = []
+    while process.poll() is None and not any(worker.cpu_times().user > 0.5 for worker in workers):  # until one has begun to import
+        time.sleep(1e-2)
+        workers = _workers(process)
+    process.kill()
+    process.wait()
+    _, alive = psutil.wait_procs(workers, timeout=60.0)
+    assert not alive
+    assert _chunks(tmp_path / "discs.zarr") == 0
+
+
 @pytest.mark.slow
 def test_runs_and_workers_that_are_killed_lose_and_repeat_nothing(tmp_path):
     """Twenty times, at random moments: every other time the run itself, otherwise one of its workers."""
@@ -304,7 +322,7 @@ def test_runs_and_workers_that_are_killed_lose_and_repeat_nothing(tmp_path):
         time.sleep(generator.uniform(0.0, 0.05))
         assert process.poll() is None
         if kill % 2:
-            workers = [other for other in psutil.Process(process.pid).children() if "spawn_main" in " ".join(other.cmdline())]
+            workers = _workers(process)
             workers[int(generator.integers(len(workers)))].kill()
             _wait_for(process, path, _chunks(path) + 4)
         process.kill()

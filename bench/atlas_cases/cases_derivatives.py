@@ -44,7 +44,7 @@ def along_an_axis() -> DerivativeOfAccelerations:
 
 
 def dependent() -> DerivativeOfAccelerations:
-    """The same with the row three times, at heading 0.4."""
+    """An edge stated by three equal rows, at heading 0.4."""
     scene, v, w, pull = Edges(), 0.7, 1.3, 9.81 * np.sin(0.3)
 
     def state(h):

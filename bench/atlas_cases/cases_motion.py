@@ -132,7 +132,7 @@ def celt_on_edge(scale: float = 1.0, w0=(2.0, 1.0, -3.0)) -> Motion:
 
 
 def celt_on_edge_in_angles() -> Motion:
-    """The same in the usual angles."""
+    """The rattleback set on its long edge in the usual angles, which are singular there."""
     scene, ts = jj.models.Rattleback(), np.linspace(0.0, 0.5, 6)
     compare = _celt_error(ts, (2.0, 1.0, -3.0))
 

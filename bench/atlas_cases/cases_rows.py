@@ -174,7 +174,7 @@ def cone_from_rest() -> Motion:
 
 
 def cone_in_motion() -> Motion:
-    """The same falling: a straight line with `sdotdot = g k/(1 + k^2)` (from Chetaev's rule, which gives the row the force 2 lambda (v, -k^2 zdot))."""
+    """Appell and Hamel's row, falling: a straight line with `sdotdot = g k/(1 + k^2)`, for Chetaev's rule gives the row the force 2 lambda (v, -k^2 zdot)."""
     scene, k, s0 = AppellHamel(), 0.8, 0.5
     ts = np.linspace(0.0, 2.0, 6)
     path = s0 * ts + 9.81 * k / (1 + k**2) * ts**2 / 2

@@ -84,7 +84,7 @@ class Motion:
             return jj.simulate(self.scene, self.start, ts=self.ts, **self.tolerances, **{**self.options, **method.options(self.scene), **steps})
 
     def _rollout(self):
-        """The same twice, as a batch."""
+        """Two equal lanes of a batch; the second one."""
         state = self.start if isinstance(self.start, jj.State) else jj.start(self.scene, **self.start)
         leaves = {name: jnp.stack([getattr(state, name)] * 2) for name in ("t", "q", "u", "moved_q", "moved_u", "residual")}
         lanes = jj.State(**leaves, names=state.names)

@@ -85,7 +85,7 @@ def svd_basis(A, rank: int):
 
 
 def qr_basis(A, rank: int):
-    """The same from an unpivoted QR decomposition."""
+    """Null space from an unpivoted QR decomposition."""
     return jnp.linalg.qr(A.T, mode="complete")[0][:, rank:]
 
 

@@ -111,7 +111,7 @@ class Robot(jj.Scene):
 
 
 class RobotAhead(Robot):
-    """The same, headings near zero expected."""
+    """A robot whose headings are expected near zero."""
 
     domain = {"heading": (-0.4, 0.4)}
 
@@ -231,7 +231,7 @@ class SampledWagon(Wagon):
 
 
 class CarriedPendulum(jj.Scene):
-    """The same as a pose that is a function of time."""
+    """A pendulum on a cart whose pose is a function of time."""
 
     coordinates = jj.coordinates("angle")
     size: object = jj.parameter(0.3, unit="m")

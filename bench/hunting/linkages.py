@@ -162,7 +162,7 @@ def starting(branch, pins: bool):
 
 
 def _jax_branch(branch, m):
-    """The same formulas on JAX's numbers."""
+    """The formulas of a branch on JAX's numbers."""
     import types
 
     space = types.FunctionType(branch.__code__, {**branch.__globals__, "np": jnp})

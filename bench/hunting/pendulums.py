@@ -68,7 +68,7 @@ ROD = {
 
 
 class SphericalPendulum(RodPendulum):
-    """The same in space."""
+    """A rod pendulum in space."""
 
     coordinates = jj.coordinates("x y z")
     domain = {"x": (-0.4, 0.4), "y": (-0.4, 0.4), "z": (-1.0, -0.8)}
@@ -111,7 +111,7 @@ class BeadOnRing(jj.Scene):
 
 
 class BeadOnWideRing(BeadOnRing):
-    """The same, its domain all around."""
+    """A bead on a ring, its domain all around."""
 
     domain = {"x": (-1.0, 1.0), "y": (-1.0, 1.0), "s": (-3.2, 3.2)}
 

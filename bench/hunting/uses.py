@@ -148,7 +148,7 @@ class LateRow(jj.Scene):
 
 
 class ElsewhereRow(LateRow):
-    """The same beyond a place in the place of a time."""
+    """A row that sets in beyond a place instead of a time."""
 
     def velocity_constraints(self, motion):
         u, more = motion.u, jnp.maximum(motion.q.x - self.late, 0.0)

@@ -77,7 +77,7 @@ def motion(t, *, mass, radius, gravity, theta, psi=0.0, phi=0.0, w1, w2, w3, x0=
 def motion_yaw_lean_spin(
     t, *, mass, radius, gravity, yaw, lean, spin, yaw_rate, lean_rate, spin_rate, x0=0.0, y0=0.0, inertia=None, t_end=None
 ) -> dict[str, np.ndarray]:
-    """The same motion from and in yaw, lean, spin (the last are keys beside those of `motion`)."""
+    """The motion from and in yaw, lean, spin (the last are keys beside those of `motion`)."""
     theta = LONG(np.pi) / 2 + LONG(lean)  # pi/2 of double precision: cos(theta) = -sin(lean) to 6e-17
     result = motion(
         t,

@@ -43,7 +43,7 @@ class Problem:
         return self._assembled(theta, members, self.lanes.evaluate(*self.unknowns.split(theta), members), self.taus(members))
 
     def _assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable, taus: dict[str, np.ndarray]) -> Linearised:
-        """The same from what was evaluated; `taus`: correlation times by channel, of these members."""
+        """What is minimised, from what was evaluated; `taus`: correlation times by channel, of these members."""
         shared, local = self.unknowns.split(theta)
         (count, runs, m), p, kinds = local.shape, shared.shape[1], 1 + len(self.estimated)
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))

@@ -152,7 +152,7 @@ def _text_lines(text: str, _: str) -> Iterator[tuple[int, str]]:
 
 
 def _yaml_lines(text: str, path: str) -> Iterator[tuple[int, str]]:
-    """The same of a set in YAML, written as in a text file: those of the section `values`, or all where there is none."""
+    """Numbers and content of the lines of a set in YAML, written as in a text file: those of the section `values`, or all where there is none."""
     lines = [(number, line.partition("#")[0].rstrip()) for number, line in enumerate(text.splitlines(), start=1)]
     has_section = any(line.partition(":")[0] == "values" for _, line in lines)
     inside = not has_section

@@ -9,18 +9,15 @@ import os
 import pickle
 import signal
 import threading
-import time
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from multiprocessing import connection, get_context, parent_process
 
 from jourdain_jax.ensembles.deadly_lanes import MOST_DEATHS, without_deadly_lanes
 from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
-
-_LOOK = 2.0  # s, between two looks whether the parent lives
 
 _asked: list[tuple[Task, Store]] = []  # of this worker, one
 _runner: list[Runner] = []  # made for its first chunk
@@ -102,8 +99,9 @@ def _pool(sent: bytes, store: Store, count: int) -> ProcessPoolExecutor:
 def _begin(sent: bytes, path: str, places) -> None:
     """Start a worker: its cores, no Ctrl-C (which is for the parent), an end with the parent's."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if parent := parent_process():
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True).start()
     keep_to_share(*places.get())
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     _asked.append((pickle.loads(sent), Store(path)))
 
 
@@ -117,8 +115,8 @@ def keep_to_share(place: int, count: int) -> None:
 
 
 def _end_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(_LOOK)
+    """End this process when its parent, a handle of the operating system, has ended, also where that was before this began."""
+    connection.wait([parent])
     os._exit(1)
 
 

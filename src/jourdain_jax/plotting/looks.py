@@ -32,7 +32,7 @@ class Look:
     radius: float  # m, of a line
 
     def at(self, chosen: np.ndarray) -> "Look":
-        """The same at the `chosen` times."""
+        """This look at the `chosen` times."""
         return Look(self.visual, self.positions[chosen], self.orientations[chosen], self.points[chosen], self.radius)
 
 
@@ -48,7 +48,7 @@ class DrawnBody:
     looks: list[Look]
 
     def at(self, chosen: np.ndarray) -> "DrawnBody":
-        """The same at the `chosen` times."""
+        """This body at the `chosen` times."""
         looks = [look.at(chosen) for look in self.looks]
         return DrawnBody(self.name, self.colour, self.positions[chosen], self.orientations[chosen], self.angular_velocities[chosen], looks)
 
@@ -65,7 +65,7 @@ class Drawn:
     sized: bool  # whether any body has a size of its own; particles are drawn as large as the picture asks
 
     def at(self, chosen: np.ndarray) -> "Drawn":
-        """The same at the `chosen` ones of its times."""
+        """This drawing at the `chosen` ones of its times."""
         bodies = {name: body.at(chosen) for name, body in self.bodies.items()}
         return Drawn(self.ts[chosen], self.reached[chosen], bodies, _at(self.contacts, chosen), self.size, self.sized)
 

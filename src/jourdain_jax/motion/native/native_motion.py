@@ -70,7 +70,7 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
 
 @lru_cache(maxsize=MOST_KERNELS)
 def _reason_against_program(form: Form) -> str:
-    """The same, of the program alone."""
+    """Why machine code cannot evaluate the program of a form, in words; empty where it can."""
     program, graph = form.program, form.program.graph
     operations = graph.operations(form.nodes)
     if operations > LARGEST_PROGRAM:

@@ -18,7 +18,7 @@ def sketch(record: Record) -> str:
 
 
 def sketch_of_lanes(record: Record) -> str:
-    """The same of many motions, with a leading axis of lanes: the median, and the bands that hold half and 95 % of those that are under way."""
+    """Many motions, with a leading axis of lanes, as one drawing: the median, and the bands that hold half and 95 % of those that are under way."""
     lanes = _spread(len(record.q), _LANES)
     ts, q = np.asarray(record.ts[0]), np.asarray(record.q[lanes])
     reached = np.isfinite(q).all(axis=2).any(axis=0)
