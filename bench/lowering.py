@@ -97,7 +97,7 @@ def our_starts(y) -> jj.State:
     return jj.State(start.t, q, u, start.moved_q, start.moved_u, start.residual, start.names, start.guess)
 
 
-RUN = {"ts": jnp.array([disc_run.END]), "solver": diffrax.Dopri8(), "events": False, "projection": False}
+RUN = {"ts": jnp.array([disc_run.END]), "solver": diffrax.Dopri8(), "events": False, "formulation": jj.Formulation(stabilisation=None)}
 
 
 def our_disc(alone: bool = False) -> Callable:

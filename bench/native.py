@@ -39,7 +39,7 @@ jax.block_until_ready(jj.simulate(jj.models.MODELS[sys.argv[1]](), backend=sys.a
 print(time.perf_counter() - begin)
 """
 Figure = dict
-BARE = {"events": False, "projection": False}  # as in `lowering.py`
+BARE = {"events": False, "formulation": jj.Formulation(stabilisation=None)}  # as in `lowering.py`
 MOTIONS = (
     ("tilting-disc", 10.0, BARE),
     ("chaplygin-sleigh", 12.0, BARE),

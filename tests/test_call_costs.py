@@ -57,7 +57,7 @@ def test_a_new_function_with_other_numbers_compiles_nothing(compilations):
         "array": lambda k: functools.partial(lambda a, t: a * jnp.sin(t), jnp.asarray(k)),
         "table": lambda k: lambda t: k * jnp.sin(t) + 0.0 * jnp.interp(t, table, k * table),
     }
-    options = {"start": jj.start(Pushed(), x=0.1), "projection": False}
+    options = {"start": jj.start(Pushed(), x=0.1), "formulation": jj.Formulation(stabilisation=None)}
     for make in kinds.values():
         np.testing.assert_allclose(moved(make(1.0), **options)["x"][-1], pulled(1.0), atol=1e-7)
         before = len(compilations)

@@ -54,7 +54,7 @@ def test_a_train_on_a_full_circle_keeps_its_privileged_speeds():
     assert np.all(np.ptp(motion.q[:, 2::3], axis=0) > 2 * np.pi)  # every heading has gone round
     assert int(motion.fallback) == 0
     assert motion.smallest_pivot > 0.5
-    dense = jj.simulate(scene, jj.start(scene, **scene.towing([0.0] * 4, forward=1.0, turn=0.5)), t1=16.0, state="full", reduction="kkt")
+    dense = jj.simulate(scene, jj.start(scene, **scene.towing([0.0] * 4, forward=1.0, turn=0.5)), t1=16.0, formulation=jj.Formulation("full", "kkt"))
     np.testing.assert_allclose(motion.q_end, dense.q_end, atol=1e-7)
 
 

@@ -158,7 +158,7 @@ def compiled_by_the_user(scene):
 USES = {
     "simulate": after_a_second,
     "simulate without lowering": lambda: after_a_second(backend="dense"),
-    "simulate with the full state": lambda: after_a_second(state="full"),
+    "simulate with the full state": lambda: after_a_second(formulation=jj.Formulation("full")),
     "rollout": lambda: jj.rollout(SCENE, {"x": jnp.ones(2)}, t1=1.0).lanes.q_end[0, 0],
     "a function compiled by the user": lambda: compiled_by_the_user(SCENE),
     "a gradient": lambda: jax.grad(lambda x: jj.simulate(SCENE, {"x": x}, t1=1.0).q_end[0])(1.0),

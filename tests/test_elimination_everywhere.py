@@ -63,7 +63,7 @@ def motion_and_reference(scene, start, t1, *, traced=(), **options):
         return jj.simulate(scene.replace(**values) if values else scene, start, ts=jnp.linspace(0.0, t1, 9), rtol=1e-10, atol=1e-10, work=False, **options)
 
     values = {name: getattr(scene, name) for name in traced}
-    reference = jj.simulate(scene, start, ts=jnp.array([t1]), state="full", backend="dense", rtol=1e-11, atol=1e-11, work=False)
+    reference = jj.simulate(scene, start, ts=jnp.array([t1]), formulation=jj.Formulation("full"), backend="dense", rtol=1e-11, atol=1e-11, work=False)
     return jax.jit(run)(values, jj.start(scene, **start)), reference
 
 
@@ -77,7 +77,7 @@ def motion_and_reference(scene, start, t1, *, traced=(), **options):
 )
 @pytest.mark.parametrize("state", ["auto", "full"])
 def test_motions_through_full_turns_are_served_by_one_program(scene, start, state):
-    motion, reference = motion_and_reference(scene, start, 3.0, state=state)
+    motion, reference = motion_and_reference(scene, start, 3.0, formulation=jj.Formulation(state))
     assert int(motion.result) == results.SUCCESS
     assert "lowered" in motion.reduction
     assert motion.smallest_pivot > 0.1
@@ -100,7 +100,16 @@ def test_every_lane_of_beads_on_a_ring_arrives():
     lanes = jj.rollout(scene, starts, ts=jnp.array([3.0]), rtol=1e-10, atol=1e-10, work=False)
     assert np.all(np.asarray(lanes.result) == results.SUCCESS)
     assert not np.any(np.asarray(lanes.lanes.fallback))
-    one = jj.simulate(scene, {**scene.start(), "s_rate": speeds[4]}, ts=jnp.array([3.0]), state="full", backend="dense", rtol=1e-11, atol=1e-11, work=False)
+    one = jj.simulate(
+        scene,
+        {**scene.start(), "s_rate": speeds[4]},
+        ts=jnp.array([3.0]),
+        formulation=jj.Formulation("full"),
+        backend="dense",
+        rtol=1e-11,
+        atol=1e-11,
+        work=False,
+    )
     np.testing.assert_allclose(lanes.lanes.q_end[4], one.q_end, atol=1e-8)
 
 
@@ -118,7 +127,7 @@ WEIGHTLESS_CAR = TrailerChain(trailers=1, **WEIGHTLESS), TrailerChain(trailers=1
     ],
 )
 def test_massless_trailers_follow_also_where_their_masses_are_traced(scene, start, state):
-    motion, reference = motion_and_reference(scene, start, 2.0, traced=WEIGHTLESS, state=state)
+    motion, reference = motion_and_reference(scene, start, 2.0, traced=WEIGHTLESS, formulation=jj.Formulation(state))
     assert int(motion.result) == results.SUCCESS
     np.testing.assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
 
@@ -167,7 +176,7 @@ def test_dependent_rows_are_served_in_both_forms_of_the_state(state):
     assert structure.rank == 3
     assert structure.redundant_rows == ("again[0]", "again[1]")
     assert structure.dependent_rows  # what is left of them still depends on each other
-    motion, reference = motion_and_reference(scene, scene.start(**ROBOT), 2.0, state=state, traced=("turned",))
+    motion, reference = motion_and_reference(scene, scene.start(**ROBOT), 2.0, formulation=jj.Formulation(state), traced=("turned",))
     assert int(motion.result) == results.SUCCESS
     np.testing.assert_allclose(motion.q_end, reference.q_end, atol=1e-8)
 

@@ -96,7 +96,14 @@ def short_motion(name: str, *, projection: bool):
 
     def end(x, reverse: bool):
         parameters, u, duration = unravel(x)
-        options = {"rtol": 1e3, "atol": 1e3, "dt0": 0.008, "work": False, "events": False, "projection": projection}
+        options = {
+            "rtol": 1e3,
+            "atol": 1e3,
+            "dt0": 0.008,
+            "work": False,
+            "events": False,
+            "formulation": jj.Formulation(stabilisation="projection" if projection else None),
+        }
         adjoint = None if reverse else diffrax.ForwardMode()
         begun = eqx.tree_at(lambda s: s.u, start, u)
         motion = jj.simulate(scene.replace(**parameters), begun, ts=start.t + duration[None], adjoint=adjoint, **options)

@@ -140,7 +140,7 @@ def work_by_quadrature():
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"backend": "dense"}, pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow), {"state": "full"}],
+    [{}, {"backend": "dense"}, pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow), {"formulation": jj.Formulation("full")}],
     ids=["lowered", "dense", "diffrax", "full state"],
 )
 def test_the_work_of_a_sampled_input_in_a_potential_is_that_of_a_quadrature(options):
@@ -201,7 +201,9 @@ class Towed(jj.Scene):
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"state": "full"}, pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow)], ids=["minimal", "full state", "diffrax"]
+    "options",
+    [{}, {"formulation": jj.Formulation("full")}, pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow)],
+    ids=["minimal", "full state", "diffrax"],
 )
 def test_rates_of_inputs_in_rows_accelerate_and_do_work(options):
     motion = jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, rtol=1e-9, atol=1e-9, inputs={"speed": lambda t: t**2}, **options).raise_if_failed()

@@ -196,8 +196,8 @@ def test_baumgartes_terms_pull_a_start_off_the_constraints_back_as_their_own_osc
     off = jj.State(jnp.asarray(0.0), q, u, *(jnp.asarray(0.0),) * 3, (scene.coordinate_names, scene.speed_names))
     ts = jnp.linspace(0.0, 1.0, 6)
     terms = jj.Baumgarte(alpha=4.0, beta=4.0)
-    motion = jj.simulate(scene, off, ts=ts, stabilisation=terms, projection=False, state="full", **TIGHT)
+    motion = jj.simulate(scene, off, ts=ts, formulation=jj.Formulation("full", stabilisation=terms), **TIGHT)
     positions, _ = motion.residuals()
     assert relative_error(positions[:, 0], 1e-3 * (1 + 4 * ts) * jnp.exp(-4 * ts)) <= 1e-8
-    without = jj.simulate(scene, off, ts=ts, projection=False, state="full", **TIGHT)
+    without = jj.simulate(scene, off, ts=ts, formulation=jj.Formulation("full", stabilisation=None), **TIGHT)
     assert relative_error(without.residuals()[0][:, 0], jnp.full(6, 1e-3)) <= 1e-8

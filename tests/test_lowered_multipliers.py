@@ -88,7 +88,7 @@ def test_which_scenes_keep_all_speeds():
         assert form.lowered is not None
         assert form.reduction_name == ("privileged, lowered" if name == "chaplygin-sleigh" else "multipliers (KKT), lowered")
     # on request, also where speeds could be eliminated
-    full = jj.simulate(MODELS["chaplygin-sleigh"](), state="full", t1=1.0, rtol=1e-11, atol=1e-11)
+    full = jj.simulate(MODELS["chaplygin-sleigh"](), formulation=jj.Formulation("full"), t1=1.0, rtol=1e-11, atol=1e-11)
     assert full.reduction == "multipliers (KKT), lowered to machine code"
     np.testing.assert_allclose(full.u_end, jj.simulate(MODELS["chaplygin-sleigh"](), t1=1.0, rtol=1e-11, atol=1e-11).u_end, atol=1e-9)
 

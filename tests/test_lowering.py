@@ -235,7 +235,7 @@ def test_a_coordinate_that_chooses_a_branch_is_not_ignorable_where_no_probe_take
     assert jj.lower(MODELS["chaplygin-sleigh"]()).held == ("x", "y")
     assert jj.lower(scene).held == ("y",)
     start = jj.start(scene, x=10.5, x_rate=0.5)
-    ends = [jj.simulate(scene, start, t1=1.0, **options).q_end for options in ({}, {"state": "full", "reduction": "kkt"})]
+    ends = [jj.simulate(scene, start, t1=1.0, **options).q_end for options in ({}, {"formulation": jj.Formulation("full", "kkt")})]
     np.testing.assert_allclose(*ends, atol=1e-6)
 
 

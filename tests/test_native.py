@@ -140,7 +140,7 @@ MODELS = {"tilting-disc": "auto", "whipple-bicycle": "auto", "tilting-disc-quate
 @pytest.mark.parametrize("name", MODELS)
 def test_rates_are_those_of_xla_at_random_states(name):
     scene = jj.models.MODELS[name]()
-    program = set_up(scene, state=MODELS[name]).field.lowered
+    program = set_up(scene, formulation=jj.Formulation(MODELS[name])).field.lowered
     _, q, u = jj.sample_states(scene, 1000)
     fixed, inputs = program.fixed_values(scene), jnp.zeros(len(scene.inputs))
     y = u[:, np.array(program.independent, int)]
@@ -166,7 +166,7 @@ def _motions(scene, starts=None, **options):
         ("tilting-disc", {"t1": 3.0, "rtol": 1e-5, "atol": 1e-5}),
         ("chaplygin-sleigh", {"ts": [7.0]}),
         ("whipple-bicycle", {"ts": [1.0, 2.0]}),
-        ("tilting-disc-quaternion", {"t1": 2.0, "state": "full"}),
+        ("tilting-disc-quaternion", {"t1": 2.0, "formulation": jj.Formulation("full")}),
         ("ball-on-turntable", {"ts": [2.0]}),
         ("double-pendulum-rods", {"ts": [0.0, 3.0], "t1": 3.5, "solver": diffrax.Dopri5()}),
         ("snakeboard", {"ts": [-2.0], "t1": -3.0}),
@@ -326,7 +326,7 @@ def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
     assert reason_against_machine_code(set_up(disc)) == ""
     assert reason_against_machine_code(set_up(disc, backend="xla")) == "another backend was asked for"
     assert "diffrax" in reason_against_machine_code(set_up(disc, solver=diffrax.Heun()))
-    assert "scalar program" in reason_against_machine_code(set_up(disc, reduction="kkt"))
+    assert "scalar program" in reason_against_machine_code(set_up(disc, formulation=jj.Formulation(reduction="kkt")))
     assert "function of time" in reason_against_machine_code(set_up(bicycle, inputs={"steer_torque": lambda t: jnp.sin(t)}))
     monkeypatch.setattr(host, "reason_against", lambda: "llvmlite is not installed")
     assert reason_against_machine_code(set_up(disc)) == "llvmlite is not installed"
@@ -355,8 +355,8 @@ def test_a_scene_is_integrated_without_llvmlite(monkeypatch):
     ("options", "said"),
     [
         ({"backend": "native", "solver": diffrax.Heun()}, "'native' cannot integrate `TiltingDisc`: a solver"),
-        ({"backend": "native", "reduction": "kkt"}, "'native' cannot integrate `TiltingDisc`: a reduction"),
-        ({"backend": "xla", "reduction": "kkt"}, "'xla' cannot integrate `TiltingDisc`: a reduction"),
+        ({"backend": "native", "formulation": jj.Formulation(reduction="kkt")}, "'native' cannot integrate `TiltingDisc`: a reduction"),
+        ({"backend": "xla", "formulation": jj.Formulation(reduction="kkt")}, "'xla' cannot integrate `TiltingDisc`: a reduction"),
         ({"backend": "nativ"}, "unknown backend `nativ`.*native"),
     ],
 )

@@ -171,8 +171,8 @@ CASES = {
     "tilting-disc, falling": ({"lean": 0.6, "spin_rate": -0.1}, {"t1": 5.0}, ["radius", "mass"]),
     "tilting-disc, at rest": ({"lean": 0.0}, {"t1": 0.5}, ["radius", "gravity"]),
     "chaplygin-sleigh": (None, {"t1": 2.0}, ["mass", "inertia"]),
-    "tilting-disc-quaternion": (None, {"t1": 0.5, "state": "full"}, ["radius"]),
-    "whipple-bicycle": (None, {"t1": 0.5, "projection": False}, ["w", "g", "mB"]),
+    "tilting-disc-quaternion": (None, {"t1": 0.5, "formulation": jj.Formulation("full")}, ["radius"]),
+    "whipple-bicycle": (None, {"t1": 0.5, "formulation": jj.Formulation(stabilisation=None)}, ["w", "g", "mB"]),
     "whipple-bicycle, projected": (None, {"t1": 0.5}, ["w", "g", "mB"]),
     "double-pendulum-rods": (None, {"t1": 0.5}, []),
 }

@@ -180,7 +180,7 @@ def test_both_forms_of_the_state_move_alike_along_a_spline():
     scene = Prescribed(curve=jj.Spline(TS, DRIVE))
     exact = jj.simulate(Driven(curve=lambda t: 0.1 * jnp.sin(3.0 * t)), {"angle": 0.1}, t1=1.5)
     for state in ("minimal", "full"):
-        motion = jj.simulate(scene, {"angle": 0.1}, ts=[1.5], state=state, rtol=1e-6, atol=1e-7, work=False).raise_if_failed()
+        motion = jj.simulate(scene, {"angle": 0.1}, ts=[1.5], formulation=jj.Formulation(state), rtol=1e-6, atol=1e-7, work=False).raise_if_failed()
         assert float(motion.q_end[1]) == pytest.approx(float(exact.q_end[0]), abs=1e-5)
 
 

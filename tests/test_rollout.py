@@ -120,7 +120,7 @@ def test_states_made_by_hand_are_starts_of_lanes():
     sleigh = ChaplyginSleigh()
     made = [jj.start(sleigh, x_rate=speed, heading_rate=0.3) for speed in (0.4, 0.6)]
     starts = eqx.tree_at(lambda s: s.guess, jax.tree.map(lambda *x: jnp.stack(x), *made), jnp.zeros(()))  # what `jj.State` has by default
-    options = {"ts": jnp.array([0.2]), "projection": False}
+    options = {"ts": jnp.array([0.2]), "formulation": jj.Formulation(stabilisation=None)}
     lanes = jj.rollout(sleigh, starts, **options)
     for k, state in enumerate(made):
         np.testing.assert_allclose(lanes.lanes.q_end[k], jj.simulate(sleigh, state, **options).q_end, rtol=1e-9, atol=1e-12)

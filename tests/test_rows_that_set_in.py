@@ -63,8 +63,10 @@ def test_a_row_that_may_set_in_is_not_left_out(name, monkeypatch):
     assert jj.structure_of(scene).may_set_in == ("late",)
     with pytest.raises(jj.NotLowered, match="rows `late` follow from the others at all probed states, but nothing says that they do elsewhere or later"):
         jj.lower(scene)
-    with pytest.raises(ValueError, match=r"of `Slider` (may set in where they do not follow from the others|are nonlinear in the speeds).*use state='full'"):
-        jj.simulate(scene, {}, t1=1.0, state="minimal")
+    with pytest.raises(
+        ValueError, match=r"of `Slider` (may set in where they do not follow from the others|are nonlinear in the speeds).*use jj.Formulation\('full'\)"
+    ):
+        jj.simulate(scene, {}, t1=1.0, formulation=jj.Formulation("minimal"))
 
 
 @pytest.mark.parametrize("name", FOLLOWS)

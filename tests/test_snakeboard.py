@@ -22,7 +22,7 @@ START = {
 @pytest.mark.parametrize("reduction", ["qr", *(pytest.param(name, marks=pytest.mark.slow) for name in ("svd", "kkt", "udwadia-kalaba"))])
 def test_it_passes_smoothly_where_the_wheel_rows_are_parallel(reduction):
     times = np.linspace(0.0, oracle.RUN["t_end"], 10)  # steer is 90 degrees between the fifth and the sixth
-    motion = jj.simulate(BOARD, START, ts=jnp.asarray(times), rtol=1e-12, atol=1e-12, reduction=reduction)
+    motion = jj.simulate(BOARD, START, ts=jnp.asarray(times), rtol=1e-12, atol=1e-12, formulation=jj.Formulation(reduction=reduction))
     expected = oracle.motion(times, **oracle.RUN)
     pairs = {
         "x": "x",
@@ -42,7 +42,7 @@ def test_it_passes_smoothly_where_the_wheel_rows_are_parallel(reduction):
 @pytest.mark.parametrize("reduction", [pytest.param("qr", marks=pytest.mark.slow), "kkt"])
 def test_a_step_that_ends_where_the_rows_are_parallel_is_right_or_says_so(reduction):
     times = np.linspace(0.0, oracle.RUN["t_end"], 9)  # steer is 90 degrees, to the last digits, at the fifth
-    motion = jj.simulate(BOARD, START, ts=jnp.asarray(times), rtol=1e-12, atol=1e-12, reduction=reduction)
+    motion = jj.simulate(BOARD, START, ts=jnp.asarray(times), rtol=1e-12, atol=1e-12, formulation=jj.Formulation(reduction=reduction))
     heading = oracle.motion(times, **oracle.RUN)["th"]
     if int(motion.result) != results.SUCCESS:
         assert int(motion.result) == results.STEP_TOO_SMALL

@@ -100,7 +100,7 @@ def test_the_method_of_radau_is_of_order_five():
     errors = []
     for dt0 in (0.4, 0.2):
         steps = {"stepsize_controller": diffrax.ConstantStepSize(), "dt0": dt0}
-        motion = jj.simulate(Ridge(strength=-4.0), {"x": 1.0}, ts=TS[[0, -1]], t1=2.0, solver=jj.RadauIIA(), land_on_ts=False, **steps)
+        motion = jj.simulate(Ridge(strength=-4.0), {"x": 1.0}, saveat=diffrax.SaveAt(ts=TS[[0, -1]]), t1=2.0, solver=jj.RadauIIA(), **steps)
         errors.append(abs(float(motion.q_end[0]) - np.cos(4.0)))
     assert 4.7 < np.log2(errors[0] / errors[1]) < 5.4
 
@@ -146,8 +146,9 @@ def test_every_other_way_is_tried_once_and_ways_add_up(damped):
     assert next_retry(form, lost(results.IMPLICIT), 0.0, {}) == both
     assert next_retry(form, lost(both), 0.0, {}) == results.AS_ASKED
     assert next_retry(form, lost(results.AS_ASKED, results.SUCCESS), 0.0, {}) == results.AS_ASKED
-    assert next_retry(form, lost(results.AS_ASKED), 0.0, {"state": "minimal"}) == results.AS_ASKED
-    assert retry_options(both, 1000) == {"state": "full", "backend": "dense", "solver": jj.RadauIIA(), "max_steps": 100}
+    assert next_retry(form, lost(results.AS_ASKED), 0.0, {"formulation": jj.Formulation("minimal")}) == results.AS_ASKED
+    changed = {"formulation": jj.Formulation("full", "qr"), "backend": "dense", "solver": jj.RadauIIA(), "max_steps": 100}
+    assert retry_options(both, {"formulation": jj.Formulation(reduction="qr"), "max_steps": 1000}) == changed
     assert "full state, dense matrices and an implicit solver" in results.FALLBACKS[both]
 
 

@@ -276,18 +276,18 @@ WRONG = {
         r"`DiscreteGradient` takes steps of one length and has no error estimate, which `stepsize_controller` = PIDController needs; leave it away"
     ),
     "jj.simulate(oscillator, dt0=0.0, solver=jj.ImplicitMidpoint())": r"`dt0` is 0, expected a finite first step in s that is not zero",
-    "jj.simulate(oscillator, dt0=0.1, solver=jj.ImplicitMidpoint(), land_on_ts=False)": r"states at ends of steps only: leave `land_on_ts` at True",
+    "jj.simulate(oscillator, dt0=0.1, solver=jj.ImplicitMidpoint(), saveat=diffrax.SaveAt(ts=[0.1]))": r"states at ends of steps only: give times",
     "jj.simulate(oscillator, solver=jj.MuntheKaas())": r"`ContactOscillator` has no quaternion among its coordinates; use solver=Tsit5\(\) by itself",
     "jj.MuntheKaas(jj.DiscreteGradient())": r"`solver` of `MuntheKaas` is DiscreteGradient, expected a Runge-Kutta method",
     "jj.DiscreteLagrangeDAlembert('midpiont')": r"unknown rule `midpiont` of `DiscreteLagrangeDAlembert`; did you mean `midpoint`",
-    "jj.simulate(oscillator, dt0=0.1, solver=jj.DiscreteLagrangeDAlembert(), state='minimal')": r"integrates all speeds; leave `state` at 'auto'",
+    "jj.simulate(oscillator, dt0=0.1, solver=jj.DiscreteLagrangeDAlembert(), formulation=jj.Formulation('minimal'))": r"leave the `state` of its `Formulation`",
     "jj.simulate(model('free-rigid-body'), dt0=0.1, solver=jj.DiscreteLagrangeDAlembert())": (
         r"does not apply to `FreeRigidBody`: its speeds are quasi-velocities or angular velocities.*; use solver=jj.ImplicitMidpoint\(\)"
     ),
     "jj.simulate(model('isokinetic-particle'), dt0=0.1, solver=jj.DiscreteLagrangeDAlembert())": r"its rows are nonlinear in the speeds",
     "jj.simulate(DrivenPendulum(), dt0=0.1, solver=jj.DiscreteGradient())": r"does not apply to `DrivenPendulum`: its T \+ V is not constant",
     "jj.simulate(model('double-pendulum-rods'), dt0=0.1, solver=jj.DiscreteGradient())": r"its geometric rows would have to be projected",
-    "jj.simulate(model('skate'), dt0=0.1, solver=jj.DiscreteGradient())": r"needs the minimal state \(state='minimal' keeps to the privileged speeds",
+    "jj.simulate(model('skate'), dt0=0.1, solver=jj.DiscreteGradient())": r"needs the minimal state \(`jj.Formulation\('minimal'\)` keeps to the privileged",
 }
 
 

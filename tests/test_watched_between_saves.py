@@ -52,7 +52,7 @@ def test_a_pendulum_that_leaves_its_narrow_domain_is_flagged_under_jit():
 )
 def test_every_way_of_integrating_watches_its_pivots(options):
     ts, speeds = ENDS["one save"], SPEEDS[::5]
-    asked = jj.rollout(NarrowPendulum(), _swinging(speeds), ts=ts, state="minimal", **options)
+    asked = jj.rollout(NarrowPendulum(), _swinging(speeds), ts=ts, formulation=jj.Formulation("minimal"), **options)
     assert np.all(asked.result == results.SINGULAR_PARTITION)
 
 
@@ -83,7 +83,7 @@ def test_a_slider_crank_of_equal_lengths_passes_the_axis_on_its_branch_or_is_fla
     count = 64 if not options else 8
     w, ts = np.linspace(0.5, 6.0, count), np.linspace(0.0, 2.0, 41)
     starts = {"a": np.full(count, 0.5), "b": np.full(count, -0.5), "x": np.full(count, 2 * np.cos(0.5)), "a_rate": w}
-    found = jj.rollout(SliderCrank(), starts, ts=ts, state="full", **options)
+    found = jj.rollout(SliderCrank(), starts, ts=ts, formulation=jj.Formulation("full"), **options)
     arrived = found.result == results.SUCCESS
     assert np.mean(arrived) > 0.6
     for lane in np.flatnonzero(arrived):
@@ -94,7 +94,13 @@ def test_a_slider_crank_of_equal_lengths_passes_the_axis_on_its_branch_or_is_fla
 
 def test_a_loss_of_energy_is_warned_of():
     pendulum = NarrowPendulum()
-    crude = {"solver": diffrax.Euler(), "stepsize_controller": diffrax.ConstantStepSize(), "dt0": 0.02, "ts": np.linspace(0.0, 2.0, 21), "state": "full"}
+    crude = {
+        "solver": diffrax.Euler(),
+        "stepsize_controller": diffrax.ConstantStepSize(),
+        "dt0": 0.02,
+        "ts": np.linspace(0.0, 2.0, 21),
+        "formulation": jj.Formulation("full"),
+    }
     crude = jj.simulate(pendulum, dict(zip(["x", "z", "x_rate"], (0.3, -np.sqrt(0.91), 1.0), strict=True)), **crude)
     assert any("which is constant for a right motion, drifts" in text for text in crude.warnings)
     assert not jj.simulate(pendulum, pendulum.example, t1=1.0).warnings
@@ -104,7 +110,7 @@ def test_a_loss_of_energy_is_warned_of():
 def test_a_row_is_compared_with_its_usual_length_for_the_parameters_of_the_motion(backend):
     def motion(scene):
         start = {"a": 0.7, "b": 0.0, "c": 0.7, "a_rate": 1.0, "b_rate": 0.0, "c_rate": 1.0}
-        return jj.simulate(scene, start, ts=jnp.array([1.0]), rtol=1e-6, atol=1e-6, state="full", backend=backend)
+        return jj.simulate(scene, start, ts=jnp.array([1.0]), rtol=1e-6, atol=1e-6, formulation=jj.Formulation("full"), backend=backend)
 
     motion(Parallelogram())  # of ordinary size, first
     for size in (1e-5, 1e5):

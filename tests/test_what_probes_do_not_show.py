@@ -187,7 +187,8 @@ def test_derivatives_by_decree_are_those_of_the_dense_path():
     def slopes(backend):
         def end(stiffness, y):
             scene = Decreed(stiffness=stiffness)
-            return jj.simulate(scene, {"x": 1.0, "y": y}, t1=1.0, backend=backend, projection=False, adjoint=diffrax.ForwardMode()).q_end
+            by = {"backend": backend, "formulation": jj.Formulation(stabilisation=None), "adjoint": diffrax.ForwardMode()}
+            return jj.simulate(scene, {"x": 1.0, "y": y}, t1=1.0, **by).q_end
 
         return jax.jacfwd(end, argnums=(0, 1))(2.0, 0.7)
 
@@ -207,7 +208,7 @@ class Called(Plane):
 
 
 def test_a_callback_that_knows_no_batches_runs_alone_and_is_refused_by_name_in_batches():
-    np.testing.assert_allclose(*ends(Called(), {"x": 1.0}, projection=False), atol=1e-7)
+    np.testing.assert_allclose(*ends(Called(), {"x": 1.0}, formulation=jj.Formulation(stabilisation=None)), atol=1e-7)
     with pytest.raises(NotImplementedError, match="vmap"):
         jj.rollout(Called(), {"x": jnp.array([1.0, 1.1])}, t1=0.1)
 

@@ -50,7 +50,7 @@ class DerivativeOfMotion:
             return self._by_naive(method, x, tolerance)
         options = {**self.options, **method.options(self.begin(x)[0])}
         if method.reduction:  # each by itself: reverse mode through the choice of one out of several has met NaN of the others
-            options |= {"max_steps": FEWER_STEPS, "reduction": jj.reductions(self.begin(x)[0])[method.reduction]}
+            options |= {"max_steps": FEWER_STEPS, "formulation": jj.Formulation("full", jj.reductions(self.begin(x)[0])[method.reduction])}
         if method.name == "Kvaerno5":
             options |= {"max_steps": IMPLICIT_STEPS}
         options |= {"rtol": by_type(self.rtol, self.rtol32), "atol": by_type(self.atol, self.atol32), "ts": self.ts}

@@ -85,11 +85,11 @@ class Method:
 
 
 def _by_reduction(name: str) -> Method:
-    return Method(name, "reductions", lambda scene: {"state": "full", "reduction": reduction(scene, name)}, reduction=name)
+    return Method(name, "reductions", lambda scene: {"formulation": jj.Formulation("full", reduction(scene, name))}, reduction=name)
 
 
 def _stabilised(name: str, rate: float) -> Method:
-    terms = lambda scene: {"state": "full", "projection": False, "stabilisation": jj.Baumgarte(rate, rate)}  # noqa: E731
+    terms = lambda scene: {"formulation": jj.Formulation("full", stabilisation=jj.Baumgarte(rate, rate))}  # noqa: E731
     return Method(name, "constraints", terms)
 
 

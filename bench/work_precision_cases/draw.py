@@ -40,7 +40,7 @@ class Look:
 MAIN_LOOKS = {
     "Dopri8": Look("jourdain-jax, Dopri8", BLUE, "o", width=2.4),
     "Tsit5": Look("jourdain-jax, Tsit5", BLUE, "s", "--", 2.0),
-    "minimal state, not projected, Dopri8": Look("jourdain-jax, Dopri8, projection=False", SKY, "o", "-", 1.8),
+    "minimal state, not projected, Dopri8": Look("jourdain-jax, Dopri8, not projected", SKY, "o", "-", 1.8),
     "simulate, as it comes": Look("jourdain-jax, called from Python", GREY, "D", ":"),
     "heyoka, the engine's equations": Look("heyoka, our equations", GREEN, "^"),
     "SymPy to C, SciPy ode DOP853": Look("SymPy to C, SciPy DOP853", ORANGE, "v"),
@@ -61,7 +61,7 @@ OWN_LOOKS = {
     "implicit midpoint": Look("implicit midpoint", BLACK, "d"),
     "discrete Lagrange-d'Alembert": Look("discrete Lagrange-d'Alembert", BLACK, "P", "--"),
     "discrete gradient": Look("discrete gradient", BLACK, "X", ":"),
-    "minimal state, not projected, Dopri8": Look("Dopri8 (lowered), projection=False", SKY, "o", ":"),
+    "minimal state, not projected, Dopri8": Look("Dopri8 (lowered), not projected", SKY, "o", ":"),
     "full state, projected, Dopri8": Look("full state, projected", ORANGE, "s"),
     "full state, not projected, Dopri8": Look("full state, not projected", ORANGE, "x", ":"),
     "privileged reduction, Dopri8": Look("privileged reduction, dense", RED, "o"),

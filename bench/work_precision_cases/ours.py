@@ -99,8 +99,8 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
     ]
     if not problem.large:
         found.append(_step("implicit midpoint", problem, jj.ImplicitMidpoint()))
-    given = _tolerance("minimal state, not projected, Dopri8", "state", diffrax.Dopri8(), projection=False)
-    full = _tolerance("full state, projected, Dopri8", "state", diffrax.Dopri8(), COARSE, state="full")
+    given = _tolerance("minimal state, not projected, Dopri8", "state", diffrax.Dopri8(), formulation=jj.Formulation(stabilisation=None))
+    full = _tolerance("full state, projected, Dopri8", "state", diffrax.Dopri8(), COARSE, formulation=jj.Formulation("full"))
     if quick:
         return [*found, given, full]
     if not problem.large:
@@ -109,8 +109,10 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
         found += [_step("discrete Lagrange-d'Alembert", problem, jj.DiscreteLagrangeDAlembert()), _step("discrete gradient", problem, jj.DiscreteGradient())]
     if problem.scene.coordinates.quaternions:
         found.append(_tolerance("Munthe-Kaas Dopri8", "solver", jj.MuntheKaas(diffrax.Dopri8()), COARSE))
-    loose = _tolerance("full state, not projected, Dopri8", "state", diffrax.Dopri8(), COARSE, state="full", projection=False)
+    loose = _tolerance("full state, not projected, Dopri8", "state", diffrax.Dopri8(), COARSE, formulation=jj.Formulation("full", stabilisation=None))
     # the privileged reduction is the default one, here with dense matrices
     reductions = ("privileged", "kkt") if problem.large else REDUCTIONS
-    reduced = [_tolerance(f"{name} reduction, Dopri8", "reduction", diffrax.Dopri8(), COARSE, reduction=name) for name in reductions]
+    reduced = [
+        _tolerance(f"{name} reduction, Dopri8", "reduction", diffrax.Dopri8(), COARSE, formulation=jj.Formulation(reduction=name)) for name in reductions
+    ]
     return [*found, given, full, loose, *reduced]

@@ -74,6 +74,7 @@ from jourdain_jax.lowering.built import Built, build
 from jourdain_jax.lowering.lower import NotLowered, lower
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.batches.rollout import Rollout, rollout
+from jourdain_jax.motion.formulation import Formulation
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
 from jourdain_jax.motion.integrators.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
@@ -123,6 +124,7 @@ __all__ = [
     "Estimate",
     "EventTime",
     "Fit",
+    "Formulation",
     "GibbsAppell",
     "Happened",
     "HeightMap",

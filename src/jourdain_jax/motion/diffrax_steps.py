@@ -23,10 +23,10 @@ def solved_by_diffrax(setup: Setup, begun: Begun) -> Solved:
     origin = args[4]
     t0, t1, ts, knots = setup.t0 - origin, setup.t1 - origin, setup.ts - origin, setup.knots
     names, (rtol, atol) = options.event_names, options.tolerances
-    landings = jnp.append(ts if options.land else ts[:0], t1)
+    landings = jnp.append(ts if options.saveat is None else ts[:0], t1)
     landings = landings if knots is None else merged(landings, knots + t0, jnp.sign(t1 - t0))
     controller = controller_of(options.solver, options.controller, landings)
-    land = (options.land or knots is not None) and controller is None
+    land = (options.saveat is None or knots is not None) and controller is None
     controller = options.controller if controller is None else controller
     if controller is None:
         controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, force_dtmin=False)

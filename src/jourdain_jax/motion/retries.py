@@ -11,9 +11,11 @@ from typing import TypeVar
 import equinox as eqx
 import jax.numpy as jnp
 
+from jourdain_jax.motion.formulation import as_formulation
 from jourdain_jax.motion.integrators.radau import RadauIIA
 from jourdain_jax.motion.integrators.solver_choice import may_be_full
 from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS, implicit_steps, is_stiff
+from jourdain_jax.motion.setup import MOST_STEPS
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import VectorField
@@ -27,7 +29,7 @@ def next_retry(field: VectorField, motion: Trajectory, t0, options: dict) -> int
     `field`: how it was integrated; `options`: those of `simulate` that were given.
     """
     tried, solver, backend = int(motion.fallback), options.get("solver"), options.get("backend", "auto")
-    lost = options.get("state", "auto") in may_be_another_form(field) and may_be_full(solver) and int(motion.result) in lost_codes(field)
+    lost = as_formulation(options.get("formulation")).state in may_be_another_form(field) and may_be_full(solver) and int(motion.result) in lost_codes(field)
     if lost and backend in ("auto", "dense") and not tried & results.FULL_STATE:
         return tried | results.FULL_STATE
     free = solver is None and backend != "native" and options.get("stepsize_controller") is None
@@ -36,10 +38,10 @@ def next_retry(field: VectorField, motion: Trajectory, t0, options: dict) -> int
     return results.AS_ASKED
 
 
-def retry_options(retries: int, max_steps: int) -> dict:
-    """The options of `simulate` that make these retries; `max_steps`: as was asked for."""
-    full = {"state": "full", "backend": "dense"} if retries & results.FULL_STATE else {}
-    implicit = {"solver": RadauIIA(), "max_steps": implicit_steps(max_steps)} if retries & results.IMPLICIT else {}
+def retry_options(retries: int, options: dict) -> dict:
+    """The options of `simulate` that make these retries; `options`: those that were given."""
+    full = {"formulation": as_formulation(options.get("formulation")).with_state("full"), "backend": "dense"} if retries & results.FULL_STATE else {}
+    implicit = {"solver": RadauIIA(), "max_steps": implicit_steps(options.get("max_steps", MOST_STEPS))} if retries & results.IMPLICIT else {}
     return full | implicit
 
 

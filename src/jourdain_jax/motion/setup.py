@@ -20,6 +20,7 @@ from jourdain_jax.motion.start import State
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
+TOLERANCE, MOST_STEPS = 1e-8, 100_000  # of `simulate`, where nothing else is asked for
 OWN_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
 OWN_ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode)
 
@@ -33,15 +34,14 @@ class Options(eqx.Module):
     dt0: Float[Array, ""] | float
     adjoint: diffrax.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
-    land: bool = eqx.field(static=True)  # whether a step ends at every saved time
-    saveat: diffrax.SaveAt | None  # None: at the times asked for
+    saveat: diffrax.SaveAt | None  # None: at the times asked for, at each of which a step ends
     event_names: tuple[str, ...] = eqx.field(static=True)
     native: bool = eqx.field(static=True, default=True)  # whether machine code of our own may integrate it
 
     @property
     def by_own_steps(self) -> bool:
         """Whether our own explicit Runge-Kutta loop integrates it: it has a solver, a controller and an adjoint of its own, and nothing else was stated."""
-        plain = self.controller is None and self.saveat is None and self.land
+        plain = self.controller is None and self.saveat is None
         checkpoints = isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) and self.adjoint.checkpoints is not None
         return plain and not checkpoints and type(self.solver) in OWN_SOLVERS and type(self.adjoint) in OWN_ADJOINTS
 

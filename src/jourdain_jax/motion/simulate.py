@@ -16,8 +16,8 @@ import numpy as np
 
 from jourdain_jax.build.event_names import names_of_events
 from jourdain_jax.calculus.reals import Number
-from jourdain_jax.dynamics.accelerations import Baumgarte, as_stabilisation
 from jourdain_jax.motion.arguments import check_options
+from jourdain_jax.motion.formulation import Formulation, as_formulation
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
@@ -26,7 +26,7 @@ from jourdain_jax.motion.marks import marked
 from jourdain_jax.motion.own_steps import reason_against_machine_code
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
-from jourdain_jax.motion.setup import Options, Setup
+from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Options, Setup
 from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -36,7 +36,6 @@ from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
-TOLERANCE, MOST_STEPS = 1e-8, 100_000
 _OFF = 1e4  # units of round-off: a residual that is more
 
 
@@ -56,22 +55,20 @@ def simulate(
     dt0: Number | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     max_steps: int = MOST_STEPS,
-    state: str = "auto",
-    reduction=None,
-    stabilisation: Baumgarte | None = None,
-    projection: bool = True,
+    formulation: Formulation | None = None,
+    backend: str = "auto",
     inputs=None,
     events: bool = True,
     work: bool = True,
-    land_on_ts: bool = True,
-    backend: str = "auto",
 ) -> Trajectory:
     """Integrate a scene's equations of motion from `start` over [t0, t1].
 
     **Arguments**
     - `start`: a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
     - `t0`, `t1`: ends of the span (s; defaults: the time of a `State`, otherwise 0; the last of `ts`, or the scene's
-      `example_span` after t0); `ts`: times to save at (default: 201 even ones). `saveat`: a `diffrax.SaveAt` instead.
+      `example_span` after t0); `ts`: times to save at (default: 201 even ones), at each of which a step ends.
+    - `saveat`: a `diffrax.SaveAt` in place of `ts`. Values between steps come from the solver's dense output: fewer steps, but
+      its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
     - `rtol`, `atol`, `solver`, `stepsize_controller`, `dt0` (default: 1e-4 of the span), `adjoint`, `max_steps`: as in
       `diffrax.diffeqsolve`. Default solver: Tsit5 for
       rtol >= 1e-6, Dopri8 below, and where these run out of steps on a stiff motion, `RadauIIA`; structure-preserving ones (`ImplicitMidpoint`,
@@ -79,18 +76,16 @@ def simulate(
       Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order, by recorded steps; with `checkpoints=`, that of
       diffrax); `diffrax.ForwardMode()`
       for forward mode of any order; `diffrax.DirectAdjoint()` for all.
-    - `state`: "minimal" (q and privileged speeds), "full" (q and u) or "auto"; `reduction`: as in `accelerations`.
-    - `projection`: put the state back onto the constraints after each step, where the state form does not keep them by itself.
-    - `stabilisation`: Baumgarte terms, for comparison; `inputs`: name -> number, function of time, or `Sampled`.
-    - `land_on_ts`: end a step at every saved time. With False, values between steps come from the solver's dense output: fewer steps, but
-      its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
+    - `formulation`: which equations are integrated, a `jj.Formulation(state, reduction, stabilisation)` (default: what serves the scene).
     - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code made for it, on CPUs, where llvmlite is installed and the solver is a
       default one; "xla", that program compiled by XLA, as `jax.export` needs, and as derivatives of higher order and with respect to times are in any case;
       "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
+    - `inputs`: name -> number, function of time, or `Sampled`.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
 
     Where nothing is traced, a motion that leaves the domain of its privileged speeds is run again with the full state, and a stiff one by an implicit
-    solver (unless `state` or `solver` is chosen); `trajectory.fallback` and its summary say so. Inside your own `jit` or `vmap` the result code stays.
+    solver (unless `formulation` or `solver` is chosen so); `trajectory.fallback` and its summary say so. Inside your own `jit` or `vmap` the result code
+    stays.
 
     **Returns** a `Trajectory`, with a result code instead of an exception; `trajectory.raise_if_failed()` raises `SimulationError`.
 
@@ -115,7 +110,7 @@ def simulate(
     if isinstance(motion.result, jax.core.Tracer):
         return motion
     while retries := next_retry(setup.field, motion, setup.t0, given):
-        setup = _set_up(**(given | retry_options(retries, max_steps)))
+        setup = _set_up(**(given | retry_options(retries, given)))
         motion = mark_retried(warn_if_ill_conditioned(setup, _integrated), retries)
     return motion
 
@@ -132,20 +127,18 @@ def set_up(scene: Scene | BuiltFor, start=None, **options) -> Setup:
 
 
 def _set_up(
-    *, scene, start, t0, t1, ts, saveat, rtol, atol, solver, stepsize_controller, dt0, adjoint, max_steps, state, reduction, stabilisation,
-    projection, inputs, events, work, land_on_ts, backend,
+    *, scene, start, t0, t1, ts, saveat, rtol, atol, solver, stepsize_controller, dt0, adjoint, max_steps, formulation, backend, inputs, events, work,
 ) -> Setup:  # fmt: skip
-    scene = as_scene(scene)
-    switches = {"projection": projection, "events": events, "work": work, "land_on_ts": land_on_ts}
+    scene, formulation = as_scene(scene), as_formulation(formulation)
+    switches = {"events": events, "work": work}
     objects = {"solver": solver, "adjoint": adjoint, "stepsize_controller": stepsize_controller, "saveat": saveat}
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, switches=switches, **objects)
-    as_stabilisation(stabilisation)
     _check_adjoint(adjoint)
-    check_solver(solver, stepsize_controller, dt0, land_on_ts, saveat)
+    check_solver(solver, stepsize_controller, dt0, saveat)
     made_here = not isinstance(start, State)
     inputs = as_inputs(scene, inputs)
     start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs)
-    field = fitted(solver, scene, vector_field(scene, state, reduction, stabilisation, projection, work, backend, inputs), state)
+    field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
     warn_float32(start.q.dtype, rtol)
     options = Options(
         solver=default_solver(rtol) if solver is None else solver,
@@ -154,12 +147,11 @@ def _set_up(
         dt0=_first_step(solver, dt0, t0, t1),  # diffrax's own guess costs two more copies of the vector field to compile
         adjoint=diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         max_steps=max_steps,
-        land=land_on_ts,
         saveat=None if saveat is None else _checked_saveat(saveat),
         event_names=names_of_events(scene) if events else (),
         native=backend in ("auto", "native"),
     )
-    start = _on_constraints(scene, t0, start, inputs, made_here) if projection else start
+    start = _on_constraints(scene, t0, start, inputs, made_here) if formulation.projects else start
     setup = Setup(scene, start, inputs, t0, t1, ts, field, options)
     if backend == "native" and (reason := reason_against_machine_code(setup)):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")

@@ -22,7 +22,8 @@ from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.retries import lost_codes, mark_retried, next_retry, retry_options
-from jourdain_jax.motion.simulate import MOST_STEPS, TOLERANCE, default_solver, set_up, warn_float32
+from jourdain_jax.motion.setup import TOLERANCE
+from jourdain_jax.motion.simulate import default_solver, set_up, warn_float32
 from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.trajectories import labelled, results
@@ -191,7 +192,7 @@ def rollout(
     ways: dict[int, tuple] = {}
     while (again := _next_retries(scene, lanes, varied, options)).any():
         for way in np.unique(again[again > 0]).tolist():
-            chosen, changed = np.flatnonzero(again == way), options | retry_options(way, options.get("max_steps", MOST_STEPS))
+            chosen, changed = np.flatnonzero(again == way), options | retry_options(way, options)
             for first in range(0, len(chosen), chunk):
                 index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
                 with reference_parameters(sound):
@@ -231,7 +232,7 @@ def _next_retries(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int
     begun = np.broadcast_to(np.asarray(starts.t if own_times else _first_time(options)), lanes.result.shape)
     found = np.full(lanes.result.shape, results.AS_ASKED)
     for tried in np.unique(lanes.fallback).tolist():
-        field = _form(scene, options | retry_options(tried, options.get("max_steps", MOST_STEPS)))
+        field = _form(scene, options | retry_options(tried, options))
         for i in np.flatnonzero((np.asarray(lanes.fallback) == tried) & np.isin(lanes.result, (*lost_codes(field), *OUT_OF_STEPS))):
             found[i] = next_retry(field, jax.tree.map(lambda x, i=i: x[i], lanes), begun[i], options)
     return found
@@ -239,8 +240,7 @@ def _next_retries(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int
 
 def _form(scene: Scene, options: dict) -> VectorField:
     """How the lanes' state is integrated."""
-    how = {name: options[name] for name in ("state", "reduction", "stabilisation", "projection", "work", "backend", "inputs") if name in options}
-    return vector_field(scene, **how)
+    return vector_field(scene, **{name: options[name] for name in ("formulation", "work", "backend", "inputs") if name in options})
 
 
 def _round_up(count: int) -> int:

@@ -126,6 +126,6 @@ def _fault(scene: Scene, field: VectorField, asked: str) -> str:
     if names_of_position_rows(scene):
         return "its geometric rows would have to be projected after each step, which moves the energy"
     if field.independent is None:
-        way_out = "" if asked == "full" or not structure.affine else " (state='minimal' keeps to the privileged speeds, where the motion allows it)"
+        way_out = "" if asked == "full" or not structure.affine else " (`jj.Formulation('minimal')` keeps to the privileged speeds, where the motion allows it)"
         return f"it is integrated in all speeds, and the method needs the minimal state{way_out}"
     return ""

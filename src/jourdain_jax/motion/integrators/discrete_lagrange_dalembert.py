@@ -58,7 +58,7 @@ class DiscreteLagrangeDAlembert(FixedStepSolver):
         if fault:
             raise ValueError(f"`DiscreteLagrangeDAlembert` does not apply to `{name}`: {fault}; use solver=jj.ImplicitMidpoint()")
         if asked == "minimal":
-            raise ValueError("`DiscreteLagrangeDAlembert` integrates all speeds; leave `state` at 'auto'")
+            raise ValueError("`DiscreteLagrangeDAlembert` integrates all speeds; leave the `state` of its `Formulation` at 'auto'")
         equations = f"discrete Lagrange-d'Alembert equations, {self.rule} rule"
         return full_without_projection(field, scene, equations)
 

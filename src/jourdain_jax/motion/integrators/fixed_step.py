@@ -45,7 +45,7 @@ class FixedStepSolver(diffrax.AbstractSolver):
 
     @abc.abstractmethod
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
-        """The form of the state that this method integrates; `asked`: the `state` given to `simulate`. ValueError where it does not apply."""
+        """The form of the state that this method integrates; `asked`: the `state` of the `Formulation`. ValueError where it does not apply."""
 
     @abc.abstractmethod
     def stepped(self, step: Step, y: PyTree) -> Stepped:

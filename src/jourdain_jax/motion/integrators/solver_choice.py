@@ -14,7 +14,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 def fitted(solver, scene: Scene, field: VectorField, asked: str) -> VectorField:
-    """The form of the state that the solver integrates; a ValueError where it does not apply to the scene. `asked`: the `state` of `simulate`."""
+    """The form of the state that the solver integrates; a ValueError where it does not apply to the scene. `asked`: the `state` of its `Formulation`."""
     return solver.fitted(scene, field, asked) if isinstance(solver, FixedStepSolver | MuntheKaas) else field
 
 
@@ -23,13 +23,13 @@ def may_be_full(solver) -> bool:
     return not isinstance(solver, DiscreteGradient)
 
 
-def check_solver(solver, controller, dt0, land: bool, saveat) -> None:
+def check_solver(solver, controller, dt0, saveat) -> None:
     """ValueError for options that do not go with a structure-preserving solver; others pass."""
     if not isinstance(solver, FixedStepSolver | MuntheKaas):
         return
     name = type(solver).__name__
-    if not land or (saveat is not None and saveat.subs.ts is not None):
-        raise ValueError(f"`{name}` has states at ends of steps only: leave `land_on_ts` at True, and give times to save at as `ts`, not in `saveat`")
+    if saveat is not None and saveat.subs.ts is not None:
+        raise ValueError(f"`{name}` has states at ends of steps only: give times to save at as `ts`, not in `saveat`")
     if not isinstance(solver, FixedStepSolver):
         return
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):

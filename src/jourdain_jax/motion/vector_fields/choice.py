@@ -1,18 +1,21 @@
 """Which form of the state is integrated, given what was asked."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
 from jourdain_jax.build.structure import WELL_CONDITIONED, Structure, structure_of
 from jourdain_jax.build.usual_lengths import usual_lengths
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
-from jourdain_jax.dynamics.accelerations import Baumgarte, as_reduction
+from jourdain_jax.dynamics.accelerations import as_reduction
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
 from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.motion.formulation import Formulation, as_formulation
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.vector_fields.by_matrices import Full, Minimal
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
@@ -21,44 +24,42 @@ from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
-_STATE_FORMS = ("auto", "minimal", "full")
 _BACKENDS = ("auto", "native", "xla", "dense")
 
 
-def vector_field(
-    scene: Scene, state="auto", reduction=None, stabilisation: Baumgarte | None = None, projection=True, work=True, backend="auto", inputs=None
-) -> VectorField:
+def vector_field(scene: Scene, formulation: Formulation | None = None, work: bool = True, backend: str = "auto", inputs=None) -> VectorField:
     """What is integrated of a scene; the arguments are those of `simulate`."""
-    structure = structure_of(scene)
+    structure, formulation = structure_of(scene), as_formulation(formulation)
+    state, reduction = formulation.state, formulation.reduction
     _check(scene, structure, state, backend)
     minimal = state == "minimal" or (state == "auto" and structure.has_minimal_state)
     independent = structure.independent if minimal else None
     inputs_in_rows = structure.rows_of_inputs and not as_inputs(scene, inputs).constant
     with_work = work and needs_work(scene, structure)
     dense = inputs_in_rows or (with_work and (structure.driven or structure.varying_inertia))
-    program = _program(scene, minimal, backend, reduction, stabilisation, dense)
+    program = _program(scene, minimal, backend, formulation, dense)
     cutoff = _cutoff(structure) if reduction is None and not minimal else None
     reduction = as_reduction(scene, _default_reduction(structure, independent, program) if reduction is None else reduction)
-    common = {
+    common: dict[str, Any] = {
         "independent": independent,
         "reduction": reduction,
         "with_work": with_work,
-        "projects_positions": projection and _is_closed(scene),
-        "projects_speeds": projection and not minimal and bool(structure.row_names),
+        "projects_positions": formulation.projects and _is_closed(scene),
+        "projects_speeds": formulation.projects and not minimal and bool(structure.row_names),
         "of_inputs": structure.potentials_of_inputs,
     }
     if program is not None:
         return ByProgram(**common, program=program, affine=structure.affine)
-    common |= {"stabilisation": stabilisation, "usual": usual_lengths(scene), "inputs_in_rows": inputs_in_rows, "cutoff": cutoff}
+    common |= {"stabilisation": formulation.baumgarte, "usual": usual_lengths(scene), "inputs_in_rows": inputs_in_rows, "cutoff": cutoff}
     if minimal:
         return Minimal(**common)
     return Full(**common, may_branch=cutoff is not None and isinstance(reduction, NullSpaceQR) and bool(names_of_position_rows(scene)))
 
 
-def _program(scene: Scene, minimal: bool, backend: str, reduction, stabilisation, dense: bool) -> Lowered | None:
+def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation, dense: bool) -> Lowered | None:
     """The scalar program that is integrated; None: dense matrices are. ValueError where a backend asks for a program and there is none."""
     reason = ""
-    if reduction is not None or stabilisation is not None:
+    if formulation.reduction is not None or formulation.baumgarte is not None:
         reason = "a reduction or a stabilisation of its own needs dense matrices"
     elif dense:
         reason = "velocity rows with inputs that change with time, and work along driven poses, need dense matrices"
@@ -74,14 +75,13 @@ def _program(scene: Scene, minimal: bool, backend: str, reduction, stabilisation
 
 
 def _check(scene: Scene, structure: Structure, state, backend) -> None:
-    for what, given, known in (("state form", state, _STATE_FORMS), ("backend", backend, _BACKENDS)):
-        if given not in known:
-            raise ValueError(f"unknown {what} `{given}`; {nearest(str(given), known)}")
+    if backend not in _BACKENDS:
+        raise ValueError(f"unknown backend `{backend}`; {nearest(str(backend), _BACKENDS)}")
     if state == "minimal" and not structure.affine:
-        raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use state='full'")
+        raise ValueError(f"the rows of `{type(scene).__name__}` are nonlinear in the speeds and have no minimal state; use jj.Formulation('full')")
     if state == "minimal" and structure.may_set_in:
         named = ", ".join(f"`{name}`" for name in structure.may_set_in)
-        raise ValueError(f"rows {named} of `{type(scene).__name__}` may set in where they do not follow from the others; use state='full'")
+        raise ValueError(f"rows {named} of `{type(scene).__name__}` may set in where they do not follow from the others; use jj.Formulation('full')")
 
 
 def _cutoff(structure: Structure) -> float | None:
