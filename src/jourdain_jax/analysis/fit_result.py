@@ -1,10 +1,15 @@
 """The result of a fit: estimates with their uncertainty, residuals, the fitted scene, and what the measurements cannot tell."""
 
+import os
+from collections.abc import Sequence
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jourdain_jax.analysis.fit_page import fit_page
 from jourdain_jax.analysis.information import Information, hidden_combinations
+from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.profile import FAR_BEYOND
 from jourdain_jax.analysis.table import table
 from jourdain_jax.build.plausibility import impossible_bodies
@@ -182,6 +187,25 @@ class Fit(Printed, eqx.Module):
     def residual_summary(self) -> tuple[ChannelResiduals, ...]:
         """Count, mean, rms and largest residual per run and channel."""
         return tuple(_summary(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
+
+    def report(self, path: str | os.PathLike, data: Measurements | Sequence[Measurements] = ()) -> None:
+        """Write this fit as one HTML file that loads nothing from elsewhere: estimates, correlations, warnings, residuals and their autocorrelation.
+
+        `data`: the runs fitted; their samples are drawn beside the prediction, and R^2 = 1 - sum (prediction - value)^2 / sum (value - mean)^2 of each
+        channel is told. ValueError for a path that is no .html file, a fit of a batch or one that failed, and other data than the fit's.
+        """
+        runs = (data,) if isinstance(data, Measurements) else tuple(data)
+        if not str(path).lower().endswith((".html", ".htm")):
+            raise ValueError(f"cannot write `{os.fspath(path)}`: the report of a fit is a .html file")
+        if self.values.ndim > 1 or not np.isfinite(self.chi_square):
+            raise ValueError("there is a report of one fit whose motion does not fail; of a batch, and of a failed fit, see `print`")
+        shapes = lambda runs: [{name: np.shape(x) for name, x in run.items()} for run in runs]  # noqa: E731
+        if runs and shapes(run.values for run in runs) != shapes(self.residuals):
+            raise ValueError(
+                f"`data` has {len(runs)} runs with channels {shapes(run.values for run in runs)}, expected those of the fit: {shapes(self.residuals)}"
+            )
+        with open(path, "w", encoding="utf-8") as file:
+            file.write(fit_page(self, runs))
 
     def _text(self) -> str:
         return _batch_text(self) if self.values.ndim > 1 else _text(self)
