@@ -5,6 +5,7 @@ threads on the CPU, unless PJRT_NPROC or NPROC is set; and lets XLA compile smal
 holds `xla_backend_extra_options`. The last two take effect if JAX has not computed anything yet.
 """
 
+import gc as _gc
 import os as _os
 
 import jax as _jax
@@ -22,6 +23,9 @@ if not {"PJRT_NPROC", "NPROC"} & _os.environ.keys():
 if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _option = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1048576"
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
+
+if _collects := _gc.isenabled():
+    _gc.disable()  # what modules hold stays: looking through it again and again takes a tenth of the time of the import
 
 from jourdain_jax import models
 from jourdain_jax.analysis.accelerometer import Accelerometer
@@ -103,6 +107,9 @@ from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.spline import Spline
 from jourdain_jax.scene.visuals import Visual
+
+if _collects:
+    _gc.enable()
 
 __version__ = _version_of("jourdain-jax")
 

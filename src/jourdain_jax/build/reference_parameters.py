@@ -42,7 +42,7 @@ def once_per_values(probe):
         if any(_is_traced(x) for x in leaves):
             concrete = with_reference_parameters(scene)
             leaves, treedef = jax.tree.flatten(concrete)
-        key = tuple((np.asarray(x).tobytes(), np.shape(x), str(np.asarray(x).dtype)) for x in leaves)
+        key = tuple((x.tobytes(), x.shape, x.dtype) for x in map(np.asarray, leaves))
         return cached(_Hashable(concrete, (treedef, key, type(scene), jax.config.jax_enable_x64)), *case)
 
     return of

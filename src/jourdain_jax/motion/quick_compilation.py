@@ -14,7 +14,6 @@ from jax.extend.core import get_opaque_trace_state
 from jourdain_jax.scene.numbers import is_traced
 
 _OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
-_RUN_SELDOM: dict[str, Any] = _OPTIONS | {"xla_backend_optimization_level": 0}
 
 
 def compiled(f: Callable, **options) -> Callable:
@@ -59,12 +58,9 @@ def _whole(arrays, treedef, rest):
     return jax.tree.unflatten(treedef, [next(left) if x is _AN_ARRAY else x for x in rest])
 
 
-def quickly_compiled(f: Callable, compiler: Callable = compiled, run_seldom: bool = False) -> Callable:
-    """`f`, compiled by `compiler`; on a CPU with the quick options, but for calls inside another transformation: JAX takes options of whole programs only.
-
-    `run_seldom`: what `f` costs is its compilation.
-    """
-    plain, quick = compiler(f), compiler(f, compiler_options=_RUN_SELDOM if run_seldom else _OPTIONS)
+def quickly_compiled(f: Callable, compiler: Callable = compiled) -> Callable:
+    """`f`, compiled by `compiler`; on a CPU with the quick options, but for calls inside another transformation: JAX takes options of whole programs only."""
+    plain, quick = compiler(f), compiler(f, compiler_options=_OPTIONS)
 
     def run(*arguments):
         return (quick if jax.default_backend() == "cpu" and _outermost(arguments) else plain)(*arguments)

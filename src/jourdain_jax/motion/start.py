@@ -80,7 +80,7 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
     inside jit and vmap); the quaternion (0, 0, 0, 0) has no direction and stays as it is, with a residual of 1/2. ValueError for wrong shapes.
     """
     t, q, u = checked_unless_traced(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many"), as_coordinates(scene, q), as_speeds(scene, u)
-    inputs = as_input_vector(scene, inputs, q.dtype)
+    inputs = inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, q.dtype)
     known = (*scene.coordinate_names.entries, *scene.speed_names.entries)
     for name in held:
         if name not in known:
@@ -188,7 +188,7 @@ def _tolerance(dtype) -> float:
     return 1e3 * float(np.sqrt(np.finfo(dtype).eps))
 
 
-_compiled_projection = quickly_compiled(_put_onto_constraints, run_seldom=True)  # one program for every choice of what is held
+_compiled_projection = quickly_compiled(_put_onto_constraints)  # one program for every choice of what is held
 _uncompiled_projection = eval_numpy(_put_onto_constraints)
 
 
