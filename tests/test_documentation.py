@@ -5,6 +5,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import jourdain_jax as jj
@@ -45,6 +46,20 @@ def test_files_that_the_theory_names_exist():
     text = (DOCS / "theory.md").read_text(encoding="utf-8")
     for name in re.findall(r"`([\w/]+\.py)`", text):
         assert (ROOT / "src" / "jourdain_jax" / name).exists(), name
+
+
+@pytest.mark.slow
+def test_the_results_of_the_paper_hold_where_they_are_shown():
+    text, page = (DOCS / "paper_by_example.md").read_text(encoding="utf-8"), {}
+    assert [f"S{number}" for number in range(1, 13)] == re.findall(r"^## (S\d+)\.", text, re.M)
+    for cell in re.findall(r"```\{code-cell\}[^\n]*\n(.*?)```", text, re.S):
+        exec(cell, page)
+    np.testing.assert_allclose(page["force"][:2] @ page["blade"], 0.0, atol=1e-12)
+    np.testing.assert_allclose(page["force"][:2] @ page["across"], page["solved"].multipliers[0], rtol=1e-12)
+    np.testing.assert_allclose(page["lagrange"].h, jj.unconstrained_equations(page["pendulum"], *page["here"]).h, atol=1e-12)
+    np.testing.assert_allclose(page["by_minimum"], page["solved"].udot, atol=1e-12)
+    np.testing.assert_allclose(page["psi"], page["closed"], atol=1e-10)  # (64), by quasi-velocities
+    np.testing.assert_allclose(page["length"], page["scene"].rod_length, atol=1e-12)
 
 
 def test_the_readme_has_at_most_nine_hundred_words():

@@ -5,7 +5,7 @@ by evaluating the scene at a few states, which takes numbers for its parameters.
 """
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import fields
@@ -32,18 +32,18 @@ def without_collecting() -> Iterator[None]:
 
 
 def once_per_values(probe):
-    """A function of a scene that runs on concrete parameters, also while they are traced, and once per class and values."""
-    cached = lru_cache(maxsize=512)(lambda wrapped: probe(wrapped.scene))
+    """A function of a scene (and of what else tells its cases apart), run once per class and values, on concrete parameters, also while they are traced."""
+    cached = lru_cache(maxsize=512)(lambda wrapped, *case: probe(wrapped.scene, *case))
 
     @wraps(probe)
-    def of(scene: Scene):
+    def of(scene: Scene, *case: Hashable):
         leaves, treedef = jax.tree.flatten(scene)
         concrete = scene
         if any(_is_traced(x) for x in leaves):
             concrete = with_reference_parameters(scene)
             leaves, treedef = jax.tree.flatten(concrete)
-        key = tuple((np.asarray(x).tobytes(), np.shape(x), str(np.asarray(x).dtype)) for x in leaves)
-        return cached(_Hashable(concrete, (treedef, key, type(scene))))
+        key = tuple((x.tobytes(), x.shape, x.dtype) for x in map(np.asarray, leaves))
+        return cached(_Hashable(concrete, (treedef, key, type(scene), jax.config.jax_enable_x64)), *case)
 
     return of
 

@@ -48,7 +48,7 @@ def _run(jaxpr, constants, arguments) -> list[np.ndarray]:
 
     for equation in jaxpr.eqns:
         inputs = [read(x) for x in equation.invars]
-        results = _apply(equation, inputs)
+        results = applied(equation, inputs)
         for variable, result in zip(equation.outvars, results, strict=True):
             values[variable] = result
     return [read(x) for x in jaxpr.outvars]
@@ -58,7 +58,8 @@ def _closed(inner, inputs):
     return _run(inner.jaxpr, inner.consts, inputs) if hasattr(inner, "consts") else _run(inner, [], inputs)
 
 
-def _apply(equation, inputs) -> list[np.ndarray]:
+def applied(equation, inputs) -> list[np.ndarray]:
+    """Results of one equation of a traced function."""
     name, params = equation.primitive.name, equation.params
     if name == "while":
         return _while(equation, inputs)

@@ -59,10 +59,13 @@ class Formulation(eqx.Module):
         return replace(self, state=state)
 
 
+_DEFAULT = Formulation()
+
+
 def as_formulation(formulation) -> Formulation:
     """The formulation, the default one for None; ValueError for anything else."""
     if formulation is None:
-        return Formulation()
+        return _DEFAULT
     if not isinstance(formulation, Formulation):
         raise ValueError(f"`formulation` is {described(formulation)}, expected `jj.Formulation(state, reduction, stabilisation)` or None")
     return formulation

@@ -16,6 +16,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, Primitive, Var, jaxpr_as_fun
 from jaxtyping import Array, Float
 
+from jourdain_jax.motion.quick_compilation import compiled
 from jourdain_jax.program.calls import description
 from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.what_is_read import WhatIsRead, is_function, is_read_by
@@ -96,7 +97,7 @@ def traced(function: Callable, real) -> tuple[FunctionOfTime | None, object]:
     if kept.read is not None and kept.now == (kept.read.now(), real):
         return kept.found
     found = _traced_now(function, real)
-    if kept.again and found[0] is not None and not is_traced(found[0].held):
+    if kept.again and found[0] is not None and not is_traced(found[0]):
         kept.read, kept.found = is_read_by(function), found
         kept.now = kept.read.now(), real
     kept.again = True
@@ -150,11 +151,8 @@ def for_programs(f: Callable, compiled_by: Callable[[Callable, Callable], Callab
 
     `compiled_by`: takes the function and what compiles it.
     """
-    for_none = compiled_by(f, eqx.filter_jit)
-
-    @lru_cache(maxsize=MOST_COMPILED)
-    def for_some(programs: Hashable) -> Callable:
-        return compiled_by(f, _compiled)
+    for_none = compiled_by(f, compiled)
+    for_some = lru_cache(maxsize=MOST_COMPILED)(lambda programs: compiled_by(f, compiled))
 
     def of(programs: Hashable) -> Callable:
         return for_some(programs) if programs else for_none
@@ -165,33 +163,3 @@ def for_programs(f: Callable, compiled_by: Callable[[Callable, Callable], Callab
 def by_itself(f: Callable, compiler: Callable) -> Callable:
     """`f` as the compiler makes it."""
     return compiler(f)
-
-
-class _Kept(eqx.Module):
-    """What is no array in what a compiled function returns."""
-
-    value: object = eqx.field(static=True)
-
-
-def _compiled(f: Callable, **options) -> Callable:
-    """As `equinox.filter_jit`, which holds on to what it compiled for as long as the process lives."""
-
-    def on_arrays(arrays, others):
-        treedef, rest = others
-        left = iter(arrays)
-        found = f(*jax.tree.unflatten(treedef, [next(left) if x is _AN_ARRAY else x for x in rest]))
-        arrays, kept = eqx.partition(found, eqx.is_array)
-        return arrays, _Kept(kept)
-
-    jitted = jax.jit(on_arrays, static_argnums=1, **options)
-
-    def run(*arguments):
-        leaves, treedef = jax.tree.flatten(arguments)
-        arrays = [x for x in leaves if eqx.is_array(x)]
-        found, kept = jitted(arrays, (treedef, tuple(_AN_ARRAY if eqx.is_array(x) else x for x in leaves)))
-        return eqx.combine(found, kept.value)
-
-    return run
-
-
-_AN_ARRAY = object()

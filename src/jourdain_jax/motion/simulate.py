@@ -36,6 +36,7 @@ from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
+_REVERSE, _LOOSE, _TIGHT = diffrax.RecursiveCheckpointAdjoint(), diffrax.Tsit5(), diffrax.Dopri8()  # made once: each takes a tenth of a millisecond
 _OFF = 1e4  # units of round-off: a residual that is more
 
 
@@ -145,7 +146,7 @@ def _set_up(
         controller=stepsize_controller,
         tolerances=tuple((jnp if is_traced(x) else np).asarray(x, start.q.dtype) for x in (rtol, atol)),  # arrays: another tolerance is no other program
         dt0=_first_step(solver, dt0, t0, t1),  # diffrax's own guess costs two more copies of the vector field to compile
-        adjoint=diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        adjoint=_REVERSE if adjoint is None else adjoint,
         max_steps=max_steps,
         saveat=None if saveat is None else _checked_saveat(saveat),
         event_names=names_of_events(scene) if events else (),
@@ -196,7 +197,7 @@ def _on_constraints(scene: Scene, t0, start: State, inputs: Inputs, made_here: b
 
 def default_solver(rtol: Number) -> diffrax.AbstractERK:
     """The solver for this tolerance."""
-    return diffrax.Tsit5() if rtol >= 1e-6 else diffrax.Dopri8()
+    return _LOOSE if rtol >= 1e-6 else _TIGHT
 
 
 def warn_float32(dtype, rtol) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.sampling import NoStateFoundError, seen_on_rows
 from jourdain_jax.build.structure import Structure, closure_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.damped import damped_root
@@ -26,7 +27,7 @@ from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.numbers import checked_unless_traced, is_traced
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
@@ -78,8 +79,8 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
     Differentiable in any mode. What cannot be met stays in `residual`, which is infinite where numbers are not finite (no error: this also runs
     inside jit and vmap); the quaternion (0, 0, 0, 0) has no direction and stays as it is, with a residual of 1/2. ValueError for wrong shapes.
     """
-    t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
-    inputs = as_input_vector(scene, inputs, q.dtype)
+    t, q, u = checked_unless_traced(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many"), as_coordinates(scene, q), as_speeds(scene, u)
+    inputs = inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, q.dtype)
     known = (*scene.coordinate_names.entries, *scene.speed_names.entries)
     for name in held:
         if name not in known:
@@ -92,25 +93,17 @@ def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable
     """The nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`."""
     arguments = (scene, t, q, u, inputs, free_q, free_u, _usual(scene))
     if is_traced(arguments):
-        found = _put_onto_constraints(*arguments, guesses())
-    else:
-        found = _compiled_projection(*arguments, None)
-        if not found.arrived and _can_search(scene):  # rare, and long to compile
-            found = jax.tree.map(jnp.asarray, _uncompiled_projection(*arguments, guesses()))
-    return State(
-        t, found.q, found.u, found.moved_q, found.moved_u, found.residual, (scene.coordinate_names, scene.speed_names), found.guess.astype(found.q.dtype)
-    )
+        return _put_onto_constraints(*arguments, guesses()).state
+    found = _compiled_projection(*arguments, None)
+    if not found.arrived and _can_search(scene):  # rare, and long to compile
+        found = jax.tree.map(jnp.asarray, _uncompiled_projection(*arguments, guesses()))
+    return found.state
 
 
 class _Found(eqx.Module):
-    """A state, how far it is from the guess, what is left of the rows (infinite where a number is not finite), and which guess led to it."""
+    """A state; its residual is infinite where a number is not finite."""
 
-    q: Float[Array, "coordinates"]
-    u: Float[Array, "speeds"]
-    moved_q: Float[Array, ""]
-    moved_u: Float[Array, ""]
-    residual: Float[Array, ""]
-    guess: Int[Array, ""]
+    state: State
     arrived: Bool[Array, ""]  # whether the coordinates did, and are within reach of the domain
 
 
@@ -123,6 +116,10 @@ class _Usual(eqx.Module):
 
 
 def _usual(scene: Scene) -> _Usual:
+    return _worked_out(scene) if is_traced(scene) else _once(scene)
+
+
+def _worked_out(scene: Scene) -> _Usual:
     low, high = coordinate_bounds(scene)
     width = np.where(high > low, high - low, 1.0).astype(jnp.result_type(float))
     try:
@@ -130,6 +127,9 @@ def _usual(scene: Scene) -> _Usual:
     except ValueError:  # of a scene that is wrong in itself; said where its structure is asked for
         norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
         return _Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width)
+
+
+_once = once_per_values(_worked_out)
 
 
 def _can_search(scene: Scene) -> bool:
@@ -150,7 +150,9 @@ def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: 
     left = jnp.concatenate([closure_residual(scene, t, near_q), velocity_residual(scene, t, near_q, near_u, inputs)])
     finite = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left])))
     moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
-    return _Found(near_q, near_u, moved_q, moved_u, jnp.where(finite, residual, jnp.inf), guess, arrived)
+    names = scene.coordinate_names, scene.speed_names
+    state = State(jnp.asarray(t), near_q, near_u, moved_q, moved_u, jnp.where(finite, residual, jnp.inf), names, guess.astype(q.dtype))
+    return _Found(state, arrived)
 
 
 def _left(scene: Scene, t, q) -> Float[Array, ""]:
@@ -205,7 +207,7 @@ def start(scene: Scene | BuiltFor, *, t0: Number = 0.0, inputs=None, **values) -
     return named_start(scene, values, t0, as_inputs(scene, inputs).at(as_time(t0)))
 
 
-def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs: Float[Array, "inputs"]) -> State:
+def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs: Float[Array | np.ndarray, "inputs"]) -> State:
     """A start from a dictionary of `values`, as of `start`, and the `inputs` at time `t0` as a vector."""
     scene = as_scene(scene)
     q, u, given = scene.named(**values)

@@ -15,6 +15,7 @@ import numpy as np
 from jax.extend.core import Literal
 
 from jourdain_jax.calculus.scalar_operations import TABLE
+from jourdain_jax.eager.numpy_backend import applied
 from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
 from jourdain_jax.program.graph import Graph, Unsupported
 
@@ -98,7 +99,7 @@ def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
             inputs = [Nodes(as_nodes(graph, x)) if i in _MIXED[name](len(inputs)) else x for i, x in enumerate(inputs)]
         return _boxed(rule(graph, inputs, equation.params, out), symbolic)
     if not symbolic:
-        return [np.asarray(x) for x in _bind_concretely(equation, inputs)]
+        return applied(equation, [np.asarray(x, v.aval.dtype) for x, v in zip(inputs, equation.invars, strict=True)])
     if out.dtype.kind in "iu" and name in _NOT_OF_INTEGERS:
         raise Unsupported("an integer that depends on the state")
     if _is_rounded(out.dtype):
@@ -143,12 +144,6 @@ def _own_rule(name: str, params) -> str:
         return ""
     info = getattr(inner_jaxpr(name, params).jaxpr.debug_info, "func_src_info", None) or "a function"
     return "" if _HOME in info else f"`{info.split(' at ')[0]}`, which has a derivative of its own,"
-
-
-def _bind_concretely(equation, inputs):
-    with jax.ensure_compile_time_eval():
-        result = equation.primitive.bind(*(jnp.asarray(x) for x in inputs), **equation.params)
-    return result if equation.primitive.multiple_results else [result]
 
 
 def _boxed(result, symbolic: bool) -> list[Value]:

@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.structure import WELL_CONDITIONED, Structure, structure_of
 from jourdain_jax.build.usual_lengths import usual_lengths
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
@@ -21,6 +22,7 @@ from jourdain_jax.motion.vector_fields.by_matrices import Full, Minimal
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
@@ -29,12 +31,17 @@ _BACKENDS = ("auto", "native", "xla", "dense")
 
 def vector_field(scene: Scene, formulation: Formulation | None = None, work: bool = True, backend: str = "auto", inputs=None) -> VectorField:
     """What is integrated of a scene; the arguments are those of `simulate`."""
-    structure, formulation = structure_of(scene), as_formulation(formulation)
-    state, reduction = formulation.state, formulation.reduction
+    formulation, constant = as_formulation(formulation), as_inputs(scene, inputs).constant
+    plain = formulation.reduction is None and formulation.baumgarte is None and isinstance(backend, str)
+    return (_vector_field if is_traced(scene) or not plain else _once)(scene, formulation, work, backend, constant)
+
+
+def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: str, constant: bool) -> VectorField:
+    structure, state, reduction = structure_of(scene), formulation.state, formulation.reduction
     _check(scene, structure, state, backend)
     minimal = state == "minimal" or (state == "auto" and structure.has_minimal_state)
     independent = structure.independent if minimal else None
-    inputs_in_rows = structure.rows_of_inputs and not as_inputs(scene, inputs).constant
+    inputs_in_rows = structure.rows_of_inputs and not constant
     with_work = work and needs_work(scene, structure)
     dense = inputs_in_rows or (with_work and (structure.driven or structure.varying_inertia))
     program = _program(scene, minimal, backend, formulation, dense)
@@ -54,6 +61,9 @@ def vector_field(scene: Scene, formulation: Formulation | None = None, work: boo
     if minimal:
         return Minimal(**common)
     return Full(**common, may_branch=cutoff is not None and isinstance(reduction, NullSpaceQR) and bool(names_of_position_rows(scene)))
+
+
+_once = once_per_values(_vector_field)
 
 
 def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation, dense: bool) -> Lowered | None:
