@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.analysis.asked import Asked
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.information import information, students_t_95
@@ -29,6 +30,7 @@ from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.reference_parameters import reference_parameters
 from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
@@ -40,6 +42,7 @@ _STEPS, _ROUGHLY = 12, 0.05  # tried on each of them, and their tolerance
 _SAME = 0.05  # of half the sum of squares, by which the same minimum is found lower from elsewhere
 _FEWEST_RUNS = 5  # that tell how much runs differ
 _FEWEST_DEGREES = 4  # of freedom
+_WHOLE, _WITH_MEMORY = "whole runs", "whole runs, after a turn of correlation times"  # what is minimised
 _TURNS, _SETTLED = 20, 1e-3  # of correlation times and unknowns at most; change of the correlation of neighbouring samples that ends them
 
 
@@ -131,18 +134,20 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
         )
     runs = as_runs(scene, data, repeats=repeats)
     _check_choices(runs, loss, errors)
+    free = free if isinstance(free, Mapping) else tuple(as_names(free))
     unknowns = unknowns_of(scene, runs, free)
     with reference_parameters(scene):
         check_starts(scene, runs, unknowns)
         members = _repeats(runs) if repeats else None
         _check_enough(runs, unknowns, repeats)
-        problem = Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members), loss or LEAST_SQUARES)
+        asked = Asked(scene, free, simulation, loss or LEAST_SQUARES, control)
+        problem = Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members), asked.loss)
         theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
         limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
         found = _minimum(problem, theta, limits, control, one_will_do=members is None)
         same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
         found = _with_memory(problem, found if members else found.lowest(), limits, control)
-        return _result(problem, found, limits, control, errors, guesses, same)
+        return _result(problem, found, limits, asked, errors, guesses, same)
 
 
 def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
@@ -152,17 +157,18 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
     a short span does not tell stays near the first guess. `one_will_do`: spans grow
     only where no theta led to a minimum with small residuals.
     """
-    found = minimise(problem.linearised, theta, limits, control)
+    found = minimise(problem.linearised, theta, limits, control, _WHOLE)
     is_poor = ~found.converged | (found.at.cost > 0.5 * _POOR * problem.samples)
     poor = np.flatnonzero(is_poor)
     if not poor.size or not problem.samples or (one_will_do and not is_poor[np.argmin(found.at.cost)]):
         return found
-    begin, steps, problem.begun = theta[poor], found.steps[poor], theta
+    begin, steps, trace, problem.begun = theta[poor], found.steps[poor], found.trace[poor], theta
     roughly = replace(control, most_steps=min(_STEPS, control.most_steps), tolerance=_ROUGHLY)
     for problem.share, how in (*((share, roughly) for share in _SPANS), (1.0, control)):
-        grown = minimise(lambda x, here: problem.linearised(x, poor[here]), begin, limits, how)
-        begin, steps = grown.theta, steps + grown.steps
-    return found.lowered(poor, replace(grown, steps=steps))
+        what = _WHOLE if problem.share == 1 else f"the first {problem.share:.3g} of each run"
+        grown = minimise(lambda x, here: problem.linearised(x, poor[here]), begin, limits, how, what)
+        begin, steps, trace = grown.theta, steps + grown.steps, trace + grown.trace
+    return found.lowered(poor, replace(grown, steps=steps, trace=trace))
 
 
 def _with_memory(problem: Problem, found: Minimum, limits: Limits, control: Control) -> Minimum:
@@ -173,7 +179,7 @@ def _with_memory(problem: Problem, found: Minimum, limits: Limits, control: Cont
         if not going.size:
             break
         changed = problem.restrict(found.theta[going], going)
-        again = minimise(lambda x, here, going=going: problem.linearised(x, going[here]), found.theta[going], limits, some)
+        again = minimise(lambda x, here, going=going: problem.linearised(x, going[here]), found.theta[going], limits, some, _WITH_MEMORY)
         found = found.replaced(going, again)
         going = going[(changed > _SETTLED) | ~again.converged]
     found.converged[going] = False
@@ -218,15 +224,15 @@ def _check_enough(runs: Sequence[Measurements], unknowns: Unknowns, repeats: boo
         )
 
 
-def _result(problem: Problem, found: Minimum, limits: Limits, control: Control, errors: str, guesses: int, agreeing: np.ndarray) -> Fit:
-    unknowns, theta, single = problem.unknowns, found.theta, problem.lanes.members is None
+def _result(problem: Problem, found: Minimum, limits: Limits, asked: Asked, errors: str, guesses: int, agreeing: np.ndarray) -> Fit:
+    unknowns, theta, single, control = problem.unknowns, found.theta, problem.lanes.members is None, asked.control
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     low, high = limits.low[places], limits.high[places]
     bound = (theta <= limits.low) | (theta >= limits.high)
     limit, beyond = (one(x[:, places]) for x in limits_at_bounds(problem.linearised, found, limits, control))
-    residuals = tuple(problem.by_channel(run, found, one) for run in range(len(problem.runs)))
-    white = tuple(problem.by_channel(run, found, one, white=True) for run in range(len(problem.runs)))
+    residuals = tuple(problem.by_channel(run, found.at, one) for run in range(len(problem.runs)))
+    white = tuple(problem.by_channel(run, found.at, one, white=True) for run in range(len(problem.runs)))
     samples = sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())
     known = information(found.at.arrow, size, places, bound, fails, control.cutoff, single)
     errors_of = lambda arrow: information(arrow, size, places, bound, fails, control.cutoff, False).standard_errors  # noqa: E731
@@ -268,6 +274,8 @@ def _result(problem: Problem, found: Minimum, limits: Limits, control: Control, 
         units=unknowns.units,
         cutoff=control.cutoff,
         errors=errors,
+        trace=found.trace[0] if single else (),
+        asked=asked,
     )
 
 

@@ -60,12 +60,13 @@ class Minimum:
     stuck: Bool[np.ndarray, "members"]  # no step lowers F, however short, and this is no minimum
     steps: Int[np.ndarray, "members"]  # tried
     grown: Bool[np.ndarray, "members"]  # whether it was found over growing spans
+    trace: np.ndarray  # (members,) of tuples of (what was minimised, F at first and after each step tried)
 
     def lowest(self) -> "Minimum":
         """That of the member with the lowest value."""
         best = [int(np.argmin(self.at.cost))]
         at = Linearised(self.at.cost[best], self.at.arrow.at(best), self.at.residual[best], self.at.sigma[best])
-        return Minimum(self.theta[best], at, self.converged[best], self.stuck[best], self.steps[best], self.grown[best])
+        return Minimum(self.theta[best], at, self.converged[best], self.stuck[best], self.steps[best], self.grown[best], self.trace[best])
 
     def agreeing(self, apart: float) -> int:
         """How many members converged to a value at most so far `apart` from the lowest one."""
@@ -77,7 +78,7 @@ class Minimum:
         here = members[lower]
         for kept, new in ((self.theta, grown.theta), (self.at.cost, grown.at.cost), (self.converged, grown.converged), (self.stuck, grown.stuck)):
             kept[here] = new[lower]
-        self.steps[members], self.grown[here] = grown.steps, True
+        self.steps[members], self.grown[here], self.trace[here] = grown.steps, True, grown.trace[lower]
         self.at.residual[here], self.at.sigma[here] = grown.at.residual[lower], grown.at.sigma[lower]
         for kept, new in zip(self.at.arrow.arrays, grown.at.arrow.arrays, strict=True):
             kept[here] = new[lower]
@@ -90,18 +91,19 @@ class Minimum:
         for kept, one in zip(kept_ones, new_ones, strict=True):
             kept[members] = one
         self.steps[members] += new.steps
+        self.trace[members] += new.trace
         return self
 
 
 def minimise(
-    evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Float[np.ndarray, "members unknowns"], limits: Limits, control: Control
+    evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Float[np.ndarray, "members unknowns"], limits: Limits, control: Control, what: str = ""
 ) -> Minimum:
-    """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers."""
+    """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers; `what`: says in the trace what is minimised."""
     theta, members = theta.copy(), np.arange(len(theta))
     at = evaluate(theta, members)
     damping, growth, fall = (np.full(len(theta), x) for x in (FIRST, 4.0, FASTEST))
     converged, stuck, steps = np.zeros(len(theta), bool), np.zeros(len(theta), bool), np.zeros(len(theta), int)
-    going = np.isfinite(at.cost)
+    going, costs = np.isfinite(at.cost), [[cost] for cost in at.cost.tolist()]
     for _ in range(control.most_steps):
         here = members[going]
         if not here.size:
@@ -130,6 +132,8 @@ def minimise(
         at.residual[rising], at.sigma[rising] = trial.residual[better], trial.sigma[better]
         for kept, new in zip(at.arrow.arrays, trial.arrow.arrays, strict=True):
             kept[rising] = new[better]
+        for b in here.tolist():
+            costs[b].append(float(at.cost[b]))
         # after a step that failed, damping falls slowly: in a curved valley every other step would fail. It rises where steps overshoot: where residuals
         # stay large, undamped ones go to and fro along what shows least
         change = np.where(ratio > 0.9, 1 / fall[here], np.where(ratio < 0.6, 3.0, 1.0))
@@ -139,7 +143,9 @@ def minimise(
         fall[here] = np.where(better, np.minimum(1.5 * fall[here], FASTEST), 2.0)
         lost = damping[here] > MOST
         stuck[here[lost]], going[here[lost]] = True, False
-    return Minimum(theta, at, converged, stuck, steps, np.zeros(len(theta), bool))
+    trace = np.empty(len(theta), object)
+    trace[:] = [((what, tuple(of_one)),) for of_one in costs]
+    return Minimum(theta, at, converged, stuck, steps, np.zeros(len(theta), bool), trace)
 
 
 def _step(arrow: Arrow, theta, damping, limits: Limits, cutoff: float) -> np.ndarray:
