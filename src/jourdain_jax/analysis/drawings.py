@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+Number = int | float
 DATA, PALE, MODEL, QUIET, BAND = "#d1495b", "#e88d98", "#1b4f72", "#888", "#e6e6e6"
 COLOURS = ("#1b4f72", "#d98c00", "#3c8d5a", "#8c4b8c", "#d1495b", "#5b6d7d")  # of several things side by side
 _EDGE_RIGHT = 10  # pixels; left, above and below the axes leave room for numbers
@@ -23,7 +24,7 @@ def span_of(*numbers) -> tuple[float, float]:
     return low - 0.04 * (high - low), high + 0.04 * (high - low)
 
 
-def ticks(low: float, high: float, most: int) -> list[tuple[float, str]]:
+def ticks(low: Number, high: Number, most: int) -> list[tuple[float, str]]:
     """Round numbers from low to high, at most `most` and one, with their texts."""
     rough = (high - low) / most
     power = 10.0 ** np.floor(np.log10(rough))
@@ -34,7 +35,7 @@ def ticks(low: float, high: float, most: int) -> list[tuple[float, str]]:
     return [(k * step, f"{k * step:.{decimals}f}" if plain else f"{k * step:.10g}") for k in range(first, last + 1)]
 
 
-def text(x: float, y: float, words: str, anchor: str = "start", kind: str = "") -> str:
+def text(x: Number, y: Number, words: str, anchor: str = "start", kind: str = "") -> str:
     """A text at a place in pixels."""
     of_kind = f' class="{kind}"' if kind else ""
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}"{of_kind}>{html.escape(words)}</text>'
@@ -50,12 +51,12 @@ def drawing(width: int, height: int, parts: Sequence[str], caption: str = "") ->
 class Axes:
     """A frame in pixels, and the numbers at its edges."""
 
-    left: float
-    top: float
-    width: float
-    height: float
-    x: tuple[float, float]
-    y: tuple[float, float]
+    left: Number
+    top: Number
+    width: Number
+    height: Number
+    x: tuple[Number, Number]
+    y: tuple[Number, Number]
 
     def right(self, x):
         """Pixels from the left."""
@@ -80,7 +81,7 @@ class Axes:
         parts += [text(2, self.top - 6, y_label)] if y_label else []
         return "".join(parts)
 
-    def dots(self, x, y, colour: str = DATA, kind: str = "dots", size: float = 3.2) -> str:
+    def dots(self, x, y, colour: str = DATA, kind: str = "dots", size: Number = 3.2) -> str:
         """Dots; what is not finite is left out."""
         at = "".join(f"M{a:.1f},{b:.1f}h0" for a, b in self._finite(x, y))
         return f'<path class="{kind}" d="{at}" stroke="{colour}" stroke-width="{size}" stroke-linecap="round" fill="none"/>' if at else ""
@@ -91,20 +92,20 @@ class Axes:
         dash = ' stroke-dasharray="4 3"' if dashed else ""
         return f'<polyline class="{kind}" points="{at}" fill="none" stroke="{colour}" stroke-width="1.3"{dash}/>' if at else ""
 
-    def level(self, y: float, colour: str = QUIET, dashed: bool = False) -> str:
+    def level(self, y: Number, colour: str = QUIET, dashed: bool = False) -> str:
         """A horizontal line."""
         return _rule(self.left, float(self.down(y)), self.left + self.width, float(self.down(y)), colour, dashed)
 
-    def upright(self, x: float, colour: str = QUIET, dashed: bool = False) -> str:
+    def upright(self, x: Number, colour: str = QUIET, dashed: bool = False) -> str:
         """A vertical line."""
         return _rule(float(self.right(x)), self.top, float(self.right(x)), self.top + self.height, colour, dashed)
 
-    def band(self, low: float, high: float) -> str:
+    def band(self, low: Number, high: Number) -> str:
         """A grey band over all x."""
         top, bottom = float(self.down(min(high, self.y[1]))), float(self.down(max(low, self.y[0])))
         return f'<rect x="{self.left:.1f}" y="{top:.1f}" width="{self.width:.1f}" height="{bottom - top:.1f}" fill="{BAND}"/>'
 
-    def bar(self, x0: float, x1: float, y0: float, y1: float, colour: str = "") -> str:
+    def bar(self, x0: Number, x1: Number, y0: Number, y1: Number, colour: str = "") -> str:
         """A filled rectangle between these numbers; without a colour, in that of what it is part of."""
         (a, b), (c, d) = sorted((float(self.right(x0)), float(self.right(x1)))), sorted((float(self.down(y0)), float(self.down(y1))))
         fill = f' fill="{colour}"' if colour else ""
@@ -115,6 +116,6 @@ class Axes:
         return at[np.isfinite(at).all(axis=1)].tolist()
 
 
-def _rule(x0: float, y0: float, x1: float, y1: float, colour: str, dashed: bool = False) -> str:
+def _rule(x0: Number, y0: Number, x1: Number, y1: Number, colour: str, dashed: bool = False) -> str:
     dash = ' stroke-dasharray="4 3"' if dashed else ""
     return f'<line x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}" stroke="{colour}"{dash}/>'
