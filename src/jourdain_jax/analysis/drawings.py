@@ -9,7 +9,6 @@ import numpy as np
 Number = int | float
 DATA, PALE, MODEL, QUIET, BAND = "#d1495b", "#e88d98", "#1b4f72", "#888", "#e6e6e6"
 COLOURS = ("#1b4f72", "#d98c00", "#3c8d5a", "#8c4b8c", "#d1495b", "#5b6d7d")  # of several things side by side
-_EDGE_RIGHT = 10  # pixels; left, above and below the axes leave room for numbers
 _LEAST_SPAN = 1e-9  # of the numbers on an axis: less is round-off, and is drawn as one number
 
 

@@ -9,7 +9,7 @@ from jourdain_jax.analysis.held_out import Prediction
 from jourdain_jax.analysis.informed import Informed
 from jourdain_jax.analysis.likelihood_profiles import RISE_95, Profile
 
-_WIDTH, _LEFT = 460, 62  # pixels
+_WIDTH, _LEFT, _RIGHT = 460, 62, 20  # pixels
 _BINS = 60  # of time, at most
 _MOST_ROWS = 40  # unknowns in one drawing
 _NARROWEST, _WIDEST = 1e-4, 100.0  # per cent
@@ -23,7 +23,7 @@ def data_and_prediction(caption: str, label: str, one: Prediction, component: in
     every = -(-count // most)
     ts, value, predicted, sigma = (x[::every] for x in (one.ts, value, predicted, sigma))
     left = (predicted - value) / sigma
-    x, width = (float(one.ts[0]), float(one.ts[-1])), _WIDTH - _LEFT - 10
+    x, width = (float(one.ts[0]), float(one.ts[-1])), _WIDTH - _LEFT - _RIGHT
     if x[0] == x[1]:
         x = span_of(x)
     above = Axes(_LEFT, 20, width, 130, x, span_of(value, predicted))
@@ -43,7 +43,7 @@ def autocorrelation(name: str, found: np.ndarray, limit: float) -> str:
     """Correlation of whitened residuals by lag, over the band that white noise hardly leaves."""
     lags = np.arange(1, len(found) + 1)
     low, high = span_of(found, [-limit, limit])
-    axes = Axes(_LEFT, 20, _WIDTH - _LEFT - 10, 120, (0.0, len(found) + 0.5), (max(low, -1.05), max(high, 1.0)))
+    axes = Axes(_LEFT, 20, _WIDTH - _LEFT - _RIGHT, 120, (0.0, len(found) + 0.5), (max(low, -1.05), max(high, 1.0)))
     parts = [axes.band(-limit, limit), axes.frame("lag in samples", f"correlation of {name}"), axes.level(0.0, "#444")]
     parts += ["".join(axes.bar(lag - 0.06, lag + 0.06, 0.0, r, QUIET) for lag, r in zip(lags, found, strict=True)), axes.dots(lags, found, DATA, size=5)]
     return drawing(_WIDTH, 176, parts)
@@ -123,7 +123,7 @@ def profile(one: Profile, error: float) -> str:
     shown = one.rise <= 3 * RISE_95
     values, rise = one.values[shown], one.rise[shown]
     label = f"{one.name} in {one.unit}" if one.unit else one.name
-    axes = Axes(_LEFT, 20, _WIDTH - _LEFT - 10, 130, span_of(values), span_of(rise, [0.0, 1.3 * RISE_95]))
+    axes = Axes(_LEFT, 20, _WIDTH - _LEFT - _RIGHT, 130, span_of(values), span_of(rise, [0.0, 1.3 * RISE_95]))
     parts = [axes.frame(label, "2 (F - F_min)"), axes.level(RISE_95, DATA, dashed=True), axes.upright(one.estimate)]
     if np.isfinite(error) and error > 0:
         x = np.linspace(*axes.x, 60)
@@ -144,7 +144,7 @@ def way_to_the_minimum(trace: tuple[tuple[str, tuple[float, ...]], ...]) -> str:
         begins.append(len(above))
     low, high = span_of(above, [-3.0, 0.0])
     low, high = np.floor(low + 0.2), np.ceil(high - 0.2)
-    axes = Axes(_LEFT, 20, 2 * _WIDTH - _LEFT - 10 if len(above) > 60 else _WIDTH - _LEFT - 10, 130, (-0.5, len(above) - 0.5), (low - 0.15, high + 0.15))
+    axes = Axes(_LEFT, 20, 2 * _WIDTH - _LEFT - _RIGHT if len(above) > 60 else _WIDTH - _LEFT - _RIGHT, 130, (-0.5, len(above) - 0.5), (low - 0.15, high + 0.15))
     every = int(np.ceil((high - low) / 5))
     powers = [(p, f"1e{p:.0f}" if abs(p) > 2 else f"{10.0**p:g}") for p in np.arange(low, high + 0.5, every)]
     parts = [axes.frame("steps tried", "F above its minimum", y_ticks=powers)]
