@@ -144,11 +144,12 @@ def way_to_the_minimum(trace: tuple[tuple[str, tuple[float, ...]], ...]) -> str:
         begins.append(len(above))
     low, high = span_of(above, [-3.0, 0.0])
     low, high = np.floor(low + 0.2), np.ceil(high - 0.2)
-    axes = Axes(_LEFT, 20, 2 * _WIDTH - _LEFT - _RIGHT if len(above) > 60 else _WIDTH - _LEFT - _RIGHT, 130, (-0.5, len(above) - 0.5), (low - 0.15, high + 0.15))
+    whole = 2 * _WIDTH if len(above) > 60 else _WIDTH
+    axes = Axes(_LEFT, 20, whole - _LEFT - _RIGHT, 130, (-0.5, len(above) - 0.5), (low - 0.15, high + 0.15))
     every = int(np.ceil((high - low) / 5))
     powers = [(p, f"1e{p:.0f}" if abs(p) > 2 else f"{10.0**p:g}") for p in np.arange(low, high + 0.5, every)]
     parts = [axes.frame("steps tried", "F above its minimum", y_ticks=powers)]
     parts += [axes.upright(begin - 0.5, QUIET, dashed=True) for begin in begins[1:-1]]
     for a, b in pairwise(begins):
         parts.append(axes.line(np.arange(a, b), above[a:b]) + axes.dots(np.arange(a, b), above[a:b], MODEL, size=4))
-    return drawing(int(axes.left + axes.width + 10), 186, parts)
+    return drawing(int(axes.left + axes.width + _RIGHT), 186, parts)
