@@ -44,6 +44,12 @@ def test_links_lead_to_pages_that_exist(page):
         assert found.exists() or found.with_suffix(".md").exists(), f"{page.name}: {target}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
+def test_code_fits_the_width_of_a_page(page):
+    blocks = re.findall(r"```(?:\{code-cell\} ipython3|python)[^\n]*\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    assert [line for block in blocks for line in block.splitlines() if len(line) > 112] == []
+
+
 def test_files_that_the_theory_names_exist():
     text = (DOCS / "theory.md").read_text(encoding="utf-8")
     for name in re.findall(r"`([\w/]+\.py)`", text):
