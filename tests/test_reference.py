@@ -1,0 +1,57 @@
+"""The examples of the reference: every public name has one, and they print what their pages say."""
+
+import contextlib
+import inspect
+import io
+import re
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+import jourdain_jax.bicycle
+
+PAGES = sorted(page for page in (Path(__file__).parents[1] / "docs" / "reference").glob("*.md") if page.stem != "index")
+NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|nan|inf)", re.IGNORECASE)
+
+
+def blocks(page: Path) -> list[tuple[str, str]]:
+    """Code, and what it prints."""
+    return re.findall(r"```python\n(.*?)```\n(?:\n```text\n(.*?)```\n)?", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_name_has_an_example(page):
+    code, text = "\n".join(code for code, _ in blocks(page)), page.read_text(encoding="utf-8")
+    for module, name in re.findall(r"auto\w+:: (jourdain_jax(?:\.bicycle)?)\.(\w+)$", text, re.MULTILINE):
+        documented = inspect.getdoc(getattr(jj if module == "jourdain_jax" else jourdain_jax.bicycle, name)) or ""
+        assert re.search(rf"\b{name}\b", code) or re.search(r"^    \S", documented, re.MULTILINE), name
+
+
+def assert_alike(printed: str, told: str):
+    """Words are equal, and numbers but for round-off and what other machines print otherwise."""
+    assert NUMBER.sub("#", printed).split() == NUMBER.sub("#", told).split()
+    found, expected = ([float(x) for x in NUMBER.findall(text)] for text in (printed, told))
+    np.testing.assert_allclose(found, expected, rtol=1e-2, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_examples_print_what_is_told(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    for code, told in blocks(page):
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(code, names)
+        assert_alike(printed.getvalue(), told)
+    plt.close("all")
+
+
+def test_other_numbers_are_not_alike():
+    assert_alike("x = 1.0001 m, -0.00 8e-17", "x = 1.0 m, 0.00 2e-16")
+    for other in ("x = 1.1 m", "y = 1.0 m", "x = 1.0 m 2", "x = nan m"):
+        with pytest.raises(AssertionError):
+            assert_alike(other, "x = 1.0 m")
