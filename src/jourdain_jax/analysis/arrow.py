@@ -16,15 +16,14 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 
-def triangle(residual: Float[np.ndarray, "*batch samples"], jacobian: Float[np.ndarray, "*batch samples unknowns"]) -> np.ndarray:
-    """T of [J r], shape (*batch, unknowns + 1, unknowns + 1); NaN where something is not finite."""
-    whole = np.concatenate([jacobian, residual[..., None]], axis=-1)
-    good = np.all(np.isfinite(whole), axis=(-2, -1), keepdims=True)
-    found = np.linalg.qr(np.where(good, whole, 0.0), mode="r")
-    width = whole.shape[-1]
+def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarray, "*batch width width"]:
+    """T of [J r]; with entries that are not finite where those of [J r] are not."""
+    found, width = np.linalg.qr(whole, mode="r"), whole.shape[-1]
+    if found.shape[-2] == width:
+        return found
     square = np.zeros((*found.shape[:-2], width, width))
     square[..., : found.shape[-2], :] = found
-    return np.where(good, square, np.nan)
+    return square
 
 
 @dataclass(frozen=True)

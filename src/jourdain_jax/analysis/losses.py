@@ -39,6 +39,10 @@ class Loss:
             return np.ones_like(r)
         return (k + 1) / (k + r**2) if self.kind == "student-t" else np.minimum(1.0, k / np.maximum(np.abs(r), np.finfo(float).tiny))
 
+    def weighted(self, rows: Float[np.ndarray, "*samples width"], r: Float[np.ndarray, "*samples"]) -> Float[np.ndarray, "*samples width"]:
+        """Rows times the roots of their weights."""
+        return np.sqrt(self.weight(r))[..., None] * rows if np.isfinite(self.parameter) else rows
+
     def inflation(self, r: Float[np.ndarray, "samples"]) -> float:
         """By what the covariance (J'WJ)^-1 is to be multiplied, from the residuals that count."""
         k = self.parameter

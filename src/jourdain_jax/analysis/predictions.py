@@ -6,11 +6,12 @@ A lane is one run of one member (a repeat of the experiment, or a first guess of
 compiled once for runs of equal structure, whatever their number: memory does not grow with it. Short runs are filled up to the length of the longest.
 """
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
-from itertools import islice
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -128,7 +129,7 @@ class Lanes:
         self.lengths = [run.ts.shape[0] for run in data]
 
     def evaluate(self, shared: Float[np.ndarray, "members shared"], local: Float[np.ndarray, "members runs local"], members: np.ndarray):
-        """Yields, some lanes at a time: numbers of members (among those given) and of runs, residuals by lane, and Jacobians (own unknowns first)."""
+        """Yields, some lanes at a time: numbers of members (among those given) and of runs, and [J r] (lanes, samples, unknowns + 1), own unknowns first."""
         for group in self._groups:
             yield from group.evaluate(shared, local, members)
 
@@ -152,13 +153,10 @@ class Lanes:
         group = self._group_of(int(runs[0]))
         return group.within([group.indices.index(run) for run in runs.tolist()], share)
 
-    def whitened(self, runs: np.ndarray, members: np.ndarray, r, J, taus: dict[str, np.ndarray]) -> tuple:
-        """Residuals and Jacobians (None: none) of lanes of equal structure, whitened; `taus`: correlation times (lanes,) that are estimated, s."""
+    def whitened(self, runs: np.ndarray, members: np.ndarray, rows: Float[np.ndarray, "lanes samples width"], taus: dict[str, np.ndarray]) -> np.ndarray:
+        """Rows of lanes of equal structure, whitened; `taus`: correlation times (lanes,) that are estimated, s."""
         before, rho = self._group_of(int(runs[0])).chained(runs, members, taus)
-        if before is None:
-            return r, J
-        w = whitened(r, np.take_along_axis(r, before, axis=1), rho)
-        return w, None if J is None else whitened(J, np.take_along_axis(J, before[..., None], axis=1), rho[..., None])
+        return rows if before is None else whitened(rows, np.take_along_axis(rows, before[..., None], axis=1), rho[..., None])
 
     def log_widths(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> Float[np.ndarray, "lanes"]:
         """`sum log sqrt(1 - rho^2)` of lanes of equal structure."""
@@ -178,33 +176,40 @@ class _Group:
     """Runs of equal structure, filled up to one length."""
 
     def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None):
-        self.indices, self._members, self._counts = indices, members, layout.sizes
+        self.indices, self._members, self._runs = indices, members, np.array(indices)
         times, knots = max(run.ts.shape[0] for run in runs), _most_knots(runs)
         filled = [_filled(run, times, knots, 0 if members is None else 1) for run in _on_equal_grids(runs)]
-        self._arrays = jax.tree.map(lambda *xs: np.stack(xs), *[eqx.partition(run, _is_array)[0] for run in filled])
-        self._repeated = eqx.tree_at(
-            lambda r: (r.values, r.weights), jax.tree.map(lambda _: False, self._arrays), (dict.fromkeys(filled[0].values, members is not None),) * 2
-        )
-        self._common, rest = eqx.partition((scene, simulation), _is_array)
-        static = jax.tree.flatten((rest, eqx.partition(filled[0], _is_array)[1], layout))
-        self._run = _program(static[1], tuple(static[0]))
+        leaves, treedef = jax.tree.flatten(((scene, simulation), filled[0]))
+        common = len(jax.tree.leaves((scene, simulation)))
+        self._common = np.concatenate([np.zeros(0), *(np.ravel(x) for x in leaves[:common] if _is_array(x))])
+        # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
+        repeated = {id(x) for part in (filled[0].values, filled[0].weights) for x in part.values()} if members is not None else set()
+        columns = [(np.stack(x), id(x[0]) in repeated) for x in zip(*map(jax.tree.leaves, filled), strict=True) if _is_array(x[0])]
+        self._rows = np.concatenate([x.reshape(len(filled), 1, -1) for x, has_members in columns if not has_members], axis=2)
+        self._own_rows = np.concatenate([np.zeros((len(filled), members or 1, 0)), *(x.reshape(len(filled), members, -1) for x, has in columns if has)], axis=2)
+        marks = [
+            _Number(np.shape(x)[1:] if id(x) in repeated else np.shape(x), k >= common, id(x) in repeated) if _is_array(x) else x for k, x in enumerate(leaves)
+        ]
+        self._run = _program(treedef, tuple(marks), layout)
+        self.weights = {name: np.stack([run.weights[name] for run in filled]) for name in filled[0].weights}  # (runs, *members, times, *channel)
+        self._t0, self._ts = np.stack([run.t0 for run in filled]), np.stack([run.ts for run in filled])
         sizes = {name: int(np.prod(w.shape[0 if members is None else 1 :])) for name, w in sorted(filled[0].weights.items())}
         ends = np.cumsum([0, *sizes.values()]).tolist()
         self.channels = {name: slice(begin, end) for name, begin, end in zip(sizes, ends[:-1], ends[1:], strict=True)}
-        taus, arrays = self._arrays.correlation_time, self._arrays
-        self.chains = Chains.of(arrays.weights, arrays.ts, taus, self.channels, members is not None) if taus else None
+        taus = {name: np.stack([run.correlation_time[name] for run in filled]) for name in filled[0].correlation_time}
+        self.chains = Chains.of(self.weights, self._ts, taus, self.channels, members is not None) if taus else None
         saved = times if filled[0].grid is None else filled[0].grid.shape[0]
         states = saved * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
         self._width = int(min(MOST_LANES, max(1, TOUCHED // states)))
-        self._kept: tuple = ((), [])
 
     def evaluate(self, shared, local, members):
-        chunks = self._chunks(members)
-        yield self._ended(self._begin(shared, local, *chunks[0]))  # compiles, where that is needed
+        chunks = self._chunks(len(members))
+        lanes = lambda kept, b, j: self._ended(kept, b, j, self._begun(shared, local, members, b, j))  # noqa: E731
+        yield lanes(*chunks[0])  # compiles, where that is needed
         waiting: list[Future] = []
         try:
             for chunk in chunks[1:]:
-                waiting.append(_threads().submit(lambda chunk=chunk: self._ended(self._begin(shared, local, *chunk))))
+                waiting.append(_threads().submit(lanes, *chunk))
                 if len(waiting) == AHEAD:
                     yield waiting.pop(0).result()
             while waiting:
@@ -213,34 +218,22 @@ class _Group:
             for future in waiting:
                 future.cancel()
 
-    def _chunks(self, members):
-        """Positions of members and runs of some lanes, filled up with copies of the last, and their arrays."""
-        key = members.tobytes()
-        if self._kept[0] != key:
-            lanes = [(b, j) for b in range(len(members)) for j in range(len(self.indices))]
-            width = min(self._width, 1 << (len(lanes) - 1).bit_length())
-            chunks, rest = [], iter(lanes)
-            while some := list(islice(rest, width)):
-                b, j = np.array(some + some[-1:] * (width - len(some))).T
-                take = lambda x, repeated, b=b, j=j: jnp.asarray(x[j, members[b]] if repeated else x[j])  # noqa: E731
-                chunks.append((len(some), b, j, jax.tree.map(take, self._arrays, self._repeated)))
-            self._kept = key, chunks if len(chunks) * width <= 4096 else []
-            return chunks
-        return self._kept[1]
+    def _chunks(self, members: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        """How many lanes at a time, with positions of their members and runs; these are filled up with copies of the last."""
+        b, j = np.divmod(np.arange(members * len(self.indices)), len(self.indices))
+        width = min(self._width, 1 << (len(b) - 1).bit_length())
+        found = []
+        for first in range(0, len(b), width):
+            some = np.minimum(np.arange(first, first + width), len(b) - 1)
+            found.append((min(width, len(b) - first), b[some], j[some]))
+        return found
 
-    def _begin(self, shared, local, kept, b, j, arrays):
-        runs = np.array(self.indices)[j]
-        return kept, b, runs, self._run(self._common, arrays, shared[b], local[b, runs])
+    def _begun(self, shared, local, members, b, j):
+        own = members[b] if self._members is not None else 0
+        return self._run(self._common, np.concatenate([self._rows[j, 0], self._own_rows[j, own], local[b, self._runs[j]], shared[b]], axis=1))
 
-    def _ended(self, begun):
-        kept, b, runs, found = begun
-        r, J = (np.asarray(x)[:kept] for x in found)
-        return b[:kept], runs[:kept], r, J
-
-    @property
-    def weights(self) -> dict[str, np.ndarray]:
-        """Weights by channel, shape (runs, *members, times, *channel)."""
-        return self._arrays.weights
+    def _ended(self, kept, b, j, found):
+        return b[:kept], self._runs[j[:kept]], np.asarray(found)[:kept]
 
     def chained(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> tuple[np.ndarray | None, np.ndarray]:
         """Of each sample of lanes, the place of the one before it (None: all noise is white) and their correlation."""
@@ -251,7 +244,7 @@ class _Group:
 
     def within(self, places: list[int], share: float) -> np.ndarray:
         """Which samples of the runs at these places lie in the first `share` of the span, shape (lanes, samples)."""
-        ts, t0 = (np.asarray(x)[places] for x in (self._arrays.ts, self._arrays.t0))
+        ts, t0 = self._ts[places], self._t0[places]
         early = np.abs(ts - t0[:, None]) <= share * np.abs(ts[:, -1] - t0)[:, None]
         counts = [(where.stop - where.start) // early.shape[1] for where in self.channels.values()]
         return np.concatenate([np.repeat(early, count, axis=1) for count in counts], axis=1)
@@ -260,7 +253,7 @@ class _Group:
         """Residuals of the run at this place by channel; all NaN where `flat` is empty, since they were not worked out."""
         found = {}
         for name, where in self.channels.items():
-            weight = self._arrays.weights[name][place]
+            weight = self.weights[name][place]
             shape = weight.shape if self._members is None else weight.shape[1:]
             part = flat[..., where].reshape((*flat.shape[:-1], *shape)) if flat.shape[-1] else np.full((*flat.shape[:-1], *shape), np.nan)
             found[name] = np.where(weight > 0, part, np.nan)[(slice(None),) * (flat.ndim - 1) + (slice(times),)]
@@ -272,24 +265,42 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="jourdain_fit")
 
 
-@lru_cache(maxsize=16)
-def _program(treedef, leaves: tuple) -> Callable:
-    """Residuals (lanes, samples) and Jacobians (lanes, samples, local + shared) of lanes; compiled once for what is no array."""
-    rest, run_rest, layout = jax.tree.unflatten(treedef, leaves)
-    local_count = layout.sizes[1]
+class _Number(NamedTuple):
+    """What stands in place of an array: its shape, and whether it is in the row of a run, and there among the numbers that differ by member."""
 
-    def lane(common, arrays, shared, local):
-        (scene, simulation), run = eqx.combine(common, rest), eqx.combine(arrays, run_rest)
+    shape: tuple[int, ...]
+    of_run: bool
+    of_member: bool
+
+
+@lru_cache(maxsize=16)
+def _program(treedef, leaves: tuple, layout: Layout) -> Callable:
+    """[J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns; compiled once.
+
+    `treedef`, `leaves`: of scene, options and run, with a `_Number` in place of each array.
+    """
+    own = layout.sizes[1]
+
+    def lane(common: Float[Array, "numbers"], row: Float[Array, "numbers"]) -> Float[Array, "samples width"]:
+        begin, found = 0, dict.fromkeys(range(len(leaves)))
+        for vector, kinds in ((common, [(False, False)]), (row, [(True, False), (True, True)])):
+            begin = 0
+            for kind in kinds:
+                for k, leaf in enumerate(leaves):
+                    if isinstance(leaf, _Number) and leaf[1:] == kind:
+                        end = begin + math.prod(leaf.shape)
+                        found[k], begin = vector[begin:end].reshape(leaf.shape), end
+        (scene, simulation), run = jax.tree.unflatten(treedef, [found[k] if isinstance(leaf, _Number) else leaf for k, leaf in enumerate(leaves)])
 
         def flat(x):
-            found = run.at(layout, x[local_count:], x[:local_count]).residuals(layout.scene(scene, x[local_count:]), simulate_forward, simulation)
-            r = jnp.concatenate([jnp.ravel(found[name]) for name in sorted(found)])
+            residuals = run.at(layout, x[own:], x[:own]).residuals(layout.scene(scene, x[own:]), simulate_forward, simulation)
+            r = jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
             return r, r
 
-        J, r = jax.jacfwd(flat, has_aux=True)(jnp.concatenate([local, shared]))
-        return r, J
+        J, r = jax.jacfwd(flat, has_aux=True)(row[begin:])
+        return jnp.concatenate([J, r[:, None]], axis=1)
 
-    return quickly_compiled(jax.vmap(lane, (None, 0, 0, 0)), jax.jit)
+    return quickly_compiled(jax.vmap(lane, (None, 0)), jax.jit)
 
 
 def _alike(data: Sequence[Measurements]) -> list[list[int]]:

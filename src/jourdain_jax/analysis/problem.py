@@ -49,19 +49,18 @@ class Problem:
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
         cost, squares, samples = np.zeros(count), np.zeros((count, kinds)), self.lanes.counted(self.estimated, members)
         residual = np.empty((count, runs), object)
-        for b, j, plain, plain_J in evaluated:
-            r, J = self.lanes.whitened(j, members[b], plain, plain_J, {name: tau[b] for name, tau in taus.items()})
+        for b, j, plain in evaluated:
+            whole = self.lanes.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
             if self.share < 1:
-                early = self.lanes.within(j, self.share)
-                r, J = np.where(early, r, 0.0), np.where(early[..., None], J, 0.0)
+                whole = np.where(self.lanes.within(j, self.share)[..., None], whole, 0.0)
             with np.errstate(over="ignore", invalid="ignore"):
-                for k, (rows, counted) in enumerate(self._kinds(int(j[0]), r)):
-                    root = np.sqrt(self.loss.weight(rows))
-                    triangles[b, j, k] = triangle(root * rows, root[..., None] * J[:, counted])
-                    np.add.at(squares, (b, k), np.sum(rows**2, axis=1))
+                for k, rows in enumerate(self._kinds(int(j[0]), whole)):
+                    r = rows[..., -1]
+                    triangles[b, j, k] = triangle(self.loss.weighted(rows, r))
+                    np.add.at(squares, (b, k), np.sum(r**2, axis=1))
                     if k == 0:
-                        np.add.at(cost, b, self.loss.value(rows))
-            for place, one in zip(zip(b, j, strict=True), plain, strict=True):
+                        np.add.at(cost, b, self.loss.value(r))
+            for place, one in zip(zip(b, j, strict=True), plain[..., -1], strict=True):
                 residual[place] = one
             if count == 1 and not np.all(np.isfinite(triangles[b, j])):  # whatever the other runs say
                 triangles.fill(np.nan)
@@ -106,7 +105,7 @@ class Problem:
     def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: dict[str, np.ndarray]) -> tuple[np.ndarray, Linearised]:
         """What the restricted likelihood is made of, to be as low as possible."""
         at, logs = self._assembled(theta, members, evaluated, taus), np.zeros(len(members))
-        for b, j, _, _ in evaluated:
+        for b, j, _ in evaluated:
             np.add.at(logs, b, self.lanes.log_widths(j, members[b], {n: tau[b] for n, tau in taus.items()}))
         return at.cost + logs + half_log_determinant(at.arrow, self.unknowns.sizes(theta)), at
 
@@ -143,7 +142,7 @@ class Problem:
         whole = np.stack([np.full(longest, np.nan) if len(r) < longest else r for r in flat])
         members = np.arange(len(whole))
         if white and longest:
-            whole, _ = self.lanes.whitened(np.full(len(whole), run), members, whole, None, self.taus(members))
+            whole = self.lanes.whitened(np.full(len(whole), run), members, whole[..., None], self.taus(members))[..., 0]
         parts = self.lanes.by_channel(run, one(whole))
         for k, name in enumerate(self.estimated):
             if name in parts:
@@ -164,12 +163,10 @@ class Problem:
         """Whether no sigma is known."""
         return bool(self.estimated) and all(set(run.values) <= set(self.estimated) for run in self.runs)
 
-    def _kinds(self, run: int, r: np.ndarray):
-        """Residuals and their places: those of channels whose sigma is known, then those of each other channel."""
+    def _kinds(self, run: int, whole: np.ndarray) -> list[np.ndarray]:
+        """[J r] of lanes: of channels whose sigma is known, then of each other channel."""
         if not self.estimated:
-            yield r, slice(None)
-            return
+            return [whole]
         channels = self.lanes.channels(run)
-        known = [np.arange(r.shape[1])[where] for name, where in channels.items() if name not in self.estimated]
-        for counted in (np.concatenate([np.zeros(0, int), *known]), *(np.arange(r.shape[1])[channels.get(name, slice(0))] for name in self.estimated)):
-            yield r[:, counted], counted
+        known = [whole[:, where] for name, where in channels.items() if name not in self.estimated]
+        return [np.concatenate([whole[:, :0], *known], axis=1), *(whole[:, channels.get(name, slice(0))] for name in self.estimated)]
