@@ -48,6 +48,8 @@ class Information(eqx.Module):
 
     def times(self, factor: Float[np.ndarray, "*members"]) -> "Information":
         """With all covariances multiplied by this factor."""
+        if np.all(factor == 1):
+            return self
         f = factor[..., None]
         changed = self.standard_errors * np.sqrt(f), self.shared * f[..., None], self.own * f[..., None, None]
         return eqx.tree_at(lambda i: (i.standard_errors, i.shared, i.own), self, changed)

@@ -26,11 +26,11 @@ class Loss:
     def value(self, r: Float[np.ndarray, "*batch samples"]) -> Float[np.ndarray, "*batch"]:
         """Sum of rho over the last axis."""
         k, size = self.parameter, np.abs(r)
-        if self.kind == "student-t" and np.isfinite(k):
+        if not np.isfinite(k):
+            return 0.5 * np.sum(r**2, axis=-1)
+        if self.kind == "student-t":
             return np.sum((k + 1) / 2 * np.log1p(r**2 / k), axis=-1)
-        return np.sum(
-            np.where(size <= k, 0.5 * r**2, k * np.minimum(size, np.finfo(float).max / max(k, 1.0)) - 0.5 * k**2) if np.isfinite(k) else 0.5 * r**2, axis=-1
-        )
+        return np.sum(np.where(size <= k, 0.5 * r**2, k * np.minimum(size, np.finfo(float).max / max(k, 1.0)) - 0.5 * k**2), axis=-1)
 
     def weight(self, r: Float[np.ndarray, "*samples"]) -> Float[np.ndarray, "*samples"]:
         """w(r)."""

@@ -34,6 +34,7 @@ TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far be
 MOST_LANES = 64
 AHEAD = 4  # groups of lanes that are begun before the first is read
 FEWEST_INTERVALS = 64  # of a motion that is read between its times
+_WHITE = np.zeros((1, 1))
 FILLED = 1e-6  # of a run's span: between the times that fill up a short one
 
 
@@ -127,6 +128,7 @@ class Lanes:
             _Group(scene, indices, [run_of(data[i], repeats=members is not None) for i in indices], layout, simulation, members) for indices in _alike(data)
         ]
         self.lengths = [run.ts.shape[0] for run in data]
+        self._of_run = {run: group for group in self._groups for run in group.indices}
 
     def evaluate(self, shared: Float[np.ndarray, "members shared"], local: Float[np.ndarray, "members runs local"], members: np.ndarray):
         """Yields, some lanes at a time: numbers of members (among those given) and of runs, and [J r] (lanes, samples, unknowns + 1), own unknowns first."""
@@ -169,7 +171,7 @@ class Lanes:
         return group.by_channel(group.indices.index(run), flat, self.lengths[run])
 
     def _group_of(self, run: int) -> "_Group":
-        return next(g for g in self._groups if run in g.indices)
+        return self._of_run[run]
 
 
 class _Group:
@@ -180,35 +182,42 @@ class _Group:
         times, knots = max(run.ts.shape[0] for run in runs), _most_knots(runs)
         filled = [_filled(run, times, knots, 0 if members is None else 1) for run in _on_equal_grids(runs)]
         leaves, treedef = jax.tree.flatten(((scene, simulation), filled[0]))
-        common = len(jax.tree.leaves((scene, simulation)))
-        self._common = np.concatenate([np.zeros(0), *(np.ravel(x) for x in leaves[:common] if _is_array(x))])
         # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
         repeated = {id(x) for part in (filled[0].values, filled[0].weights) for x in part.values()} if members is not None else set()
-        columns = [(np.stack(x), id(x[0]) in repeated) for x in zip(*map(jax.tree.leaves, filled), strict=True) if _is_array(x[0])]
-        self._rows = np.concatenate([x.reshape(len(filled), 1, -1) for x, has_members in columns if not has_members], axis=2)
-        self._own_rows = np.concatenate([np.zeros((len(filled), members or 1, 0)), *(x.reshape(len(filled), members, -1) for x, has in columns if has)], axis=2)
-        marks = [
-            _Number(np.shape(x)[1:] if id(x) in repeated else np.shape(x), k >= common, id(x) in repeated) if _is_array(x) else x for k, x in enumerate(leaves)
-        ]
+        of_runs = list(zip(*map(jax.tree.leaves, filled), strict=True))
+        common = len(leaves) - len(of_runs)
+        self._common = np.concatenate([np.zeros(0), *(np.ravel(x) for x in leaves[:common] if _is_array(x))])
+        columns = [[np.zeros((len(filled), count, 0))] for count in (1, members or 1)]
+        for x in of_runs:
+            if _is_array(x[0]):
+                has_members = id(x[0]) in repeated
+                columns[has_members].append(np.array(x).reshape(len(filled), members if has_members else 1, -1))
+        self._rows, self._own_rows = (np.concatenate(parts, axis=2) for parts in columns)
+        self._rows = self._rows[:, 0]
+        marks = [_Number.of(x, k >= common, id(x) in repeated) if _is_array(x) else x for k, x in enumerate(leaves)]
         self._run = _program(treedef, tuple(marks), layout)
-        self.weights = {name: np.stack([run.weights[name] for run in filled]) for name in filled[0].weights}  # (runs, *members, times, *channel)
-        self._t0, self._ts = np.stack([run.t0 for run in filled]), np.stack([run.ts for run in filled])
-        sizes = {name: int(np.prod(w.shape[0 if members is None else 1 :])) for name, w in sorted(filled[0].weights.items())}
-        ends = np.cumsum([0, *sizes.values()]).tolist()
-        self.channels = {name: slice(begin, end) for name, begin, end in zip(sizes, ends[:-1], ends[1:], strict=True)}
+        self.weights = {name: np.array([run.weights[name] for run in filled]) for name in filled[0].weights}  # (runs, *members, times, *channel)
+        self._t0, self._ts = np.array([run.t0 for run in filled]), np.array([run.ts for run in filled])
+        self.channels, end = {}, 0
+        for name, weight in sorted(filled[0].weights.items()):
+            begin, end = end, end + math.prod(weight.shape[0 if members is None else 1 :])
+            self.channels[name] = slice(begin, end)
         taus = {name: np.stack([run.correlation_time[name] for run in filled]) for name in filled[0].correlation_time}
         self.chains = Chains.of(self.weights, self._ts, taus, self.channels, members is not None) if taus else None
         saved = times if filled[0].grid is None else filled[0].grid.shape[0]
         states = saved * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
         self._width = int(min(MOST_LANES, max(1, TOUCHED // states)))
+        self._kept: dict[int, list] = {}
 
     def evaluate(self, shared, local, members):
-        chunks = self._chunks(len(members))
+        if len(members) not in self._kept:
+            self._kept = {len(members): self._chunks(len(members))}
+        first, *chunks = self._kept[len(members)]
         lanes = lambda kept, b, j: self._ended(kept, b, j, self._begun(shared, local, members, b, j))  # noqa: E731
-        yield lanes(*chunks[0])  # compiles, where that is needed
+        yield lanes(*first)  # compiles, where that is needed
         waiting: list[Future] = []
         try:
-            for chunk in chunks[1:]:
+            for chunk in chunks:
                 waiting.append(_threads().submit(lanes, *chunk))
                 if len(waiting) == AHEAD:
                     yield waiting.pop(0).result()
@@ -220,17 +229,14 @@ class _Group:
 
     def _chunks(self, members: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
         """How many lanes at a time, with positions of their members and runs; these are filled up with copies of the last."""
-        b, j = np.divmod(np.arange(members * len(self.indices)), len(self.indices))
-        width = min(self._width, 1 << (len(b) - 1).bit_length())
-        found = []
-        for first in range(0, len(b), width):
-            some = np.minimum(np.arange(first, first + width), len(b) - 1)
-            found.append((min(width, len(b) - first), b[some], j[some]))
-        return found
+        count = members * len(self.indices)
+        width = min(self._width, 1 << (count - 1).bit_length())
+        lanes = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
+        return [(min(width, count - k * width), *np.divmod(some, len(self.indices))) for k, some in enumerate(lanes)]
 
     def _begun(self, shared, local, members, b, j):
         own = members[b] if self._members is not None else 0
-        return self._run(self._common, np.concatenate([self._rows[j, 0], self._own_rows[j, own], local[b, self._runs[j]], shared[b]], axis=1))
+        return self._run(self._common, np.concatenate([self._rows[j], self._own_rows[j, own], local[b, self._runs[j]], shared[b]], axis=1))
 
     def _ended(self, kept, b, j, found):
         return b[:kept], self._runs[j[:kept]], np.asarray(found)[:kept]
@@ -238,7 +244,7 @@ class _Group:
     def chained(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> tuple[np.ndarray | None, np.ndarray]:
         """Of each sample of lanes, the place of the one before it (None: all noise is white) and their correlation."""
         if self.chains is None:
-            return None, np.zeros((len(runs), 1))
+            return None, _WHITE
         places = [self.indices.index(run) for run in runs.tolist()]
         return self.chains.at(places, None if self._members is None else members, taus)
 
@@ -266,11 +272,17 @@ def _threads() -> ThreadPoolExecutor:
 
 
 class _Number(NamedTuple):
-    """What stands in place of an array: its shape, and whether it is in the row of a run, and there among the numbers that differ by member."""
+    """What stands in place of an array: what it is, and whether it is in the row of a run, and there among the numbers that differ by member."""
 
     shape: tuple[int, ...]
+    dtype: np.dtype
     of_run: bool
     of_member: bool
+
+    @staticmethod
+    def of(x, of_run: bool, of_member: bool) -> "_Number":
+        """That of an array; `of_member`: without its first axis."""
+        return _Number(x.shape[1:] if of_member else x.shape, jax.dtypes.canonicalize_dtype(x.dtype), of_run, of_member)
 
 
 @lru_cache(maxsize=16)
@@ -281,15 +293,15 @@ def _program(treedef, leaves: tuple, layout: Layout) -> Callable:
     """
     own = layout.sizes[1]
 
-    def lane(common: Float[Array, "numbers"], row: Float[Array, "numbers"]) -> Float[Array, "samples width"]:
+    def lane(common: Float[Array, "shared"], row: Float[Array, "own"]) -> Float[Array, "samples width"]:
         begin, found = 0, dict.fromkeys(range(len(leaves)))
         for vector, kinds in ((common, [(False, False)]), (row, [(True, False), (True, True)])):
             begin = 0
             for kind in kinds:
                 for k, leaf in enumerate(leaves):
-                    if isinstance(leaf, _Number) and leaf[1:] == kind:
+                    if isinstance(leaf, _Number) and leaf[2:] == kind:
                         end = begin + math.prod(leaf.shape)
-                        found[k], begin = vector[begin:end].reshape(leaf.shape), end
+                        found[k], begin = vector[begin:end].reshape(leaf.shape).astype(leaf.dtype), end
         (scene, simulation), run = jax.tree.unflatten(treedef, [found[k] if isinstance(leaf, _Number) else leaf for k, leaf in enumerate(leaves)])
 
         def flat(x):
@@ -342,6 +354,8 @@ def _on_equal_grids(runs: Sequence[Run]) -> Sequence[Run]:
 def _filled(run: Run, times: int, knots: list[int], axis: int) -> Run:
     """The run with as many times and knots as these; what is added is close behind its end, and does not count."""
     more = times - run.ts.shape[0]
+    if not (more or knots):
+        return run
     counts = iter(knots)
 
     def longer(x):

@@ -32,6 +32,7 @@ class Problem:
         self.begun = np.zeros((0, 0))  # first guesses of the members, where spans grow
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
         self.tau = np.zeros((lanes.members or 1, len(self.with_memory)))  # s, of these: at first as if their noise were white
+        self._counted = lanes.counted(self.estimated, np.arange(lanes.members or 1))  # samples of channels whose sigma is estimated, of each member
 
     def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
         """Correlation times of some members, by channel, s."""
@@ -44,10 +45,9 @@ class Problem:
 
     def _assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable, taus: dict[str, np.ndarray]) -> Linearised:
         """What is minimised, from what was evaluated; `taus`: correlation times by channel, of these members."""
-        shared, local = self.unknowns.split(theta)
-        (count, runs, m), p, kinds = local.shape, shared.shape[1], 1 + len(self.estimated)
+        (p, m), count, runs, kinds = self.unknowns.layout.sizes, len(theta), self.unknowns.runs, 1 + len(self.estimated)
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
-        cost, squares, samples = np.zeros(count), np.zeros((count, kinds)), self.lanes.counted(self.estimated, members)
+        costs, squares = np.zeros((count, runs)), np.zeros((count, runs, kinds))
         residual = np.empty((count, runs), object)
         for b, j, plain in evaluated:
             whole = self.lanes.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
@@ -57,24 +57,32 @@ class Problem:
                 for k, rows in enumerate(self._kinds(int(j[0]), whole)):
                     r = rows[..., -1]
                     triangles[b, j, k] = triangle(self.loss.weighted(rows, r))
-                    np.add.at(squares, (b, k), np.sum(r**2, axis=1))
-                    if k == 0:
-                        np.add.at(cost, b, self.loss.value(r))
+                    if k:
+                        squares[b, j, k] = np.sum(r**2, axis=1)
+                    else:
+                        costs[b, j] = self.loss.value(r)
             for place, one in zip(zip(b, j, strict=True), plain[..., -1], strict=True):
                 residual[place] = one
-            if count == 1 and not np.all(np.isfinite(triangles[b, j])):  # whatever the other runs say
+            if count == 1 and not np.isfinite(triangles[b, j]).all():  # whatever the other runs say
                 triangles.fill(np.nan)
                 break
-        sigma = np.sqrt(np.maximum(squares[:, 1:] / samples, _LEAST_SIGMA**2))
-        cost = cost + np.sum(samples * np.log(sigma), axis=1)
-        mean, spread = self._known_before(theta, members)
-        with_mean = np.isfinite(mean)
-        cost = cost + 0.5 * np.sum(np.where(with_mean, (theta - np.where(with_mean, mean, 0.0)) / spread, 0.0) ** 2, axis=1)
+        cost = costs.sum(axis=1)
+        samples = self._counted[members if self.lanes.members else np.zeros(count, int)]
+        sigma = np.sqrt(np.maximum(squares.sum(axis=1)[:, 1:] / samples, _LEAST_SIGMA**2))
         finite = np.isfinite(triangles).all(axis=(1, 2, 3, 4)) & np.isfinite(cost)
-        scaled = np.where(finite[:, None, None, None, None], triangles, 0.0) / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
-        together = scaled[:, :, 0] if kinds == 1 else np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
-        whole = arrow(together, m)
-        return Linearised(np.where(finite, cost, np.inf), with_prior(whole, theta, mean, spread) if with_mean.any() else whole, residual, sigma)
+        triangles[~finite] = 0.0
+        if kinds > 1:
+            cost = cost + np.sum(samples * np.log(sigma), axis=1)
+            scaled = triangles / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
+            together = np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
+        else:
+            together = triangles[:, :, 0]
+        whole, (mean, spread) = arrow(together, m), self._known_before(theta, members)
+        with_mean = np.isfinite(mean)
+        if with_mean.any():
+            cost = cost + 0.5 * np.sum(np.where(with_mean, (theta - np.where(with_mean, mean, 0.0)) / spread, 0.0) ** 2, axis=1)
+            whole = with_prior(whole, theta, mean, spread)
+        return Linearised(np.where(finite, cost, np.inf), whole, residual, sigma)
 
     def _known_before(self, theta: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and standard deviation of priors, (members, unknowns); NaN where there is none.

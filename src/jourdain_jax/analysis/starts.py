@@ -17,17 +17,17 @@ _right: dict[tuple, None] = {}
 
 def check_starts(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> None:
     """ValueError unless the start of each run meets the constraints at the first guess, and still does when the unknowns change."""
-    guess = unknowns.guess
+    guess, layout = unknowns.guess, unknowns.layout
     elsewhere = guess + 1e-3 * unknowns.sizes(guess) * np.where(unknowns.fixed, 0.0, np.sin(1.0 + np.arange(guess.size)))  # by unequal amounts
     for theta, changed in ((guess, False), (elsewhere, True)):
         shared, local = unknowns.split(theta)
-        moved = unknowns.layout.scene(scene, shared)
         for index, run in enumerate(runs):
-            given = unknowns.layout.start(run.start, local[index])
-            leaves, treedef = jax.tree.flatten((moved, given, run.t0, run.inputs))
-            key = treedef, *(x if callable(x) else np.asarray(x).tobytes() for x in leaves)
+            leaves, treedef = jax.tree.flatten((scene, run.start, run.t0, run.inputs))
+            numbers = shared, local[index], *leaves
+            key = layout, treedef, *(x if callable(x) else np.asarray(x).tobytes() for x in numbers)
             if key in _right:
                 continue
+            moved, given = layout.scene(scene, shared), layout.start(run.start, local[index])
             try:
                 consistent_start(moved, t0=run.t0, inputs=run.inputs, **given)
             except ValueError as error:
