@@ -38,7 +38,7 @@ _WHITE = np.zeros((1, 1))
 FILLED = 1e-6  # of a run's span: between the times that fill up a short one
 
 
-class Run(eqx.Module):
+class Run(NamedTuple):
     """A run made ready: its measurements with weights 1 / sigma, zero where a sample is missing."""
 
     t0: Float[Array | np.ndarray, ""]
@@ -69,10 +69,9 @@ class Run(eqx.Module):
         """The run with these unknowns."""
         changed = layout.start(self.start, local)
         if not layout.numbers:
-            return eqx.tree_at(lambda r: r.start, self, changed)
+            return self._replace(start=changed)
         known = layout.known(shared, local)
-        parts = changed, with_numbers(self.sensors, known), with_numbers(self.drives, known)
-        return Run(self.t0, self.ts, self.grid, self.values, self.weights, parts[0], self.inputs, parts[1], parts[2], self.correlation_time)
+        return self._replace(start=changed, sensors=with_numbers(self.sensors, known), drives=with_numbers(self.drives, known))
 
 
 def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
@@ -348,7 +347,7 @@ def _on_equal_grids(runs: Sequence[Run]) -> Sequence[Run]:
     if runs[0].grid is None:
         return runs
     count = max(run.grid.shape[0] for run in runs if run.grid is not None) - 1
-    return [eqx.tree_at(lambda r: r.grid, run, _equal_intervals(run.t0, run.ts[-1], count)) for run in runs]
+    return [run._replace(grid=_equal_intervals(run.t0, run.ts[-1], count)) for run in runs]
 
 
 def _filled(run: Run, times: int, knots: list[int], axis: int) -> Run:
@@ -367,10 +366,9 @@ def _filled(run: Run, times: int, knots: list[int], axis: int) -> Run:
         return eqx.tree_at(lambda s: (s.ts, s.values), x, (ts, np.concatenate([x.values, np.full(extra, x.values[-1])])))
 
     inputs, drives = jax.tree.map(longer, (run.inputs, run.drives), is_leaf=_is_sampled)
-    run = eqx.tree_at(lambda r: (r.inputs, r.drives), run, (inputs, drives), is_leaf=lambda x: x is run.inputs or x is run.drives)
+    run = run._replace(inputs=inputs, drives=drives)
     if not more:
         return run
     pad = lambda x: np.concatenate([x, np.zeros((*x.shape[:axis], more, *x.shape[axis + 1 :]))], axis=axis)  # noqa: E731
     ts = np.concatenate([run.ts, run.ts[-1] + FILLED * (run.ts[-1] - run.t0) * np.arange(1, more + 1)])
-    changed = ts, {n: pad(x) for n, x in run.values.items()}, {n: pad(x) for n, x in run.weights.items()}
-    return eqx.tree_at(lambda r: (r.ts, r.values, r.weights), run, changed)
+    return run._replace(ts=ts, values={n: pad(x) for n, x in run.values.items()}, weights={n: pad(x) for n, x in run.weights.items()})

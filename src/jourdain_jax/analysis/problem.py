@@ -77,9 +77,10 @@ class Problem:
             together = np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
         else:
             together = triangles[:, :, 0]
-        whole, (mean, spread) = arrow(together, m), self._known_before(theta, members)
-        with_mean = np.isfinite(mean)
-        if with_mean.any():
+        whole = arrow(together, m)
+        if self.share < 1 or self.unknowns.with_prior.size:
+            mean, spread = self._known_before(theta, members)
+            with_mean = np.isfinite(mean)
             cost = cost + 0.5 * np.sum(np.where(with_mean, (theta - np.where(with_mean, mean, 0.0)) / spread, 0.0) ** 2, axis=1)
             whole = with_prior(whole, theta, mean, spread)
         return Linearised(np.where(finite, cost, np.inf), whole, residual, sigma)

@@ -3,6 +3,7 @@
 theta = (shared, own of run 0, own of run 1, ...), every run with a place for each initial value that is unknown in any; where it is known, it is held.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -33,7 +34,7 @@ class Place:
     @property
     def end(self) -> int:
         """One past the last."""
-        return self.begin + int(np.prod(self.shape, dtype=int))
+        return self.begin + math.prod(self.shape)
 
     def of(self, vector):
         """Its numbers in a vector (or in many, with leading axes), in their own shape."""
