@@ -87,14 +87,14 @@ class Minimum:
         """How many members converged to a value at most so far `apart` from the lowest one."""
         return int(np.sum(self.converged & (self.at.cost <= np.min(self.at.cost) + apart)))
 
-    def lowered(self, members: Int[np.ndarray, "some"], grown: "Minimum") -> "Minimum":
-        """With the minima of these members found over growing spans, where they are lower."""
-        lower = grown.at.cost < self.at.cost[members]
+    def lowered(self, members: Int[np.ndarray, "some"], other: "Minimum") -> "Minimum":
+        """With the minima of these members that were found in another way, where they are lower; and the steps of that one."""
+        lower = other.at.cost < self.at.cost[members]
         here = members[lower]
-        self.at = self.at.replaced(members, grown.at, lower)
-        for kept, new in ((self.theta, grown.theta), (self.converged, grown.converged), (self.stuck, grown.stuck)):
+        self.at = self.at.replaced(members, other.at, lower)
+        for kept, new in ((self.theta, other.theta), (self.converged, other.converged), (self.stuck, other.stuck), (self.grown, other.grown)):
             kept[here] = new[lower]
-        self.steps[members], self.grown[here] = grown.steps, True
+        self.steps[members] = other.steps
         return self
 
     def replaced(self, members: Int[np.ndarray, "some"], new: "Minimum") -> "Minimum":

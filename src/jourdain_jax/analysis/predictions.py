@@ -149,7 +149,7 @@ class Lanes:
         """Where the samples of each channel are in the residuals of a run."""
         return self._group_of(run).channels
 
-    def within(self, runs: np.ndarray, share: float) -> np.ndarray:
+    def within(self, runs: np.ndarray, share: Float[np.ndarray, "lanes"]) -> np.ndarray:
         """Which samples (lanes, samples) of these runs, of equal structure, lie in the first `share` of a run's span."""
         group = self._group_of(int(runs[0]))
         return group.within([group.indices.index(run) for run in runs.tolist()], share)
@@ -247,10 +247,10 @@ class _Group:
         places = [self.indices.index(run) for run in runs.tolist()]
         return self.chains.at(places, None if self._members is None else members, taus)
 
-    def within(self, places: list[int], share: float) -> np.ndarray:
+    def within(self, places: list[int], share: Float[np.ndarray, "lanes"]) -> np.ndarray:
         """Which samples of the runs at these places lie in the first `share` of the span, shape (lanes, samples)."""
         ts, t0 = self._ts[places], self._t0[places]
-        early = np.abs(ts - t0[:, None]) <= share * np.abs(ts[:, -1] - t0)[:, None]
+        early = np.abs(ts - t0[:, None]) <= (share * np.abs(ts[:, -1] - t0))[:, None]
         counts = [(where.stop - where.start) // early.shape[1] for where in self.channels.values()]
         return np.concatenate([np.repeat(early, count, axis=1) for count in counts], axis=1)
 

@@ -19,7 +19,7 @@ from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
 
 _LEAST_SIGMA = 1e-12  # of a channel that is met exactly
-_STEP, _MOST_VARIANCE = 0.3, 4.0  # of differences in the logarithm of a correlation time; variance of that which is counted at most
+_NODES = np.linspace(-3.2, 3.2, 9)  # of arcsin rho, in its standard deviations: 1 / sqrt(samples) without unknowns
 
 
 class Problem:
@@ -28,7 +28,7 @@ class Problem:
     def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss):
         self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
-        self.share = 1.0  # of each run's span, from its start: samples beyond do not count
+        self.shares: np.ndarray | None = None  # of each run's span, from its start, by member: samples beyond do not count
         self.begun = np.zeros((0, 0))  # first guesses of the members, where spans grow
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
         self.tau = np.zeros((lanes.members or 1, len(self.with_memory)))  # s, of these: at first as if their noise were white
@@ -51,8 +51,8 @@ class Problem:
         residual = np.empty((count, runs), object)
         for b, j, plain in evaluated:
             whole = self.lanes.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
-            if self.share < 1:
-                whole = np.where(self.lanes.within(j, self.share)[..., None], whole, 0.0)
+            if self.shares is not None:
+                whole = np.where(self.lanes.within(j, self.shares[members[b]])[..., None], whole, 0.0)
             with np.errstate(over="ignore", invalid="ignore"):
                 for k, rows in enumerate(self._kinds(int(j[0]), whole)):
                     r = rows[..., -1]
@@ -78,12 +78,24 @@ class Problem:
         else:
             together = triangles[:, :, 0]
         whole = arrow(together, m)
-        if self.share < 1 or self.unknowns.with_prior.size:
+        if self.shares is not None or self.unknowns.with_prior.size:
             mean, spread = self._known_before(theta, members)
             with_mean = np.isfinite(mean)
             cost = cost + 0.5 * np.sum(np.where(with_mean, (theta - np.where(with_mean, mean, 0.0)) / spread, 0.0) ** 2, axis=1)
             whole = with_prior(whole, theta, mean, spread)
         return Linearised(np.where(finite, cost, np.inf), whole, residual, sigma)
+
+    def is_followed(self, at: Linearised, share: float, most: float) -> np.ndarray:
+        """Of which members the squares of residuals over this share of the span are on average at most so many times those of noise."""
+        good = np.isfinite(at.cost)
+        squares, counted = np.zeros(good.sum()), np.zeros(good.sum())
+        for run in range(len(self.runs) if good.any() else 0):
+            r = np.where(self.lanes.within(np.array([run]), np.array([share])), np.stack(at.residual[good, run]), 0.0)
+            for name, where in self.lanes.channels(run).items():
+                if name not in self.estimated:
+                    squares, counted = squares + np.sum(r[:, where] ** 2, axis=1), counted + np.count_nonzero(r[:, where], axis=1)
+        good[good] = squares <= most * counted
+        return good
 
     def _known_before(self, theta: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and standard deviation of priors, (members, unknowns); NaN where there is none.
@@ -91,7 +103,7 @@ class Problem:
         Over part of the span the first guess is a weak prior, known to its own size: what so few samples do not tell stays there.
         """
         mean, spread = (np.broadcast_to(x, theta.shape) for x in (self.unknowns.prior_mean, self.unknowns.prior_sigma))
-        if self.share == 1:
+        if self.shares is None:
             return mean, spread
         begun = self.begun[members]
         none = ~np.isfinite(mean) & ~self.unknowns.fixed
@@ -118,22 +130,36 @@ class Problem:
             np.add.at(logs, b, self.lanes.log_widths(j, members[b], {n: tau[b] for n, tau in taus.items()}))
         return at.cost + logs + half_log_determinant(at.arrow, self.unknowns.sizes(theta)), at
 
-    def doubt(self, theta: np.ndarray, errors: Callable[[Arrow], np.ndarray]) -> np.ndarray:
-        """Variance of the logarithm of each squared standard error that comes from correlation times which are estimated: `sum (d log C / d log tau)^2 / F''`.
+    def doubt(self, theta: np.ndarray, of: Callable[[Arrow], tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+        """What estimated correlation times add, (members, unknowns): to each squared standard error C, relative to it; and the variance of log C.
 
-        `errors`: standard errors (members, unknowns) of an arrow. Zero where no correlation time is estimated.
+        By moments over the restricted likelihood of each correlation time, with weights that are even in arcsin rho (Jeffreys' prior of AR(1) noise): C becomes
+        mean C + variance of the estimates, which move with it. `of`: standard errors and changes of the estimates from an arrow. Zero where none is estimated.
         """
+        members, more, spread = np.arange(len(theta)), np.zeros((1, 1)), np.zeros((1, 1))
         if not self.with_memory:
-            return np.zeros(1)
-        members, found = np.arange(len(theta)), np.zeros(1)
+            return more, spread
         evaluated, taus = list(self.lanes.evaluate(*self.unknowns.split(theta), members)), self.taus(members)
         for name in self.with_memory:
-            left, middle, right = (self._restricted(theta, members, evaluated, taus | {name: np.exp(k * _STEP) * taus[name]}) for k in (-1, 0, 1))
-            curvature = np.maximum((left[0] - 2 * middle[0] + right[0]) / _STEP**2, 1 / _MOST_VARIANCE)
+            low, high = correlation_limits([np.asarray(run.ts) for run in self.runs if name in run.values])
+            interval, counted = low / SHORTEST, self.lanes.counted([name], members)[:, 0]
+            angle = lambda tau, h=interval: np.arcsin(np.exp(-h / tau))  # noqa: E731
+            nodes = angle(taus[name])[:, None] + _NODES / np.sqrt(counted)[:, None]
+            inside = (nodes >= angle(low)) & (nodes <= angle(high))
+            found = []
+            for node in np.clip(nodes, angle(low), angle(high)).T:
+                value, at = self._restricted(theta, members, evaluated, taus | {name: -interval / np.log(np.sin(node))})
+                found.append((value, *of(at.arrow)))
+            values, errors, moved = (np.stack(x, axis=1) for x in zip(*found, strict=True))
+            weight = np.where(inside, np.exp(np.min(values, axis=1, keepdims=True) - values), 0.0)
+            weight = (weight / weight.sum(axis=1, keepdims=True))[..., None]
+            mean = lambda x, weight=weight: np.sum(weight * x, axis=1)  # noqa: E731
+            middle = errors[:, len(_NODES) // 2] ** 2
             with np.errstate(divide="ignore", invalid="ignore"):
-                slope = np.log(errors(right[1].arrow) / errors(left[1].arrow)) / _STEP
-            found = found + np.where(np.isfinite(slope), slope, 0.0) ** 2 / curvature[:, None]
-        return found
+                logs = 2 * np.log(errors)
+                more = more + mean(errors**2) / middle - 1 + (mean(moved**2) - mean(moved) ** 2) / middle
+                spread = spread + mean(logs**2) - mean(logs) ** 2
+        return np.nan_to_num(more), np.nan_to_num(spread)
 
     @property
     def samples(self) -> int:
