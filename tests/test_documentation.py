@@ -5,6 +5,8 @@ import json
 import re
 from pathlib import Path
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -42,6 +44,12 @@ def test_links_lead_to_pages_that_exist(page):
         assert found.exists() or found.with_suffix(".md").exists(), f"{page.name}: {target}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
+def test_code_fits_the_width_of_a_page(page):
+    blocks = re.findall(r"```(?:\{code-cell\} ipython3|python)[^\n]*\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    assert [line for block in blocks for line in block.splitlines() if len(line) > 112] == []
+
+
 def test_files_that_the_theory_names_exist():
     text = (DOCS / "theory.md").read_text(encoding="utf-8")
     for name in re.findall(r"`([\w/]+\.py)`", text):
@@ -60,6 +68,31 @@ def test_the_results_of_the_paper_hold_where_they_are_shown():
     np.testing.assert_allclose(page["by_minimum"], page["solved"].udot, atol=1e-12)
     np.testing.assert_allclose(page["psi"], page["closed"], atol=1e-10)  # (64), by quasi-velocities
     np.testing.assert_allclose(page["length"], page["scene"].rod_length, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_large_scenes_have_as_many_operations_as_their_page_says():
+    text, page = (DOCS / "howto" / "large_scenes.md").read_text(encoding="utf-8"), {"jj": jj, "jnp": jnp, "eqx": eqx}
+    exec(re.search(r"```python\n(.*?)```", text, re.S)[1], page)
+    rows = [[cell.strip().replace(",", "") for cell in row.split("|")[1:-1]] for row in re.findall(r"^\| \d+ .*$", text, re.M)]
+    assert [row[0] for row in rows] == ["4", "16", "32", "64"]
+    for row in rows[:2]:
+        scenes = jj.models.TrailerChain(trailers=int(row[0])), page["RelativeTrailers"](trailers=int(row[0]))
+        found = [x for scene in scenes for x in (len(scene.coordinate_names.entries), jj.lower(scene).operations)]
+        assert found == [int(row[i]) for i in (1, 2, 4, 5)]
+
+
+@pytest.mark.slow
+def test_redundant_rows_are_as_their_page_says(capsys):
+    text, page = (DOCS / "howto" / "redundant_rows.md").read_text(encoding="utf-8"), {}
+    for cell in re.findall(r"```\{code-cell\}[^\n]*\n(.*?)```", text, re.S):
+        exec(cell, page)
+    assert page["two"].succeeded
+    np.testing.assert_allclose(page["three"].q, page["two"].q, atol=1e-12)
+    assert not np.any(page["three"].constraint_forces().determined)
+    assert np.all(page["two"].constraint_forces().determined)
+    told = [line.rpartition("; ")[2] for line in capsys.readouterr().out.splitlines() if "rad/s" in line]
+    assert [words == "reached the end of its span" for words in told] == [True, False, True]
 
 
 def test_the_readme_has_at_most_nine_hundred_words():

@@ -1,6 +1,7 @@
-"""The HTML report of a fit: its numbers are those of the fit, its predictions those of a simulation, and it loads nothing."""
+"""The HTML report of a fit: its numbers are those of the fit, its drawings those of data and simulation, and it loads nothing."""
 
 import re
+from pathlib import Path
 from xml.etree import ElementTree
 
 import jax.numpy as jnp
@@ -8,25 +9,53 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.analysis.fit_page import prediction
+from jourdain_jax.analysis.drawings import span_of, ticks
+from jourdain_jax.analysis.weak_directions import weak_combinations
 
 START = {"x_rate": -0.6, "heading_rate": 0.9}
 TS = jnp.linspace(0.0, 4.0, 41)
+TRUTH = jj.models.ChaplyginSleigh(offset=0.25)
+
+
+def measured(seed: int, start=START, ts=TS) -> jj.Measurements:
+    motion, noise = jj.simulate(TRUTH, start, ts=ts), np.random.default_rng(seed)
+    values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=len(ts)) for name in ("x", "heading")}
+    values["x"][3] = np.nan
+    return jj.Measurements(ts, values, {"x": 0.01, "heading": None}, start=start)
 
 
 @pytest.fixture(scope="module")
 def fitted():
-    truth, noise = jj.models.ChaplyginSleigh(offset=0.25), np.random.default_rng(0)
-    motion = jj.simulate(truth, START, ts=TS)
-    values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=41) for name in ("x", "heading")}
-    values["x"][3] = np.nan
-    data = jj.Measurements(TS, values, {"x": 0.01, "heading": None}, start=START)
-    return jj.fit(truth.replace(offset=0.3), data, free=("offset", "inertia")), data
+    data = measured(0)
+    return jj.fit(TRUTH.replace(offset=0.3), data, free=("offset", "inertia")), data
 
 
-def tables(path) -> dict[str, list[list[str]]]:
-    page = ElementTree.fromstring(path.read_text(encoding="utf-8").removeprefix("<!DOCTYPE html>").replace('<meta charset="utf-8">', ""))
-    return {table.get("id"): [[cell.text or "" for cell in row] for row in table.iter("tr")] for table in page.iter("table")}
+def page(path: Path) -> ElementTree.Element:
+    return ElementTree.fromstring(path.read_text(encoding="utf-8").removeprefix("<!DOCTYPE html>").replace('<meta charset="utf-8">', ""))
+
+
+def tables(path: Path) -> dict[str, list[list[str]]]:
+    return {table.get("id"): [[cell.text or "" for cell in row] for row in table.iter("tr")] for table in page(path).iter("table")}
+
+
+def pictures(path: Path) -> dict[str, ElementTree.Element]:
+    """Drawings by caption."""
+    return {figure.findtext("figcaption"): figure.find("svg") for figure in page(path).iter("figure")}
+
+
+def places(d: str) -> np.ndarray:
+    """Pixels of dots, from their path."""
+    return np.array([[float(x) for x in place.split(",")] for place in re.findall(r"M([-\d.,]+)h0", d)])
+
+
+def by_ticks(picture: ElementTree.Element, pixels: np.ndarray, axis: int) -> np.ndarray:
+    """Numbers that a reader takes from pixels by the axis nearest to them: the upper drawing's y, or x. Labels of y stand 4 pixels below their line."""
+    kind, coordinate, shift = (("x", "x", 0.0), ("y", "y", 4.0))[axis]
+    marks = [(float(t.get(coordinate)) - shift, float(t.text)) for t in picture.iter("text") if t.get("class") == kind]
+    if axis == 1:
+        marks = [mark for mark in marks if mark[0] < 155]  # residuals are drawn below
+    (a, first), (b, last) = min(marks), max(marks)
+    return first + (pixels - a) * (last - first) / (b - a)
 
 
 def test_report_holds_the_numbers_of_the_fit(fitted, tmp_path):
@@ -38,31 +67,169 @@ def test_report_holds_the_numbers_of_the_fit(fitted, tmp_path):
         np.testing.assert_allclose([float(x) for x in row[2:]], [e.value, e.standard_error, e.low, e.high], rtol=0.05)
         assert float(row[2]) == pytest.approx(float(e.value), rel=1e-5)
     assert float(found["correlations"][1][2]) == pytest.approx(float(fit.correlation[0, 1]), abs=0.0051)
-    channels = {row[0]: row for row in found["channels"][1:]}
-    assert channels["x"][2] == "40"
-    assert float(channels["heading"][6]) == pytest.approx(float(fit.sigma["heading"]), rel=1e-3)
-    motion = jj.simulate(fit.scene, START, ts=TS)
+    heads = found["channels"][0]
+    channels = {row[0]: dict(zip(heads, row, strict=True)) for row in found["channels"][1:]}
+    assert channels["x"]["samples"] == "40"
+    assert channels["x"]["sigma"] == "given"
+    assert float(channels["heading"]["sigma"].split()[0]) == pytest.approx(float(fit.sigma["heading"]), rel=1e-3)
+    error = np.asarray(jj.simulate(fit.scene, START, ts=TS)["heading"]) - np.asarray(data.values["heading"])
     value = np.asarray(data.values["heading"])
-    r_squared = 1 - np.sum((np.asarray(motion["heading"]) - value) ** 2) / np.sum((value - value.mean()) ** 2)
-    assert float(channels["heading"][7]) == pytest.approx(r_squared, abs=2e-6)
+    assert float(channels["heading"]["R²"]) == pytest.approx(1 - np.sum(error**2) / np.sum((value - value.mean()) ** 2), abs=2e-6)
+    assert float(channels["heading"]["rms"]) == pytest.approx(np.sqrt(np.mean(error**2)), rel=5e-3)
+    for row in found["whiteness"][1:]:
+        assert float(row[1]) == pytest.approx(fit.autocorrelation[row[0]][0], abs=6e-4)
+        assert row[3] == "yes"
 
 
-def test_predictions_drawn_are_those_of_a_simulation(fitted):
+def test_what_is_drawn_are_the_data_and_a_simulation(fitted, tmp_path):
     fit, data = fitted
-    motion = jj.simulate(fit.scene, START, ts=TS)
-    for name in ("x", "heading"):
-        found = prediction(fit, 0, data, name)
-        known = np.isfinite(np.asarray(data.values[name]))
-        np.testing.assert_allclose(found[known], np.asarray(motion[name])[known], atol=1e-5)
+    fit.report(tmp_path / "fit.html", data, units={"x": "m"})
+    drawn, motion = pictures(tmp_path / "fit.html"), jj.simulate(fit.scene, START, ts=TS)
+    for name, label in (("x", "x in m"), ("heading", "heading in SI units")):
+        picture, value = drawn[f"run 0: {name}"], np.asarray(data.values[name])
+        known = np.isfinite(value)
+        dots = places(next(p.get("d") for p in picture.iter("path") if p.get("class") == "dots"))
+        assert len(dots) == known.sum()  # a missing sample has no dot
+        a_pixel = 0.11 * np.ptp(value[known]) / 130
+        np.testing.assert_allclose(by_ticks(picture, dots[:, 0], 0), np.asarray(TS)[known], atol=2e-3)
+        np.testing.assert_allclose(by_ticks(picture, dots[:, 1], 1), value[known], atol=a_pixel)
+        line = next(p.get("points") for p in picture.iter("polyline") if p.get("class") == "line")
+        line = np.array([[float(x) for x in place.split(",")] for place in line.split()])
+        np.testing.assert_allclose(by_ticks(picture, line[:, 1], 1), np.asarray(motion[name])[known], atol=a_pixel)
+        assert label in [t.text for t in picture.iter("text")]
+
+
+def test_numbers_at_axes_are_round_and_zero_is_zero():
+    texts = lambda low, high: [words for _, words in ticks(low, high, 5)]  # noqa: E731
+    assert texts(-0.3 + 1e-17, 0.3) == ["-0.2", "0.0", "0.2"]
+    assert texts(0.0, 1e-6)[0] == "0"
+    assert texts(100000.001, 100000.003) == ["100000.001", "100000.0015", "100000.002", "100000.0025", "100000.003"]
+    for low, high in (span_of([1.7e-18, -2e-18, 0.5]), span_of([3.0]), span_of([np.nan]), span_of([0.0, 0.0]), span_of([5.0, 5.0 + 1e-13])):
+        found = ticks(low, high, 4)
+        assert 2 <= len(found) <= 6
+        assert all(float(words) == pytest.approx(value, abs=1e-9 * (high - low)) for value, words in found)
 
 
 def test_report_loads_nothing_and_is_small(fitted, tmp_path):
     fit, data = fitted
-    fit.report(tmp_path / "fit.html", data)
+    fit.report(tmp_path / "fit.html", data, held_out=measured(1), profiles=True, units={"x": "m"})
     text = (tmp_path / "fit.html").read_text(encoding="utf-8")
-    assert text.count("<svg") == 4  # two channels with their data, and their autocorrelations
+    # two channels with data and two held out, two autocorrelations, two profiles, widths of intervals, what informs, the way to the minimum
+    assert text.count("<svg") == 11
     assert not re.search(r"(https?:|src=|href=|url\(|@import|<script)", text)
-    assert len(text) < 2e6
+    assert len(text) < 2e5
+
+
+def test_many_long_runs_stay_below_two_megabytes(tmp_path):
+    runs = [measured(seed, {"x_rate": -0.5 - 0.01 * seed, "heading_rate": 0.9}, jnp.linspace(0.0, 4.0, 3001)) for seed in range(30)]
+    fit = jj.fit(TRUTH.replace(offset=0.26), runs, free=("offset",))
+    fit.report(tmp_path / "fit.html", runs[:30], held_out=measured(40))
+    assert (tmp_path / "fit.html").stat().st_size < 2e6
+    found = tables(tmp_path / "fit.html")
+    assert len(found["informed"][0]) == 2 + 8 + 2  # name and span, eight runs of thirty, two channels
+    assert "20 more are not drawn" in (tmp_path / "fit.html").read_text(encoding="utf-8")
+
+
+def test_runs_held_out_are_predicted_in_table_and_drawing(fitted, tmp_path):
+    fit, data = fitted
+    other_start = {"x_rate": -0.4, "heading_rate": 0.6}
+    other = measured(1, other_start)
+    fit.report(tmp_path / "fit.html", data, held_out=other)
+    rows, motion = {row[0]: row for row in tables(tmp_path / "fit.html")["held_out"][1:]}, jj.simulate(fit.scene, other_start, ts=TS)
+    for name in ("x", "heading"):
+        error = np.asarray(motion[name]) - np.asarray(other.values[name])
+        assert float(rows[name][4]) == pytest.approx(np.sqrt(np.nanmean(error**2)), rel=6e-3)
+    assert {"held out, run 0: x", "held out, run 0: heading"} <= set(pictures(tmp_path / "fit.html"))
+
+
+def test_profiles_and_a_bootstrap_stand_beside_the_intervals(fitted, tmp_path):
+    fit, data = fitted
+    along = fit.profiles(data, "offset")
+    noise, motion = np.random.default_rng(5), jj.simulate(fit.scene, START, ts=TS)
+    values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=(40, 41)) for name in ("x", "heading")}
+    again = jj.fit_batch(fit.scene, jj.Measurements(TS, values, {"x": 0.01, "heading": None}, start=START), ("offset", "inertia"))
+    fit.report(tmp_path / "fit.html", profiles=along, bootstrap=again)
+    rows = tables(tmp_path / "fit.html")["estimates"]
+    offset, inertia = (dict(zip(rows[0], row, strict=True)) for row in rows[1:])
+    assert offset["profile"] == along["offset"].kind == "bounded"
+    assert float(offset["low (profile)"]) == pytest.approx(along["offset"].low, rel=1e-5)
+    assert inertia["profile"] == "-"
+    assert float(inertia["high (bootstrap)"]) == pytest.approx(np.quantile(again.values[:, 1], 0.975), rel=1e-5)
+    with pytest.raises(ValueError, match="`bootstrap` is a fit of offset"):
+        fit.report(tmp_path / "fit.html", bootstrap=fit)
+
+
+def test_report_tells_the_way_to_the_minimum(tmp_path):
+    data = jj.Measurements(TS, measured(0).values, 0.01, start=START)
+    guess = TRUTH.replace(offset=0.3)
+    fit = jj.fit(guess, data, free={"offset": jj.bounds(0.05, 1.0)}, guesses=4)
+    (what, costs), logs = fit.trace[0], np.log(0.01 * np.sqrt(2 * np.pi)) * 81
+    assert what == "whole runs"
+    assert len(costs) == int(fit.steps) + 1
+    assert costs[-1] == pytest.approx(0.5 * float(fit.chi_square), rel=1e-9)
+    alone = jj.fit(guess, data, free=("offset",))
+    assert alone.trace[0][1][0] == pytest.approx(-float(jj.log_likelihood(guess, data)) - logs, rel=1e-6)
+    assert np.all(np.diff(alone.trace[0][1]) <= 1e-6)
+    fit.report(tmp_path / "fit.html")
+    text = (tmp_path / "fit.html").read_text(encoding="utf-8")
+    assert f"{int(fit.agreeing)} of 4 first guesses led to this minimum" in text
+    assert tables(tmp_path / "fit.html")["trace"][1][:2] == ["whole runs", str(int(fit.steps))]
+
+
+def test_residuals_that_are_not_white_are_told_with_what_that_means(tmp_path):
+    noise, motion = np.random.default_rng(0), jj.simulate(TRUTH, START, ts=TS)
+    e = 0.01 * noise.normal(size=41)
+    for k in range(1, 41):
+        e[k] = 0.9 * e[k - 1] + np.sqrt(1 - 0.9**2) * e[k]
+    data = jj.Measurements(TS, {"heading": np.asarray(motion["heading"]) + e}, 0.01, start=START)
+    fit = jj.fit(TRUTH, data, free=("offset",))
+    fit.report(tmp_path / "fit.html", data)
+    (row,) = tables(tmp_path / "fit.html")["whiteness"][1:]
+    rho = fit.autocorrelation["heading"][0]
+    assert row[3] == "NO"
+    assert float(row[4].split()[1]) == pytest.approx(-0.1 / np.log(rho), rel=0.06)
+    assert float(row[5].split()[1]) == pytest.approx(np.sqrt((1 + rho) / (1 - rho)), rel=0.06)
+    assert "intervals from the sigmas are too narrow" in (tmp_path / "fit.html").read_text(encoding="utf-8")
+
+
+def test_weak_directions_are_named_by_what_changes_along_them():
+    sizes, labels = np.array([2.0, 4.0, 1.0]), ("a", "b", "c")
+    values = np.array([2.0, -4.0, 0.0])
+    poor, good = np.array([3.0, 4.0, 0.0]) / 5, np.array([[4.0, -3.0, 0.0], [0.0, 0.0, 5.0]]) / 5
+    relative = 0.5**2 * np.outer(poor, poor) + 0.01**2 * good.T @ good
+    (told,) = weak_combinations(relative * sizes * sizes[:, None], values, sizes, labels)
+    assert told.startswith("a change of `b` by 40 % and a change of `a` by 30 % together")
+    lone = np.diag([1e-6, 1e-6, 0.2**2])
+    (told,) = weak_combinations(lone * sizes * sizes[:, None], values, sizes, labels)
+    assert told.startswith("a change of `c` by 0.2 is one standard error")
+    assert weak_combinations(np.full((3, 3), np.nan), values, sizes, labels) == ()
+
+
+def test_names_that_no_data_tell_stand_in_the_report(tmp_path):
+    data = measured(0)
+    fit = jj.fit(TRUTH.replace(offset=0.3), data, free=("offset", "inertia", "mass"))
+    fit.report(tmp_path / "fit.html", data, profiles=("mass",))
+    text = (tmp_path / "fit.html").read_text(encoding="utf-8")
+    assert "<code>inertia</code> and <code>mass</code> do not show separately" in text
+    assert "the data do not tell" in text
+    rows = tables(tmp_path / "fit.html")
+    mass = next(row for row in rows["estimates"] if row[0] == "mass")
+    assert mass[6:] == ["flat", "0 (its bound)", "none"]
+    assert [row[0] for row in rows["informed"][1:]] == ["offset"]
+
+
+def test_a_notebook_shows_how_well_each_unknown_is_known(fitted):
+    fit, _ = fitted
+    shown = fit._repr_html_()
+    assert shown.startswith("<pre>Fit of ChaplyginSleigh")
+    assert len(shown) < 1e5
+    svg = ElementTree.fromstring(re.search(r"<svg.*</svg>", shown)[0])
+    marks = [(float(t.get("x")), np.log10(float(t.text.split()[0]))) for t in svg.iter("text") if t.get("class") == "x"]
+    bars = [float(r.get("x")) + float(r.get("width")) for r in svg.iter("rect") if r.get("fill") != "none"]
+    (a, low), (b, high) = min(marks), max(marks)
+    for end, e in zip(bars, fit.estimates.values(), strict=True):
+        half = 100 * (e.high - e.value) / e.value
+        assert 10 ** (low + (end - a) * (high - low) / (b - a)) == pytest.approx(half, rel=0.01)
 
 
 def test_report_answers_what_it_cannot_write(fitted, tmp_path):
@@ -71,3 +238,7 @@ def test_report_answers_what_it_cannot_write(fitted, tmp_path):
         fit.report(tmp_path / "fit.pdf")
     with pytest.raises(ValueError, match="expected those of the fit"):
         fit.report(tmp_path / "fit.html", [data, data])
+    with pytest.raises(ValueError, match="are not those of the fit"):
+        fit.report(tmp_path / "fit.html", measured(7))
+    with pytest.raises(ValueError, match="computed from the runs that were fitted"):
+        fit.report(tmp_path / "fit.html", profiles=True)

@@ -123,6 +123,22 @@ def test_cotangents_reach_back_over_more_steps_than_there_is_memory_for_at_first
 
 
 @pytest.mark.parametrize("adjoint", [None, FORWARD], ids=["reverse", "forward"])
+def test_derivatives_pass_through_motions_one_after_the_other(adjoint):
+    """One compiled step, called with numbers of which other ones vary each time."""
+    step = jax.jit(lambda scene, state, until: jj.simulate(scene, state, t1=until, inputs={"push": X[5]}, rtol=1e-11, atol=1e-11, adjoint=adjoint).end)
+
+    def late(stiffness):
+        scene = Oscillator(mass=X[0], stiffness=stiffness, wall=10.0)
+        state = jj.start(scene, x=X[3], x_rate=X[4])
+        for until in (0.5, 0.9, 3.0):
+            state = step(scene, state, jnp.asarray(until))
+        return jnp.concatenate([state.q, state.u])
+
+    found = (jax.jacrev if adjoint is None else jax.jacfwd)(late)(X[1])
+    np.testing.assert_allclose(found, jax.jacfwd(lambda k: _exact(X.at[1].set(k))[2:4])(X[1]), rtol=1e-8)
+
+
+@pytest.mark.parametrize("adjoint", [None, FORWARD], ids=["reverse", "forward"])
 def test_the_loop_of_xla_is_not_traced_unless_a_time_varies(adjoint, monkeypatch):
     traced = []
     monkeypatch.setattr(erk_loop, "integrate", lambda *a, integrate=erk_loop.integrate: traced.append(1) or integrate(*a))

@@ -424,7 +424,8 @@ def test_a_likelihood_of_measurements_that_are_made_inside_jit_is_the_same():
     assert float(jax.jit(value)(scene.stiffness)) == pytest.approx(float(value(scene.stiffness)), rel=1e-3)
 
 
-def test_the_page_on_identification_runs(capsys):
+def test_the_page_on_identification_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # it writes a report
     page = (Path(__file__).parents[1] / "docs" / "howto" / "identification.md").read_text(encoding="utf-8")
     names = {"jj": jj, "jnp": jnp, "np": np}
     exec("\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL)), names)

@@ -81,3 +81,30 @@ def test_unreadable_files_are_refused_with_the_reason(rolling, tmp_path):
     ):
         with pytest.raises(ValueError, match=sentence):
             jj.load_trajectory(tmp_path / name, TiltingDisc)
+
+
+def test_a_motion_goes_on_from_the_end_of_another():
+    scene, start = TiltingDisc(), {"lean": 0.3, "spin_rate": 4.0}
+    first = jj.simulate(scene, start, t1=0.7)
+    second = jj.simulate(scene, first.end, ts=jnp.array([1.5]))
+    whole = jj.simulate(scene, start, t1=1.5)
+    assert float(second.ts[0]) == 1.5
+    np.testing.assert_allclose(second.q[-1], whole.q_end, atol=2e-8)
+    np.testing.assert_allclose(second.u[-1], whole.u_end, atol=2e-8)
+
+
+def test_the_end_is_the_state_at_an_event():
+    fallen = jj.simulate(TiltingDisc(), {"lean": 0.3}, t1=5.0)
+    assert fallen.event_names[int(fallen.event)] == "fallen"
+    assert float(fallen.end.t) == float(fallen.t_end) < 5.0
+    np.testing.assert_allclose(fallen.end.q, fallen.q_end, atol=1e-12)
+
+
+def test_a_batch_goes_on_from_its_ends():
+    scene, starts = TiltingDisc(), {"lean": jnp.array([0.1, 0.2, 0.3]), "spin_rate": 4.0}
+    first = jj.rollout(scene, starts, t1=0.7)
+    ends = first.lanes.end
+    assert ends.q.shape == first.lanes.q_end.shape
+    second = jj.rollout(scene, ends, t1=1.5)
+    whole = jj.rollout(scene, starts, t1=1.5)
+    np.testing.assert_allclose(second.lanes.q_end, whole.lanes.q_end, atol=2e-8)

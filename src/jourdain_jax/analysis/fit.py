@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.analysis.arrow import Arrow
+from jourdain_jax.analysis.asked import Asked
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.information import information, students_t_95
@@ -30,6 +31,7 @@ from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.reference_parameters import reference_parameters
 from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
@@ -43,6 +45,7 @@ _SOME = 12  # steps between two estimates of correlation times
 _SAME = 0.05  # of half the sum of squares, by which the same minimum is found lower from elsewhere
 _FEWEST_RUNS = 5  # that tell how much runs differ
 _FEWEST_DEGREES = 4  # of freedom
+_WHOLE, _WITH_MEMORY = "whole runs", "whole runs, after a turn of correlation times"  # what is minimised
 _TURNS, _SETTLED = 20, 1e-3  # of correlation times and unknowns at most; change of the correlation of neighbouring samples that ends them
 
 
@@ -135,18 +138,20 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
         )
     runs = as_runs(scene, data, repeats=repeats)
     _check_choices(runs, loss, errors)
+    free = free if isinstance(free, Mapping) else tuple(as_names(free))
     unknowns = unknowns_of(scene, runs, free)
     with reference_parameters(scene):
         check_starts(scene, runs, unknowns)
         members = _repeats(runs) if repeats else None
         _check_enough(runs, unknowns, repeats)
-        problem = Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members), loss or LEAST_SQUARES)
+        asked = Asked(scene, free, simulation, loss or LEAST_SQUARES, control)
+        problem = Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members), asked.loss)
         theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
         limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
         found = _minimum(problem, theta, limits, control, one_will_do=members is None)
         same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
         found = _with_memory(problem, found if members else found.lowest(), limits, control)
-        return _result(problem, found, limits, control, errors, guesses, same)
+        return _result(problem, found, limits, asked, errors, guesses, same)
 
 
 def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
@@ -159,11 +164,11 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
     samples, few = problem.samples, replace(control, most_steps=min(_STEPS, control.most_steps))
     rest = replace(control, most_steps=control.most_steps - few.most_steps)
     in_parts = samples > 0 and not (one_will_do and len(theta) > 1)
-    found = minimise(problem.linearised, theta, limits, few if in_parts else control)
+    found = minimise(problem.linearised, theta, limits, few if in_parts else control, _WHOLE)
     unfinished = ~found.converged & ~found.stuck & in_parts & (rest.most_steps > 0)
 
     def of(members: np.ndarray, begin: np.ndarray, how: Control) -> Minimum:
-        return minimise(lambda x, here: problem.linearised(x, members[here]), begin, limits, how)
+        return minimise(lambda x, here: problem.linearised(x, members[here]), begin, limits, how, _WHOLE)
 
     def far() -> np.ndarray:
         return found.at.cost > 0.5 * _POOR * samples
@@ -174,22 +179,25 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
     if not poor.size or not samples or (one_will_do and np.argmin(found.at.cost) not in poor):
         return found
     ended, begin, steps, place = found.theta.copy(), theta[poor], found.steps[poor], np.zeros(len(poor), int)
+    trace = found.trace[poor]
     problem.begun, problem.shares = theta, np.ones(len(theta))
     while (some := np.flatnonzero(place < len(_SPANS))).size:
         problem.shares[poor[some]] = np.array(_SPANS)[place[some]]
         grown = of(poor[some], begin[some], replace(few, tolerance=_ROUGHLY))
         begin[some], steps[some] = grown.theta, steps[some] + grown.steps
+        for i, (_, costs), k in zip(some.tolist(), (of_one[0] for of_one in grown.trace), place[some].tolist(), strict=True):
+            trace[i] += ((f"the first {_SPANS[k]:.3g} of each run", costs),)
         followed = np.stack([problem.is_followed(grown.at, share, _FOLLOWED) for share in _SPANS])
         place[some] += 1
         for k in range(1, len(_SPANS)):
             place[some] += (place[some] == k) & followed[k]  # the next one is followed, and left out
     problem.shares = None
     grown = of(poor, begin, control)
-    steps = steps + grown.steps
-    found = found.lowered(poor, replace(grown, steps=steps, grown=np.ones(len(poor), bool)))
+    steps, trace = steps + grown.steps, trace + grown.trace
+    found = found.lowered(poor, replace(grown, steps=steps, trace=trace, grown=np.ones(len(poor), bool)))
     if (late := np.flatnonzero(unfinished & (~found.converged | far()))).size:
         more = of(late, ended[late], rest)
-        found = found.lowered(late, replace(more, steps=found.steps[late] + more.steps))
+        found = found.lowered(late, replace(more, steps=found.steps[late] + more.steps, trace=found.trace[late] + more.trace))
     return found
 
 
@@ -201,7 +209,7 @@ def _with_memory(problem: Problem, found: Minimum, limits: Limits, control: Cont
         if not going.size:
             break
         changed = problem.restrict(found.theta[going], going)
-        again = minimise(lambda x, here, going=going: problem.linearised(x, going[here]), found.theta[going], limits, some)
+        again = minimise(lambda x, here, going=going: problem.linearised(x, going[here]), found.theta[going], limits, some, _WITH_MEMORY)
         found = found.replaced(going, again)
         going = going[(changed > _SETTLED) | ~again.converged]
     found.converged[going] = False
@@ -246,15 +254,15 @@ def _check_enough(runs: Sequence[Measurements], unknowns: Unknowns, repeats: boo
         )
 
 
-def _result(problem: Problem, found: Minimum, limits: Limits, control: Control, errors: str, guesses: int, agreeing: np.ndarray) -> Fit:
-    unknowns, theta, single = problem.unknowns, found.theta, problem.lanes.members is None
+def _result(problem: Problem, found: Minimum, limits: Limits, asked: Asked, errors: str, guesses: int, agreeing: np.ndarray) -> Fit:
+    unknowns, theta, single, control = problem.unknowns, found.theta, problem.lanes.members is None, asked.control
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     low, high = limits.low[places], limits.high[places]
     bound = (theta <= limits.low) | (theta >= limits.high)
     limit, beyond = (one(x[:, places]) for x in limits_at_bounds(problem.linearised, found, limits, control))
-    residuals = tuple(problem.by_channel(run, found, one) for run in range(len(problem.runs)))
-    white = tuple(problem.by_channel(run, found, one, white=True) for run in range(len(problem.runs)))
+    residuals = tuple(problem.by_channel(run, found.at, one) for run in range(len(problem.runs)))
+    white = tuple(problem.by_channel(run, found.at, one, white=True) for run in range(len(problem.runs)))
     samples = sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())
     known = information(found.at.arrow, size, places, bound, fails, control.cutoff, single)
 
@@ -302,6 +310,8 @@ def _result(problem: Problem, found: Minimum, limits: Limits, control: Control, 
         units=unknowns.units,
         cutoff=control.cutoff,
         errors=errors,
+        trace=found.trace[0] if single else (),
+        asked=asked,
     )
 
 

@@ -1,24 +1,32 @@
 """The result of a fit: estimates with their uncertainty, residuals, the fitted scene, and what the measurements cannot tell."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jourdain_jax.analysis.asked import Asked, taken_up
 from jourdain_jax.analysis.fit_page import fit_page
+from jourdain_jax.analysis.fit_pictures import interval_widths
+from jourdain_jax.analysis.held_out import Prediction, of_fitted, of_held_out
 from jourdain_jax.analysis.information import Information, hidden_combinations
+from jourdain_jax.analysis.informed import informed
+from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.profile import FAR_BEYOND
 from jourdain_jax.analysis.table import table
+from jourdain_jax.analysis.weak_directions import weak_combinations
 from jourdain_jax.build.plausibility import impossible_bodies
-from jourdain_jax.scene.names import UnknownNameError, nearest
+from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
+from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 CORRELATED = 0.98
 MOST_COMPARED, MOST_NAMED = 1000, 8  # unknowns; pairs of them in the table
+MOST_INFORMED = 24  # unknowns of which the report says what informs them
 
 
 class Estimated(eqx.Module):
@@ -74,6 +82,8 @@ class Fit(Printed, eqx.Module):
     units: tuple[str, ...] = eqx.field(static=True)
     cutoff: float = eqx.field(static=True)
     errors: str = eqx.field(static=True)  # whence standard errors come: "sigmas" or "runs"
+    trace: tuple[tuple[str, tuple[float, ...]], ...] = eqx.field(static=True)  # what was minimised, and F at first and after each step tried; none of a batch
+    asked: Asked = eqx.field(static=True)  # the arguments of `fit`
 
     def __getitem__(self, name: str) -> Estimated:
         if name not in self.labels:
@@ -126,6 +136,11 @@ class Fit(Printed, eqx.Module):
             "the data tell a combination of them far better than either"
             for i, j in pairs
         )
+
+    @property
+    def weak(self) -> tuple[str, ...]:
+        """Shared unknowns, and combinations of them, that the data tell with a relative standard error of 0.1 or more, weakest first, one sentence each."""
+        return weak_combinations(self.covariance, self.values, self.sizes, self.labels)
 
     @property
     def impossible(self) -> tuple[str, ...]:
@@ -188,24 +203,83 @@ class Fit(Printed, eqx.Module):
         """Count, mean, rms and largest residual per run and channel."""
         return tuple(_summary(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
 
-    def report(self, path: str | os.PathLike, data: Measurements | Sequence[Measurements] = ()) -> None:
-        """Write this fit as one HTML file that loads nothing from elsewhere: estimates, correlations, warnings, residuals and their autocorrelation.
+    def profiles(self, data: Measurements | Sequence[Measurements], names: str | Iterable[str] = ()) -> dict[str, Profile]:
+        """The profile likelihood of the unknowns in `names` (default: all that are not of one run alone), by name: how far each may be moved, all others
+        being fitted anew, before 2 (F - F_min) reaches 3.84, and whether that is "bounded", "one-sided" or "flat". `data`: the runs fitted.
 
-        `data`: the runs fitted; their samples are drawn beside the prediction, and R^2 = 1 - sum (prediction - value)^2 / sum (value - mean)^2 of each
-        channel is told. ValueError for a path that is no .html file, a fit of a batch or one that failed, and other data than the fit's.
+        It takes ten to thirty fits for each name. Where sigmas are estimated or a robust loss was used, the rise is divided by what the covariance is
+        multiplied by. ValueError for a fit of a batch or one that failed, and other data than the fit's; KeyError for names that were not estimated.
         """
-        runs = (data,) if isinstance(data, Measurements) else tuple(data)
+        self._check_one()
+        of_all = [name for name in self.labels if not name.startswith("run ")] or self.labels
+        fitted = taken_up(self, data)
+        inflation = float(fitted.problem.inflation(self.residuals, self.samples, self.information.rank)[0])
+        return profiles(fitted, as_names(names) or of_all, dict(zip(self.labels, self.standard_errors.tolist(), strict=True)), inflation)
+
+    def predict(self, runs: Measurements | Sequence[Measurements]) -> tuple[dict[str, Prediction], ...]:
+        """What the fit predicts for `runs` that had no part in it, by channel: `prediction`, `error`, `rms` (in the unit of the channel) and `r_squared`.
+
+        What all runs share is held at its estimate; start values that are unknown, and numbers of sensors of each run, are fitted to the run itself.
+        ValueError for a fit of a batch or one that failed, and for runs that do not fit its scene or whose motion fails.
+        """
+        self._check_one()
+        return of_held_out(self, runs)
+
+    def report(
+        self,
+        path: str | os.PathLike,
+        data: Measurements | Sequence[Measurements] = (),
+        *,
+        held_out: Measurements | Sequence[Measurements] = (),
+        profiles: "bool | str | Iterable[str] | Mapping[str, Profile]" = False,
+        bootstrap: "Fit | None" = None,
+        units: Mapping[str, str] | None = None,
+    ) -> None:
+        """Write this fit as one HTML file that loads nothing from elsewhere: estimates, warnings, what the data do not tell, correlations, residuals, the way
+        to the minimum.
+
+        - `data`: the runs fitted; their samples are drawn beside the prediction, with R^2 = 1 - sum (prediction - value)^2 / sum (value - mean)^2, and it is
+          told which run, channel and time span informs which unknown: shares a_k^2 / sum a^2, a = C J', of the variance of the estimate.
+        - `held_out`: other runs, which are predicted as by `predict`.
+        - `profiles`: True or names, to compute them now; or what `profiles` returned.
+        - `bootstrap`: a `fit_batch` of the same unknowns, of samples drawn anew; its 2.5 and 97.5 % quantiles stand beside the intervals.
+        - `units`: channel -> its unit, for labels, such as `{"x": "m"}`; a scene knows the units of its parameters only.
+
+        ValueError for a path that is no .html file, a fit of a batch or one that failed, other data than the fit's, and a bootstrap of other unknowns.
+        """
+        runs, others = ((x,) if isinstance(x, Measurements) else tuple(x) for x in (data, held_out))
         if not str(path).lower().endswith((".html", ".htm")):
             raise ValueError(f"cannot write `{os.fspath(path)}`: the report of a fit is a .html file")
-        if self.values.ndim > 1 or not np.isfinite(self.chi_square):
-            raise ValueError("there is a report of one fit whose motion does not fail; of a batch, and of a failed fit, see `print`")
+        self._check_one()
         shapes = lambda runs: [{name: np.shape(x) for name, x in run.items()} for run in runs]  # noqa: E731
         if runs and shapes(run.values for run in runs) != shapes(self.residuals):
             raise ValueError(
                 f"`data` has {len(runs)} runs with channels {shapes(run.values for run in runs)}, expected those of the fit: {shapes(self.residuals)}"
             )
+        if bootstrap is not None and (bootstrap.labels != self.labels or bootstrap.values.ndim != 2):
+            raise ValueError(f"`bootstrap` is a fit of {', '.join(bootstrap.labels)}; expected a `fit_batch` of {', '.join(self.labels)}")
+        if profiles and not runs and not isinstance(profiles, Mapping):
+            raise ValueError("`profiles` are computed from the runs that were fitted; give them as `data`")
+        along = profiles if isinstance(profiles, Mapping) else self.profiles(runs, () if profiles is True else profiles) if profiles else {}
+        page = fit_page(
+            self,
+            fitted=of_fitted(self, runs) if runs else (),
+            shares=informed(taken_up(self, runs), MOST_INFORMED) if runs else None,
+            held_out=self.predict(others) if others else (),
+            profiles=along,
+            bootstrap=bootstrap,
+            units=units or {},
+        )
         with open(path, "w", encoding="utf-8") as file:
-            file.write(fit_page(self, runs))
+            file.write(page)
+
+    def _check_one(self) -> None:
+        if self.values.ndim > 1 or not np.isfinite(self.chi_square):
+            raise ValueError("there is a report of one fit whose motion does not fail; of a batch, and of a failed fit, see `print`")
+
+    def _repr_html_(self) -> str:
+        one = not is_traced(self) and self.values.ndim == 1 and np.isfinite(self.chi_square)
+        return super()._repr_html_() + (interval_widths(self) if one else "")
 
     def _text(self) -> str:
         return _batch_text(self) if self.values.ndim > 1 else _text(self)

@@ -77,11 +77,12 @@ class Minimum:
     stuck: Bool[np.ndarray, "members"]  # no step lowers F, however short, and this is no minimum
     steps: Int[np.ndarray, "members"]  # tried
     grown: Bool[np.ndarray, "members"]  # whether it was found over growing spans
+    trace: np.ndarray  # (members,) of tuples of (what was minimised, F at first and after each step tried)
 
     def lowest(self) -> "Minimum":
         """That of the member with the lowest value."""
         best = [int(np.argmin(self.at.cost))]
-        return Minimum(self.theta[best], self.at.at(best), self.converged[best], self.stuck[best], self.steps[best], self.grown[best])
+        return Minimum(self.theta[best], self.at.at(best), self.converged[best], self.stuck[best], self.steps[best], self.grown[best], self.trace[best])
 
     def agreeing(self, apart: float) -> int:
         """How many members converged to a value at most so far `apart` from the lowest one."""
@@ -92,7 +93,8 @@ class Minimum:
         lower = other.at.cost < self.at.cost[members]
         here = members[lower]
         self.at = self.at.replaced(members, other.at, lower)
-        for kept, new in ((self.theta, other.theta), (self.converged, other.converged), (self.stuck, other.stuck), (self.grown, other.grown)):
+        names = ("theta", "converged", "stuck", "grown", "trace")
+        for kept, new in ((getattr(self, name), getattr(other, name)) for name in names):
             kept[here] = new[lower]
         self.steps[members] = other.steps
         return self
@@ -103,18 +105,19 @@ class Minimum:
         for kept, one in ((self.theta, new.theta), (self.converged, new.converged), (self.stuck, new.stuck)):
             kept[members] = one
         self.steps[members] += new.steps
+        self.trace[members] += new.trace
         return self
 
 
 def minimise(
-    evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Float[np.ndarray, "members unknowns"], limits: Limits, control: Control
+    evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Float[np.ndarray, "members unknowns"], limits: Limits, control: Control, what: str = ""
 ) -> Minimum:
-    """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers."""
+    """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers; `what`: says in the trace what is minimised."""
     theta, members = theta.copy(), np.arange(len(theta))
     at = evaluate(theta, members)
     damping, growth, fall = (np.full(len(theta), x) for x in (FIRST, 4.0, FASTEST))
     converged, stuck, steps = np.zeros(len(theta), bool), np.zeros(len(theta), bool), np.zeros(len(theta), int)
-    going = np.isfinite(at.cost)
+    going, costs = np.isfinite(at.cost), [[cost] for cost in at.cost.tolist()]
     for _ in range(control.most_steps):
         here = members[going]
         if not here.size:
@@ -141,6 +144,8 @@ def minimise(
             ratio = np.where(np.isfinite(found), found / np.maximum(promised, np.finfo(float).tiny), -1.0)
         theta[here[better]] = (x + d)[better]
         at = at.replaced(here, trial, better)
+        for b in here.tolist():
+            costs[b].append(float(at.cost[b]))
         # after a step that failed, damping falls slowly: in a curved valley every other step would fail. It rises where steps overshoot: where residuals
         # stay large, undamped ones go to and fro along what shows least
         change = np.where(ratio > 0.9, 1 / fall[here], np.where(ratio < 0.6, 3.0, 1.0))
@@ -150,7 +155,9 @@ def minimise(
         fall[here] = np.where(better, np.minimum(1.5 * fall[here], FASTEST), 2.0)
         lost = damping[here] > MOST
         stuck[here[lost]], going[here[lost]] = True, False
-    return Minimum(theta, at, converged, stuck, steps, np.zeros(len(theta), bool))
+    trace = np.empty(len(theta), object)
+    trace[:] = [((what, tuple(of_one)),) for of_one in costs]
+    return Minimum(theta, at, converged, stuck, steps, np.zeros(len(theta), bool), trace)
 
 
 def _step(arrow: Arrow, theta, size, damping, limits: Limits, cutoff: float) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jourdain_jax.analysis.arrow import Arrow, arrow, triangle, with_prior
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
-from jourdain_jax.analysis.levenberg_marquardt import Linearised, Minimum
+from jourdain_jax.analysis.levenberg_marquardt import Linearised
 from jourdain_jax.analysis.losses import Loss
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.predictions import Lanes
@@ -167,12 +167,12 @@ class Problem:
         channels = [(run, name) for i, run in enumerate(self.runs) for name in run.values if name not in self.estimated]
         return sum(int(np.prod(np.shape(run.values[name])[int(self.lanes.members is not None) :])) for run, name in channels)
 
-    def by_channel(self, run: int, found: Minimum, one: Callable, white: bool = False) -> dict[str, np.ndarray]:
+    def by_channel(self, run: int, at: Linearised, one: Callable, white: bool = False) -> dict[str, np.ndarray]:
         """Residuals of a run in units of sigma by channel; NaN where a sample is missing, or they were not worked out since another run had failed.
 
         `white`: whitened ones.
         """
-        flat = [np.zeros(0) if r is None else r for r in found.at.residual[:, run]]
+        flat = [np.zeros(0) if r is None else r for r in at.residual[:, run]]
         longest = max(map(len, flat))
         whole = np.stack([np.full(longest, np.nan) if len(r) < longest else r for r in flat])
         members = np.arange(len(whole))
@@ -181,7 +181,7 @@ class Problem:
         parts = self.lanes.by_channel(run, one(whole))
         for k, name in enumerate(self.estimated):
             if name in parts:
-                sigma = one(found.at.sigma[:, k])
+                sigma = one(at.sigma[:, k])
                 parts[name] = parts[name] / sigma.reshape(sigma.shape + (1,) * (parts[name].ndim - sigma.ndim))
         return parts
 

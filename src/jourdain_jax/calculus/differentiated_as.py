@@ -83,21 +83,19 @@ def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
     def own(arguments):
         return lanes_first(quick(*arguments))
 
+    # What is kept for the way back is the same whatever varies: under `jit`, JAX keeps one structure of it for all calls that share a trace.
     @own.def_fwd
     def forth(perturbed, arguments):
-        if rules is not None and rules.serve(*perturbed):
-            found = quick(*arguments)
-            return lanes_first(found), (None, eqx.filter_eval_shape(lambda: found))
-        moving, fixed = eqx.partition(arguments, perturbed)
-        found, pull = eqx.filter_vjp(lambda moving: differentiable(*eqx.combine(moving, fixed)), moving)
-        return lanes_first(found), (pull, eqx.filter_eval_shape(lambda: found))
+        found = own(arguments)
+        return found, eqx.filter_eval_shape(lambda: found)
 
     @own.def_bwd
-    def back(residuals, cotangents, perturbed, arguments):
-        pull, shapes = residuals
+    def back(shapes, cotangents, perturbed, arguments):
         g = jax.tree.map(_filled, shapes, cotangents, is_leaf=lambda x: x is None)
-        if pull is None:
+        if rules is not None and rules.serve(*perturbed):
             return rules.pull(perturbed, arguments, g)
+        moving, fixed = eqx.partition(arguments, perturbed)
+        _, pull = eqx.filter_vjp(lambda moving: differentiable(*eqx.combine(moving, fixed)), moving)
         return pull(g)[0]
 
     return lambda *arguments: own(arguments)

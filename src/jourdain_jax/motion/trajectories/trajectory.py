@@ -11,6 +11,7 @@ from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.motion.marks import nan_is_a_mark
+from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.trajectories import labelled, over_times, results
 from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, energies_of, summary, summary_html, warnings_of
 from jourdain_jax.motion.trajectories.sketch import sketch
@@ -80,6 +81,16 @@ class Trajectory(eqx.Module):
     def valid(self) -> Bool[Array, "*lanes times"]:
         """Which times were reached."""
         return jnp.all(jnp.isfinite(self.q), axis=-1)
+
+    @property
+    def end(self) -> State:
+        """The last state that was reached, put onto the constraints; of many motions a batch. Another motion goes on from it, at its time.
+
+        motion = jj.simulate(scene, motion.end, t1=motion.t_end + 1.0)
+        """
+        if self.q_end.ndim > 1:
+            return eqx.filter_vmap(lambda motion: motion.end)(self)
+        return consistent(self.scene, self.t_end, self.q_end, self.u_end, self.inputs.at(self.t_end))
 
     # Derived quantities. -------------------------------------------------------------------------------------------
 
