@@ -479,7 +479,7 @@ def main() -> None:
         "starts": starts,
         "unstable": lambda: unstable(20 if options.quick else 100),
         "coverage": lambda: coverage(50 if options.quick else 500),
-        "three": lambda: three(50 if options.quick else 500),
+        "three": lambda: three(50 if options.quick else 1000),
         "windows": of_windows,
         "logs": logs,
     }

@@ -124,6 +124,39 @@ def test_intervals_cover_the_truth_where_noise_has_a_memory():
     assert np.all(np.abs(single.values - found.values[4]) < 0.02 * single.standard_errors)
 
 
+class Coasting(jj.Scene):
+    """`x = x0 + v t`: linear in what is unknown."""
+
+    mass: object = jj.parameter(1.0, positive=True)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+
+def test_intervals_are_those_of_all_correlation_times_by_their_restricted_likelihood():
+    ts, start = np.linspace(0.0, 8.0, 81), {"x": 0.5, "x_rate": -0.2}
+    x = 0.5 - 0.2 * ts + SIGMA * coloured(np.random.default_rng(5), ts, TAU)
+    found = jj.fit(Coasting(), jj.Measurements(ts, {"x": x}, SIGMA, start=start, unknown_start=("x", "x_rate"), correlation_time=None))
+    # the same by dense covariances, on a fine grid of arcsin rho
+    J, logs, estimates, variances = np.stack([np.ones(81), ts], axis=1), [], [], []
+    angles = np.linspace(0.01, 1.5, 600)
+    for rho in np.sin(angles):
+        V = SIGMA**2 * rho ** (np.abs(ts[:, None] - ts) / 0.1)
+        Vi = np.linalg.inv(V)
+        C = np.linalg.inv(J.T @ Vi @ J)
+        theta = C @ J.T @ Vi @ x
+        logs.append(-0.5 * ((x - J @ theta) @ Vi @ (x - J @ theta) + np.linalg.slogdet(V)[1] - np.linalg.slogdet(C)[1]))
+        estimates.append(theta)
+        variances.append(np.diag(C))
+    weight, estimates, variances = np.exp(np.array(logs) - max(logs)), np.array(estimates), np.array(variances)
+    weight /= weight.sum()
+    whole = weight @ variances + weight @ estimates**2 - (weight @ estimates) ** 2
+    best = int(np.argmax(logs))
+    np.testing.assert_allclose(found.standard_errors, np.sqrt(variances[best]), rtol=0.01)
+    np.testing.assert_allclose(found.high - found.values, 1.98 * np.sqrt(whole), rtol=0.02)
+
+
 def test_golden_section_finds_the_lowest_of_each():
     at = np.array([0.3, -1.2, 4.0])
     np.testing.assert_allclose(lowest(lambda x: (x - at) ** 2, np.full(3, -5.0), np.full(3, 5.0)), at, atol=1e-3)

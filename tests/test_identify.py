@@ -493,7 +493,7 @@ def told(J, size, local=0, runs=1):
     """Information of a dense Jacobian whose last columns are the `local` unknowns of each of `runs` runs, block by block."""
     shared = J.shape[1] - runs * local
     blocks = [np.concatenate([J[i::runs, shared + i * local : shared + (i + 1) * local], J[i::runs, :shared]], axis=1) for i in range(runs)]
-    triangles = np.stack([triangle(np.zeros(len(block)), block) for block in blocks])[None]
+    triangles = np.stack([triangle(np.column_stack([block, np.zeros(len(block))])) for block in blocks])[None]
     places = np.arange(J.shape[1])
     return information(arrow(triangles, local), np.asarray(size, float)[None], places, np.zeros((1, len(places)), bool), np.zeros(1, bool), 1e-6, True)
 

@@ -52,6 +52,25 @@ def test_a_frequency_far_from_the_guess_is_found_over_growing_spans(factor):
     np.testing.assert_allclose(found.values, near.values, atol=1e-3 * near.standard_errors.min())
 
 
+def test_spans_that_a_motion_follows_already_are_left_out(monkeypatch):
+    quick = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
+    monkeypatch.setattr("jourdain_jax.analysis.fit._FOLLOWED", 0.0)
+    every = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
+    assert quick.grown
+    assert every.grown
+    assert quick.steps < every.steps
+    np.testing.assert_allclose(quick.values, every.values, atol=1e-3 * every.standard_errors.min())
+
+
+def test_a_fit_that_is_far_off_goes_on_where_growing_spans_do_not_help(monkeypatch):
+    measured = data(0, more=0.05)  # no parameters give this
+    monkeypatch.setattr("jourdain_jax.analysis.fit._STEPS", 1)
+    found = jj.fit(Oscillator(stiffness=18.9), measured, FREE)
+    monkeypatch.setattr("jourdain_jax.analysis.fit._STEPS", 50)
+    at_once = jj.fit(Oscillator(stiffness=18.9), measured, FREE)
+    assert found.chi_square < at_once.chi_square * (1 + 1e-6)
+
+
 def test_repeats_that_end_in_a_local_minimum_are_fitted_again_alone():
     measured = data(1, (5,), more=3.0 * (np.arange(5) == 3)[:, None])  # no parameters give the fourth
     found = jj.fit_batch(Oscillator(stiffness=50.0), measured, FREE)

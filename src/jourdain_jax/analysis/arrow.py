@@ -11,20 +11,20 @@ Source: G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1; J. J. Moré, 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Shaped
 
 
-def triangle(residual: Float[np.ndarray, "*batch samples"], jacobian: Float[np.ndarray, "*batch samples unknowns"]) -> np.ndarray:
-    """T of [J r], shape (*batch, unknowns + 1, unknowns + 1); NaN where something is not finite."""
-    whole = np.concatenate([jacobian, residual[..., None]], axis=-1)
-    good = np.all(np.isfinite(whole), axis=(-2, -1), keepdims=True)
-    found = np.linalg.qr(np.where(good, whole, 0.0), mode="r")
-    width = whole.shape[-1]
+def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarray, "*batch width width"]:
+    """T of [J r]; with entries that are not finite where those of [J r] are not."""
+    found, width = np.linalg.qr(whole, mode="r"), whole.shape[-1]
+    if found.shape[-2] == width:
+        return found
     square = np.zeros((*found.shape[:-2], width, width))
     square[..., : found.shape[-2], :] = found
-    return np.where(good, square, np.nan)
+    return square
 
 
 @dataclass(frozen=True)
@@ -65,50 +65,61 @@ class Arrow:
         runs, local, shared = self.counts
         return x[:, :shared], x[:, shared:].reshape(len(x), runs, local)
 
+    @cached_property
     def column_norms(self) -> Float[np.ndarray, "members unknowns"]:
         """Length of each column of the Jacobian."""
-        _, local, shared = self.counts
-        own = np.linalg.norm(self.local[..., :local], axis=2).reshape(len(self.local), -1)
-        squares = np.sum(self.local[..., local : local + shared] ** 2, axis=(1, 2)) + np.sum(self.shared[..., :shared] ** 2, axis=1)
-        return np.concatenate([np.sqrt(squares), own], axis=1)
+        _, m, _ = self.counts
+        squares = np.sum(self.shared[..., :-1] ** 2, axis=1)
+        if not m:
+            return np.sqrt(squares)
+        of_runs = np.sum(self.local[..., :-1] ** 2, axis=2)
+        return np.sqrt(np.concatenate([squares + np.sum(of_runs[..., m:], axis=1), of_runs[..., :m].reshape(len(of_runs), -1)], axis=1))
 
+    @cached_property
     def gradient(self) -> Float[np.ndarray, "members unknowns"]:
         """`J' r`."""
-        _, local, shared = self.counts
-        own = np.einsum("bkij,bki->bkj", self.local[..., :-1], self.local[..., -1])
-        of_shared = np.sum(own[..., local : local + shared], axis=1) + np.einsum("bij,bi->bj", self.shared[..., :-1], self.shared[..., -1])
-        return np.concatenate([of_shared, own[..., :local].reshape(len(own), -1)], axis=1)
+        _, m, _ = self.counts
+        found = (self.shared[:, None, :, -1] @ self.shared[..., :-1])[:, 0]
+        if not m:
+            return found
+        of_runs = (self.local[..., None, :, -1] @ self.local[..., :-1])[..., 0, :]
+        return np.concatenate([found + np.sum(of_runs[..., m:], axis=1), of_runs[..., :m].reshape(len(of_runs), -1)], axis=1)
 
     def change(self, d: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members"]:
         """`|J d|^2`."""
         shared, own = self.split(d)
         _, m, _ = self.counts
-        of_runs = np.einsum("bkij,bkj->bki", self.local[..., :m], own) + np.einsum("bkij,bj->bki", self.local[..., m:-1], shared)
-        return np.sum(of_runs**2, axis=(1, 2)) + np.sum(np.einsum("bij,bj->bi", self.shared[..., :-1], shared) ** 2, axis=1)
+        found = np.sum((self.shared[..., :-1] @ shared[..., None]) ** 2, axis=(1, 2))
+        if not m:
+            return found
+        of_runs = self.local[..., :m] @ own[..., None] + self.local[..., m:-1] @ shared[:, None, :, None]
+        return found + np.sum(of_runs**2, axis=(1, 2, 3))
 
     def step(self, damping: Float[np.ndarray, "members"], D, held, moved, cutoff) -> Float[np.ndarray, "members unknowns"]:
         """The damped step; unknowns that are `held` move by `moved`. D: (members, unknowns), positive."""
         _, m, _ = self.counts
-        local, shared = self.local.copy(), self.shared.copy()
-        (held_s, held_l), (moved_s, moved_l) = (self.split(x) for x in (held, np.where(held, moved, 0.0)))
-        local[..., -1] += np.einsum("bkij,bkj->bki", local[..., :m], moved_l) + np.einsum("bkij,bj->bki", local[..., m:-1], moved_s)
-        shared[..., -1] += np.einsum("bij,bj->bi", shared[..., :-1], moved_s)
-        local[..., :m] *= ~held_l[:, :, None]
-        local[..., m:-1] *= ~held_s[:, None, None]
-        shared[..., :-1] *= ~held_s[:, None]
+        local, shared = self.local, self.shared
+        if held.any():
+            local, shared = local.copy(), shared.copy()
+            (held_s, held_l), (moved_s, moved_l) = (self.split(x) for x in (held, np.where(held, moved, 0.0)))
+            local[..., -1] += np.einsum("bkij,bkj->bki", local[..., :m], moved_l) + np.einsum("bkij,bj->bki", local[..., m:-1], moved_s)
+            shared[..., -1] += np.einsum("bij,bj->bi", shared[..., :-1], moved_s)
+            local[..., :m] *= ~held_l[:, :, None]
+            local[..., m:-1] *= ~held_s[:, None, None]
+            shared[..., :-1] *= ~held_s[:, None]
         D_s, D_l = self.split(D)
-        root = np.sqrt(damping)
-        upper, rest = eliminated(local, root[:, None, None] * D_l)
-        stack = np.concatenate([shared, rest], axis=1)
+        if m:
+            upper, rest = eliminated(local, np.sqrt(damping)[:, None, None] * D_l)
+            shared = np.concatenate([shared, rest], axis=1)
         # in unknowns times D, by singular values: (S^2 + lambda) ds = - S U' c
-        U, S, Vt = np.linalg.svd(stack[..., :-1] / D_s[:, None], full_matrices=False)
+        U, S, Vt = np.linalg.svd(shared[..., :-1] / D_s[:, None], full_matrices=False)
         shows = np.max(S, axis=1, initial=0.0, keepdims=True) * cutoff < S
-        weight = np.where(shows, S / (S**2 + damping[:, None] + np.where(shows, 0.0, 1.0)), 0.0)
-        ds = -np.einsum("bji,bj->bi", Vt, weight * np.einsum("bji,bj->bi", U, stack[..., -1])) / D_s
-        right = -(upper[..., -1] + np.einsum("bkij,bj->bki", upper[..., m:-1], ds))
-        dx = np.linalg.solve(upper[..., :m], right[..., None])[..., 0] if m else right
-        d = np.concatenate([ds, dx.reshape(len(dx), -1)], axis=1)
-        return np.where(held, moved, d)
+        weight = np.where(shows, S / (S**2 + damping[:, None] + ~shows), 0.0)
+        ds = -((weight * (shared[:, None, :, -1] @ U)[:, 0])[:, None] @ Vt)[:, 0] / D_s
+        if m:
+            right = -(upper[..., -1:] + upper[..., m:-1] @ ds[:, None, :, None])
+            ds = np.concatenate([ds, np.linalg.solve(upper[..., :m], right).reshape(len(ds), -1)], axis=1)
+        return np.where(held, moved, ds)
 
 
 def with_prior(arrow: Arrow, theta: Float[np.ndarray, "members unknowns"], mean: np.ndarray, sigma: np.ndarray) -> Arrow:
@@ -138,9 +149,11 @@ def eliminated(local: np.ndarray, below: Float[np.ndarray, "members runs local"]
 
 
 def arrow(triangles: Float[np.ndarray, "members runs width width"], local: int) -> Arrow:
-    """From the triangles of all runs, with `local` unknowns of their own in the first columns."""
+    """From the triangles of all runs, with `local` unknowns of their own in the first columns. Those of a single run count as shared: nothing goes out."""
     members, runs, width, _ = triangles.shape
+    if runs == 1:
+        triangles, local = triangles[..., [*range(local, width - 1), *range(local), -1]], 0
     rest = triangles[:, :, local:, local:]
-    scores = np.einsum("bkij,bki->bkj", rest[..., :-1], rest[..., -1])
+    scores = (rest[..., None, :, -1] @ rest[..., :-1])[..., 0, :]
     together = rest.reshape(members, runs * (width - local), width - local)
     return Arrow(triangles[:, :, :local], np.linalg.qr(together, mode="r") if runs > 1 else together, scores)

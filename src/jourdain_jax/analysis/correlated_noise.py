@@ -8,6 +8,7 @@ This is exact at uneven times and across samples that are missing. A correlation
     sum w^2 / 2 + sum log sqrt(1 - rho_k^2) + log det(J_w' J_w) / 2
 
 is lowest (restricted likelihood): without its last term, which stands for the unknowns, tau would come out too short. tau and the unknowns take turns.
+Intervals are as wide as estimates and their variance are spread over all tau, weighted by that likelihood, evenly in arcsin rho (see `Problem.doubt`).
 Source: H. D. Patterson and R. Thompson, Biometrika 58 (1971) 545; R. H. Jones, Longitudinal Data with Serial Correlation (1993), chapter 3.
 """
 

@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.asked import Asked
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.information import information, students_t_95
-from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, minimise
+from jourdain_jax.analysis.levenberg_marquardt import LEAST, Control, Limits, Minimum, minimise
 from jourdain_jax.analysis.likelihood import as_runs
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.measurements import Measurements
@@ -38,7 +39,9 @@ from jourdain_jax.scene.tracebacks import shown_from_users_lines
 _NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
 _POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
 _SPANS = (1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4)  # shares of the span that a fit grows over
-_STEPS, _ROUGHLY = 12, 0.05  # tried on each of them, and their tolerance
+_STEPS, _ROUGHLY = 8, 1.0  # tried on each of them, and their tolerance
+_FOLLOWED = 100.0  # times the squares that noise leaves, up to which a motion is followed, and a longer span can be next
+_SOME = 12  # steps between two estimates of correlation times
 _SAME = 0.05  # of half the sum of squares, by which the same minimum is found lower from elsewhere
 _FEWEST_RUNS = 5  # that tell how much runs differ
 _FEWEST_DEGREES = 4  # of freedom
@@ -79,7 +82,8 @@ def fit(
     - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events are ignored.
 
     Where that finds no minimum, or one whose residuals are far beyond their sigmas, the fit is made once more over growing spans: the first 1/32 of each
-    run, then more of it, each from where the shorter one ended, with the first guess as a weak prior (known to its own size). So unstable motions are fitted
+    run, then more of it, as far as the motion that was found follows the data, with the first guess as a weak prior (known to its own size). So unstable
+    motions are fitted
     that no first guess would follow to their end. The lower minimum counts, and `Fit.grown` says which one it was.
 
     **Returns** a `Fit`: estimates with covariance and 95 % intervals (sigmas that were given are taken as known), residuals, the fitted
@@ -154,27 +158,53 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
     """The minimum from each `theta`; where none is found, or residuals are far beyond their sigmas, the lower one of it and that over growing spans.
 
     Over a short span a motion depends on its unknowns almost linearly, also an unstable one; each fit begins where that over the shorter span ended, and what
-    a short span does not tell stays near the first guess. `one_will_do`: spans grow
-    only where no theta led to a minimum with small residuals.
+    a short span does not tell stays near the first guess. After a few steps, what is far off gives way to growing spans, and goes on only where these do not
+    lead to small residuals either. `one_will_do`: spans grow only where no theta led to a minimum with small residuals.
     """
-    found = minimise(problem.linearised, theta, limits, control, _WHOLE)
-    is_poor = ~found.converged | (found.at.cost > 0.5 * _POOR * problem.samples)
-    poor = np.flatnonzero(is_poor)
-    if not poor.size or not problem.samples or (one_will_do and not is_poor[np.argmin(found.at.cost)]):
+    samples, few = problem.samples, replace(control, most_steps=min(_STEPS, control.most_steps))
+    rest = replace(control, most_steps=control.most_steps - few.most_steps)
+    in_parts = samples > 0 and not (one_will_do and len(theta) > 1)
+    found = minimise(problem.linearised, theta, limits, few if in_parts else control, _WHOLE)
+    unfinished = ~found.converged & ~found.stuck & in_parts & (rest.most_steps > 0)
+
+    def of(members: np.ndarray, begin: np.ndarray, how: Control) -> Minimum:
+        return minimise(lambda x, here: problem.linearised(x, members[here]), begin, limits, how, _WHOLE)
+
+    def far() -> np.ndarray:
+        return found.at.cost > 0.5 * _POOR * samples
+
+    if (near := np.flatnonzero(unfinished & ~far())).size:
+        found, unfinished[near] = found.replaced(near, of(near, found.theta[near], rest)), False
+    poor = np.flatnonzero(~found.converged | far())
+    if not poor.size or not samples or (one_will_do and np.argmin(found.at.cost) not in poor):
         return found
-    begin, steps, trace, problem.begun = theta[poor], found.steps[poor], found.trace[poor], theta
-    roughly = replace(control, most_steps=min(_STEPS, control.most_steps), tolerance=_ROUGHLY)
-    for problem.share, how in (*((share, roughly) for share in _SPANS), (1.0, control)):
-        what = _WHOLE if problem.share == 1 else f"the first {problem.share:.3g} of each run"
-        grown = minimise(lambda x, here: problem.linearised(x, poor[here]), begin, limits, how, what)
-        begin, steps, trace = grown.theta, steps + grown.steps, trace + grown.trace
-    return found.lowered(poor, replace(grown, steps=steps, trace=trace))
+    ended, begin, steps, place = found.theta.copy(), theta[poor], found.steps[poor], np.zeros(len(poor), int)
+    trace = found.trace[poor]
+    problem.begun, problem.shares = theta, np.ones(len(theta))
+    while (some := np.flatnonzero(place < len(_SPANS))).size:
+        problem.shares[poor[some]] = np.array(_SPANS)[place[some]]
+        grown = of(poor[some], begin[some], replace(few, tolerance=_ROUGHLY))
+        begin[some], steps[some] = grown.theta, steps[some] + grown.steps
+        for i, (_, costs), k in zip(some.tolist(), (of_one[0] for of_one in grown.trace), place[some].tolist(), strict=True):
+            trace[i] += ((f"the first {_SPANS[k]:.3g} of each run", costs),)
+        followed = np.stack([problem.is_followed(grown.at, share, _FOLLOWED) for share in _SPANS])
+        place[some] += 1
+        for k in range(1, len(_SPANS)):
+            place[some] += (place[some] == k) & followed[k]  # the next one is followed, and left out
+    problem.shares = None
+    grown = of(poor, begin, control)
+    steps, trace = steps + grown.steps, trace + grown.trace
+    found = found.lowered(poor, replace(grown, steps=steps, trace=trace, grown=np.ones(len(poor), bool)))
+    if (late := np.flatnonzero(unfinished & (~found.converged | far()))).size:
+        more = of(late, ended[late], rest)
+        found = found.lowered(late, replace(more, steps=found.steps[late] + more.steps, trace=found.trace[late] + more.trace))
+    return found
 
 
 def _with_memory(problem: Problem, found: Minimum, limits: Limits, control: Control) -> Minimum:
     """The minimum with the correlation times of the noise estimated: these and the unknowns take turns, from what was found as if the noise were white."""
     going = np.flatnonzero(np.isfinite(found.at.cost)) if problem.with_memory else np.zeros(0, int)
-    some = replace(control, most_steps=min(_STEPS, control.most_steps))
+    some = replace(control, most_steps=min(_SOME, control.most_steps))
     for _ in range(_TURNS):
         if not going.size:
             break
@@ -235,8 +265,14 @@ def _result(problem: Problem, found: Minimum, limits: Limits, asked: Asked, erro
     white = tuple(problem.by_channel(run, found.at, one, white=True) for run in range(len(problem.runs)))
     samples = sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())
     known = information(found.at.arrow, size, places, bound, fails, control.cutoff, single)
-    errors_of = lambda arrow: information(arrow, size, places, bound, fails, control.cutoff, False).standard_errors  # noqa: E731
-    reach = _normal_or_t(one(problem.doubt(theta, errors_of)), (samples - known.rank)[..., None] if problem.all_estimated else np.inf)
+
+    def elsewhere(arrow: Arrow) -> tuple[np.ndarray, np.ndarray]:
+        norms = np.where(arrow.column_norms > 0, arrow.column_norms, 1.0)
+        moved = arrow.step(np.full(len(theta), LEAST), norms, limits.fixed | bound, np.zeros_like(theta), control.cutoff)
+        return information(arrow, size, places, bound, fails, control.cutoff, False).standard_errors, moved[:, places]
+
+    more, doubt = (one(x) for x in problem.doubt(theta, elsewhere))
+    reach = _normal_or_t(doubt, (samples - known.rank)[..., None] if problem.all_estimated else np.inf) * np.sqrt(1 + more)
     known = known.times(one(problem.inflation(residuals, samples, known.rank)))
     reach = reach * known.standard_errors
     if errors == "runs":
@@ -280,13 +316,14 @@ def _result(problem: Problem, found: Minimum, limits: Limits, asked: Asked, erro
 
 
 def _normal_or_t(doubt: np.ndarray, left) -> np.ndarray:
-    """97.5 % quantile by which a standard error is multiplied: normal where correlation times are known, else Student's t.
+    """97.5 % quantile by which a standard error is multiplied: normal where correlation times are known, else Student's t of that standard deviation.
 
     Its degrees of freedom are 2 / var(log C): F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110. `left`: samples less unknowns, where sigmas are estimated.
     """
     if not np.any(doubt > 0):
         return np.asarray(_NORMAL_95)
-    return students_t_95(np.maximum(2 / (np.maximum(doubt, 1e-12) + 2 / left), _FEWEST_DEGREES))
+    doubt = np.clip(doubt, 1e-12, 2 / _FEWEST_DEGREES)
+    return students_t_95(np.maximum(2 / (doubt + 2 / left), _FEWEST_DEGREES)) * np.sqrt(1 - doubt)  # t has the variance n / (n - 2)
 
 
 def _sum_of_squares(r: np.ndarray, single: bool) -> np.ndarray:

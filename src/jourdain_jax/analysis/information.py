@@ -10,16 +10,21 @@ An unknown with a part in the remaining directions V_0 has no standard error and
 Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), sections 2.1 and 3.4; G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1.
 """
 
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
-import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow
 
+_ARRAYS = ["singular_values", "hidden", "rank", "identifiable", "standard_errors", "shared", "own", "follow"]
 
-class Information(eqx.Module):
+
+@partial(jax.tree_util.register_dataclass, meta_fields=["estimated"], data_fields=_ARRAYS)
+@dataclass(frozen=True, eq=False)
+class Information:
     """Covariance in blocks, and directions (changes of theta / size) that do not show. A batch of fits has a leading axis `members` in all arrays."""
 
     singular_values: Float[np.ndarray, "*members shared"]  # of the shared unknowns, largest first
@@ -30,7 +35,7 @@ class Information(eqx.Module):
     shared: Float[np.ndarray, "*members shared shared"]
     own: Float[np.ndarray, "*members runs own own"]  # covariance where the shared unknowns are known
     follow: Float[np.ndarray, "*members runs own shared"]  # G
-    estimated: tuple[int, ...] = eqx.field(static=True)  # places of the unknowns among those of all runs
+    estimated: tuple[int, ...]  # places of the unknowns among those of all runs
 
     @cached_property
     def covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
@@ -48,9 +53,10 @@ class Information(eqx.Module):
 
     def times(self, factor: Float[np.ndarray, "*members"]) -> "Information":
         """With all covariances multiplied by this factor."""
+        if np.all(factor == 1):
+            return self
         f = factor[..., None]
-        changed = self.standard_errors * np.sqrt(f), self.shared * f[..., None], self.own * f[..., None, None]
-        return eqx.tree_at(lambda i: (i.standard_errors, i.shared, i.own), self, changed)
+        return replace(self, standard_errors=self.standard_errors * np.sqrt(f), shared=self.shared * f[..., None], own=self.own * f[..., None, None])
 
     def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
         """With the covariance of the shared unknowns from how much runs differ: C (sum g g') C n / (n - 1), g: scores of n runs, C: the covariance so far.
@@ -63,7 +69,7 @@ class Information(eqx.Module):
         of_own = np.diagonal(self.own, axis1=-2, axis2=-1) + np.einsum("...kij,...jl,...kil->...ki", self.follow, shared, self.follow)
         variance = np.concatenate([of_shared, of_own.reshape(*of_own.shape[:-2], -1)], axis=-1)[..., np.array(self.estimated, int)]
         errors = np.where(self.identifiable, np.sqrt(variance), np.nan)
-        return eqx.tree_at(lambda i: (i.standard_errors, i.shared), self, (errors, shared))
+        return replace(self, standard_errors=errors, shared=shared)
 
 
 def students_t_95(degrees):
@@ -83,8 +89,7 @@ def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimat
     found = [_information(arrow.at([b]), size[b], estimated, bound[b], not fails[b], cutoff) for b in range(len(size))]
     if single:
         return found[0]
-    names = ("singular_values", "rank", "identifiable", "standard_errors", "shared", "own", "follow")
-    stacked = {name: np.stack([getattr(one, name) for one in found]) for name in names}
+    stacked = {name: np.stack([getattr(one, name) for one in found]) for name in _ARRAYS if name != "hidden"}
     return Information(**stacked, hidden=tuple(one.hidden[0] for one in found), estimated=tuple(estimated.tolist()))
 
 

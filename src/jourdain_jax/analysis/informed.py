@@ -61,10 +61,12 @@ def informed(fitted: TakenUp, most: int) -> Informed:
     variance = np.concatenate([np.diagonal(known.shared), _of_own(known).ravel()])[places]
     found: list[dict[str, np.ndarray]] = [{}] * runs
     taus = problem.taus(np.array([0]))
-    for b, j, plain, plain_J in lanes.evaluate(*unknowns.split(fitted.theta), np.array([0])):
-        r, J = lanes.whitened(j, b, plain, plain_J, {name: np.broadcast_to(tau, len(j)) for name, tau in taus.items()})
-        for run, r_run, J_run in zip(j.tolist(), r, J, strict=True):
+    for b, j, plain in lanes.evaluate(*unknowns.split(fitted.theta), np.array([0])):
+        white = lanes.whitened(j, b, plain, {name: np.broadcast_to(tau, len(j)) for name, tau in taus.items()})
+        for run, r_run, J_run in zip(j.tolist(), white[..., -1], white[..., :-1], strict=True):
             rows = np.sqrt(problem.loss.weight(r_run))[:, None] * J_run
+            if m < unknowns.layout.sizes[1]:  # those of a single run count as shared, and come last
+                rows = np.roll(rows, -unknowns.layout.sizes[1], axis=1)
             for k, name in enumerate(problem.estimated):
                 if name in problem.runs[run].values:
                     rows[lanes.channels(run)[name]] /= fitted.at.sigma[0, k]

@@ -30,6 +30,23 @@ class Linearised:
     residual: np.ndarray  # (members, runs) of vectors
     sigma: Float[np.ndarray, "members channels"]  # of channels whose noise is estimated
 
+    def at(self, members) -> "Linearised":
+        """That of some members."""
+        return Linearised(self.cost[members], self.arrow.at(members), self.residual[members], self.sigma[members])
+
+    def replaced(self, members: Int[np.ndarray, "some"], new: "Linearised", chosen: Bool[np.ndarray, "some"]) -> "Linearised":
+        """With what is `new` of these members where it is `chosen`."""
+        if len(members) == len(self.cost) and chosen.all():
+            return new
+        found = self.at(np.arange(len(self.cost)))  # a copy
+        for kept, one in zip(found._arrays, new._arrays, strict=True):
+            kept[members[chosen]] = one[chosen]
+        return found
+
+    @property
+    def _arrays(self) -> tuple[np.ndarray, ...]:
+        return self.cost, self.residual, self.sigma, *self.arrow.arrays
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -65,30 +82,27 @@ class Minimum:
     def lowest(self) -> "Minimum":
         """That of the member with the lowest value."""
         best = [int(np.argmin(self.at.cost))]
-        at = Linearised(self.at.cost[best], self.at.arrow.at(best), self.at.residual[best], self.at.sigma[best])
-        return Minimum(self.theta[best], at, self.converged[best], self.stuck[best], self.steps[best], self.grown[best], self.trace[best])
+        return Minimum(self.theta[best], self.at.at(best), self.converged[best], self.stuck[best], self.steps[best], self.grown[best], self.trace[best])
 
     def agreeing(self, apart: float) -> int:
         """How many members converged to a value at most so far `apart` from the lowest one."""
         return int(np.sum(self.converged & (self.at.cost <= np.min(self.at.cost) + apart)))
 
-    def lowered(self, members: Int[np.ndarray, "some"], grown: "Minimum") -> "Minimum":
-        """With the minima of these members found over growing spans, where they are lower."""
-        lower = grown.at.cost < self.at.cost[members]
+    def lowered(self, members: Int[np.ndarray, "some"], other: "Minimum") -> "Minimum":
+        """With the minima of these members that were found in another way, where they are lower; and the steps of that one."""
+        lower = other.at.cost < self.at.cost[members]
         here = members[lower]
-        for kept, new in ((self.theta, grown.theta), (self.at.cost, grown.at.cost), (self.converged, grown.converged), (self.stuck, grown.stuck)):
+        self.at = self.at.replaced(members, other.at, lower)
+        names = ("theta", "converged", "stuck", "grown", "trace")
+        for kept, new in ((getattr(self, name), getattr(other, name)) for name in names):
             kept[here] = new[lower]
-        self.steps[members], self.grown[here], self.trace[here] = grown.steps, True, grown.trace[lower]
-        self.at.residual[here], self.at.sigma[here] = grown.at.residual[lower], grown.at.sigma[lower]
-        for kept, new in zip(self.at.arrow.arrays, grown.at.arrow.arrays, strict=True):
-            kept[here] = new[lower]
+        self.steps[members] = other.steps
         return self
 
     def replaced(self, members: Int[np.ndarray, "some"], new: "Minimum") -> "Minimum":
         """With what was found for these members once more; steps add up."""
-        kept_ones = (self.theta, self.at.cost, self.at.residual, self.at.sigma, self.converged, self.stuck, *self.at.arrow.arrays)
-        new_ones = (new.theta, new.at.cost, new.at.residual, new.at.sigma, new.converged, new.stuck, *new.at.arrow.arrays)
-        for kept, one in zip(kept_ones, new_ones, strict=True):
+        self.at = self.at.replaced(members, new.at, np.ones(len(members), bool))
+        for kept, one in ((self.theta, new.theta), (self.converged, new.converged), (self.stuck, new.stuck)):
             kept[members] = one
         self.steps[members] += new.steps
         self.trace[members] += new.trace
@@ -108,18 +122,19 @@ def minimise(
         here = members[going]
         if not here.size:
             break
-        arrow, x = at.arrow.at(here), theta[here]
-        d = _step(arrow, x, damping[here], limits, control.cutoff)
-        done = _is_small(arrow, x, d, limits, control)
-        if np.any(done & (damping[here] > LEAST)):
-            done &= _is_small(arrow, x, _step(arrow, x, np.full(len(here), LEAST), limits, control.cutoff), limits, control)
-        if np.any(done):
+        arrow, x = at.arrow if len(here) == len(theta) else at.arrow.at(here), theta[here]
+        size = limits.size(x)
+        d = _step(arrow, x, size, damping[here], limits, control.cutoff)
+        done = _is_small(arrow, size, d, control)
+        if (done & (damping[here] > LEAST)).any():
+            done &= _is_small(arrow, size, _step(arrow, x, size, np.full(len(here), LEAST), limits, control.cutoff), control)
+        if done.any():
             converged[here[done]], going[here[done]] = True, False
             here, d, x, arrow = here[~done], d[~done], x[~done], arrow.at(~done)
             if not here.size:
                 break
         steps[here] += 1
-        promised = -np.sum(arrow.gradient() * d, axis=1) - 0.5 * arrow.change(d)
+        promised = -np.sum(arrow.gradient * d, axis=1) - 0.5 * arrow.change(d)
         trial = evaluate(x + d, here)
         with np.errstate(invalid="ignore", over="ignore"):
             found = at.cost[here] - trial.cost
@@ -127,11 +142,8 @@ def minimise(
             level = (promised < 100 * control.tolerance**2) & (np.abs(found) < control.tolerance)
             better = np.isfinite(trial.cost) & ((found > 1e-4 * promised) | level)
             ratio = np.where(np.isfinite(found), found / np.maximum(promised, np.finfo(float).tiny), -1.0)
-        rising = here[better]
-        theta[rising], at.cost[rising] = (x + d)[better], trial.cost[better]
-        at.residual[rising], at.sigma[rising] = trial.residual[better], trial.sigma[better]
-        for kept, new in zip(at.arrow.arrays, trial.arrow.arrays, strict=True):
-            kept[rising] = new[better]
+        theta[here[better]] = (x + d)[better]
+        at = at.replaced(here, trial, better)
         for b in here.tolist():
             costs[b].append(float(at.cost[b]))
         # after a step that failed, damping falls slowly: in a curved valley every other step would fail. It rises where steps overshoot: where residuals
@@ -148,23 +160,25 @@ def minimise(
     return Minimum(theta, at, converged, stuck, steps, np.zeros(len(theta), bool), trace)
 
 
-def _step(arrow: Arrow, theta, damping, limits: Limits, cutoff: float) -> np.ndarray:
+def _step(arrow: Arrow, theta, size, damping, limits: Limits, cutoff: float) -> np.ndarray:
     """The damped step within the bounds."""
-    norms, size = arrow.column_norms(), limits.size(theta)
-    D = np.maximum(norms, 1e-8 * np.max(norms * size, axis=1, keepdims=True) / size)
+    norms, g = arrow.column_norms, arrow.gradient
+    D = np.maximum(norms, 1e-8 * (norms * size).max(axis=1, keepdims=True) / size)
     D = np.where(D > 0, D, 1.0)
-    g = arrow.gradient()
     held = limits.fixed | ((theta <= limits.low) & (g >= 0)) | ((theta >= limits.high) & (g <= 0))
     moved = np.zeros_like(theta)
     for _ in range(RELEASES):
         d = arrow.step(damping, D, held, moved, cutoff)
+        low, high = theta + d < limits.low, theta + d > limits.high
+        if not (low.any() or high.any()):
+            return d
         within = np.clip(theta + d, limits.low, limits.high) - theta
-        over = ~held & (within != d) & ((theta + d < limits.low) | (theta + d > limits.high))
-        if not np.any(over):
+        over = ~held & (within != d) & (low | high)
+        if not over.any():
             return d
         held, moved = held | over, np.where(over, within, moved)
     return np.clip(theta + d, limits.low, limits.high) - theta
 
 
-def _is_small(arrow: Arrow, theta, d, limits: Limits, control: Control) -> Bool[np.ndarray, "members"]:
-    return (arrow.change(d) <= control.tolerance**2) & np.all(np.abs(d) <= control.tolerance * limits.size(theta), axis=1)
+def _is_small(arrow: Arrow, size, d, control: Control) -> Bool[np.ndarray, "members"]:
+    return (arrow.change(d) <= control.tolerance**2) & (np.abs(d) <= control.tolerance * size).all(axis=1)

@@ -26,11 +26,11 @@ class Loss:
     def value(self, r: Float[np.ndarray, "*batch samples"]) -> Float[np.ndarray, "*batch"]:
         """Sum of rho over the last axis."""
         k, size = self.parameter, np.abs(r)
-        if self.kind == "student-t" and np.isfinite(k):
+        if not np.isfinite(k):
+            return 0.5 * np.sum(r**2, axis=-1)
+        if self.kind == "student-t":
             return np.sum((k + 1) / 2 * np.log1p(r**2 / k), axis=-1)
-        return np.sum(
-            np.where(size <= k, 0.5 * r**2, k * np.minimum(size, np.finfo(float).max / max(k, 1.0)) - 0.5 * k**2) if np.isfinite(k) else 0.5 * r**2, axis=-1
-        )
+        return np.sum(np.where(size <= k, 0.5 * r**2, k * np.minimum(size, np.finfo(float).max / max(k, 1.0)) - 0.5 * k**2), axis=-1)
 
     def weight(self, r: Float[np.ndarray, "*samples"]) -> Float[np.ndarray, "*samples"]:
         """w(r)."""
@@ -38,6 +38,10 @@ class Loss:
         if not np.isfinite(k):
             return np.ones_like(r)
         return (k + 1) / (k + r**2) if self.kind == "student-t" else np.minimum(1.0, k / np.maximum(np.abs(r), np.finfo(float).tiny))
+
+    def weighted(self, rows: Float[np.ndarray, "*samples width"], r: Float[np.ndarray, "*samples"]) -> Float[np.ndarray, "*samples width"]:
+        """Rows times the roots of their weights."""
+        return np.sqrt(self.weight(r))[..., None] * rows if np.isfinite(self.parameter) else rows
 
     def inflation(self, r: Float[np.ndarray, "samples"]) -> float:
         """By what the covariance (J'WJ)^-1 is to be multiplied, from the residuals that count."""

@@ -3,10 +3,10 @@
 value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 """
 
+import copy
 from collections.abc import Callable, Iterable, Mapping
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -19,8 +19,8 @@ from jourdain_jax.analysis.sensors import Actuator, Drive, Reading, Sensor, late
 from jourdain_jax.calculus.reals import Number
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
-from jourdain_jax.scene.numbers import checked_real, described, is_traced
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.numbers import checked_unless_traced, described, is_traced
+from jourdain_jax.scene.scene import Scene, entries_named
 
 
 class Measurements(eqx.Module):
@@ -48,18 +48,18 @@ class Measurements(eqx.Module):
     that do not match, and samples that may show what was before the start.
     """
 
-    ts: Float[Array, "times"]  # s
-    values: dict[str, Float[Array, "..."]]
-    sigma: dict[str, Float[Array, "..."]]
-    start: dict[str, Float[Array, "..."]]
+    ts: Float[Array | np.ndarray, "times"]  # s; all on NumPy where it is known
+    values: dict[str, Float[Array | np.ndarray, "..."]]
+    sigma: dict[str, Float[Array | np.ndarray, "..."]]
+    start: dict[str, Float[Array | np.ndarray, "..."]]
     unknown_start: dict[str, Range | None]
     inputs: dict | Inputs | None
     sensors: dict[str, Sensor]
     readings: dict[str, Reading]  # the sensors made ready; none before the run is `checked`, as of the next two
     drives: dict[str, Drive]  # actuators with numbers to be estimated, by input
     estimates: dict[str, Estimate]  # of sensors and actuators, as "gyro.gain"
-    t0: Float[Array, ""]  # s
-    correlation_time: dict[str, Float[Array, ""]]  # s, of channels whose noise has a memory; zero where it is to be estimated
+    t0: Float[Array | np.ndarray, ""]  # s
+    correlation_time: dict[str, Float[Array | np.ndarray, ""]]  # s, of channels whose noise has a memory; zero where it is to be estimated
     unknown_sigma: tuple[str, ...] = eqx.field(static=True)  # channels; their sigma here is 1
     unknown_correlation: tuple[str, ...] = eqx.field(static=True)  # channels
 
@@ -76,8 +76,7 @@ class Measurements(eqx.Module):
         t0: Number | None = None,
         correlation_time: "Mapping | Number | None" = 0.0,
     ):
-        real = jnp.result_type(float)
-        self.ts = checked_real(ts, "`ts`", advice="give times in s").astype(real)
+        self.ts = checked_unless_traced(ts, "`ts`", advice="give times in s")
         _check_times(self.ts)
         for what, part in (("values", values), ("start", start), ("sensors", {} if sensors is None else sensors)):
             if not isinstance(part, Mapping):
@@ -94,10 +93,10 @@ class Measurements(eqx.Module):
         self.inputs = inputs
         self.sensors = {name: one if isinstance(one, Sensor) else Sensor(one) for name, one in (sensors or {}).items()}
         self.readings, self.drives, self.estimates = {}, {}, {}
-        self.t0 = self.ts[0] if t0 is None else jnp.asarray(t0, real)
+        self.t0 = _array(self.ts[0] if t0 is None else t0)
 
     def __check_init__(self):
-        if not _holds(lambda t: (t[0] <= t[1]) & (t[0] < t[2]), jnp.stack([self.t0, self.ts[0], self.ts[-1]])):
+        if not _holds(lambda t: (t[0] <= t[1]) & (t[0] < t[2]), [self.t0, self.ts[0], self.ts[-1]]):
             raise ValueError(
                 f"the start at t0 = {self.t0} s comes after the first sample ({self.ts[0]} s), or not before the last ({self.ts[-1]} s); give an earlier `t0`"
             )
@@ -137,25 +136,29 @@ class Measurements(eqx.Module):
 
 def _holds(condition: Callable, x) -> bool:
     """Whether a condition holds throughout; traced values are not looked at."""
-    return isinstance(x, jax.core.Tracer) or bool(np.all(condition(np.asarray(x))))
+    return is_traced(x) or bool(np.all(condition(np.asarray(x))))
 
 
-def _reals(what: str, given: Mapping) -> dict[str, Array]:
-    return {name: checked_real(value, f"{what} `{name}`").astype(jnp.result_type(float)) for name, value in given.items()}
+def _array(x) -> Array | np.ndarray:
+    return (jnp if is_traced(x) else np).asarray(x, jnp.result_type(float))
 
 
-def _correlation_times(given: Mapping) -> dict[str, Array]:
+def _reals(what: str, given: Mapping) -> dict[str, Array | np.ndarray]:
+    return {name: checked_unless_traced(value, f"{what} `{name}`", advice="check how it is put together") for name, value in given.items()}
+
+
+def _correlation_times(given: Mapping) -> dict[str, Array | np.ndarray]:
     """Those that are not zero; zero where it is not known."""
     found = {}
     for name, value in given.items():
         if value is None:
-            found[name] = jnp.zeros((), jnp.result_type(float))
+            found[name] = np.zeros((), jnp.result_type(float))
             continue
-        time = checked_real(value, f"correlation time of channel `{name}`", (), advice="give a time in s, or None where it is not known")
+        time = checked_unless_traced(value, f"correlation time of channel `{name}`", (), advice="give a time in s, or None where it is not known")
         if not _holds(lambda x: np.isfinite(x) & (x >= 0), time):
             raise ValueError(f"the correlation time of channel `{name}` is {float(time):g} s, expected zero or more; None where it is not known")
         if is_traced(time) or time != 0:
-            found[name] = time.astype(jnp.result_type(float))
+            found[name] = time
     return found
 
 
@@ -182,7 +185,7 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
     what was before the start.
     """
     where = f"run {index} of `{type(scene).__name__}`"
-    scene.named(**run.start)
+    entries_named(scene, run.start)
     times = run.ts.shape[0]
     readings: dict[str, Reading] = {}
     estimates: dict[str, Estimate] = {}
@@ -192,16 +195,19 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
             readings[name] = _reading(run.sensors[name], name, where, quantity, shape, estimates)
             _check_begin(run, name, where, repeats)
         shape = (times, *shape)
-        found = values.shape[1:] if repeats else values.shape
-        if found != shape:
+        if (values.shape[1:] if repeats else values.shape) != shape:
             expected = f"(repeats, {', '.join(map(str, shape))})" if repeats else f"{shape}"
             hint = "; many repeats go to `fit_batch`" if values.shape[1:] == shape and not repeats else ""
             raise ValueError(f"channel `{name}` of {where} has shape {values.shape}, expected {expected} for {times} times{hint}")
         if run.sigma[name].shape not in ((), (times,), shape):
             raise ValueError(f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, expected (), {(times,)} or {shape}")
     inputs, drives = _inputs(scene, run, where, estimates)
-    ready, of = (inputs, readings, drives, estimates), lambda r: (r.inputs, r.readings, r.drives, r.estimates)
-    return eqx.tree_at(of, run, ready, is_leaf=lambda x: x is None or any(x is part for part in of(run)))
+    found = copy.copy(run)  # without another look at all that was looked at when it was made
+    of_channels = {field: getattr(run, field) for field in ("values", "sigma", "start", "unknown_start", "sensors", "correlation_time")}
+    for field, value in (of_channels | {"readings": readings, "drives": drives, "estimates": estimates}).items():
+        object.__setattr__(found, field, dict(sorted(value.items())))  # as JAX orders them
+    object.__setattr__(found, "inputs", inputs)
+    return found
 
 
 def _quantity(scene: Scene, given: str | Callable | Accelerometer | None, channel_name: str, where: str):

@@ -6,11 +6,12 @@ A lane is one run of one member (a repeat of the experiment, or a first guess of
 compiled once for runs of equal structure, whatever their number: memory does not grow with it. Short runs are filled up to the length of the longest.
 """
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
-from itertools import islice
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -33,10 +34,11 @@ TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far be
 MOST_LANES = 64
 AHEAD = 4  # groups of lanes that are begun before the first is read
 FEWEST_INTERVALS = 64  # of a motion that is read between its times
+_WHITE = np.zeros((1, 1))
 FILLED = 1e-6  # of a run's span: between the times that fill up a short one
 
 
-class Run(eqx.Module):
+class Run(NamedTuple):
     """A run made ready: its measurements with weights 1 / sigma, zero where a sample is missing."""
 
     t0: Float[Array | np.ndarray, ""]
@@ -67,10 +69,9 @@ class Run(eqx.Module):
         """The run with these unknowns."""
         changed = layout.start(self.start, local)
         if not layout.numbers:
-            return eqx.tree_at(lambda r: r.start, self, changed)
+            return self._replace(start=changed)
         known = layout.known(shared, local)
-        parts = changed, with_numbers(self.sensors, known), with_numbers(self.drives, known)
-        return Run(self.t0, self.ts, self.grid, self.values, self.weights, parts[0], self.inputs, parts[1], parts[2], self.correlation_time)
+        return self._replace(start=changed, sensors=with_numbers(self.sensors, known), drives=with_numbers(self.drives, known))
 
 
 def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
@@ -126,9 +127,10 @@ class Lanes:
             _Group(scene, indices, [run_of(data[i], repeats=members is not None) for i in indices], layout, simulation, members) for indices in _alike(data)
         ]
         self.lengths = [run.ts.shape[0] for run in data]
+        self._of_run = {run: group for group in self._groups for run in group.indices}
 
     def evaluate(self, shared: Float[np.ndarray, "members shared"], local: Float[np.ndarray, "members runs local"], members: np.ndarray):
-        """Yields, some lanes at a time: numbers of members (among those given) and of runs, residuals by lane, and Jacobians (own unknowns first)."""
+        """Yields, some lanes at a time: numbers of members (among those given) and of runs, and [J r] (lanes, samples, unknowns + 1), own unknowns first."""
         for group in self._groups:
             yield from group.evaluate(shared, local, members)
 
@@ -147,18 +149,15 @@ class Lanes:
         """Where the samples of each channel are in the residuals of a run."""
         return self._group_of(run).channels
 
-    def within(self, runs: np.ndarray, share: float) -> np.ndarray:
+    def within(self, runs: np.ndarray, share: Float[np.ndarray, "lanes"]) -> np.ndarray:
         """Which samples (lanes, samples) of these runs, of equal structure, lie in the first `share` of a run's span."""
         group = self._group_of(int(runs[0]))
         return group.within([group.indices.index(run) for run in runs.tolist()], share)
 
-    def whitened(self, runs: np.ndarray, members: np.ndarray, r, J, taus: dict[str, np.ndarray]) -> tuple:
-        """Residuals and Jacobians (None: none) of lanes of equal structure, whitened; `taus`: correlation times (lanes,) that are estimated, s."""
+    def whitened(self, runs: np.ndarray, members: np.ndarray, rows: Float[np.ndarray, "lanes samples width"], taus: dict[str, np.ndarray]) -> np.ndarray:
+        """Rows of lanes of equal structure, whitened; `taus`: correlation times (lanes,) that are estimated, s."""
         before, rho = self._group_of(int(runs[0])).chained(runs, members, taus)
-        if before is None:
-            return r, J
-        w = whitened(r, np.take_along_axis(r, before, axis=1), rho)
-        return w, None if J is None else whitened(J, np.take_along_axis(J, before[..., None], axis=1), rho[..., None])
+        return rows if before is None else whitened(rows, np.take_along_axis(rows, before[..., None], axis=1), rho[..., None])
 
     def log_widths(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> Float[np.ndarray, "lanes"]:
         """`sum log sqrt(1 - rho^2)` of lanes of equal structure."""
@@ -171,40 +170,54 @@ class Lanes:
         return group.by_channel(group.indices.index(run), flat, self.lengths[run])
 
     def _group_of(self, run: int) -> "_Group":
-        return next(g for g in self._groups if run in g.indices)
+        return self._of_run[run]
 
 
 class _Group:
     """Runs of equal structure, filled up to one length."""
 
     def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None):
-        self.indices, self._members, self._counts = indices, members, layout.sizes
+        self.indices, self._members, self._runs = indices, members, np.array(indices)
         times, knots = max(run.ts.shape[0] for run in runs), _most_knots(runs)
         filled = [_filled(run, times, knots, 0 if members is None else 1) for run in _on_equal_grids(runs)]
-        self._arrays = jax.tree.map(lambda *xs: np.stack(xs), *[eqx.partition(run, _is_array)[0] for run in filled])
-        self._repeated = eqx.tree_at(
-            lambda r: (r.values, r.weights), jax.tree.map(lambda _: False, self._arrays), (dict.fromkeys(filled[0].values, members is not None),) * 2
-        )
-        self._common, rest = eqx.partition((scene, simulation), _is_array)
-        static = jax.tree.flatten((rest, eqx.partition(filled[0], _is_array)[1], layout))
-        self._run = _program(static[1], tuple(static[0]))
-        sizes = {name: int(np.prod(w.shape[0 if members is None else 1 :])) for name, w in sorted(filled[0].weights.items())}
-        ends = np.cumsum([0, *sizes.values()]).tolist()
-        self.channels = {name: slice(begin, end) for name, begin, end in zip(sizes, ends[:-1], ends[1:], strict=True)}
-        taus, arrays = self._arrays.correlation_time, self._arrays
-        self.chains = Chains.of(arrays.weights, arrays.ts, taus, self.channels, members is not None) if taus else None
+        leaves, treedef = jax.tree.flatten(((scene, simulation), filled[0]))
+        # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
+        repeated = {id(x) for part in (filled[0].values, filled[0].weights) for x in part.values()} if members is not None else set()
+        of_runs = list(zip(*map(jax.tree.leaves, filled), strict=True))
+        common = len(leaves) - len(of_runs)
+        self._common = np.concatenate([np.zeros(0), *(np.ravel(x) for x in leaves[:common] if _is_array(x))])
+        columns = [[np.zeros((len(filled), count, 0))] for count in (1, members or 1)]
+        for x in of_runs:
+            if _is_array(x[0]):
+                has_members = id(x[0]) in repeated
+                columns[has_members].append(np.array(x).reshape(len(filled), members if has_members else 1, -1))
+        self._rows, self._own_rows = (np.concatenate(parts, axis=2) for parts in columns)
+        self._rows = self._rows[:, 0]
+        marks = [_Number.of(x, k >= common, id(x) in repeated) if _is_array(x) else x for k, x in enumerate(leaves)]
+        self._run = _program(treedef, tuple(marks), layout)
+        self.weights = {name: np.array([run.weights[name] for run in filled]) for name in filled[0].weights}  # (runs, *members, times, *channel)
+        self._t0, self._ts = np.array([run.t0 for run in filled]), np.array([run.ts for run in filled])
+        self.channels, end = {}, 0
+        for name, weight in sorted(filled[0].weights.items()):
+            begin, end = end, end + math.prod(weight.shape[0 if members is None else 1 :])
+            self.channels[name] = slice(begin, end)
+        taus = {name: np.stack([run.correlation_time[name] for run in filled]) for name in filled[0].correlation_time}
+        self.chains = Chains.of(self.weights, self._ts, taus, self.channels, members is not None) if taus else None
         saved = times if filled[0].grid is None else filled[0].grid.shape[0]
         states = saved * (len(scene.coordinate_names) + len(scene.speed_names)) * 8 * (1 + sum(layout.sizes))
         self._width = int(min(MOST_LANES, max(1, TOUCHED // states)))
-        self._kept: tuple = ((), [])
+        self._kept: dict[int, list] = {}
 
     def evaluate(self, shared, local, members):
-        chunks = self._chunks(members)
-        yield self._ended(self._begin(shared, local, *chunks[0]))  # compiles, where that is needed
+        if len(members) not in self._kept:
+            self._kept = {len(members): self._chunks(len(members))}
+        first, *chunks = self._kept[len(members)]
+        lanes = lambda kept, b, j: self._ended(kept, b, j, self._begun(shared, local, members, b, j))  # noqa: E731
+        yield lanes(*first)  # compiles, where that is needed
         waiting: list[Future] = []
         try:
-            for chunk in chunks[1:]:
-                waiting.append(_threads().submit(lambda chunk=chunk: self._ended(self._begin(shared, local, *chunk))))
+            for chunk in chunks:
+                waiting.append(_threads().submit(lanes, *chunk))
                 if len(waiting) == AHEAD:
                     yield waiting.pop(0).result()
             while waiting:
@@ -213,46 +226,31 @@ class _Group:
             for future in waiting:
                 future.cancel()
 
-    def _chunks(self, members):
-        """Positions of members and runs of some lanes, filled up with copies of the last, and their arrays."""
-        key = members.tobytes()
-        if self._kept[0] != key:
-            lanes = [(b, j) for b in range(len(members)) for j in range(len(self.indices))]
-            width = min(self._width, 1 << (len(lanes) - 1).bit_length())
-            chunks, rest = [], iter(lanes)
-            while some := list(islice(rest, width)):
-                b, j = np.array(some + some[-1:] * (width - len(some))).T
-                take = lambda x, repeated, b=b, j=j: jnp.asarray(x[j, members[b]] if repeated else x[j])  # noqa: E731
-                chunks.append((len(some), b, j, jax.tree.map(take, self._arrays, self._repeated)))
-            self._kept = key, chunks if len(chunks) * width <= 4096 else []
-            return chunks
-        return self._kept[1]
+    def _chunks(self, members: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        """How many lanes at a time, with positions of their members and runs; these are filled up with copies of the last."""
+        count = members * len(self.indices)
+        width = min(self._width, 1 << (count - 1).bit_length())
+        lanes = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
+        return [(min(width, count - k * width), *np.divmod(some, len(self.indices))) for k, some in enumerate(lanes)]
 
-    def _begin(self, shared, local, kept, b, j, arrays):
-        runs = np.array(self.indices)[j]
-        return kept, b, runs, self._run(self._common, arrays, shared[b], local[b, runs])
+    def _begun(self, shared, local, members, b, j):
+        own = members[b] if self._members is not None else 0
+        return self._run(self._common, np.concatenate([self._rows[j], self._own_rows[j, own], local[b, self._runs[j]], shared[b]], axis=1))
 
-    def _ended(self, begun):
-        kept, b, runs, found = begun
-        r, J = (np.asarray(x)[:kept] for x in found)
-        return b[:kept], runs[:kept], r, J
-
-    @property
-    def weights(self) -> dict[str, np.ndarray]:
-        """Weights by channel, shape (runs, *members, times, *channel)."""
-        return self._arrays.weights
+    def _ended(self, kept, b, j, found):
+        return b[:kept], self._runs[j[:kept]], np.asarray(found)[:kept]
 
     def chained(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> tuple[np.ndarray | None, np.ndarray]:
         """Of each sample of lanes, the place of the one before it (None: all noise is white) and their correlation."""
         if self.chains is None:
-            return None, np.zeros((len(runs), 1))
+            return None, _WHITE
         places = [self.indices.index(run) for run in runs.tolist()]
         return self.chains.at(places, None if self._members is None else members, taus)
 
-    def within(self, places: list[int], share: float) -> np.ndarray:
+    def within(self, places: list[int], share: Float[np.ndarray, "lanes"]) -> np.ndarray:
         """Which samples of the runs at these places lie in the first `share` of the span, shape (lanes, samples)."""
-        ts, t0 = (np.asarray(x)[places] for x in (self._arrays.ts, self._arrays.t0))
-        early = np.abs(ts - t0[:, None]) <= share * np.abs(ts[:, -1] - t0)[:, None]
+        ts, t0 = self._ts[places], self._t0[places]
+        early = np.abs(ts - t0[:, None]) <= (share * np.abs(ts[:, -1] - t0))[:, None]
         counts = [(where.stop - where.start) // early.shape[1] for where in self.channels.values()]
         return np.concatenate([np.repeat(early, count, axis=1) for count in counts], axis=1)
 
@@ -260,7 +258,7 @@ class _Group:
         """Residuals of the run at this place by channel; all NaN where `flat` is empty, since they were not worked out."""
         found = {}
         for name, where in self.channels.items():
-            weight = self._arrays.weights[name][place]
+            weight = self.weights[name][place]
             shape = weight.shape if self._members is None else weight.shape[1:]
             part = flat[..., where].reshape((*flat.shape[:-1], *shape)) if flat.shape[-1] else np.full((*flat.shape[:-1], *shape), np.nan)
             found[name] = np.where(weight > 0, part, np.nan)[(slice(None),) * (flat.ndim - 1) + (slice(times),)]
@@ -272,24 +270,48 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="jourdain_fit")
 
 
-@lru_cache(maxsize=16)
-def _program(treedef, leaves: tuple) -> Callable:
-    """Residuals (lanes, samples) and Jacobians (lanes, samples, local + shared) of lanes; compiled once for what is no array."""
-    rest, run_rest, layout = jax.tree.unflatten(treedef, leaves)
-    local_count = layout.sizes[1]
+class _Number(NamedTuple):
+    """What stands in place of an array: what it is, and whether it is in the row of a run, and there among the numbers that differ by member."""
 
-    def lane(common, arrays, shared, local):
-        (scene, simulation), run = eqx.combine(common, rest), eqx.combine(arrays, run_rest)
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    of_run: bool
+    of_member: bool
+
+    @staticmethod
+    def of(x, of_run: bool, of_member: bool) -> "_Number":
+        """That of an array; `of_member`: without its first axis."""
+        return _Number(x.shape[1:] if of_member else x.shape, jax.dtypes.canonicalize_dtype(x.dtype), of_run, of_member)
+
+
+@lru_cache(maxsize=16)
+def _program(treedef, leaves: tuple, layout: Layout) -> Callable:
+    """[J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns; compiled once.
+
+    `treedef`, `leaves`: of scene, options and run, with a `_Number` in place of each array.
+    """
+    own = layout.sizes[1]
+
+    def lane(common: Float[Array, "shared"], row: Float[Array, "own"]) -> Float[Array, "samples width"]:
+        begin, found = 0, dict.fromkeys(range(len(leaves)))
+        for vector, kinds in ((common, [(False, False)]), (row, [(True, False), (True, True)])):
+            begin = 0
+            for kind in kinds:
+                for k, leaf in enumerate(leaves):
+                    if isinstance(leaf, _Number) and leaf[2:] == kind:
+                        end = begin + math.prod(leaf.shape)
+                        found[k], begin = vector[begin:end].reshape(leaf.shape).astype(leaf.dtype), end
+        (scene, simulation), run = jax.tree.unflatten(treedef, [found[k] if isinstance(leaf, _Number) else leaf for k, leaf in enumerate(leaves)])
 
         def flat(x):
-            found = run.at(layout, x[local_count:], x[:local_count]).residuals(layout.scene(scene, x[local_count:]), simulate_forward, simulation)
-            r = jnp.concatenate([jnp.ravel(found[name]) for name in sorted(found)])
+            residuals = run.at(layout, x[own:], x[:own]).residuals(layout.scene(scene, x[own:]), simulate_forward, simulation)
+            r = jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
             return r, r
 
-        J, r = jax.jacfwd(flat, has_aux=True)(jnp.concatenate([local, shared]))
-        return r, J
+        J, r = jax.jacfwd(flat, has_aux=True)(row[begin:])
+        return jnp.concatenate([J, r[:, None]], axis=1)
 
-    return quickly_compiled(jax.vmap(lane, (None, 0, 0, 0)), jax.jit)
+    return quickly_compiled(jax.vmap(lane, (None, 0)), jax.jit)
 
 
 def _alike(data: Sequence[Measurements]) -> list[list[int]]:
@@ -325,12 +347,14 @@ def _on_equal_grids(runs: Sequence[Run]) -> Sequence[Run]:
     if runs[0].grid is None:
         return runs
     count = max(run.grid.shape[0] for run in runs if run.grid is not None) - 1
-    return [eqx.tree_at(lambda r: r.grid, run, _equal_intervals(run.t0, run.ts[-1], count)) for run in runs]
+    return [run._replace(grid=_equal_intervals(run.t0, run.ts[-1], count)) for run in runs]
 
 
 def _filled(run: Run, times: int, knots: list[int], axis: int) -> Run:
     """The run with as many times and knots as these; what is added is close behind its end, and does not count."""
     more = times - run.ts.shape[0]
+    if not (more or knots):
+        return run
     counts = iter(knots)
 
     def longer(x):
@@ -342,10 +366,9 @@ def _filled(run: Run, times: int, knots: list[int], axis: int) -> Run:
         return eqx.tree_at(lambda s: (s.ts, s.values), x, (ts, np.concatenate([x.values, np.full(extra, x.values[-1])])))
 
     inputs, drives = jax.tree.map(longer, (run.inputs, run.drives), is_leaf=_is_sampled)
-    run = eqx.tree_at(lambda r: (r.inputs, r.drives), run, (inputs, drives), is_leaf=lambda x: x is run.inputs or x is run.drives)
+    run = run._replace(inputs=inputs, drives=drives)
     if not more:
         return run
     pad = lambda x: np.concatenate([x, np.zeros((*x.shape[:axis], more, *x.shape[axis + 1 :]))], axis=axis)  # noqa: E731
     ts = np.concatenate([run.ts, run.ts[-1] + FILLED * (run.ts[-1] - run.t0) * np.arange(1, more + 1)])
-    changed = ts, {n: pad(x) for n, x in run.values.items()}, {n: pad(x) for n, x in run.weights.items()}
-    return eqx.tree_at(lambda r: (r.ts, r.values, r.weights), run, changed)
+    return run._replace(ts=ts, values={n: pad(x) for n, x in run.values.items()}, weights={n: pad(x) for n, x in run.weights.items()})

@@ -19,7 +19,7 @@ from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
 
 _LEAST_SIGMA = 1e-12  # of a channel that is met exactly
-_STEP, _MOST_VARIANCE = 0.3, 4.0  # of differences in the logarithm of a correlation time; variance of that which is counted at most
+_NODES = np.linspace(-3.2, 3.2, 9)  # of arcsin rho, in its standard deviations: 1 / sqrt(samples) without unknowns
 
 
 class Problem:
@@ -28,10 +28,11 @@ class Problem:
     def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss):
         self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
-        self.share = 1.0  # of each run's span, from its start: samples beyond do not count
+        self.shares: np.ndarray | None = None  # of each run's span, from its start, by member: samples beyond do not count
         self.begun = np.zeros((0, 0))  # first guesses of the members, where spans grow
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
         self.tau = np.zeros((lanes.members or 1, len(self.with_memory)))  # s, of these: at first as if their noise were white
+        self._counted = lanes.counted(self.estimated, np.arange(lanes.members or 1))  # samples of channels whose sigma is estimated, of each member
 
     def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
         """Correlation times of some members, by channel, s."""
@@ -44,38 +45,57 @@ class Problem:
 
     def _assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable, taus: dict[str, np.ndarray]) -> Linearised:
         """What is minimised, from what was evaluated; `taus`: correlation times by channel, of these members."""
-        shared, local = self.unknowns.split(theta)
-        (count, runs, m), p, kinds = local.shape, shared.shape[1], 1 + len(self.estimated)
+        (p, m), count, runs, kinds = self.unknowns.layout.sizes, len(theta), self.unknowns.runs, 1 + len(self.estimated)
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
-        cost, squares, samples = np.zeros(count), np.zeros((count, kinds)), self.lanes.counted(self.estimated, members)
+        costs, squares = np.zeros((count, runs)), np.zeros((count, runs, kinds))
         residual = np.empty((count, runs), object)
-        for b, j, plain, plain_J in evaluated:
-            r, J = self.lanes.whitened(j, members[b], plain, plain_J, {name: tau[b] for name, tau in taus.items()})
-            if self.share < 1:
-                early = self.lanes.within(j, self.share)
-                r, J = np.where(early, r, 0.0), np.where(early[..., None], J, 0.0)
+        for b, j, plain in evaluated:
+            whole = self.lanes.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
+            if self.shares is not None:
+                whole = np.where(self.lanes.within(j, self.shares[members[b]])[..., None], whole, 0.0)
             with np.errstate(over="ignore", invalid="ignore"):
-                for k, (rows, counted) in enumerate(self._kinds(int(j[0]), r)):
-                    root = np.sqrt(self.loss.weight(rows))
-                    triangles[b, j, k] = triangle(root * rows, root[..., None] * J[:, counted])
-                    np.add.at(squares, (b, k), np.sum(rows**2, axis=1))
-                    if k == 0:
-                        np.add.at(cost, b, self.loss.value(rows))
-            for place, one in zip(zip(b, j, strict=True), plain, strict=True):
+                for k, rows in enumerate(self._kinds(int(j[0]), whole)):
+                    r = rows[..., -1]
+                    triangles[b, j, k] = triangle(self.loss.weighted(rows, r))
+                    if k:
+                        squares[b, j, k] = np.sum(r**2, axis=1)
+                    else:
+                        costs[b, j] = self.loss.value(r)
+            for place, one in zip(zip(b, j, strict=True), plain[..., -1], strict=True):
                 residual[place] = one
-            if count == 1 and not np.all(np.isfinite(triangles[b, j])):  # whatever the other runs say
+            if count == 1 and not np.isfinite(triangles[b, j]).all():  # whatever the other runs say
                 triangles.fill(np.nan)
                 break
-        sigma = np.sqrt(np.maximum(squares[:, 1:] / samples, _LEAST_SIGMA**2))
-        cost = cost + np.sum(samples * np.log(sigma), axis=1)
-        mean, spread = self._known_before(theta, members)
-        with_mean = np.isfinite(mean)
-        cost = cost + 0.5 * np.sum(np.where(with_mean, (theta - np.where(with_mean, mean, 0.0)) / spread, 0.0) ** 2, axis=1)
+        cost = costs.sum(axis=1)
+        samples = self._counted[members if self.lanes.members else np.zeros(count, int)]
+        sigma = np.sqrt(np.maximum(squares.sum(axis=1)[:, 1:] / samples, _LEAST_SIGMA**2))
         finite = np.isfinite(triangles).all(axis=(1, 2, 3, 4)) & np.isfinite(cost)
-        scaled = np.where(finite[:, None, None, None, None], triangles, 0.0) / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
-        together = scaled[:, :, 0] if kinds == 1 else np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
+        triangles[~finite] = 0.0
+        if kinds > 1:
+            cost = cost + np.sum(samples * np.log(sigma), axis=1)
+            scaled = triangles / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
+            together = np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
+        else:
+            together = triangles[:, :, 0]
         whole = arrow(together, m)
-        return Linearised(np.where(finite, cost, np.inf), with_prior(whole, theta, mean, spread) if with_mean.any() else whole, residual, sigma)
+        if self.shares is not None or self.unknowns.with_prior.size:
+            mean, spread = self._known_before(theta, members)
+            with_mean = np.isfinite(mean)
+            cost = cost + 0.5 * np.sum(np.where(with_mean, (theta - np.where(with_mean, mean, 0.0)) / spread, 0.0) ** 2, axis=1)
+            whole = with_prior(whole, theta, mean, spread)
+        return Linearised(np.where(finite, cost, np.inf), whole, residual, sigma)
+
+    def is_followed(self, at: Linearised, share: float, most: float) -> np.ndarray:
+        """Of which members the squares of residuals over this share of the span are on average at most so many times those of noise."""
+        good = np.isfinite(at.cost)
+        squares, counted = np.zeros(good.sum()), np.zeros(good.sum())
+        for run in range(len(self.runs) if good.any() else 0):
+            r = np.where(self.lanes.within(np.array([run]), np.array([share])), np.stack(at.residual[good, run]), 0.0)
+            for name, where in self.lanes.channels(run).items():
+                if name not in self.estimated:
+                    squares, counted = squares + np.sum(r[:, where] ** 2, axis=1), counted + np.count_nonzero(r[:, where], axis=1)
+        good[good] = squares <= most * counted
+        return good
 
     def _known_before(self, theta: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and standard deviation of priors, (members, unknowns); NaN where there is none.
@@ -83,7 +103,7 @@ class Problem:
         Over part of the span the first guess is a weak prior, known to its own size: what so few samples do not tell stays there.
         """
         mean, spread = (np.broadcast_to(x, theta.shape) for x in (self.unknowns.prior_mean, self.unknowns.prior_sigma))
-        if self.share == 1:
+        if self.shares is None:
             return mean, spread
         begun = self.begun[members]
         none = ~np.isfinite(mean) & ~self.unknowns.fixed
@@ -106,26 +126,40 @@ class Problem:
     def _restricted(self, theta, members: np.ndarray, evaluated: list, taus: dict[str, np.ndarray]) -> tuple[np.ndarray, Linearised]:
         """What the restricted likelihood is made of, to be as low as possible."""
         at, logs = self._assembled(theta, members, evaluated, taus), np.zeros(len(members))
-        for b, j, _, _ in evaluated:
+        for b, j, _ in evaluated:
             np.add.at(logs, b, self.lanes.log_widths(j, members[b], {n: tau[b] for n, tau in taus.items()}))
         return at.cost + logs + half_log_determinant(at.arrow, self.unknowns.sizes(theta)), at
 
-    def doubt(self, theta: np.ndarray, errors: Callable[[Arrow], np.ndarray]) -> np.ndarray:
-        """Variance of the logarithm of each squared standard error that comes from correlation times which are estimated: `sum (d log C / d log tau)^2 / F''`.
+    def doubt(self, theta: np.ndarray, of: Callable[[Arrow], tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+        """What estimated correlation times add, (members, unknowns): to each squared standard error C, relative to it; and the variance of log C.
 
-        `errors`: standard errors (members, unknowns) of an arrow. Zero where no correlation time is estimated.
+        By moments over the restricted likelihood of each correlation time, with weights that are even in arcsin rho (Jeffreys' prior of AR(1) noise): C becomes
+        mean C + variance of the estimates, which move with it. `of`: standard errors and changes of the estimates from an arrow. Zero where none is estimated.
         """
+        members, more, spread = np.arange(len(theta)), np.zeros((1, 1)), np.zeros((1, 1))
         if not self.with_memory:
-            return np.zeros(1)
-        members, found = np.arange(len(theta)), np.zeros(1)
+            return more, spread
         evaluated, taus = list(self.lanes.evaluate(*self.unknowns.split(theta), members)), self.taus(members)
         for name in self.with_memory:
-            left, middle, right = (self._restricted(theta, members, evaluated, taus | {name: np.exp(k * _STEP) * taus[name]}) for k in (-1, 0, 1))
-            curvature = np.maximum((left[0] - 2 * middle[0] + right[0]) / _STEP**2, 1 / _MOST_VARIANCE)
+            low, high = correlation_limits([np.asarray(run.ts) for run in self.runs if name in run.values])
+            interval, counted = low / SHORTEST, self.lanes.counted([name], members)[:, 0]
+            angle = lambda tau, h=interval: np.arcsin(np.exp(-h / tau))  # noqa: E731
+            nodes = angle(taus[name])[:, None] + _NODES / np.sqrt(counted)[:, None]
+            inside = (nodes >= angle(low)) & (nodes <= angle(high))
+            found = []
+            for node in np.clip(nodes, angle(low), angle(high)).T:
+                value, at = self._restricted(theta, members, evaluated, taus | {name: -interval / np.log(np.sin(node))})
+                found.append((value, *of(at.arrow)))
+            values, errors, moved = (np.stack(x, axis=1) for x in zip(*found, strict=True))
+            weight = np.where(inside, np.exp(np.min(values, axis=1, keepdims=True) - values), 0.0)
+            weight = (weight / weight.sum(axis=1, keepdims=True))[..., None]
+            mean = lambda x, weight=weight: np.sum(weight * x, axis=1)  # noqa: E731
+            middle = errors[:, len(_NODES) // 2] ** 2
             with np.errstate(divide="ignore", invalid="ignore"):
-                slope = np.log(errors(right[1].arrow) / errors(left[1].arrow)) / _STEP
-            found = found + np.where(np.isfinite(slope), slope, 0.0) ** 2 / curvature[:, None]
-        return found
+                logs = 2 * np.log(errors)
+                more = more + mean(errors**2) / middle - 1 + (mean(moved**2) - mean(moved) ** 2) / middle
+                spread = spread + mean(logs**2) - mean(logs) ** 2
+        return np.nan_to_num(more), np.nan_to_num(spread)
 
     @property
     def samples(self) -> int:
@@ -143,7 +177,7 @@ class Problem:
         whole = np.stack([np.full(longest, np.nan) if len(r) < longest else r for r in flat])
         members = np.arange(len(whole))
         if white and longest:
-            whole, _ = self.lanes.whitened(np.full(len(whole), run), members, whole, None, self.taus(members))
+            whole = self.lanes.whitened(np.full(len(whole), run), members, whole[..., None], self.taus(members))[..., 0]
         parts = self.lanes.by_channel(run, one(whole))
         for k, name in enumerate(self.estimated):
             if name in parts:
@@ -164,12 +198,10 @@ class Problem:
         """Whether no sigma is known."""
         return bool(self.estimated) and all(set(run.values) <= set(self.estimated) for run in self.runs)
 
-    def _kinds(self, run: int, r: np.ndarray):
-        """Residuals and their places: those of channels whose sigma is known, then those of each other channel."""
+    def _kinds(self, run: int, whole: np.ndarray) -> list[np.ndarray]:
+        """[J r] of lanes: of channels whose sigma is known, then of each other channel."""
         if not self.estimated:
-            yield r, slice(None)
-            return
+            return [whole]
         channels = self.lanes.channels(run)
-        known = [np.arange(r.shape[1])[where] for name, where in channels.items() if name not in self.estimated]
-        for counted in (np.concatenate([np.zeros(0, int), *known]), *(np.arange(r.shape[1])[channels.get(name, slice(0))] for name in self.estimated)):
-            yield r[:, counted], counted
+        known = [whole[:, where] for name, where in channels.items() if name not in self.estimated]
+        return [np.concatenate([whole[:, :0], *known], axis=1), *(whole[:, channels.get(name, slice(0))] for name in self.estimated)]

@@ -33,7 +33,7 @@ def limits_at_bounds(evaluate: Callable, found: Minimum, limits: Limits, control
         size, estimated = limits.size(one), np.flatnonzero(~limits.fixed)
         known = information(found.at.arrow.at([b]), size, estimated, others, np.zeros(1, bool), control.cutoff, True)
         error = float(known.standard_errors[np.searchsorted(estimated, place)])
-        slope = abs(float(found.at.arrow.at([b]).gradient()[0, place]))
+        slope = abs(float(found.at.arrow.at([b]).gradient[0, place]))
         beyond[b, place] = slope * error
         inward = 1.0 if one[0, place] <= limits.low[place] else -1.0
         if beyond[b, place] > FAR_BEYOND:  # the bound decides: the slope alone gives the limit

@@ -23,13 +23,11 @@ class Range:
     high: float = np.inf
     scale: float | None = None
 
-    def size(self, value, guess) -> Float[np.ndarray, "*shape"]:
-        """What counts as a large change of the unknown: its own magnitude; near zero the typical change, or a hundredth of the first guess or of the width."""
+    def least_size(self, guess: float) -> float:
+        """What counts as a large change of an unknown that is near zero: the typical change, or a hundredth of the first guess or of the width."""
         if self.kind == "unbounded":
-            least = np.where(guess == 0, 1.0, np.abs(guess)) if self.scale is None else self.scale
-        else:
-            least = 0.01 * (self.high - self.low) if self.kind == "bounds" else 0.01 * np.abs(guess)
-        return np.asarray(np.maximum(np.abs(value), least))
+            return self.scale or abs(guess) or 1.0
+        return 0.01 * (self.high - self.low if self.kind == "bounds" else abs(guess))
 
     def spread(self, guess, share) -> Float[np.ndarray, "*shape"]:
         """Other first guesses: for `share` from 0 to 1 all numbers between the bounds; without bounds a factor of five to either side, or a typical change."""
@@ -37,7 +35,7 @@ class Range:
             return np.asarray(self.low + share * (self.high - self.low))
         if self.kind == "positive":
             return guess * _FAR ** (2 * share - 1)
-        return guess + (2 * share - 1) * self.size(guess, guess)
+        return guess + (2 * share - 1) * max(abs(guess), self.least_size(guess))
 
     def refusal(self, guess: np.ndarray) -> str:
         """Why a first guess cannot be taken; empty where it can."""

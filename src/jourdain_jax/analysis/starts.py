@@ -19,20 +19,35 @@ def check_starts(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns)
     """ValueError unless the start of each run meets the constraints at the first guess, and still does when the unknowns change."""
     guess = unknowns.guess
     elsewhere = guess + 1e-3 * unknowns.sizes(guess) * np.where(unknowns.fixed, 0.0, np.sin(1.0 + np.arange(guess.size)))  # by unequal amounts
-    for theta, changed in ((guess, False), (elsewhere, True)):
-        shared, local = unknowns.split(theta)
-        moved = unknowns.layout.scene(scene, shared)
-        for index, run in enumerate(runs):
-            given = unknowns.layout.start(run.start, local[index])
-            leaves, treedef = jax.tree.flatten((moved, given, run.t0, run.inputs))
-            key = treedef, *(x if callable(x) else np.asarray(x).tobytes() for x in leaves)
-            if key in _right:
-                continue
-            try:
-                consistent_start(moved, t0=run.t0, inputs=run.inputs, **given)
-            except ValueError as error:
-                why = "no longer meets the constraints when the unknowns change: the values in `start` depend on each other" if changed else "is not admissible"
-                raise ValueError(f"the start of run {index} {why}. {error}") from None
-            _right[key] = None
-            while len(_right) > MOST:
-                del _right[next(iter(_right))]
+    for index, run in enumerate(runs):
+        if (here := _key(scene, run, unknowns, guess, index)) in _right:
+            continue
+        _check(scene, run, unknowns, guess, index, "is not admissible")
+        # whether given values depend on each other is no matter of the numbers that change
+        if (changed := _key(scene, run, unknowns, np.where(unknowns.fixed, guess, 0.0), index)) not in _right:
+            _check(
+                scene, run, unknowns, elsewhere, index, "no longer meets the constraints when the unknowns change: the values in `start` depend on each other"
+            )
+        _right.update({here: None, changed: None})
+        while len(_right) > MOST:
+            del _right[next(iter(_right))]
+
+
+def _key(scene: Scene, run: Measurements, unknowns: Unknowns, theta: np.ndarray, index: int) -> tuple:
+    """All numbers of a start with these unknowns, and what is no number."""
+    (moved, given), layout = _with(scene, run, unknowns, theta, index), unknowns.layout
+    leaves, treedef = jax.tree.flatten((moved, given, run.t0, run.inputs))
+    return layout, treedef, *(x if callable(x) else np.asarray(x).tobytes() for x in leaves)
+
+
+def _with(scene: Scene, run: Measurements, unknowns: Unknowns, theta: np.ndarray, index: int) -> tuple[Scene, dict]:
+    shared, local = unknowns.split(theta)
+    return unknowns.layout.scene(scene, shared), unknowns.layout.start(run.start, local[index])
+
+
+def _check(scene: Scene, run: Measurements, unknowns: Unknowns, theta: np.ndarray, index: int, why: str) -> None:
+    moved, given = _with(scene, run, unknowns, theta, index)
+    try:
+        consistent_start(moved, t0=run.t0, inputs=run.inputs, **given)
+    except ValueError as error:
+        raise ValueError(f"the start of run {index} {why}. {error}") from None

@@ -3,11 +3,12 @@
 theta = (shared, own of run 0, own of run 1, ...), every run with a place for each initial value that is unknown in any; where it is known, it is held.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -33,7 +34,7 @@ class Place:
     @property
     def end(self) -> int:
         """One past the last."""
-        return self.begin + int(np.prod(self.shape, dtype=int))
+        return self.begin + math.prod(self.shape)
 
     def of(self, vector):
         """Its numbers in a vector (or in many, with leading axes), in their own shape."""
@@ -54,9 +55,11 @@ class Layout:
 
     def scene(self, scene: Scene, shared: Float[Array | np.ndarray, "*members shared"]) -> Scene:
         """The scene with these shared unknowns."""
-        places = [place for place in self.shared if not place.of_sensor]
-        names, values = [place.name for place in places], [jnp.asarray(place.of(shared)) for place in places]
-        return eqx.tree_at(lambda s: [getattr(s, name) for name in names], scene, values) if names else scene
+        leaves, treedef = jax.tree.flatten(scene)
+        for place in self.shared:
+            if not place.of_sensor:
+                leaves[_leaf(treedef, place.name)] = jnp.asarray(place.of(shared))
+        return jax.tree.unflatten(treedef, leaves)
 
     def start(self, start: dict, local: Float[Array | np.ndarray, "*members local"]) -> dict:
         """The start of a run with these unknowns of its own."""
@@ -70,6 +73,12 @@ class Layout:
     def known(self, shared, local) -> dict[str, Array]:
         """Numbers of sensors and actuators by name, of one run."""
         return {place.name: place.of(vector) for places, vector in ((self.shared, shared), (self.local, local)) for place in places if place.of_sensor}
+
+
+@lru_cache(maxsize=256)
+def _leaf(treedef, name: str) -> int:
+    """Which leaf of a scene the parameter of this name is."""
+    return getattr(jax.tree.unflatten(treedef, range(treedef.num_leaves)), name)
 
 
 @dataclass(frozen=True)
@@ -102,21 +111,21 @@ class Unknowns:
         return np.array([r.low for r in self.ranges]), np.array([r.high for r in self.ranges])
 
     @cached_property
-    def _kinds(self) -> list[tuple[Range, np.ndarray]]:
-        return [(kind, np.array([i for i, r in enumerate(self.ranges) if r == kind])) for kind in dict.fromkeys(self.ranges)]
+    def _least(self) -> np.ndarray:
+        return np.array([r.least_size(x) for r, x in zip(self.ranges, self.guess.tolist(), strict=True)])
 
     def sizes(self, theta: Float[np.ndarray, "*members places"]) -> Float[np.ndarray, "*members places"]:
-        """The magnitude against which changes of each are measured."""
-        found = np.ones_like(theta)
-        for kind, where in self._kinds:
-            found[..., where] = kind.size(theta[..., where], self.guess[where])
-        return found
+        """The magnitude against which changes of each are measured: its own; near zero a typical one."""
+        return np.asarray(np.maximum(np.abs(theta), self._least))
 
     def first_guesses(self, count: int) -> Float[np.ndarray, "guesses places"]:
         """The first guess, and others on a Latin hypercube over the ranges; always the same ones."""
-        generator, theta = np.random.default_rng(0), np.tile(self.guess, (count, 1))
+        theta = np.tile(self.guess, (count, 1))
+        if count == 1:
+            return theta
+        generator = np.random.default_rng(0)
         for place in self.estimated:
-            share = (generator.permutation(count - 1) + generator.uniform(size=count - 1)) / max(count - 1, 1)
+            share = (generator.permutation(count - 1) + generator.uniform(size=count - 1)) / (count - 1)
             theta[1:, place] = self.ranges[place].spread(self.guess[place], share)
         return theta
 

@@ -174,6 +174,11 @@ def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
     return _whatever_its_faults(scene).plain_row_lengths * (TRACED if is_traced(scene) else 1.0)
 
 
+def rows_are_affine(scene: Scene) -> bool:
+    """Whether all rows are linear or affine in the speeds."""
+    return _whatever_its_faults(scene).affine
+
+
 def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
     """Typical lengths of the geometric rows and of quaternion norms in the coordinates, for `project_positions`; of the former as rates."""
     geometric = plain_row_lengths(scene)[: len(names_of_position_rows(scene))]

@@ -3,7 +3,7 @@
     q <- q - G+ g(q),  G = dg/dq               u <- u - M^-1 A' (A M^-1 A')+ phi(u)
 
 Each is iterated until nothing changes any more, in a way that can be differentiated in any mode; the iteration converges quadratically, and its
-derivative with it. Unit norms of quaternions count as position rows here.
+derivative with it. Rows affine in the speeds are met by one step. Unit norms of quaternions count as position rows here.
 """
 
 import jax
@@ -73,11 +73,12 @@ def project_speeds(
     iterations: int = 8,
     cutoff: float | None = None,
     typical=None,
+    affine: bool = False,
 ) -> Float[Array, "speeds"]:
     """Speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are `free` move.
 
     Rows count as dependent below `cutoff` (default: `rank_cutoff`). `typical`: lengths of the rows in scaled speeds by which one counts as vanishing,
-    from `usual_rows` (default: none does, unless it is zero).
+    from `usual_rows` (default: none does, unless it is zero). `affine`: rows are, in the speeds, so that one step is exact; `iterations` do not count then.
     """
     if jax.eval_shape(lambda s, q, u: velocity_residual(s, 0.0, q, u), scene, q, u).shape[0] == 0:
         return u
@@ -87,11 +88,20 @@ def project_speeds(
     M = jnp.where(free[:, None] & free, c[:, None] * M * c, jnp.eye(u.shape[0], dtype=u.dtype))
     L, _ = cholesky(M)  # the identity where M is singular: then nearest in the scaled speeds
 
-    def step(u):
+    def towards_rows(u):
+        """The residual of rows at u, and the linear function that takes a residual to the change of speeds which removes it."""
         phi, A = velocity_residual(scene, t, q, u, inputs), jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
         weighted = jax.scipy.linalg.solve_triangular(L, jnp.where(free, A * c, 0.0).T, lower=True).T  # A L'^-1
         d = row_scale(weighted, typical)
-        x = pseudo_inverse(d[:, None] * weighted, cutoff) @ (d * phi)
-        return u - jnp.where(free, c * jax.scipy.linalg.solve_triangular(L.T, x, lower=False), 0.0)
+        P = pseudo_inverse(d[:, None] * weighted, cutoff)
+        return phi, lambda phi: -jnp.where(free, c * jax.scipy.linalg.solve_triangular(L.T, P @ (d * phi), lower=False), 0.0)
 
-    return fixed_point(step, u, iterations)
+    def step(u):
+        phi, change = towards_rows(u)
+        return u + change(phi)
+
+    if not affine:
+        return fixed_point(step, u, iterations)
+    phi, change = towards_rows(u)
+    u = u + change(phi)
+    return u + jax.lax.stop_gradient(change(velocity_residual(scene, t, q, u, inputs)))  # round-off, of which no derivative is wanted

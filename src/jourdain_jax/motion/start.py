@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.sampling import NoStateFoundError, seen_on_rows
-from jourdain_jax.build.structure import Structure, closure_lengths, structure_of, usual_rows
+from jourdain_jax.build.structure import Structure, closure_lengths, rows_are_affine, structure_of, usual_rows
 from jourdain_jax.calculus.damped import damped_root
 from jourdain_jax.calculus.reals import Number, Numbers
 from jourdain_jax.eager.eager import eval_numpy
@@ -108,11 +108,12 @@ class _Found(eqx.Module):
 
 
 class _Usual(eqx.Module):
-    """Sizes by which rows and coordinates are measured."""
+    """Sizes by which rows and coordinates are measured, and of what kind rows are."""
 
     closures: Float[np.ndarray, "closures"]
     rows: Float[np.ndarray, "rows"]
     width: Float[np.ndarray, "coordinates"]  # of the domain
+    affine: bool = eqx.field(static=True)  # rows are, in the speeds
 
 
 def _usual(scene: Scene) -> _Usual:
@@ -123,10 +124,10 @@ def _worked_out(scene: Scene) -> _Usual:
     low, high = coordinate_bounds(scene)
     width = np.where(high > low, high - low, 1.0).astype(jnp.result_type(float))
     try:
-        return _Usual(closure_lengths(scene), usual_rows(scene).lengths, width)
+        return _Usual(closure_lengths(scene), usual_rows(scene).lengths, width, rows_are_affine(scene))
     except ValueError:  # of a scene that is wrong in itself; said where its structure is asked for
         norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
-        return _Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width)
+        return _Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, False)
 
 
 _once = once_per_values(_worked_out)
@@ -146,7 +147,7 @@ def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: 
         other_q, other = jax.lax.cond(eqxi.unvmap_any(lost), lambda: _searched(scene, t, q, free, usual, guesses), lambda: (near_q, guess))
         better = lost & (_left(scene, t, other_q) <= _left(scene, t, near_q))
         near_q, guess = jnp.where(better, other_q, near_q), jnp.where(better, other, guess)
-    near_u = project_speeds(scene, t, near_q, u, inputs, free=jnp.asarray(free_u), typical=usual.rows)
+    near_u = project_speeds(scene, t, near_q, u, inputs, free=jnp.asarray(free_u), typical=usual.rows, affine=usual.affine)
     left = jnp.concatenate([closure_residual(scene, t, near_q), velocity_residual(scene, t, near_q, near_u, inputs)])
     finite = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left])))
     moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))

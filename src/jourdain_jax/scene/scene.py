@@ -2,7 +2,7 @@
 them and what holds them. Everything else (velocities, partial velocities, mass matrix, rows) comes by automatic differentiation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -19,7 +19,7 @@ from jourdain_jax.scene.description import check_description, checked_arguments
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
-from jourdain_jax.scene.numbers import checked_real
+from jourdain_jax.scene.numbers import checked_unless_traced
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
 from jourdain_jax.scene.printing import scene_html
 from jourdain_jax.scene.static_callables import hold_functions
@@ -180,21 +180,27 @@ class Scene(eqx.Module, metaclass=_SceneClass):
 
         A quaternion or its angular velocity may be given whole, by its own name. ValueError for an unknown name or a wrong shape.
         """
-        q, u = list(self.coordinates.reference()), [0.0] * len(self.speed_names)
-        given: list[str] = []
-        for name, value in values.items():
-            hits = _put(self.coordinate_names, q, name, value) + _put(self.speed_names, u, name, value)
-            if not hits:
-                valid = self.coordinate_names.entries + self.speed_names.entries
-                raise ValueError(f"scene `{type(self).__name__}` has no coordinate or speed `{name}`; {nearest(name, valid)}")
-            given += hits
-        return _vector(q), _vector(u), tuple(given)
+        q, u, given = entries_named(self, values)
+        return _vector(q), _vector(u), given
+
+
+def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, tuple[str, ...]]:
+    """As `Scene.named`, with entries of q and u in lists."""
+    q, u = list(scene.coordinates.reference()), [0.0] * len(scene.speed_names)
+    given: list[str] = []
+    for name, value in values.items():
+        hits = _put(scene.coordinate_names, q, name, value) + _put(scene.speed_names, u, name, value)
+        if not hits:
+            valid = scene.coordinate_names.entries + scene.speed_names.entries
+            raise ValueError(f"scene `{type(scene).__name__}` has no coordinate or speed `{name}`; {nearest(name, valid)}")
+        given += hits
+    return q, u, tuple(given)
 
 
 def _put(names: Names, entries: list, name: str, value) -> list[str]:
     """Put a value, or a run of values, where `name` says; the names of the entries that were set."""
     if name in names.entries or name in (group for group, _, _ in names.groups):
-        checked_real(value, f"`{name}`", advice="give its value")
+        checked_unless_traced(value, f"`{name}`", advice="give its value")
     shape = np.shape(value)
     if name in names.entries:
         if shape != ():
