@@ -1,4 +1,4 @@
-"""How the documentation is built: `python -m sphinx -W -b html docs docs/_build/html`. Nothing is fetched while it is built or read."""
+"""How the documentation is built: `python -m sphinx -W -j auto -b html docs docs/_build/html`. Nothing is fetched while it is built or read."""
 
 import os
 import shutil
