@@ -140,6 +140,16 @@ def test_expressions_and_latex_are_there_for_small_scenes():
     assert not any(line.startswith(r"\dot{\phi}") for line in lines)  # what a dot means needs no equation
 
 
+def test_a_notebook_shows_short_equations_and_the_summary_of_long_ones():
+    pytest.importorskip("sympy")
+    short, long = jj.lower(jj.models.TiltingDisc()), jj.lower(MODELS["rattleback"]())
+    shown = short._repr_latex_()
+    assert shown.startswith("$$\\begin{aligned}\n")
+    assert short.latex() in shown
+    assert long.operations > 100
+    assert long._repr_latex_() is None
+
+
 class Steered(jj.Scene):
     """A point on a path that is found by an iteration, which has no scalar form, and whose derivatives are needed."""
 

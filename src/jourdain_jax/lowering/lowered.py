@@ -1,6 +1,7 @@
 """The lowered equations of a scene: which program was chosen, what it computes, and how it runs in JAX."""
 
 import functools
+import importlib.util
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,8 @@ from jourdain_jax.lowering.jacobian import differentiable
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import ARRAYS, Graph
 from jourdain_jax.scene.scene import Scene
+
+MOST_TYPESET = 100  # operations of a program whose equations a notebook shows
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,12 @@ class Lowered:
     def latex(self) -> str:
         """One equation per rate, for an `align` environment; needs SymPy."""
         return export.latex(self)
+
+    def _repr_latex_(self) -> str | None:
+        """The equations in a notebook, if they are short; otherwise, and without SymPy, the summary."""
+        if self.operations > MOST_TYPESET or importlib.util.find_spec("sympy") is None:
+            return None
+        return "$$\\begin{aligned}\n" + self.latex() + "\n\\end{aligned}$$"
 
     def fixed_values(self, scene: Scene) -> tuple[Num[Array, "..."], ...]:
         """The values of what depends on parameters alone, for the parameters of `scene`; computed once per motion."""
