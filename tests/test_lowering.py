@@ -140,6 +140,14 @@ def test_expressions_and_latex_are_there_for_small_scenes():
     assert not any(line.startswith(r"\dot{\phi}") for line in lines)  # what a dot means needs no equation
 
 
+def test_latex_rounds_long_numbers_only():
+    pytest.importorskip("sympy")
+    program = jj.lower(Sloped())
+    assert program.latex() == r"\ddot{x} &= 2.89905"
+    assert float(program.expressions()["d_x_rate"]) == pytest.approx(9.81 * np.sin(0.3), rel=1e-14)
+    assert jj.lower(PushedByHalf()).latex() == r"\ddot{x} &= \frac{1}{2}"
+
+
 def test_a_notebook_shows_short_equations_and_the_summary_of_long_ones():
     pytest.importorskip("sympy")
     short, long = jj.lower(jj.models.TiltingDisc()), jj.lower(MODELS["rattleback"]())
@@ -148,6 +156,23 @@ def test_a_notebook_shows_short_equations_and_the_summary_of_long_ones():
     assert short.latex() in shown
     assert long.operations > 100
     assert long._repr_latex_() is None
+
+
+class Sloped(jj.Scene):
+    """A point that a number, no parameter, pushes along x."""
+
+    push = 9.81 * np.sin(0.3)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"point": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=self.push),)
+
+
+class PushedByHalf(Sloped):
+    push = 0.5
 
 
 class Steered(jj.Scene):

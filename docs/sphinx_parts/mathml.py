@@ -13,7 +13,8 @@ def setup(app: Sphinx) -> dict:
         raise SkipNode
 
     def block(self, node):
-        self.body.append(f'<div class="math">{convert(node.astext(), display="block")}</div>')
+        formula = node.astext().replace("{aligned}", "{align*}")  # the one environment of the two that latex2mathml knows
+        self.body.append(f'<div class="math">{convert(formula, display="block")}</div>')
         raise SkipNode
 
     app.add_html_math_renderer("mathml", (inline, None), (block, None))

@@ -6,6 +6,7 @@ import numpy as np
 
 from jourdain_jax.program.source import PYTHON, C, statements, sympy_expressions
 
+DIGITS = 6  # significant ones of a long number in LaTeX
 SHORT, FEW = 60, 8  # characters of an expression in the summary, and how many there may be
 _IN_C = {"auto", "char", "const", "default", "do", "double", "enum", "extern", "float", "goto", "inline", "int", "long", "register", "restrict", "short"}
 _IN_C |= {"signed", "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "case"} | C.names
@@ -172,7 +173,10 @@ def expressions(lowered) -> dict:
 
 
 def latex(lowered) -> str:
-    """The equations for an `align` environment; needs SymPy. Speeds that are the rate of a coordinate stand as its derivative, which needs no equation."""
+    """The equations for an `align` environment, long numbers with `DIGITS` digits; needs SymPy.
+
+    Speeds that are the rate of a coordinate stand as its derivative, which needs no equation.
+    """
     import sympy
 
     names, traced = identifiers(lowered), lowered.traced
@@ -183,8 +187,14 @@ def latex(lowered) -> str:
     left = [rf"\dot{{{shown[int(n)]}}}" for n in traced.q]
     left += [rf"\ddot{{{rate_of[n]}}}" if n in rate_of else rf"\dot{{{shown[n]}}}" for n in (int(traced.u[i]) for i in lowered.independent)]
     symbols = {sympy.Symbol(names[n]): symbol for n, symbol in shown.items()}
-    lines = [f"{rate} &= {sympy.latex(value, symbol_names=symbols)}" for rate, value in zip(left, expressions(lowered).values(), strict=True)]
+    values = [value.replace(_is_long, lambda number: sympy.Float(number, DIGITS)) for value in expressions(lowered).values()]
+    lines = [f"{rate} &= {sympy.latex(value, symbol_names=symbols)}" for rate, value in zip(left, values, strict=True)]
     return " \\\\\n".join(line for line in lines if len(set(line.split(" &= "))) > 1)
+
+
+def _is_long(value) -> bool:
+    """Whether `value` is a fraction that is longer than its decimals: 9/2 is not, 144952661367387/50000000000000 is."""
+    return value.is_Rational and value.q >= 1000
 
 
 def _symbol(name: str) -> str:

@@ -97,7 +97,7 @@ class Lowered:
         return export.expressions(self)
 
     def latex(self) -> str:
-        """One equation per rate, for an `align` environment; needs SymPy."""
+        """One equation per rate, for an `align` environment, long numbers with six digits; needs SymPy."""
         return export.latex(self)
 
     def _repr_latex_(self) -> str | None:
