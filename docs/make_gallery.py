@@ -256,13 +256,23 @@ Source: [{shown}]({link})
 """
 
 
+def caption_of(entry: Entry) -> str:
+    """What the scene is, in one line: the first sentence of the docstring of its class, or of its file where that has one scene."""
+    told = inspect.getdoc(inspect.getmodule(entry.kind) if entry.source.parent == SCENES else entry.kind)
+    return re.split(r"(?<=[.:;])\s", " ".join(told.split("\n\n")[0].split()))[0].rstrip(".:;")
+
+
 def index_of(chosen: list[Entry]) -> str:
     """Thumbnails of the chosen pages, and their table of contents."""
-    cards = "\n".join(f":::{{grid-item-card}} {entry.title}\n:img-top: {entry.name}.png\n:link: {entry.name}\n:link-type: doc\n:::\n" for entry in chosen)
+    cards = "\n".join(
+        f":::{{grid-item-card}} {entry.title}\n:img-top: {entry.name}.png\n:link: {entry.name}\n:link-type: doc\n\n{caption_of(entry)}\n:::\n"
+        for entry in chosen
+    )
     pages = "\n".join(entry.name for entry in chosen)
     return f"""# Gallery
 
 Each page has a picture, the lines that draw it, what to look at, and the source. Earlier times are drawn paler; lengths are in metres.
+A ball in a bowl, a robot with driven wheels and a disc on a hill stand, with their code, among the [rolling contacts](../../contacts.md).
 
 ::::{{grid}} 1 2 3 3
 :gutter: 2

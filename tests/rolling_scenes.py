@@ -217,7 +217,7 @@ class DiscOnHill(jj.Scene):
     def contacts(self, pose):
         land = jj.HeightMap(hill)
         point = land.point_at(pose.q.x, pose.q.y)
-        return {"rim": jj.Contact(pose["body"], point, land.plane_at(point))}
+        return {"rim": jj.Contact(pose["body"], point, ground=land)}
 
 
 class TyredWheel(jj.Scene):

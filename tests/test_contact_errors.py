@@ -37,7 +37,9 @@ BODY = jj.pose_at(Rolls(make_ground=lambda scene, pose: None), 0.0, jnp.array([0
         (lambda: jj.Contact(BODY, (0.0, 0.0, 0.0), height="line"), "contact height `line` is unknown"),
         (lambda: jj.Contact(BODY, (0.0, 0.0)), r"point of the contact of `body` has shape \(2,\), expected \(3,\)"),
         (lambda: jj.Contact(3.0, (0.0, 0.0, 0.0)), "the body of a contact is a float, expected the pose of a body"),
-        (lambda: jj.Contact(BODY, (0.0, 0.0, 0.0), jj.Sphere(1.0, side="inside")), r"expected a `jj.Plane\(...\)`, .*write ground.plane_at\(point\)"),
+        (lambda: jj.Contact(BODY, (0.0, 0.0, 0.0), jj.Sphere(1.0, side="inside")), r"expected a `jj.Plane\(...\)`, .*write ground=\.\.\."),
+        (lambda: jj.Contact(BODY, (0.0, 0.0, 0.0), shape="ball"), "`shape` of the contact of `body` is the text 'ball', .*state the body's look in `visuals`"),
+        (lambda: jj.Contact(BODY, (0.0, 0.0, 0.0), ground=0.0), "`ground` of the contact of `body` is a float, expected a `jj.Plane"),
     ],
 )
 def test_what_is_no_contact_is_refused_by_name(make, sentence):

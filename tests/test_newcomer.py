@@ -189,6 +189,7 @@ def test_a_tricycle_turns_as_its_front_wheel_says():
     assert np.all(forces["front wheel"].determined)
     assert not np.any(forces["left wheel"].determined)
     assert str(motion).count("; the tangential force is not determined by the rows (minimum norm)") == 2
+    assert re.search(r"inputs +pedals = 2, handlebar = 0.3\n", str(motion))
 
 
 def test_a_ball_swings_in_a_bowl_as_fast_as_the_page_says():
@@ -227,3 +228,33 @@ def test_a_scooter_that_nobody_steers_falls():
     upright = jj.simulate(scooter, {"x_rate": 4.0}, ts=jnp.array([0.0, 0.1]))
     pressed = sum(float(force.normal[0]) for force in upright.contact_forces().values())
     assert pressed == pytest.approx((70.0 + 4.0 + 2.0 + 2 * 0.5) * G, rel=1e-9)
+
+
+class Stick(jj.Scene):
+    """A particle on a rod that stands on its lower end, in speeds that serve while it stands."""
+
+    coordinates = jj.coordinates("angle x z")
+    inputs = jj.inputs("wind")
+    domain = {"angle": (-0.6, 0.6)}
+    privileged = ("x_rate",)
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, q.z]))}
+
+    def geometric_constraints(self, pose):
+        return {"x": pose.q.x - jnp.sin(pose.q.angle), "z": pose.q.z - jnp.cos(pose.q.angle)}
+
+    def loads(self, motion):
+        return jj.gravity(motion, G), jj.generalized_force(motion, x_rate=motion.inputs.wind)
+
+
+def test_the_summary_says_which_coordinate_left_its_domain_and_what_the_inputs_were():
+    fallen = jj.simulate(Stick(), {"x_rate": 0.5}, t1=2.0)
+    first = int(np.argmax(np.asarray(fallen["angle"]) > 0.6))
+    said = str(fallen)
+    assert f"`angle` leaves its domain, -0.6 to 0.6: {float(fallen['angle'][first]):.4g} at t = {float(fallen.ts[first]):.4g} s" in said
+    assert re.search(r"(?m)inputs +wind = 0$", said)
+    swung = str(jj.simulate(Stick(), {"x_rate": 0.5}, t1=0.1, inputs={"wind": jj.Sampled((0.0, 1.0), (0.0, 1.0))}))
+    assert "leaves its domain" not in swung
+    assert re.search(r"inputs +wind of 2 samples\n?", swung)
+    assert "wind a function of time" in str(jj.simulate(Stick(), t1=0.1, inputs={"wind": lambda t: jnp.sin(t)}))

@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from browser import needs_browser, screenshot
+from rolling_scenes import DiscOnHill, hill
 
 import jourdain_jax as jj
+from jourdain_jax.plotting.grounds_drawn import grounds_of
 from jourdain_jax.plotting.guesses import guessed
 from jourdain_jax.plotting.looks import looks_of
 
@@ -274,3 +276,27 @@ def test_a_browser_draws_the_ball_where_it_is(shown, motion, tmp_path):
     assert places[1] == pytest.approx(0.5, abs=0.02)
     assert places[0] == pytest.approx(1.0 - places[2], abs=0.02)
     assert places[0] < 0.3
+
+
+class DiscOnUnnamedHill(DiscOnHill):
+    """The disc on a hill, of which its contact states the tangent planes alone."""
+
+    def contacts(self, pose):
+        found = super().contacts(pose)["rim"]
+        return {"rim": jj.Contact(found.body, found.point, found.plane)}
+
+
+def test_a_hill_is_drawn_where_a_contact_names_it():
+    """Its triangles lie on the hill; where tangent planes alone are known, none of them is drawn as if it were the ground."""
+    scene, low, high = DiscOnHill(), np.array([-0.3, -0.3, 0.0]), np.array([0.3, 0.3, 0.2])
+    motion = jj.simulate(scene, {"x": 0.1, "spin_rate": 2.0}, t1=0.2)
+    (drawn,) = grounds_of(motion, looks_of(motion), low, high)
+    x, y, z = drawn["triangles"].reshape(-1, 3).T
+    assert drawn["kind"] == "mesh"
+    assert len(x) > 1000
+    assert np.abs(z - np.asarray(hill(x, y))).max() < 1e-12
+    other = jj.simulate(DiscOnUnnamedHill(), {"x": 0.1, "spin_rate": 2.0}, t1=0.2)
+    np.testing.assert_allclose(other.q_end, motion.q_end, rtol=0, atol=1e-12)
+    (floor,) = grounds_of(other, looks_of(other), low, high)
+    assert floor["kind"] == "plane"
+    assert np.array_equal(floor["axes"], np.eye(3))

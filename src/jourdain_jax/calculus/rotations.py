@@ -2,6 +2,9 @@
 
 A rotation matrix `R` takes body components to space components, `r_space = R r_body`. Its body angular velocity is
 `omega_body = vee(R' Rdot)`, its space angular velocity `omega = vee(Rdot R') = R omega_body`. Quaternions are `(w, x, y, z)`.
+
+Column k of `R` is body axis k in the inertial frame. With x ahead, y to the left and z up, a positive angle of `rot_z` turns to the left, one of `rot_x` leans
+to the right, and one of `rot_y` pitches the nose down and rolls a wheel ahead.
 """
 
 from collections.abc import Sequence
@@ -19,7 +22,10 @@ def _angle(angle: Number) -> Float[Array, ""]:
 
 
 def rot_x(angle: Number) -> Float[Array, "3 3"]:
-    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the x axis."""
+    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the x axis.
+
+    With x ahead and z up a positive angle leans to the right. Column k, `R[:, k]`, is body axis k in the inertial frame.
+    """
     angle = _angle(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     o, i = jnp.zeros_like(c), jnp.ones_like(c)
@@ -27,7 +33,10 @@ def rot_x(angle: Number) -> Float[Array, "3 3"]:
 
 
 def rot_y(angle: Number) -> Float[Array, "3 3"]:
-    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the y axis."""
+    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the y axis.
+
+    With x ahead and z up a positive angle pitches the nose down, and rolls a wheel ahead. Column k, `R[:, k]`, is body axis k in the inertial frame.
+    """
     angle = _angle(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     o, i = jnp.zeros_like(c), jnp.ones_like(c)
@@ -35,7 +44,10 @@ def rot_y(angle: Number) -> Float[Array, "3 3"]:
 
 
 def rot_z(angle: Number) -> Float[Array, "3 3"]:
-    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the z axis."""
+    """Rotation matrix (3, 3), body to space, of a turn by `angle` (rad) about the z axis.
+
+    With z up a positive angle turns to the left. Column k, `R[:, k]`, is body axis k in the inertial frame.
+    """
     angle = _angle(angle)
     c, s = jnp.cos(angle), jnp.sin(angle)
     o, i = jnp.zeros_like(c), jnp.ones_like(c)

@@ -6,7 +6,7 @@ import numpy as np
 
 from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.plotting.looks import Drawn
+from jourdain_jax.plotting.looks import Curved, Drawn
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere
 from jourdain_jax.scene.validated import contacts_of
@@ -19,7 +19,7 @@ def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.n
     """Planes {kind, origin, axes} and meshes {kind, triangles (n, 3, 3)} within or around the box from `low` to `high`, m, as they are at the first time."""
     found: list[dict] = []
     for name, contact in drawn.contacts.items():
-        if _moves(contact):  # the body that carries it shows it
+        if _moves(contact):  # the body that carries it shows it, or the tangent planes of a ground that was not given
             continue
         found += [ground for ground in (_ground(trajectory, drawn, name, contact, low, high),) if not any(_same(ground, other) for other in found)]
     return found or [_floor(low, high)]
@@ -34,7 +34,7 @@ def _ground(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, l
         corners = np.array([[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
         ends = (corners - origin) @ axis
         return _mesh(_cylinder(float(ground.radius[0]), axis, ends.min(), ends.max()), origin)
-    if ground is None and contact.shape is not None:
+    if isinstance(ground, Curved):
         return _surface(trajectory, drawn, name, contact, low, high)
     plane = contact.plane
     return _plane(np.asarray(plane.origin)[0], np.stack([*np.asarray(plane.tangents)[0], np.asarray(plane.normal)[0]], axis=1), low, high)
@@ -43,7 +43,7 @@ def _ground(trajectory: Trajectory, drawn: Drawn, name: str, contact: Contact, l
 def _moves(contact: Contact) -> bool:
     """Whether the contact is with a plane that changes its place."""
     normals, offsets = np.asarray(contact.plane.normal), np.sum(np.asarray(contact.plane.origin) * np.asarray(contact.plane.normal), axis=1)
-    return isinstance(contact.ground, Plane) and bool(np.ptp(normals, axis=0).max() > 1e-9 or np.ptp(offsets) > 1e-9 * (1 + np.abs(offsets).max()))
+    return isinstance(contact.ground, Plane | None) and bool(np.ptp(normals, axis=0).max() > 1e-9 or np.ptp(offsets) > 1e-9 * (1 + np.abs(offsets).max()))
 
 
 def _plane(origin, axes, low, high) -> dict:

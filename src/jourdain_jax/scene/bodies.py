@@ -31,7 +31,8 @@ class RigidBody(eqx.Module):
     """A rigid body.
 
     - `mass` in kg; `inertia`: (3, 3), or three principal moments, in kg m^2, about the mass centre, body axes.
-    - `position` (3,) of the mass centre in m, inertial frame; `orientation` (3, 3): body components to space components.
+    - `position` (3,) of the mass centre in m, inertial frame; `orientation` R (3, 3): body components to space components. Its column `R[:, k]` is body axis
+      k in the inertial frame; a row `R[k]` is not, and nothing can tell the two apart for you.
     - `outline`: (points, 3) in m, a line in the body frame, relative to the mass centre; for drawing only (default: none).
 
     ValueError for other shapes. Velocities come by differentiating the pose.

@@ -21,7 +21,8 @@ def _point(position: Vector, what: str) -> Float[Array, "3"]:
 def knife_edge(body: BodyMotion, contact: Vector, lateral: Vector) -> Float[Array, ""]:
     """Velocity row of a blade or skate: `v(contact) . lateral`, in m/s. The point of `body` at `contact` does not move along `lateral`.
 
-    - `body`: `motion["name"]`; `contact` (m) and the unit vector `lateral`, both in the inertial frame. Eq. (7).
+    - `body`: `motion["name"]`; `contact` (m) and the unit vector `lateral`, both in the inertial frame. Eq. (7). The body's own axis y is
+      `body.orientation[:, 1]`, a column.
     """
     contact = _point(contact, f"contact of the knife edge of `{body.name}`")
     return body.velocity_at(contact) @ checked_real(lateral, f"lateral direction of the knife edge of `{body.name}`", (3,), advice="give a unit vector")

@@ -25,14 +25,15 @@ class Contact(eqx.Module):
     """A point contact of a body with the ground, rolling without slip; for what `ball_contact` and its like do not know.
 
     - `body`: `pose["name"]`, or its name. `point` (m, inertial frame): the body's point that touches.
-    - `plane`: a `jj.Plane`, tangent to the ground at the point (default: z = 0 at rest); of other grounds `ground.plane_at(point)`.
+    - `plane`: a `jj.Plane`, tangent to the ground at the point (default: `ground.plane_at(point)`; without a ground z = 0 at rest).
+    - `ground`: a `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap`; pictures show it.
     - `height`: "coordinates" where they keep the point on the ground by themselves, "row" for a geometric row.
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all of the scene), for the normal
       force where `height="coordinates"`.
     - `distance` (m): the gap, where it is not the point's height above the plane.
-    - `shape`, `ground`: what rolls on what, for pictures; `disc_contact` and its like say it.
+    - `shape`: left to `ball_contact` and its like, for pictures; how any other body looks is said by the scene's `visuals`.
 
-    Where the point is known in the coordinates, this spares the search for it: `jj.Contact(pose["disc"], p, hill.plane_at(p))`.
+    Where the point is known in the coordinates, this spares the search for it: `jj.Contact(pose["disc"], p, ground=hill)`.
     ValueError for an unknown height, or anything of another kind or shape.
     """
 
@@ -51,10 +52,15 @@ class Contact(eqx.Module):
             raise ValueError(f'the body of a contact is {described(body)}, expected the pose of a body; write pose["name"]')
         self.body = body if isinstance(body, str) else body.name
         if plane is not None and not isinstance(plane, Plane):
-            advice = "; write ground.plane_at(point)" if isinstance(plane, get_args(Ground)) else ""
+            advice = "; write ground=..." if isinstance(plane, get_args(Ground)) else ""
             raise ValueError(f"`plane` of the contact of `{self.body}` is {described(plane)}, expected a `jj.Plane(...)`, or None for z = 0 at rest{advice}")
+        if ground is not None:
+            _checked_ground(ground, "ground", self.body)
+        if shape is not None and not isinstance(shape, get_args(Shape)):
+            advice = "leave it away, and state the body's look in `visuals`"
+            raise ValueError(f"`shape` of the contact of `{self.body}` is {described(shape)}, expected what `ball_contact` and its like fill in; {advice}")
         self.point = checked_real(point, f"point of the contact of `{self.body}`", (3,), advice="give three components in the inertial frame, m")
-        self.plane = Plane() if plane is None else plane
+        self.plane = plane if plane is not None else Plane() if ground is None else ground.plane_at(self.point)
         self.height = _checked_height(height)
         self.carried = _checked_carried(carried, self.body)
         self.distance = None if distance is None else checked_real(distance, f"distance of the contact of `{self.body}`", ())
@@ -210,9 +216,13 @@ def _checked(body, ground, plane, height: str) -> Ground:
     name, given = ("plane", plane) if ground is None else ("ground", ground)
     if given is None:
         return Plane()
+    return _checked_ground(given, name, body.name)
+
+
+def _checked_ground(given, name: str, body: str) -> Ground:
     if not isinstance(given, get_args(Ground)):
         known = "`jj.Plane(...)`" if name == "plane" else "`jj.Plane(...)`, `jj.Cylinder`, `jj.Sphere`, `jj.Surface` or `jj.HeightMap`"
-        raise ValueError(f"`{name}` of the contact of `{body.name}` is {described(given)}, expected a {known}, or None for z = 0 at rest")
+        raise ValueError(f"`{name}` of the contact of `{body}` is {described(given)}, expected a {known}, or None for z = 0 at rest")
     return given
 
 

@@ -13,6 +13,7 @@ from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.rows import UsualRows
+from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.trajectories.over_times import Record, accelerations_over_times, contact_forces_over_times, energies, invariants, residuals
 from jourdain_jax.motion.trajectories.results import FALLBACKS
@@ -171,16 +172,49 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
     rows = [
         ("motion", f"t {float(ts[0]):.6g} to {float(trajectory.t_end):.6g} s, {saved}; {message}"),
         ("solver", f"{trajectory.solver}, {int(trajectory.accepted)} steps accepted, {int(trajectory.rejected)} rejected"),
-        *([("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again "))] if int(trajectory.fallback) else []),
+        *([("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again ") + _left_domain(trajectory))] if int(trajectory.fallback) else []),
         ("state", f"{trajectory.state_form}, reduction: {trajectory.reduction}" + (", projected after each step" if trajectory.projected else "") + pivot),
         ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}"),
         ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
         ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),
-        ("start", f"moved by {float(trajectory.moved_q):.1e} (coordinates), {float(trajectory.moved_u):.1e} (speeds) onto the constraints"),
+        ("start", _start_text(trajectory)),
+        *([("inputs", _inputs_text(trajectory))] if trajectory.scene.inputs else []),
     ]
     rows += [(f"invariant {name}", f"drift {float(drift):.2e}") for name, drift in found.invariant_drifts.items()]
     rows += [(f"contact {name}", _contact_text(contact)) for name, contact in found.contacts.items()]
     return rows + [("warning", text) for text in warnings_of(found, trajectory) if not text.startswith("contact")]
+
+
+def _start_text(trajectory: Record) -> str:
+    q, u = float(trajectory.moved_q), float(trajectory.moved_u)
+    return f"put onto the rows: coordinates changed by {q:.1e}, speeds by {u:.1e}; named values are kept"
+
+
+def _left_domain(trajectory: Record) -> str:
+    """Which coordinate or speed left the scene's `domain` first, and when."""
+    scene, first = trajectory.scene, []
+    for names, values in ((scene.coordinate_names, trajectory.q), (scene.speed_names, trajectory.u)):
+        for k, name in enumerate(names.entries):
+            if name in scene.domain:
+                low, high = scene.domain[name]
+                outside = np.flatnonzero((np.asarray(values)[:, k] < low) | (np.asarray(values)[:, k] > high))
+                first += [(int(i), name, float(np.asarray(values)[i, k]), low, high) for i in outside[:1]]
+    if not first:
+        return ""
+    i, name, value, low, high = min(first)
+    return f"; `{name}` leaves its domain, {low:.4g} to {high:.4g}: {value:.4g} at t = {float(trajectory.ts[i]):.4g} s"
+
+
+def _inputs_text(trajectory: Record) -> str:
+    """The inputs as they were given; those that were not are zero."""
+    pairs = zip(trajectory.scene.inputs, trajectory.inputs.channels, strict=True)
+    return ", ".join(f"{name} {_channel_text(channel)}" for name, channel in pairs)
+
+
+def _channel_text(channel) -> str:
+    if isinstance(channel, Constant):
+        return f"= {float(channel.value):.6g}"
+    return f"of {channel.ts.shape[0]} samples" if isinstance(channel, Sampled) else "a function of time"
 
 
 def _contact_text(contact: ContactExtremes) -> str:

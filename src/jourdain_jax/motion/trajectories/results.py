@@ -36,11 +36,10 @@ MESSAGES = {
 AS_ASKED, FULL_STATE, IMPLICIT = 0, 1, 2
 FALLBACKS = {
     AS_ASKED: "",
-    FULL_STATE: "run again with the full state and dense matrices: the first way came near where it does not serve",
+    FULL_STATE: "run again with the full state and dense matrices: the privileged speeds, or the scalar program, do not serve all along it",
     IMPLICIT: "run again with an implicit solver: the motion is stiff",
-    FULL_STATE
-    | IMPLICIT: "run again with the full state, dense matrices and an implicit solver: the first way came near where it does not serve, and the motion "
-    "is stiff",
+    FULL_STATE | IMPLICIT: "run again with the full state, dense matrices and an implicit solver: the motion is stiff, and the privileged speeds, or the "
+    "scalar program, do not serve all along it",
 }
 
 
