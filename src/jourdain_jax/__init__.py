@@ -27,6 +27,7 @@ from jourdain_jax import models
 from jourdain_jax.analysis.accelerometer import Accelerometer
 from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.filtering import filtered_log_likelihood
 from jourdain_jax.analysis.fit import fit, fit_batch
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.gradients import derivative_exists
@@ -35,6 +36,7 @@ from jourdain_jax.analysis.linearize import Linearization, linearize
 from jourdain_jax.analysis.log_density import LogDensity, log_density
 from jourdain_jax.analysis.losses import huber, student_t
 from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.planning import PlannedInformation, planned_information
 from jourdain_jax.analysis.ranges import bounds, positive, unbounded
 from jourdain_jax.analysis.report import Report, report
 from jourdain_jax.analysis.sensors import Actuator, Sensor
@@ -151,6 +153,7 @@ __all__ = [
     "NullSpaceSVD",
     "Particle",
     "Plane",
+    "PlannedInformation",
     "Privileged",
     "Quantity",
     "RadauIIA",
@@ -193,6 +196,7 @@ __all__ = [
     "ellipsoid_contact",
     "energy",
     "energy_balance",
+    "filtered_log_likelihood",
     "fit",
     "fit_batch",
     "fixed_point",
@@ -223,6 +227,7 @@ __all__ = [
     "parameter",
     "partial_velocities",
     "pin",
+    "planned_information",
     "plot",
     "point_force",
     "pose_at",

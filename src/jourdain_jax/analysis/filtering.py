@@ -1,0 +1,222 @@
+"""Motions that are disturbed as they go on: the likelihood of measurements by an extended Kalman filter.
+
+    x = (independent coordinates, independent speeds y),   y' = f(t, x) + w,   E w(t) w(t')' = W delta(t - t'),   W = diag(process noise)
+
+    from sample to sample   x <- x(t_k+1),   P <- F P F' + sum_j h w_j B_j W B_j',   B_j = F F_j^-1 [0; 1]        F_j = d x(s_j) / d x(t_k)
+    at a sample             r = value - reading(x),   S = H P H' + R,   K = P H' S^-1,   H = d reading / d x
+                            x <- x + K r,   P <- (1 - K H) P (1 - K H)' + K R K'
+    log L                   - sum (r' S^-1 r + log det S + n log 2 pi) / 2
+
+s_j, w_j: nodes and weights of Gauss and Legendre between two samples. Dependent coordinates and speeds follow from the constraints. For linear scenes all of
+this is exact; otherwise it is to first order in the spread of x. Source: A. H. Jazwinski, Stochastic Processes and Filtering Theory (1970), section 8.3;
+G. J. Bierman, Factorization Methods for Discrete Sequential Estimation (1977), section II.6 (Joseph's form of P).
+"""
+
+from collections.abc import Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.analysis.accelerometer import Accelerometer
+from jourdain_jax.analysis.likelihood import as_runs, mapped
+from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.predictions import Run, equal_runs
+from jourdain_jax.analysis.sensors import Reading, ideal
+from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_speeds
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.motion.integrators.forward_mode import simulate_forward
+from jourdain_jax.motion.start import State, consistent
+from jourdain_jax.motion.start import start as consistent_start
+from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.numbers import checked_unless_traced, is_traced
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
+
+_NODES, _WEIGHTS = (x / 2 for x in np.polynomial.legendre.leggauss(5))
+_NODES = _NODES + 0.5
+
+
+@shown_from_users_lines
+def filtered_log_likelihood(scene: Scene | BuiltFor, data: Measurements | Sequence[Measurements], *, process_noise: Mapping, **simulation) -> Float[Array, ""]:
+    """`log_likelihood` of a motion that is disturbed as it goes on, by an extended Kalman filter: a rider or rough ground is no noise of a sensor.
+
+    **Arguments**
+    - `data`: one run or several. A start value is known, or a first guess with an `Estimate(prior=Normal(mean, sigma))` in `unknown_start`: the motion then
+      begins with this spread. Sensors show what is now, with known gain and bias; all numbers are known.
+    - `process_noise`: independent speed -> intensity q of a white disturbance of its rate, in (unit of the speed)^2 / s: left to it alone, the variance of
+      the speed grows by q t. Speeds that are not named are not disturbed. Which speeds are independent: `scene.privileged`, or the engine's choice.
+    - `simulation`: options of `simulate`.
+
+    The motion and its derivatives with respect to the state come from `simulate`, from each sample to the next. Linear scenes have their exact likelihood; of
+    others, the spread of the state is carried along to first order. With no process noise and a known start it is `log_likelihood`.
+
+    Differentiable with respect to parameters, start values, sigmas and intensities in forward mode (`jax.jacfwd`: second derivatives of the motion, which XLA
+    compiles and runs), under `jit` and `vmap`. -inf where the motion fails. Make sensors outside of `jit`: inside, their delay is no number.
+
+    **Raises** ValueError for names that are no independent speed, intensities below zero, quaternions, sensors with a delay or lag, accelerometers, noise with
+    a correlation time, and numbers that are not known.
+
+    **Example**
+
+        jj.filtered_log_likelihood(sleigh, run, process_noise={"heading_rate": 0.01})      # (rad/s)^2 / s
+    """
+    scene = as_scene(scene)
+    runs = as_runs(scene, data)
+    _check_supported(scene, runs)
+    speeds = privileged_speeds(scene)
+    intensities = _intensities(scene, speeds, process_noise)
+    total = jnp.zeros(())
+    for numbers, alike in equal_runs(runs):
+        names = tuple(dict.fromkeys(name for i in numbers for name in runs[i].unknown_start))
+
+        def one(run: Run, begun: Float[Array, "2 unknown"], names=names) -> Float[Array, ""]:
+            mean, sigma = begun
+            run = run._replace(start=run.start | dict(zip(names, mean, strict=True)))
+            return _Filter(scene, run, simulation, speeds, intensities).log_likelihood(names, sigma)
+
+        total = total + jnp.sum(mapped(one, alike, jnp.stack([_begun(runs[i], names) for i in numbers])))
+    return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+
+class _Filter:
+    """The filter of one run."""
+
+    def __init__(self, scene: Scene, run: Run, simulation: dict, speeds: tuple[int, ...], intensities: Float[Array, "speeds"]):
+        self.scene, self.run, self.simulation = scene, run, simulation
+        self.speeds, self.intensities = np.array(speeds, int), intensities
+        self.begin = self._start(run.start)
+        count = len(scene.coordinate_names.entries)
+        self.coordinates = others(dependent_coordinates(scene, self.begin, (), None), count)
+        self.held = (*(scene.coordinate_names.entries[i] for i in self.coordinates), *(scene.speed_names.entries[i] for i in speeds))
+
+    def log_likelihood(self, unknown: tuple[str, ...], sigma: Float[Array, "unknown"]) -> Float[Array, ""]:
+        """Of all samples; `sigma`: standard deviations of start values."""
+        run, begin = self.run, self.begin
+        x = self._independent(begin.q, begin.u)
+        P = jnp.zeros((x.size, x.size))
+        if unknown:
+            J = jax.jacfwd(lambda values: self._independent_at_start(unknown, values))(jnp.stack([run.start[name] for name in unknown]))
+            P = (J * sigma**2) @ J.T
+        names = sorted(run.weights)
+        flat = lambda parts: jnp.concatenate([parts[name].reshape(run.ts.shape[0], -1) for name in names], axis=1)  # noqa: E731
+
+        def step(carry, sample):
+            t, q, x, P, total = carry
+            t1, values, weights = sample
+            q, x, P = self._propagated(t, t1, q, x, P)
+            x, P, more = self._updated(t1, q, x, P, values, weights)
+            return (t1, q, x, P, total + more), None
+
+        carry = jnp.asarray(run.t0), begin.q, x, P, jnp.zeros(())
+        return jax.lax.scan(step, carry, (jnp.asarray(run.ts), flat(run.values), flat(run.weights)))[0][-1]
+
+    def _start(self, values: dict) -> State:
+        return consistent_start(self.scene, t0=self.run.t0, inputs=self.run.inputs, **values)
+
+    def _independent_at_start(self, names: tuple[str, ...], values: Float[Array, "unknown"]) -> Float[Array, "states"]:
+        begin = self._start(self.run.start | dict(zip(names, values, strict=True)))
+        return self._independent(begin.q, begin.u)
+
+    def _independent(self, q, u) -> Float[Array, "*times states"]:
+        return jnp.concatenate([q[..., self.coordinates], u[..., self.speeds]], axis=-1)
+
+    def _state(self, t, q: Float[Array, "coordinates"], x: Float[Array, "states"]) -> State:
+        """The state with these independent coordinates and speeds; the others follow, the coordinates near q."""
+        count = len(self.coordinates)
+        q = jax.lax.stop_gradient(q).at[self.coordinates].set(x[:count])
+        u = jnp.zeros(len(self.scene.speed_names.entries)).at[self.speeds].set(x[count:])
+        return consistent(self.scene, t, q, u, self.run.inputs.at(t), held=self.held)
+
+    def _propagated(self, t, t1, q, x, P):
+        """q, x, P at the time t1, which may be t itself."""
+        moves = t1 > t
+        span = jnp.where(moves, t1 - t, (self.run.ts[-1] - self.run.t0) / self.run.ts.shape[0])
+        times = jnp.concatenate([t + span * jnp.asarray(_NODES), jnp.where(moves, t1, t + span)[None]])
+
+        def later(x):
+            motion = simulate_forward(self.scene, self._state(t, q, x), t0=t, ts=times, inputs=self.run.inputs, events=False, work=False, **self.simulation)
+            found = self._independent(motion.q, motion.u)
+            return found, (found[-1], motion.q[-1])
+
+        slopes, (x1, q1) = jax.jacfwd(later, has_aux=True)(x)
+        F, into = slopes[-1], jnp.eye(x.size)[:, len(self.coordinates) :]
+        B = jax.vmap(lambda F_j: F @ jnp.linalg.solve(F_j, into))(slopes[:-1])
+        added = span * jnp.einsum("j,jik,k,jlk->il", _WEIGHTS, B, self.intensities, B)
+        return tuple(jnp.where(moves, new, old) for new, old in ((q1, q), (x1, x), (F @ P @ F.T + added, P)))
+
+    def _updated(self, t, q, x, P, values, weights):
+        """x and P with the samples at one time, and the logarithm of their density; those with a weight of zero are missing."""
+
+        def shown(x):
+            found = self._shown(t, self._state(t, q, x))
+            return found, found
+
+        H, reading = jax.jacfwd(shown, has_aux=True)(x)
+        there = weights > 0
+        H, r = jnp.where(there[:, None], H, 0.0), jnp.where(there, values - reading, 0.0)
+        R = jnp.where(there, 1 / jnp.where(there, weights, 1.0) ** 2, 1.0)
+        L = jnp.linalg.cholesky(H @ P @ H.T + jnp.diag(R))
+        K = jax.scipy.linalg.cho_solve((L, True), H @ P).T
+        rest = jnp.eye(x.size) - K @ H
+        white = jax.scipy.linalg.solve_triangular(L, r, lower=True)
+        more = -0.5 * white @ white - jnp.sum(jnp.log(jnp.diagonal(L))) - 0.5 * jnp.sum(there) * jnp.log(2 * jnp.pi)
+        return x + K @ r, rest @ P @ rest.T + (K * R) @ K.T, more
+
+    def _shown(self, t, state: State) -> Float[Array, "channels"]:
+        sensors = {name: self.run.sensors.get(name, ideal(name)) for name in sorted(self.run.weights)}
+        motion = motion_at(self.scene, t, state.q, state.u, self.run.inputs(t)) if any(s.operation is not None for s in sensors.values()) else None
+        quantities = [state[sensor.name] if sensor.operation is None else sensor.operation(motion) for sensor in sensors.values()]
+        return jnp.concatenate([jnp.ravel(sensor.shown(x[None], None, None)) for sensor, x in zip(sensors.values(), quantities, strict=True)])
+
+
+def _check_supported(scene: Scene, runs: Sequence[Measurements]) -> None:
+    if scene.coordinates.quaternions:
+        raise ValueError(f"`{type(scene).__name__}` has quaternions, whose spread a filter cannot tell yet; use a scene whose coordinates are angles")
+    for index, run in enumerate(runs):
+        for name in run.unknown_sigma:
+            raise ValueError(f"sigma of channel `{name}` is None, but a filter needs the standard deviation of its noise; give a number")
+        for name in (*run.correlation_time, *run.unknown_correlation):
+            raise ValueError(f"the noise of channel `{name}` has a correlation time, but a filter takes it as white; leave it out")
+        for label in run.estimates:
+            raise ValueError(f"`{label}` is to be estimated, but a filter needs its value; give a number, which may be traced, in place of the `Estimate`")
+        for name, reading in run.readings.items():
+            _check_reading(name, reading, index)
+        for name, given in run.unknown_start.items():
+            if getattr(given, "prior", None) is None:
+                raise ValueError(
+                    f"start value `{name}` of run {index} is unknown, but nothing says how far off it may be; give `jj.Estimate(prior=jj.Normal(mean, sigma))`"
+                )
+
+
+def _check_reading(name: str, reading: Reading, index: int) -> None:
+    if reading.is_late:
+        raise ValueError(f"sensor `{name}` of run {index} has a delay or a lag, which a filter does not know; shift its times by the delay, or use `fit`")
+    if isinstance(reading.operation, Accelerometer):
+        raise ValueError(f"sensor `{name}` of run {index} is an accelerometer, which shows the white disturbance itself; leave it out, or use `fit`")
+
+
+def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Float[Array, "speeds"]:
+    names = [scene.speed_names.entries[i] for i in speeds]
+    if not isinstance(given, Mapping):
+        raise ValueError(f"`process_noise` is {given!r}, expected a dictionary: independent speed -> intensity in (unit of the speed)^2 / s")
+    found = dict.fromkeys(names, jnp.zeros(()))
+    for name, value in given.items():
+        if name not in names:
+            raise ValueError(
+                f"`process_noise` names `{name}`, which is no independent speed of `{type(scene).__name__}`; {nearest(name, names)} "
+                "Others can be made so by `privileged` of the scene."
+            )
+        number = checked_unless_traced(value, f"process noise of `{name}`", (), advice="give one number")
+        if not is_traced(number) and not (np.isfinite(number) and number >= 0):
+            raise ValueError(f"process noise of `{name}` is {float(number):g}, expected zero or more")
+        found[name] = jnp.asarray(number, jnp.result_type(float))
+    return jnp.stack(list(found.values())) if found else jnp.zeros(0)
+
+
+def _begun(run: Measurements, names: tuple[str, ...]) -> Float[Array, "2 unknown"]:
+    """Means and standard deviations of these start values."""
+    known = [run.unknown_start[name].known_before if name in run.unknown_start else (run.start[name], 0.0) for name in names]
+    return jnp.array(known, jnp.result_type(float)).T if known else jnp.zeros((2, 0))

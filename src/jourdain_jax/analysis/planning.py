@@ -1,0 +1,130 @@
+"""What a run will tell before it is made: the Fisher information of a planned experiment, differentiable with respect to its start and inputs.
+
+    F = sum_k (d y_k / d theta)' (d y_k / d theta) / sigma_k^2 + prior,     cov(theta) >= F^-1 (Cramer and Rao)
+
+Unknown start values are among theta; log det F of those unknowns that are asked for is that of their block of F^-1, all others being estimated with them.
+Source: A. C. Atkinson, A. N. Donev and R. D. Tobias, Optimum Experimental Designs, with SAS (2007), chapters 9 and 10 (D- and D_s-optimality).
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.likelihood import as_runs
+from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.predictions import run_of
+from jourdain_jax.analysis.ranges import Range
+from jourdain_jax.analysis.table import table
+from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
+from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.motion.integrators.forward_mode import simulate_forward
+from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
+from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
+
+
+class PlannedInformation(Printed, eqx.Module):
+    """What planned runs will tell of each unknown. `print` shows the standard errors that they lead to."""
+
+    matrix: Float[Array, "unknowns unknowns"]  # F, in the units of the unknowns
+    sensitivities: tuple[dict[str, Float[Array, "*samples unknowns"]], ...]  # of each run and channel: (d y / d theta) / sigma, zero where there is no sample
+    labels: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def covariance(self) -> Float[Array, "unknowns unknowns"]:
+        """F^-1. Entries grow beyond all bounds where a combination of unknowns does not show."""
+        scale = 1 / jnp.sqrt(jnp.where(jnp.diagonal(self.matrix) > 0, jnp.diagonal(self.matrix), 1.0))
+        return scale[:, None] * jnp.linalg.inv(scale[:, None] * self.matrix * scale) * scale
+
+    @property
+    def standard_errors(self) -> dict[str, Float[Array, ""]]:
+        """The least that an unbiased estimate can have, by name, in the unit of the unknown."""
+        return dict(zip(self.labels, jnp.sqrt(jnp.diagonal(self.covariance)), strict=True))
+
+    def log_det(self, names: str | Iterable[str] = ()) -> Float[Array, ""]:
+        """`log det F`; of the unknowns in `names`, that of the inverse of their block of F^-1, all others being estimated too. To be made as large as possible.
+
+        Raises KeyError for names that are not unknown.
+        """
+        asked = as_names(names) or self.labels
+        for name in asked:
+            if name not in self.labels:
+                raise UnknownNameError(f"`{name}` is not among the unknowns; {nearest(name, self.labels)}")
+        places = np.array([self.labels.index(name) for name in asked], int)
+        return -jnp.linalg.slogdet(self.covariance[places[:, None], places])[1]
+
+    def _text(self) -> str:
+        rows = [("unknown", "unit", "std. error")]
+        rows += [(name, unit, f"{float(e):.3g}") for (name, e), unit in zip(self.standard_errors.items(), self.units, strict=True)]
+        return "\n".join([f"Planned: {len(self.sensitivities)} runs, {len(self.labels)} unknowns", *table(rows)])
+
+
+@shown_from_users_lines
+def planned_information(
+    scene: Scene | BuiltFor,
+    plan: Measurements | Sequence[Measurements],
+    free: "Mapping[str, Range | Estimate | None] | Iterable[str]" = (),
+    **simulation,
+) -> PlannedInformation:
+    """What runs that are planned will tell of the unknowns, taken at the values that the scene has.
+
+    **Arguments**
+    - `plan`: one run or several, as they will be measured: times, channels and sigmas, start, inputs and sensors. Their `values` do not matter, but where they
+      are NaN there will be no sample.
+    - `free`, `simulation`: as of `fit`. Start values in `unknown_start` and numbers of sensors that are estimated are unknowns, too, and priors count.
+
+    **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with respect to start values and samples of inputs, under
+    `jit` and in forward mode (`jax.jacfwd`; second derivatives of the motion, which XLA compiles and runs): so starts and inputs can be optimised.
+
+    **Raises** ValueError for what does not fit the scene, and for sigmas or correlation times that are None or noise with a memory.
+
+    **Example**
+
+        def told(spin):
+            plan = jj.Measurements(ts, {"lean": ts}, 0.005, start={"lean": 0.3, "spin_rate": spin})
+            return jj.planned_information(disc, plan, free=("radius", "gravity")).log_det()
+
+        slope = jax.jacfwd(told)(-3.0)
+    """
+    scene = as_scene(scene)
+    runs = as_runs(scene, plan)
+    for run in runs:
+        for name in run.unknown_sigma:
+            raise ValueError(f"sigma of channel `{name}` is None, but a plan needs the standard deviation of its noise; give a number")
+        for name in (*run.correlation_time, *run.unknown_correlation):
+            raise ValueError(f"the noise of channel `{name}` has a correlation time, of which a plan knows nothing; leave it out")
+    numbers = [eqx.tree_at(lambda r: r.start, run, {n: np.zeros(x.shape) if is_traced(x) else x for n, x in run.start.items()}) for run in runs]
+    unknowns = unknowns_of(scene, numbers, free if isinstance(free, Mapping) else tuple(as_names(free)))
+    places, layout = unknowns.estimated, unknowns.layout
+    theta, count = _values(runs, unknowns), layout.sizes[0]
+
+    def residuals(free_ones: Float[Array, "unknowns"]):
+        every = theta.at[places].set(free_ones)
+        moved, local = layout.scene(scene, every[:count]), every[count:].reshape(len(runs), -1)
+        return tuple(
+            run_of(run, jnp).at(layout, every[:count], own).residuals(moved, simulate_forward, simulation) for run, own in zip(runs, local, strict=True)
+        )
+
+    with reference_parameters(scene):
+        J = jax.jacfwd(residuals)(theta[places])
+    flat = jnp.concatenate([of.reshape(-1, len(places)) for run in J for of in run.values()])
+    prior = np.where(np.isfinite(unknowns.prior_mean[places]), unknowns.prior_sigma[places], np.inf) ** -2.0
+    return PlannedInformation(flat.T @ flat + jnp.diag(prior), J, unknowns.labels, unknowns.units)
+
+
+def _values(runs: Sequence[Measurements], unknowns: Unknowns) -> Float[Array, "places"]:
+    """All unknowns at the values that the scene and the runs have; those of starts may be traced."""
+    shared, local = unknowns.split(unknowns.guess)
+    rows = [jnp.asarray(shared)]
+    for run, own in zip(runs, local, strict=True):
+        rows += [jnp.ravel(run.start.get(place.name, place.of(own))) for place in unknowns.layout.local]
+    return jnp.concatenate(rows)

@@ -1,0 +1,130 @@
+"""The likelihood of disturbed motions by an extended Kalman filter: against Kalman's filter for a linear scene, and where nothing disturbs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import jourdain_jax as jj
+
+
+class Oscillator(jj.Scene):
+    """`m x'' = - c x' - k x`."""
+
+    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
+    damping: jnp.ndarray = jj.parameter(0.3, non_negative=True)
+    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x),)
+
+
+TIGHT = {"rtol": 1e-12, "atol": 1e-13}
+TS = np.array([0.0, 0.2, 0.45, 0.5, 0.9, 1.3, 1.7, 2.0])
+NOISE = 0.04  # (m/s)^2 / s
+
+
+def kalman(damping, stiffness, noise, run, spread, mass=2.0):
+    """The textbook filter of x' = A x + w, discretised by C. F. Van Loan, IEEE Trans. Automatic Control 23 (1978) 395."""
+    A = np.array([[0.0, 1.0], [-stiffness / mass, -damping / mass]])
+    W = np.diag([0.0, noise])
+    x, P, t, total = np.array([0.3, -0.1]), np.diag(spread) ** 2, 0.0, 0.0
+    for k, t1 in enumerate(TS):
+        block = scipy.linalg.expm(np.block([[-A, W], [np.zeros((2, 2)), A.T]]) * (t1 - t))
+        F = block[2:, 2:].T
+        x, P, t = F @ x, F @ P @ F.T + F @ block[:2, 2:], t1
+        rows = [(np.array([1.0, 0.0]), run["x"][k], 0.02), (2.0 * np.array([0.0, 1.0]), run["speedometer"][k] - 0.1, 0.05)]
+        rows = [row for row in rows if np.isfinite(row[1])]
+        H, z, R = np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), np.diag([r[2] ** 2 for r in rows])
+        S = H @ P @ H.T + R
+        K = P @ H.T @ np.linalg.inv(S)
+        r = z - H @ x
+        total += -0.5 * r @ np.linalg.solve(S, r) - 0.5 * np.linalg.slogdet(2 * np.pi * S)[1]
+        x, P = x + K @ r, (np.eye(2) - K @ H) @ P
+    return total
+
+
+def samples():
+    draw = np.random.default_rng(5)
+    x = 0.3 * np.cos(1.5 * TS) + 0.05 * draw.normal(size=8)
+    v = 2.0 * (-0.45 * np.sin(1.5 * TS) + 0.05 * draw.normal(size=8)) + 0.1
+    v[3] = np.nan
+    return {"x": x, "speedometer": v}
+
+
+def measured(unknown=(), values=None):
+    values = samples() if values is None else values
+    sensors = {"speedometer": jj.Sensor("x_rate", gain=2.0, bias=0.1)}
+    return jj.Measurements(TS, values, {"x": 0.02, "speedometer": 0.05}, start={"x": 0.3, "x_rate": -0.1}, unknown_start=unknown, sensors=sensors)
+
+
+@pytest.mark.parametrize("spread", [(0.0, 0.0), (0.1, 0.3)])
+@pytest.mark.parametrize("noise", [0.0, NOISE])
+def test_linear_scene_has_the_likelihood_of_kalmans_filter(spread, noise):
+    unknown = {n: jj.Estimate(prior=jj.Normal(m, s)) for n, m, s in zip(("x", "x_rate"), (0.3, -0.1), spread, strict=True) if s}
+    found = jj.filtered_log_likelihood(Oscillator(), measured(unknown), process_noise={"x_rate": noise}, **TIGHT)
+    np.testing.assert_allclose(found, kalman(0.3, 5.0, noise, samples(), spread), rtol=1e-9)
+
+
+def test_derivatives_are_those_of_kalmans_filter():
+    run = measured()
+
+    def of(theta):
+        return jj.filtered_log_likelihood(Oscillator(damping=theta[0], stiffness=theta[1]), run, process_noise={"x_rate": theta[2]}, **TIGHT)
+
+    theta = jnp.array([0.3, 5.0, NOISE])
+    found = jax.jit(jax.jacfwd(of))(theta)
+
+    def differences(i, h=1e-5):
+        up, down = (theta.at[i].add(s * h) for s in (1, -1))
+        return (kalman(*up, samples(), (0.0, 0.0)) - kalman(*down, samples(), (0.0, 0.0))) / (2 * h)
+
+    np.testing.assert_allclose(found, [differences(i) for i in range(3)], rtol=1e-5)
+
+
+def test_undisturbed_sleigh_has_the_plain_likelihood():
+    sleigh, start, ts = jj.models.ChaplyginSleigh(), {"x_rate": -0.6, "heading_rate": 0.9}, np.linspace(0.0, 2.0, 9)
+    values = {"x": -0.5 * ts, "nose": np.stack([-0.5 * ts, 0.1 * ts, 0.0 * ts], axis=1)}
+    sensors = {"nose": lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))}
+    runs = [jj.Measurements(ts + t0, values, 0.05, start=start, sensors=sensors) for t0 in (0.0, 1.0)]
+    found = jj.filtered_log_likelihood(sleigh, runs, process_noise={})
+    np.testing.assert_allclose(found, jj.log_likelihood(sleigh, runs), rtol=1e-6)
+
+
+def test_dependent_coordinates_follow():
+    """Two particles and a rod between them, undisturbed and with a start that is known."""
+    scene, ts = jj.models.SpringAndRod(), np.linspace(0.1, 0.6, 6)
+    motion = jj.simulate(scene, scene.example, t0=0.0, ts=ts)
+    run = jj.Measurements(ts, {name: np.asarray(motion[name]) + 0.01 for name in ("z1", "x2", "z2")}, 0.02, start=scene.example, t0=0.0)
+    np.testing.assert_allclose(jj.filtered_log_likelihood(scene, run, process_noise={}), jj.log_likelihood(scene, run), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("noise", "change", "message"),
+    [
+        ({"x": 0.1}, {}, "`process_noise` names `x`, which is no independent speed of `Oscillator`"),
+        ({"x_rate": -1.0}, {}, "process noise of `x_rate` is -1, expected zero or more"),
+        ({}, {"sigma": None}, "sigma of channel `x` is None"),
+        ({}, {"correlation_time": 0.1}, "has a correlation time"),
+        ({}, {"unknown_start": ("x",)}, "start value `x` of run 0 is unknown"),
+        ({}, {"sensors": {"x": jj.Sensor(lag=0.1)}}, "sensor `x` of run 0 has a delay or a lag"),
+        ({}, {"sensors": {"x": jj.Sensor(gain=jj.Estimate(1.0))}}, "`x.gain` is to be estimated"),
+    ],
+)
+def test_what_a_filter_does_not_know_is_said_by_name(noise, change, message):
+    run = jj.Measurements(TS, {"x": samples()["x"]}, **({"sigma": 0.02, "start": {"x": 0.3}} | change))
+    with pytest.raises(ValueError, match=message):
+        jj.filtered_log_likelihood(Oscillator(), run, process_noise=noise)
+
+
+def test_quaternions_and_accelerometers_are_refused():
+    with pytest.raises(ValueError, match="has quaternions"):
+        jj.filtered_log_likelihood(jj.models.FreeRigidBody(), jj.Measurements(TS, {"x": TS}, 0.1, start={}), process_noise={})
+    run = jj.Measurements(TS, {"imu": np.zeros((8, 3))}, 0.1, start={}, sensors={"imu": jj.Accelerometer("cart")})
+    with pytest.raises(ValueError, match="is an accelerometer"):
+        jj.filtered_log_likelihood(Oscillator(), run, process_noise={})

@@ -1,0 +1,82 @@
+"""What planned runs will tell: against the covariance of a fit, closed forms, and differences of the start and the inputs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+TS = np.linspace(0.1, 3.0, 16)
+
+
+class Cart(jj.Scene):
+    """`m x'' = - k x + force`."""
+
+    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
+    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("force")
+
+    def bodies(self, t, q):
+        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.force - self.stiffness * motion.q.x),)
+
+
+def plan(x=0.3, force=0.0, unknown=()):
+    return jj.Measurements(TS, {"x": TS}, 0.01, start={"x": x}, unknown_start=unknown, inputs={"force": force}, t0=0.0)
+
+
+def test_planned_covariance_is_that_of_a_fit():
+    unknown = {"x": jj.Estimate(prior=jj.Normal(0.3, 0.005))}
+    values = {"x": jj.simulate(Cart(), {"x": 0.3}, t0=0.0, ts=TS, inputs={"force": 0.4})["x"]}
+    run = jj.Measurements(TS, values, 0.01, start={"x": 0.3}, unknown_start=unknown, inputs={"force": 0.4}, t0=0.0)
+    fit = jj.fit(Cart(), run, ("mass", "stiffness"))
+    found = jj.planned_information(Cart(), plan(force=0.4, unknown=unknown), ("mass", "stiffness"))
+    assert found.labels == fit.labels == ("mass", "stiffness", "run 0: x")
+    np.testing.assert_allclose(found.covariance, fit.covariance, rtol=1e-5)
+    np.testing.assert_allclose(found.log_det(), -np.linalg.slogdet(fit.covariance)[1], rtol=1e-6)
+    np.testing.assert_allclose(found.log_det("mass"), -np.log(fit.covariance[0, 0]), rtol=1e-6)
+    assert "mass" in str(found)
+
+
+def test_information_and_its_slope_in_the_start_have_a_closed_form():
+    def stated(x):
+        """`sum (d x / d stiffness)^2 / sigma^2` of x0 cos(w t)."""
+        w = jnp.sqrt(5.0 / 2.0)
+        return jnp.sum((x * jnp.sin(w * TS) * TS / (2 * jnp.sqrt(5.0 * 2.0)) / 0.01) ** 2)
+
+    def found(x):
+        return jj.planned_information(Cart(), plan(x), ("stiffness",)).matrix[0, 0]
+
+    np.testing.assert_allclose(found(0.3), stated(0.3), rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(found))(0.3), jax.grad(stated)(0.3), rtol=1e-6)
+
+
+def test_slope_in_the_samples_of_an_input_is_that_of_differences():
+    knots = jnp.linspace(0.0, 3.0, 5)
+
+    def told(values):
+        return jj.planned_information(Cart(), plan(0.1, jj.Sampled(knots, values)), ("mass", "stiffness")).log_det()
+
+    values, way = jnp.array([0.0, 0.5, -0.3, 0.8, 0.1]), jnp.array([0.3, -1.0, 0.5, 0.2, 0.0])
+    _, slope = jax.jit(lambda v, w: jax.jvp(told, (v,), (w,)))(values, way)
+    h = 1e-3
+    np.testing.assert_allclose(slope, (told(values + h * way) - told(values - h * way)) / (2 * h), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"sigma": None}, "sigma of channel `x` is None"), ({"correlation_time": 0.1}, "has a correlation time")],
+)
+def test_a_plan_needs_to_know_its_noise(change, message):
+    run = jj.Measurements(TS, {"x": TS}, **({"sigma": 0.01, "start": {"x": 0.3}} | change))
+    with pytest.raises(ValueError, match=message):
+        jj.planned_information(Cart(), run, ("mass",))
+
+
+def test_an_unknown_name_is_answered():
+    with pytest.raises(KeyError, match="`mas` is not among the unknowns"):
+        jj.planned_information(Cart(), plan(), ("mass",)).log_det("mas")
