@@ -42,17 +42,22 @@ def test_planned_covariance_is_that_of_a_fit():
     assert "mass" in str(found)
 
 
-def test_information_and_its_slope_in_the_start_have_a_closed_form():
-    def stated(x):
-        """`sum (d x / d stiffness)^2 / sigma^2` of x0 cos(w t)."""
-        w = jnp.sqrt(5.0 / 2.0)
-        return jnp.sum((x * jnp.sin(w * TS) * TS / (2 * jnp.sqrt(5.0 * 2.0)) / 0.01) ** 2)
+def stated(x):
+    """`sum (d x / d stiffness)^2 / sigma^2` of x0 cos(w t)."""
+    w = jnp.sqrt(5.0 / 2.0)
+    return jnp.sum((x * jnp.sin(w * TS) * TS / (2 * jnp.sqrt(5.0 * 2.0)) / 0.01) ** 2)
 
-    def found(x):
-        return jj.planned_information(Cart(), plan(x), ("stiffness",)).matrix[0, 0]
 
-    np.testing.assert_allclose(found(0.3), stated(0.3), rtol=1e-6)
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(found))(0.3), jax.grad(stated)(0.3), rtol=1e-6)
+def of_stiffness(x):
+    return jj.planned_information(Cart(), plan(x), ("stiffness",)).matrix[0, 0]
+
+
+def test_information_has_a_closed_form():
+    np.testing.assert_allclose(of_stiffness(0.3), stated(0.3), rtol=1e-6)
+
+
+def test_slope_in_the_start_has_a_closed_form():
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(of_stiffness))(0.3), jax.grad(stated)(0.3), rtol=1e-6)
 
 
 def test_slope_in_the_samples_of_an_input_is_that_of_differences():

@@ -20,12 +20,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.accelerometer import Accelerometer
+from jourdain_jax.analysis.channels import Channel
+from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.likelihood import as_runs, mapped
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.predictions import Run, equal_runs
 from jourdain_jax.analysis.sensors import Reading, ideal
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_speeds
 from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.motion.integrators.forward_mode import simulate_forward
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.start import start as consistent_start
@@ -85,7 +88,8 @@ class _Filter:
     """The filter of one run."""
 
     def __init__(self, scene: Scene, run: Run, simulation: dict, speeds: tuple[int, ...], intensities: Float[Array, "speeds"]):
-        self.scene, self.run, self.simulation = scene, run, simulation
+        assert isinstance(run.inputs, Inputs)  # of a run that was checked
+        self.scene, self.run, self.inputs, self.simulation = scene, run, run.inputs, simulation
         self.speeds, self.intensities = np.array(speeds, int), intensities
         self.begin = self._start(run.start)
         count = len(scene.coordinate_names.entries)
@@ -128,7 +132,7 @@ class _Filter:
         count = len(self.coordinates)
         q = jax.lax.stop_gradient(q).at[self.coordinates].set(x[:count])
         u = jnp.zeros(len(self.scene.speed_names.entries)).at[self.speeds].set(x[count:])
-        return consistent(self.scene, t, q, u, self.run.inputs.at(t), held=self.held)
+        return consistent(self.scene, t, q, u, self.inputs.at(t), held=self.held)
 
     def _propagated(self, t, t1, q, x, P):
         """q, x, P at the time t1, which may be t itself."""
@@ -166,10 +170,13 @@ class _Filter:
         return x + K @ r, rest @ P @ rest.T + (K * R) @ K.T, more
 
     def _shown(self, t, state: State) -> Float[Array, "channels"]:
-        sensors = {name: self.run.sensors.get(name, ideal(name)) for name in sorted(self.run.weights)}
-        motion = motion_at(self.scene, t, state.q, state.u, self.run.inputs(t)) if any(s.operation is not None for s in sensors.values()) else None
-        quantities = [state[sensor.name] if sensor.operation is None else sensor.operation(motion) for sensor in sensors.values()]
-        return jnp.concatenate([jnp.ravel(sensor.shown(x[None], None, None)) for sensor, x in zip(sensors.values(), quantities, strict=True)])
+        found = []
+        for name in sorted(self.run.weights):
+            sensor = self.run.sensors.get(name, ideal(name))
+            operation = sensor.operation
+            x = operation(motion_at(self.scene, t, state.q, state.u, self.inputs(t))) if isinstance(operation, Channel) else state[sensor.name]
+            found.append(jnp.ravel(sensor.shown(x[None], None, None)))
+        return jnp.concatenate(found)
 
 
 def _check_supported(scene: Scene, runs: Sequence[Measurements]) -> None:
@@ -185,7 +192,7 @@ def _check_supported(scene: Scene, runs: Sequence[Measurements]) -> None:
         for name, reading in run.readings.items():
             _check_reading(name, reading, index)
         for name, given in run.unknown_start.items():
-            if getattr(given, "prior", None) is None:
+            if not isinstance(given, Estimate) or given.known_before is None:
                 raise ValueError(
                     f"start value `{name}` of run {index} is unknown, but nothing says how far off it may be; give `jj.Estimate(prior=jj.Normal(mean, sigma))`"
                 )
@@ -218,5 +225,9 @@ def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Float
 
 def _begun(run: Measurements, names: tuple[str, ...]) -> Float[Array, "2 unknown"]:
     """Means and standard deviations of these start values."""
-    known = [run.unknown_start[name].known_before if name in run.unknown_start else (run.start[name], 0.0) for name in names]
+    known = []
+    for name in names:
+        given = run.unknown_start.get(name)
+        before = given.known_before if isinstance(given, Estimate) else None
+        known.append((run.start[name], 0.0) if before is None else before)
     return jnp.array(known, jnp.result_type(float)).T if known else jnp.zeros((2, 0))

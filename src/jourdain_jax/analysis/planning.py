@@ -21,7 +21,7 @@ from jourdain_jax.analysis.predictions import run_of
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
-from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.build.reference_parameters import reference_parameters, with_reference_parameters
 from jourdain_jax.motion.integrators.forward_mode import simulate_forward
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
@@ -82,8 +82,8 @@ def planned_information(
       are NaN there will be no sample.
     - `free`, `simulation`: as of `fit`. Start values in `unknown_start` and numbers of sensors that are estimated are unknowns, too, and priors count.
 
-    **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with respect to start values and samples of inputs, under
-    `jit` and in forward mode (`jax.jacfwd`; second derivatives of the motion, which XLA compiles and runs): so starts and inputs can be optimised.
+    **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with respect to parameters, start values and samples of
+    inputs in forward mode (`jax.jacfwd`; second derivatives of the motion, which XLA compiles and runs) and under `jit`: starts and inputs can be optimised.
 
     **Raises** ValueError for what does not fit the scene, and for sigmas or correlation times that are None or noise with a memory.
 
@@ -103,9 +103,9 @@ def planned_information(
         for name in (*run.correlation_time, *run.unknown_correlation):
             raise ValueError(f"the noise of channel `{name}` has a correlation time, of which a plan knows nothing; leave it out")
     numbers = [eqx.tree_at(lambda r: r.start, run, {n: np.zeros(x.shape) if is_traced(x) else x for n, x in run.start.items()}) for run in runs]
-    unknowns = unknowns_of(scene, numbers, free if isinstance(free, Mapping) else tuple(as_names(free)))
+    unknowns = unknowns_of(with_reference_parameters(scene), numbers, free if isinstance(free, Mapping) else tuple(as_names(free)))
     places, layout = unknowns.estimated, unknowns.layout
-    theta, count = _values(runs, unknowns), layout.sizes[0]
+    theta, count = _values(scene, runs, unknowns), layout.sizes[0]
 
     def residuals(free_ones: Float[Array, "unknowns"]):
         every = theta.at[places].set(free_ones)
@@ -121,10 +121,10 @@ def planned_information(
     return PlannedInformation(flat.T @ flat + jnp.diag(prior), J, unknowns.labels, unknowns.units)
 
 
-def _values(runs: Sequence[Measurements], unknowns: Unknowns) -> Float[Array, "places"]:
-    """All unknowns at the values that the scene and the runs have; those of starts may be traced."""
+def _values(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> Float[Array, "places"]:
+    """All unknowns at the values that the scene and the runs have; those of parameters and starts may be traced."""
     shared, local = unknowns.split(unknowns.guess)
-    rows = [jnp.asarray(shared)]
+    rows = [jnp.ravel(place.of(shared) if place.of_sensor else getattr(scene, place.name)) for place in unknowns.layout.shared]
     for run, own in zip(runs, local, strict=True):
         rows += [jnp.ravel(run.start.get(place.name, place.of(own))) for place in unknowns.layout.local]
     return jnp.concatenate(rows)
