@@ -22,7 +22,7 @@ from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
 from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
-from jourdain_jax.motion.integrators.taylor import Taylor
+from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import marked
 from jourdain_jax.motion.own_steps import reason_against_machine_code, reason_against_series
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
@@ -134,7 +134,7 @@ def _set_up(
 ) -> Setup:  # fmt: skip
     scene, formulation = as_scene(scene), as_formulation(formulation)
     switches = {"events": events, "work": work}
-    series, solver = (solver.for_tolerance(rtol), None) if isinstance(solver, Taylor) else (None, solver)
+    order, solver = (solver.order or order_for(rtol), None) if isinstance(solver, Taylor) else (None, solver)
     objects = {"solver": solver, "adjoint": adjoint, "stepsize_controller": stepsize_controller, "saveat": saveat}
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, switches=switches, **objects)
     _check_adjoint(adjoint)
@@ -145,7 +145,7 @@ def _set_up(
     field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
     warn_float32(start.q.dtype, rtol)
     options = Options(
-        solver=(default_solver(rtol) if series is None else _TIGHT) if solver is None else solver,
+        solver=(default_solver(rtol) if order is None else _TIGHT) if solver is None else solver,
         controller=stepsize_controller,
         tolerances=tuple((jnp if is_traced(x) else np).asarray(x, start.q.dtype) for x in (rtol, atol)),  # arrays: another tolerance is no other program
         dt0=_first_step(solver, dt0, t0, t1),  # diffrax's own guess costs two more copies of the vector field to compile
@@ -154,13 +154,13 @@ def _set_up(
         saveat=None if saveat is None else _checked_saveat(saveat),
         event_names=names_of_events(scene) if events else (),
         native=backend in ("auto", "native"),
-        order=None if series is None else series.order,
+        order=order,
     )
     start = _on_constraints(scene, t0, start, inputs, made_here) if formulation.projects else start
     setup = Setup(scene, start, inputs, t0, t1, ts, field, options)
     if backend == "native" and (reason := reason_against_machine_code(setup)):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
-    if series is not None and (reason := reason_against_series(setup, series.order)):
+    if order is not None and (reason := reason_against_series(setup, order)):
         raise ValueError(f"solver=jj.Taylor() cannot integrate `{type(scene).__name__}`: {reason}; leave `solver` away, or use solver=diffrax.Dopri8()")
     return setup
 

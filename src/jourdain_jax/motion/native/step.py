@@ -95,14 +95,14 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
         w.store(at_time(w, series, step), y1, row)
         if form.has_events:
             w.store(at_time(w, slope(series), step), k, (method.order + 1) * count + row)
-    if at_start is not None:
-        at_end = watched_at(w, form, p, t1, y1)
-        w.store(w.where(at_start.holds & at_end.holds, w.load(w.real, y1), math.nan), y1)
-        accept, length = accept & at_start.holds & at_end.holds, w.where(at_start.holds, length, 0.0)
-        for a, b in zip(at_start.pivots, at_end.pivots, strict=True):
-            least = w.smaller(w.magnitude(a), w.magnitude(b))
-            pivot = least if pivot is None else w.smaller(pivot, least)
-            accept = accept & ~(((a < 0.0) & (b > 0.0)) | ((a > 0.0) & (b < 0.0)))
+    at_end = watched_at(w, form, p, t1, y1)
+    holds = at_start.holds & at_end.holds
+    w.store(w.where(holds, w.load(w.real, y1), math.nan), y1)
+    accept, length = accept & holds, w.where(at_start.holds, length, 0.0)
+    for a, b in zip(at_start.pivots, at_end.pivots, strict=True):
+        least = w.smaller(w.magnitude(a), w.magnitude(b))
+        pivot = least if pivot is None else w.smaller(pivot, least)
+        accept = accept & ~(((a < 0.0) & (b > 0.0)) | ((a > 0.0) & (b < 0.0)))
     if form.projects:
         error = w.room(w.real, layout.y)
         each_row(w, range(layout.y), error, lambda i: w.number(0.0))

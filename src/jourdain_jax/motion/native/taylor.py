@@ -48,7 +48,7 @@ class Jet(NamedTuple):
     """The coefficients of every number that is integrated, and what is watched at their start."""
 
     rows: list[Coefficients]
-    watched: Watched | None  # where something is
+    watched: Watched
 
 
 def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> Jet:
@@ -84,15 +84,13 @@ def _watched(form: Form) -> list[int]:
     return [*form.program.guards, *form.program.pivots[: form.pivots]]
 
 
-def watched_at(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> Watched | None:
+def watched_at(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> Watched:
     """What is watched, at a state in memory."""
     known = known_values(w, form, p.pointer, t, y)
     return _evaluated(w, form, form.program.graph, _watched(form), known, known)
 
 
-def _evaluated(w: Writer, form: Form, graph, nodes: Sequence[int], values: Mapping[int, Value], known: Mapping[int, Value]) -> Watched | None:
-    if not nodes:
-        return None
+def _evaluated(w: Writer, form: Form, graph, nodes: Sequence[int], values: Mapping[int, Value], known: Mapping[int, Value]) -> Watched:
     found, of_variables = [as_real(w, x) for x in written(w, graph, nodes, values)], list(known.values())
     count, holds = len(form.program.guards), w.literal(-1, w.truth)
     for guard in found[:count]:
