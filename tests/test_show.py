@@ -99,6 +99,24 @@ def test_a_page_asks_for_nothing_beyond_itself_and_is_small(shown):
     assert not re.search(r"\bimport\(|XMLHttpRequest|@import", shown.html + code)
 
 
+def test_arrows_of_usual_forces_are_seen_beside_a_force_that_is_far_larger():
+    class Struck(Rolling):
+        """Something presses the ball onto the table for a moment."""
+
+        def loads(self, motion):
+            blow = 1e4 * jnp.exp(-(((motion.t - 1.0) / 0.01) ** 2))
+            return jj.gravity(motion, 9.81), jj.point_force(motion["ball"].point(), jnp.stack([0.0, 0.0, -1.0]) * blow)
+
+    struck = Struck()
+    page, numbers = contents(jj.show(jj.simulate(struck, jj.start(struck, **struck.example), ts=jnp.linspace(0.0, 2.0, 41))).html)
+    (force,) = page["motions"][0]["forces"]
+    lengths = np.linalg.norm(numbers(force["vectors"]).reshape(-1, 3), axis=1)
+    weight = 2.0 * 9.81
+    assert "longest arrow: 39.2 N and more, up to 1e+04 N" in page["note"]
+    np.testing.assert_allclose(lengths[[0, -1]], lengths.max() * weight / (2 * weight), rtol=1e-5)
+    assert lengths.argmax() == 20
+
+
 @pytest.mark.slow
 def test_a_ride_of_ten_seconds_is_one_file_below_a_megabyte(tmp_path):
     bicycle = jj.models.WhippleBicycle()
