@@ -56,7 +56,7 @@ def coefficients(graph: Graph, s: int, outputs, at, known=None) -> np.ndarray:
 
 
 def expected(f, at) -> np.ndarray:
-    """The same by mpmath."""
+    """Those by mpmath."""
     with mpmath.workdps(80):
         return np.array([float(c) for c in mpmath.taylor(f, mpmath.mpf(at), ORDER - 1)])
 

@@ -30,10 +30,6 @@ class Taylor(eqx.Module):
         if self.order is not None and (not isinstance(self.order, int) or isinstance(self.order, bool) or not LEAST <= self.order <= MOST):
             raise ValueError(f"`order` is {self.order!r}, expected a whole number from {LEAST} to {MOST}, or None for that which suits the tolerance")
 
-    def for_tolerance(self, rtol: Number) -> "Taylor":
-        """The same with its order."""
-        return Taylor(order_for(rtol)) if self.order is None else self
-
 
 def order_for(rtol: Number) -> int:
     """p = ceil(1 - log(rtol)/2), at which the arithmetic for a length of time is least."""

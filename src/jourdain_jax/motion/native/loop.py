@@ -178,7 +178,9 @@ def _write_save_within(w: Writer, form: Form, method: TaylorSteps) -> None:
                 with w.counted(0, every) as row:
                     w.store(w.load("double", y, row * w.lanes + lane), states, place * every + row)
                 w.store(saved + 1, who, lane + w.lanes)
-                lanes.set("goal", lane, w.load("double", goals, place + 1))
+                lanes.set("goal", lane, lanes.of("direction", lane) * math.inf)  # where an event was found a rounding beyond the last time
+                with w.when((saved + 1) < times):
+                    lanes.set("goal", lane, w.load("double", goals, place + 1))
         w.give()
 
 
