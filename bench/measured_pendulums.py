@@ -13,8 +13,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.bicycle import benchmark_from_measurements, interval, linear_matrices, measured_bicycle, sample_parameters, shipped_bicycles
-from jourdain_jax.bicycle import shipped_measurements, stability_speeds
+from jourdain_jax.bicycle import (
+    benchmark_from_measurements,
+    interval,
+    linear_matrices,
+    measured_bicycle,
+    sample_parameters,
+    shipped_bicycles,
+    shipped_measurements,
+    stability_speeds,
+)
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
 
 ABOUT_CENTRES = ("xB", "zB", "xH", "zH", "IByy", "IHyy")  # published as means over pairs of lines

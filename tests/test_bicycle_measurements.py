@@ -144,7 +144,7 @@ def test_bad_files_are_refused_by_name(text, told, tmp_path):
 
 
 def test_an_unknown_bicycle_is_refused_with_the_nearest_one():
-    with pytest.raises(ValueError, match="no measurements of a bicycle `Browsr`.*`Browser`"):
+    with pytest.raises(ValueError, match=r"no measurements of a bicycle `Browsr`.*`Browser`"):
         benchmark_from_measurements("Browsr")
 
 

@@ -64,7 +64,7 @@ class TwistedPart(Scene):
 
 
 def period(pendulum: SwungPart | TwistedPart) -> Scalar:
-    """Period of small motions about rest, s: 2 pi sqrt(M / K), with the mass M of the scene's equation and K, by how much its force falls with the coordinate."""
+    """Period of small motions about rest, s: 2 pi sqrt(M / K), M the mass in the scene's equation, K by how much its force falls with the coordinate."""
     zero, rest = jnp.zeros(()), jnp.zeros(1)
     force = lambda q: generalized_forces(pendulum, zero, q, rest)[0]  # noqa: E731
     return 2 * jnp.pi * jnp.sqrt(mass_matrix_at(pendulum, zero, rest)[0, 0] / -jax.jvp(force, (rest,), (jnp.ones(1),))[1])

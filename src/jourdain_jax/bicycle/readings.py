@@ -8,7 +8,7 @@ deviation is sqrt(sum sigma^2) / readings. Part and number follow the name of wh
 | `dR nR`, `dF nF` | way of a wheel over so many turns; turns | m |
 | `w gamma f`, or `h1`...`h5`, `d1`...`d4`, `d` | wheelbase, slope of the steer axis, fork offset; or heights and diameters on a level table | m, deg |
 | `mR mF mB mH`, or `mG mS` for `mH` | masses of wheels, rear frame, fork with handlebar; or of the handlebar G and the fork S by themselves | kg |
-| `lR TcR1`, `lF TcF1`, `TcB1`, `TcH1` | swung on a level axle: its distance from the middle of a wheel, the period; frame and fork hang by the middle of their wheel | m, s |
+| `lR TcR1`, `lF TcF1`, `TcB1`, `TcH1` | swung: from axle to middle of a wheel, period; frame and fork hang by the middle of their wheel | m, s |
 | `TtR1`, `TtF1` | twisted on an upright rod, about a diameter of the wheel | s |
 | `alphaB1 aB1 TtB1`, ... | twisted: slope of the steer axis, place of the rod beside the middle of the wheel, period; three hangings or more | deg, m, s |
 | `mP lP dP TtP1` | a steel bar of known inertia, by which the rod is gauged | kg, m, s |
