@@ -67,7 +67,10 @@ def read_readings(path: str | Path) -> Readings:
     negative sigma; and all that is missing for the parameters of a bicycle.
     """
     path = Path(path)
-    means, sigmas, lines, without = {}, {}, {}, []
+    means: dict[str, float] = {}
+    sigmas: dict[str, float] = {}
+    lines: dict[str, int] = {}
+    without: list[str] = []
     for number, line in text_lines(read_text(path), str(path)):
         where = f"{path}, line {number}"
         name, _, right = (part.strip() for part in line.partition("="))
