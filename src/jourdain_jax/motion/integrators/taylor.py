@@ -16,7 +16,7 @@ class Taylor(eqx.Module):
 
     y(t + s) = sum_{k=0}^p y_k s^k with coefficients from recurrences, by machine code of the CPU. The order is p = ceil(1 - log(rtol)/2) unless it is given,
     and a step is as long as its last two terms stay within the tolerance (Jorba and Zou). States at times to save come from the series: steps do not end
-    there. Against Dopri8 at equal error, a Chaplygin sleigh takes 0.4 of the time alone at 1e-12, a scene of some hundred operations more time than it.
+    there. Against Dopri8 at equal error, a Chaplygin sleigh takes half of the time alone at 1e-12, a scene of some hundred operations more time than it.
 
     **Arguments:** `order`, from 4 to 30; None: from the tolerance `rtol`.
     **Raises** from `simulate`: ValueError where no machine code serves, an input is given by samples, the equations branch, or they are too long.
