@@ -56,10 +56,15 @@ class Layout:
     def scene(self, scene: Scene, shared: Float[Array | np.ndarray, "*members shared"]) -> Scene:
         """The scene with these shared unknowns."""
         leaves, treedef = jax.tree.flatten(scene)
+        return jax.tree.unflatten(treedef, [x if x is own else jnp.asarray(x) for x, own in zip(self.leaves(leaves, treedef, shared), leaves, strict=True)])
+
+    def leaves(self, leaves: list, treedef, shared: Float[Array | np.ndarray, "*members shared"]) -> list:
+        """The leaves of a scene, with these shared unknowns in their places."""
+        found = list(leaves)
         for place in self.shared:
             if not place.of_sensor:
-                leaves[_leaf(treedef, place.name)] = jnp.asarray(place.of(shared))
-        return jax.tree.unflatten(treedef, leaves)
+                found[_leaf(treedef, place.name)] = place.of(shared)
+        return found
 
     def start(self, start: dict, local: Float[Array | np.ndarray, "*members local"]) -> dict:
         """The start of a run with these unknowns of its own."""
