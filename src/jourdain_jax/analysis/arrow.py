@@ -94,8 +94,9 @@ class Arrow:
         shared, own = self.split(d)
         _, m, _ = self.counts
         local, rest = self.local.copy(), self.shared.copy()
-        local[..., -1] += np.einsum("bkij,bkj->bki", local[..., :m], own) + np.einsum("bkij,bj->bki", local[..., m:-1], shared)
-        rest[..., -1] += np.einsum("bij,bj->bi", rest[..., :-1], shared)
+        rest[..., -1] += (rest[..., :-1] @ shared[..., None])[..., 0]
+        if m:
+            local[..., -1] += (local[..., :m] @ own[..., None] + local[..., m:-1] @ shared[:, None, :, None])[..., 0]
         return Arrow(local, rest, self.scores)
 
     def change(self, d: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members"]:

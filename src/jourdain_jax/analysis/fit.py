@@ -24,7 +24,7 @@ from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.profile import limits_at_bounds
 from jourdain_jax.analysis.ranges import Range
-from jourdain_jax.analysis.starts import check_starts
+from jourdain_jax.analysis.starts import check_first_guess, check_starts
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.reference_parameters import reference_parameters
 from jourdain_jax.calculus.guards import DifferentiationModeError
@@ -145,6 +145,8 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
         theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
         limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
         found = _minimum(problem, theta, limits, control, one_will_do=members is None)
+        if not all(np.isfinite(trace[0][1][0]) for trace in found.trace):
+            check_first_guess(scene, runs, unknowns)
         same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
         found = _with_memory(problem, found if members else found.lowest(), limits, control)
         return _result(problem, found, limits, asked, errors, guesses, same)
@@ -183,10 +185,10 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
         begin[some], steps[some] = grown.theta, steps[some] + grown.steps
         for i, (_, costs), k in zip(some.tolist(), (of_one[0] for of_one in grown.trace), place[some].tolist(), strict=True):
             trace[i] += ((f"the first {_SPANS[k]:.3g} of each run", costs),)
-        followed = np.stack([problem.is_followed(grown.at, share, _FOLLOWED) for share in _SPANS])
         place[some] += 1
         for k in range(1, len(_SPANS)):
-            place[some] += (place[some] == k) & followed[k]  # the next one is followed, and left out
+            if (place[some] == k).any():
+                place[some] += (place[some] == k) & problem.is_followed(grown.at, _SPANS[k], _FOLLOWED)  # the next one is followed, and left out
     problem.shares = None
     grown = of(poor, begin, control)
     steps, trace = steps + grown.steps, trace + grown.trace

@@ -96,6 +96,8 @@ class Minimum:
 
     def lowest(self) -> "Minimum":
         """That of the member with the lowest value."""
+        if len(self.theta) == 1:
+            return self
         best = [int(np.argmin(self.at.cost))]
         return Minimum(self.theta[best], self.at.at(best), self.converged[best], self.stuck[best], self.steps[best], self.grown[best], self.trace[best])
 
@@ -158,7 +160,7 @@ def minimise(
             last = _is_small(change * np.square(shrank), size, d * np.array(shrank)[:, None], replace(control, tolerance=_SURELY * control.tolerance))
             if last.any():
                 of = going[last]
-                at = at.replaced(of, at.at(of).moved(d[last], promised[last]), np.ones(of.size, bool))
+                at = at.replaced(of, (at if of.size == count else at.at(of)).moved(d[last], promised[last]), np.ones(of.size, bool))
                 theta[of], converged[of], going = x[last] + d[last], True, going[~last]
                 for b in of.tolist():
                     costs[b].append(float(at.cost[b]))

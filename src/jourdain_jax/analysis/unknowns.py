@@ -185,7 +185,7 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
     if all(entry.fixed for entry in entries):
         raise ValueError(f"nothing is free; name parameters in `free` ({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
     free_ones = [entry for entry in entries if not entry.fixed]
-    each = lambda of: np.concatenate([np.full(entry.guess.size, of(entry)) for entry in entries])  # noqa: E731
+    each = lambda of: np.array([x for entry in entries for x in [of(entry)] * entry.guess.size])  # noqa: E731
     return Unknowns(
         layout=Layout(tuple(shared.found), tuple(local.found)),
         runs=len(runs),
