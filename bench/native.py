@@ -1,6 +1,6 @@
 """Motions by machine code of our own against the same motions by XLA, in one run on one core: batches, alone, cold starts.
 
-    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|records|watching|compilation ...]
+    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|heyoka|records|watching|compilation ...]
 
 Writes a list of {"figure", "model", "value", "required", "met"}; `required` is None where a figure is only told. Times of warm motions are processor
 time, the least of some repeats, the two ways in turn; cold ones are wall time of fresh processes.
@@ -17,11 +17,12 @@ from functools import partial
 
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
 
+import against_heyoka
 import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from baselines import disc_run
+from baselines import disc_run, heyoka_lowered
 from baselines.timing import least_processor_time
 
 import jourdain_jax as jj
@@ -105,6 +106,17 @@ def batches(quick: bool) -> Iterator[Figure]:
                 yield figure(f"{who}, {tolerance:.0e}, tried steps, XLA", name, steps["XLA"])
 
 
+def heyoka(quick: bool) -> Iterator[Figure]:
+    """A thousand spread starts, and motions alone, at equal final error."""
+    if heyoka_lowered.heyoka is None:
+        print(heyoka_lowered.MISSING)
+        return
+    for name, span, more in [entry for entry in MOTIONS if entry[2]][: 1 if quick else None]:
+        starts = spread_starts(jj.models.MODELS[name](), 128 if quick else LANES)
+        for what, value, required in against_heyoka.compared(name, starts, span, {"solver": diffrax.Dopri8(), **more}, quick):
+            yield figure(what, name, value, required)
+
+
 def records(quick: bool) -> Iterator[Figure]:
     """2 s of a bicycle under a record of 201 samples of the steer torque, each lane its own; and its derivatives with respect to four parameters."""
     scene, name, lanes, scale = jj.models.MODELS["whipple-bicycle"](), "whipple-bicycle", 2 if quick else 8, 1e-8
@@ -181,7 +193,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few lanes, the disc alone")
     parser.add_argument("--json", help="write the figures to this file")
-    parts = {"batches": batches, "records": records, "watching": watching, "compilation": compilation}
+    parts = {"batches": batches, "heyoka": heyoka, "records": records, "watching": watching, "compilation": compilation}
     parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="these figures")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
