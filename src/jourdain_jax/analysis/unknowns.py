@@ -56,10 +56,15 @@ class Layout:
     def scene(self, scene: Scene, shared: Float[Array | np.ndarray, "*members shared"]) -> Scene:
         """The scene with these shared unknowns."""
         leaves, treedef = jax.tree.flatten(scene)
+        return jax.tree.unflatten(treedef, [x if x is own else jnp.asarray(x) for x, own in zip(self.leaves(leaves, treedef, shared), leaves, strict=True)])
+
+    def leaves(self, leaves: list, treedef, shared: Float[Array | np.ndarray, "*members shared"]) -> list:
+        """The leaves of a scene, with these shared unknowns in their places."""
+        found = list(leaves)
         for place in self.shared:
             if not place.of_sensor:
-                leaves[_leaf(treedef, place.name)] = jnp.asarray(place.of(shared))
-        return jax.tree.unflatten(treedef, leaves)
+                found[_leaf(treedef, place.name)] = place.of(shared)
+        return found
 
     def start(self, start: dict, local: Float[Array | np.ndarray, "*members local"]) -> dict:
         """The start of a run with these unknowns of its own."""
@@ -180,7 +185,7 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
     if all(entry.fixed for entry in entries):
         raise ValueError(f"nothing is free; name parameters in `free` ({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
     free_ones = [entry for entry in entries if not entry.fixed]
-    each = lambda of: np.concatenate([np.full(entry.guess.size, of(entry)) for entry in entries])  # noqa: E731
+    each = lambda of: np.array([x for entry in entries for x in [of(entry)] * entry.guess.size])  # noqa: E731
     return Unknowns(
         layout=Layout(tuple(shared.found), tuple(local.found)),
         runs=len(runs),
@@ -235,10 +240,15 @@ def _of_sensor(label: str, name: str, estimate: Estimate) -> _Entry:
 
 
 def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _Entry:
-    """An unknown from what was given for it: an `Estimate`, a range or None; after a look at its first guess."""
-    estimate = given if isinstance(given, Estimate) else Estimate(range=given) if given is None or isinstance(given, Range) else None
-    if estimate is None:
-        raise ValueError(f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, `Estimate(...)` or None")
+    """An unknown from what was given for it: an `Estimate`, a range, a prior or None; after a look at its first guess."""
+    if isinstance(given, Estimate):
+        estimate = given
+    elif given is None or isinstance(given, Range):
+        estimate = Estimate(range=given)
+    elif hasattr(given, "mean") and hasattr(given, "sigma"):
+        estimate = Estimate(prior=given)
+    else:
+        raise ValueError(f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, `Normal(...)`, `Estimate(...)` or None")
     guess = value if estimate.guess is None else np.asarray(estimate.guess, float)
     if guess.shape != value.shape:
         raise ValueError(f"first guess of `{label}` has shape {guess.shape}, expected {value.shape}; leave it out for the value that is there")
