@@ -82,6 +82,7 @@ from jourdain_jax.motion.integrators.discrete_lagrange_dalembert import Discrete
 from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
 from jourdain_jax.motion.integrators.munthe_kaas import MuntheKaas
 from jourdain_jax.motion.integrators.radau import RadauIIA
+from jourdain_jax.motion.integrators.taylor import Taylor
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import State, consistent, start
@@ -101,6 +102,7 @@ from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surfa
 from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
 from jourdain_jax.scene.motion_state import fixed_point
 from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.spline import Spline
 from jourdain_jax.scene.visuals import Visual
@@ -171,6 +173,7 @@ __all__ = [
     "Study",
     "StudyResult",
     "Surface",
+    "Taylor",
     "Trajectory",
     "UdwadiaKalaba",
     "Uniform",
@@ -205,6 +208,7 @@ __all__ = [
     "gibbs_function",
     "gravity",
     "huber",
+    "inertia_from_log_cholesky",
     "inputs",
     "kinetic_energy",
     "knife_edge",
@@ -213,6 +217,7 @@ __all__ = [
     "load_rollout",
     "load_study",
     "load_trajectory",
+    "log_cholesky",
     "log_density",
     "log_likelihood",
     "lower",
