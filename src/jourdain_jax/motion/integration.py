@@ -47,8 +47,8 @@ def integrate_lanes(setups: Setup) -> Trajectory:
         solved = lanes_solved_by_own_steps(fitting, begun)
     else:
         # lanes often share their times: what XLA knows to be the same in all of them it moves through diffrax's `nextafter`, one operation per pass
-        times = jax.lax.optimization_barrier((fitting.t0, fitting.t1, fitting.options.dt0))
-        timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.options.dt0), fitting, times)
+        times = jax.lax.optimization_barrier((fitting.t0, fitting.t1, fitting.dt0))
+        timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.dt0), fitting, times)
         solved = eqx.filter_vmap(_solved)(timed, begun)
     return eqx.filter_vmap(_finish)(setups, fitting, begun, solved)
 
