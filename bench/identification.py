@@ -3,10 +3,10 @@
     python bench/identification.py [--quick] [--only NAME ...] [--json FILE]
 
 Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), unstable (100 first guesses of a bicycle below its weave
-speed), coverage, three (coverage of three models, unknown starts and sigmas, white noise and AR(1) noise), windows (57 runs of the steer-by-wire bicycle with
-an unknown start each; the data are in `data/sbw_bicycle`), logs (what halves of these runs say of each other, with and without delays of the sensors, a lag
-of the motor and a memory of the noise). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs, with fewer
-repeats. Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
+speed), coverage, three (coverage of three models, unknown starts and sigmas, white noise and AR(1) noise), nuts (sampling by BlackJAX), windows (57 runs of the
+steer-by-wire bicycle with an unknown start each; the data are in `data/sbw_bicycle`), logs (what halves of these runs say of each other, with and without
+delays of the sensors, a lag of the motor and a memory of the noise). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out
+windows and logs, with fewer repeats. Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
 """
 
 import argparse
@@ -260,6 +260,55 @@ def three(repeats: int) -> list[Figure]:
     return found
 
 
+# Sampling. ---------------------------------------------------------------------------------------------------------------
+
+
+def nuts(draws: int) -> list[Figure]:
+    """NUTS of BlackJAX on the four unknowns of the disc, whitened by the fit: effective draws for a second, one chain and four side by side."""
+    import blackjax
+
+    data, guess, free = disc_data(0), jj.models.TiltingDisc(radius=0.55, gravity=10.8), ("radius", "gravity")
+    fit = jj.fit(guess, data, free)
+    density = jj.log_density(guess, data, free).whitened(fit)
+    count = density.initial.size
+    # on a normal density of variance one nearly all trees have 3 steps of 1.1: chains side by side hardly wait for each other
+    sampler = blackjax.nuts(density, step_size=1.1, inverse_mass_matrix=jnp.ones(count))
+
+    def chain(key, z):
+        def step(state, key):
+            state, told = sampler.step(key, state)
+            return state, (state.position, told.is_divergent, told.num_integration_steps)
+
+        return jax.lax.scan(step, sampler.init(z), jax.random.split(key, draws))[1]
+
+    keys, starts = jax.random.split(jax.random.key(1), 4), jax.random.normal(jax.random.key(2), (4, count))
+    one, four, found = jax.jit(chain), jax.jit(jax.vmap(chain)), {}
+
+    def alone():
+        found["one"] = jax.block_until_ready(one(keys[0], starts[0]))
+
+    def side_by_side():
+        found["four"] = jax.block_until_ready(four(keys, starts))
+
+    times = processor_times({"one": alone, "four": side_by_side}, 5)
+    positions, diverged, steps = (np.asarray(x) for x in found["four"])
+    effective = float(np.min(blackjax.diagnostics.effective_sample_size(found["one"][0][None])))
+    together = float(np.min(blackjax.diagnostics.effective_sample_size(positions)))
+    spread = np.asarray(density.constrain(jnp.asarray(positions))).reshape(-1, count).std(axis=0)
+    print(
+        f"  {draws} draws: {times['one']:.2f} s, four chains {times['four']:.2f} s; effective {effective:.0f}, of four {together:.0f}; steps of a tree: "
+        f"{np.mean(steps):.2f}, the most of four {np.mean(steps.max(axis=0)):.2f}"
+    )
+    model = "tilting-disc, 4 unknowns"
+    return [
+        figure("NUTS: effective draws/s, the fewest of all unknowns", model, effective / times["one"], 200, at_least=True),
+        figure("NUTS: such, of four chains side by side", model, together / times["four"]),
+        figure("NUTS: divergences of 4 chains", model, int(diverged.sum() + np.asarray(found["one"][1]).sum()), 0),
+        figure("NUTS: 4 chains over one", model, times["four"] / times["one"], 1.5),
+        figure("NUTS: marginal standard deviations off those of the fit, relative", model, float(np.max(np.abs(spread / fit.standard_errors - 1))), 0.05),
+    ]
+
+
 # The steer-by-wire bicycle. ---------------------------------------------------------------------------------------------------
 
 
@@ -480,6 +529,7 @@ def main() -> None:
         "unstable": lambda: unstable(20 if options.quick else 100),
         "coverage": lambda: coverage(50 if options.quick else 500),
         "three": lambda: three(50 if options.quick else 1000),
+        "nuts": lambda: nuts(500 if options.quick else 2000),
         "windows": of_windows,
         "logs": logs,
     }

@@ -30,6 +30,7 @@ import jourdain_jax as jj
 ROOT = Path(__file__).resolve().parents[1]
 SCENES = ROOT / "docs" / "gallery" / "scenes"
 PAGES = ROOT / "docs" / "gallery" / "pages"
+WIDTH = 112  # columns of code on a page
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,23 @@ MODEL_PICTURES = {
     ),
 }
 
+TITLES = {  # of models, where the name in the registry is no title
+    "two-wheel-axle-free": "Two wheels on an axle, as free bodies",
+    "two-wheel-axle-coordinates": "Two wheels on an axle, in seven coordinates",
+    "two-wheel-axle-quasi": "Two wheels on an axle, in quasi-velocities",
+    "two-wheel-axle-redundant": "Two wheels on an axle, with redundant rows",
+    "tilting-disc-quaternion": "Tilting disc as a free body",
+    "rosenberg-particle": "Rosenberg's particle",
+    "heisenberg-particle": "Heisenberg's system",
+    "ball-on-turntable": "Ball on a turntable",
+    "suslov": "Suslov's problem",
+    "whipple-bicycle": "Whipple's bicycle",
+    "double-pendulum-rods": "Double pendulum with rods as rows",
+    "double-pendulum-angles": "Double pendulum in angles",
+    "trailer-chain": "Chain of trailers",
+    "pendulum-chain": "Chain of pendulums",
+}
+
 
 @dataclass(frozen=True)
 class Entry:
@@ -181,7 +199,7 @@ class Entry:
 
     @property
     def title(self) -> str:
-        return self.picture.title or self.name.replace("-", " ").capitalize()
+        return self.picture.title or TITLES.get(self.name) or self.name.replace("-", " ").capitalize()
 
 
 def entries() -> dict[str, Entry]:
@@ -207,11 +225,14 @@ def code_of(entry: Entry) -> str:
     inputs = f", inputs={p.inputs}" if p.inputs else ""
     start = f"jj.start(scene, {p.start})" if p.start else "jj.start(scene)"
     more = "".join(f",\n    {name}={value}" for name, value in (("paths", p.paths),) if value)
+    call = f"motion = jj.simulate(scene, {start}, t1={p.span}{inputs})"
+    if len(call) > WIDTH:
+        call = f"motion = jj.simulate(\n    scene,\n    {start},\n    t1={p.span},\n   {inputs[1:]},\n)"
     lines = [
         "import jax.numpy as jnp\n\n" if "jnp." in inputs else "",
         "import jourdain_jax as jj\nfrom jourdain_jax.plotting.still import draw_still\n",
         entry.import_line,
-        f"\nscene = {entry.made}\nmotion = jj.simulate(scene, {start}, t1={p.span}{inputs})\n",
+        f"\nscene = {entry.made}\n{call}\n",
         f'draw_still(\n    motion,\n    "{entry.name}.png",\n    view={p.view},\n    at={p.at}{more},\n)',
     ]
     return "".join(lines)
@@ -259,7 +280,7 @@ Source: [{shown}]({link})
 def caption_of(entry: Entry) -> str:
     """What the scene is, in one line: the first sentence of the docstring of its class, or of its file where that has one scene."""
     told = inspect.getdoc(inspect.getmodule(entry.kind) if entry.source.parent == SCENES else entry.kind)
-    return re.split(r"(?<=[.:;])\s", " ".join(told.split("\n\n")[0].split()))[0].rstrip(".:;")
+    return re.split(r"(?<=[.;])\s", " ".join(told.split("\n\n")[0].split()))[0].rstrip(".:;")
 
 
 def index_of(chosen: list[Entry]) -> str:

@@ -43,9 +43,18 @@ def test_limits_hold_the_value_and_say_how_many_samples_have_the_speed(studies):
     assert studies[1].speeds["capsize_speed"] is None or studies[1].speeds["capsize_speed"]["value"] is None
 
 
-def test_a_degenerate_file_is_refused_by_name_and_the_others_go_on(studies):
+def test_a_degenerate_file_is_refused_by_name(tmp_path):
+    (refused,) = run([shipped_bicycles()["Tms"]], samples=60)
+    assert isinstance(refused, Refused)
+    assert "rR" in refused.error
+    write_results([refused], tmp_path / "result.json")
+    (row,) = json.loads((tmp_path / "result.json").read_text())
+    assert row["weave_speed"] is None
+    assert "refused" in table([refused])
+
+
+def test_other_files_go_on_where_one_is_refused(studies):
     assert [isinstance(one, Refused) for one in studies] == [False, False, True]
-    assert "rR" in studies[2].error
 
 
 def test_below_the_stable_range_the_bicycle_falls_and_inside_it_does_not(studies):

@@ -50,6 +50,25 @@ def test_code_fits_the_width_of_a_page(page):
     assert [line for block in blocks for line in block.splitlines() if len(line) > 112] == []
 
 
+def test_each_formula_of_the_theory_is_followed_by_the_functions_that_compute_it():
+    told = (DOCS / "theory.md").read_text(encoding="utf-8").split("$$")
+    assert len(told) > 30
+    for formula, below in zip(told[1::2], told[2::2], strict=True):
+        computed = re.match(r"\n\n\*Computed by\* (.*?)(?:\n\n|$)", below, re.DOTALL)
+        assert computed, formula
+        functions = ""
+        for part in re.split(r"(\[`[\w/]+\.py`\]\([^)]*\))", computed[1]):
+            if (link := re.match(r"\[`([\w/]+\.py)`\]\(\.\./src/jourdain_jax/(.*)\)", part)) is None:
+                functions += part
+                continue
+            assert link[1] == link[2]
+            source = (ROOT / "src" / "jourdain_jax" / link[1]).read_text(encoding="utf-8")
+            for name in re.findall(r"`(\w+)`", functions):
+                assert re.search(rf"^(?:def|class) {name}\b", source, re.MULTILINE), (name, link[1])
+            functions = ""
+        assert "`" not in functions
+
+
 def test_files_that_the_theory_names_exist():
     text = (DOCS / "theory.md").read_text(encoding="utf-8")
     for name in re.findall(r"`([\w/]+\.py)`", text):
@@ -93,6 +112,26 @@ def test_redundant_rows_are_as_their_page_says(capsys):
     assert np.all(page["two"].constraint_forces().determined)
     told = [line.rpartition("; ")[2] for line in capsys.readouterr().out.splitlines() if "rad/s" in line]
     assert [words == "reached the end of its span" for words in told] == [True, False, True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["inputs", "events", "learned"])
+def test_the_code_of_a_page_runs_as_it_stands(page, capsys):
+    names: dict = {}
+    for code in re.findall(r"```python\n(.*?)```", (DOCS / "howto" / f"{page}.md").read_text(encoding="utf-8"), re.DOTALL):
+        exec(code, names)
+    printed = capsys.readouterr().out
+    if page == "inputs":
+        # the blow of 0.9 N s on 2 kg shows in the speed right after it
+        shortly = jj.simulate(names["Cart"](gain=0.0), ts=jnp.array([0.0, 1.002]), inputs={"push": names["blow"]})
+        np.testing.assert_allclose(shortly["x_rate"][-1], 0.45, rtol=5e-3)
+    if page == "events":
+        fall = np.sqrt(2 * 1.0 / 9.81)
+        np.testing.assert_allclose(names["motion"].t_end, fall, rtol=1e-9)
+        np.testing.assert_allclose(names["second"].t_end, fall * (1 + 2 * 0.8), rtol=1e-7)
+        assert printed.count("floor") == 2
+    if page == "learned":
+        assert names["errors"][-1] < 0.3 * names["errors"][0]
 
 
 def test_the_readme_has_at_most_nine_hundred_words():

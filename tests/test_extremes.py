@@ -12,6 +12,7 @@ from jourdain_jax.ensembles.along import integral, largest
 ALL = jnp.asarray(41)
 TIMES = jnp.linspace(0.0, 2.0, 41)
 PHASES = jnp.linspace(0.0, 2 * jnp.pi, 97)
+LARGEST, INTEGRAL = (jax.jit(jax.value_and_grad(lambda values, times, count, f=f: f(times, values, count))) for f in (largest, integral))
 
 
 def wave(phase, frequency=3.0):
@@ -20,7 +21,7 @@ def wave(phase, frequency=3.0):
 
 def test_the_largest_value_is_found_to_the_fifth_order_wherever_it_lies():
     """Over 2 s a sine of 3 rad/s takes the value 1 at any phase, or is largest at an end."""
-    found = jax.vmap(lambda phase: largest(TIMES, wave(phase), ALL))(PHASES)
+    found = jax.jit(jax.vmap(lambda phase: largest(TIMES, wave(phase), ALL)))(PHASES)
     inside = (jnp.pi / 2 - PHASES) % (2 * jnp.pi) / 3.0 <= 2.0
     exact = jnp.where(inside, 1.0, jnp.maximum(jnp.sin(PHASES), jnp.sin(6.0 + PHASES)))
     coarse = jax.vmap(lambda phase: jnp.max(wave(phase)))(PHASES)
@@ -29,7 +30,7 @@ def test_the_largest_value_is_found_to_the_fifth_order_wherever_it_lies():
 
 
 def test_the_integral_is_found_to_the_fourth_order():
-    found = jax.vmap(lambda phase: integral(TIMES, wave(phase), ALL))(PHASES)
+    found = jax.jit(jax.vmap(lambda phase: integral(TIMES, wave(phase), ALL)))(PHASES)
     exact = (jnp.cos(PHASES) - jnp.cos(6.0 + PHASES)) / 3.0
     assert float(jnp.max(jnp.abs(found - exact))) < 3e-6
     assert float(jnp.max(jnp.abs(jax.vmap(lambda phase: jnp.trapezoid(wave(phase), TIMES))(PHASES) - exact))) > 1e-4  # of the trapezoidal rule
@@ -44,10 +45,10 @@ def test_values_that_were_not_reached_do_not_count(count):
     kept = jnp.arange(41) < count
     times, values = jnp.where(kept, TIMES, TIMES[count - 1]), jnp.where(kept, wave(0.07), wave(0.07)[count - 1])
     exact = 1.0 if 3.0 * TIMES[count - 1] + 0.07 > np.pi / 2 else float(values[count - 1])
-    found, by = jax.value_and_grad(lambda values: largest(times, values, jnp.asarray(count)))(values)
+    found, by = LARGEST(values, times, jnp.asarray(count))
     assert float(found) == pytest.approx(exact, abs=1e-6)
     assert np.isfinite(by).all()
-    total, by = jax.value_and_grad(lambda values: integral(times, values, jnp.asarray(count)))(values)
+    total, by = INTEGRAL(values, times, jnp.asarray(count))
     exact = (np.cos(0.07) - np.cos(3.0 * float(TIMES[count - 1]) + 0.07)) / 3.0
     assert float(total) == pytest.approx(exact, abs=5e-6 if count > 3 else 1e-4)
     assert np.isfinite(by).all()
@@ -55,7 +56,7 @@ def test_values_that_were_not_reached_do_not_count(count):
 
 def test_the_derivative_is_that_of_the_largest_value():
     """Of a sin(3 t + phase): 1 by the amplitude, 0 by the phase."""
-    by = jax.grad(lambda a, phase: largest(TIMES, a * wave(phase), ALL), argnums=(0, 1))(1.3, 0.4)
+    by = jax.jit(jax.grad(lambda a, phase: largest(TIMES, a * wave(phase), ALL), argnums=(0, 1)))(1.3, 0.4)
     np.testing.assert_allclose(by, [1.0, 0.0], atol=2e-5)
 
 

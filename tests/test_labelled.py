@@ -1,6 +1,7 @@
 """Motions as labelled arrays and tables, and how scenes and motions show themselves in notebooks."""
 
 import builtins
+import re
 
 import jax
 import jax.numpy as jnp
@@ -87,6 +88,28 @@ def test_a_scene_shows_its_parameters_with_units_in_a_notebook(lanes):
     for part in ("<b>TiltingDisc</b> A thin disc", ">mass</th>", ">2.5</td>", ">kg</td>", "coordinates: x, y, yaw, lean, spin", "speeds: x_rate"):
         assert part in shown
     assert "&lt;" in type("Odd", (jj.models.TiltingDisc,), {"__doc__": "a <b"})()._repr_html_()
+
+
+def test_a_scene_is_drawn_at_its_example_start_in_a_notebook():
+    shown = jj.models.TiltingDisc()._repr_html_()
+    drawn = shown[shown.index("<svg") :]
+    width, height = (float(re.search(rf"{side}='(\d+)'", drawn)[1]) for side in ("width", "height"))
+    places = np.array([[float(x) for x in place.split(",")] for place in re.findall(r"[\d.]+,[\d.]+", drawn)])
+    assert np.all(places >= 5.9)
+    assert np.all(places <= [width - 5.9 + 1, height - 5.9 + 1])
+    fills = {tuple(int(part, 16) for part in found) for found in re.findall(r"fill='#(\w\w)(\w\w)(\w\w)ff'", drawn)}
+    assert len({blue for red, green, blue in fills if blue > 1.5 * red}) >= 2  # the disc is blue, painted and lit
+    # where nothing can be drawn, the table alone is shown
+    broken = type("Broken", (jj.models.TiltingDisc,), {"bodies": lambda self, t, q: 1 / 0})()._repr_html_()
+    assert "<svg" not in broken
+    assert ">mass</th>" in broken
+
+
+def test_a_report_shows_how_far_manoeuvres_reach_in_a_notebook():
+    shown = jj.report(jj.models.VerticalDisc())._repr_html_()
+    assert shown.startswith("<pre>Report on VerticalDisc")
+    assert re.findall(r">(freedoms|brackets of \d|coordinates)</text>", shown) == ["freedoms", "brackets of 2", "brackets of 3", "coordinates"]
+    assert re.findall(r'start">(\d)</text>', shown) == ["2", "3", "4", "4"]
 
 
 def test_a_motion_shows_its_coordinates_as_lines_in_a_notebook(motion):

@@ -7,7 +7,7 @@ import pytest
 from jaxtyping import Array, Float
 
 import jourdain_jax as jj
-from jourdain_jax.build.plausibility import pose_numbers
+from jourdain_jax.build.plausibility import numbers_of
 from jourdain_jax.build.probed import TIMED, generic_inputs
 from jourdain_jax.build.probed_on_graph import probed_on_graph, sampled_on_graph
 from jourdain_jax.build.sampling import random_states, symmetric_configurations
@@ -58,7 +58,7 @@ def by_jax(scene, t, q, q_beyond, u, u_other):
         "timed": jax.jvp(pieces, (t,), (jnp.ones_like(t),))[1] | explicit_rates(scene, motion),
         "inertia_rates": jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), qdot))[1],
         "potential_rates": jax.jvp(lambda i: potentials_of(scene, motion_at(scene, t, q, u, i)), (inputs,), (inputs**2,))[1],
-        "numbers": pose_numbers(scene, t, q),
+        "numbers": numbers_of(scene, pose_at(scene, t, q)),
     }
 
 

@@ -113,7 +113,8 @@ def test_a_row_is_compared_with_its_usual_length_for_the_parameters_of_the_motio
         return jj.simulate(scene, start, ts=jnp.array([1.0]), rtol=1e-6, atol=1e-6, formulation=jj.Formulation("full"), backend=backend)
 
     motion(Parallelogram())  # of ordinary size, first
+    of_size = jax.jit(lambda size: motion(Parallelogram(crank=size, coupler=2 * size, mass=size**3)))
     for size in (1e-5, 1e5):
-        found = jax.jit(lambda size: motion(Parallelogram(crank=size, coupler=2 * size, mass=size**3)))(size)
+        found = of_size(size)
         assert int(found.result) == results.SUCCESS
         np.testing.assert_allclose(found.q_end, [1.7, 0.0, 1.7], atol=1e-5)

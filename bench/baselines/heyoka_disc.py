@@ -12,16 +12,20 @@ from collections.abc import Callable
 
 import numpy as np
 
-from . import dense, disc_run
+from . import dense, disc_run, heyoka_lowered
 from .hand_derived import HAND_DERIVED, tilting_disc
+from .heyoka_lowered import MISSING, heyoka
 from .timing import fastest
 
-try:
-    import heyoka
-except ImportError:
-    heyoka = None
 
-MISSING = "heyoka cannot be imported, so it is not measured; `pip install heyoka` (wheels for Linux only)"
+def system() -> list:
+    """The hand-derived equations as heyoka takes them."""
+    if heyoka is None:
+        raise ImportError(MISSING)
+    known = HAND_DERIVED["tilting-disc"]
+    y = heyoka.make_vars(*known.coordinates, *known.speeds)
+    qdot, vdot = tilting_disc(dense.DISC_PARAMETERS, heyoka.time, tuple(y[:5]), tuple(y[5:]), xp=heyoka)
+    return list(zip(y, (*qdot, *vdot), strict=True))
 
 
 def final_states(tolerance: float, width: int = 1, fast_math: bool = True) -> Callable[[np.ndarray], np.ndarray]:
@@ -31,33 +35,7 @@ def final_states(tolerance: float, width: int = 1, fast_math: bool = True) -> Ca
     `fast_math`, which lets the compiler reorder sums: faster by a quarter here, with the same error.
     **Raises:** `ImportError` where heyoka is not installed; `ValueError` where an integration does not reach its end.
     """
-    if heyoka is None:
-        raise ImportError(MISSING)
-    known = HAND_DERIVED["tilting-disc"]
-    y = heyoka.make_vars(*known.coordinates, *known.speeds)
-    qdot, vdot = tilting_disc(dense.DISC_PARAMETERS, heyoka.time, tuple(y[:5]), tuple(y[5:]), xp=heyoka)
-    system = list(zip(y, (*qdot, *vdot), strict=True))
-    if width == 1:
-        solver = heyoka.taylor_adaptive(system, disc_run.START, tol=tolerance, fast_math=fast_math)
-    else:
-        solver = heyoka.taylor_adaptive_batch(system, np.tile(disc_run.START[:, None], width), tol=tolerance, fast_math=fast_math)
-
-    def run(starts: np.ndarray) -> np.ndarray:
-        groups = starts.reshape(-1, width, len(y)).transpose(0, 2, 1)  # (groups, states, width)
-        found = np.empty_like(groups)
-        for start, final in zip(groups, found, strict=True):
-            solver.state[:] = start.reshape(solver.state.shape)
-            if width == 1:
-                solver.time = 0.0
-            else:
-                solver.set_time(0.0)
-            solver.propagate_until(disc_run.END)
-            if np.any(solver.time != disc_run.END):
-                raise ValueError(f"heyoka stopped at t = {solver.time}, expected {disc_run.END}; a state is not finite or the tolerance is too small")
-            final[:] = solver.state.reshape(final.shape)
-        return found.transpose(0, 2, 1).reshape(starts.shape)
-
-    return run
+    return heyoka_lowered.final_states(system(), disc_run.END, tolerance, width, fast_math=fast_math)
 
 
 def seconds_per_trajectory(tolerance: float, width: int = 1, fast_math: bool = True, lanes: int = disc_run.LANES, repeats: int = 7) -> float:

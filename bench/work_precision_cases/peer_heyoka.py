@@ -4,23 +4,16 @@ Also the second computation behind most references, in extended precision. Sourc
 """
 
 import functools
-import inspect
-import math
 
 import numpy as np
-from baselines import dense
+from baselines import dense, heyoka_lowered
 from baselines.hand_derived import tilting_disc
+from baselines.heyoka_lowered import MISSING, heyoka
 
 import jourdain_jax as jj
 from work_precision_cases.curve import Curve, Prepared, Solved
 from work_precision_cases.problem import Problem
 
-try:
-    import heyoka
-except ImportError:
-    heyoka = None
-
-MISSING = "heyoka cannot be imported, so it is not measured; `pip install heyoka` (wheels for Linux only)"
 TOLERANCES = tuple(10.0**-k for k in range(4, 16, 2))
 FEWER = TOLERANCES[::2]  # every tolerance is compiled anew
 LARGE, HUGE = 100, 1000  # operations: from LARGE on fewer tolerances, from HUGE on in compact mode, without which compiling takes minutes
@@ -46,17 +39,7 @@ def states(problem: Problem) -> tuple[tuple[str, ...], np.ndarray, list[int]]:
 
 def system(problem: Problem) -> list:
     """The engine's scalar program as equations of heyoka."""
-    scene = problem.scene
-    source = jj.lower(scene).python_source().replace("import math", "")
-    in_numbers, in_symbols = {"math": math}, {"math": heyoka}
-    exec(source, in_numbers)
-    exec(source, in_symbols)
-    parameters = [float(getattr(scene, name)) for name in inspect.signature(in_numbers["fixed"]).parameters]
-    taken = list(inspect.signature(in_symbols["rates"]).parameters)[2:]  # after `fixed` and t
-    y = heyoka.make_vars(*states(problem)[0])
-    inputs = [0.0] * (len(taken) - len(y))
-    rates = in_symbols["rates"](in_numbers["fixed"](*parameters), heyoka.time, *y, *inputs)
-    return list(zip(y, [heyoka.expression(rate) if isinstance(rate, float) else rate for rate in rates], strict=True))
+    return heyoka_lowered.equations(problem.scene)
 
 
 def operations(problem: Problem) -> int:

@@ -32,6 +32,7 @@ from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.gradients import derivative_exists
 from jourdain_jax.analysis.likelihood import log_likelihood
 from jourdain_jax.analysis.linearize import Linearization, linearize
+from jourdain_jax.analysis.log_density import LogDensity, log_density
 from jourdain_jax.analysis.losses import huber, student_t
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.ranges import bounds, positive, unbounded
@@ -136,6 +137,7 @@ __all__ = [
     "Levels",
     "Linearization",
     "Load",
+    "LogDensity",
     "LogNormal",
     "LogUniform",
     "Lowered",
@@ -211,6 +213,7 @@ __all__ = [
     "load_rollout",
     "load_study",
     "load_trajectory",
+    "log_density",
     "log_likelihood",
     "lower",
     "merge_studies",

@@ -3,9 +3,11 @@
 r = (reading - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi));      where noise has a memory, as in `correlated_noise`
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -47,19 +49,25 @@ def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **
         raise ValueError(f"the correlation time of channel `{unknown[0]}` is None, but a likelihood needs to know it; give a number in s, or 0 for white noise")
     if label := next((label for run in runs for label in run.estimates), None):
         raise ValueError(f"`{label}` is to be estimated, but a likelihood needs its value; give a number, which may be traced, in place of the `Estimate`")
-    total = jnp.zeros(())
-    for alike in equal_runs(runs):  # one batch
+    return jnp.sum(jnp.stack([jnp.sum(mapped(partial(of_run, scene, simulation=simulation), run)) for _, run in equal_runs(runs)]))
 
-        def one(run: Run) -> Float[Array, ""]:
-            found = jnp.zeros(())
-            for name, r in run.residuals(scene, simulate, simulation).items():
-                counted = run.weights[name] > 0
-                # log sigma = - log weight
-                logs = jnp.log(jnp.where(counted, run.weights[name], 1.0) / jnp.sqrt(2 * jnp.pi))
-                tau = run.correlation_time.get(name)
-                of_r = jnp.sum(-0.5 * r**2) if tau is None else log_density(r, run.weights[name], run.ts, tau)
-                found = found + jnp.sum(jnp.where(counted, logs, 0.0)) + of_r
-            return found
 
-        total = total + jnp.sum(eqx.filter_vmap(one)(alike))
-    return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+def of_run(scene: Scene, run: Run, *, simulation: dict) -> Float[Array, ""]:
+    """The logarithm of the density of the measurements of one run; -inf where its motion fails."""
+    found = jnp.zeros(())
+    for name, r in run.residuals(scene, simulate, simulation).items():
+        weight = run.weights[name]
+        counted = weight > 0
+        # log sigma = - log weight
+        logs = jnp.log(jnp.where(counted, weight, 1.0) / jnp.sqrt(2 * jnp.pi))
+        tau = run.correlation_time.get(name)
+        of_r = jnp.sum(-0.5 * r**2) if tau is None else log_density(r, weight, run.ts, tau)
+        found = found + jnp.sum(jnp.where(counted, logs, 0.0)) + of_r
+    return jnp.where(jnp.isfinite(found), found, -jnp.inf)
+
+
+def mapped(f: Callable, runs: Run, *more: Array) -> Array:
+    """`f(run, *more)` of each of the stacked runs; a single one is not put into a batch, whose steps would run in wider registers, each a little later."""
+    if runs.ts.shape[0] > 1:
+        return eqx.filter_vmap(f)(runs, *more)
+    return f(*jax.tree.map(lambda x: x[0] if eqx.is_array(x) else x, (runs, *more)))[None]

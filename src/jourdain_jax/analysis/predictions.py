@@ -105,17 +105,19 @@ def _equal_intervals(t0, t1, count: int) -> Float[Array | np.ndarray, "grid"]:
     return xp.concatenate([found[:-1], xp.asarray(t1)[None]])  # the last one without round-off
 
 
-def equal_runs(data: Sequence[Measurements]) -> list[Run]:
-    """Runs of equal structure and shapes stacked, for use where numbers may be traced."""
-    groups: dict[tuple, list[Run]] = {}
+def equal_runs(data: Sequence[Measurements]) -> list[tuple[tuple[int, ...], Run]]:
+    """Runs of equal structure and shapes stacked, with their numbers, for use where numbers may be traced."""
+    groups: dict[tuple, list[tuple[int, Run]]] = {}
     for indices in _alike(data):
         for i in indices:
             run = run_of(data[i], jnp)
-            groups.setdefault((indices[0], *(x.shape for x in jax.tree.leaves(eqx.filter(run, _is_array)))), []).append(run)
-    return [
-        eqx.combine(jax.tree.map(lambda *xs: jnp.stack(xs), *(eqx.filter(run, _is_array) for run in runs)), eqx.filter(runs[0], _is_array, inverse=True))
-        for runs in groups.values()
-    ]
+            groups.setdefault((indices[0], *(x.shape for x in jax.tree.leaves(eqx.filter(run, _is_array)))), []).append((i, run))
+    found = []
+    for members in groups.values():
+        numbers, runs = zip(*members, strict=True)
+        stacked = jax.tree.map(lambda *xs: jnp.stack(xs), *(eqx.filter(run, _is_array) for run in runs))
+        found.append((numbers, eqx.combine(stacked, eqx.filter(runs[0], _is_array, inverse=True))))
+    return found
 
 
 class Lanes:

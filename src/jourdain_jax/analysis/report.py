@@ -2,6 +2,7 @@
 
 from dataclasses import asdict, dataclass
 
+from jourdain_jax.analysis.drawings import MODEL, QUIET, Axes, drawing, text
 from jourdain_jax.analysis.integrability import growth_vector, row_integrability
 from jourdain_jax.build.domain import COORDINATE_DOMAIN, SPEED_DOMAIN
 from jourdain_jax.build.structure import structure_of
@@ -14,7 +15,7 @@ from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.scene.arguments import BuiltFor
-from jourdain_jax.scene.printing import Printed
+from jourdain_jax.scene.printing import Printed, preformatted
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
@@ -90,9 +91,24 @@ class Report(Printed):
             "conventions": self.conventions,
         }
         lines = [f"Report on {self.scene}"]
-        for label, text in facts.items():
-            lines += _wrapped(label, text)
+        for label, fact in facts.items():
+            lines += _wrapped(label, fact)
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return preformatted(str(self)) + (self._growth_drawn() if self.degrees_of_freedom and self.growth_vector else "")
+
+    def _growth_drawn(self) -> str:
+        """The growth vector as bars, up to the number of coordinates."""
+        names = ["freedoms", *(f"brackets of {k}" for k in range(2, len(self.growth_vector) + 1)), "coordinates"]
+        sizes = [*self.growth_vector, len(self.coordinates)]
+        axes = Axes(100, 4, 260, 18 * len(sizes), (0, max(sizes)), (len(sizes), 0))
+        bars = [axes.bar(0, size, k + 0.15, k + 0.85, QUIET if k == len(sizes) - 1 else MODEL) for k, size in enumerate(sizes)]
+        words = [text(94, float(axes.down(k + 0.7)), name, "end") for k, name in enumerate(names)]
+        numbers = [text(float(axes.right(size)) + 6, float(axes.down(k + 0.7)), str(size)) for k, size in enumerate(sizes)]
+        return drawing(
+            400, 18 * len(sizes) + 8, [*bars, *words, *numbers], "Directions of motion: those that are free, and those that are reached by manoeuvres"
+        )
 
     def _no_redundant_rows(self) -> str:
         if self.rank < len(self.rows):

@@ -34,11 +34,6 @@ class PoseNumbers(eqx.Module):
     gaps: dict[str, Float[Array, "*states 2"]]  # where the coordinates keep them closed; and the distance of the contact from the mass centre, m
 
 
-def pose_numbers(scene: Scene, t, q) -> PoseNumbers:
-    """What the scene gives for its bodies and planes at (t, q)."""
-    return numbers_of(scene, pose_at(scene, t, q))
-
-
 def numbers_of(scene: Scene, pose: Pose) -> PoseNumbers:
     """What the scene gives for its bodies and planes, from known poses."""
     rigid = {name: body.body for name, body in pose.bodies.items() if isinstance(body.body, RigidBody)}

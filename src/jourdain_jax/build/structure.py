@@ -299,11 +299,6 @@ def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
     )
 
 
-def _may_set_in(scene: Scene, redundant: tuple[str, ...], names: tuple[str, ...], states: tuple) -> tuple[str, ...]:
-    """The redundant rows, unless it is an identity that they follow from the others, and not only so at the probes."""
-    return () if redundant and follow_from_others(scene, *states, rows=[names.index(name) for name in redundant]) else redundant
-
-
 def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
     """Scaled rows with coordinates up to half a turn away from those given, where they are on the geometric rows."""
     generator = np.random.default_rng(4)

@@ -1,13 +1,13 @@
-"""The reduced Appell equations (42) and the recovery of what they leave out (row S9).
+"""The reduced Appell equations (42): which coordinates they keep, and their accelerations (row S9).
 
 Cyclic and ignorable coordinates need not be known for the privileged accelerations: they are held at the reference, and the system
 is integrated in the others, the *kept* coordinates k, alone:
 
     dk/dt = B_k(t, k) y + b_k(t, k),     dy/dt = yddot(t, k, y)
 
-The dropped coordinates d follow by quadrature along the known motion, `d(t) = d_0 + int B_d y + b_d dt`, in groups: a group may need
-those recovered before it (the disc's x and y need its yaw). An ignorable coordinate is kept where a kept rate needs it, or where its
-own rate does (quaternions, the sleigh's heading): then no quadrature gives it.
+The dropped coordinates d would follow by quadrature along the known motion, `d(t) = d_0 + int B_d y + b_d dt`, in groups: a group may need
+those recovered before it (the disc's x and y need its yaw); `simulate` integrates them with the others. An ignorable coordinate is kept where a kept
+rate needs it, or where its own rate does (quaternions, the sleigh's heading): then no quadrature gives it.
 Source: Wang and Pao (2003), eq. (42).
 """
 
@@ -113,65 +113,3 @@ def reduced_accelerations(scene: Scene, t, kept: Float[Array, "kept"], y, inputs
     rates = admissible_rates(scene, t, q, jnp.zeros(len(scene.speed_names)))
     found = bare_accelerations(scene, t, q, rates.C @ y + rates.c, inputs, reduction=Privileged(independent))
     return found.udot[jnp.array(independent, jnp.int32)]
-
-
-def reduced_rates(scene: Scene, t, kept: Float[Array, "kept"], y) -> Float[Array, "kept"]:
-    """Rates of the kept coordinates, `B_k y + b_k`."""
-    return _rates(scene, t, full_coordinates(scene, kept), y)[_indices(scene, reduced_coordinates(scene).kept)]
-
-
-def _rates(scene: Scene, t, q, y) -> Float[Array, "coordinates"]:
-    rates = admissible_rates(scene, t, q, jnp.zeros(len(scene.speed_names)))
-    return rates.B @ y + rates.b
-
-
-def quadrature_times(times: Float[Array, "times"], nodes: int = 5) -> Float[Array, "intervals nodes"]:
-    """Gauss-Legendre nodes of every interval between `times` (s): where `recover_dropped` wants the motion."""
-    points, _, _ = _gauss(nodes)
-    return times[:-1, None] + jnp.diff(times)[:, None] * points
-
-
-def recover_dropped(
-    scene: Scene,
-    times: Float[Array, "times"],
-    kept: Float[Array, "intervals nodes kept"],
-    y: Float[Array, "intervals nodes freedoms"],
-    start: dict[str, float | Array],
-) -> dict[str, Float[Array, "times"]]:
-    """The dropped coordinates at `times` by Gauss-Legendre quadrature of their rates along a known motion.
-
-    `kept` and `y` are the kept coordinates and privileged speeds at `quadrature_times(times, nodes)`; `start` the dropped
-    coordinates at the first time. The error falls with the power 2 x nodes of the interval's length (nodes + 1 for coordinates whose
-    rate needs another dropped one).
-    """
-    reduced = reduced_coordinates(scene)
-    missing = [name for name in reduced.recovered if name not in start]
-    if missing:
-        raise ValueError(f"start values of dropped coordinates missing: {', '.join(f'`{name}`' for name in missing)}; give one for each")
-    _, weights, partial = _gauss(kept.shape[1])
-    at, lengths = quadrature_times(times, kept.shape[1]), jnp.diff(times)
-    inside: dict[str, Array] = {}  # dropped coordinates at the nodes
-    found: dict[str, Array] = {}
-    for group in reduced.dropped:
-        known = tuple(inside)
-
-        def rates(t, kept, y, *values, known=known, group=group):
-            q = full_coordinates(scene, kept, dict(zip(known, values, strict=True)))
-            return _rates(scene, t, q, y)[_indices(scene, group)]
-
-        rate = jax.vmap(jax.vmap(rates))(at, kept, y, *inside.values())
-        for k, name in enumerate(group):
-            steps = lengths * (rate[:, :, k] @ weights)
-            found[name] = start[name] + jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
-            inside[name] = found[name][:-1, None] + lengths[:, None] * (rate[:, :, k] @ partial.T)
-    return found
-
-
-def _gauss(nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nodes and weights on (0, 1), and the weights of the integrals from 0 to each node."""
-    x, w = np.polynomial.legendre.leggauss(nodes)
-    x, w = (x + 1) / 2, w / 2
-    # integrals of the powers 0..nodes-1 up to each node, through the values of those powers at the nodes
-    powers = np.arange(nodes)
-    partial = np.linalg.solve(np.vander(x, nodes, increasing=True).T, (x[:, None] ** (powers + 1) / (powers + 1)).T).T
-    return x, w, partial

@@ -193,7 +193,8 @@ def _on_constraints(scene: Scene, t0, start: State, inputs: Inputs, made_here: b
         return consistent(scene, t0, start.q, start.u, inputs_at(inputs, t0))
     if is_traced(start.residual):
         off = start.residual > _OFF * jnp.finfo(start.q.dtype).eps
-        return jax.lax.cond(eqxi.unvmap_any(off), moved_again, lambda start: start, start)
+        # worked out once more on the way back of a derivative: what would be kept for it, of a branch that is rarely taken, costs as much as the start itself
+        return jax.lax.cond(eqxi.unvmap_any(off), jax.checkpoint(moved_again), lambda start: start, start)
     return moved_again(start) if np.asarray(start.residual) > _OFF * np.finfo(start.q.dtype).eps else start
 
 

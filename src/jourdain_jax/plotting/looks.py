@@ -6,13 +6,16 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.motion.start import State
 from jourdain_jax.motion.trajectories.over_times import map_over_times
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.guesses import guessed
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.grounds import HeightMap, Surface
+from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, visuals_of
 from jourdain_jax.scene.visuals import Visual
 
@@ -76,7 +79,17 @@ def looks_of(trajectory: Trajectory, what: str = "draw") -> Drawn:
     reached = np.flatnonzero(np.asarray(trajectory.valid))
     if reached.size == 0:
         raise ValueError(f"the motion reached none of its saved times; there is nothing to {what}")
-    bodies, velocities, visuals, contacts = _at(map_over_times(_seen, trajectory), reached)
+    return _drawn(np.asarray(trajectory.ts)[reached], reached, _at(map_over_times(_seen, trajectory), reached))
+
+
+def looks_at(scene: Scene, state: State) -> Drawn:
+    """What there is to draw of one state, found without compiling."""
+    seen = eager_if_concrete(_seen)(scene, state.t, state.q, state.u, None)
+    return _drawn(np.asarray(state.t)[None], np.zeros(1, int), jax.tree.map(lambda x: np.asarray(x)[None], seen))
+
+
+def _drawn(ts: np.ndarray, reached: np.ndarray, seen) -> Drawn:
+    bodies, velocities, visuals, contacts = seen
     paths = np.concatenate([np.asarray(body.position) for body in bodies.values()])
     first = {name: _at(body, 0) for name, body in bodies.items()}
     # a particle that moves far is small in the picture: what has no size is measured by the whole motion, if there is nothing else
@@ -95,7 +108,7 @@ def looks_of(trajectory: Trajectory, what: str = "draw") -> Drawn:
     if stated.get(""):
         still = np.zeros((len(reached), 3))
         drawn[""] = DrawnBody("", PLAIN, still, np.broadcast_to(np.eye(3), (len(reached), 3, 3)), still, [_look(v, size) for v in stated[""]])
-    return Drawn(np.asarray(trajectory.ts)[reached], reached, drawn, contacts, size, sized)
+    return Drawn(ts, reached, drawn, contacts, size, sized)
 
 
 def _seen(scene, t, q, u, inputs):

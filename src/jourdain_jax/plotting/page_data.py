@@ -12,6 +12,7 @@ from jourdain_jax.scene.visuals import Visual
 _FRAMES = 1000  # at most, of one motion
 _LONG = 5.0  # the whole motion is so many times as long as its bodies: the view follows them
 _ARROW = 0.4  # length of the longest arrow, of the bodies
+_USUAL = 0.9  # part of the forces that are usual: arrows show up to twice as much in proportion
 
 
 @dataclass
@@ -53,11 +54,11 @@ def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dic
     colours = {name: body.colour for one in drawn for name, body in one.bodies.items() if name}
     follow = first.sized and far.longest > _LONG * near.longest and not _at_rest(first) if options["follow"] is None else options["follow"]
     shown = near.longest if follow else max(near.longest, far.longest / 3)
-    arrows, strongest = _arrows(motions, drawn, shown) if options["forces"] else ([[] for _ in drawn], 0.0)
+    arrows, longest = _arrows(motions, drawn, shown) if options["forces"] else ([[] for _ in drawn], "")
     tile = _round_number(shown / 4)
     grounds = grounds_of(motions[0], first, far.low, far.high)
     squares = f"squares of the ground: {tile:g} m" if any(ground["kind"] == "plane" for ground in grounds) else ""
-    notes = [squares, f"longest arrow: {strongest:.3g} N" if strongest else ""]
+    notes = [squares, longest]
     parts = zip(motions, drawn, arrows, strict=True)
     page = {
         "title": title,
@@ -215,8 +216,12 @@ def _near(drawn: list[Drawn]) -> Box:
     return Box(np.min(lows, axis=0), np.max(highs, axis=0))
 
 
-def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple[list, float]:
-    """Name, point and scaled force of every contact at all times, of all motions; and the largest force, N."""
+def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple[list, str]:
+    """Name, point and scaled force of every contact at all times, of all motions; and what the longest arrow stands for.
+
+    Where a few forces are far larger than the others (a fall, a configuration that is nearly singular), the longest arrow stands for these and for less,
+    so that the others are seen.
+    """
     found = []
     for motion, one in zip(motions, drawn, strict=True):
         forces = motion.contact_forces() if one.contacts else {}
@@ -227,9 +232,19 @@ def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple
             vectors = normal[:, None] * np.asarray(plane.normal) + np.einsum("tk,tkj->tj", tangential, np.asarray(plane.tangents))
             own.append((name, np.asarray(one.contacts[name].point), np.where(np.isfinite(vectors), vectors, 0.0)))
         found.append(own)
-    strongest = max((float(np.linalg.norm(vectors, axis=1).max()) for own in found for _, _, vectors in own), default=0.0)
-    scale = _ARROW * size / strongest if strongest else 0.0
-    return [[(name, points, scale * vectors) for name, points, vectors in own] for own in found], strongest
+    sizes = np.concatenate([np.zeros(1), *(np.linalg.norm(vectors, axis=1) for own in found for _, _, vectors in own)])
+    strongest = float(sizes.max())
+    if strongest == 0.0:
+        return [[(name, points, 0.0 * vectors) for name, points, vectors in own] for own in found], ""
+    usual = 2.0 * float(np.quantile(sizes[1:], _USUAL))
+    longest = strongest if usual == 0.0 or strongest < 2.0 * usual else usual
+
+    def scaled(vectors: np.ndarray) -> np.ndarray:
+        lengths = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), longest)
+        return _ARROW * size * vectors / lengths
+
+    told = f"longest arrow: {longest:.3g} N" + (f" and more, up to {strongest:.3g} N" if longest < strongest else "")
+    return [[(name, points, scaled(vectors)) for name, points, vectors in own] for own in found], told
 
 
 def _round_number(length: float) -> float:

@@ -67,7 +67,7 @@ def draw_still(
         strength = 1.0 if len(chosen) == 1 else 0.35 + 0.65 * order / (len(chosen) - 1)
         for body in drawn.bodies.values():
             for look, part in parts_in_space(body, k):
-                painted.append(_lit(part, look.visual.colour or body.colour, strength, camera, look.visual.opacity))
+                painted.append(lit(part, look.visual.colour or body.colour, strength, camera, look.visual.opacity))
     figure = plt.figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
     if view in ("above", "side"):
         axes = figure.add_axes((0.115, 0.125, 0.865, 0.765))
@@ -91,7 +91,7 @@ def _times(drawn: Drawn, at: int | Sequence) -> np.ndarray:
     return np.unique([int(np.argmin(np.abs(drawn.ts - t))) for t in wanted])
 
 
-def _lit(part: Part, colour: str, strength: float, camera: Camera, opacity: float) -> _Painted:
+def lit(part: Part, colour: str, strength: float, camera: Camera, opacity: float) -> _Painted:
     """The faces of a part that look at the eye, in the light."""
     seen = [face for face in part if face.normal() @ camera.towards > 1e-9]
     polygons = [face.corners for face in seen]

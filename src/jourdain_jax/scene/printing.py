@@ -1,6 +1,7 @@
 """How results show themselves: their text in a console, the same in a notebook, and shapes while they are being traced."""
 
 import html
+from collections.abc import Callable
 
 import jax
 
@@ -24,8 +25,16 @@ class Printed:
         raise NotImplementedError(f"`{type(self).__name__}` does not say how it is printed; define `_text(self)`")
 
 
+_pictures: list[Callable] = []  # of a scene: functions of layers above
+
+
+def show_scenes_with(picture: Callable) -> None:
+    """Have notebooks show what `picture(scene)`, HTML, draws of a scene, too."""
+    _pictures.append(picture)
+
+
 def scene_html(scene) -> str:
-    """A scene for a notebook: parameters with values and units, names of coordinates, speeds and inputs."""
+    """A scene for a notebook: parameters with values and units, names of coordinates, speeds and inputs; a picture at its example start."""
     left = "style='text-align:left'"
     cell = lambda text: f"<td {left}>{html.escape(text)}</td>"  # noqa: E731
     about = (type(scene).__doc__ or "").strip().split("\n")[0]
@@ -37,7 +46,7 @@ def scene_html(scene) -> str:
     listed = (("coordinates", scene.coordinate_names), ("speeds", scene.speed_names), ("inputs", scene.inputs))
     names = "".join(f"<div>{what}: {html.escape(', '.join(given.entries))}</div>" for what, given in listed if given.entries)
     table = f"<table><thead><tr>{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table>" if rows else ""
-    return f"<div><b>{html.escape(type(scene).__name__)}</b> {html.escape(about)}{table}{names}</div>"
+    return f"<div><b>{html.escape(type(scene).__name__)}</b> {html.escape(about)}{table}{names}</div>" + "".join(picture(scene) for picture in _pictures)
 
 
 def _value(value) -> str:

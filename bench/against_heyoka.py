@@ -1,0 +1,86 @@
+"""Motions by machine code of our own against heyoka on the same equations, at equal final error: part `heyoka` of `native.py`.
+
+The error of a method is the median over lanes of the largest error of a number of the final state, absolute in SI units, against heyoka in extended
+precision. The tolerance that gives an error of 1e-8 or 1e-12 is read off the curve of error over tolerance (straight between points, in logarithms), and the
+motions are timed at it, the methods in turn. Alone means one motion after another inside one compiled program, which knows nothing of the other motions.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from baselines import heyoka_disc, heyoka_lowered
+from baselines.timing import least_processor_time
+
+import jourdain_jax as jj
+
+ERRORS = (1e-8, 1e-12)
+TOLERANCES = tuple(10.0**-k for k in range(7, 16))
+JUDGED = 64  # lanes whose final states are compared with the reference
+REPEATED = 64  # motions alone in one call
+REQUIRED = {"tilting-disc": 1.2, "chaplygin-sleigh": 1.2, "rattleback": 0.5, "whipple-bicycle": 0.5}
+REQUIRED_ALONE = 1.5
+
+
+def ours(scene: jj.Scene, end: float, options: dict, alone: bool) -> Callable:
+    """A compiled function of a tolerance and starts that returns final states of the program."""
+    integrated = jnp.array(jj.lower(scene).independent)
+
+    @jax.jit
+    def run(tolerance, starts):
+        more = {"ts": jnp.array([end]), "rtol": tolerance, "atol": tolerance, "backend": "native", **options}
+        if alone:
+            found = jax.lax.map(lambda start: jj.simulate(scene, start, **more), starts)
+        else:
+            found = jj.rollout(scene, starts, **more).lanes
+        return jnp.concatenate([found.q_end, found.u_end[:, integrated]], axis=1)
+
+    return lambda tolerance, starts: jax.block_until_ready(run(tolerance, starts))
+
+
+def tolerance_at(wanted: float, run: Callable, starts, expected: np.ndarray) -> float:
+    """The tolerance whose final states have an error, straight between points in logarithms."""
+    before = None
+    for tolerance in TOLERANCES:
+        error = float(np.median(np.max(np.abs(np.asarray(run(tolerance, starts)) - expected), axis=1)))
+        if error <= wanted and before is None:
+            return tolerance
+        if error <= wanted:
+            share = np.log(before[1] / wanted) / np.log(before[1] / error)
+            return float(before[0] * (tolerance / before[0]) ** share)
+        before = tolerance, error
+    raise ValueError(f"no tolerance down to {TOLERANCES[-1]:.0e} gives a final error of {wanted:.0e}")
+
+
+def compared(name: str, starts: jj.State, end: float, options: dict, quick: bool) -> Iterator[tuple[str, float, float | None]]:
+    """(figure, value, required) of one model."""
+    scene = jj.models.MODELS[name]()
+    system, plain = heyoka_lowered.equations(scene), heyoka_lowered.states(scene, starts.q, starts.u)
+    expected = heyoka_lowered.extended(system, end, plain[:JUDGED])
+
+    systems = {"": system}
+    if name == "tilting-disc":
+        systems["by hand, "] = heyoka_disc.system()  # as an expert writes them, with fewer operations
+    for wanted in ERRORS:
+        at = {}
+        for how, equations in systems.items():
+            run = partial(_by_heyoka, equations, end)
+            at[how] = tolerance_at(wanted, run, plain[:JUDGED], expected)
+        for alone, count, widths in ((False, len(plain), (4, 8)), (True, REPEATED, (1,))):
+            who, run = f"{'alone' if alone else f'batch of {count}'}, error {wanted:.0e}", ours(scene, end, options, alone)
+            judged, first = (jax.tree.map(lambda x, count=count: x[:count], starts) for count in (JUDGED, count))
+            runs = {"ours": partial(run, tolerance_at(wanted, run, judged, expected), first)}
+            for how, compact, width in ((how, compact, width) for how in systems for compact in (False, True) for width in widths):
+                way = f"heyoka, {how}{width} side by side, {'compact' if compact else 'normal'} mode"
+                runs[way] = partial(heyoka_lowered.final_states(systems[how], end, at[how], width, compact), plain[:count])
+            seconds = least_processor_time(runs, 3 if quick else 7)
+            for way, value in seconds.items():
+                yield f"{who}, {way}, us per trajectory", 1e6 * value / count, None
+            best = min(value for way, value in seconds.items() if way != "ours")
+            yield f"{who}, ours / heyoka at its best", seconds["ours"] / best, REQUIRED_ALONE if alone else REQUIRED[name]
+
+
+def _by_heyoka(system: list, end: float, tolerance: float, starts: np.ndarray) -> np.ndarray:
+    return heyoka_lowered.final_states(system, end, tolerance, 4, compact=True)(starts)

@@ -1,0 +1,224 @@
+"""The posterior density of the unknowns of a fit, as a function of any real numbers, for samplers.
+
+    log p(z) = log L(theta) + sum log prior(theta) + sum log |d theta / dx| + log |det F|,      theta = constrain(x),   x = centre + F z
+
+L: `log_likelihood`; x: one real number for each unknown (`transforms`); centre, F: zero and the identity, or from a fit (`whitened`).
+Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 1.8 and 12.4.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.fit_result import Fit
+from jourdain_jax.analysis.likelihood import as_runs, mapped, of_run
+from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.predictions import Run, equal_runs
+from jourdain_jax.analysis.ranges import Range, positive
+from jourdain_jax.analysis.starts import check_starts
+from jourdain_jax.analysis.transforms import Transforms
+from jourdain_jax.analysis.unknowns import Layout, unknowns_of
+from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.motion.simulate import simulate
+from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.names import as_names, nearest
+from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import shown_from_users_lines
+
+
+class LogDensity(eqx.Module):
+    """`log p(z)` of a vector z of real numbers, up to a constant: call it, under `jit`, `grad` and `vmap` as you like.
+
+    `labels` names the unknowns, as those of a `Fit`; a sigma that is estimated is `"lean.sigma"`.
+    """
+
+    scene: Scene
+    groups: tuple[Run, ...]  # runs of equal structure, stacked
+    simulation: dict
+    fixed: Float[np.ndarray, "places"]  # the first guess, and what is known, of all places of a layout
+    transforms: Transforms
+    guess: Float[np.ndarray, "unknowns"]  # in their units
+    prior_mean: Float[np.ndarray, "unknowns"]
+    prior_sigma: Float[np.ndarray, "unknowns"]  # infinite where nothing is known beforehand
+    centre: Float[np.ndarray, "unknowns"]
+    factor: Float[np.ndarray, "unknowns unknowns"]  # lower triangular
+    labels: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+    layout: Layout = eqx.field(static=True)
+    runs: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # numbers of those of each group
+    places: tuple[int, ...] = eqx.field(static=True)  # of those unknowns that are no sigmas
+    sigmas: tuple[str, ...] = eqx.field(static=True)  # channels whose sigma is unknown, last among the unknowns
+
+    def __call__(self, z: Float[Array, "unknowns"]) -> Float[Array, ""]:
+        """The logarithm of the density; -inf where the motion fails."""
+        x = self._spread(self._checked(z))
+        theta = self.transforms.constrain(x)
+        known = jnp.where(np.isfinite(self.prior_sigma), (theta - self.prior_mean) / self.prior_sigma, 0.0)
+        logs = self.transforms.log_slopes(x)
+        logs = logs - 0.5 * known**2 - jnp.where(np.isfinite(self.prior_sigma), jnp.log(self.prior_sigma * jnp.sqrt(2 * jnp.pi)), 0.0)
+        # of a sigma: flat in its logarithm, which is x
+        count = len(self.places)
+        logs = jnp.sum(logs[:count]) + jnp.sum(jnp.log(jnp.diagonal(self.factor)))
+        shared, local = self._split(theta)
+        scene, sigma = self.layout.scene(self.scene, shared), dict(zip(self.sigmas, theta[count:], strict=True))
+
+        def one(run: Run, local: Float[Array, "local"]) -> Float[Array, ""]:
+            here = run.at(self.layout, shared, local)
+            weights = {name: weight / sigma[name] if name in sigma else weight for name, weight in here.weights.items()}
+            return of_run(scene, here._replace(weights=weights), simulation=self.simulation)
+
+        with reference_parameters(self.scene):
+            return logs + sum(jnp.sum(mapped(one, group, local[np.array(runs)])) for group, runs in zip(self.groups, self.runs, strict=True))
+
+    @property
+    def initial(self) -> Float[Array, "unknowns"]:
+        """z at the first guess of all unknowns."""
+        return self.unconstrain({})
+
+    def constrain(self, z: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+        """The unknowns at z, in their units and in the order of `labels`; of one vector or many."""
+        return self.transforms.constrain(self._spread(self._checked(z)))
+
+    def named(self, z: Float[Array, "*batch unknowns"]) -> dict[str, Float[Array, "*batch"]]:
+        """The unknowns at z by name, in their units; of one vector or many."""
+        theta = self.constrain(z)
+        return {label: theta[..., i] for i, label in enumerate(self.labels)}
+
+    def unconstrain(self, values: Mapping) -> Float[Array, "unknowns"]:
+        """z at these values of unknowns by name, in their units; those that are not given are at their first guess.
+
+        Raises ValueError for names that are not unknown, and for values at or beyond a bound.
+        """
+        for name in values:
+            if name not in self.labels:
+                raise ValueError(f"`{name}` is not among the unknowns; {nearest(name, self.labels)}")
+        theta = jnp.stack([jnp.asarray(values.get(label, self.guess[i]), jnp.result_type(float)) for i, label in enumerate(self.labels)])
+        x = self.transforms.unconstrain(theta)
+        if not is_traced(x) and (off := np.flatnonzero(~np.isfinite(np.asarray(x)))).size:
+            raise ValueError(f"`{self.labels[off[0]]}` is {float(theta[off[0]]):g}, which is at or beyond a bound of it; give a value inside")
+        return jax.scipy.linalg.solve_triangular(self.factor, x - self.centre, lower=True)
+
+    def scene_at(self, z: Float[Array, "unknowns"]) -> Scene:
+        """The scene with the parameters at z."""
+        return self.layout.scene(self.scene, self._split(self.constrain(z))[0])
+
+    def whitened(self, fit: Fit) -> "LogDensity":
+        """The density in other unknowns z, which a fit of the same data takes to be independent and of variance one: samplers then need few steps.
+
+        It is the density of the same unknowns: `constrain` and `named` lead to the same values. Where the fit is at its minimum, z is zero.
+        ValueError for a fit of other unknowns, one of a batch, and unknowns that have no standard error, hidden in the data or at a bound.
+        """
+        if fit.values.ndim > 1 or fit.labels != self.labels[: len(self.places)] or not set(self.sigmas) <= set(fit.sigma):
+            raise ValueError(f"the fit is of {', '.join(fit.labels)}, the density of {', '.join(self.labels)}; give the fit of the same unknowns and data")
+        for label, error in zip(fit.labels, fit.standard_errors, strict=True):
+            if not np.isfinite(error):
+                raise ValueError(
+                    f"`{label}` has no standard error in the fit, so that nothing is known of its spread; give it a prior, or leave it out of `free`"
+                )
+        theta = np.concatenate([fit.values, [float(fit.sigma[name]) for name in self.sigmas]])
+        x = self.transforms.unconstrain(jnp.asarray(theta))
+        slopes = np.exp(-np.asarray(self.transforms.log_slopes(x)))
+        covariance = np.zeros((len(theta), len(theta)))
+        covariance[: fit.values.size, : fit.values.size] = fit.covariance
+        for i, name in enumerate(self.sigmas, fit.values.size):
+            samples = sum(np.count_nonzero(np.asarray(group.weights[name])) for group in self.groups if name in group.weights)
+            covariance[i, i] = theta[i] ** 2 / (2 * samples)
+        factor = np.linalg.cholesky(slopes[:, None] * covariance * slopes)
+        return eqx.tree_at(lambda d: (d.centre, d.factor), self, (np.asarray(x), factor))
+
+    def _checked(self, z) -> Array:
+        z = jnp.asarray(z, jnp.result_type(float))
+        if z.shape[-1:] != (len(self.labels),):
+            raise ValueError(f"the vector has shape {z.shape}, expected ({len(self.labels)},): one number for each of {', '.join(self.labels)}")
+        return z
+
+    def _spread(self, z: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+        return self.centre + z @ self.factor.T
+
+    def _split(self, theta: Float[Array, "unknowns"]) -> tuple[Float[Array, "shared"], Float[Array, "runs local"]]:
+        shared, local = self.layout.sizes
+        every = jnp.asarray(self.fixed).at[np.array(self.places, int)].set(theta[: len(self.places)])
+        return every[:shared], every[shared:].reshape(-1, local) if local else jnp.zeros((sum(map(len, self.runs)), 0))
+
+
+@shown_from_users_lines
+def log_density(
+    scene: Scene | BuiltFor,
+    data: Measurements | Sequence[Measurements],
+    free: "Mapping[str, Range | Estimate | None] | Iterable[str]" = (),
+    **simulation,
+) -> LogDensity:
+    """The posterior density of the unknowns of `fit`, as a function of a vector of any real numbers, for samplers such as those of BlackJAX and NumPyro.
+
+    **Arguments**
+    - `scene`, `data`, `free`, `simulation`: as of `fit`: parameters that are free, start values that are unknown, numbers of sensors and actuators that are
+      estimated, and sigmas that are None, which are named `"lean.sigma"`.
+    - Priors: `Normal` where an `Estimate` has one. Otherwise the prior is flat in the unknown itself, between its bounds; flat in the logarithm of a sigma.
+      A flat prior without bounds has no integral: where the data do not tell an unknown, neither has the posterior, and a sampler runs away.
+
+    **Returns** a `LogDensity`: call it with a vector; `initial`, `constrain`, `named` and `unconstrain` lead to and fro. The logarithms of the transforms'
+    derivatives are in it. It is a pure function: it works under `jit`, `vmap` and `grad` (reverse mode; forward mode with `adjoint=diffrax.ForwardMode()`).
+
+    **Raises** ValueError as `fit`, and for a correlation time that is None.
+
+    **Example**
+
+        density = jj.log_density(scene, data, free=("radius",)).whitened(jj.fit(scene, data, free=("radius",)))
+        sampler = blackjax.nuts(density, step_size=0.8, inverse_mass_matrix=jnp.ones(density.initial.size))
+        draws = density.named(positions)["radius"]                               # m, of the positions (draws, unknowns) that were sampled
+    """
+    scene = as_scene(scene)
+    runs = as_runs(scene, data)
+    if unknown := sorted({name for run in runs for name in run.unknown_correlation}):
+        raise ValueError(
+            f"the correlation time of channel `{unknown[0]}` is None, but a density needs to know it; give a number in s, such as the one that `fit` finds"
+        )
+    sigmas = tuple(sorted({name for run in runs for name in run.unknown_sigma}))
+    for name in sigmas:
+        if any(name in run.values and name not in run.unknown_sigma for run in runs):
+            raise ValueError(f"sigma of channel `{name}` is None in one run and given in another; give it in all runs, or in none")
+    unknowns = unknowns_of(scene, runs, free if isinstance(free, Mapping) else tuple(as_names(free)))
+    with reference_parameters(scene):
+        if not is_traced((scene, [(run.start, run.t0, run.inputs) for run in runs])):
+            check_starts(scene, runs, unknowns)
+        grouped = equal_runs(runs)
+        guesses = [_rms(scene, [group for _, group in grouped if name in group.weights], name, simulation) for name in sigmas]
+    places, priors = unknowns.estimated, np.concatenate
+    none = np.full(len(sigmas), np.inf)
+    size = len(places) + len(sigmas)
+    return LogDensity(
+        scene=scene,
+        groups=tuple(group for _, group in grouped),
+        simulation=simulation,
+        fixed=unknowns.guess,
+        transforms=Transforms([*(unknowns.ranges[place] for place in places), *(positive() for _ in sigmas)]),
+        guess=np.concatenate([unknowns.guess[places], guesses]),
+        prior_mean=np.concatenate([np.nan_to_num(unknowns.prior_mean[places]), np.zeros(len(sigmas))]),
+        prior_sigma=priors([np.where(np.isfinite(unknowns.prior_mean[places]), unknowns.prior_sigma[places], np.inf), none]),
+        centre=np.zeros(size),
+        factor=np.eye(size),
+        labels=(*unknowns.labels, *(f"{name}.sigma" for name in sigmas)),
+        units=(*unknowns.units, *("" for _ in sigmas)),
+        layout=unknowns.layout,
+        runs=tuple(numbers for numbers, _ in grouped),
+        places=tuple(places.tolist()),
+        sigmas=sigmas,
+    )
+
+
+def _rms(scene: Scene, groups: Sequence[Run], name: str, simulation: dict) -> float:
+    """Root mean square of the residuals of a channel at the first guess, whose weights are one: a first guess of its sigma."""
+    of = partial(Run.residuals, scene=scene, simulate=simulate, simulation=simulation)
+    residuals = [mapped(lambda run: of(run)[name], group) for group in groups]
+    samples = sum(np.count_nonzero(np.asarray(group.weights[name])) for group in groups)
+    found = float(np.sqrt(sum(float(jnp.sum(r**2)) for r in residuals) / samples))
+    if not np.isfinite(found):
+        raise ValueError(f"the motion fails at the first guess, so that the sigma of channel `{name}` has none; look at it with `simulate`")
+    return max(found, 1e-12)

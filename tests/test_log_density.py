@@ -1,0 +1,138 @@
+"""The posterior density of unknowns: against closed forms, with its transforms, and its gradients."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.analysis.ranges import bounds, positive, unbounded
+from jourdain_jax.analysis.transforms import Transforms
+
+
+class Oscillator(jj.Scene):
+    """`m x'' = - c x' - k x`."""
+
+    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
+    damping: jnp.ndarray = jj.parameter(0.3, non_negative=True)
+    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x),)
+
+
+TS = np.linspace(0.0, 4.0, 21)
+FREE = {"damping": jj.bounds(0.0, 2.0), "stiffness": jj.Estimate(prior=jj.Normal(5.2, 0.4))}
+
+
+def closed(start, damping, stiffness, mass=2.0):
+    """x(t) of the underdamped oscillator from x0 at rest."""
+    d = damping / (2 * mass)
+    w = jnp.sqrt(stiffness / mass - d**2)
+    return start * jnp.exp(-d * TS) * (jnp.cos(w * TS) + d / w * jnp.sin(w * TS))
+
+
+def runs(sigma=0.02, starts=(0.3, -0.2)):
+    noise = np.random.default_rng(2)
+    return [
+        jj.Measurements(TS, {"x": np.asarray(closed(x, 0.3, 5.0)) + 0.02 * noise.normal(size=len(TS))}, sigma, start={"x": x + 0.01}, unknown_start=("x",))
+        for x in starts
+    ]
+
+
+def by_hand(theta, data, sigma):
+    """`log p` in the unknowns themselves."""
+    damping, stiffness, *starts = theta
+    r = jnp.stack([(closed(x, damping, stiffness) - run.values["x"]) / sigma for x, run in zip(starts, data, strict=True)])
+    likelihood = -0.5 * jnp.sum(r**2) - r.size * jnp.log(sigma * jnp.sqrt(2 * jnp.pi))
+    return likelihood - 0.5 * ((stiffness - 5.2) / 0.4) ** 2 - jnp.log(0.4 * jnp.sqrt(2 * jnp.pi))
+
+
+def test_density_is_likelihood_times_prior_times_derivative_of_the_transforms():
+    data = runs()
+    density = jj.log_density(Oscillator(), data, FREE)
+    assert density.labels == ("damping", "stiffness", "run 0: x", "run 1: x")
+
+    def constrain(z):
+        return jnp.stack([2.0 * jax.nn.sigmoid(z[0]), jnp.exp(z[1]), z[2], z[3]])
+
+    def expected(z):
+        slopes = jax.jacfwd(constrain)(z)
+        return by_hand(constrain(z), data, 0.02) + jnp.linalg.slogdet(slopes)[1]
+
+    z = density.initial + jnp.array([0.1, 0.03, -0.005, 0.002])
+    np.testing.assert_allclose(density.constrain(z), constrain(z), rtol=1e-14)
+    value, slope = jax.jit(jax.value_and_grad(density))(z)
+    np.testing.assert_allclose(value, expected(z), rtol=1e-8)
+    np.testing.assert_allclose(slope, jax.grad(expected)(z), rtol=2e-6)
+    many = z + 1e-3 * jnp.arange(3.0)[:, None]
+    values, slopes = jax.jit(jax.vmap(jax.value_and_grad(density)))(many)
+    np.testing.assert_allclose(values, [expected(one) for one in many], rtol=1e-8)
+    np.testing.assert_allclose(slopes, [jax.grad(expected)(one) for one in many], rtol=2e-6)
+
+
+def test_whitened_density_is_that_of_the_same_unknowns_and_nearly_round():
+    data = runs(sigma=None)
+    fit = jj.fit(Oscillator(), data, FREE)
+    plain = jj.log_density(Oscillator(), data, FREE)
+    assert plain.labels[-1] == "x.sigma"
+    white = plain.whitened(fit)
+    z = jnp.array([0.5, -0.3, 0.2, 0.8, -0.4])
+    x = plain.unconstrain(white.named(z))
+    np.testing.assert_allclose(white.unconstrain(white.named(z)), z, atol=1e-10)
+    # log p(z) = log p(x) + log |dx / dz|
+    np.testing.assert_allclose(white(z), plain(x) + np.linalg.slogdet(jax.jacfwd(lambda z: plain.unconstrain(white.named(z)))(z))[1], rtol=1e-9)
+    middle = white.named(jnp.zeros(5))
+    np.testing.assert_allclose([middle[label] for label in fit.labels], fit.values, rtol=1e-12)
+    np.testing.assert_allclose(middle["x.sigma"], fit.sigma["x"], rtol=1e-12)
+    steps = jnp.concatenate([jnp.zeros((1, 5)), 0.1 * jnp.eye(5), -0.1 * jnp.eye(5)])
+    here, *others = np.asarray(jax.vmap(white)(steps))
+    curvatures = (np.array(others[:5]) + np.array(others[5:]) - 2 * here) / 0.01
+    # the fit allows for the 4 of 42 degrees of freedom that go into the unknowns
+    np.testing.assert_allclose(curvatures, [*4 * [-42 / 38], -1.0], atol=0.05)
+
+
+def test_transforms_lead_back_and_have_the_derivative_they_say():
+    transforms = Transforms([unbounded(), positive(), bounds(-1.0, 3.0)])
+    x = jnp.array([[0.3, -2.0, 1.5], [800.0, 3.0, -20.0]])
+    theta = transforms.constrain(x)
+    np.testing.assert_allclose(transforms.unconstrain(theta), x, rtol=1e-7)
+    logs = jnp.log(jnp.diagonal(jax.jacfwd(transforms.constrain)(x[0])))
+    np.testing.assert_allclose(transforms.log_slopes(x[0]), logs, rtol=1e-12)
+    assert np.isfinite(jax.jacrev(transforms.constrain)(x[1])).all()
+
+
+def test_failing_motion_has_no_density():
+    density = jj.log_density(Oscillator(), runs(), FREE, max_steps=3)
+    assert density(density.initial) == -jnp.inf
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda d, f: d.unconstrain({"dampin": 0.1}), "`dampin` is not among the unknowns; did you mean `damping`"),
+        (lambda d, f: d.unconstrain({"damping": 2.0}), "`damping` is 2, which is at or beyond a bound"),
+        (lambda d, f: d(jnp.zeros(3)), r"the vector has shape \(3,\), expected \(4,\)"),
+        (lambda d, f: jj.log_density(Oscillator(), runs(), {"damping": None}).whitened(f), "give the fit of the same unknowns"),
+        (
+            lambda d, f: jj.log_density(Oscillator(), [jj.Measurements(TS, {"x": TS}, 0.1, start={"x": 0.1}, correlation_time=None)], ("mass",)),
+            "correlation time",
+        ),
+        (lambda d, f: jj.log_density(Oscillator(), [runs()[0], runs(None)[1]], ("mass",)), "None in one run and given in another"),
+        (lambda d, f: jj.log_density(Oscillator(), runs(None), ("damping",), max_steps=3), "the motion fails at the first guess"),
+    ],
+)
+def test_wrong_use_is_answered_by_name(make, message):
+    density = jj.log_density(Oscillator(), runs(), FREE)
+    with pytest.raises(ValueError, match=message):
+        make(density, jj.fit(Oscillator(), runs(), FREE))
+
+
+def test_unknown_without_a_standard_error_cannot_be_whitened():
+    data, free = runs(), ("mass", "damping", "stiffness")
+    with pytest.raises(ValueError, match="`mass` has no standard error in the fit"):
+        jj.log_density(Oscillator(), data, free).whitened(jj.fit(Oscillator(), data, free))
