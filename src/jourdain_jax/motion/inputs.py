@@ -93,7 +93,7 @@ class Inputs(eqx.Module):
 def inputs_at(inputs: Inputs, t) -> Float[Array | np.ndarray, "inputs"]:
     """The vector of inputs at time t; on NumPy or compiled where all is known, instead of one operation after another."""
     if not inputs.channels or (inputs.constant and not is_traced(inputs)):
-        return np.array([np.asarray(channel.value) for channel in inputs.channels], real_type())
+        return np.array([np.asarray(value) for value in jax.tree.leaves(inputs)], real_type())
     return inputs(t) if is_traced(inputs, t) else _compiled_inputs(inputs.programs)(inputs, np.asarray(t, real_type()))
 
 
