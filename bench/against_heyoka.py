@@ -1,4 +1,4 @@
-"""Motions by machine code of our own against heyoka on the same equations, at equal final error: part `heyoka` of `native.py`.
+"""Motions by machine code of our own, Dopri8 and Taylor series, against heyoka on the same equations at equal final error: part `heyoka` of `native.py`.
 
 The error of a method is the median over lanes of the largest error of a number of the final state, absolute in SI units, against heyoka in extended
 precision. The tolerance that gives an error of 1e-8 or 1e-12 is read off the curve of error over tolerance (straight between points, in logarithms), and the
@@ -8,6 +8,7 @@ motions are timed at it, the methods in turn. Alone means one motion after anoth
 from collections.abc import Callable, Iterator
 from functools import partial
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,9 @@ from baselines import heyoka_disc, heyoka_lowered
 from baselines.timing import least_processor_time
 
 import jourdain_jax as jj
+from jourdain_jax.motion.integrators.taylor import order_for
+from jourdain_jax.motion.own_steps import reason_against_series
+from jourdain_jax.motion.simulate import set_up
 
 ERRORS = (1e-8, 1e-12)
 TOLERANCES = tuple(10.0**-k for k in range(7, 16))
@@ -69,17 +73,30 @@ def compared(name: str, starts: jj.State, end: float, options: dict, quick: bool
             run = partial(_by_heyoka, equations, end)
             at[how] = tolerance_at(wanted, run, plain[:JUDGED], expected)
         for alone, count, widths in ((False, len(plain), (4, 8)), (True, REPEATED, (1,))):
-            who, run = f"{'alone' if alone else f'batch of {count}'}, error {wanted:.0e}", ours(scene, end, options, alone)
+            who = f"{'alone' if alone else f'batch of {count}'}, error {wanted:.0e}"
             judged, first = (jax.tree.map(lambda x, count=count: x[:count], starts) for count in (JUDGED, count))
-            runs = {"ours": partial(run, tolerance_at(wanted, run, judged, expected), first)}
+            runs = {}
+            for solver in _our_solvers(scene, wanted, options):
+                run = ours(scene, end, {"solver": solver, **options}, alone)
+                runs[f"ours, {type(solver).__name__}"] = partial(run, tolerance_at(wanted, run, judged, expected), first)
+            own = list(runs)
             for how, compact, width in ((how, compact, width) for how in systems for compact in (False, True) for width in widths):
                 way = f"heyoka, {how}{width} side by side, {'compact' if compact else 'normal'} mode"
                 runs[way] = partial(heyoka_lowered.final_states(systems[how], end, at[how], width, compact), plain[:count])
             seconds = least_processor_time(runs, 3 if quick else 7)
             for way, value in seconds.items():
                 yield f"{who}, {way}, us per trajectory", 1e6 * value / count, None
-            best = min(value for way, value in seconds.items() if way != "ours")
-            yield f"{who}, ours / heyoka at its best", seconds["ours"] / best, REQUIRED_ALONE if alone else REQUIRED[name]
+            best, theirs = (min(value for way, value in seconds.items() if (way in own) is is_ours) for is_ours in (True, False))
+            yield f"{who}, ours at its best / heyoka at its best", best / theirs, REQUIRED_ALONE if alone else REQUIRED[name]
+            if len(own) > 1:
+                yield f"{who}, Taylor / Dopri8", seconds[own[1]] / seconds[own[0]], None
+
+
+def _our_solvers(scene: jj.Scene, wanted: float, options: dict) -> list:
+    """Dopri8, and Taylor series of the order for the tolerance that gives an error, some tenth of it, where they serve."""
+    order = order_for(0.1 * wanted)
+    serves = not reason_against_series(set_up(scene, **options), order)
+    return [diffrax.Dopri8(), *([jj.Taylor(order)] if serves else [])]
 
 
 def _by_heyoka(system: list, end: float, tolerance: float, starts: np.ndarray) -> np.ndarray:

@@ -113,7 +113,7 @@ def heyoka(quick: bool) -> Iterator[Figure]:
         return
     for name, span, more in [entry for entry in MOTIONS if entry[2]][: 1 if quick else None]:
         starts = spread_starts(jj.models.MODELS[name](), 128 if quick else LANES)
-        for what, value, required in against_heyoka.compared(name, starts, span, {"solver": diffrax.Dopri8(), **more}, quick):
+        for what, value, required in against_heyoka.compared(name, starts, span, more, quick):
             yield figure(what, name, value, required)
 
 

@@ -200,15 +200,15 @@ def test_motions_that_end_early_say_so_as_by_xla(options):
     assert (int(ours.accepted), int(ours.rejected)) == (int(theirs.accepted), int(theirs.rejected))
 
 
-@pytest.fixture(scope="module")
-def disc_kernel():
+@pytest.fixture(scope="module", params=[None, 8], ids=["Tsit5", "Taylor"])
+def disc_kernel(request):
     """A kernel of the disc, and rows of a hundred lanes: some fall, one begins beyond the event, one is NaN, one infinite."""
     scene = jj.models.TiltingDisc()
     setup = set_up(scene, t1=1.0)
     form = Form(setup.field.lowered, False, False, True, True, False)
     lean = np.linspace(0.0, 1.5, 100)
     lean[[3, 40, 77]] = 1.7, np.nan, np.inf
-    kernel = kernels.kernel(form, diffrax.Tsit5)
+    kernel = kernels.kernel(form, diffrax.Tsit5, request.param)
     layout, fixed = kernel.layout, setup.field.lowered.fixed_values(scene)
     starts = np.zeros((100, layout.given))
     starts[:, 3], starts[:, 5:8] = lean, np.stack([0.5 + lean, 0.2 + np.zeros(100), -3 + 2 * lean], axis=1)
@@ -216,11 +216,11 @@ def disc_kernel():
     for name, value in (progress | {"shortest": 1e-14, "max_steps": 1000}).items():
         starts[:, layout.rows[name].start] = value
     starts[:, layout.rows["known"].start : layout.rows["known"].stop] = fixed
-    return kernel, jnp.asarray(starts), jnp.broadcast_to(jnp.linspace(0.0, 1.0, 5), (100, 5))
+    return kernel, request.param, jnp.asarray(starts), jnp.broadcast_to(jnp.linspace(0.0, 1.0, 5), (100, 5))
 
 
 def test_a_lane_does_not_depend_on_its_company(disc_kernel):
-    kernel, starts, goals = disc_kernel
+    kernel, _, starts, goals = disc_kernel
     many = jax.jit(jax.vmap(kernel.run))
     states, ends = (np.asarray(x) for x in many(starts, goals))
     assert set(ends[:, kernel.layout.rows["code"].start]) >= {-1.0, 1.0}
@@ -235,18 +235,18 @@ def test_a_lane_does_not_depend_on_its_company(disc_kernel):
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_a_lane_does_not_depend_on_the_number_of_threads(disc_kernel, threads, monkeypatch):
-    usual, starts, goals = disc_kernel
+    usual, order, starts, goals = disc_kernel
     starts, goals = jnp.tile(starts, (13, 1)), jnp.tile(goals, (13, 1))
     kernels.kernel.cache_clear()
     monkeypatch.setattr(host, "threads", lambda: threads)
-    other = kernels.kernel(usual.form, diffrax.Tsit5)
+    other = kernels.kernel(usual.form, diffrax.Tsit5, order)
     assert other is not usual
     for found, expected in zip(jax.vmap(other.run)(starts, goals), jax.vmap(usual.run)(starts, goals), strict=True):
         np.testing.assert_array_equal(found, expected)
 
 
 def test_no_lanes_and_axes_of_lanes(disc_kernel):
-    kernel, starts, goals = disc_kernel
+    kernel, _, starts, goals = disc_kernel
     states, ends = jax.vmap(kernel.run)(starts[:0], goals[:0])
     assert states.shape == (0, 5, kernel.layout.y)
     assert len(ends) == 0

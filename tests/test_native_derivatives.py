@@ -60,11 +60,12 @@ def _exact(x, events=False):
     return jnp.stack([at(0.3)[0], at(0.9)[1], *at(end), end])
 
 
+@pytest.mark.parametrize("solver", [None, jj.Taylor()], ids=["Dopri8", "Taylor"])
 @pytest.mark.parametrize("events", [False, True])
 @pytest.mark.parametrize("mode", ["jacfwd", "jacrev"])
-def test_sensitivities_of_an_oscillator_are_those_of_its_closed_form(mode, events):
+def test_sensitivities_of_an_oscillator_are_those_of_its_closed_form(mode, events, solver):
     adjoint = FORWARD if mode == "jacfwd" else None
-    found = jax.jit(getattr(jax, mode)(lambda x: _ends(x, adjoint=adjoint, events=events)))(X)
+    found = jax.jit(getattr(jax, mode)(lambda x: _ends(x, adjoint=adjoint, events=events, solver=solver)))(X)
     np.testing.assert_allclose(found, jax.jacfwd(lambda x: _exact(x, events))(X), rtol=1e-9, atol=1e-9)
 
 

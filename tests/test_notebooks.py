@@ -12,7 +12,7 @@ SOURCES = sorted(FOLDER.glob("*.py"))
 
 
 # what these show is also looked at in `test_bicycle_job.py`, `test_bicycle_stability.py` and `test_studies.py`
-@pytest.mark.parametrize("source", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * path.stem.startswith(("02", "04"))) for path in SOURCES])
+@pytest.mark.parametrize("source", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * path.stem.startswith(("02", "04", "05"))) for path in SOURCES])
 def test_a_notebook_runs_to_its_end(source, tmp_path, monkeypatch):
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel then shows its figures in the notebook
     notebook = jupytext.read(source)

@@ -76,7 +76,10 @@ def test_small_lean_and_steer_obey_the_published_linear_equations(name):
 
 def test_any_other_bicycle_obeys_them_too():
     values = other_bicycle()
-    expected, found = oracle.matrices(values), matrices(WhippleBicycle.from_values(values))
+    expected, bicycle = oracle.matrices(values), WhippleBicycle.from_values(values)
+    starts = [jj.consistent(bicycle, 0.0, *bicycle.named(**bicycle.upright(speed))[:2]) for speed in (0.0, 1.0)]
+    standing, rolling = (jj.linearize(bicycle, start, ("lean", "steer"), dependent=("pitch",)) for start in starts)
+    found = {"M": standing.M, "C1": rolling.C, "K0": standing.K / bicycle.g, "K2": rolling.K - standing.K}
     for name, matrix in found.items():
         assert relative_error(matrix, expected[name]) <= tolerance("linearization"), name
 

@@ -82,6 +82,7 @@ from jourdain_jax.motion.integrators.discrete_lagrange_dalembert import Discrete
 from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
 from jourdain_jax.motion.integrators.munthe_kaas import MuntheKaas
 from jourdain_jax.motion.integrators.radau import RadauIIA
+from jourdain_jax.motion.integrators.taylor import Taylor
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import State, consistent, start
@@ -171,6 +172,7 @@ __all__ = [
     "Study",
     "StudyResult",
     "Surface",
+    "Taylor",
     "Trajectory",
     "UdwadiaKalaba",
     "Uniform",

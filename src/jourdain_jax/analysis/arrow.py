@@ -11,20 +11,24 @@ Source: G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1; J. J. Moré, 
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 
 
 def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarray, "*batch width width"]:
     """T of [J r]; with entries that are not finite where those of [J r] are not."""
-    found, width = np.linalg.qr(whole, mode="r"), whole.shape[-1]
-    if found.shape[-2] == width:
-        return found
-    square = np.zeros((*found.shape[:-2], width, width))
-    square[..., : found.shape[-2], :] = found
-    return square
+    width = whole.shape[-1]
+    if whole.shape[-2] < width:
+        whole = np.concatenate([whole, np.zeros((*whole.shape[:-2], width - whole.shape[-2], width))], axis=-2)
+    reflected, _ = np.linalg.qr(whole, mode="raw")  # as LAPACK leaves it: the transposed triangle, and reflectors beyond its diagonal
+    return np.where(_upper(width), np.swapaxes(reflected, -1, -2)[..., :width, :], 0.0)
+
+
+@lru_cache(maxsize=64)
+def _upper(width: int) -> Bool[np.ndarray, "width width"]:
+    return np.triu(np.ones((width, width), bool))
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,16 @@ class Arrow:
         of_runs = (self.local[..., None, :, -1] @ self.local[..., :-1])[..., 0, :]
         return np.concatenate([found + np.sum(of_runs[..., m:], axis=1), of_runs[..., :m].reshape(len(of_runs), -1)], axis=1)
 
+    def moved(self, d: Float[np.ndarray, "members unknowns"]) -> "Arrow":
+        """Close by, with the residuals that it has there to first order. The scores stay."""
+        shared, own = self.split(d)
+        _, m, _ = self.counts
+        local, rest = self.local.copy(), self.shared.copy()
+        rest[..., -1] += (rest[..., :-1] @ shared[..., None])[..., 0]
+        if m:
+            local[..., -1] += (local[..., :m] @ own[..., None] + local[..., m:-1] @ shared[:, None, :, None])[..., 0]
+        return Arrow(local, rest, self.scores)
+
     def change(self, d: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members"]:
         """`|J d|^2`."""
         shared, own = self.split(d)
@@ -100,10 +114,9 @@ class Arrow:
         _, m, _ = self.counts
         local, shared = self.local, self.shared
         if held.any():
-            local, shared = local.copy(), shared.copy()
-            (held_s, held_l), (moved_s, moved_l) = (self.split(x) for x in (held, np.where(held, moved, 0.0)))
-            local[..., -1] += np.einsum("bkij,bkj->bki", local[..., :m], moved_l) + np.einsum("bkij,bj->bki", local[..., m:-1], moved_s)
-            shared[..., -1] += np.einsum("bij,bj->bi", shared[..., :-1], moved_s)
+            held_s, held_l = self.split(held)
+            ended = self.moved(np.where(held, moved, 0.0))
+            local, shared = ended.local, ended.shared
             local[..., :m] *= ~held_l[:, :, None]
             local[..., m:-1] *= ~held_s[:, None, None]
             shared[..., :-1] *= ~held_s[:, None]
@@ -113,7 +126,7 @@ class Arrow:
             shared = np.concatenate([shared, rest], axis=1)
         # in unknowns times D, by singular values: (S^2 + lambda) ds = - S U' c
         U, S, Vt = np.linalg.svd(shared[..., :-1] / D_s[:, None], full_matrices=False)
-        shows = np.max(S, axis=1, initial=0.0, keepdims=True) * cutoff < S
+        shows = S[:, :1] * cutoff < S  # the first is the largest
         weight = np.where(shows, S / (S**2 + damping[:, None] + ~shows), 0.0)
         ds = -((weight * (shared[:, None, :, -1] @ U)[:, 0])[:, None] @ Vt)[:, 0] / D_s
         if m:
@@ -149,11 +162,11 @@ def eliminated(local: np.ndarray, below: Float[np.ndarray, "members runs local"]
 
 
 def arrow(triangles: Float[np.ndarray, "members runs width width"], local: int) -> Arrow:
-    """From the triangles of all runs, with `local` unknowns of their own in the first columns. Those of a single run count as shared: nothing goes out."""
+    """From the triangles of all runs, with `local` unknowns of their own in the first columns."""
     members, runs, width, _ = triangles.shape
-    if runs == 1:
-        triangles, local = triangles[..., [*range(local, width - 1), *range(local), -1]], 0
+    if runs == 1 and not local:
+        return Arrow(triangles[:, :, :0], triangles[:, 0], np.zeros((members, 1, width - 1)))  # there is nothing to compare one run with
     rest = triangles[:, :, local:, local:]
     scores = (rest[..., None, :, -1] @ rest[..., :-1])[..., 0, :]
     together = rest.reshape(members, runs * (width - local), width - local)
-    return Arrow(triangles[:, :, :local], np.linalg.qr(together, mode="r") if runs > 1 else together, scores)
+    return Arrow(triangles[:, :, :local], np.linalg.qr(together, mode="r"), scores)

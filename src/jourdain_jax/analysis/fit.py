@@ -8,17 +8,15 @@ Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.asked import Asked
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
-from jourdain_jax.analysis.information import information, students_t_95
-from jourdain_jax.analysis.levenberg_marquardt import LEAST, Control, Limits, Minimum, minimise
+from jourdain_jax.analysis.fit_statistics import statistics
+from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, minimise
 from jourdain_jax.analysis.likelihood import as_runs
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.measurements import Measurements
@@ -26,7 +24,7 @@ from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.profile import limits_at_bounds
 from jourdain_jax.analysis.ranges import Range
-from jourdain_jax.analysis.starts import check_starts
+from jourdain_jax.analysis.starts import check_first_guess, check_starts
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.reference_parameters import reference_parameters
 from jourdain_jax.calculus.guards import DifferentiationModeError
@@ -36,7 +34,6 @@ from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
-_NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
 _POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
 _SPANS = (1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4)  # shares of the span that a fit grows over
 _STEPS, _ROUGHLY = 8, 1.0  # tried on each of them, and their tolerance
@@ -44,7 +41,6 @@ _FOLLOWED = 100.0  # times the squares that noise leaves, up to which a motion i
 _SOME = 12  # steps between two estimates of correlation times
 _SAME = 0.05  # of half the sum of squares, by which the same minimum is found lower from elsewhere
 _FEWEST_RUNS = 5  # that tell how much runs differ
-_FEWEST_DEGREES = 4  # of freedom
 _WHOLE, _WITH_MEMORY = "whole runs", "whole runs, after a turn of correlation times"  # what is minimised
 _TURNS, _SETTLED = 20, 1e-3  # of correlation times and unknowns at most; change of the correlation of neighbouring samples that ends them
 
@@ -149,6 +145,8 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
         theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
         limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
         found = _minimum(problem, theta, limits, control, one_will_do=members is None)
+        if not all(np.isfinite(trace[0][1][0]) for trace in found.trace):
+            check_first_guess(scene, runs, unknowns)
         same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
         found = _with_memory(problem, found if members else found.lowest(), limits, control)
         return _result(problem, found, limits, asked, errors, guesses, same)
@@ -187,10 +185,10 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
         begin[some], steps[some] = grown.theta, steps[some] + grown.steps
         for i, (_, costs), k in zip(some.tolist(), (of_one[0] for of_one in grown.trace), place[some].tolist(), strict=True):
             trace[i] += ((f"the first {_SPANS[k]:.3g} of each run", costs),)
-        followed = np.stack([problem.is_followed(grown.at, share, _FOLLOWED) for share in _SPANS])
         place[some] += 1
         for k in range(1, len(_SPANS)):
-            place[some] += (place[some] == k) & followed[k]  # the next one is followed, and left out
+            if (place[some] == k).any():
+                place[some] += (place[some] == k) & problem.is_followed(grown.at, _SPANS[k], _FOLLOWED)  # the next one is followed, and left out
     problem.shares = None
     grown = of(poor, begin, control)
     steps, trace = steps + grown.steps, trace + grown.trace
@@ -255,77 +253,27 @@ def _check_enough(runs: Sequence[Measurements], unknowns: Unknowns, repeats: boo
 
 
 def _result(problem: Problem, found: Minimum, limits: Limits, asked: Asked, errors: str, guesses: int, agreeing: np.ndarray) -> Fit:
-    unknowns, theta, single, control = problem.unknowns, found.theta, problem.lanes.members is None, asked.control
+    unknowns, single, control = problem.unknowns, problem.lanes.members is None, asked.control
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
-    places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
-    low, high = limits.low[places], limits.high[places]
-    bound = (theta <= limits.low) | (theta >= limits.high)
-    limit, beyond = (one(x[:, places]) for x in limits_at_bounds(problem.linearised, found, limits, control))
-    residuals = tuple(problem.by_channel(run, found.at, one) for run in range(len(problem.runs)))
-    white = tuple(problem.by_channel(run, found.at, one, white=True) for run in range(len(problem.runs)))
-    samples = sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())
-    known = information(found.at.arrow, size, places, bound, fails, control.cutoff, single)
-
-    def elsewhere(arrow: Arrow) -> tuple[np.ndarray, np.ndarray]:
-        norms = np.where(arrow.column_norms > 0, arrow.column_norms, 1.0)
-        moved = arrow.step(np.full(len(theta), LEAST), norms, limits.fixed | bound, np.zeros_like(theta), control.cutoff)
-        return information(arrow, size, places, bound, fails, control.cutoff, False).standard_errors, moved[:, places]
-
-    more, doubt = (one(x) for x in problem.doubt(theta, elsewhere))
-    reach = _normal_or_t(doubt, (samples - known.rank)[..., None] if problem.all_estimated else np.inf) * np.sqrt(1 + more)
-    known = known.times(one(problem.inflation(residuals, samples, known.rank)))
-    reach = reach * known.standard_errors
-    if errors == "runs":
-        known = known.between_runs(one(found.at.arrow.scores))
-        reach = students_t_95(len(problem.runs) - 1) * known.standard_errors
-    values = one(theta[:, places])
-    shared, local = unknowns.split(theta)
-    scene = unknowns.layout.scene(problem.scene, one(shared))
-    if not single:
-        scene = jax.tree.map(lambda x, own: jnp.asarray(x if x is not own else np.broadcast_to(own, (len(theta), *own.shape))), scene, problem.scene)
-    return Fit(
-        scene=scene,
-        starts=tuple(unknowns.layout.start(run.start, one(local[:, i])) for i, run in enumerate(problem.runs)),
-        values=values,
-        sizes=one(size[:, places]),
-        standard_errors=known.standard_errors,
-        low=np.where(values <= low, low, np.where(values >= high, limit, np.maximum(values - reach, low))),
-        high=np.where(values >= high, high, np.where(values <= low, limit, np.minimum(values + reach, high))),
-        at_bound=one(bound[:, places]),
-        beyond=beyond,
-        information=known,
-        residuals=residuals,
-        whitened=white,
-        sigma={name: one(found.at.sigma[:, k]) for k, name in enumerate(problem.estimated)},
-        correlation_time={name: one(problem.tau[:, k]) for k, name in enumerate(problem.with_memory)},
-        chi_square=np.where(one(fails), np.nan, sum(_sum_of_squares(r, single) for run in white for r in run.values())),
-        samples=np.asarray(samples),
+    places = unknowns.estimated
+    limit, beyond = limits_at_bounds(problem.linearised, found, limits, control)
+    told = Fit(
+        values=one(found.theta[:, places]),
+        beyond=one(beyond[:, places]),
         converged=one(found.converged),
         stuck=one(found.stuck),
         steps=one(found.steps),
         grown=one(found.grown),
-        guesses=guesses,
         agreeing=agreeing,
+        guesses=guesses,
         labels=unknowns.labels,
         units=unknowns.units,
         cutoff=control.cutoff,
         errors=errors,
         trace=found.trace[0] if single else (),
         asked=asked,
+        work_out=partial(statistics, problem, found, limits, control, errors, limit),
     )
-
-
-def _normal_or_t(doubt: np.ndarray, left) -> np.ndarray:
-    """97.5 % quantile by which a standard error is multiplied: normal where correlation times are known, else Student's t of that standard deviation.
-
-    Its degrees of freedom are 2 / var(log C): F. E. Satterthwaite, Biometrics Bulletin 2 (1946) 110. `left`: samples less unknowns, where sigmas are estimated.
-    """
-    if not np.any(doubt > 0):
-        return np.asarray(_NORMAL_95)
-    doubt = np.clip(doubt, 1e-12, 2 / _FEWEST_DEGREES)
-    return students_t_95(np.maximum(2 / (doubt + 2 / left), _FEWEST_DEGREES)) * np.sqrt(1 - doubt)  # t has the variance n / (n - 2)
-
-
-def _sum_of_squares(r: np.ndarray, single: bool) -> np.ndarray:
-    with np.errstate(over="ignore"):
-        return np.asarray(np.nansum(r**2, axis=tuple(range(0 if single else 1, r.ndim))))
+    if problem.with_memory:  # its motions are needed, in the context that is here
+        told.statistics  # noqa: B018
+    return told

@@ -1,7 +1,9 @@
 """The result of a fit: estimates with their uncertainty, residuals, the fitted scene, and what the measurements cannot tell."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import equinox as eqx
 import numpy as np
@@ -10,22 +12,22 @@ from jaxtyping import Array, Bool, Float, Int
 from jourdain_jax.analysis.asked import Asked, taken_up
 from jourdain_jax.analysis.fit_page import fit_page
 from jourdain_jax.analysis.fit_pictures import interval_widths
+from jourdain_jax.analysis.fit_statistics import Statistics
+from jourdain_jax.analysis.fit_text import batch_text, text
 from jourdain_jax.analysis.held_out import Prediction, of_fitted, of_held_out
 from jourdain_jax.analysis.information import Information, hidden_combinations
 from jourdain_jax.analysis.informed import informed
 from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.profile import FAR_BEYOND
-from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.weak_directions import weak_combinations
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
-from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 CORRELATED = 0.98
-MOST_COMPARED, MOST_NAMED = 1000, 8  # unknowns; pairs of them in the table
+MOST_COMPARED = 1000  # unknowns
 MOST_INFORMED = 24  # unknowns of which the report says what informs them
 
 
@@ -50,40 +52,104 @@ class ChannelResiduals(eqx.Module):
     largest: float  # in magnitude
 
 
-class Fit(Printed, eqx.Module):
+@dataclass(frozen=True, eq=False, repr=False)
+class Fit(Printed):
     """Estimates by name (`fit["offset"].value`), with covariance, residuals and the fitted scene; `print(fit)` shows a table.
 
-    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too.
+    From `fit_batch`, every array has a leading axis `repeats`, those of `scene` too. What follows from the minimum (`statistics`) is worked out when it is
+    first asked for.
     """
 
-    scene: Scene  # with the estimates
-    starts: tuple[dict[str, Float[Array | np.ndarray, "..."]], ...]  # initial values of each run, with the estimates
     values: Float[np.ndarray, "*repeats unknowns"]
-    sizes: Float[np.ndarray, "*repeats unknowns"]  # against which the rank is judged
-    standard_errors: Float[np.ndarray, "*repeats unknowns"]  # NaN where not identifiable
-    low: Float[np.ndarray, "*repeats unknowns"]  # ends of the 95 % intervals; NaN where not identifiable
-    high: Float[np.ndarray, "*repeats unknowns"]
-    at_bound: Bool[np.ndarray, "*repeats unknowns"]  # estimates at a bound: no standard error, and a one-sided interval
-    beyond: Float[np.ndarray, "*repeats unknowns"]  # of these, by how many standard errors the data would put them beyond; NaN elsewhere
-    information: Information
-    residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # (times, *channel): (prediction - value) / sigma; NaN where missing
-    whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]  # the same where noise is white; where it has a memory, less what the sample before foretells
-    sigma: dict[str, Float[np.ndarray, "*repeats"]]  # of channels whose noise was estimated
-    correlation_time: dict[str, Float[np.ndarray, "*repeats"]]  # s, of channels where it was estimated; near zero: white
-    chi_square: Float[np.ndarray, "*repeats"]
-    samples: Int[np.ndarray, "*repeats"]  # with a finite sigma
+    beyond: Float[np.ndarray, "*repeats unknowns"]  # of estimates at a bound, by how many standard errors the data would put them beyond; NaN elsewhere
     converged: Bool[np.ndarray, "*repeats"]
     stuck: Bool[np.ndarray, "*repeats"]  # no step lowers the sum of squares, however short, and this is no minimum
     steps: Int[np.ndarray, "*repeats"]  # tried
     grown: Bool[np.ndarray, "*repeats"]  # whether the minimum was found over growing spans, far from where the first guess led to
     agreeing: Int[np.ndarray, "*repeats"]  # first guesses that led to this minimum, of those tried; of a batch, which has one for each repeat, zero
-    guesses: int = eqx.field(static=True)  # first guesses tried
-    labels: tuple[str, ...] = eqx.field(static=True)  # names of the unknowns
-    units: tuple[str, ...] = eqx.field(static=True)
-    cutoff: float = eqx.field(static=True)
-    errors: str = eqx.field(static=True)  # whence standard errors come: "sigmas" or "runs"
-    trace: tuple[tuple[str, tuple[float, ...]], ...] = eqx.field(static=True)  # what was minimised, and F at first and after each step tried; none of a batch
-    asked: Asked = eqx.field(static=True)  # the arguments of `fit`
+    guesses: int  # first guesses tried
+    labels: tuple[str, ...]  # names of the unknowns
+    units: tuple[str, ...]
+    cutoff: float
+    errors: str  # whence standard errors come: "sigmas" or "runs"
+    trace: tuple[tuple[str, tuple[float, ...]], ...]  # what was minimised, and F at first and after each step tried; none of a batch
+    asked: Asked  # the arguments of `fit`
+    work_out: Callable[[], Statistics]
+
+    @cached_property
+    def statistics(self) -> Statistics:
+        """What follows from the minimum; each part of it is a property here."""
+        return self.work_out()
+
+    @property
+    def scene(self) -> Scene:
+        """The scene with the estimates."""
+        return self.statistics.scene
+
+    @property
+    def starts(self) -> tuple[dict[str, Float[Array | np.ndarray, "..."]], ...]:
+        """Initial values of each run, with the estimates."""
+        return self.statistics.starts
+
+    @property
+    def sizes(self) -> Float[np.ndarray, "*repeats unknowns"]:
+        """Magnitudes of the unknowns, against which the rank is judged."""
+        return self.statistics.sizes
+
+    @property
+    def standard_errors(self) -> Float[np.ndarray, "*repeats unknowns"]:
+        """Standard errors; NaN where not identifiable."""
+        return self.statistics.standard_errors
+
+    @property
+    def low(self) -> Float[np.ndarray, "*repeats unknowns"]:
+        """Lower ends of the 95 % intervals; NaN where not identifiable."""
+        return self.statistics.low
+
+    @property
+    def high(self) -> Float[np.ndarray, "*repeats unknowns"]:
+        """Upper ends of the 95 % intervals; NaN where not identifiable."""
+        return self.statistics.high
+
+    @property
+    def at_bound(self) -> Bool[np.ndarray, "*repeats unknowns"]:
+        """Which estimates lie at a bound: no standard error, and a one-sided interval."""
+        return self.statistics.at_bound
+
+    @property
+    def information(self) -> Information:
+        """Covariance in blocks, and the directions that do not show."""
+        return self.statistics.information
+
+    @property
+    def residuals(self) -> tuple[dict[str, Float[np.ndarray, "..."]], ...]:
+        """Of each run by channel, (times, *channel): (prediction - value) / sigma; NaN where missing."""
+        return self.statistics.residuals
+
+    @property
+    def whitened(self) -> tuple[dict[str, Float[np.ndarray, "..."]], ...]:
+        """Residuals, where their noise has a memory less what the sample before foretells."""
+        return self.statistics.whitened
+
+    @property
+    def sigma(self) -> dict[str, Float[np.ndarray, "*repeats"]]:
+        """Sigmas of channels whose noise was estimated."""
+        return self.statistics.sigma
+
+    @property
+    def correlation_time(self) -> dict[str, Float[np.ndarray, "*repeats"]]:
+        """Correlation times in s, of channels where they were estimated; near zero: white."""
+        return self.statistics.correlation_time
+
+    @property
+    def chi_square(self) -> Float[np.ndarray, "*repeats"]:
+        """Sum of squared whitened residuals; NaN where the motion fails."""
+        return self.statistics.chi_square
+
+    @property
+    def samples(self) -> Int[np.ndarray, "*repeats"]:
+        """How many samples have a finite sigma."""
+        return self.statistics.samples
 
     def __getitem__(self, name: str) -> Estimated:
         if name not in self.labels:
@@ -278,58 +344,14 @@ class Fit(Printed, eqx.Module):
             raise ValueError("there is a report of one fit whose motion does not fail; of a batch, and of a failed fit, see `print`")
 
     def _repr_html_(self) -> str:
-        one = not is_traced(self) and self.values.ndim == 1 and np.isfinite(self.chi_square)
+        one = self.values.ndim == 1 and np.isfinite(self.chi_square)
         return super()._repr_html_() + (interval_widths(self) if one else "")
 
     def _text(self) -> str:
-        return _batch_text(self) if self.values.ndim > 1 else _text(self)
+        return batch_text(self) if self.values.ndim > 1 else text(self)
 
 
 def _summary(run: int, name: str, r: np.ndarray) -> ChannelResiduals:
     r = r[~np.isnan(r)]
     mean, rms, largest = (r.mean(), np.sqrt((r**2).mean()), np.abs(r).max()) if r.size else (np.nan,) * 3
     return ChannelResiduals(run, name, r.size, float(mean), float(rms), float(largest))
-
-
-def _text(fit: Fit) -> str:
-    lines = [
-        f"Fit of {type(fit.scene).__name__}: {'converged' if fit.converged else 'NOT CONVERGED'} in {int(fit.steps)} steps; "
-        f"{int(fit.samples)} samples, {len(fit.labels)} unknowns, reduced chi-square {float(fit.reduced_chi_square):.4g}"
-    ]
-    lines += [f"WARNING: {sentence}" for sentence in fit.warnings]
-    if fit.grown:
-        lines.append("found over growing spans: the first guess led elsewhere")
-    if fit.guesses > 1:
-        lines.append(f"{int(fit.agreeing)} of {fit.guesses} first guesses led to this minimum")
-    if fit.errors == "runs":
-        lines.append(f"standard errors from how much the {len(fit.residuals)} runs differ")
-    lines += [f"sigma of `{name}`, estimated: {float(sigma):.4g}" for name, sigma in fit.sigma.items()]
-    lines += [f"correlation time of the noise of `{name}`, estimated: {float(tau):.4g} s" for name, tau in fit.correlation_time.items()]
-    rows = [("unknown", "unit", "estimate", "std. error", "95 % interval")]
-    for name, e in fit.estimates.items():
-        error = f"{e.standard_error:.2g}" if np.isfinite(e.standard_error) else "-"
-        interval = f"[{e.low:.6g}, {e.high:.6g}]" if not np.isnan(e.low + e.high) else "none"
-        interval += " (one-sided, at its bound)" if fit.at_bound[fit.labels.index(name)] else ""
-        rows.append((name, e.unit, f"{e.value:.6g}", error, interval))
-    lines += table(rows)
-    if fit.not_identifiable:
-        lines.append(f"singular values below {fit.cutoff:g} of the largest count as zero:")
-        lines += [f"  {sentence}" for sentence in fit.not_identifiable]
-    lines += [f"  {sentence}" for sentence in fit.correlated[:MOST_NAMED]]
-    lines += [f"  and {len(fit.correlated) - MOST_NAMED} more pairs"] if len(fit.correlated) > MOST_NAMED else []
-    rows = [("run", "channel", "samples", "mean", "rms", "largest residual (in sigmas)")]
-    for s in fit.residual_summary():
-        rows.append((str(s.run), s.channel, str(s.samples), f"{s.mean:.2g}", f"{s.rms:.3g}", f"{s.largest:.3g}"))
-    return "\n".join(lines + table(rows))
-
-
-def _batch_text(fit: Fit) -> str:
-    good = np.asarray(fit.converged)
-    rows = [("unknown", "unit", "mean", "std. deviation", "mean std. error")]
-    for name, e in fit.estimates.items():
-        values, errors = np.asarray(e.value)[good], np.asarray(e.standard_error)[good]
-        errors = errors[np.isfinite(errors)]  # an estimate at its bound has none
-        some, error = good.sum() > 1, f"{errors.mean():.2g}" if errors.size else "-"
-        numbers = (f"{values.mean():.6g}", f"{values.std(ddof=1):.2g}", error) if some else ("-", "-", "-")
-        rows.append((name, e.unit, *numbers))
-    return "\n".join([f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} converged", *table(rows)])

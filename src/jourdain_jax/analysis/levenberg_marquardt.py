@@ -2,14 +2,17 @@
 
 minimise F(theta), low <= theta <= high;      near theta   F + g' d + |J d|^2 / 2
 step       (J'J + lambda D^2) d = - g          D: lengths of the columns of J;  unknowns that would pass a bound end there, and the others are solved for again
-converged  the undamped step is at most `tolerance` standard errors long, |J d|, and moves no unknown by more than that fraction of its size
+converged  the undamped step is at most `tolerance` standard errors long, |J d|, and moves no unknown by more than that fraction of its size;
+           or a step is at whose end it will be a tenth of that, as far as it shrank from the last one to this one: the end is then known without evaluation
 
 Several problems of one shape (`members`) go side by side; those that have ended cost nothing.
 Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105.
 """
 
+import math
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,6 +21,9 @@ from jourdain_jax.analysis.arrow import Arrow
 
 FIRST, LEAST, MOST = 1e-3, 1e-9, 1e9  # damping lambda: at first, at least, and where no step is found
 FASTEST = 10.0  # factor by which damping falls after a good step
+_SURELY = 0.1  # times the tolerance: what the next step is to be below, where it is not looked at
+_SHORT, _FAST = 0.01, 0.1  # standard errors, of a step after which the next may be foretold; by what factor steps shrink then
+_TINY = sys.float_info.min
 RELEASES = 8  # times that unknowns which would pass a bound are put there and the others solved for again
 
 
@@ -27,12 +33,21 @@ class Linearised:
 
     cost: Float[np.ndarray, "members"]  # F; not finite where the motion fails
     arrow: Arrow  # J and residuals with J'r = dF/dtheta
-    residual: np.ndarray  # (members, runs) of vectors
+    rows: np.ndarray  # (members, runs) of [J r] with the run's own unknowns first, (samples, width); None where another run had failed
     sigma: Float[np.ndarray, "members channels"]  # of channels whose noise is estimated
 
     def at(self, members) -> "Linearised":
         """That of some members."""
-        return Linearised(self.cost[members], self.arrow.at(members), self.residual[members], self.sigma[members])
+        return Linearised(self.cost[members], self.arrow.at(members), self.rows[members], self.sigma[members])
+
+    def moved(self, d: Float[np.ndarray, "members unknowns"], promised: Float[np.ndarray, "members"]) -> "Linearised":
+        """Close by, at theta + d, to first order; there F is lower by what is `promised`."""
+        shared, own = self.arrow.split(d)
+        rows = self.rows.copy()
+        for b, k in np.ndindex(*rows.shape):
+            rows[b, k] = rows[b, k].copy()
+            rows[b, k][:, -1] += rows[b, k][:, :-1] @ np.concatenate([own[b, k], shared[b]])
+        return Linearised(self.cost - promised, self.arrow.moved(d), rows, self.sigma)
 
     def replaced(self, members: Int[np.ndarray, "some"], new: "Linearised", chosen: Bool[np.ndarray, "some"]) -> "Linearised":
         """With what is `new` of these members where it is `chosen`."""
@@ -45,7 +60,7 @@ class Linearised:
 
     @property
     def _arrays(self) -> tuple[np.ndarray, ...]:
-        return self.cost, self.residual, self.sigma, *self.arrow.arrays
+        return self.cost, self.rows, self.sigma, *self.arrow.arrays
 
 
 @dataclass(frozen=True)
@@ -81,6 +96,8 @@ class Minimum:
 
     def lowest(self) -> "Minimum":
         """That of the member with the lowest value."""
+        if len(self.theta) == 1:
+            return self
         best = [int(np.argmin(self.at.cost))]
         return Minimum(self.theta[best], self.at.at(best), self.converged[best], self.stuck[best], self.steps[best], self.grown[best], self.trace[best])
 
@@ -113,72 +130,116 @@ def minimise(
     evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Float[np.ndarray, "members unknowns"], limits: Limits, control: Control, what: str = ""
 ) -> Minimum:
     """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers; `what`: says in the trace what is minimised."""
-    theta, members = theta.copy(), np.arange(len(theta))
-    at = evaluate(theta, members)
-    damping, growth, fall = (np.full(len(theta), x) for x in (FIRST, 4.0, FASTEST))
-    converged, stuck, steps = np.zeros(len(theta), bool), np.zeros(len(theta), bool), np.zeros(len(theta), int)
-    going, costs = np.isfinite(at.cost), [[cost] for cost in at.cost.tolist()]
+    theta, going = theta.copy(), np.arange(len(theta))
+    at, count = evaluate(theta, going), len(theta)
+    converged, stuck, steps = np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, int)
+    paces, costs = [_Pace() for _ in range(count)], [[cost] for cost in at.cost.tolist()]
+    going = going[np.isfinite(at.cost)]
     for _ in range(control.most_steps):
-        here = members[going]
-        if not here.size:
+        if not going.size:
             break
-        arrow, x = at.arrow if len(here) == len(theta) else at.arrow.at(here), theta[here]
-        size = limits.size(x)
-        d = _step(arrow, x, size, damping[here], limits, control.cutoff)
-        done = _is_small(arrow, size, d, control)
-        if (done & (damping[here] > LEAST)).any():
-            done &= _is_small(arrow, size, _step(arrow, x, size, np.full(len(here), LEAST), limits, control.cutoff), control)
-        if done.any():
-            converged[here[done]], going[here[done]] = True, False
-            here, d, x, arrow = here[~done], d[~done], x[~done], arrow.at(~done)
-            if not here.size:
+        arrow, x = (at.arrow, theta) if going.size == count else (at.arrow.at(going), theta[going])
+        size, damping = limits.size(x), np.array([paces[b].damping for b in going.tolist()])
+        scaling = _scaling(arrow, size)
+        d = _step(arrow, x, scaling, damping, limits, control.cutoff)
+        change = arrow.change(d)
+        done = _is_small(change, size, d, control)
+        if True in done.tolist():
+            if (done & (damping > LEAST)).any():
+                undamped = _step(arrow, x, scaling, np.full(going.size, LEAST), limits, control.cutoff)
+                done &= _is_small(arrow.change(undamped), size, undamped, control)
+            converged[going[done]] = True
+            going, size, d, x, change, arrow = going[~done], size[~done], d[~done], x[~done], change[~done], arrow.at(~done)
+            if not going.size:
                 break
-        steps[here] += 1
-        promised = -np.sum(arrow.gradient * d, axis=1) - 0.5 * arrow.change(d)
-        trial = evaluate(x + d, here)
-        with np.errstate(invalid="ignore", over="ignore"):
-            found = at.cost[here] - trial.cost
-            # near the minimum the simulation's own error decides whether F falls
-            level = (promised < 100 * control.tolerance**2) & (np.abs(found) < control.tolerance)
-            better = np.isfinite(trial.cost) & ((found > 1e-4 * promised) | level)
-            ratio = np.where(np.isfinite(found), found / np.maximum(promised, np.finfo(float).tiny), -1.0)
-        theta[here[better]] = (x + d)[better]
-        at = at.replaced(here, trial, better)
-        for b in here.tolist():
+        steps[going] += 1
+        promised = -np.sum(arrow.gradient * d, axis=1) - 0.5 * change
+        here = going.tolist()
+        shrank = [paces[b].shrinkage(length) for b, length in zip(here, np.sqrt(change).tolist(), strict=True)]
+        if min(shrank) < 1:
+            last = _is_small(change * np.square(shrank), size, d * np.array(shrank)[:, None], replace(control, tolerance=_SURELY * control.tolerance))
+            if last.any():
+                of = going[last]
+                at = at.replaced(of, (at if of.size == count else at.at(of)).moved(d[last], promised[last]), np.ones(of.size, bool))
+                theta[of], converged[of], going = x[last] + d[last], True, going[~last]
+                for b in of.tolist():
+                    costs[b].append(float(at.cost[b]))
+                if not going.size:
+                    break
+                d, x, promised, here = d[~last], x[~last], promised[~last], going.tolist()
+        trial = evaluate(x + d, going)
+        better = [paces[b].tried(costs[b][-1] - cost, by, control.tolerance) for b, cost, by in zip(here, trial.cost.tolist(), promised.tolist(), strict=True)]
+        chosen = np.array(better)
+        theta[going[chosen]] = (x + d)[chosen]
+        at = at.replaced(going, trial, chosen)
+        for b in here:
             costs[b].append(float(at.cost[b]))
-        # after a step that failed, damping falls slowly: in a curved valley every other step would fail. It rises where steps overshoot: where residuals
-        # stay large, undamped ones go to and fro along what shows least
-        change = np.where(ratio > 0.9, 1 / fall[here], np.where(ratio < 0.6, 3.0, 1.0))
-        damping[here] *= np.where(better, change, growth[here])
-        damping[here] = np.where(better & level, LEAST, np.maximum(damping[here], LEAST))
-        growth[here] = np.where(better, 4.0, growth[here] * 2)
-        fall[here] = np.where(better, np.minimum(1.5 * fall[here], FASTEST), 2.0)
-        lost = damping[here] > MOST
-        stuck[here[lost]], going[here[lost]] = True, False
-    trace = np.empty(len(theta), object)
+        lost = [paces[b].damping > MOST for b in here]
+        if True in lost:
+            stuck[going[lost]], going = True, going[np.logical_not(lost)]
+    trace = np.empty(count, object)
     trace[:] = [((what, tuple(of_one)),) for of_one in costs]
-    return Minimum(theta, at, converged, stuck, steps, np.zeros(len(theta), bool), trace)
+    return Minimum(theta, at, converged, stuck, steps, np.zeros(count, bool), trace)
 
 
-def _step(arrow: Arrow, theta, size, damping, limits: Limits, cutoff: float) -> np.ndarray:
-    """The damped step within the bounds."""
-    norms, g = arrow.column_norms, arrow.gradient
+@dataclass
+class _Pace:
+    """Damping of the next step of one member, and how it changes."""
+
+    damping: float = FIRST
+    growth: float = 4.0  # factor by which it grows after a step that failed
+    fall: float = FASTEST  # and falls after a good one
+    lengths: tuple[float, ...] = ()  # |J d| of the last steps, as long as they were taken
+
+    def shrinkage(self, length: float) -> float:
+        """By what factor this step is shorter than the last; one, unless steps have become short so fast that the problem is seen to be linear here."""
+        before, self.lengths = self.lengths, (*self.lengths[-1:], length)
+        if len(before) < 2 or length > _SHORT or before[1] > _FAST * before[0] or length > _FAST * before[1]:
+            return 1.0
+        return length / max(before[1], _TINY)
+
+    def tried(self, found: float, promised: float, tolerance: float) -> bool:
+        """Whether a step is taken that lowered F by `found` (not finite: the motion failed) where the linear problem `promised` so much."""
+        # near the minimum the simulation's own error decides whether F falls
+        level = promised < 100 * tolerance**2 and abs(found) < tolerance
+        if not (math.isfinite(found) and (found > 1e-4 * promised or level)):
+            # after a step that failed, damping falls slowly: in a curved valley every other step would fail
+            self.damping, self.growth, self.fall, self.lengths = max(self.damping * self.growth, LEAST), 2 * self.growth, 2.0, ()
+            return False
+        ratio = found / max(promised, _TINY)
+        # it rises where steps overshoot: where residuals stay large, undamped ones go to and fro along what shows least
+        change = 1 / self.fall if ratio > 0.9 else 3.0 if ratio < 0.6 else 1.0
+        self.damping = LEAST if level else max(self.damping * change, LEAST)
+        self.growth, self.fall = 4.0, min(1.5 * self.fall, FASTEST)
+        return True
+
+
+def _scaling(arrow: Arrow, size: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members unknowns"]:
+    """D: lengths of the columns of J, and something positive for those that are zero."""
+    norms = arrow.column_norms
     D = np.maximum(norms, 1e-8 * (norms * size).max(axis=1, keepdims=True) / size)
-    D = np.where(D > 0, D, 1.0)
+    return np.where(D > 0, D, 1.0)
+
+
+def _step(arrow: Arrow, theta, D, damping, limits: Limits, cutoff: float) -> np.ndarray:
+    """The damped step within the bounds."""
+    g = arrow.gradient
     held = limits.fixed | ((theta <= limits.low) & (g >= 0)) | ((theta >= limits.high) & (g <= 0))
     moved = np.zeros_like(theta)
     for _ in range(RELEASES):
         d = arrow.step(damping, D, held, moved, cutoff)
-        low, high = theta + d < limits.low, theta + d > limits.high
-        if not (low.any() or high.any()):
+        ended = theta + d
+        low, high = ended < limits.low, ended > limits.high
+        beyond = low | high
+        if not beyond.any():
             return d
-        within = np.clip(theta + d, limits.low, limits.high) - theta
-        over = ~held & (within != d) & (low | high)
+        within = np.clip(ended, limits.low, limits.high) - theta
+        over = ~held & (within != d) & beyond
         if not over.any():
             return d
         held, moved = held | over, np.where(over, within, moved)
     return np.clip(theta + d, limits.low, limits.high) - theta
 
 
-def _is_small(arrow: Arrow, size, d, control: Control) -> Bool[np.ndarray, "members"]:
-    return (arrow.change(d) <= control.tolerance**2) & (np.abs(d) <= control.tolerance * size).all(axis=1)
+def _is_small(change, size, d, control: Control) -> Bool[np.ndarray, "members"]:
+    return (change <= control.tolerance**2) & (np.abs(d) <= control.tolerance * size).all(axis=1)

@@ -8,6 +8,7 @@ Covariance: (J'J)^-1 mean(psi^2) / mean(psi')^2 with psi = rho'; J'J from the we
 Source: P. J. Huber and E. M. Ronchetti, Robust Statistics, 2nd ed. (2009), section 7.6; K. L. Lange, R. J. A. Little and J. M. G. Taylor, JASA 84 (1989) 881.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,9 +26,10 @@ class Loss:
 
     def value(self, r: Float[np.ndarray, "*batch samples"]) -> Float[np.ndarray, "*batch"]:
         """Sum of rho over the last axis."""
-        k, size = self.parameter, np.abs(r)
-        if not np.isfinite(k):
+        k = self.parameter
+        if math.isinf(k):
             return 0.5 * np.sum(r**2, axis=-1)
+        size = np.abs(r)
         if self.kind == "student-t":
             return np.sum((k + 1) / 2 * np.log1p(r**2 / k), axis=-1)
         return np.sum(np.where(size <= k, 0.5 * r**2, k * np.minimum(size, np.finfo(float).max / max(k, 1.0)) - 0.5 * k**2), axis=-1)
@@ -41,7 +43,7 @@ class Loss:
 
     def weighted(self, rows: Float[np.ndarray, "*samples width"], r: Float[np.ndarray, "*samples"]) -> Float[np.ndarray, "*samples width"]:
         """Rows times the roots of their weights."""
-        return np.sqrt(self.weight(r))[..., None] * rows if np.isfinite(self.parameter) else rows
+        return rows if math.isinf(self.parameter) else np.sqrt(self.weight(r))[..., None] * rows
 
     def inflation(self, r: Float[np.ndarray, "samples"]) -> float:
         """By what the covariance (J'WJ)^-1 is to be multiplied, from the residuals that count."""

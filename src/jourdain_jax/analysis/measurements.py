@@ -3,7 +3,6 @@
 value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 """
 
-import copy
 from collections.abc import Callable, Iterable, Mapping
 
 import equinox as eqx
@@ -21,6 +20,8 @@ from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.numbers import checked_unless_traced, described, is_traced
 from jourdain_jax.scene.scene import Scene, entries_named
+
+_NO_INPUTS = Inputs(())
 
 
 class Measurements(eqx.Module):
@@ -124,6 +125,9 @@ class Measurements(eqx.Module):
             if not _holds(lambda x: x > 0, value):
                 raise ValueError(f"sigma of channel `{name}` must be above zero (and not NaN); give the standard deviation of its noise")
 
+    # Equinox's own costs a microsecond each time, to make methods pytrees; a fit asks for a hundred fields
+    __getattribute__ = object.__getattribute__
+
     def sigma_of(self, name: str, repeats: bool = False) -> Float[Array | np.ndarray, "..."]:
         """Sigma of each measured value of the channel `name`, in its unit; `repeats`: the values have a leading axis of repeats."""
         sigma, values = self.sigma[name], self.values[name]
@@ -202,11 +206,10 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
         if run.sigma[name].shape not in ((), (times,), shape):
             raise ValueError(f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, expected (), {(times,)} or {shape}")
     inputs, drives = _inputs(scene, run, where, estimates)
-    found = copy.copy(run)  # without another look at all that was looked at when it was made
+    found = object.__new__(type(run))  # without another look at all that was looked at when it was made
     of_channels = {field: getattr(run, field) for field in ("values", "sigma", "start", "unknown_start", "sensors", "correlation_time")}
-    for field, value in (of_channels | {"readings": readings, "drives": drives, "estimates": estimates}).items():
-        object.__setattr__(found, field, dict(sorted(value.items())))  # as JAX orders them
-    object.__setattr__(found, "inputs", inputs)
+    changed = of_channels | {"readings": readings, "drives": drives, "estimates": estimates}
+    vars(found).update(vars(run) | {field: dict(sorted(value.items())) for field, value in changed.items()} | {"inputs": inputs})  # sorted as JAX orders them
     return found
 
 
@@ -252,6 +255,8 @@ def _check_begin(run: Measurements, name: str, where: str, repeats: bool) -> Non
 
 def _inputs(scene: Scene, run: Measurements, where: str, estimates: dict) -> tuple[Inputs, dict[str, Drive]]:
     """All inputs, at the first guess of what is to be estimated; and the actuators that have such numbers."""
+    if run.inputs is None and not len(scene.inputs):
+        return _NO_INPUTS, {}
     given = run.inputs if isinstance(run.inputs, Mapping) else {}
     actuators = {name: one for name, one in given.items() if isinstance(one, Actuator)}
     if not actuators:
@@ -278,9 +283,12 @@ def _inputs(scene: Scene, run: Measurements, where: str, estimates: dict) -> tup
 
 def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> tuple[int, ...]:
     """The shape of a coordinate or speed: of a quaternion (4,), of its rates (3,)."""
-    groups = {group: length for names in (scene.coordinate_names, scene.speed_names) for group, _, length in names.groups}
-    entries = (*scene.coordinate_names.entries, *scene.speed_names.entries)
-    if name not in groups and name not in entries:
+    both = scene.coordinate_names, scene.speed_names
+    entries = both[0].entries + both[1].entries
+    if name in entries:
+        return ()
+    groups = {group: length for names in both for group, _, length in names.groups}
+    if name not in groups:
         unknown = f"unknown channel `{name}`" if name == channel_name else f"channel `{channel_name}`, whose sensor measures an unknown quantity `{name}`"
         raise ValueError(f"{where} has {unknown}; {nearest(name, (*groups, *entries))} For other quantities give a function of the motion in `sensors`.")
-    return (groups[name],) if name in groups else ()
+    return (groups[name],)

@@ -318,6 +318,8 @@ def _program(treedef, leaves: tuple, layout: Layout) -> Callable:
 
 def _alike(data: Sequence[Measurements]) -> list[list[int]]:
     """Indices of the runs, grouped by equal structure: names, sensors, kinds of inputs, shapes but for the number of times."""
+    if len(data) == 1:
+        return [[0]]
     groups: dict[tuple, list[int]] = {}
     for index, run in enumerate(data):
         parts = run.start, run.readings, run.inputs, run.drives, run.correlation_time

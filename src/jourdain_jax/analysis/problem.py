@@ -5,6 +5,7 @@ F = sum rho(w) + sum n log sigma + sum ((theta - mean) / s)^2 / 2        w: whit
 sigma^2 = mean w^2 of each channel whose sigma is not known; mean, s: of priors
 """
 
+import math
 from collections.abc import Callable, Iterable
 
 import numpy as np
@@ -36,6 +37,8 @@ class Problem:
 
     def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
         """Correlation times of some members, by channel, s."""
+        if not self.with_memory:
+            return {}
         found = self.tau[members if self.lanes.members else np.zeros(len(members), int)]
         return dict(zip(self.with_memory, found.T, strict=True))
 
@@ -48,12 +51,14 @@ class Problem:
         (p, m), count, runs, kinds = self.unknowns.layout.sizes, len(theta), self.unknowns.runs, 1 + len(self.estimated)
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
         costs, squares = np.zeros((count, runs)), np.zeros((count, runs, kinds))
-        residual = np.empty((count, runs), object)
-        for b, j, plain in evaluated:
-            whole = self.lanes.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
-            if self.shares is not None:
-                whole = np.where(self.lanes.within(j, self.shares[members[b]])[..., None], whole, 0.0)
-            with np.errstate(over="ignore", invalid="ignore"):
+        kept, sigma = np.empty((count, runs), object), np.zeros((count, 0))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for b, j, plain in evaluated:
+                if runs == 1:  # all unknowns are shared
+                    plain = plain[..., [*range(m, m + p), *range(m), -1]]
+                whole = self.lanes.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
+                if self.shares is not None:
+                    whole = np.where(self.lanes.within(j, self.shares[members[b]])[..., None], whole, 0.0)
                 for k, rows in enumerate(self._kinds(int(j[0]), whole)):
                     r = rows[..., -1]
                     triangles[b, j, k] = triangle(self.loss.weighted(rows, r))
@@ -61,36 +66,36 @@ class Problem:
                         squares[b, j, k] = np.sum(r**2, axis=1)
                     else:
                         costs[b, j] = self.loss.value(r)
-            for place, one in zip(zip(b, j, strict=True), plain[..., -1], strict=True):
-                residual[place] = one
-            if count == 1 and not np.isfinite(triangles[b, j]).all():  # whatever the other runs say
-                triangles.fill(np.nan)
-                break
-        cost = costs.sum(axis=1)
-        samples = self._counted[members if self.lanes.members else np.zeros(count, int)]
-        sigma = np.sqrt(np.maximum(squares.sum(axis=1)[:, 1:] / samples, _LEAST_SIGMA**2))
-        finite = np.isfinite(triangles).all(axis=(1, 2, 3, 4)) & np.isfinite(cost)
-        triangles[~finite] = 0.0
+                for place, one in zip(zip(b.tolist(), j.tolist(), strict=True), plain, strict=True):
+                    kept[place] = one
+                if count == 1 and runs > 1 and not math.isfinite(triangles[b, j].sum()):  # whatever the other runs say
+                    triangles.fill(np.nan)
+                    break
+            cost = costs.sum(axis=1)
+            finite = np.isfinite(triangles.sum(axis=(1, 2, 3, 4)) + cost)
+        if False in finite.tolist():
+            triangles[~finite], cost[~finite] = 0.0, np.inf
+        together = triangles[:, :, 0]
         if kinds > 1:
+            samples = self._counted[members if self.lanes.members else np.zeros(count, int)]
+            sigma = np.sqrt(np.maximum(squares.sum(axis=1)[:, 1:] / samples, _LEAST_SIGMA**2))
             cost = cost + np.sum(samples * np.log(sigma), axis=1)
             scaled = triangles / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
             together = np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
-        else:
-            together = triangles[:, :, 0]
-        whole = arrow(together, m)
+        whole = arrow(together, m if runs > 1 else 0)
         if self.shares is not None or self.unknowns.with_prior.size:
             mean, spread = self._known_before(theta, members)
             with_mean = np.isfinite(mean)
             cost = cost + 0.5 * np.sum(np.where(with_mean, (theta - np.where(with_mean, mean, 0.0)) / spread, 0.0) ** 2, axis=1)
             whole = with_prior(whole, theta, mean, spread)
-        return Linearised(np.where(finite, cost, np.inf), whole, residual, sigma)
+        return Linearised(cost, whole, kept, sigma)
 
     def is_followed(self, at: Linearised, share: float, most: float) -> np.ndarray:
         """Of which members the squares of residuals over this share of the span are on average at most so many times those of noise."""
         good = np.isfinite(at.cost)
         squares, counted = np.zeros(good.sum()), np.zeros(good.sum())
         for run in range(len(self.runs) if good.any() else 0):
-            r = np.where(self.lanes.within(np.array([run]), np.array([share])), np.stack(at.residual[good, run]), 0.0)
+            r = np.where(self.lanes.within(np.array([run]), np.array([share])), np.stack([rows[:, -1] for rows in at.rows[good, run]]), 0.0)
             for name, where in self.lanes.channels(run).items():
                 if name not in self.estimated:
                     squares, counted = squares + np.sum(r[:, where] ** 2, axis=1), counted + np.count_nonzero(r[:, where], axis=1)
@@ -172,7 +177,7 @@ class Problem:
 
         `white`: whitened ones.
         """
-        flat = [np.zeros(0) if r is None else r for r in at.residual[:, run]]
+        flat = [np.zeros(0) if rows is None else rows[:, -1] for rows in at.rows[:, run]]
         longest = max(map(len, flat))
         whole = np.stack([np.full(longest, np.nan) if len(r) < longest else r for r in flat])
         members = np.arange(len(whole))

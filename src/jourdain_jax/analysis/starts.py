@@ -10,34 +10,47 @@ from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.scene import Scene
 
-MOST = 4096  # starts that were found right, and are not looked at again
+MOST = 4096  # kinds of starts that were found right, and are not looked at again
 
 _right: dict[tuple, None] = {}
 
 
 def check_starts(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> None:
-    """ValueError unless the start of each run meets the constraints at the first guess, and still does when the unknowns change."""
+    """ValueError unless the start of each run meets the constraints at the first guess, and still does when the unknowns change.
+
+    Where it did at other numbers of the unknowns, this is no matter of the numbers, and it is not looked at again: a look at new parameters takes longer than
+    a fit. Where the motion fails at the first guess, ask `check_first_guess`.
+    """
     guess = unknowns.guess
     elsewhere = guess + 1e-3 * unknowns.sizes(guess) * np.where(unknowns.fixed, 0.0, np.sin(1.0 + np.arange(guess.size)))  # by unequal amounts
+    leaves, treedef = jax.tree.flatten(scene)
     for index, run in enumerate(runs):
-        if (here := _key(scene, run, unknowns, guess, index)) in _right:
+        if (key := _key(leaves, treedef, run, unknowns, index)) in _right:
             continue
         _check(scene, run, unknowns, guess, index, "is not admissible")
-        # whether given values depend on each other is no matter of the numbers that change
-        if (changed := _key(scene, run, unknowns, np.where(unknowns.fixed, guess, 0.0), index)) not in _right:
-            _check(
-                scene, run, unknowns, elsewhere, index, "no longer meets the constraints when the unknowns change: the values in `start` depend on each other"
-            )
-        _right.update({here: None, changed: None})
+        _check(scene, run, unknowns, elsewhere, index, "no longer meets the constraints when the unknowns change: the values in `start` depend on each other")
+        _right[key] = None
         while len(_right) > MOST:
             del _right[next(iter(_right))]
 
 
-def _key(scene: Scene, run: Measurements, unknowns: Unknowns, theta: np.ndarray, index: int) -> tuple:
-    """All numbers of a start with these unknowns, and what is no number."""
-    (moved, given), layout = _with(scene, run, unknowns, theta, index), unknowns.layout
-    leaves, treedef = jax.tree.flatten((moved, given, run.t0, run.inputs))
-    return layout, treedef, *(x if callable(x) else np.asarray(x).tobytes() for x in leaves)
+def check_first_guess(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> None:
+    """ValueError unless the start of each run meets the constraints at the first guess."""
+    for index, run in enumerate(runs):
+        _check(scene, run, unknowns, unknowns.guess, index, "is not admissible")
+
+
+def _key(leaves: list, treedef, run: Measurements, unknowns: Unknowns, index: int) -> tuple:
+    """What a start consists of, and its numbers but for those of unknowns. `leaves`, `treedef`: of the scene."""
+    layout = unknowns.layout
+    others, of_run = jax.tree.flatten((run.t0, run.inputs))
+    shared, local = unknowns.split(np.where(unknowns.fixed, unknowns.guess, 0.0))
+    start = layout.start(run.start, local[index])
+    return layout, treedef, of_run, *start, *map(_content, (*others, *layout.leaves(leaves, treedef, shared), *start.values()))
+
+
+def _content(x):
+    return x if callable(x) else np.asarray(x).tobytes()
 
 
 def _with(scene: Scene, run: Measurements, unknowns: Unknowns, theta: np.ndarray, index: int) -> tuple[Scene, dict]:

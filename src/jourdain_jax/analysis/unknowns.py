@@ -56,10 +56,15 @@ class Layout:
     def scene(self, scene: Scene, shared: Float[Array | np.ndarray, "*members shared"]) -> Scene:
         """The scene with these shared unknowns."""
         leaves, treedef = jax.tree.flatten(scene)
+        return jax.tree.unflatten(treedef, [x if x is own else jnp.asarray(x) for x, own in zip(self.leaves(leaves, treedef, shared), leaves, strict=True)])
+
+    def leaves(self, leaves: list, treedef, shared: Float[Array | np.ndarray, "*members shared"]) -> list:
+        """The leaves of a scene, with these shared unknowns in their places."""
+        found = list(leaves)
         for place in self.shared:
             if not place.of_sensor:
-                leaves[_leaf(treedef, place.name)] = jnp.asarray(place.of(shared))
-        return jax.tree.unflatten(treedef, leaves)
+                found[_leaf(treedef, place.name)] = place.of(shared)
+        return found
 
     def start(self, start: dict, local: Float[Array | np.ndarray, "*members local"]) -> dict:
         """The start of a run with these unknowns of its own."""
@@ -180,7 +185,7 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
     if all(entry.fixed for entry in entries):
         raise ValueError(f"nothing is free; name parameters in `free` ({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
     free_ones = [entry for entry in entries if not entry.fixed]
-    each = lambda of: np.concatenate([np.full(entry.guess.size, of(entry)) for entry in entries])  # noqa: E731
+    each = lambda of: np.array([x for entry in entries for x in [of(entry)] * entry.guess.size])  # noqa: E731
     return Unknowns(
         layout=Layout(tuple(shared.found), tuple(local.found)),
         runs=len(runs),

@@ -1,8 +1,9 @@
-"""Measured bicycles: parameter files, linear stability and its uncertainty, rides."""
+"""Measured bicycles: parameter files and raw measurements, linear stability and its uncertainty, rides."""
 
+from jourdain_jax.bicycle.from_measurements import benchmark_from_measurements
 from jourdain_jax.bicycle.job import Refused, Study, run, study, table, write_results
 from jourdain_jax.bicycle.linear import linear_matrices, upright_running
-from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, measured_bicycle, read_bicycle, shipped_bicycles
+from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, measured_bicycle, read_bicycle, shipped_bicycles, shipped_measurements
 from jourdain_jax.bicycle.stability import StabilitySpeeds, eigenvalues, stability_speeds
 from jourdain_jax.bicycle.uncertainty import Interval, ParameterSamples, interval, sample_parameters
 
@@ -13,6 +14,7 @@ __all__ = [
     "Refused",
     "StabilitySpeeds",
     "Study",
+    "benchmark_from_measurements",
     "eigenvalues",
     "interval",
     "linear_matrices",
@@ -21,6 +23,7 @@ __all__ = [
     "run",
     "sample_parameters",
     "shipped_bicycles",
+    "shipped_measurements",
     "stability_speeds",
     "study",
     "table",

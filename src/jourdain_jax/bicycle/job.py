@@ -13,9 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.bicycle.from_measurements import benchmark_from_measurements
 from jourdain_jax.bicycle.linear import linear_matrices
 from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, read_bicycle
 from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
+from jourdain_jax.bicycle.readings import holds_readings
 from jourdain_jax.bicycle.rides import Rides, ride, ride_speeds
 from jourdain_jax.bicycle.stability import eigenvalues, stability_speeds
 from jourdain_jax.bicycle.uncertainty import interval, sample_parameters
@@ -26,7 +28,8 @@ SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")
 MAX_SPEED = 50.0  # m/s; a speed beyond it counts as none
 CAVEAT = (
     "Limits are the 2.5 and 97.5 % quantiles over the samples that have the speed; `fraction` is how many have it. Sigmas are taken as\n"
-    f"independent, because the files carry no covariance; a missing sigma counts as zero. Speeds above {MAX_SPEED:g} m/s count as none."
+    "independent, because files of parameters carry no covariance; of raw measurements, `*Measured.txt`, it is known, and used. A missing sigma\n"
+    f"counts as zero. Speeds above {MAX_SPEED:g} m/s count as none."
 )
 _GRID = 81
 
@@ -85,7 +88,7 @@ class Study(eqx.Module):
 def study(path: str | Path, *, samples: int = 2000, seed: int = 0) -> Study | Refused:
     """Everything about one file; `Refused`, not an exception, where it describes no bicycle."""
     try:
-        bicycle = read_bicycle(path)
+        bicycle = benchmark_from_measurements(path) if holds_readings(Path(path)) else read_bicycle(path)
     except ValueError as error:
         return Refused(str(path), str(error))
     drawn = sample_parameters(bicycle, jax.random.key(seed), samples)
@@ -187,6 +190,8 @@ def _notes(one: Study) -> list[str]:
     refused = int(np.sum(~one.physical))
     if refused:
         notes.append(f"{refused} samples are no bicycles and do not count")
+    if one.bicycle.covariance is not None:
+        notes.append("parameters from raw measurements, with their covariance")
     if one.bicycle.without_sigma:
         notes.append("without a sigma: " + ", ".join(one.bicycle.without_sigma))
     return notes + [f"warning: {text}" for text in one.bicycle.warnings]

@@ -5,6 +5,7 @@ Its sets in YAML, `name: value`, with or without a section `values`, are read as
 files carry no covariance: sigmas are those of independent errors.
 """
 
+import dataclasses
 import difflib
 import math
 import re
@@ -13,6 +14,8 @@ from importlib import resources
 from pathlib import Path
 
 import equinox as eqx
+import numpy as np
+from jaxtyping import Float
 
 from jourdain_jax.ensembles.distributions import Normal
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
@@ -39,6 +42,12 @@ class MeasuredBicycle(eqx.Module):
     without_sigma: tuple[str, ...] = eqx.field(static=True)  # names whose sigma the file does not give
     ignored: tuple[str, ...] = eqx.field(static=True)  # names in the file that the Whipple bicycle does not use
     warnings: tuple[str, ...] = eqx.field(static=True)  # sentences: odd values, taken as they are
+    covariance: Float[np.ndarray, "parameters parameters"] | None = None  # in the order of `values`; None: not known, and sigmas count as independent
+
+    @property
+    def with_independent_errors(self) -> "MeasuredBicycle":
+        """The bicycle as if its parameters had nothing to do with each other: without covariance."""
+        return dataclasses.replace(self, covariance=None)
 
     @property
     def scene(self) -> WhippleBicycle:
@@ -68,6 +77,15 @@ def shipped_bicycles() -> dict[str, Path]:
     return {_bicycle_name(path): path for path in sorted(folder.glob("*Benchmark.txt"))}
 
 
+def shipped_measurements() -> dict[str, Path]:
+    """The files of raw measurements that come with the package, name -> path, for `benchmark_from_measurements`.
+
+    Those of `Silver` hold none of its parts; those of `Gyro`, `Rigidcl` and `Stratos` have no published parameters.
+    """
+    folder = Path(str(resources.files("jourdain_jax") / "data" / "bicycles"))
+    return {path.stem.removesuffix("Measured"): path for path in sorted(folder.glob("*Measured.txt"))}
+
+
 def read_bicycle(path: str | Path) -> MeasuredBicycle:
     """Read one parameter file: text, or YAML by the ending of `path`.
 
@@ -82,8 +100,8 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
     values: dict[str, float] = {}
     sigmas: dict[str, float] = {}
     lines: dict[str, int] = {}
-    lines_of = _yaml_lines if path.suffix.lower() in (".yml", ".yaml") else _text_lines
-    for number, line in lines_of(_read_text(path), str(path)):
+    lines_of = _yaml_lines if path.suffix.lower() in (".yml", ".yaml") else text_lines
+    for number, line in lines_of(read_text(path), str(path)):
         where = f"{path}, line {number}"
         name, value, sigma = _read_line(line, where)
         if name in lines:
@@ -95,7 +113,7 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
 
     missing = [name for name in PARAMETER_NAMES if name not in values]
     if missing:
-        raise ValueError(f"{path}: missing {_listed(missing)}; a bicycle needs all of {' '.join(PARAMETER_NAMES)}. Add a line {_FORMAT} for each.")
+        raise ValueError(f"{path}: missing {listed(missing)}; a bicycle needs all of {' '.join(PARAMETER_NAMES)}. Add a line {_FORMAT} for each.")
     known = {name: values[name] for name in PARAMETER_NAMES}
     broken = [sentence for sentence, is_broken in violations(known).items() if is_broken]
     if broken:
@@ -119,7 +137,7 @@ def _bicycle_name(path: Path) -> str:
     return path.stem.removesuffix("Benchmark") or path.stem
 
 
-def _read_text(path: Path) -> str:
+def read_text(path: Path) -> str:
     try:
         with path.open("rb") as file:
             content = file.read(_LARGEST_FILE + 1)
@@ -143,7 +161,7 @@ def _read_text(path: Path) -> str:
     return text
 
 
-def _text_lines(text: str, _: str) -> Iterator[tuple[int, str]]:
+def text_lines(text: str, _: str) -> Iterator[tuple[int, str]]:
     """Number and content of the lines that hold a parameter, without comments."""
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.partition("#")[0].strip()
@@ -182,16 +200,16 @@ def _read_line(line: str, where: str) -> tuple[str, float, float | None]:
         nearest = lower_case[near[0]] if near else PARAMETER_NAMES[0]
         raise ValueError(f"{where}: unknown parameter {_clipped(name)}; the nearest valid name is `{nearest}`. Valid names: {' '.join(PARAMETER_NAMES)}.")
     value_text, separator, sigma_text = right.replace("±", "+/-").partition("+/-")
-    value = _read_number(value_text, f"value of `{name}`", where)
+    value = read_number(value_text, f"value of `{name}`", where)
     if not separator:
         return name, value, None
-    sigma = _read_number(sigma_text, f"sigma of `{name}`", where)
+    sigma = read_number(sigma_text, f"sigma of `{name}`", where)
     if sigma < 0:
         raise ValueError(f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0. Give its size, or leave `+/-` out if it is not known.")
     return name, value, sigma
 
 
-def _read_number(text: str, what: str, where: str) -> float:
+def read_number(text: str, what: str, where: str) -> float:
     try:
         number = float(text)
     except ValueError:
@@ -222,5 +240,5 @@ def _clipped(text: str) -> str:
     return f"`{text}`" if len(text) <= 60 else f"`{text[:57]}...`"
 
 
-def _listed(names: list[str]) -> str:
+def listed(names: list[str]) -> str:
     return ", ".join(f"`{name}`" for name in names)

@@ -1,13 +1,14 @@
 """From measured standard deviations to limits on what follows from the parameters, by Monte Carlo.
 
-Each parameter is drawn from a normal distribution with the measured value and sigma, independently of the others: the
-files carry no covariance. A quantity that only some bicycles have (a capsize speed) is reported with the fraction of
+Parameters are drawn from a normal distribution with the measured values and their covariance; where that is not known, as from files of parameters, each
+with its sigma independently of the others. A quantity that only some bicycles have (a capsize speed) is reported with the fraction of
 samples that have it, and its limits are those of these samples.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Key, UInt32
@@ -43,7 +44,7 @@ class Interval(eqx.Module):
 
 
 def sample_parameters(bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Array, "2"], count: int) -> ParameterSamples:
-    """Draw `count` bicycles from independent normal distributions with the measured values and sigmas.
+    """Draw `count` bicycles from normal distributions with the measured values and their covariance, or independent with their sigmas where there is none.
 
         samples = sample_parameters(bicycle, jax.random.key(0), 2000)
         weave = jax.vmap(lambda parameters: ...)(samples.by_name())
@@ -55,8 +56,8 @@ def sample_parameters(bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Arr
     if count < 1:
         raise ValueError(f"`count` is {count}, expected at least 1 sample. Some 2000 give limits to about 0.1 sigma.")
     value = jnp.array([bicycle.values[name] for name in PARAMETER_NAMES])
-    sigma = jnp.array([bicycle.sigmas[name] for name in PARAMETER_NAMES])
-    values = value + sigma * jax.random.normal(key, (count, len(PARAMETER_NAMES)), value.dtype)
+    standard = jax.random.normal(key, (count, len(PARAMETER_NAMES)), value.dtype)
+    values = value + standard @ jnp.asarray(_root(bicycle), value.dtype).T
     broken = violations(dict(zip(PARAMETER_NAMES, values.T, strict=True)))
     return ParameterSamples(
         values=values,
@@ -64,6 +65,16 @@ def sample_parameters(bicycle: MeasuredBicycle, key: Key[Array, ""] | UInt32[Arr
         refused={sentence: jnp.sum(where) for sentence, where in broken.items() if jnp.any(where)},
         names=PARAMETER_NAMES,
     )
+
+
+def _root(bicycle: MeasuredBicycle) -> np.ndarray:
+    """R with R R' the covariance, which need not have full rank."""
+    sigma = np.array([bicycle.sigmas[name] for name in PARAMETER_NAMES])
+    if bicycle.covariance is None:
+        return np.diag(sigma)
+    scale = np.where(sigma > 0, sigma, 1.0)  # of correlations: units do not matter
+    squares, directions = np.linalg.eigh(bicycle.covariance / np.outer(scale, scale))
+    return scale[:, None] * directions * np.sqrt(np.maximum(squares, 0.0))
 
 
 def interval(

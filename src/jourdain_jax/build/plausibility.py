@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import pose_at
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import Contact
@@ -87,18 +88,24 @@ def impossible_bodies(scene: Scene, q) -> tuple[str, ...]:
     m >= 0,   0 <= I_1 <= I_2 <= I_3 <= I_1 + I_2
     """
     found = []
-    for name, placed in pose_at(scene, 0.0, q).bodies.items():
-        body, what = placed.body, f"body `{name}` of `{type(scene).__name__}`"
-        found.append(_of_mass(what, np.atleast_1d(body.mass)))
-        if isinstance(body, RigidBody):
-            found.append(_of_inertia(what, np.asarray(body.inertia)[None]))
-            least, middle, largest = np.linalg.eigvalsh(np.asarray(body.inertia))
+    for name, (mass, inertia) in _masses_and_inertias(scene, q).items():
+        what = f"body `{name}` of `{type(scene).__name__}`"
+        found.append(_of_mass(what, np.atleast_1d(mass)))
+        if inertia is not None:
+            found.append(_of_inertia(what, inertia[None]))
+            least, middle, largest = np.linalg.eigvalsh(inertia)
             if least > _TOLERANCE * largest and largest > (1 + _ROUNDED) * (least + middle):
                 found.append(
                     f"{what} has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, the last above the sum of the others: no "
                     "distribution of mass has them; bound the parameters of its inertia, or free fewer"
                 )
     return tuple(sentence for sentence in found if sentence)
+
+
+@eval_numpy
+def _masses_and_inertias(scene: Scene, q) -> dict:
+    bodies = {name: placed.body for name, placed in pose_at(scene, 0.0, q).bodies.items()}
+    return {name: (body.mass, body.inertia if isinstance(body, RigidBody) else None) for name, body in bodies.items()}
 
 
 def _is_negative(I) -> Bool[Array, ""]:

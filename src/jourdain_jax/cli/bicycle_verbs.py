@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from jourdain_jax.bicycle.job import Refused, Study, run, table, write_results
-from jourdain_jax.bicycle.parameter_files import shipped_bicycles
+from jourdain_jax.bicycle.parameter_files import shipped_bicycles, shipped_measurements
 from jourdain_jax.plotting.bicycle_figures import animate_ride, draw_eigenvalues, draw_rides
 
 DEMO = "Rigid"  # a measured bicycle with all sigmas and a stable range
@@ -16,7 +16,9 @@ DEMO = "Rigid"  # a measured bicycle with all sigmas and a stable range
 def add(verbs) -> None:
     """Add the verbs to the parser."""
     job = verbs.add_parser("bicycle", help="stability speeds with uncertainty, and rides, of measured bicycles")
-    job.add_argument("files", nargs="+", metavar="FILE", help="parameter files (NAME = VALUE+/-SIGMA), or names of shipped bicycles")
+    job.add_argument(
+        "files", nargs="+", metavar="FILE", help="parameter files (NAME = VALUE+/-SIGMA), raw measurements (*Measured.txt), or names of shipped bicycles"
+    )
     _options(job, "bicycle-results")
     job.set_defaults(run=_bicycle)
 
@@ -34,7 +36,7 @@ def _options(parser, folder: str) -> None:
 
 
 def _bicycle(options) -> bool:
-    shipped = shipped_bicycles()
+    shipped = shipped_bicycles() | {path.stem: path for path in shipped_measurements().values()}
     return _job([shipped.get(name, name) if not os.path.exists(name) else name for name in options.files], options)
 
 

@@ -128,7 +128,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         inputs=inputs,
         state_form=field.name,
         reduction=field.reduction_name if reason_against_machine_code(setup) else f"{field.reduction_name} to machine code",
-        solver=type(options.solver).__name__,
+        solver=type(options.solver).__name__ if options.order is None else "Taylor",
         projected=moving,
         event_names=options.event_names,
     )

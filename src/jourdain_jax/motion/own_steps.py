@@ -45,6 +45,12 @@ def reason_against_machine_code(setup: Setup) -> str:
     return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(setup.options.event_names))
 
 
+def reason_against_series(setup: Setup, order: int) -> str:
+    """Why machine code does not integrate by Taylor series of an order, in words; empty where it can."""
+    reason = reason_against_machine_code(setup)
+    return reason or native_motion.reason_against_series(setup.field, setup.inputs, bool(setup.options.event_names), order)
+
+
 def _by_xla(setup: Setup, begun: Begun) -> Solved:
     return _loop(setup, begun.y0, begun.args, setup.ts, setup.knots)
 
@@ -84,7 +90,7 @@ def _motion(setup: Setup, begun: Begun) -> native_motion.Motion:
     options, knots = setup.options, setup.knots
     rtol, atol = setup.tolerances
     control = native_motion.Control(rtol, atol, setup.shortest, setup.dt0, _most_steps(setup, knots))
-    return native_motion.Motion(begun.args, type(options.solver), bool(options.event_names), begun.y0, _goals(setup, setup.ts), knots, control)
+    return native_motion.Motion(begun.args, type(options.solver), options.order, bool(options.event_names), begun.y0, _goals(setup, setup.ts), knots, control)
 
 
 def _most_steps(setup: Setup, knots) -> int:

@@ -8,6 +8,7 @@ Retries add up, and each is made once: a stiff motion that left the domain runs 
 
 from typing import TypeVar
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +17,7 @@ from jourdain_jax.motion.formulation import as_formulation
 from jourdain_jax.motion.integrators.radau import RadauIIA
 from jourdain_jax.motion.integrators.solver_choice import may_be_full
 from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS, implicit_steps, is_stiff
+from jourdain_jax.motion.integrators.taylor import Taylor
 from jourdain_jax.motion.setup import MOST_STEPS
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -44,6 +46,8 @@ def next_retry(field: VectorField, motion: Trajectory, t0, options: dict) -> int
 def retry_options(retries: int, options: dict) -> dict:
     """The options of `simulate` that make these retries; `options`: those that were given."""
     full = {"formulation": as_formulation(options.get("formulation")).with_state("full"), "backend": "dense"} if retries & results.FULL_STATE else {}
+    if full and isinstance(options.get("solver"), Taylor):  # which dense matrices do not have
+        full["solver"] = diffrax.Dopri8()
     implicit = {"solver": RadauIIA(), "max_steps": implicit_steps(options.get("max_steps", MOST_STEPS))} if retries & results.IMPLICIT else {}
     return full | implicit
 

@@ -35,6 +35,7 @@ class Options(eqx.Module):
     saveat: diffrax.SaveAt | None  # None: at the times asked for, at each of which a step ends
     event_names: tuple[str, ...] = eqx.field(static=True)
     native: bool = eqx.field(static=True, default=True)  # whether machine code of our own may integrate it
+    order: int | None = eqx.field(static=True, default=None)  # of Taylor series, by which machine code steps in place of the solver's tableau
 
     @property
     def by_own_steps(self) -> bool:

@@ -23,8 +23,9 @@ from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
 from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
+from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import marked
-from jourdain_jax.motion.own_steps import reason_against_machine_code
+from jourdain_jax.motion.own_steps import reason_against_machine_code, reason_against_series
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Options, Setup
@@ -53,7 +54,7 @@ def simulate(
     saveat: diffrax.SaveAt | None = None,
     rtol: Number = TOLERANCE,
     atol: Number = TOLERANCE,
-    solver: diffrax.AbstractSolver | None = None,
+    solver: diffrax.AbstractSolver | Taylor | None = None,
     stepsize_controller: diffrax.AbstractStepSizeController | None = None,
     dt0: Number | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
@@ -74,7 +75,8 @@ def simulate(
       its error can be far above the tolerance where steps are long (Dopri8 on a pendulum: 100 times at 1e-12; on a sleigh at 1e-11: 1e-6).
     - `rtol`, `atol`, `solver`, `stepsize_controller`, `dt0` (default: 1e-4 of the span), `adjoint`, `max_steps`: as in
       `diffrax.diffeqsolve`. Default solver: Tsit5 for
-      rtol >= 1e-6, Dopri8 below, and where these run out of steps on a stiff motion, `RadauIIA`; structure-preserving ones (`ImplicitMidpoint`,
+      rtol >= 1e-6, Dopri8 below, and where these run out of steps on a stiff motion, `RadauIIA`; `Taylor` for small scenes at
+      tight tolerances; structure-preserving ones (`ImplicitMidpoint`,
       `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps of at most `dt0` between saved times.
       Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order, by recorded steps; with `checkpoints=`, that of
       diffrax); `diffrax.ForwardMode()`
@@ -134,6 +136,7 @@ def _set_up(
 ) -> Setup:  # fmt: skip
     scene, formulation = as_scene(scene), as_formulation(formulation)
     switches = {"events": events, "work": work}
+    order, solver = (solver.order or order_for(rtol), None) if isinstance(solver, Taylor) else (None, solver)
     objects = {"solver": solver, "adjoint": adjoint, "stepsize_controller": stepsize_controller, "saveat": saveat}
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, switches=switches, **objects)
     _check_adjoint(adjoint)
@@ -144,13 +147,14 @@ def _set_up(
     field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
     warn_float32(start.q.dtype, rtol)
     options = (Options if any(x is not None for x in objects.values()) else _options)(
-        solver=default_solver(rtol) if solver is None else solver,
+        solver=(default_solver(rtol) if order is None else _TIGHT) if solver is None else solver,
         controller=stepsize_controller,
         adjoint=_REVERSE if adjoint is None else adjoint,
         max_steps=max_steps,
         saveat=None if saveat is None else _checked_saveat(saveat),
         event_names=names_of_events(scene) if events else (),
         native=backend in ("auto", "native"),
+        order=order,
     )
     tolerances = tuple((jnp if is_traced(x) else np).asarray(x, start.q.dtype) for x in (rtol, atol))  # arrays: another tolerance is no other program
     first_step = _first_step(solver, dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
@@ -158,6 +162,8 @@ def _set_up(
     setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, options)
     if backend == "native" and (reason := reason_against_machine_code(setup)):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
+    if order is not None and (reason := reason_against_series(setup, order)):
+        raise ValueError(f"solver=jj.Taylor() cannot integrate `{type(scene).__name__}`: {reason}; leave `solver` away, or use solver=diffrax.Dopri8()")
     return setup
 
 

@@ -191,12 +191,13 @@ def vectors_named(scene: Scene, values: Mapping) -> tuple[Float[Array | np.ndarr
 
 def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, tuple[str, ...]]:
     """As `Scene.named`, with entries of q and u in lists."""
-    q, u = scene.coordinates.reference().tolist(), [0.0] * len(scene.speed_names)
+    coordinates, speeds = scene.coordinate_names, scene.speed_names
+    q, u = scene.coordinates.reference().tolist(), [0.0] * len(speeds)
     given: list[str] = []
     for name, value in values.items():
-        hits = _put(scene.coordinate_names, q, name, value) + _put(scene.speed_names, u, name, value)
+        hits = _put(coordinates, q, name, value) + _put(speeds, u, name, value)
         if not hits:
-            valid = scene.coordinate_names.entries + scene.speed_names.entries
+            valid = coordinates.entries + speeds.entries
             raise ValueError(f"scene `{type(scene).__name__}` has no coordinate or speed `{name}`; {nearest(name, valid)}")
         given += hits
     return q, u, tuple(given)

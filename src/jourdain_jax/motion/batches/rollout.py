@@ -19,6 +19,7 @@ from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS
+from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.retries import lost_codes, mark_retried, next_retry, retry_options
@@ -282,6 +283,8 @@ def _with_arrays(options: dict) -> dict:
     check_options(**{name: value for name, value in numbers.items() if name in ("rtol", "atol", "dt0")})
     if options.get("solver") is None:
         options["solver"] = default_solver(options["rtol"])
+    if isinstance(options["solver"], Taylor):
+        options["solver"] = Taylor(options["solver"].order or order_for(options["rtol"]))
     real = jnp.result_type(float)
     warn_float32(real, options["rtol"])
     return options | {name: checked_real(value, f"`{name}`", None if name == "ts" else ()).astype(real) for name, value in numbers.items()}

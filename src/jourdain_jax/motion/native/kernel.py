@@ -17,6 +17,7 @@ from jourdain_jax.motion.integrators.erk_loop import method_of
 from jourdain_jax.motion.native import back, loop, samples
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Layout
+from jourdain_jax.motion.native.taylor import TaylorSteps
 from jourdain_jax.native import ffi, host
 
 ALONE = 2  # places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
@@ -36,9 +37,9 @@ class Kernel(NamedTuple):
 
 
 @lru_cache(maxsize=MOST_KERNELS)
-def kernel(form: Form, solver: type[diffrax.AbstractERK]) -> Kernel:
-    """The kernel for what is integrated, by the tableau of a solver of diffrax."""
-    method, layout = method_of(solver()), form.layout
+def kernel(form: Form, solver: type[diffrax.AbstractERK], order: int | None = None) -> Kernel:
+    """The kernel for what is integrated, by the tableau of a solver of diffrax, or by Taylor series up to an order."""
+    method, layout = method_of(solver()) if order is None else TaylorSteps(order), form.layout
 
     def shapes(*arguments):
         return (arguments[-1].shape[-1], layout.integrated), (layout.returned + 1,)

@@ -3,7 +3,8 @@
 A lane is handed over with all rows of `Layout.given`, its progress at the start among them, and handed back with those of its progress. Where a tangent is
 pushed along, the state is followed by its own, and so are the numbers that the rates are given; `dt` is that of the time of an event. Where inputs are
 given by samples, rows of pointers and whole numbers say where the samples of a lane are (`table`), how many each input has (`samples`), and where the next
-knot is at which a step must end (`knot`).
+knot is at which a step must end (`knot`). `taken` is by how far the last step has gone; of a step by Taylor series, `before` is the time at which it began, and
+`bound` how long the next one may be after one that was rejected.
 """
 
 from dataclasses import dataclass
@@ -51,7 +52,7 @@ class Layout:
         search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1, "search_slope": self.events}
         tangents = {"dt": 0 if self.moving is None else 1}, {"dknown": self.moving or 0}
         counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), **tangents[0], **dict.fromkeys(CONTROL, 1), "known": self.known, **tangents[1]}
-        counts |= {"goal": 1, "taken": 1, **(search if self.events else {}), **dict.fromkeys(SAMPLES if self.sampled else (), 1)}
+        counts |= {"goal": 1, "taken": 1, "before": 1, "bound": 1, **(search if self.events else {}), **dict.fromkeys(SAMPLES if self.sampled else (), 1)}
         found, first = {}, 0
         for name, count in counts.items():
             found[name] = range(first, first + count)

@@ -5,11 +5,14 @@ progress at the end with the number of times that were reached one after the oth
 (`samples.py`).
 """
 
+import math
+
 from jourdain_jax.motion.integrators.erk_step import LOCATING, RUNNING, Method
 from jourdain_jax.motion.native import samples
 from jourdain_jax.motion.native.functions import Form, write_events, write_projection, write_rates
 from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.motion.native.step import IDLE, write_step
+from jourdain_jax.motion.native.taylor import TaylorSteps
 from jourdain_jax.native.ffi import Given, write_handler
 from jourdain_jax.native.ir import Value, Writer
 
@@ -20,18 +23,20 @@ _STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
 MANY = 8  # times as many lanes as side by side make it worth while to start another thread, which takes some 30 us
 
 
-def written(form: Form, method: Method, lanes: int, fused: bool, threads: int) -> str:
+def written(form: Form, method: Method | TaylorSteps, lanes: int, fused: bool, threads: int) -> str:
     """The module of LLVM IR; `threads`: among which many lanes are shared."""
     w = Writer(lanes, fused)
     write_functions(w, form, method)
     _write_begin(w, form)
     _write_serve(w, form)
+    if isinstance(method, TaylorSteps):
+        _write_save_within(w, form, method)
     _write_loop(w, form, method)
     write_handler(w, 2 + samples.arguments(form.layout), 2, lambda arguments, results: write_job(w, form, arguments, results, threads))
     return w.text
 
 
-def write_functions(w: Writer, form: Form, method: Method) -> None:
+def write_functions(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     """`step`, and what it calls."""
     if form.sampled:
         samples.write_inputs(w, form.layout)
@@ -70,14 +75,14 @@ def write_job(w: Writer, form: Form, arguments: list[Given], results: list[Value
             w.external("pthread_join", "i32", w.load("i64", others, number), nothing)
 
 
-def _write_loop(w: Writer, form: Form, method: Method) -> None:
+def _write_loop(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     """`loop(job)`: lanes side by side until none is left."""
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         _write_lanes(w, form, method, job)
         w.give(Value(w, "ptr", "null"))
 
 
-def _write_lanes(w: Writer, form: Form, method: Method, job: Value) -> None:
+def _write_lanes(w: Writer, form: Form, method: Method | TaylorSteps, job: Value) -> None:
     # of each place, which lane is there and how many of its times are saved; after them, at how many places there is one
     state, who, k = w.room(w.real, form.layout.all), w.room("i64", 2 * w.lanes + 1), w.room(w.real, form.layout.integrated * method.needed)
     w.store(w.literal(w.lanes, "i64"), who, 2 * w.lanes)
@@ -90,6 +95,8 @@ def _write_lanes(w: Writer, form: Form, method: Method, job: Value) -> None:
     with w.repeated() as leave:
         leave(w.load("i64", who, 2 * w.lanes).equals(0))
         w.call("step", "void", state, k)
+        if isinstance(method, TaylorSteps):
+            w.call("save_within", "void", job, state, who, k)
         code = lanes["code"]
         on_its_way = (code.equals(float(RUNNING)) & lanes["t"].differs(lanes["goal"])) | code.equals(float(LOCATING)) | code.equals(IDLE)
         with w.when(w.any(~on_its_way)), w.counted(0, w.lanes) as lane:
@@ -113,6 +120,7 @@ def _write_begin(w: Writer, form: Form) -> None:
                 samples.begin(w, form.layout, w.at(job, FIRST_OF_SAMPLES, "i64"), w.load("i64", job, COUNT), lanes, lane, number)
                 goal = samples.nearer(w, lanes, lane, goal)
             lanes.set("goal", lane, goal)
+            lanes.set("bound", lane, math.inf)
             if form.has_events:
                 lanes.set("search_left", lane, 0.0)
         with w.when(~there):
@@ -142,6 +150,37 @@ def _write_serve(w: Writer, form: Form) -> None:
                     _save(w, form, job, who, lanes, lane, runs)
             else:
                 _save(w, form, job, who, lanes, lane, runs)
+        w.give()
+
+
+def _write_save_within(w: Writer, form: Form, method: TaylorSteps) -> None:
+    """`save_within(job, state, who, k)`: saves what is due before the end of a step, by the Taylor coefficients `k` of its start."""
+    with w.function("save_within", "void", {"job": "ptr", "state": "ptr", "who": "ptr", "k": "ptr"}, attributes="noinline") as (job, state, who, k):
+        layout, lanes = form.layout, Lanes(w, form.layout, state)
+        every, flags, y = layout.integrated, w.room(w.real), w.room(w.real, layout.integrated)
+        times, goals, states = (w.load("i64", job, TIMES), *(w.load("ptr", job, word) for word in (_GOALS, _STATES)))
+        with w.repeated() as leave:
+            goal = lanes["goal"]
+            due = ((goal - lanes["t"]) * lanes["direction"] < 0.0) & lanes["code"].differs(IDLE)
+            leave(~w.any(due))
+            s = goal - lanes["before"]
+            with w.counted(0, every) as row:
+                total = w.load(w.real, k, row + method.order * every)
+                for j in reversed(range(method.order)):
+                    total = w.fma(total, s, w.load(w.real, k, row + j * every))
+                w.store(total, y, row)
+            if form.projects:
+                w.call("project", "void", state, goal, y)
+            w.store(w.where(due, 1.0, w.number(0.0)), flags)
+            with w.counted(0, w.lanes) as lane, w.when(w.load("double", flags, lane) > 0.0):
+                saved = w.load("i64", who, lane + w.lanes)
+                place = w.load("i64", who, lane) * times + saved
+                with w.counted(0, every) as row:
+                    w.store(w.load("double", y, row * w.lanes + lane), states, place * every + row)
+                w.store(saved + 1, who, lane + w.lanes)
+                lanes.set("goal", lane, lanes.of("direction", lane) * math.inf)  # where an event was found a rounding beyond the last time
+                with w.when((saved + 1) < times):
+                    lanes.set("goal", lane, w.load("double", goals, place + 1))
         w.give()
 
 

@@ -16,13 +16,16 @@ from jourdain_jax.motion.native.functions import Form, event_program, outputs_of
 from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel, kernel_back
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.pulled import pulled_program, steps_of
+from jourdain_jax.motion.native.taylor import rates_of
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
-from jourdain_jax.native import ffi, host
+from jourdain_jax.native import ffi, host, series
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.graph import Unsupported
 
 LARGEST_PROGRAM = 10_000  # operations of all that is evaluated; measured: 2,000 take 0.3 to 0.5 s to compile, 6,800 1 to 2.4 s
+
+MOST_PRODUCTS = 12_000  # of coefficients in a step by Taylor series, which is written out
 
 
 class Control(NamedTuple):
@@ -40,6 +43,7 @@ class Motion(NamedTuple):
 
     args: tuple  # as rates take them
     solver: type
+    order: int | None  # of Taylor series, in place of the solver's tableau
     has_events: bool
     y0: Integrated
     goals: Float[Array, "times"]
@@ -88,6 +92,23 @@ def _reason_against_program(form: Form) -> str:
     return reason
 
 
+def reason_against_series(field: VectorField, inputs: Inputs, has_events: bool, order: int) -> str:
+    """Why machine code that integrates a scene cannot do so by Taylor series, in words; empty where it can."""
+    assert isinstance(field, ByProgram)
+    return _reason_against_series(_form(field, inputs, has_events), order)
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def _reason_against_series(form: Form, order: int) -> str:
+    if form.sampled:
+        return "an input is given by samples"
+    graph, rates = form.program.graph, rates_of(form)
+    if reason := series.reason_against(graph, rates):
+        return reason
+    count = series.products(graph, rates, order)
+    return f"its series take {count} products, more than {MOST_PRODUCTS}" if count > MOST_PRODUCTS else ""
+
+
 def reason_against_derivatives(field: VectorField, inputs: Inputs, has_events: bool) -> str:
     """Why machine code that integrates a scene cannot differentiate it, in words; empty where it can."""
     assert isinstance(field, ByProgram)
@@ -119,14 +140,14 @@ def _form_of(motion: Motion, moving: tuple[int, ...] | None = None) -> Form:
 
 def integrate(motion: Motion) -> tuple[Integrated, Bool[Array, "times"], Progress]:
     """As `erk_loop.integrate`, of one motion from time zero."""
-    own = kernel(_form_of(motion), motion.solver)
+    own = kernel(_form_of(motion), motion.solver, motion.order)
     return _unpacked(own.layout, motion.goals, *own.run(*_samples(motion), jnp.concatenate([_packed(motion.y0), *_rows(motion)]), motion.goals))
 
 
 def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, of: Callable) -> PyTree:
     """The tangents of `of` what `integrate` returns; `dy0`, `dknown`: of the state, and of each of the numbers that the rates are given, None: zero."""
     moving = tuple(i for i, d in enumerate(dknown) if d is not None)
-    own = kernel(_form_of(motion, moving), motion.solver)
+    own = kernel(_form_of(motion, moving), motion.solver, motion.order)
     layout, (progress, limits, known) = own.layout, _rows(motion)
     more = [jnp.asarray(dknown[i], jnp.float64)[None] for i in moving]
     states, end = own.run(*_samples(motion), jnp.concatenate([_packed(motion.y0), _packed(dy0), progress, jnp.zeros(1), limits, known, *more]), motion.goals)

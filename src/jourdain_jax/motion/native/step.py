@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from jourdain_jax.motion.integrators.event_search import DIFFERENTIABLE
 from jourdain_jax.motion.native import search
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Lanes, Layout
+from jourdain_jax.motion.native.taylor import TaylorSteps, at_time, jet, radius, slope, watched_at
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import power
@@ -20,18 +22,33 @@ UNROLLED = 12  # numbers of a state; more are gone through by loops, whose code 
 IDLE = -9.0  # code of a place that has no lane
 
 
-def write_step(w: Writer, form: Form, method: Method) -> None:
-    """`step(state, k)`: one step, tried by all lanes that are on their way; `k`: room for the slopes of its stages."""
+class Trial(NamedTuple):
+    """A step that is tried by all lanes."""
+
+    t1: Value
+    step: Value
+    y1: Value  # pointer: the state after it
+    accept: Value
+    next_h: Value  # positive
+    pivot: Value | None  # the smallest magnitude of a pivot that is watched
+
+
+def write_step(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
+    """`step(state, k)`: one step, tried by all lanes that are on their way; `k`: room for the slopes of its stages, or for Taylor coefficients."""
     with w.function("step", "void", {"state": "ptr noalias", "k": "ptr noalias"}, attributes="noinline") as (state, k):
-        _write_step(w, form, method, Lanes(w, form.layout, state), k)
+        lanes = Lanes(w, form.layout, state)
+        if isinstance(method, TaylorSteps):
+            _take(w, form, method, lanes, w.at(k, form.layout.integrated, w.real), _tried_by_series(w, form, method, lanes, k))
+        else:
+            _take(w, form, method, lanes, k, _tried_by_stages(w, form, method, lanes, k))
         w.give()
 
 
-def _write_step(w: Writer, form: Form, method: Method, p: Lanes, k: Value) -> None:
+def _tried_by_stages(w: Writer, form: Form, method: Method, p: Lanes, k: Value) -> Trial:
+    """A step of a Runge-Kutta method, which ends at the next time to save at, if not before."""
     layout, y = form.layout, p.pointer  # the state comes first in the rows of a lane
-    rows = range(layout.integrated)
-    t, h, code, goal, direction = p["t"], p["h"], p["code"], p["goal"], p["direction"]
-    locating = code.equals(float(LOCATING))
+    t, h, goal, direction = p["t"], p["h"], p["goal"], p["direction"]
+    locating = p["code"].equals(float(LOCATING))
     rest = w.magnitude(goal - t)
     lands = ~locating & (h >= 0.999 * rest)
     size = w.where(lands, rest, w.where(2.0 * h > rest, 0.5 * rest, h))
@@ -41,7 +58,7 @@ def _write_step(w: Writer, form: Form, method: Method, p: Lanes, k: Value) -> No
     step = t1 - t
     smallest, changed_sign = _stages(w, form, method, p, k, t, step)
     y1, error = w.room(w.real, layout.integrated), w.room(w.real, layout.y)
-    each_row(w, rows, y1, lambda i: w.fma(step, weighted(w, method.b, k, layout, i), w.load(w.real, y, i)))
+    each_row(w, range(layout.integrated), y1, lambda i: w.fma(step, weighted(w, method.b, k, layout, i), w.load(w.real, y, i)))
     each_row(w, range(layout.y), error, lambda i: step * weighted(w, method.b_error, k, layout, i))
     if form.projects:
         _project(w, layout, p, t1, y1, error)
@@ -53,6 +70,57 @@ def _write_step(w: Writer, form: Form, method: Method, p: Lanes, k: Value) -> No
     factor = w.larger(w.where(size_of_error < math.inf, factor, 0.0), LEAST_FACTOR)
     proposed = size * w.smaller(factor, w.where(accept, LARGEST_FACTOR, w.number(1.0)))
     next_h = w.where(accept & shortened, w.larger(proposed, h), proposed)
+    return Trial(t1, step, y1, accept, next_h, smallest if form.pivots else None)
+
+
+def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Value) -> Trial:
+    """A step by Taylor series, which goes over the times to save at; puts the coefficients into `k`, and after them the slope at the end of the step."""
+    layout, count = form.layout, form.layout.integrated
+    t, last_goal, direction = p["t"], p["last_goal"], p["direction"]
+    locating = p["code"].equals(float(LOCATING))
+    rows, at_start = jet(w, form, p, t, method.order)
+    for row, series in enumerate(rows):
+        for j, x in enumerate(series):
+            w.store(w.number(0.0) if x is None else x, k, j * count + row)
+    length = radius(w, layout, p, rows)
+    size = w.smaller(length, p["bound"])
+    rest = w.magnitude(last_goal - t)
+    lands = ~locating & (size >= 0.999 * rest)
+    size = w.where(lands, rest, size)
+    step = w.where(locating, p["search_shift"], direction * size) if form.has_events else direction * size
+    t1 = w.where(lands, last_goal, t + step)
+    step = t1 - t
+    y1, pivot, accept = w.room(w.real, count), None, size > 0.0
+    for row, series in enumerate(rows):
+        w.store(at_time(w, series, step), y1, row)
+        if form.has_events:
+            w.store(at_time(w, slope(series), step), k, (method.order + 1) * count + row)
+    at_end = watched_at(w, form, p, t1, y1)
+    holds = at_start.holds & at_end.holds
+    w.store(w.where(holds, w.load(w.real, y1), math.nan), y1)
+    accept, length = accept & holds, w.where(at_start.holds, length, 0.0)
+    for a, b in zip(at_start.pivots, at_end.pivots, strict=True):
+        least = w.smaller(w.magnitude(a), w.magnitude(b))
+        pivot = least if pivot is None else w.smaller(pivot, least)
+        accept = accept & ~(((a < 0.0) & (b > 0.0)) | ((a > 0.0) & (b < 0.0)))
+    if form.projects:
+        error = w.room(w.real, layout.y)
+        each_row(w, range(layout.y), error, lambda i: w.number(0.0))
+        _project(w, layout, p, t1, y1, error)
+        accept = accept & (_norm(w, layout, p, error, y1) <= 1.0)
+    accept = locating | accept
+    p["bound"] = w.where(accept, math.inf, 0.5 * size)
+    p["before"] = t
+    return Trial(t1, step, y1, accept, w.where(accept, length, w.smaller(length, 0.5 * size)), pivot)
+
+
+def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Value, trial: Trial) -> None:
+    """What becomes of the lanes after a step that was tried; `k`: slopes, the one at the start first."""
+    layout, y = form.layout, p.pointer
+    rows = range(layout.integrated)
+    t, code, direction = p["t"], p["code"], p["direction"]
+    locating = code.equals(float(LOCATING))
+    t1, step, y1, accept, next_h, _ = trial
     accepted = p["accepted"] + _count(w, accept & ~locating)
     rejected = p["rejected"] + _count(w, ~accept)
     too_short = (next_h < p["shortest"]) | (t1 + direction * next_h).equals(t1)
@@ -64,9 +132,9 @@ def _write_step(w: Writer, form: Form, method: Method, p: Lanes, k: Value) -> No
     each_row(w, rows, y1, lambda i: w.where(accept, w.load(w.real, y1, i), w.load(w.real, y, i)))
     if form.has_events:
         new = _watched(w, form, method, p, k, step, accept, new, y1)
-    if form.pivots:
+    if trial.pivot is not None:
         counts = accept & ~locating & new["code"].equals(float(RUNNING)) & new["t"].equals(t1)
-        pivot = w.where(counts, w.smaller(p["pivot"], smallest), p["pivot"])
+        pivot = w.where(counts, w.smaller(p["pivot"], trial.pivot), p["pivot"])
         new |= {"pivot": pivot, "code": w.where(counts & (pivot < SMALLEST_PIVOT), float(results.SINGULAR_PARTITION), new["code"])}
     moving = locating | code.equals(float(RUNNING))
     each_row(w, rows, y, lambda i: w.where(moving, w.load(w.real, y1, i), w.load(w.real, y, i)))
@@ -161,7 +229,9 @@ def _count(w: Writer, happens: Value) -> Value:
     return w.where(happens, 1.0, w.number(0.0))
 
 
-def _watched(w: Writer, form: Form, method: Method, p: Lanes, k: Value, step: Value, accept: Value, new: dict[str, Value], y1: Value) -> dict[str, Value]:
+def _watched(
+    w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Value, step: Value, accept: Value, new: dict[str, Value], y1: Value
+) -> dict[str, Value]:
     """The step in which an event may have happened or is being located, or before which one has; changes `y1`."""
     layout, count, y = form.layout, form.layout.events, p.pointer
     t, code, rows = p["t"], p["code"], range(layout.integrated)

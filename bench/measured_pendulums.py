@@ -1,0 +1,99 @@
+"""Parameters of bicycles from raw measurements against the published ones, and what their covariance does to the limits on the weave speed.
+
+    python bench/measured_pendulums.py [--quick] [--json FILE]
+
+Writes a list of {"figure", "model", "value", "required", "met"}. `--quick`: three bicycles, 200 samples each instead of 2,000.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.bicycle import (
+    benchmark_from_measurements,
+    interval,
+    linear_matrices,
+    measured_bicycle,
+    sample_parameters,
+    shipped_bicycles,
+    shipped_measurements,
+    stability_speeds,
+)
+from jourdain_jax.bicycle.parameters import PARAMETER_NAMES
+
+ABOUT_CENTRES = ("xB", "zB", "xH", "zH", "IByy", "IHyy")  # published as means over pairs of lines
+ROUNDED = ("Balanceassistv1",)  # its file gives two or three digits
+SPLIT = ("Rigid",)  # moments of its fork follow from two mass centres
+
+
+def figure(name: str, model: str, value: float, required: float | None = None) -> dict:
+    """One entry of the result."""
+    met = required is None or value <= required
+    print(f"  {name}, {model}: {value:.4g}" + ("" if required is None else f" (required: <= {required:g})"), flush=True)
+    return {"figure": name, "model": model, "value": value, "required": required, "met": bool(met)}
+
+
+def against_published(name: str) -> list[dict]:
+    """How far values and sigmas are from the published ones, in published sigmas."""
+    found, published = benchmark_from_measurements(name), measured_bicycle(name)
+    about = ABOUT_CENTRES + (("IHxx", "IHzz", "IHxz") if name in SPLIT else ())
+    known = [n for n in PARAMETER_NAMES if published.sigmas[n] > 0]
+    apart = {n: abs(found.values[n] - published.values[n]) / published.sigmas[n] for n in known}
+    ratio = {n: abs(found.sigmas[n] / published.sigmas[n] - 1) for n in known}
+    others = [n for n in known if n not in about]
+    exact = name not in ROUNDED and name not in SPLIT
+    return [
+        figure("values that no mass centre enters, published sigmas apart", name, max(apart[n] for n in others), 0.1 if name in ROUNDED else 1e-6),
+        figure("their sigmas, relative to the published ones, off by", name, max(ratio[n] for n in others), 1e-6 if exact else None),
+        figure("values that follow from mass centres, published sigmas apart", name, max(apart[n] for n in about if n in known)),
+    ]
+
+
+def weave_speeds(values):
+    """Of many bicycles."""
+    return jax.vmap(lambda one: stability_speeds(*linear_matrices(one)).weave_speed)(values)
+
+
+compiled = jax.jit(weave_speeds, compiler_options={"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0})
+
+
+def width(bicycle, count: int) -> float:
+    """Of the 95 % limits on the weave speed, m/s."""
+    samples = sample_parameters(bicycle, jax.random.key(0), count)
+    nominal = jnp.array([[bicycle.values[n]] for n in PARAMETER_NAMES])
+    values = jnp.where(samples.physical, samples.values.T, nominal)
+    limits = interval(compiled(dict(zip(PARAMETER_NAMES, values, strict=True))), counted=samples.physical)
+    return float(limits.high - limits.low)
+
+
+def main() -> None:
+    """Run, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    names = ["Browser", "Crescendo", "Stratos"] if options.quick else list(shipped_measurements())
+    figures, ratios = [], []
+    for name in names:
+        print(name)
+        if name in shipped_bicycles():
+            figures += against_published(name)
+        bicycle = benchmark_from_measurements(name)
+        together, alone = (width(one, 200 if options.quick else 2000) for one in (bicycle, bicycle.with_independent_errors))
+        ratios.append(together / alone)
+        figures += [
+            figure("95 % limits on the weave speed, width with covariance, m/s", name, together),
+            figure("and with independent sigmas, m/s", name, alone),
+            figure("one over the other", name, ratios[-1]),
+        ]
+    figures.append(figure("widths with covariance over those with independent sigmas, median", f"{len(names)} bicycles", float(np.median(ratios))))
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

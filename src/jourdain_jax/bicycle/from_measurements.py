@@ -1,0 +1,224 @@
+"""The parameters of a bicycle from what was read off its parts, with their covariance.
+
+    y: readings with standard deviations s;   theta(y): parameters, defined by conditions F(theta, y) = 0
+    covariance of theta = J diag(s^2) J',     J = d theta / d y = - F_theta^-1 F_y      (implicit function theorem)
+
+F says that the scenes of `pendulums.py` have the periods that were timed, and that the mass centre of a hung part lies below the rod. Of more than
+three hangings, and of three upright lines through one point, the sum of squares is smallest. Readings are independent; parameters that come of the same
+readings are not: all inertias share the stiffness of the rod, and the place of a mass centre its moment of inertia about y.
+Source: J. D. G. Kooijman, M.Sc. thesis, Delft (2006), chapter 3; J. K. Moore, Human control of a bicycle, Ph.D. thesis, Davis (2012), chapter 4.
+"""
+
+from functools import lru_cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.bicycle.parameter_files import MeasuredBicycle, shipped_measurements
+from jourdain_jax.bicycle.parameters import PARAMETER_NAMES, doubts, violations
+from jourdain_jax.bicycle.pendulums import SwungPart, TwistedPart, period
+from jourdain_jax.bicycle.readings import Readings, read_readings
+from jourdain_jax.calculus.newton import newton_root
+from jourdain_jax.motion.quick_compilation import quickly_compiled
+from jourdain_jax.scene.names import nearest
+
+Scalar = Float[Array, ""]
+Values = dict[str, Scalar]
+
+_FAR = 3.0  # standard deviations, by which upright lines may miss a mass centre without a word
+
+
+def benchmark_from_measurements(path: str | Path) -> MeasuredBicycle:
+    """The 26 parameters of a bicycle with their covariance, from periods, hang angles and lengths of its parts.
+
+        bicycle = benchmark_from_measurements("Browser")  # shipped; or the path of a file
+        bicycle.values["IBxx"], bicycle.covariance        # kg m^2; in the order of the names in `values`
+
+    Derivatives of the parameters by the readings are exact, to first order in the sigmas of the readings (see the head of the module). A mass centre is where
+    the squared distances to the upright lines through it are least: the published values are means over all pairs of lines, to which two lines that are
+    nearly parallel contribute as much as others.
+
+    **Arguments:** `path`, of a file of readings (`readings.py` lists what it holds), or the name of a shipped one (`shipped_measurements`).
+    **Returns:** a `MeasuredBicycle`, with a warning for lines that miss the mass centre by more than their sigmas allow.
+    **Raises** ValueError: a file that cannot be read or does not hold what is needed, an unknown name, and readings that belong to no bicycle.
+    """
+    if isinstance(path, str) and not Path(path).exists() and not Path(path).suffix:
+        known = shipped_measurements()
+        if path not in known:
+            raise ValueError(f"there are no measurements of a bicycle `{path}`, and no such file; {nearest(path, known)}")
+        path = known[path]
+    readings = read_readings(path)
+    found, slopes = _with_slopes(readings)
+    sigmas = np.array([readings.sigmas[name] for name in readings.means])
+    jacobian = np.array([slopes[name] for name in (*PARAMETER_NAMES, *_misses(readings))]) * sigmas
+    values = {name: float(found[name]) for name in PARAMETER_NAMES}
+    if broken := [sentence for sentence, is_broken in violations(values).items() if is_broken]:
+        raise ValueError(f"{readings.path}: these readings belong to no bicycle: {'; '.join(broken)}. Look for a reading in another unit, or of another part.")
+    parameters, misses = np.split(jacobian, [len(PARAMETER_NAMES)])
+    covariance = parameters @ parameters.T
+    return MeasuredBicycle(
+        name=Path(readings.path).stem,
+        values=values,
+        sigmas=dict(zip(PARAMETER_NAMES, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        path=readings.path,
+        without_sigma=readings.without_sigma,
+        ignored=readings.unused,
+        warnings=doubts(values) + _missing_lines(readings, found, misses),
+        covariance=covariance,
+    )
+
+
+def _misses(readings: Readings) -> tuple[str, ...]:
+    return tuple(f"miss {part}{k}" for part, numbers in readings.hangings.items() for k in numbers)
+
+
+def _missing_lines(readings: Readings, found: Values, misses: np.ndarray) -> tuple[str, ...]:
+    """A sentence for each part whose upright lines do not meet, as far as their sigmas tell."""
+    names, warnings = _misses(readings), []
+    for part in readings.hangings:
+        here = [i for i, name in enumerate(names) if name.startswith(f"miss {part}")]
+        distance = [abs(float(found[names[i]])) for i in here]
+        sigma = np.sqrt(np.sum(misses[here] ** 2, axis=1))
+        # where sigmas are zero, so is the scale
+        ratio = np.divide(distance, sigma, out=np.where(np.array(distance) > 1e-12, np.inf, 0.0), where=sigma > 0)
+        worst = int(np.argmax(ratio))
+        if ratio[worst] > _FAR:
+            warnings.append(
+                f"upright lines through the hung part {part} miss its mass centre by up to {1e3 * max(distance):.1f} mm, {ratio[worst]:.0f} sigmas: "
+                "these sigmas are too small, or a reading is wrong"
+            )
+    return tuple(warnings)
+
+
+def _with_slopes(readings: Readings) -> tuple[Values, dict[str, Float[Array, "readings"]]]:
+    """Parameters and distances of upright lines, and their derivatives with respect to each reading, in the order of its means."""
+    means = {name: jnp.asarray(value, jnp.result_type(float)) for name, value in readings.means.items()}
+    return _program(tuple(readings.hangings.items()), readings.by_table)(means)
+
+
+@lru_cache(maxsize=8)
+def _program(hangings: tuple[tuple[str, tuple[int, ...]], ...], by_table: bool):
+    """The compiled function of readings with these names."""
+
+    def run(means: Values):
+        found, slope = jax.linearize(lambda y: _parameters(y, dict(hangings), by_table), means)  # compiles in half the time of `jacfwd`
+        by = [{name: jnp.asarray(float(name == one)) for name in means} for one in means]
+        return found, jax.vmap(slope)(jax.tree.map(lambda *x: jnp.stack(x), *by))
+
+    return quickly_compiled(run, run_seldom=True)
+
+
+def _parameters(y: Values, hangings: dict[str, tuple[int, ...]], by_table: bool) -> Values:
+    """All parameters of the benchmark, and by how much upright lines miss the mass centres ("miss B1")."""
+    found = {"g": y["g"]} | {f"r{wheel}": y[f"d{wheel}"] / (2 * jnp.pi * y[f"n{wheel}"]) for wheel in "RF"}
+    found |= {f"m{part}": y[f"m{part}"] for part in ("R", "F", *hangings)}
+    found |= _geometry(y, found, by_table)
+    rear, front = jnp.stack([jnp.zeros(()), -found["rR"]]), jnp.stack([found["w"], -found["rF"]])
+    hung_by, lengths = {"B": rear, "H": front, "S": front}, {wheel: y[f"l{wheel}"] for wheel in "RF"}
+    if "G" in hangings:
+        hung_by["G"] = front - _handlebar_to_axle(y, found["lam"])
+    tilts = {}
+    for part, numbers in hangings.items():
+        # with the steer axis as on the road, alpha is 90 degrees + lam
+        tilts[part] = jnp.deg2rad(_column("alpha", part, numbers, y)) - found["lam"] - jnp.pi / 2
+        r, misses = _mass_centre(tilts[part], _column("a", part, numbers, y))
+        found |= {f"{axis}{part}": at for axis, at in zip("xz", hung_by[part] + r, strict=True)}
+        found |= {f"miss {part}{k}": miss for k, miss in zip(numbers, misses, strict=True)}
+        lengths[part] = jnp.sqrt(r @ r)
+    found |= _moments_about_y(y, lengths) | _moments_in_plane(y, hangings, tilts)
+    return found if "G" not in hangings else found | _together(found)
+
+
+def _column(what: str, part: str, numbers: tuple[int, ...], y: Values) -> Float[Array, "hangings"]:
+    return jnp.stack([y[f"{what}{part}{k}"] for k in numbers])
+
+
+def _geometry(y: Values, known: Values, by_table: bool) -> Values:
+    """Wheelbase, trail and tilt of the steer axis: with lengths of the rear frame a, of the fork b, across, and along the steer axis d between the wheels,
+
+    w = (a + b) cos lam + d sin lam,    rR - rF = d cos lam - (a + b) sin lam,    trail = (rF sin lam - b) / cos lam
+    """
+    if not by_table:
+        w, lam, b = y["w"], jnp.deg2rad(90 - y["gamma"]), y["f"]
+    else:
+        a = y["h1"] + y["h2"] - y["h3"] + (y["d1"] - y["d2"]) / 2
+        b = y["h4"] - y["h5"] + (y["d4"] - y["d3"]) / 2
+        d = jnp.sqrt((y["d"] + (y["d2"] + y["d3"]) / 2) ** 2 - (a - b) ** 2)
+
+        def wheels_on_the_ground(x):
+            return d * jnp.cos(x) - (a + b) * jnp.sin(x) - (known["rR"] - known["rF"])
+
+        lam = newton_root(wheels_on_the_ground, jnp.full(1, 0.3), jnp.ones(1)).x[0]
+        w = (a + b) * jnp.cos(lam) + d * jnp.sin(lam)
+    return {"w": w, "lam": lam, "c": (known["rF"] * jnp.sin(lam) - b) / jnp.cos(lam)}
+
+
+def _handlebar_to_axle(y: Values, lam: Scalar) -> Float[Array, "2"]:
+    """From where the handlebar hung to the front axle, (x, z), m; both lay on a table, with the steer axis level."""
+    across = y["h7"] - y["h6"] + (y["d5"] - y["d6"]) / 2
+    along = jnp.sqrt((y["l"] - (y["d5"] + y["d6"]) / 2) ** 2 - across**2)
+    return jnp.stack([along * jnp.sin(lam) - across * jnp.cos(lam), along * jnp.cos(lam) + across * jnp.sin(lam)])
+
+
+def _mass_centre(tilts: Float[Array, "hangings"], beside: Float[Array, "hangings"]) -> tuple[Float[Array, "2"], Float[Array, "hangings"]]:
+    """(x, z) from where the part hangs by to its mass centre, m, and by how much the lines of the rod miss it.
+
+    cos(tilt) x + sin(tilt) z = a: the rod, whose line is upright, is a beside the point that the part hangs by.
+    """
+    across = jnp.stack([jnp.cos(tilts), jnp.sin(tilts)], axis=1)
+    misses = lambda r: across @ r - beside  # noqa: E731
+    r = newton_root(lambda r: across.T @ misses(r), jnp.zeros(2), jnp.ones(2)).x
+    return r, misses(r)
+
+
+def _moments_about_y(y: Values, lengths: Values) -> Values:
+    """Iyy of the parts with these distances of the mass centre from the axle, kg m^2: the swung scenes have the periods that were timed."""
+    mass, length, timed = (jnp.stack(of) for of in zip(*((y[f"m{p}"], lengths[p], y[f"Tc{p}1"]) for p in lengths), strict=True))
+
+    def wrong(moments):
+        swung = lambda m, moment, l: period(SwungPart(mass=m, inertia=moment, length=l, gravity=y["g"])) ** 2  # noqa: E731
+        return jax.vmap(swung)(mass, moments, length) - timed**2
+
+    moments = newton_root(wrong, jnp.full(len(lengths), 0.3), jnp.ones(len(lengths))).x
+    return {f"I{part}yy": moment for part, moment in zip(lengths, moments, strict=True)}
+
+
+def _moments_in_plane(y: Values, hangings: dict[str, tuple[int, ...]], tilts: dict[str, Float[Array, "_"]]) -> Values:
+    """Ixx, Izz, Ixz of the parts and Ixx of the wheels, kg m^2: the twisted scenes have the periods that were timed, of more than three as nearly as may be."""
+    names = [f"I{wheel}xx" for wheel in "RF"] + [f"I{part}{axes}" for part in hangings for axes in ("xx", "zz", "xz")]
+    # a bar of known inertia gauges the rod. Then the wheels, on the rod by their rims: Izz = Ixx, Ixz = 0. The sixth is a zero, the seventh the bar
+    bar = y["mP"] * (3 * (y["dP"] / 2) ** 2 + y["lP"] ** 2) / 12
+    zero, gauge = len(names), len(names) + 1
+    places = [(gauge, gauge, zero), (0, 0, zero), (1, 1, zero)]
+    places += [tuple(names.index(f"I{part}{axes}") for axes in ("xx", "zz", "xz")) for part, numbers in hangings.items() for _ in numbers]
+    tilt = jnp.concatenate([jnp.zeros(3), *tilts.values()])
+    timed = jnp.stack([y["TtP1"], y["TtR1"], y["TtF1"], *(y[f"Tt{part}{k}"] for part, numbers in hangings.items() for k in numbers)])
+
+    def squared_ratios(moments):
+        """Squares of the periods over that of the bar, on which the stiffness of the rod has no influence."""
+        entries = jnp.concatenate([moments, jnp.stack([jnp.zeros(()), bar])])[np.array(places)]
+        twisted = lambda entry, angle: period(TwistedPart(Ixx=entry[0], Izz=entry[1], Ixz=entry[2], tilt=angle)) ** 2  # noqa: E731
+        squares = jax.vmap(twisted)(entries, tilt)
+        return squares[1:] / squares[0]
+
+    def condition(moments):
+        wrong, back = jax.vjp(lambda m: squared_ratios(m) - (timed[1:] / timed[0]) ** 2, moments)
+        return back(wrong)[0]
+
+    guess = jnp.array([0.0 if name.endswith("xz") else 0.3 for name in names])
+    return dict(zip(names, newton_root(condition, guess, jnp.ones(len(names))).x, strict=True))
+
+
+def _together(found: Values) -> Values:
+    """Handlebar G and fork S as one body H."""
+    mass = found["mG"] + found["mS"]
+    x, z = ((found["mG"] * found[f"{axis}G"] + found["mS"] * found[f"{axis}S"]) / mass for axis in "xz")
+    moments = dict.fromkeys(("xx", "yy", "zz", "xz"), jnp.zeros(()))
+    for part in "GS":
+        m, dx, dz = found[f"m{part}"], found[f"x{part}"] - x, found[f"z{part}"] - z
+        apart = {"xx": m * dz**2, "yy": m * (dx**2 + dz**2), "zz": m * dx**2, "xz": -m * dx * dz}
+        moments = {axes: moments[axes] + found[f"I{part}{axes}"] + apart[axes] for axes in moments}
+    return {"mH": mass, "xH": x, "zH": z} | {f"IH{axes}": moment for axes, moment in moments.items()}

@@ -1,0 +1,125 @@
+"""Files of raw measurements of a bicycle, `name = reading+/-sigma, reading+/-sigma, ...` per line: lengths, masses, angles and periods of its parts.
+
+Format of BicycleParameters (Moore, Hubbard & Kooijman), files `*Measured.txt`. Several readings of one quantity count as their mean m, whose standard
+deviation is sqrt(sum sigma^2) / readings. Part and number follow the name of what was read: `TtB2` is the period of the rear frame B, second hanging.
+
+| name | what was read | unit |
+|---|---|---|
+| `dR nR`, `dF nF` | way of a wheel over so many turns; turns | m |
+| `w gamma f`, or `h1`...`h5`, `d1`...`d4`, `d` | wheelbase, slope of the steer axis, fork offset; or heights and diameters on a level table | m, deg |
+| `mR mF mB mH`, or `mG mS` for `mH` | masses of wheels, rear frame, fork with handlebar; or of the handlebar G and the fork S by themselves | kg |
+| `lR TcR1`, `lF TcF1`, `TcB1`, `TcH1` | swung: from axle to middle of a wheel, period; frame and fork hang by the middle of their wheel | m, s |
+| `TtR1`, `TtF1` | twisted on an upright rod, about a diameter of the wheel | s |
+| `alphaB1 aB1 TtB1`, ... | twisted: slope of the steer axis, place of the rod beside the middle of the wheel, period; three hangings or more | deg, m, s |
+| `mP lP dP TtP1` | a steel bar of known inertia, by which the rod is gauged | kg, m, s |
+| `h6 h7 d5 d6 l` | where the handlebar G hung, seen from the front axle; only with G and S | m |
+| `g` | gravity | m/s^2 |
+"""
+
+import math
+import re
+from pathlib import Path
+
+import equinox as eqx
+
+from jourdain_jax.bicycle.parameter_files import listed, read_number, read_text, text_lines
+
+_FORM = "`name = reading+/-sigma`, or several readings with commas between, for example `TcB1 = 1.7173+/-0.0001`"
+_FRAME, _TABLE = ("w", "gamma", "f"), ("h1", "h2", "h3", "h4", "h5", "d1", "d2", "d3", "d4", "d")
+_WHOLE_FORK, _SPLIT_FORK = ("mH",), ("mG", "mS", "h6", "h7", "d5", "d6", "l")
+_ALWAYS = (
+    *("g", "dR", "nR", "dF", "nF", "mR", "mF", "mB", "lR", "lF", "TcR1", "TcF1", "TtR1", "TtF1", "mP", "lP", "dP", "TtP1"),
+    *("TcB1",),
+)
+_FEWEST = 3  # hangings, for three numbers in the plane of symmetry
+
+
+class Readings(eqx.Module):
+    """What was read off one bicycle, as means and their standard deviations; `hangings`: numbers of the hangings of each part, such as B: (1, 2, 3)."""
+
+    path: str = eqx.field(static=True)
+    means: dict[str, float]
+    sigmas: dict[str, float]
+    hangings: dict[str, tuple[int, ...]] = eqx.field(static=True)
+    without_sigma: tuple[str, ...] = eqx.field(static=True)
+    unused: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def by_table(self) -> bool:
+        """Whether wheelbase and fork offset follow from heights and diameters on a table."""
+        return "w" not in self.means
+
+    @property
+    def split(self) -> bool:
+        """Whether handlebar and fork were measured by themselves."""
+        return "S" in self.hangings
+
+
+def holds_readings(path: Path) -> bool:
+    """Whether a file is one of raw measurements, by its name."""
+    return path.name.endswith("Measured.txt")
+
+
+def read_readings(path: str | Path) -> Readings:
+    """Read one file of raw measurements.
+
+    **Raises** ValueError naming file, line and quantity: a file that cannot be read, a line of another form, a quantity that is given twice or has a
+    negative sigma; and all that is missing for the parameters of a bicycle.
+    """
+    path = Path(path)
+    means: dict[str, float] = {}
+    sigmas: dict[str, float] = {}
+    lines: dict[str, int] = {}
+    without: list[str] = []
+    for number, line in text_lines(read_text(path), str(path)):
+        where = f"{path}, line {number}"
+        name, _, right = (part.strip() for part in line.partition("="))
+        if not right or not re.fullmatch(r"\w+", name):
+            raise ValueError(f"{where}: got `{line[:60]}`, expected {_FORM}")
+        if name in lines:
+            raise ValueError(f"{where}: `{name}` was already given in line {lines[name]}. Write several readings in one line, with commas between.")
+        lines[name] = number
+        means[name], sigma = _mean(right, name, where)
+        sigmas[name] = sigma or 0.0
+        if sigma is None:
+            without.append(name)
+    split = "mS" in means or "mG" in means
+    needed = [*_ALWAYS, *(_SPLIT_FORK if split else _WHOLE_FORK), *(_FRAME if "w" in means else _TABLE)]
+    needed += ["TcG1", "TcS1"] if split else ["TcH1"]
+    hangings = {part: _hangings(means, part) for part in ("BGS" if split else "BH")}
+    missing = [name for name in needed if name not in means]
+    for part, found in hangings.items():
+        missing += [f"{what}{part}{k + 1}" for k in range(len(found), _FEWEST) for what in ("alpha", "a", "Tt")]
+    if missing:
+        raise ValueError(
+            f"{path}: missing {listed(missing)}; the parameters of a bicycle do not follow without. Measure them, and add a line {_FORM} for each."
+        )
+    used = {*needed, *(f"{what}{part}{k}" for part, found in hangings.items() for k in found for what in ("alpha", "a", "Tt"))}
+    return Readings(
+        path=str(path),
+        means={name: means[name] for name in sorted(used)},
+        sigmas={name: sigmas[name] for name in sorted(used)},
+        hangings=hangings,
+        without_sigma=tuple(name for name in without if name in used and not name.startswith("n")),
+        unused=tuple(name for name in means if name not in used),
+    )
+
+
+def _hangings(means: dict[str, float], part: str) -> tuple[int, ...]:
+    """The hangings of a part of which all three readings are there."""
+    numbers = sorted(int(name[len(f"Tt{part}") :]) for name in means if re.fullmatch(rf"Tt{part}\d+", name))
+    return tuple(k for k in numbers if f"alpha{part}{k}" in means and f"a{part}{k}" in means)
+
+
+def _mean(text: str, name: str, where: str) -> tuple[float, float | None]:
+    """Mean of the readings in a line, and its standard deviation (None where none of them has one)."""
+    values, squares, known = [], 0.0, False
+    for reading in text.replace("±", "+/-").split(","):
+        value, separator, sigma_text = reading.partition("+/-")
+        values.append(read_number(value, f"reading of `{name}`", where))
+        if separator:
+            sigma = read_number(sigma_text, f"sigma of `{name}`", where)
+            if sigma < 0:
+                raise ValueError(f"{where}: sigma of `{name}` is {sigma:g}, expected a standard deviation >= 0")
+            squares, known = squares + sigma**2, True
+    return math.fsum(values) / len(values), math.sqrt(squares) / len(values) if known else None

@@ -1,0 +1,129 @@
+"""Steps by Taylor series: the coefficients of a state along its motion, how far they reach, and the state at any time within reach.
+
+    y(t + s) = sum_{k=0}^p y_k s^k,        h = safety min((1/N_{p-1})^{1/(p-1)}, (1/N_p)^{1/p}),   N_k = rms(y_k/(atol + rtol |y_0|))
+
+so that neither of the last two terms of a step is larger than what is allowed. Source: A. Jorba and M. Zou, Experimental Mathematics 14 (2005) 99, section 3.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from jourdain_jax.motion.native.functions import Form, known_values, outputs_of
+from jourdain_jax.motion.native.layout import Lanes, Layout
+from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.math_functions import power
+from jourdain_jax.native.scalar_program import as_real, written
+from jourdain_jax.native.series import Coefficients, Series
+
+SAFETY = 0.9
+
+
+@dataclass(frozen=True)
+class TaylorSteps:
+    """Taylor series up to this order, in place of a tableau."""
+
+    order: int
+
+    @property
+    def needed(self) -> int:
+        """Rows of a state that a step keeps: the coefficients, and the slope at its end."""
+        return self.order + 2
+
+    @property
+    def at_the_end(self) -> int:
+        """The place of the slope at the end, counted from that at the start."""
+        return self.order
+
+
+class Watched(NamedTuple):
+    """What must not change its sign."""
+
+    holds: Value  # whether all guards are positive
+    pivots: list[Value]  # relative to their usual sizes
+
+
+class Jet(NamedTuple):
+    """The coefficients of every number that is integrated, and what is watched at their start."""
+
+    rows: list[Coefficients]
+    watched: Watched
+
+
+def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> Jet:
+    """The Taylor series of the lanes' states, and of their tangents, at the time t."""
+    program, layout, y = form.program, form.layout, p.pointer
+    work, moving = layout.y - layout.coordinates - layout.speeds, form.moving is not None
+    rates = rates_of(form)
+    own = outputs_of(form, [*rates, *_watched(form)], len(rates))
+    first = len(program.fixed)  # time, then the state
+    known = dict(zip(own.variables, known_values(w, form, y, t, y).values(), strict=True))
+    states = own.variables[first + 1 : first + 1 + layout.coordinates + layout.speeds]
+    given = {n: x for n, x in known.items() if n not in states} | dict(zip(own.known, p.every("dknown") if moving else [], strict=True))
+
+    def with_work(nodes: list[int], other: int | None) -> list:
+        return [*nodes, *[other] * (layout.y - len(nodes))]
+
+    moved = [*with_work(states, None), *(with_work(own.states, None) if moving else [])]
+    nodes = [*with_work(own.values[: len(rates)], own.graph.zero), *(with_work(own.tangents, own.graph.zero) if moving else [])]
+    assert work in (0, 1)
+    start = [w.load(w.real, y, i) for i in range(layout.integrated)]
+    series = Series(w, own.graph, given, moved, nodes, start, order, own.variables[first])
+    values = {n: w.number(0.0) if x[0] is None else x[0] for n, x in series.of.items()}
+    return Jet(series.state, _evaluated(w, form, own.graph, own.values[len(rates) :], values, known))
+
+
+def rates_of(form: Form) -> list[int]:
+    """The nodes of the rates of all that is integrated; the last may be missing, where work is and is zero."""
+    program = form.program
+    return [*program.qdot, *program.ydot, *([program.power] if form.with_work and program.power is not None else [])]
+
+
+def _watched(form: Form) -> list[int]:
+    return [*form.program.guards, *form.program.pivots[: form.pivots]]
+
+
+def watched_at(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> Watched:
+    """What is watched, at a state in memory."""
+    known = known_values(w, form, p.pointer, t, y)
+    return _evaluated(w, form, form.program.graph, _watched(form), known, known)
+
+
+def _evaluated(w: Writer, form: Form, graph, nodes: Sequence[int], values: Mapping[int, Value], known: Mapping[int, Value]) -> Watched:
+    found, of_variables = [as_real(w, x) for x in written(w, graph, nodes, values)], list(known.values())
+    count, holds = len(form.program.guards), w.literal(-1, w.truth)
+    for guard in found[:count]:
+        holds = holds & (guard > 0.0)
+    sizes = [of_variables[form.program.variables.index(n)] for n in form.program.sizes] if form.pivots else []
+    return Watched(holds, [x / size for x, size in zip(found[count:], sizes, strict=True)])
+
+
+def radius(w: Writer, layout: Layout, p: Lanes, rows: Sequence[Coefficients]) -> Value:
+    """How long a step may be; zero where a coefficient is no number."""
+    rtol, atol, count = p["rtol"], p["atol"], layout.coordinates + layout.speeds
+    inverse = [1.0 / w.fma(rtol, w.magnitude(w.load(w.real, p.pointer, i)), atol) for i in range(count)]
+    order, length = len(rows[0]) - 1, w.number(math.inf)
+    for k in (order - 1, order):
+        square = w.number(0.0)  # of N_k, times `count`
+        for x, share in zip(rows, inverse, strict=False):
+            if x[k] is not None:
+                relative = x[k] * share
+                square = w.fma(relative, relative, square)
+        reach = power(w, square * (1.0 / count), -0.5 / k)
+        reach = w.where(square.equals(0.0), math.inf, w.where(square < math.inf, reach, 0.0))
+        length = w.smaller(length, reach)
+    return SAFETY * length
+
+
+def at_time(w: Writer, series: Coefficients, s: Value) -> Value:
+    """sum_k x_k s^k"""
+    total = w.number(0.0) if series[-1] is None else series[-1]
+    for x in reversed(series[:-1]):
+        total = total * s if x is None else w.fma(total, s, x)
+    return total
+
+
+def slope(series: Coefficients) -> Coefficients:
+    """Coefficients of the derivative."""
+    return [x if x is None or k == 0 else x * float(k + 1) for k, x in enumerate(series[1:])]

@@ -1,0 +1,228 @@
+"""Taylor series by machine code: their coefficients against mpmath, motions against closed forms and Dopri8, and when they are refused."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.calculus.scalar_operations import TABLE
+from jourdain_jax.motion.integrators.taylor import order_for
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.native import ffi, host
+from jourdain_jax.native.ir import Writer
+from jourdain_jax.native.series import Series, reason_against
+from jourdain_jax.program.graph import Graph
+
+pytestmark = pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against())
+
+ORDER = 9
+UNARY = [name for name, f in TABLE.items() if f.kind in ("analytic", "flat") and name not in ("add", "sub", "mul", "div", "pow", "atan2")]
+IN_MPMATH = {
+    "neg": lambda a: -a,
+    "exp2": lambda a: mpmath.power(2, a),
+    "log1p": lambda a: mpmath.log(1 + a),
+    "cbrt": lambda a: mpmath.sign(a) * mpmath.cbrt(abs(a)),
+    "logistic": lambda a: 1 / (1 + mpmath.exp(-a)),
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "pow": lambda a, b: a**b,
+}
+
+
+def coefficients(graph: Graph, s: int, outputs, at, known=None) -> np.ndarray:
+    """Taylor coefficients, (orders, outputs), of functions of s about a point, as machine code has them; `known`: values of other inputs."""
+    w = Writer(host.lanes(), host.fuses())
+
+    def block(arguments, found):
+        start = w.load(w.real, arguments[0].data)
+        # z' = f(s), s' = 1: coefficients of z are those of f over their order plus one
+        given = {clock: w.number(0.0)} | {node: w.number(value) for node, value in (known or {}).items()}
+        series = Series(w, graph, given, [s, *[None] * len(outputs)], [graph.one, *outputs], [start, *[w.number(0.0)] * len(outputs)], ORDER, clock)
+        for i in range(len(outputs)):
+            for k in range(1, ORDER + 1):
+                x = series.state[1 + i][k]
+                w.store(w.number(0.0) if x is None else x * float(k), found[0], (k - 1) * len(outputs) + i)
+
+    clock = graph.input("clock", True)
+    ffi.write_handler(w, 1, 1, block)
+    shape = jax.ShapeDtypeStruct((ORDER, len(outputs), w.lanes), jnp.float64)
+    points = jnp.broadcast_to(jnp.asarray(at), (w.lanes,))
+    return np.asarray(jax.ffi.ffi_call(ffi.registered(w.text), shape)(points))[..., -1]
+
+
+def expected(f, at) -> np.ndarray:
+    """Those by mpmath."""
+    with mpmath.workdps(80):
+        return np.array([float(c) for c in mpmath.taylor(f, mpmath.mpf(at), ORDER - 1)])
+
+
+def in_mpmath(op: str):
+    return IN_MPMATH.get(op) or getattr(mpmath, op)
+
+
+def test_recurrences_of_functions_give_their_taylor_series():
+    graph, at = Graph(), 0.7
+    s = graph.input("s", True)
+    base = {op: 1.3 if op == "acosh" else 0.4 for op in UNARY}
+    inner = {op: graph.add(graph.const(base[op]), graph.mul(graph.const(0.3), graph.mul(s, s))) for op in UNARY}
+    found = coefficients(graph, s, [graph.call(op, inner[op]) for op in UNARY], at)
+    for op, series in zip(UNARY, found.T, strict=True):
+        true = expected(lambda s, op=op: in_mpmath(op)(mpmath.mpf(base[op]) + mpmath.mpf(0.3) * s * s), at)
+        np.testing.assert_allclose(series, true, rtol=1e-13, atol=1e-14 * np.max(np.abs(true)), err_msg=op)
+
+
+@pytest.mark.parametrize("op", ["add", "sub", "mul", "div", "atan2", "pow"])
+def test_recurrences_of_two_arguments_give_their_taylor_series(op):
+    graph = Graph()
+    s = graph.input("s", True)
+    a, b = graph.call("sin", s), graph.const(2.7) if op == "pow" else graph.call("exp", s)
+    found = coefficients(graph, s, [graph.call(op, a, b), graph.call(op, b, a) if op != "pow" else a], 0.7)
+    f = in_mpmath(op)
+    other = (lambda s: mpmath.mpf(2.7)) if op == "pow" else mpmath.exp
+    np.testing.assert_allclose(found[:, 0], expected(lambda s: f(mpmath.sin(s), other(s)), 0.7), rtol=1e-13, atol=1e-13)
+    second = mpmath.sin if op == "pow" else lambda s: f(mpmath.exp(s), mpmath.sin(s))
+    np.testing.assert_allclose(found[:, 1], expected(second, 0.7), rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_series_of_random_programs_are_those_of_mpmath(seed):
+    random, graph = np.random.default_rng(seed), Graph()
+    s, p = graph.input("s", True), graph.input("p", False)
+    nodes = [(s, lambda s: s), (p, lambda s: mpmath.mpf(1.5)), (graph.const(0.3), lambda s: mpmath.mpf(0.3))]
+    for _ in range(14):
+        (a, f), (b, g) = (nodes[i] for i in random.integers(len(nodes), size=2))
+        op = str(random.choice(["add", "sub", "mul", "mul", "div", "sin", "cos", "tanh", "atan", "sqrt", "logistic"]))
+        if op in ("add", "sub", "mul"):
+            nodes.append((graph.call(op, a, b), _composed(in_mpmath(op), f, g)))
+        elif op in ("div", "sqrt"):  # of what is not small
+            nodes.append((graph.call(op, *([a] if op == "div" else []), graph.add(graph.const(2.0), graph.mul(b, b))), _guarded(op, f, g)))
+        else:
+            nodes.append((graph.call(op, a), _composed(in_mpmath(op), f)))
+    outputs = [n for n, _ in nodes[3:]]
+    found = coefficients(graph, s, outputs, 0.6, {p: 1.5})
+    for i, (_, f) in enumerate(nodes[3:]):
+        true = expected(f, 0.6)
+        np.testing.assert_allclose(found[:, i], true, rtol=1e-11, atol=1e-12 * np.max(np.abs(true)))
+
+
+def _composed(h, *inner):
+    return lambda s: h(*(f(s) for f in inner))
+
+
+def _guarded(op, f, g):
+    return (lambda s: f(s) / (2 + g(s) ** 2)) if op == "div" else (lambda s: mpmath.sqrt(2 + g(s) ** 2))
+
+
+def test_branches_and_varying_exponents_have_no_series():
+    graph = Graph()
+    a, b = graph.input("a", True), graph.input("b", True)
+    assert "`abs`" in reason_against(graph, [graph.call("abs", a)])
+    assert "exponent" in reason_against(graph, [graph.call("pow", a, b)])
+    assert reason_against(graph, [graph.call("pow", a, graph.const(2.5))]) == ""
+
+
+# Motions. -------------------------------------------------------------------------------------------------------------
+
+DISC, SLEIGH = jj.models.TiltingDisc(), jj.models.ChaplyginSleigh()
+
+
+def test_errors_of_a_sleigh_fall_with_the_tolerance_and_steps_with_the_order():
+    start = jj.start(SLEIGH, **SLEIGH.example)
+
+    @jax.jit
+    def run(tolerance, start):
+        motion = jj.simulate(SLEIGH, start, ts=jnp.array([12.0]), rtol=tolerance, atol=tolerance, solver=jj.Taylor(10))
+        return jnp.concatenate([motion.q_end, motion.u_end]), motion.accepted
+
+    best = jj.simulate(SLEIGH, start, ts=[12.0], rtol=3e-14, atol=3e-14, solver=diffrax.Dopri8())
+    true, steps = np.concatenate([best.q_end, best.u_end]), []
+    for tolerance in 10.0 ** -np.arange(6, 14):
+        found, accepted = run(tolerance, start)
+        assert np.max(np.abs(found - true)) < 10 * tolerance + 1e-13
+        steps.append(int(accepted))
+    # h ~ tolerance^(1/p)
+    assert steps[-1] / steps[0] == pytest.approx(10 ** (7 / 10), rel=0.15)
+
+
+def test_a_disc_rolls_to_where_its_extended_precision_motion_does():
+    from oracles import rolling_disc
+
+    run = rolling_disc.RUN
+    scene = jj.models.TiltingDisc(mass=run["mass"], radius=run["radius"], gravity=run["gravity"])
+    start = {name: run[name] for name in ("lean", "yaw_rate", "lean_rate", "spin_rate")}
+    times = np.linspace(0.0, 4.0, 33)
+    theta = np.pi / 2 + run["lean"]
+    own = {"theta": theta, "w1": run["lean_rate"], "w2": run["yaw_rate"] * np.sin(theta), "w3": -run["spin_rate"] + run["yaw_rate"] * np.cos(theta)}
+    true = rolling_disc.motion(times, mass=run["mass"], radius=run["radius"], gravity=run["gravity"], **own)
+    motion = jj.simulate(scene, start, ts=times, rtol=1e-11, atol=1e-11, solver=jj.Taylor())
+    assert int(motion.result) == 0
+    assert int(motion.accepted) < 80  # steps do not end at times to save
+    np.testing.assert_allclose(motion["lean"], true["theta"] - np.pi / 2, atol=1e-9)
+    np.testing.assert_allclose(motion["yaw"], true["psi"], atol=1e-9)
+
+
+@pytest.mark.parametrize("span", [2.0, -2.0])
+def test_motions_with_projection_and_work_are_those_of_dopri8(span):
+    scene = jj.models.MODELS["double-pendulum-rods"]()
+    options = {"ts": np.linspace(0.0, span, 11), "rtol": 1e-11, "atol": 1e-11}
+    ours, theirs = (jj.simulate(scene, solver=solver, **options) for solver in (jj.Taylor(), diffrax.Dopri8()))
+    assert ours.solver == "Taylor"
+    for a, b in ((ours.q, theirs.q), (ours.u, theirs.u), (ours.q_end, theirs.q_end)):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+    if ours.work is not None:
+        np.testing.assert_allclose(ours.work, theirs.work, atol=1e-9)
+    # states between the ends of steps are on the rows, too
+    moved = [jj.consistent(scene, 0.0, q, u).moved_q for q, u in zip(ours.q, ours.u, strict=True)]
+    assert np.max(moved) < 1e-12
+
+
+def test_a_disc_that_falls_stops_where_it_does_by_dopri8():
+    options = {"ts": np.linspace(0.0, 5.0, 51), "rtol": 1e-11, "atol": 1e-11}
+    ours, theirs = (jj.simulate(DISC, {"lean": 0.6, "spin_rate": -0.1}, solver=solver, **options) for solver in (jj.Taylor(), diffrax.Dopri8()))
+    assert int(ours.result) == int(theirs.result) == results.EVENT
+    np.testing.assert_allclose(ours.t_end, theirs.t_end, rtol=1e-11)
+    np.testing.assert_allclose(ours.q_end, theirs.q_end, rtol=1e-9, atol=1e-10)
+    np.testing.assert_array_equal(np.isnan(ours.q), np.isnan(theirs.q))
+    np.testing.assert_allclose(ours.q, theirs.q, rtol=1e-9, atol=1e-10)
+
+
+def test_a_motion_that_leaves_its_domain_and_one_that_runs_out_of_steps_say_so():
+    falls = {"start": {"lean": 0.6, "spin_rate": 0.0}, "t1": 5.0, "events": False, "rtol": 1e-9, "atol": 1e-9}
+    ours, theirs = (jj.simulate(DISC, solver=solver, **falls) for solver in (jj.Taylor(), diffrax.Dopri8()))
+    assert int(ours.result) == int(theirs.result) != 0
+    np.testing.assert_allclose(ours.t_end, theirs.t_end, rtol=1e-6)
+    assert int(jj.simulate(DISC, t1=3.0, max_steps=7, solver=jj.Taylor()).result) == results.MAX_STEPS
+
+
+def test_lanes_of_a_rollout_end_each_for_itself():
+    lean = jnp.asarray([0.1, 0.3, jnp.nan, 1.2, 0.2, 0.7, jnp.inf, 0.5, -0.4])
+    starts = {"lean": lean, "spin_rate": jnp.linspace(-4.0, 0.0, 9)}
+    ours, theirs = (jj.rollout(DISC, starts, ts=[0.25, 0.5, 1.0], solver=solver) for solver in (jj.Taylor(), diffrax.Dopri8()))
+    np.testing.assert_array_equal(ours.result, theirs.result)
+    np.testing.assert_allclose(ours.lanes.q, theirs.lanes.q, rtol=1e-6, atol=1e-6)
+    alone = jj.rollout(DISC, {name: x[1:2] for name, x in starts.items()}, ts=[0.25, 0.5, 1.0], solver=jj.Taylor())
+    np.testing.assert_array_equal(alone.lanes.q[0], ours.lanes.q[1])
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: jj.simulate(DISC, t1=1.0, solver=jj.Taylor(), backend="xla"), "jj.Taylor\\(\\) cannot integrate `TiltingDisc`: another backend"),
+        (lambda: jj.simulate(DISC, t1=1.0, solver=jj.Taylor(), adjoint=diffrax.DirectAdjoint()), "adjoint of diffrax"),
+        (lambda: jj.simulate(jj.models.MODELS["ball-on-turntable"](), t1=1.0, solver=jj.Taylor(30)), "products, more than"),
+        (lambda: jj.simulate(jj.models.MODELS["spring-and-rod"](), t1=1.0, solver=jj.Taylor()), "has no Taylor series"),
+        (lambda: jj.Taylor(2), "`order` is 2, expected a whole number from 4 to 30"),
+    ],
+)
+def test_series_that_do_not_serve_are_refused_with_the_reason(call, said):
+    with pytest.raises(ValueError, match=said):
+        call()
+
+
+def test_the_order_follows_from_the_tolerance():
+    assert [order_for(t) for t in (1e-2, 1e-6, 1e-8, 1e-12, 1e-300)] == [4, 8, 11, 15, 30]
