@@ -569,7 +569,10 @@ MEASURED: dict[str, Case] = {
     "jj.fit(b, [data, 3], 'mass')": ("ValueError", "`data` must be a `Measurements` or a sequence of at least one"),
     "jj.fit(b, data, ())": ("ValueError", "nothing is free; name parameters in `free` (`mass`, `stiffness`), or `unknown_start` values of a run"),
     "jj.fit(b, data, 'mas')": ("ValueError", "`free` names `mas`, which is no parameter of `Bead`; did you mean `mass`?"),
-    "jj.fit(b, data, {'mass': 3})": ("ValueError", "`mass` was given 3; expected `bounds(low, high)`, `positive()`, `unbounded()`, `Estimate(...)` or None"),
+    "jj.fit(b, data, {'mass': 3})": (
+        "ValueError",
+        "`mass` was given 3; expected `bounds(low, high)`, `positive()`, `unbounded()`, `Normal(...)`, `Estimate(...)` or None",
+    ),
     "jj.fit(b, data, {'mass': jj.bounds(2.0, 3.0)})": ("ValueError", "first guess of `mass` is 1.0; expected a first guess between its bounds 2.0 and 3.0"),
     "jj.fit(b, jj.Measurements([0.0, 0.1], {'z': [0.0, 0.1]}, 0.01, start={}), 'mass')": (
         "ValueError",

@@ -299,6 +299,13 @@ def test_a_prior_counts_as_a_measurement():
     assert known.samples == free.samples
 
 
+def test_a_prior_alone_is_an_estimate_with_it():
+    data = run(7, sigma=0.01)
+    long, short = (jj.fit(Cart(), data, {"mass": given}) for given in (jj.Estimate(prior=jj.Normal(2.005, 0.003)), jj.Normal(2.005, 0.003)))
+    np.testing.assert_array_equal(long.values, short.values)
+    np.testing.assert_array_equal(long.standard_errors, short.standard_errors)
+
+
 def test_priors_of_starts_and_of_numbers_of_single_runs():
     def one(k, prior):
         start = {"x": jj.Estimate(prior=jj.Normal(0.3, prior))}
@@ -362,6 +369,57 @@ def driven(truth: dict, **asked) -> jj.Measurements:
     motion = jj.simulate(Cart(), {"x": 0.3, "x_rate": 0.0}, ts=TS, inputs={"push": signal}, rtol=1e-10, atol=1e-10)
     inputs = {"push": jj.Actuator(command, **(truth | asked))}
     return jj.Measurements(TS, {"x": motion["x"], "x_rate": motion["x_rate"]}, 0.001, start={"x": 0.3, "x_rate": 0.0}, inputs=inputs)
+
+
+class Mass(jj.Scene):
+    """`x'' = push`, for closed forms."""
+
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("push")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.push),)
+
+
+def speeds_of_held(knots, command, ts, lag=0.0):
+    """Speed from rest under a command that holds, by integrals of constants, or of exponentials, over its intervals."""
+    found = []
+    for t in ts:
+        y, speed = command[0], 0.0
+        for k, begin in enumerate(knots):
+            h = min(knots[k + 1] if k + 1 < len(knots) else np.inf, t) - begin
+            if h > 0:
+                decay = np.exp(-h / lag) if lag else 0.0
+                speed, y = speed + command[k] * h + lag * (y - command[k]) * (1 - decay), command[k] + (y - command[k]) * decay
+        found.append(speed)
+    return np.array(found)
+
+
+def test_a_command_that_holds_keeps_each_value_until_the_next():
+    knots, command, ts = np.linspace(0.0, 2.0, 11), np.random.default_rng(0).normal(size=11), np.linspace(0.0, 2.0, 41)
+    delay = 0.03
+    exact = speeds_of_held(knots + delay, command, ts) + command[0] * np.minimum(ts, delay)
+    # the speed differs from that of a command which is linear in between
+    linear = np.array([np.trapezoid(np.interp(np.linspace(0, t, 2001), knots + delay, command), np.linspace(0, t, 2001)) for t in ts])
+    assert np.max(np.abs(exact - linear)) > 0.05
+    actuator = jj.Actuator(jj.Sampled(knots, command), delay=jj.Estimate(0.05, range=jj.bounds(0.0, 0.1)), gain=GAIN, hold=True)
+    data = jj.Measurements(ts, {"x_rate": 1.3 * exact}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator})
+    found = jj.fit(Mass(), data, (), rtol=1e-9, atol=1e-9)
+    assert found.converged
+    np.testing.assert_allclose([found["push.delay"].value, found["push.gain"].value], [delay, 1.3], atol=1e-6)
+    assert max(np.abs(found.residuals[0]["x_rate"])) < 0.05  # of a sigma: samples within half a passage see it
+
+
+def test_a_lag_after_a_command_that_holds():
+    knots, command, ts = np.linspace(0.0, 2.0, 41), np.random.default_rng(0).normal(size=41), np.linspace(0.0, 2.0, 41)
+    exact = speeds_of_held(knots, command, ts, lag=0.1)
+    actuator = jj.Actuator(jj.Sampled(knots, command), lag=jj.Estimate(0.05), hold=True)
+    data = jj.Measurements(ts, {"x_rate": exact}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator})
+    found = jj.fit(Mass(), data, (), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found["push.lag"].value, 0.1, rtol=0.03)  # linear between samples, of half a lag
 
 
 def test_numbers_of_an_actuator_are_found():
@@ -469,6 +527,7 @@ def with_input(push) -> jj.Fit:
         (lambda: jj.Estimate(1.0, prior=0.1), r"`prior` of `Estimate` is a float, expected `jj.Normal\(mean, sigma\)`"),
         (lambda: jj.Estimate(1.0, prior=jj.Normal(1.0, 0.0)), "expected a standard deviation above zero; a number that is known needs no estimate"),
         (lambda: jj.Actuator(1.0), "`command` of `Actuator` is a float, expected `jj.Sampled"),
+        (lambda: jj.Actuator(COMMAND, hold=1), "`hold` of `Actuator` is an? int.*expected True"),
         (lambda: jj.Actuator(COMMAND, gain=[1.0, 2.0]), r"`gain` of `Actuator` has shape \(2,\), expected one number"),
         (lambda: jj.Measurements(TS, {"x": TS}, 1.0, start={}, sensors={"y": "x"}), "sensor `y` has no measured values; Valid names: `x`"),
         (

@@ -102,6 +102,7 @@ from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surfa
 from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
 from jourdain_jax.scene.motion_state import fixed_point
 from jourdain_jax.scene.parameters import parameter
+from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.spline import Spline
 from jourdain_jax.scene.visuals import Visual
@@ -207,6 +208,7 @@ __all__ = [
     "gibbs_function",
     "gravity",
     "huber",
+    "inertia_from_log_cholesky",
     "inputs",
     "kinetic_energy",
     "knife_edge",
@@ -215,6 +217,7 @@ __all__ = [
     "load_rollout",
     "load_study",
     "load_trajectory",
+    "log_cholesky",
     "log_density",
     "log_likelihood",
     "lower",

@@ -65,7 +65,8 @@ def fit(
     - `scene`: its parameters are fixed, or first guesses where they are free.
     - `data`: one run or several, each with its own times, channels, start and inputs.
     - `free`: parameter names, or name -> `bounds(low, high)`, `positive()`, `unbounded()` or None (positive where the parameter
-      is declared so), or an `Estimate` with a prior. What `unknown_start`, sensors and actuators of the runs name is free as well.
+      is declared so), a prior `Normal(mean, sigma)`, or an `Estimate`. The measured sigmas of a bicycle are such priors:
+      `free=measured_bicycle("Browser").prior`. What `unknown_start`, sensors and actuators of the runs name is free as well.
     - `cutoff`: singular values of the scaled Jacobian below this fraction of the largest count as zero (`Information`). Keep it
       well above the relative accuracy of the simulation.
     - `tolerance`: the fit has converged when a step changes no residual by more than about this many sigmas, and no unknown by

@@ -89,6 +89,27 @@ def _relaxed(y: Float[Array, "channel"], polynomial: Float[Array, "powers channe
     return jnp.where(rho < _SMALL, by_formula, by_quadrature)
 
 
+def held(ts: Float[Array, "knots"], values: Float[Array, "knots"]) -> tuple[Float[Array, "more_knots"], Float[Array, "more_knots"]]:
+    """Knots of a command that keeps each value until the next one: it passes over in a thousandth of the shortest interval, half of it before the time."""
+    half = 0.5e-3 * jnp.min(jnp.diff(ts))
+    late = jnp.stack([ts[1:] - half, ts[1:] + half], axis=1).reshape(-1)
+    return jnp.concatenate([ts[:1], late]), jnp.concatenate([values[:1], jnp.stack([values[:-1], values[1:]], axis=1).reshape(-1)])
+
+
+def filtered_held(ts: Float[Array, "knots"], values: Float[Array, "knots"], lag) -> Float[Array, "knots"]:
+    """What the filter gives at the knots of such a command: y_k+1 = x_k + (y_k - x_k) exp(-h / lag)."""
+    steps = jnp.diff(ts)
+    decay = jnp.exp(-steps / jnp.maximum(lag, _LEAST * steps))
+
+    def next_one(y, here):
+        x, d = here
+        y = x + (y - x) * d
+        return y, y
+
+    _, found = jax.lax.scan(next_one, values[0], (values[:-1], decay))
+    return jnp.concatenate([values[:1], found])
+
+
 def filtered(ts: Float[Array, "knots"], values: Float[Array, "knots"], lag) -> Float[Array, "knots"]:
     """What the same filter gives at the knots of samples that are linear in between: exactly there.
 

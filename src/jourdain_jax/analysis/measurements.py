@@ -265,7 +265,7 @@ def _inputs(scene: Scene, run: Measurements, where: str, estimates: dict) -> tup
     drives = {}
     for name, actuator in actuators.items():
         numbers, unknown, used = numbers_of(actuator)
-        drive = Drive(actuator.command, list(scene.inputs.entries).index(name), numbers, unknown, used)
+        drive = Drive(actuator.command, list(scene.inputs.entries).index(name), numbers, unknown, used, actuator.hold)
         for number in unknown:
             if f"{name}.{number}" in estimates:
                 raise ValueError(f"{where} has a channel and an input `{name}`, both with an estimated {number}; give the channel another name")

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.accelerometer import Accelerometer
 from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.estimate import Estimate
-from jourdain_jax.analysis.lagged import filtered, read
+from jourdain_jax.analysis.lagged import filtered, filtered_held, held, read
 from jourdain_jax.analysis.ranges import positive, unbounded
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -72,9 +72,13 @@ class Actuator(eqx.Module):
     - `command`: `Sampled`; it has its first value at all times before.
     - `gain`, `bias` (in the unit of the input), `delay` (s), `lag` (s): numbers, or `Estimate`, as of a `Sensor`.
 
-    The low-pass is exact at the samples of the command, and linear in between; it does not go on after the last of them.
+    - `hold`: whether the command keeps each value until the next sample, as that of a digital controller does; otherwise it is linear between its samples.
+      Two knots then stand for a sample, and a motion takes as many more steps.
 
-    **Raises** ValueError for a command of another kind, numbers that are not finite, and delays or lags below zero.
+    The low-pass is exact at the samples of the command, and linear in between (of a command that holds, take a lag of an interval or more); it does not go on
+    after the last of them.
+
+    **Raises** ValueError for a command of another kind, a `hold` that is neither True nor False, numbers that are not finite, and delays or lags below zero.
     """
 
     command: Sampled
@@ -82,11 +86,14 @@ class Actuator(eqx.Module):
     bias: Float[Array, ""] | Estimate
     delay: Float[Array, ""] | Estimate  # s
     lag: Float[Array, ""] | Estimate  # s
+    hold: bool = eqx.field(static=True)
 
-    def __init__(self, command, *, gain=1.0, bias=0.0, delay=0.0, lag=0.0):
+    def __init__(self, command, *, gain=1.0, bias=0.0, delay=0.0, lag=0.0, hold=False):
         if not isinstance(command, Sampled):
             raise ValueError(f"`command` of `Actuator` is {described(command)}, expected `jj.Sampled(ts, values)`")
-        self.command = command
+        if not isinstance(hold, bool):
+            raise ValueError(f"`hold` of `Actuator` is {described(hold)}, expected True (each value until the next) or False (linear between samples)")
+        self.command, self.hold = command, hold
         self.gain, self.bias, self.delay, self.lag = _checked("Actuator", gain=gain, bias=bias, delay=delay, lag=lag)
 
 
@@ -167,12 +174,15 @@ class Drive(eqx.Module):
     numbers: dict[str, Float[Array | np.ndarray, ""]]
     unknown: tuple[str, ...] = eqx.field(static=True)
     used: tuple[str, ...] = eqx.field(static=True)
+    hold: bool = eqx.field(static=True)
 
     def signal(self) -> Sampled:
         """What the scene is given."""
         ts, values = jnp.asarray(self.command.ts), jnp.asarray(self.command.values)
         if "lag" in self.used:
-            values = filtered(ts, values, self.numbers["lag"])
+            values = (filtered_held if self.hold else filtered)(ts, values, self.numbers["lag"])
+        elif self.hold and ts.shape[0] > 1:
+            ts, values = held(ts, values)
         values = self.numbers["gain"] * values if "gain" in self.used else values
         values = values + self.numbers["bias"] if "bias" in self.used else values
         return eqx.tree_at(lambda s: (s.ts, s.values), self.command, (ts + self.numbers["delay"], values))

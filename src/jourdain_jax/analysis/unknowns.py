@@ -240,10 +240,15 @@ def _of_sensor(label: str, name: str, estimate: Estimate) -> _Entry:
 
 
 def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _Entry:
-    """An unknown from what was given for it: an `Estimate`, a range or None; after a look at its first guess."""
-    estimate = given if isinstance(given, Estimate) else Estimate(range=given) if given is None or isinstance(given, Range) else None
-    if estimate is None:
-        raise ValueError(f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, `Estimate(...)` or None")
+    """An unknown from what was given for it: an `Estimate`, a range, a prior or None; after a look at its first guess."""
+    if isinstance(given, Estimate):
+        estimate = given
+    elif given is None or isinstance(given, Range):
+        estimate = Estimate(range=given)
+    elif hasattr(given, "mean") and hasattr(given, "sigma"):
+        estimate = Estimate(prior=given)
+    else:
+        raise ValueError(f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, `Normal(...)`, `Estimate(...)` or None")
     guess = value if estimate.guess is None else np.asarray(estimate.guess, float)
     if guess.shape != value.shape:
         raise ValueError(f"first guess of `{label}` has shape {guess.shape}, expected {value.shape}; leave it out for the value that is there")

@@ -1,0 +1,74 @@
+"""Moments of inertia that a body can have, as numbers that may be anything: positive definite, each principal moment at most the sum of the other two.
+
+    I = tr(S) 1 - S,      S = A A'       A = [exp(d1) s12 s13; 0 exp(d2) s23; 0 0 exp(d3)]
+
+S is the second moment of the mass about the mass centre, positive definite for every body that is not flat; A is its Cholesky factor, upper triangular. It is
+the block of the pseudo-inertia of a body about its mass centre; mass and mass centre do not enter it, and have ranges of their own.
+Source: C. Rucker and P. M. Wensing, IEEE Robotics and Automation Letters 7 (2022) 2700, eqs. (10)-(13).
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.scene.numbers import checked_real, is_traced
+
+
+def inertia_from_log_cholesky(numbers) -> Float[Array, "3 3"]:
+    """Inertia matrix (3, 3) about the mass centre in kg m^2, possible whatever the numbers are.
+
+    **Arguments:** `numbers`, (d1, d2, d3, s12, s23, s13), d: logarithms of lengths times square roots of masses, s: these themselves, sqrt(kg) m; or, of a body
+    that is symmetric about its x-z plane, (d1, d2, d3, s13): Ixy = Iyz = 0.
+
+        class Frame(jj.Scene):
+            inertia: jax.Array = jj.parameter(jj.log_cholesky([0.5, 1.0, 0.7]))  # free={"inertia"} in a fit
+            ...
+                jj.RigidBody(self.mass, jj.inertia_from_log_cholesky(self.inertia), position, orientation)
+
+    **Raises** ValueError for another shape. Differentiable at all numbers.
+    """
+    numbers = checked_real(numbers, "`numbers` of `inertia_from_log_cholesky`", advice="give (d1, d2, d3, s12, s23, s13), or (d1, d2, d3, s13)")
+    if numbers.shape not in ((6,), (4,)):
+        raise ValueError(
+            f"`numbers` of `inertia_from_log_cholesky` has shape {numbers.shape}, expected (6,), or (4,) of a body that is symmetric about its x-z plane; "
+            "`log_cholesky` makes them of an inertia matrix"
+        )
+    zero = jnp.zeros((), numbers.dtype)
+    d1, d2, d3 = jnp.exp(numbers[:3])
+    s12, s23, s13 = (zero, zero, numbers[3]) if numbers.shape == (4,) else numbers[3:]
+    A = jnp.stack([jnp.stack([d1, s12, s13]), jnp.stack([zero, d2, s23]), jnp.stack([zero, zero, d3])])
+    # S = A A',   I = tr(S) 1 - S
+    S = A @ A.T
+    return jnp.trace(S) * jnp.eye(3, dtype=S.dtype) - S
+
+
+def log_cholesky(inertia, *, symmetric: bool = False) -> Float[Array, "numbers"]:
+    """The numbers (6,) of which `inertia_from_log_cholesky` makes this inertia matrix, (3, 3) or three principal moments, kg m^2, about the mass centre.
+
+    `symmetric`: four numbers, of a body that is symmetric about its x-z plane. **Raises** ValueError for another shape, a matrix that is not symmetric or has
+    Ixy or Iyz where `symmetric` says that there are none, and for moments that no body with a thickness has; traced matrices give NaN there instead.
+    """
+    I = checked_real(inertia, "`inertia` of `log_cholesky`", advice="give a 3x3 matrix or three principal moments, kg m^2")
+    I = jnp.diag(I) if I.shape == (3,) else I
+    if I.shape != (3, 3):
+        raise ValueError(f"`inertia` of `log_cholesky` has shape {I.shape}, expected (3, 3) or (3,): a matrix or three principal moments, kg m^2")
+    S = jnp.trace(I) / 2 * jnp.eye(3, dtype=I.dtype) - I
+    if not is_traced(I):
+        _check(np.asarray(I), np.asarray(S), symmetric)
+    # from the last row up, since A is upper triangular: that of S with its rows and columns the other way round
+    A = jnp.linalg.cholesky(S[::-1, ::-1])[::-1, ::-1]
+    d = jnp.log(jnp.diag(A))
+    return jnp.concatenate([d, A[0, 2:] if symmetric else jnp.stack([A[0, 1], A[1, 2], A[0, 2]])])
+
+
+def _check(I: np.ndarray, S: np.ndarray, symmetric: bool) -> None:
+    size = np.max(np.abs(I))
+    if not np.all(np.abs(I - I.T) <= 1e-9 * size):
+        raise ValueError("`inertia` of `log_cholesky` is not symmetric; give Ixy = Iyx, Ixz = Izx, Iyz = Izy")
+    if symmetric and max(abs(I[0, 1]), abs(I[1, 2])) > 1e-9 * size:
+        raise ValueError(f"`inertia` of `log_cholesky` has Ixy = {I[0, 1]:g} and Iyz = {I[1, 2]:g}, but `symmetric` says that there are none; leave it out")
+    if not np.all(np.linalg.eigvalsh(S) > 0):
+        raise ValueError(
+            f"no body with a thickness has the principal moments of inertia {np.linalg.eigvalsh(I)} kg m^2 (`inertia` of `log_cholesky`): each must be "
+            "positive, and less than the sum of the other two; of a flat body, give the largest a little less than that sum"
+        )

@@ -1,0 +1,102 @@
+"""Moments of inertia from numbers that may be anything: always those of a body."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+
+GENERATOR = np.random.default_rng(0)
+
+
+def test_inertia_is_that_of_a_body_whatever_the_numbers_are():
+    numbers = jnp.asarray(GENERATOR.normal(size=(2000, 6)) * np.array([2.0, 2.0, 2.0, 3.0, 3.0, 3.0]))
+    moments = np.linalg.eigvalsh(np.asarray(jax.vmap(jj.inertia_from_log_cholesky)(numbers)))
+    assert np.all(moments[:, 0] > 0)
+    assert np.all(moments[:, 2] <= (moments[:, 0] + moments[:, 1]) * (1 + 1e-12))
+
+
+def test_every_cloud_of_points_has_its_numbers():
+    for _ in range(20):
+        points, masses = GENERATOR.normal(size=(7, 3)), GENERATOR.uniform(0.1, 1.0, 7)
+        r = points - masses @ points / masses.sum()
+        inertia = sum(m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, r, strict=True))
+        numbers = jj.log_cholesky(inertia)
+        assert numbers.shape == (6,)
+        np.testing.assert_allclose(jj.inertia_from_log_cholesky(numbers), inertia, rtol=1e-12, atol=1e-12)
+    flat = np.array([[0.5, 0.0, 0.1], [0.0, 0.8, 0.0], [0.1, 0.0, 0.4]])
+    four = jj.log_cholesky(flat, symmetric=True)
+    assert four.shape == (4,)
+    np.testing.assert_allclose(jj.inertia_from_log_cholesky(four), flat, rtol=1e-13, atol=1e-15)
+
+
+def test_derivatives_are_finite_and_there_are_as_many_numbers_as_moments():
+    numbers = jj.log_cholesky([0.5, 0.8, 0.6])
+    six = lambda x: jj.inertia_from_log_cholesky(x)[np.triu_indices(3)]  # noqa: E731
+    J = jax.jacfwd(six)(numbers)
+    assert np.linalg.matrix_rank(J) == 6
+    np.testing.assert_allclose(J @ jax.jacfwd(lambda v: jj.log_cholesky(of(v)))(six(numbers)), np.eye(6), atol=1e-12)
+
+
+def of(v):
+    """A symmetric matrix of its upper triangle."""
+    return jnp.stack([jnp.stack([v[0], v[1], v[2]]), jnp.stack([v[1], v[3], v[4]]), jnp.stack([v[2], v[4], v[5]])])
+
+
+class Turning(jj.Scene):
+    """A body that turns about a fixed point under two springs, so that its moments of inertia show."""
+
+    moments: jnp.ndarray = jj.parameter(jnp.array([0.5, 0.7, 0.4]), unit="kg m^2")
+
+    coordinates = jj.coordinates("yaw pitch")
+
+    def inertia(self):
+        return jnp.diag(self.moments)
+
+    def bodies(self, t, q):
+        return {"body": jj.RigidBody(1.0, self.inertia(), jnp.zeros(3), jj.rot_z(q.yaw) @ jj.rot_y(q.pitch))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, yaw_rate=-2.0 * motion.q.yaw, pitch_rate=-3.0 * motion.q.pitch),)
+
+
+class TurningBody(Turning):
+    """Its motion, with moments that a body can have."""
+
+    moments: jnp.ndarray = jj.parameter(jj.log_cholesky([0.5, 0.7, 0.4])[:3])
+
+    def inertia(self):
+        return jj.inertia_from_log_cholesky(jnp.concatenate([self.moments, jnp.zeros(3)]))
+
+
+def test_a_fit_whose_moments_end_beyond_what_a_body_can_have_ends_at_a_body():
+    truth = jnp.array([0.5, 0.899, 0.4])  # Iyy is nearly the sum of the other two
+    ts, start = np.linspace(0.0, 4.0, 41), {"yaw": 0.8, "pitch": 1.0}
+    motion, noise = jj.simulate(Turning(moments=truth), start, ts=ts), np.random.default_rng(3)
+    values = {name: np.asarray(motion[name]) + 0.1 * noise.normal(size=41) for name in ("yaw", "pitch")}
+    data = jj.Measurements(ts, values, 0.1, start=start)
+    free, body = (jj.fit(scene, data, ("moments",)) for scene in (Turning(), TurningBody()))
+    assert free.impossible
+    assert body.converged
+    assert not body.impossible
+    moments = np.linalg.eigvalsh(np.asarray(body.scene.inertia()))
+    assert moments[0] > 0
+    assert moments[2] <= moments[:2].sum() * (1 + 1e-12)
+    np.testing.assert_allclose(np.sort(moments), np.sort(truth), atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: jj.log_cholesky([0.1, 0.1, 0.3]), "no body with a thickness has the principal moments"),
+        (lambda: jj.log_cholesky([-0.1, 0.1, 0.1]), "no body with a thickness"),
+        (lambda: jj.log_cholesky([1.0, 2.0]), r"has shape \(2,\), expected \(3, 3\) or \(3,\)"),
+        (lambda: jj.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.2, 1.0, 0.0], [0.0, 0.0, 1.0]])), "not symmetric; give Ixy = Iyx"),
+        (lambda: jj.log_cholesky(np.array([[1.0, 0.1, 0.0], [0.1, 1.0, 0.0], [0.0, 0.0, 1.0]]), symmetric=True), "Ixy = 0.1 and Iyz = 0"),
+        (lambda: jj.inertia_from_log_cholesky([1.0, 2.0, 3.0]), r"has shape \(3,\), expected \(6,\), or \(4,\)"),
+    ],
+)
+def test_impossible_numbers_are_refused_by_name(call, told):
+    with pytest.raises(ValueError, match=told):
+        call()
