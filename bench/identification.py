@@ -3,10 +3,11 @@
     python bench/identification.py [--quick] [--only NAME ...] [--json FILE]
 
 Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), unstable (100 first guesses of a bicycle below its weave
-speed), coverage, three (coverage of three models, unknown starts and sigmas, white noise and AR(1) noise), nuts (sampling by BlackJAX), windows (57 runs of the
-steer-by-wire bicycle with an unknown start each; the data are in `data/sbw_bicycle`), logs (what halves of these runs say of each other, with and without
-delays of the sensors, a lag of the motor and a memory of the noise). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out
-windows and logs, with fewer repeats. Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
+speed), chaotic (100 of a double pendulum, the run as a whole and in pieces), coverage, three (coverage of three models, unknown starts and sigmas, white
+noise and AR(1) noise), nuts (sampling by BlackJAX), windows (57 runs of the steer-by-wire bicycle with an unknown start each; the data are in
+`data/sbw_bicycle`), logs (what halves of these runs say of each other, with and without delays of the sensors, a lag of the motor and a memory of the noise).
+Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs, with fewer repeats. Times are processor time, the
+least of some repeats, in turn; those of the windows are wall time of a fresh process.
 """
 
 import argparse
@@ -510,6 +511,56 @@ def unstable(count: int) -> list[Figure]:
     ]
 
 
+# A chaotic double pendulum. --------------------------------------------------------------------------------------------
+
+
+def chaotic_run(seed: int, span: float) -> tuple[jj.models.DoublePendulumAngles, dict, jj.Measurements]:
+    """A double pendulum that turns over, 20 samples a second with 1 % noise; mass, lengths and start are first guesses, each off by up to half."""
+    truth, ts, generator = jj.models.DoublePendulumAngles(), np.linspace(0.0, span, round(20 * span) + 1), np.random.default_rng(seed)
+    start = {"theta1": 2.0, "theta2": 2.5, "theta1_rate": 0.0, "theta2_rate": 0.0}
+    motion = jj.simulate(truth, start, ts=ts, rtol=1e-9, atol=1e-9)
+    exact = {name: np.asarray(motion[name]) for name in ("theta1", "theta2")}
+    sigma = {name: 0.01 * float(np.std(x)) for name, x in exact.items()}
+    values = {name: x + sigma[name] * generator.normal(size=len(ts)) for name, x in exact.items()}
+    true = {name: float(getattr(truth, name)) for name in ("mass2", "length1", "length2")}
+    guess = truth.replace(**{name: x * (1 + generator.uniform(-0.5, 0.5)) for name, x in true.items()})
+    begin = {name: x * (1 + generator.uniform(-0.5, 0.5)) if x else 3 * generator.uniform(-0.5, 0.5) for name, x in start.items()}
+    return guess, true, jj.Measurements(ts, values, sigma, start=begin, unknown_start=tuple(begin))
+
+
+def in_pieces(run: jj.Measurements, samples: int) -> list[jj.Measurements]:
+    """The run as runs of so many intervals each, one after another, whose starts are unknown; first guesses of these from a parabola through five samples."""
+    ts, found = np.asarray(run.ts), []
+    for first in range(0, len(ts) - 1, samples):
+        part = slice(first, first + samples + 1)
+        t, begin = ts[part], {}
+        for name, x in run.values.items():
+            _, begin[f"{name}_rate"], begin[name] = np.polyfit(t[:5] - t[0], x[part][:5], 2)
+        pieces = {name: x[part] for name, x in run.values.items()}
+        found.append(jj.Measurements(t, pieces, dict(run.sigma), start=begin, unknown_start=dict.fromkeys(begin, jj.unbounded(1.0))))
+    return found
+
+
+def chaotic(count: int) -> list[Figure]:
+    """Whole runs of a chaotic double pendulum, by growing spans; and as pieces of half a second, whose starts are unknown."""
+    found = []
+    for span in (5.0, 10.0, 20.0):
+        whole, pieces, inside = [], [], []
+        for seed in range(count):
+            guess, true, run = chaotic_run(seed, span)
+            one, cut = (jj.fit(guess, data, tuple(true), rtol=1e-8, atol=1e-8) for data in (run, in_pieces(run, 10)))
+            whole.append(bool(one.reduced_chi_square < 1.3))
+            pieces.append(bool(cut.converged and cut.reduced_chi_square < 1.3))
+            inside += [bool(cut[name].low < x < cut[name].high) for name, x in true.items()]
+        model = f"chaotic double pendulum, {span:g} s"
+        found += [
+            figure("share of first guesses off by up to half that lead to the minimum, the run as a whole", model, np.mean(whole)),
+            figure("the same, the run in pieces of 0.5 s with unknown starts", model, np.mean(pieces)),
+            figure("95 % intervals of these that hold the truth", model, np.mean(inside)),
+        ]
+    return found
+
+
 def main() -> None:
     """Run, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -527,6 +578,7 @@ def main() -> None:
         "bound": bound,
         "starts": starts,
         "unstable": lambda: unstable(20 if options.quick else 100),
+        "chaotic": lambda: chaotic(10 if options.quick else 100),
         "coverage": lambda: coverage(50 if options.quick else 500),
         "three": lambda: three(50 if options.quick else 1000),
         "nuts": lambda: nuts(500 if options.quick else 2000),
