@@ -58,13 +58,13 @@ def lanes_of(name: str, adjoint: diffrax.AbstractAdjoint) -> tuple[Setup, Begun]
 
 def solved_by_plain_diffrax(setup: Setup, begun: Begun):
     """The end state of one motion by `diffrax.diffeqsolve`, with nothing around it."""
-    rtol, atol = setup.options.tolerances
+    rtol, atol = setup.tolerances
     return diffrax.diffeqsolve(
         diffrax.ODETerm(integrands.rates),
         setup.options.solver,
         setup.t0,
         setup.t1,
-        setup.options.dt0,
+        setup.dt0,
         begun.y0,
         begun.args,
         saveat=diffrax.SaveAt(t1=True),
@@ -83,7 +83,7 @@ def one_by_one(function: Callable, setups: Setup, begun: Begun):
 
 def apart(setups: Setup) -> Setup:
     """With times that XLA does not know to be the same in all lanes: it moves those through diffrax's `nextafter`, one operation per pass."""
-    return eqx.tree_at(lambda s: (s.t0, s.t1, s.options.dt0), setups, jax.lax.optimization_barrier((setups.t0, setups.t1, setups.options.dt0)))
+    return eqx.tree_at(lambda s: (s.t0, s.t1, s.dt0), setups, jax.lax.optimization_barrier((setups.t0, setups.t1, setups.dt0)))
 
 
 def end_states(loop: str, blocks: bool) -> Callable:

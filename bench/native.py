@@ -1,6 +1,6 @@
 """Motions by machine code of our own against the same motions by XLA, in one run on one core: batches, alone, cold starts.
 
-    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|heyoka|records|watching|compilation ...]
+    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|heyoka|records|watching|calls|compilation ...]
 
 Writes a list of {"figure", "model", "value", "required", "met"}; `required` is None where a figure is only told. Times of warm motions are processor
 time, the least of some repeats, the two ways in turn; cold ones are wall time of fresh processes.
@@ -167,6 +167,46 @@ def watching(quick: bool) -> Iterator[Figure]:
     yield figure("motions whose pivots are watched over such whose are not", name, seconds["watched"] / seconds["not watched"], 1.05)
 
 
+class Pushed(jj.Scene):
+    """A mass that two inputs push, on springs."""
+
+    stiffness: jax.Array = jj.parameter(4.0, unit="N/m")
+    coordinates = jj.coordinates("x y")
+    inputs = jj.inputs("f g")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        f, g = motion.inputs.f - self.stiffness * motion.q.x, motion.inputs.g - self.stiffness * motion.q.y
+        return (jj.generalized_force(motion, x_rate=f, y_rate=g),)
+
+
+def calls(quick: bool) -> Iterator[Figure]:
+    """What `simulate` called from Python costs more than the same motion, of 1 s saved 201 times, from a given state under the user's `jit`."""
+    two = {
+        "two numbers": {"f": 1.0, "g": 0.5},
+        "two functions of time": {"f": jnp.sin, "g": lambda t: jnp.cos(2 * t)},
+        "two records": {name: jj.Sampled(np.linspace(0.0, 1.0, 11), np.linspace(0.0, 1.0, 11) ** power) for name, power in (("f", 2), ("g", 3))},
+    }
+    cases = [("tilting-disc", jj.models.TiltingDisc(), None, 0.3), ("whipple-bicycle", jj.models.MODELS["whipple-bicycle"](), None, 0.3)]
+    cases += [(f"mass pushed by {what}", Pushed(), inputs, 0.5) for what, inputs in two.items()]
+    for name, scene, inputs, required in cases[: 1 if quick else None]:
+        values = dict(scene.example) or {"x": 0.1}
+        options = {"t1": 1.0, "inputs": inputs}
+        state = jj.start(scene, **values)
+        compiled = jax.jit(lambda state, scene=scene, options=options: jj.simulate(scene, state, **options))
+        runs = {
+            "jit": lambda compiled=compiled, state=state: jax.block_until_ready(compiled(state)),
+            "a state": lambda scene=scene, state=state, options=options: jax.block_until_ready(jj.simulate(scene, state, **options)),
+            "named values": lambda scene=scene, values=values, options=options: jax.block_until_ready(jj.simulate(scene, values, **options)),
+        }
+        seconds = least_processor_time(runs, 50 if quick else 400)
+        yield figure("a call under the user's jit, ms", name, 1e3 * seconds["jit"])
+        for way in ("a state", "named values"):
+            yield figure(f"called from Python with {way}, ms more", name, 1e3 * (seconds[way] - seconds["jit"]), required)
+
+
 def compilation(quick: bool) -> Iterator[Figure]:
     """The motion alone, lowered and compiled in this process, once the scene is built; fresh processes to the end of a first motion."""
     for name in ("tilting-disc", "whipple-bicycle"):
@@ -193,7 +233,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few lanes, the disc alone")
     parser.add_argument("--json", help="write the figures to this file")
-    parts = {"batches": batches, "heyoka": heyoka, "records": records, "watching": watching, "compilation": compilation}
+    parts = {"batches": batches, "heyoka": heyoka, "records": records, "watching": watching, "calls": calls, "compilation": compilation}
     parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="these figures")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)

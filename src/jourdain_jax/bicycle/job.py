@@ -28,8 +28,8 @@ SPEEDS = ("weave_speed", "capsize_speed", "double_root_speed")
 MAX_SPEED = 50.0  # m/s; a speed beyond it counts as none
 CAVEAT = (
     "Limits are the 2.5 and 97.5 % quantiles over the samples that have the speed; `fraction` is how many have it. Sigmas are taken as\n"
-    "independent, because files of parameters carry no covariance; of raw measurements, `*Measured.txt`, it is known, and used. A missing sigma\n"
-    f"counts as zero. Speeds above {MAX_SPEED:g} m/s count as none."
+    "independent, because files of parameters carry no covariance; of raw measurements, `*Measured.txt`, it is known, and used.\n"
+    f"A missing sigma counts as zero. Speeds above {MAX_SPEED:g} m/s count as none."
 )
 _GRID = 81
 

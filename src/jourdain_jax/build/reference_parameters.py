@@ -5,7 +5,7 @@ by evaluating the scene at a few states, which takes numbers for its parameters.
 """
 
 import gc
-from collections.abc import Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import fields
@@ -31,8 +31,11 @@ def without_collecting() -> Iterator[None]:
             gc.enable()
 
 
-def once_per_values(probe):
-    """A function of a scene (and of what else tells its cases apart), run once per class and values, on concrete parameters, also while they are traced."""
+def once_per_values(probe, of_traced: Callable | None = None):
+    """A function of a scene (and of what else tells its cases apart), run once per class and values, on concrete parameters, also while they are traced.
+
+    `of_traced`: what is run, every time, on scenes whose parameters are traced, in place of the function on numbers that stand in for them.
+    """
     cached = lru_cache(maxsize=512)(lambda wrapped, *case: probe(wrapped.scene, *case))
 
     @wraps(probe)
@@ -40,6 +43,8 @@ def once_per_values(probe):
         leaves, treedef = jax.tree.flatten(scene)
         concrete = scene
         if any(_is_traced(x) for x in leaves):
+            if of_traced is not None:
+                return of_traced(scene, *case)
             concrete = with_reference_parameters(scene)
             leaves, treedef = jax.tree.flatten(concrete)
         key = tuple((x.tobytes(), x.shape, x.dtype) for x in map(np.asarray, leaves))

@@ -165,8 +165,7 @@ def structure_of(scene: Scene) -> Structure:
 
 
 def _whatever_its_faults(scene: Scene) -> Structure:
-    with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
-        return _probed_structure(as_scene(scene))
+    return _structure(as_scene(scene))
 
 
 def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
@@ -195,6 +194,11 @@ def usual_rows(scene: Scene) -> UsualRows:
 
 
 @once_per_values
+def _structure(scene: Scene) -> Structure:
+    with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
+        return _probed_structure(scene)
+
+
 def _probed_structure(scene: Scene) -> Structure:
     names = names_of_rows(scene)
     count = len(scene.speed_names)

@@ -22,7 +22,7 @@ def solved_by_diffrax(setup: Setup, begun: Begun) -> Solved:
     field, options, args, y0 = setup.field, setup.options, begun.args, begun.y0
     origin = args[4]
     t0, t1, ts, knots = setup.t0 - origin, setup.t1 - origin, setup.ts - origin, setup.knots
-    names, (rtol, atol) = options.event_names, options.tolerances
+    names, (rtol, atol) = options.event_names, setup.tolerances
     landings = jnp.append(ts if options.saveat is None else ts[:0], t1)
     landings = landings if knots is None else merged(landings, knots + t0, jnp.sign(t1 - t0))
     controller = controller_of(options.solver, options.controller, landings)
@@ -41,7 +41,7 @@ def solved_by_diffrax(setup: Setup, begun: Begun) -> Solved:
         Remembering(solver, integrands.events) if names else solver,
         t0,
         t1,
-        options.dt0,
+        setup.dt0,
         y0,
         args,
         saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)], solver_state=True),

@@ -33,7 +33,7 @@ def conserves(setup: Setup) -> bool:
 def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -> Float[Array, "2 times 2"]:
     """T and V (J) at states, and both where each number is larger by the error that a step may leave in it."""
     field, scene, inputs, fixed, _ = args
-    rtol, atol = setup.options.tolerances
+    rtol, atol = setup.tolerances
     off = jax.tree.map(lambda x: x + jnp.where(x < 0, -1.0, 1.0) * (atol + rtol * jnp.abs(x)), y)
     every = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *jax.lax.stop_gradient(((t, y), (t, off))))
     at = lambda state: field.energies(scene, fixed, state[0], state[1], inputs(state[0]))  # noqa: E731

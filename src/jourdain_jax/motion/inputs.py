@@ -1,6 +1,7 @@
 """Inputs of a scene as functions of time: constants, callables by name, or samples with linear interpolation in between."""
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 
 import equinox as eqx
 import jax
@@ -8,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import as_real
+from jourdain_jax.calculus.reals import as_real, real_type
 from jourdain_jax.motion.input_programs import FunctionOfTime, by_itself, for_programs, traced
 from jourdain_jax.scene.arguments import ChangingInputs
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import checked_real, described, is_traced
+from jourdain_jax.scene.numbers import checked_real, checked_unless_traced, described, is_traced
 from jourdain_jax.scene.scene import Scene
 
 
@@ -50,7 +51,7 @@ class Sampled(eqx.Module):
 class Constant(eqx.Module):
     """One value at all times."""
 
-    value: Float[Array, ""]
+    value: Float[Array | np.ndarray, ""]
 
     def __call__(self, t):
         """The value."""
@@ -64,13 +65,7 @@ class Inputs(eqx.Module):
 
     def __call__(self, t) -> Float[Array, "inputs"]:
         """The vector of inputs at time t."""
-        return jnp.stack([jnp.asarray(channel(t), jnp.result_type(float)) for channel in self.channels]) if self.channels else jnp.zeros(0)
-
-    def at(self, t) -> Float[Array | np.ndarray, "inputs"]:
-        """The vector of inputs at time t; compiled where all is known, instead of one operation after another."""
-        if not self.channels:
-            return np.zeros(0, jnp.result_type(float))  # one of JAX takes a tenth of a millisecond
-        return self(t) if self.constant or is_traced(self, t) else _compiled_inputs(self.programs)(self, jnp.asarray(t, jnp.result_type(float)))
+        return jnp.stack([jnp.asarray(channel(t), real_type()) for channel in self.channels]) if self.channels else jnp.zeros(0)
 
     @property
     def constant(self) -> bool:
@@ -84,7 +79,7 @@ class Inputs(eqx.Module):
 
     def near(self, t) -> ChangingInputs:
         """Values and rates at time t; a ValueError for functions that JAX cannot differentiate."""
-        t = jnp.asarray(t, jnp.result_type(float))
+        t = jnp.asarray(t, real_type())
         try:
             values, rates = jax.jvp(self, (t,), (jnp.ones_like(t),))
         except (ValueError, TypeError, NotImplementedError) as error:
@@ -95,14 +90,31 @@ class Inputs(eqx.Module):
         return ChangingInputs(t, values, rates)
 
 
+def inputs_at(inputs: Inputs, t) -> Float[Array | np.ndarray, "inputs"]:
+    """The vector of inputs at time t; on NumPy or compiled where all is known, instead of one operation after another."""
+    if not inputs.channels or (inputs.constant and not is_traced(inputs)):
+        return np.array([np.asarray(value) for value in jax.tree.leaves(inputs)], real_type())
+    return inputs(t) if is_traced(inputs, t) else _compiled_inputs(inputs.programs)(inputs, np.asarray(t, real_type()))
+
+
 _compiled_inputs = for_programs(lambda inputs, t: inputs(t), by_itself)
+
+
+_NOTHING = object()
+_ZERO = Constant(np.zeros(()))  # made once: a module takes some 20 us
+
+
+@lru_cache(maxsize=64)
+def _at_rest(count: int) -> Inputs:
+    """So many inputs that are zero."""
+    return Inputs((_ZERO,) * count)
 
 
 def _as_channel(f: Callable, where: str) -> Callable:
     """A function of time as a channel, or a ValueError unless `f` of one time is one number; nothing is computed."""
     advice = "give a function of one time that returns one number, such as `lambda t: jnp.sin(t)`"
     try:
-        channel, found = traced(f, jnp.result_type(float))
+        channel, found = traced(f, real_type())
     except TypeError as error:
         raise ValueError(f"{where} cannot be called with a time ({str(error).splitlines()[0]}); {advice}") from None
     if not hasattr(found, "shape"):
@@ -122,13 +134,14 @@ def as_inputs(scene: Scene, given) -> Inputs:
         return given
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(f"`inputs` is {described(given)}, expected a dictionary: name -> number, function of time, or `jj.Sampled`")
-    given = {} if given is None else given
+    if not given:
+        return _at_rest(len(scene.inputs))
     for name in given:
         if name not in scene.inputs.entries:
             raise ValueError(f"`{type(scene).__name__}` has no input `{name}`; {nearest(name, scene.inputs.entries)}")
     channels: list[Callable] = []
     for name in scene.inputs.entries:
-        value = given.get(name, 0.0)
+        value = given.get(name, _NOTHING)
         advice = "give a number, a function of time, or `jj.Sampled(ts, values)`"
         where = f"input `{name}` of `{type(scene).__name__}`"
         if isinstance(value, Sampled):  # its own numbers are checked where it is made
@@ -136,5 +149,5 @@ def as_inputs(scene: Scene, given) -> Inputs:
         elif callable(value):
             channels.append(_as_channel(value, where))
         else:
-            channels.append(Constant(checked_real(value, where, (), advice=advice)))
+            channels.append(_ZERO if value is _NOTHING else Constant(checked_unless_traced(value, where, (), advice=advice)))
     return Inputs(tuple(channels))

@@ -70,14 +70,14 @@ def _loop(setup: Setup, y0, args, ts, knots) -> Solved:
         project=integrands.project if field.projects else None,
         events=integrands.events if options.event_names else None,
         norm=integrands.state_norm,
-        rtol=jnp.broadcast_to(options.tolerances[0], setup.t0.shape),
-        atol=jnp.broadcast_to(options.tolerances[1], setup.t0.shape),
+        rtol=jnp.broadcast_to(setup.tolerances[0], setup.t0.shape),
+        atol=jnp.broadcast_to(setup.tolerances[1], setup.t0.shape),
         shortest=setup.shortest,
         max_steps=_most_steps(setup, knots),
         knots=knots,
         rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
     )
-    ys, reached, end = erk_loop.integrate(problem, erk_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, options.dt0, options.kind)
+    ys, reached, end = erk_loop.integrate(problem, erk_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, setup.dt0, options.kind)
     return _as_solved(goals, ys, reached, end)
 
 
@@ -88,8 +88,8 @@ def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
 
 def _motion(setup: Setup, begun: Begun) -> native_motion.Motion:
     options, knots = setup.options, setup.knots
-    rtol, atol = options.tolerances
-    control = native_motion.Control(rtol, atol, setup.shortest, options.dt0, _most_steps(setup, knots))
+    rtol, atol = setup.tolerances
+    control = native_motion.Control(rtol, atol, setup.shortest, setup.dt0, _most_steps(setup, knots))
     return native_motion.Motion(begun.args, type(options.solver), options.order, bool(options.event_names), begun.y0, _goals(setup, setup.ts), knots, control)
 
 
@@ -102,7 +102,7 @@ def _rules(setup: Setup, mapped: Callable) -> Rules:
     """Derivatives by machine code; `mapped`: of a function of one motion, that of all lanes."""
 
     def serve(varies: Setup, begun: Begun) -> bool:
-        of_times = varies.ts, varies.t0, varies.t1, varies.options.tolerances, varies.options.dt0, begun.args[-1]
+        of_times = varies.ts, varies.t0, varies.t1, varies.tolerances, varies.dt0, begun.args[-1]
         of_samples = [channel for channel in (*varies.inputs.channels, *begun.args[2].channels) if isinstance(channel, Sampled)]
         reason = native_motion.reason_against_derivatives(setup.field, setup.inputs, bool(setup.options.event_names))
         return not any(jax.tree.leaves((of_times, of_samples))) and not reason

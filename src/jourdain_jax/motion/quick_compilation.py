@@ -5,30 +5,33 @@ XLA's newer fusion emitters on the CPU take up to twice as long to compile a sca
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
 import jax
 from jax.extend.core import get_opaque_trace_state
 
-from jourdain_jax.scene.numbers import is_traced
-
 _OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+MOST_STRUCTURES = 1024  # of arguments, arrays left out, for which one function is kept compiled
 _RUN_SELDOM: dict[str, Any] = _OPTIONS | {"xla_backend_optimization_level": 0}
 
 
 def compiled(f: Callable, **options) -> Callable:
     """As `equinox.filter_jit`, at a tenth of its costs per call; what was compiled is dropped with the function that is returned. `options`: of `jax.jit`."""
 
-    def on_arrays(arrays, others):
-        found, kept = _parted(f(*_whole(arrays, *others)))
-        return found, _Kept(kept)
+    @lru_cache(maxsize=MOST_STRUCTURES)
+    def program(treedef, others) -> Callable:
+        def on_arrays(arrays):
+            found, kept = _parted(f(*_whole(arrays, treedef, others)))
+            return found, _Kept(kept)
 
-    on_arrays.__name__ = getattr(f, "__name__", "on_arrays")
-    jitted = jax.jit(on_arrays, static_argnums=1, **options)
+        on_arrays.__name__ = getattr(f, "__name__", "on_arrays")
+        return jax.jit(on_arrays, **options)
 
     def run(*arguments):
-        found, kept = jitted(*_parted(arguments))
+        arrays, structure = _parted(arguments)
+        found, kept = program(*structure)(arrays)
         return _whole(found, *kept.value)
 
     return run
@@ -67,14 +70,14 @@ def quickly_compiled(f: Callable, compiler: Callable = compiled, run_seldom: boo
     plain, quick = compiler(f), compiler(f, compiler_options=_RUN_SELDOM if run_seldom else _OPTIONS)
 
     def run(*arguments):
-        return (quick if jax.default_backend() == "cpu" and _outermost(arguments) else plain)(*arguments)
+        return (quick if jax.default_backend() == "cpu" and nothing_is_traced() else plain)(*arguments)
 
     return run
 
 
-def _outermost(arguments) -> bool:
-    """Whether nothing is being traced, neither the arguments nor a function around this call."""
-    return get_opaque_trace_state(convention="flax") == _NOTHING_TRACED and not is_traced(arguments)
+def nothing_is_traced() -> bool:
+    """Whether this call stands outside of every transformation: no function around it is being traced, and so no argument."""
+    return get_opaque_trace_state(convention="flax") == _NOTHING_TRACED
 
 
 with jax.ensure_compile_time_eval():

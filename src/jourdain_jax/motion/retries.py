@@ -11,6 +11,7 @@ from typing import TypeVar
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from jourdain_jax.motion.formulation import as_formulation
 from jourdain_jax.motion.integrators.radau import RadauIIA
@@ -30,7 +31,7 @@ def next_retry(field: VectorField, motion: Trajectory, t0, options: dict) -> int
 
     `field`: how it was integrated; `options`: those of `simulate` that were given.
     """
-    if int(motion.result) in (results.SUCCESS, results.EVENT):
+    if np.asarray(motion.result) in (results.SUCCESS, results.EVENT):
         return results.AS_ASKED
     tried, solver, backend = int(motion.fallback), options.get("solver"), options.get("backend", "auto")
     lost = as_formulation(options.get("formulation")).state in may_be_another_form(field) and may_be_full(solver) and int(motion.result) in lost_codes(field)

@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 from jourdain_jax.calculus.cotangents import tap_cotangents, tap_tangents
+from jourdain_jax.motion.quick_compilation import nothing_is_traced
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.numbers import is_traced
@@ -110,10 +111,10 @@ def _judge(amplification: float, rtol: float, steps: int) -> None:
 
 def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     """`integrate(setup)`; its derivative, taken outside of `jit`, warns where the motion amplifies errors too much."""
-    if not is_traced(setup):
+    if nothing_is_traced() or not is_traced(setup):
         return integrate(setup)
     forward = isinstance(setup.options.adjoint, diffrax.ForwardMode)
-    start, (rtol, atol) = setup.start, setup.options.tolerances
+    start, (rtol, atol) = setup.start, setup.tolerances
     known = _known((start.q, start.u, rtol, atol))
     if known is None:
         return integrate(setup)

@@ -5,7 +5,7 @@ Rates, projection and events are given tau, and the scene and its inputs t0 + ta
 """
 
 from operator import attrgetter
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -26,12 +26,10 @@ OWN_ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode)
 
 
 class Options(eqx.Module):
-    """How to integrate."""
+    """How to integrate; what is a number of its own in every call stands in the `Setup`."""
 
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController | None  # None: the default one
-    tolerances: tuple  # rtol, atol
-    dt0: Float[Array, ""] | float
     adjoint: diffrax.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
     saveat: diffrax.SaveAt | None  # None: at the times asked for, at each of which a step ends
@@ -68,7 +66,7 @@ class Solved(eqx.Module):
     pivot: Float[Array, "*lanes"]  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was watched
 
 
-class Setup(eqx.Module):
+class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     """A motion to be integrated; in a batch all arrays have a leading axis of lanes."""
 
     scene: Scene
@@ -78,11 +76,13 @@ class Setup(eqx.Module):
     t1: Float[Array | np.ndarray, "*lanes"]
     ts: Float[Array | np.ndarray, "*lanes times"]
     field: VectorField
+    tolerances: tuple  # rtol, atol
+    dt0: Float[Array | np.ndarray, "*lanes"] | float
     options: Options
 
     def fitting(self) -> "Setup":
         """The setup with times that serve any loop, also where its own do not go together."""
-        of = attrgetter("ts", "t0", "t1", "options.dt0")
+        of = attrgetter("ts", "t0", "t1", "dt0")
         return eqx.tree_at(of, self, fitting_times(*of(self)))
 
     @property
@@ -95,7 +95,7 @@ class Setup(eqx.Module):
         """Times since the start at which steps must end for the inputs' sake."""
         if steps_are_given(self.options.controller):
             return None
-        return knots_between((self.inputs, self.scene), self.options.tolerances[0], self.t0, self.t1, self.ts)
+        return knots_between((self.inputs, self.scene), self.tolerances[0], self.t0, self.t1, self.ts)
 
 
 class Begun(eqx.Module):

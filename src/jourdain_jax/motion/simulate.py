@@ -6,6 +6,7 @@ domain and the rows are linear or affine; otherwise the full one (coordinates an
 
 import inspect
 import warnings
+from functools import lru_cache
 
 import diffrax
 import equinox as eqx
@@ -18,7 +19,7 @@ from jourdain_jax.build.event_names import names_of_events
 from jourdain_jax.calculus.reals import Number
 from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.formulation import Formulation, as_formulation
-from jourdain_jax.motion.inputs import Inputs, as_inputs
+from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
 from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
@@ -38,6 +39,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _REVERSE, _LOOSE, _TIGHT = diffrax.RecursiveCheckpointAdjoint(), diffrax.Tsit5(), diffrax.Dopri8()  # made once: each takes a tenth of a millisecond
+_options = lru_cache(maxsize=64)(Options)  # where nothing was chosen
 _OFF = 1e4  # units of round-off: a residual that is more
 
 
@@ -144,11 +146,9 @@ def _set_up(
     start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs)
     field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
     warn_float32(start.q.dtype, rtol)
-    options = Options(
+    options = (Options if any(x is not None for x in objects.values()) else _options)(
         solver=(default_solver(rtol) if order is None else _TIGHT) if solver is None else solver,
         controller=stepsize_controller,
-        tolerances=tuple((jnp if is_traced(x) else np).asarray(x, start.q.dtype) for x in (rtol, atol)),  # arrays: another tolerance is no other program
-        dt0=_first_step(solver, dt0, t0, t1),  # diffrax's own guess costs two more copies of the vector field to compile
         adjoint=_REVERSE if adjoint is None else adjoint,
         max_steps=max_steps,
         saveat=None if saveat is None else _checked_saveat(saveat),
@@ -156,8 +156,10 @@ def _set_up(
         native=backend in ("auto", "native"),
         order=order,
     )
+    tolerances = tuple((jnp if is_traced(x) else np).asarray(x, start.q.dtype) for x in (rtol, atol))  # arrays: another tolerance is no other program
+    first_step = _first_step(solver, dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
     start = _on_constraints(scene, t0, start, inputs, made_here) if formulation.projects else start
-    setup = Setup(scene, start, inputs, t0, t1, ts, field, options)
+    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, options)
     if backend == "native" and (reason := reason_against_machine_code(setup)):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
     if order is not None and (reason := reason_against_series(setup, order)):
@@ -189,17 +191,17 @@ def _on_constraints(scene: Scene, t0, start: State, inputs: Inputs, made_here: b
     """The start on the constraints, with how far it has moved from what was given; one made here is there already, unless what was given kept it off."""
 
     def moved_again(start: State) -> State:
-        state = consistent(scene, t0, start.q, start.u, inputs.at(t0))
+        state = consistent(scene, t0, start.q, start.u, inputs_at(inputs, t0))
         moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
         return eqx.tree_at(lambda s: (s.moved_q, s.moved_u), state, tuple(moved))
 
     if not made_here:
-        return consistent(scene, t0, start.q, start.u, inputs.at(t0))
-    off = start.residual > _OFF * jnp.finfo(start.q.dtype).eps
-    if is_traced(off):
+        return consistent(scene, t0, start.q, start.u, inputs_at(inputs, t0))
+    if is_traced(start.residual):
+        off = start.residual > _OFF * jnp.finfo(start.q.dtype).eps
         # worked out once more on the way back of a derivative: what would be kept for it, of a branch that is rarely taken, costs as much as the start itself
         return jax.lax.cond(eqxi.unvmap_any(off), jax.checkpoint(moved_again), lambda start: start, start)
-    return moved_again(start) if off else start
+    return moved_again(start) if np.asarray(start.residual) > _OFF * np.finfo(start.q.dtype).eps else start
 
 
 def default_solver(rtol: Number) -> diffrax.AbstractERK:

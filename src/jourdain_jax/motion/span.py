@@ -8,19 +8,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.motion.arguments import as_state
-from jourdain_jax.motion.inputs import Inputs
+from jourdain_jax.motion.inputs import Inputs, inputs_at
 from jourdain_jax.motion.start import State
-from jourdain_jax.scene.numbers import checked_unless_traced, is_traced
+from jourdain_jax.scene.numbers import checked_unless_traced, is_traced, real_type
 from jourdain_jax.scene.scene import Scene
 
 DEFAULT_SAMPLES = 201
+_EVEN = np.linspace(0.0, 1.0, DEFAULT_SAMPLES)
 _SHORT = 1e-9  # s, a span for motions that are not asked for
 _ROUND_OFF = 4  # units in the last place by which a time at an end of the span may lie beyond it
 
 
 def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs):
     """The start as a state (with the inputs at t0), t0, the times to save at, t1; a ValueError where they are known and do not go together."""
-    real = jnp.result_type(float)
+    real = real_type()
     if isinstance(start, State) and start.q.ndim != 1:
         raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
     ts = None if ts is None else saved_times(ts)
@@ -29,11 +30,11 @@ def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs):
         t0 = as_end("t", start.t if isinstance(start, State) else 0.0)
     if t1 is None:
         t1 = t0 + scene.example_span if ts is None else ts[-1]
-    start = as_state(scene, start, t0=t0, inputs=None if isinstance(start, State) else inputs.at(t0))
+    start = as_state(scene, start, t0=t0, inputs=None if isinstance(start, State) else inputs_at(inputs, t0))
     if not is_traced(t0, t1):
         check_span(t0, t1)
     if ts is None:
-        ts = t0 + (t1 - t0) * np.linspace(0.0, 1.0, DEFAULT_SAMPLES)  # of known ends: nothing to compile
+        ts = t0 + (t1 - t0) * _EVEN  # of known ends: nothing to compile
     elif not is_traced(ts, t0, t1):
         check_times(ts, t0, t1)
     return start, *((jnp if is_traced(x) else np).asarray(x, real) for x in (t0, ts, t1))

@@ -4,6 +4,7 @@ g(t, q) = 0,  phi(t, q, u) = 0
 """
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -22,14 +23,14 @@ from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.projection import closure_residual, position_error_of_rows, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.motion.inputs import as_inputs
-from jourdain_jax.motion.quick_compilation import quickly_compiled
-from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds, as_time
+from jourdain_jax.motion.inputs import as_inputs, inputs_at
+from jourdain_jax.motion.quick_compilation import nothing_is_traced, quickly_compiled
+from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import checked_unless_traced, is_traced
+from jourdain_jax.scene.numbers import checked_unless_traced, is_traced, real_type
 from jourdain_jax.scene.printing import Printed
-from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 FAR = 10.0  # widths of the domain: a coordinate that Newton's method moves by more has run away
@@ -51,7 +52,7 @@ class State(Printed, eqx.Module):
     residual: Float[Array, ""]  # what is left of rows and quaternion norms
     names: tuple[Names, Names] = eqx.field(static=True)
     # that led here: 0, what was given; then others (`start`). A floating-point number, so that a loss can be differentiated with respect to a whole state
-    guess: Float[Array, ""] = eqx.field(default=0, converter=lambda k: jnp.asarray(k, jnp.result_type(float)))
+    guess: Float[Array, ""] = eqx.field(default=0, converter=lambda k: jnp.asarray(k, real_type()))
 
     def __getitem__(self, name: str):
         """A coordinate, speed, quaternion or angular velocity by name."""
@@ -79,25 +80,41 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
     Differentiable in any mode. What cannot be met stays in `residual`, which is infinite where numbers are not finite (no error: this also runs
     inside jit and vmap); the quaternion (0, 0, 0, 0) has no direction and stays as it is, with a residual of 1/2. ValueError for wrong shapes.
     """
-    t, q, u = checked_unless_traced(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many"), as_coordinates(scene, q), as_speeds(scene, u)
-    inputs = inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, q.dtype)
-    known = (*scene.coordinate_names.entries, *scene.speed_names.entries)
+    t, q, u = _as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
+    inputs = _as_input_vector(scene, inputs, q.dtype)
+    coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
     for name in held:
-        if name not in known:
-            raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, known)}")
-    free_q, free_u = (np.array([name not in held for name in names.entries], bool) for names in (scene.coordinate_names, scene.speed_names))
+        if name not in coordinates + speeds:
+            raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, coordinates + speeds)}")
+    free_q, free_u = _free(coordinates, tuple(held)), _free(speeds, tuple(held))
     return _consistent(scene, t, q, u, inputs, free_q, free_u, lambda: np.zeros((0, q.shape[0]), q.dtype))
+
+
+@lru_cache(maxsize=1024)
+def _free(names: tuple[str, ...], held: tuple[str, ...]) -> Bool[np.ndarray, "entries"]:
+    """Which of these entries are not held."""
+    return np.array([name not in held for name in names], bool)
 
 
 def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable) -> State:
     """The nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`."""
     arguments = (scene, t, q, u, inputs, free_q, free_u, _usual(scene))
-    if is_traced(arguments):
+    if not nothing_is_traced() and is_traced(arguments):
         return _put_onto_constraints(*arguments, guesses()).state
     found = _compiled_projection(*arguments, None)
-    if not found.arrived and _can_search(scene):  # rare, and long to compile
+    if not np.asarray(found.arrived) and _can_search(scene):  # rare, and long to compile
         found = jax.tree.map(jnp.asarray, _uncompiled_projection(*arguments, guesses()))
     return found.state
+
+
+def _as_time(t):
+    """A time on NumPy, unless it is traced."""
+    return checked_unless_traced(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many")
+
+
+def _as_input_vector(scene: Scene, inputs, dtype):
+    """A vector on NumPy as it is, which is not traced and takes no time."""
+    return inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, dtype)
 
 
 class _Found(eqx.Module):
@@ -116,13 +133,9 @@ class _Usual(eqx.Module):
     affine: bool = eqx.field(static=True)  # rows are, in the speeds
 
 
-def _usual(scene: Scene) -> _Usual:
-    return _worked_out(scene) if is_traced(scene) else _once(scene)
-
-
 def _worked_out(scene: Scene) -> _Usual:
     low, high = coordinate_bounds(scene)
-    width = np.where(high > low, high - low, 1.0).astype(jnp.result_type(float))
+    width = np.where(high > low, high - low, 1.0).astype(real_type())
     try:
         return _Usual(closure_lengths(scene), usual_rows(scene).lengths, width, rows_are_affine(scene))
     except ValueError:  # of a scene that is wrong in itself; said where its structure is asked for
@@ -130,7 +143,7 @@ def _worked_out(scene: Scene) -> _Usual:
         return _Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, False)
 
 
-_once = once_per_values(_worked_out)
+_usual = once_per_values(_worked_out, of_traced=_worked_out)
 
 
 def _can_search(scene: Scene) -> bool:
@@ -139,7 +152,7 @@ def _can_search(scene: Scene) -> bool:
 
 def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: _Usual, guesses) -> _Found:
     """q and u on the constraints; no search where `guesses` is None."""
-    free = jnp.asarray(free_q)
+    q, u, free = jnp.asarray(q), jnp.asarray(u), jnp.asarray(free_q)
     near_q, guess = project_positions(scene, t, q, free=free, typical=usual.closures), jnp.zeros((), jnp.int32)
     arrived = _arrived(scene, t, q, near_q, usual)
     if guesses is not None and _can_search(scene):
@@ -186,7 +199,7 @@ def _searched(scene: Scene, t, q, free, usual: _Usual, guesses) -> tuple[Float[A
 
 
 def _tolerance(dtype) -> float:
-    return 1e3 * float(np.sqrt(np.finfo(dtype).eps))
+    return 1e3 * float(np.finfo(dtype).eps) ** 0.5
 
 
 _compiled_projection = quickly_compiled(_put_onto_constraints, run_seldom=True)  # one program for every choice of what is held
@@ -205,19 +218,19 @@ def start(scene: Scene | BuiltFor, *, t0: Number = 0.0, inputs=None, **values) -
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
     """
     scene = as_scene(scene)
-    return named_start(scene, values, t0, as_inputs(scene, inputs).at(as_time(t0)))
+    return named_start(scene, values, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)))
 
 
 def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs: Float[Array | np.ndarray, "inputs"]) -> State:
     """A start from a dictionary of `values`, as of `start`, and the `inputs` at time `t0` as a vector."""
     scene = as_scene(scene)
-    q, u, given = scene.named(**values)
-    _check_finite({**values, "t0": t0})
-    t, free_q = as_time(t0), np.array([name not in given for name in scene.coordinate_names.entries], bool)
+    q, u, given = vectors_named(scene, values)
+    t, free_q = _as_time(t0), _free(scene.coordinate_names.entries, given)
+    if is_traced(q, u, t) or not (np.isfinite(q).all() and np.isfinite(u).all() and np.isfinite(t)):
+        _check_finite({**values, "t0": t0})
     known = _structure(scene, t, q, free_q)
-    free_u = np.array([name not in (*given, *_resting(scene, known, given)) for name in scene.speed_names.entries], bool)
-    q, u = as_coordinates(scene, q), as_speeds(scene, u)
-    state = _consistent(scene, t, q, u, as_input_vector(scene, inputs, q.dtype), free_q, free_u, lambda: _guesses(scene, known, q, free_q))
+    free_u = _free(scene.speed_names.entries, (*given, *_resting(scene, known, given)))
+    state = _consistent(scene, t, q, u, _as_input_vector(scene, inputs, q.dtype), free_q, free_u, lambda: _guesses(scene, known, q, free_q))
     _check_residual(scene, state, inputs, given)
     return state
 
@@ -260,12 +273,12 @@ def _resting(scene: Scene, known: Structure, given: tuple[str, ...]) -> tuple[st
 
 def _check_finite(values: Mapping) -> None:
     for name, value in values.items():
-        if not isinstance(value, jax.core.Tracer) and not np.all(np.isfinite(np.asarray(value, float))):
+        if not is_traced(value) and not np.all(np.isfinite(np.asarray(value, float))):
             raise ValueError(f"start value `{name}` is {value}, expected a finite number; check where it was computed")
 
 
 def _check_residual(scene: Scene, state: State, inputs, given: tuple[str, ...]) -> None:
-    if isinstance(state.residual, jax.core.Tracer) or float(state.residual) < _tolerance(state.q.dtype):
+    if is_traced(state.residual) or np.asarray(state.residual) < _tolerance(state.q.dtype):
         return
     g = np.abs(np.asarray(closure_residual(scene, state.t, state.q)))
     phi = np.abs(np.asarray(velocity_residual(scene, state.t, state.q, state.u, inputs)))

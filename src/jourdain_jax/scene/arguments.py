@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import checked_real, described
+from jourdain_jax.scene.numbers import checked_real, described, real_type
 from jourdain_jax.scene.scene import Scene
 
 
@@ -37,7 +37,7 @@ def as_scene(scene) -> Scene:
 
 def as_time(t) -> Float[Array, ""]:
     """A time in s, as a number of the default floating-point type."""
-    return checked_real(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many").astype(jnp.result_type(float))
+    return checked_real(t, "`t`", (), advice="give one time in s; use `jax.vmap` for many").astype(real_type())
 
 
 def as_coordinates(scene: Scene, q) -> Float[Array, "coordinates"]:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import quaternion_rate
 from jourdain_jax.scene.names import Named, nearest
-from jourdain_jax.scene.numbers import described
+from jourdain_jax.scene.numbers import described, real_type
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Coordinates:
 
     def reference(self) -> Float[np.ndarray, "coordinates"]:
         """The reference configuration: zero, and the identity for every quaternion."""
-        q = np.zeros(len(self.names), jnp.result_type(float))
+        q = np.zeros(len(self.names), real_type())
         q[[first for first, _ in self.quaternions]] = 1.0
         return q
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -19,7 +18,7 @@ from jourdain_jax.scene.description import check_description, checked_arguments
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
-from jourdain_jax.scene.numbers import checked_unless_traced
+from jourdain_jax.scene.numbers import checked_unless_traced, is_traced, real_type
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
 from jourdain_jax.scene.printing import scene_html
 from jourdain_jax.scene.static_callables import hold_functions
@@ -180,14 +179,20 @@ class Scene(eqx.Module, metaclass=_SceneClass):
 
         A quaternion or its angular velocity may be given whole, by its own name. ValueError for an unknown name or a wrong shape.
         """
-        q, u, given = entries_named(self, values)
-        return _vector(q), _vector(u), given
+        q, u, given = vectors_named(self, values)
+        return jnp.asarray(q), jnp.asarray(u), given
+
+
+def vectors_named(scene: Scene, values: Mapping) -> tuple[Float[Array | np.ndarray, "coordinates"], Float[Array | np.ndarray, "speeds"], tuple[str, ...]]:
+    """As `Scene.named`; on NumPy where all numbers are known."""
+    q, u, given = entries_named(scene, values)
+    return _vector(q), _vector(u), given
 
 
 def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, tuple[str, ...]]:
     """As `Scene.named`, with entries of q and u in lists."""
     coordinates, speeds = scene.coordinate_names, scene.speed_names
-    q, u = list(scene.coordinates.reference()), [0.0] * len(speeds)
+    q, u = scene.coordinates.reference().tolist(), [0.0] * len(speeds)
     given: list[str] = []
     for name, value in values.items():
         hits = _put(coordinates, q, name, value) + _put(speeds, u, name, value)
@@ -200,7 +205,7 @@ def entries_named(scene: Scene, values: Mapping) -> tuple[list, list, tuple[str,
 
 def _put(names: Names, entries: list, name: str, value) -> list[str]:
     """Put a value, or a run of values, where `name` says; the names of the entries that were set."""
-    if name in names.entries or name in (group for group, _, _ in names.groups):
+    if type(value) is not float and (name in names.entries or name in (group for group, _, _ in names.groups)):
         checked_unless_traced(value, f"`{name}`", advice="give its value")
     shape = np.shape(value)
     if name in names.entries:
@@ -217,8 +222,7 @@ def _put(names: Names, entries: list, name: str, value) -> list[str]:
     return []
 
 
-def _vector(entries: list) -> Float[Array, "entries"]:
-    real = jnp.result_type(float)
-    if any(isinstance(value, jax.core.Tracer) for value in entries):
-        return jnp.stack([jnp.asarray(value, real) for value in entries])
-    return jnp.asarray(np.array([np.asarray(value) for value in entries], real))  # at once: no small programs to compile
+def _vector(entries: list) -> Float[Array | np.ndarray, "entries"]:
+    if is_traced(entries):
+        return jnp.stack([jnp.asarray(value, real_type()) for value in entries])
+    return np.array([value if type(value) is float else np.asarray(value) for value in entries], real_type())  # at once: no small programs to compile

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
-from jourdain_jax.motion.inputs import Inputs
+from jourdain_jax.motion.inputs import Inputs, inputs_at
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.trajectories import labelled, over_times, results
@@ -90,7 +90,7 @@ class Trajectory(eqx.Module):
         """
         if self.q_end.ndim > 1:
             return eqx.filter_vmap(lambda motion: motion.end)(self)
-        return consistent(self.scene, self.t_end, self.q_end, self.u_end, self.inputs.at(self.t_end))
+        return consistent(self.scene, self.t_end, self.q_end, self.u_end, inputs_at(self.inputs, self.t_end))
 
     # Derived quantities. -------------------------------------------------------------------------------------------
 

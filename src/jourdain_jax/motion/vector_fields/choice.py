@@ -22,7 +22,6 @@ from jourdain_jax.motion.vector_fields.by_matrices import Full, Minimal
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
@@ -32,8 +31,9 @@ _BACKENDS = ("auto", "native", "xla", "dense")
 def vector_field(scene: Scene, formulation: Formulation | None = None, work: bool = True, backend: str = "auto", inputs=None) -> VectorField:
     """What is integrated of a scene; the arguments are those of `simulate`."""
     formulation, constant = as_formulation(formulation), as_inputs(scene, inputs).constant
-    plain = formulation.reduction is None and formulation.baumgarte is None and isinstance(backend, str)
-    return (_vector_field if is_traced(scene) or not plain else _once)(scene, formulation, work, backend, constant)
+    if formulation.reduction is None and formulation.baumgarte is None and isinstance(backend, str):
+        return _once(scene, formulation.state, formulation.stabilisation, work, backend, constant)
+    return _vector_field(scene, formulation, work, backend, constant)
 
 
 def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: str, constant: bool) -> VectorField:
@@ -63,7 +63,12 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
     return Full(**common, may_branch=cutoff is not None and isinstance(reduction, NullSpaceQR) and bool(names_of_position_rows(scene)))
 
 
-_once = once_per_values(_vector_field)
+def _without_parts(scene: Scene, state, stabilisation, work: bool, backend: str, constant: bool) -> VectorField:
+    """As `_vector_field`, for a formulation that is texts alone: these are compared in no time."""
+    return _vector_field(scene, Formulation(state, None, stabilisation), work, backend, constant)
+
+
+_once = once_per_values(_without_parts, of_traced=_without_parts)
 
 
 def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation, dense: bool) -> Lowered | None:
