@@ -28,7 +28,7 @@ from jourdain_jax.analysis.predictions import Run, equal_runs
 from jourdain_jax.analysis.sensors import Reading, ideal
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_speeds
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.motion.inputs import Inputs
+from jourdain_jax.motion.inputs import Inputs, inputs_at
 from jourdain_jax.motion.integrators.forward_mode import simulate_forward
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.start import start as consistent_start
@@ -132,7 +132,7 @@ class _Filter:
         count = len(self.coordinates)
         q = jax.lax.stop_gradient(q).at[self.coordinates].set(x[:count])
         u = jnp.zeros(len(self.scene.speed_names.entries)).at[self.speeds].set(x[count:])
-        return consistent(self.scene, t, q, u, self.inputs.at(t), held=self.held)
+        return consistent(self.scene, t, q, u, inputs_at(self.inputs, t), held=self.held)
 
     def _propagated(self, t, t1, q, x, P):
         """q, x, P at the time t1, which may be t itself."""
