@@ -6,6 +6,7 @@ default, where rows are dependent, a coordinate does not matter, or nothing does
 
 from dataclasses import fields
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -208,3 +209,20 @@ def test_a_program_made_where_rows_do_no_work_is_not_taken_where_they_do():
     assert still.work is None
     assert "lowered" in blown.reduction
     np.testing.assert_allclose(blown.work[-1], 0.5 * 2.0 * 1.3**2 * ((1 + blown["x"][-1]) ** 2 - 1.5**2), rtol=1e-8)
+
+
+def test_a_start_that_is_known_is_put_onto_the_rows_while_other_numbers_are_traced():
+    skate, t1 = jj.models.Skate(), 0.5
+    start = jj.start(skate, **skate.example)
+    alone = jj.simulate(skate, start, t1=t1).q_end
+    of_time = jax.jit(lambda t1: jj.simulate(skate, start, t1=t1).q_end)
+    within = jax.jit(lambda t1: jj.simulate(skate, jj.start(skate, **skate.example), t1=t1).q_end)
+    of_tolerance = jax.jit(lambda rtol: jj.simulate(skate, start, t1=t1, rtol=rtol, solver=diffrax.Dopri8()).q_end)
+    for found in (of_time(t1), within(t1), of_tolerance(1e-10)):
+        np.testing.assert_allclose(found, alone, rtol=1e-7)
+
+
+def test_a_traced_tolerance_needs_a_solver():
+    skate = jj.models.Skate()
+    with pytest.raises(ValueError, match=r"`rtol` is traced, .* give a `solver` too"):
+        jax.jit(lambda rtol: jj.simulate(skate, t1=0.5, rtol=rtol).q_end)(1e-8)

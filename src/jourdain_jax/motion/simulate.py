@@ -205,7 +205,9 @@ def _on_constraints(scene: Scene, t0, start: State, inputs: Inputs, made_here: b
 
 
 def default_solver(rtol: Number) -> diffrax.AbstractERK:
-    """The solver for this tolerance."""
+    """The solver for this tolerance; a ValueError where it is traced."""
+    if is_traced(rtol):
+        raise ValueError("`rtol` is traced, and the default solver is chosen by its value; give a `solver` too, such as diffrax.Dopri8()")
     return _LOOSE if rtol >= 1e-6 else _TIGHT
 
 

@@ -101,9 +101,10 @@ def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable
     arguments = (scene, t, q, u, inputs, free_q, free_u, _usual(scene))
     if not nothing_is_traced() and is_traced(arguments):
         return _put_onto_constraints(*arguments, guesses()).state
-    found = _compiled_projection(*arguments, None)
-    if not np.asarray(found.arrived) and _can_search(scene):  # rare, and long to compile
-        found = jax.tree.map(jnp.asarray, _uncompiled_projection(*arguments, guesses()))
+    with jax.ensure_compile_time_eval():  # numbers are put onto the rows at once, also where a function around this call is being traced
+        found = _compiled_projection(*arguments, None)
+        if not np.asarray(found.arrived) and _can_search(scene):  # rare, and long to compile
+            found = jax.tree.map(jnp.asarray, _uncompiled_projection(*arguments, guesses()))
     return found.state
 
 
