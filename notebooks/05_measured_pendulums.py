@@ -14,7 +14,7 @@
 # %% [markdown]
 # # From pendulums to limits on the weave speed
 #
-# The parts of eleven bicycles were weighed, hung up, swung about an axle and twisted on a rod. From these readings follow the 26 parameters of the Whipple
+# The parts of twelve bicycles were weighed, hung up, swung about an axle and twisted on a rod. From these readings follow the 26 parameters of the Whipple
 # bicycle. Files of parameters tell their standard deviations, but not that they came of the same readings: every moment of inertia shares the stiffness of
 # one rod. We go back to the readings, differentiate the way from them to the parameters, and ask what the covariance does to the limits on the weave speed.
 

@@ -57,7 +57,7 @@ def test_centres_of_mass_differ_by_how_lines_are_averaged_only(name):
 
 
 def test_a_fork_measured_apart_from_its_handlebar_and_a_frame_on_a_table():
-    """The sigma of the trail is smaller than the published one, which takes radius and tilt as independent though both come of the radius."""
+    """The sigma of the trail is smaller than the published one; here the trail keeps the correlation of the radius with the tilt."""
     of = off("Rigid")
     of_table = {n: of[n] for n in ("w", "lam", "rR", "IRxx", "IRyy", "IFxx", "IFyy", "IBxx", "IBzz", "IBxz", "mH")}
     assert max(abs(apart) for apart, _ in of_table.values()) < 1e-6
