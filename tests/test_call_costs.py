@@ -179,9 +179,9 @@ print(pstats.Stats(profile).total_calls)
 
 
 def test_a_warm_call_from_python_is_short():
-    """Counted in calls of Python functions, which no other load on the machine changes, in a process that checks no types: 5,900 of them take 2.3 ms."""
+    """Counted in calls of Python functions, which no other load on the machine changes, in a process that checks no types: 1,371 at the time of writing."""
     done = subprocess.run([sys.executable, "-c", WARM_CALL], capture_output=True, text=True, check=True)
-    assert int(done.stdout) < 3500
+    assert int(done.stdout) < 1700
 
 
 def test_a_motion_does_not_depend_on_how_often_it_was_asked_for():

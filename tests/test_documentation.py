@@ -34,14 +34,35 @@ def test_the_search_of_the_built_site_finds_every_public_name():
     assert {page.partition("/")[0] for page in found.values()} == {"reference"}
 
 
+_CODE = re.compile(r"```.*?```", re.DOTALL)
+
+
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_to_pages_that_exist(page):
-    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
+    for target, anchor in links(page.read_text(encoding="utf-8")):
         if target.startswith(("http", "mailto")) or any(target.removeprefix("../").startswith(part) for part in WRITTEN_BY_THE_BUILD):
             continue
-        found = page.parent / target
-        assert found.exists() or found.with_suffix(".md").exists(), f"{page.name}: {target}"
+        found = page.parent / target if target else page
+        found = found if found.exists() else found.with_suffix(".md")
+        assert found.exists(), f"{page.name}: {target}"
+        assert not anchor or anchor in anchors(found.read_text(encoding="utf-8")), f"{page.name}: {target}#{anchor}"
+
+
+def test_anchors_of_links_are_seen():
+    text = "[a](page.md#some-heading) and [b](#here) and [c](page.md)\n```\n[d](no.md)\n# no heading\n```\n## Some `heading`: *two*"
+    assert links(text) == [("page.md", "some-heading"), ("", "here"), ("page.md", "")]
+    assert anchors(text) == {"some-heading-two"}
+
+
+def links(text: str) -> list[tuple[str, str]]:
+    """Targets of the links of a page and the anchors on them, those in code left out."""
+    return re.findall(r"\]\(([^)#\s]*)#?([^)\s]*)[^)]*\)", _CODE.sub("", text))
+
+
+def anchors(text: str) -> set[str]:
+    """Of the headings of a page, as GitHub and MyST name them: small letters and hyphens."""
+    headings = re.findall(r"^#+ +(.+)$", _CODE.sub("", text), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-") for heading in headings}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
