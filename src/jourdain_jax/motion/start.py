@@ -4,6 +4,7 @@ g(t, q) = 0,  phi(t, q, u) = 0
 """
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from functools import lru_cache
 
 import equinox as eqx
@@ -101,7 +102,8 @@ def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable
     arguments = (scene, t, q, u, inputs, free_q, free_u, _usual(scene))
     if not nothing_is_traced() and is_traced(arguments):
         return _put_onto_constraints(*arguments, guesses()).state
-    with jax.ensure_compile_time_eval():  # numbers are put onto the rows at once, also where a function around this call is being traced
+    # numbers are put onto the rows at once, also where a function around this call is being traced; elsewhere that would compile constants one by one
+    with nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval():
         found = _compiled_projection(*arguments, None)
         if not np.asarray(found.arrived) and _can_search(scene):  # rare, and long to compile
             found = jax.tree.map(jnp.asarray, _uncompiled_projection(*arguments, guesses()))
