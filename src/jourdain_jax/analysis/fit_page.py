@@ -43,7 +43,7 @@ def fit_page(
     """The page of a `Fit` of one experiment; `fitted` and `held_out`: predictions by run, `bootstrap`: a fit of repeats, `units`: of channels."""
     name = type(fit.scene).__name__
     profiles, units = profiles or {}, units or {}
-    parts = [f"<h1>Fit of {html.escape(name)}</h1>", *_summary(fit), "<h2>Estimates</h2>", _estimates(fit, profiles, bootstrap, units), interval_widths(fit)]
+    parts = [f"<h1>Fit of {html.escape(name)}</h1>", *_summary(fit), "<h2>Estimates</h2>", _estimates(fit, profiles, bootstrap), interval_widths(fit)]
     parts += _untold(fit)
     if profiles:
         parts += ["<h2>Profile likelihood</h2>", _note(_ABOUT_PROFILES), *(profile(one, _error(fit, one.name)) for one in profiles.values())]
@@ -87,7 +87,7 @@ def _summary(fit) -> list[str]:
     return [f"<p>{about}</p>", *(f'<p class="warning">{_words(sentence)}</p>' for sentence in fit.warnings)]
 
 
-def _estimates(fit, profiles: Mapping[str, Profile], bootstrap, units: Mapping[str, str]) -> str:
+def _estimates(fit, profiles: Mapping[str, Profile], bootstrap) -> str:
     heads = ["unknown", "unit", "estimate", "std. error", "low", "high"]
     heads += ["profile", "low (profile)", "high (profile)"] if profiles else []
     heads += ["low (bootstrap)", "high (bootstrap)"] if bootstrap is not None else []
@@ -245,11 +245,6 @@ def _end(x: float, closed: bool) -> str:
 
 def _error(fit, name: str) -> float:
     return float(fit[name].standard_error) if name in fit.labels else np.nan
-
-
-def _of_what(unknown: str) -> str:
-    """The channel whose unit an unknown has: `run 0: lean` that of `lean`, `gyro.bias` that of `gyro`."""
-    return unknown.rpartition(": ")[2].removesuffix(".bias")
 
 
 def _number(x, form: str = ".6g") -> str:
