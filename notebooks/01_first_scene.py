@@ -39,9 +39,9 @@ import jourdain_jax as jj
 class Sleigh(jj.Scene):
     """A body on a blade; the mass centre lies `offset` ahead of the blade."""
 
-    mass: object = jj.parameter(1.3, unit="kg", positive=True)
-    inertia: object = jj.parameter(0.4, unit="kg m^2", positive=True)
-    offset: object = jj.parameter(0.25, unit="m")
+    mass: float = jj.parameter(1.3, unit="kg", positive=True)
+    inertia: float = jj.parameter(0.4, unit="kg m^2", positive=True)
+    offset: float = jj.parameter(0.25, unit="m")
 
     coordinates = jj.coordinates("x y heading")  # x, y of the mass centre
 

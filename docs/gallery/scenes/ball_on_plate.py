@@ -15,14 +15,14 @@ LOOK = "The plate tilts so that the ball follows a point on a circle, with a lag
 class BallOnPlate(jj.Scene):
     """x, y of the contact on the plate; `roll` and `pitch` of the plate; attitude of the ball. Inputs: the place where the ball is wanted (m)."""
 
-    ball_mass: object = jj.parameter(0.3, unit="kg", positive=True)
-    radius: object = jj.parameter(0.03, unit="m", positive=True)
-    plate_inertia: object = jj.parameter((0.05, 0.05, 0.1), unit="kg m^2", positive=True)
-    stiffness: object = jj.parameter(20.0, unit="N m", about="of the motors about the tilt that is wanted")
-    damping: object = jj.parameter(1.6, unit="N m s", about="of the motors")
-    place_gain: object = jj.parameter(0.9, unit="rad/m", about="tilt for each metre that the ball is away")
-    rate_gain: object = jj.parameter(0.5, unit="rad s/m", about="tilt for each m/s of the ball")
-    gravity: object = jj.parameter(9.81, unit="m/s^2")
+    ball_mass: float = jj.parameter(0.3, unit="kg", positive=True)
+    radius: float = jj.parameter(0.03, unit="m", positive=True)
+    plate_inertia: jnp.ndarray = jj.parameter((0.05, 0.05, 0.1), unit="kg m^2", positive=True)
+    stiffness: float = jj.parameter(20.0, unit="N m", about="of the motors about the tilt that is wanted")
+    damping: float = jj.parameter(1.6, unit="N m s", about="of the motors")
+    place_gain: float = jj.parameter(0.9, unit="rad/m", about="tilt for each metre that the ball is away")
+    rate_gain: float = jj.parameter(0.5, unit="rad s/m", about="tilt for each m/s of the ball")
+    gravity: float = jj.parameter(9.81, unit="m/s^2")
 
     coordinates = jj.coordinates("x y roll pitch", jj.quaternion("attitude"))
     inputs = jj.inputs("wanted_x wanted_y")

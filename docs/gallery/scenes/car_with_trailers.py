@@ -16,12 +16,12 @@ class CarWithTrailers(jj.Scene):
     """x, y of the rear axle, heading, steer (of a wheel in the middle), headings of the trailers. Inputs: `drive` (N) and `steer_torque` (N m)."""
 
     trailers: int = eqx.field(static=True, default=2)
-    car_mass: object = jj.parameter(900.0, unit="kg", positive=True)
-    wheel_mass: object = jj.parameter(15.0, unit="kg", positive=True, about="of a front wheel, with what turns with it")
-    trailer_mass: object = jj.parameter(300.0, unit="kg", positive=True)
-    wheelbase: object = jj.parameter(2.6, unit="m", positive=True)
-    track: object = jj.parameter(1.5, unit="m", positive=True)
-    length: object = jj.parameter(3.4, unit="m", positive=True, about="of a trailer, from hitch to axle")
+    car_mass: float = jj.parameter(900.0, unit="kg", positive=True)
+    wheel_mass: float = jj.parameter(15.0, unit="kg", positive=True, about="of a front wheel, with what turns with it")
+    trailer_mass: float = jj.parameter(300.0, unit="kg", positive=True)
+    wheelbase: float = jj.parameter(2.6, unit="m", positive=True)
+    track: float = jj.parameter(1.5, unit="m", positive=True)
+    length: float = jj.parameter(3.4, unit="m", positive=True, about="of a trailer, from hitch to axle")
 
     inputs = jj.inputs("drive steer_torque")
     conventions = "z up; headings from x towards y; steer positive to the left."

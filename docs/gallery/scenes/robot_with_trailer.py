@@ -14,14 +14,14 @@ LOOK = "Cut corners: the trailer's axle runs inside the robot's track, by $R_t^2
 class RobotWithTrailer(jj.Scene):
     """x, y of the middle of the axle, heading; angles of the wheels; heading of the trailer. Inputs: torques on the wheels (N m)."""
 
-    hull_mass: object = jj.parameter(6.0, unit="kg", positive=True)
-    wheel_mass: object = jj.parameter(0.5, unit="kg", positive=True)
-    trailer_mass: object = jj.parameter(4.0, unit="kg", positive=True)
-    radius: object = jj.parameter(0.1, unit="m", positive=True, about="of the wheels")
-    track: object = jj.parameter(0.36, unit="m", positive=True, about="between the wheels")
-    hitch: object = jj.parameter(0.2, unit="m", about="from the axle back to the hitch")
-    tongue: object = jj.parameter(0.6, unit="m", positive=True, about="from the hitch back to the trailer's axle")
-    gravity: object = jj.parameter(9.81, unit="m/s^2")
+    hull_mass: float = jj.parameter(6.0, unit="kg", positive=True)
+    wheel_mass: float = jj.parameter(0.5, unit="kg", positive=True)
+    trailer_mass: float = jj.parameter(4.0, unit="kg", positive=True)
+    radius: float = jj.parameter(0.1, unit="m", positive=True, about="of the wheels")
+    track: float = jj.parameter(0.36, unit="m", positive=True, about="between the wheels")
+    hitch: float = jj.parameter(0.2, unit="m", about="from the axle back to the hitch")
+    tongue: float = jj.parameter(0.6, unit="m", positive=True, about="from the hitch back to the trailer's axle")
+    gravity: float = jj.parameter(9.81, unit="m/s^2")
 
     coordinates = jj.coordinates("x y heading left right trailer")
     inputs = jj.inputs("left_torque right_torque")

@@ -14,14 +14,14 @@ LOOK = "No wheel is driven: arms that swing the handlebar to and fro set it goin
 class RollerRacer(jj.Scene):
     """x, y of the seat's axle, heading; angle of the handlebar from the seat. Input: `wanted`, the angle at which the arms hold the handlebar (rad)."""
 
-    seat_mass: object = jj.parameter(20.0, unit="kg", positive=True)
-    seat_inertia: object = jj.parameter(1.5, unit="kg m^2", positive=True)
-    bar_mass: object = jj.parameter(1.0, unit="kg", positive=True)
-    bar_inertia: object = jj.parameter(0.05, unit="kg m^2", positive=True)
-    ahead: object = jj.parameter(0.6, unit="m", positive=True, about="a, from the seat's axle forward to the pivot")
-    behind: object = jj.parameter(0.1, unit="m", positive=True, about="b, from the pivot back to the handlebar's axle")
-    stiffness: object = jj.parameter(60.0, unit="N m", non_negative=True, about="of the arms")
-    damping: object = jj.parameter(3.0, unit="N m s", non_negative=True, about="of the arms")
+    seat_mass: float = jj.parameter(20.0, unit="kg", positive=True)
+    seat_inertia: float = jj.parameter(1.5, unit="kg m^2", positive=True)
+    bar_mass: float = jj.parameter(1.0, unit="kg", positive=True)
+    bar_inertia: float = jj.parameter(0.05, unit="kg m^2", positive=True)
+    ahead: float = jj.parameter(0.6, unit="m", positive=True, about="a, from the seat's axle forward to the pivot")
+    behind: float = jj.parameter(0.1, unit="m", positive=True, about="b, from the pivot back to the handlebar's axle")
+    stiffness: float = jj.parameter(60.0, unit="N m", non_negative=True, about="of the arms")
+    damping: float = jj.parameter(3.0, unit="N m s", non_negative=True, about="of the arms")
 
     coordinates = jj.coordinates("x y heading handlebar")
     inputs = jj.inputs("wanted")

@@ -14,10 +14,10 @@ LOOK = "The wheels are driven from rest; the satellite turns against them, and i
 class Satellite(jj.Scene):
     """x, y, z of the bus and its attitude; angles of the wheels on its faces. Inputs: torques of the wheels' motors (N m)."""
 
-    bus_mass: object = jj.parameter(30.0, unit="kg", positive=True)
-    sides: object = jj.parameter((0.6, 0.5, 0.4), unit="m", positive=True, about="of the bus")
-    wheel_mass: object = jj.parameter(1.5, unit="kg", positive=True)
-    wheel_radius: object = jj.parameter(0.14, unit="m", positive=True)
+    bus_mass: float = jj.parameter(30.0, unit="kg", positive=True)
+    sides: jnp.ndarray = jj.parameter((0.6, 0.5, 0.4), unit="m", positive=True, about="of the bus")
+    wheel_mass: float = jj.parameter(1.5, unit="kg", positive=True)
+    wheel_radius: float = jj.parameter(0.14, unit="m", positive=True)
 
     coordinates = jj.coordinates("x y z", jj.quaternion("attitude"), "wheel_x wheel_y wheel_z")
     inputs = jj.inputs("torque_x torque_y torque_z")

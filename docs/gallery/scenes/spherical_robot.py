@@ -14,12 +14,12 @@ LOOK = "The axle starts tilted, the drive pushes, and the robot runs along a bow
 class SphericalRobot(jj.Scene):
     """x, y of the contact, attitude of the shell, angle of the pendulum in the shell. Input: `drive`, a torque on the shell about the axle (N m)."""
 
-    shell_mass: object = jj.parameter(1.0, unit="kg", positive=True)
-    radius: object = jj.parameter(0.15, unit="m", positive=True)
-    bob_mass: object = jj.parameter(1.5, unit="kg", positive=True)
-    length: object = jj.parameter(0.08, unit="m", positive=True, about="of the pendulum, from the axle to its mass centre")
-    bob_inertia: object = jj.parameter((1e-3, 1e-3, 1e-3), unit="kg m^2", positive=True)
-    gravity: object = jj.parameter(9.81, unit="m/s^2")
+    shell_mass: float = jj.parameter(1.0, unit="kg", positive=True)
+    radius: float = jj.parameter(0.15, unit="m", positive=True)
+    bob_mass: float = jj.parameter(1.5, unit="kg", positive=True)
+    length: float = jj.parameter(0.08, unit="m", positive=True, about="of the pendulum, from the axle to its mass centre")
+    bob_inertia: jnp.ndarray = jj.parameter((1e-3, 1e-3, 1e-3), unit="kg m^2", positive=True)
+    gravity: float = jj.parameter(9.81, unit="m/s^2")
 
     coordinates = jj.coordinates("x y", jj.quaternion("attitude"), "pendulum")
     inputs = jj.inputs("drive")

@@ -14,14 +14,14 @@ LOOK = "The rear wheels turn at different rates, which is what a differential is
 class Tricycle(jj.Scene):
     """x, y under the middle of the rear axle, heading, steer; angles of the wheels. Inputs: `drive` about the front axle and `steer_torque` (N m)."""
 
-    frame_mass: object = jj.parameter(60.0, unit="kg", positive=True)
-    ahead: object = jj.parameter(0.4, unit="m", about="of the frame's mass centre before the rear axle")
-    height: object = jj.parameter(0.5, unit="m", positive=True, about="of the frame's mass centre")
-    wheel_mass: object = jj.parameter(2.0, unit="kg", positive=True)
-    radius: object = jj.parameter(0.2, unit="m", positive=True)
-    wheelbase: object = jj.parameter(1.1, unit="m", positive=True)
-    track: object = jj.parameter(0.8, unit="m", positive=True)
-    gravity: object = jj.parameter(9.81, unit="m/s^2")
+    frame_mass: float = jj.parameter(60.0, unit="kg", positive=True)
+    ahead: float = jj.parameter(0.4, unit="m", about="of the frame's mass centre before the rear axle")
+    height: float = jj.parameter(0.5, unit="m", positive=True, about="of the frame's mass centre")
+    wheel_mass: float = jj.parameter(2.0, unit="kg", positive=True)
+    radius: float = jj.parameter(0.2, unit="m", positive=True)
+    wheelbase: float = jj.parameter(1.1, unit="m", positive=True)
+    track: float = jj.parameter(0.8, unit="m", positive=True)
+    gravity: float = jj.parameter(9.81, unit="m/s^2")
 
     coordinates = jj.coordinates("x y heading steer left right front")
     inputs = jj.inputs("drive steer_torque")

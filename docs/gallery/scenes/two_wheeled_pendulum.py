@@ -14,15 +14,15 @@ LOOK = "It first rolls back in order to lean forward, then speeds up: the two to
 class TwoWheeledPendulum(jj.Scene):
     """x, y under the middle of the axle, heading, pitch of the body, angles of the wheels. Inputs: `speed` wanted (m/s), `turn` torque of one wheel (N m)."""
 
-    body_mass: object = jj.parameter(40.0, unit="kg", positive=True)
-    height: object = jj.parameter(0.6, unit="m", positive=True, about="h, of the body's mass centre above the axle")
-    wheel_mass: object = jj.parameter(3.0, unit="kg", positive=True)
-    radius: object = jj.parameter(0.2, unit="m", positive=True)
-    track: object = jj.parameter(0.6, unit="m", positive=True)
-    pitch_gain: object = jj.parameter(400.0, unit="N m")
-    rate_gain: object = jj.parameter(90.0, unit="N m s")
-    speed_gain: object = jj.parameter(35.0, unit="N s", about="torque against the speed that is lacking")
-    gravity: object = jj.parameter(9.81, unit="m/s^2")
+    body_mass: float = jj.parameter(40.0, unit="kg", positive=True)
+    height: float = jj.parameter(0.6, unit="m", positive=True, about="h, of the body's mass centre above the axle")
+    wheel_mass: float = jj.parameter(3.0, unit="kg", positive=True)
+    radius: float = jj.parameter(0.2, unit="m", positive=True)
+    track: float = jj.parameter(0.6, unit="m", positive=True)
+    pitch_gain: float = jj.parameter(400.0, unit="N m")
+    rate_gain: float = jj.parameter(90.0, unit="N m s")
+    speed_gain: float = jj.parameter(35.0, unit="N s", about="torque against the speed that is lacking")
+    gravity: float = jj.parameter(9.81, unit="m/s^2")
 
     coordinates = jj.coordinates("x y heading pitch left right")
     inputs = jj.inputs("speed turn")

@@ -15,14 +15,14 @@ LOOK = "It weaves but does not fall: the wheel turns faster than the critical sp
 class Unicycle(jj.Scene):
     """x, y of the contact; yaw and lean of the wheel; pitch of the rider; spin of the wheel. Input: `pedals`, a torque besides the rider's own (N m)."""
 
-    wheel_mass: object = jj.parameter(8.0, unit="kg", positive=True, about="all of it in the rim")
-    radius: object = jj.parameter(0.35, unit="m", positive=True)
-    rider_mass: object = jj.parameter(20.0, unit="kg", non_negative=True)
-    height: object = jj.parameter(0.5, unit="m", positive=True, about="of the rider's mass centre above the axle")
-    rider_inertia: object = jj.parameter((1.2, 1.2, 0.3), unit="kg m^2", non_negative=True)
-    pitch_gain: object = jj.parameter(250.0, unit="N m", about="pedal torque for each radian of pitch")
-    rate_gain: object = jj.parameter(60.0, unit="N m s", about="pedal torque for each rad/s of pitch")
-    gravity: object = jj.parameter(9.81, unit="m/s^2")
+    wheel_mass: float = jj.parameter(8.0, unit="kg", positive=True, about="all of it in the rim")
+    radius: float = jj.parameter(0.35, unit="m", positive=True)
+    rider_mass: float = jj.parameter(20.0, unit="kg", non_negative=True)
+    height: float = jj.parameter(0.5, unit="m", positive=True, about="of the rider's mass centre above the axle")
+    rider_inertia: jnp.ndarray = jj.parameter((1.2, 1.2, 0.3), unit="kg m^2", non_negative=True)
+    pitch_gain: float = jj.parameter(250.0, unit="N m", about="pedal torque for each radian of pitch")
+    rate_gain: float = jj.parameter(60.0, unit="N m s", about="pedal torque for each rad/s of pitch")
+    gravity: float = jj.parameter(9.81, unit="m/s^2")
 
     coordinates = jj.coordinates("x y yaw lean pitch spin")
     inputs = jj.inputs("pedals")
