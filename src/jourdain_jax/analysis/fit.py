@@ -26,7 +26,6 @@ from jourdain_jax.analysis.profile import limits_at_bounds
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.starts import check_first_guess, check_starts
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
-from jourdain_jax.build.reference_parameters import reference_parameters
 from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import as_names
@@ -137,20 +136,19 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
     _check_choices(runs, loss, errors)
     free = free if isinstance(free, Mapping) else tuple(as_names(free))
     unknowns = unknowns_of(scene, runs, free)
-    with reference_parameters(scene):
-        check_starts(scene, runs, unknowns)
-        members = _repeats(runs) if repeats else None
-        _check_enough(runs, unknowns, repeats)
-        asked = Asked(scene, free, simulation, loss or LEAST_SQUARES, control)
-        problem = Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members), asked.loss)
-        theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
-        limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
-        found = _minimum(problem, theta, limits, control, one_will_do=members is None)
-        if not all(np.isfinite(trace[0][1][0]) for trace in found.trace):
-            check_first_guess(scene, runs, unknowns)
-        same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
-        found = _with_memory(problem, found if members else found.lowest(), limits, control)
-        return _result(problem, found, limits, asked, errors, guesses, same)
+    check_starts(scene, runs, unknowns)
+    members = _repeats(runs) if repeats else None
+    _check_enough(runs, unknowns, repeats)
+    asked = Asked(scene, free, simulation, loss or LEAST_SQUARES, control)
+    problem = Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members), asked.loss)
+    theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
+    limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
+    found = _minimum(problem, theta, limits, control, one_will_do=members is None)
+    if not all(np.isfinite(trace[0][1][0]) for trace in found.trace):
+        check_first_guess(scene, runs, unknowns)
+    same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
+    found = _with_memory(problem, found if members else found.lowest(), limits, control)
+    return _result(problem, found, limits, asked, errors, guesses, same)
 
 
 def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
