@@ -1,6 +1,6 @@
 """Motions by machine code of our own against the same motions by XLA, in one run on one core: batches, alone, cold starts.
 
-    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|heyoka|records|watching|calls|compilation ...]
+    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|heyoka|records|times|watching|calls|compilation ...]
 
 Writes a list of {"figure", "model", "value", "required", "met"}; `required` is None where a figure is only told. Times of warm motions are processor
 time, the least of some repeats, the two ways in turn; cold ones are wall time of fresh processes.
@@ -144,6 +144,31 @@ def records(quick: bool) -> Iterator[Figure]:
         yield figure(f"record, {what}, largest difference", name, float(np.max(np.abs(found["native"] - found["XLA"]))))
 
 
+def times(quick: bool) -> Iterator[Figure]:
+    """Derivatives of a motion with respect to a delay of its saved times, by both modes and both ways."""
+
+    def seen(scene, start, options, delay):
+        ts = jnp.linspace(0.2, 1.0, 21) - delay
+        return jnp.sum(jnp.sin(jj.simulate(scene, start, t0=0.0, ts=ts, t1=1.0, **options, **BARE).q))
+
+    for name in ("tilting-disc",) if quick else ("tilting-disc", "whipple-bicycle"):
+        scene = jj.models.MODELS[name]()
+        start = jj.start(scene, **scene.example)
+        for mode, adjoint, differentiated in (("forward", diffrax.ForwardMode(), jax.jacfwd), ("reverse", None, jax.grad)):
+            runs, compiled = {}, {}
+            for way, backend in WAYS.items():
+                slope = jax.jit(differentiated(partial(seen, scene, start, {"backend": backend, "adjoint": adjoint})))
+                begin = time.process_time()
+                jax.block_until_ready(slope(0.013))
+                compiled[way], runs[way] = time.process_time() - begin, partial(lambda slope: jax.block_until_ready(slope(0.013)), slope)
+            seconds = least_processor_time(runs, 50)
+            apart = abs(float(runs["native"]()) / float(runs["XLA"]()) - 1.0)
+            for way in WAYS:
+                yield figure(f"slope by a delay, {mode}, {way}, trace and compile, s", name, compiled[way])
+                yield figure(f"slope by a delay, {mode}, {way}, ms", name, 1e3 * seconds[way])
+            yield figure(f"slope by a delay, {mode}, relative difference", name, apart, 1e-7)
+
+
 def watching(quick: bool) -> Iterator[Figure]:
     """What it costs to judge, at every stage of every step, whether the privileged speeds still determine the others: motions with it over motions without."""
     scene, name = jj.models.MODELS["whipple-bicycle"](), "whipple-bicycle"
@@ -233,7 +258,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few lanes, the disc alone")
     parser.add_argument("--json", help="write the figures to this file")
-    parts = {"batches": batches, "heyoka": heyoka, "records": records, "watching": watching, "calls": calls, "compilation": compilation}
+    parts = {"batches": batches, "heyoka": heyoka, "records": records, "times": times, "watching": watching, "calls": calls, "compilation": compilation}
     parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="these figures")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)

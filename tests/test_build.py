@@ -107,3 +107,39 @@ def test_checkpoints_that_are_asked_for_are_used():
 def test_a_function_that_takes_scenes_only_says_what_to_pass(disc):
     with pytest.raises(AttributeError, match=r"`Built` has no `bodies`; where a scene is asked for, pass its `\.scene`"):
         disc.bodies  # as a function of scenes would ask  # noqa: B018
+
+
+def crane() -> type[jj.Scene]:
+    """A new class of a scene whose parameters decide which speed is best kept independent."""
+
+    class Crane(jj.Scene):
+        arm: float = jj.parameter(1.0)
+        rope: float = jj.parameter(1.0)
+        coordinates = jj.coordinates("x y z")
+        domain = dict.fromkeys("xyz", (-1.0, 1.0))
+
+        def bodies(self, t, q):
+            return {"load": jj.Particle(1.0, jnp.stack([q.x, q.y, q.z]))}
+
+        def velocity_constraints(self, motion):
+            q, u = motion.q, motion.u
+            return {"rope": (self.arm + 0.3 * jnp.sin(q.x)) * u.y_rate - (self.rope + 0.2 * jnp.cos(q.z)) * u.z_rate - 0.1 * q.y * u.x_rate}
+
+    return Crane
+
+
+def test_what_a_batch_or_a_fit_runs_is_not_decided_by_the_call_before_it():
+    ts = jnp.linspace(0.0, 1.0, 6)
+    start = {"x": 0.1, "x_rate": 1.0, "y_rate": 0.5}
+    found = []
+    for order in ([(1.0, 10.0), (10.0, 1.0)], [(10.0, 1.0), (1.0, 10.0)]):
+        kind, of = crane(), {}
+        for arm, rope in order:
+            scene = kind(arm, rope)
+            lanes = jj.rollout(scene, {**start, "x": jnp.array([0.1, 0.2])}, ts=ts, progress=False)
+            data = jj.Measurements(ts, {"x": 0.1 + ts, "z": 0.02 * ts}, 0.01, start=start)
+            fit = jj.fit(scene, data, free={"arm": None}, max_iterations=2)
+            of[arm, rope] = jj.build(scene).freedoms.privileged, np.asarray(lanes["y"]).tolist(), np.asarray(fit.values).tolist()
+        found.append(of)
+    assert found[0] == found[1]
+    assert len({privileged for privileged, *_ in found[0].values()}) == 2

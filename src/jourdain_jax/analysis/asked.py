@@ -17,7 +17,6 @@ from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.shooting import MultipleShooting
 from jourdain_jax.analysis.unknowns import unknowns_of
-from jourdain_jax.build.reference_parameters import reference_parameters
 from jourdain_jax.scene.scene import Scene
 
 _SAME = 0.01  # sigmas: between residuals of one fit, computed twice
@@ -51,8 +50,7 @@ class TakenUp:
 
     def evaluate(self, theta: np.ndarray, members: np.ndarray) -> Linearised:
         """What is minimised, at any numbers."""
-        with reference_parameters(self.asked.scene):
-            return self.problem.linearised(theta, members)
+        return self.problem.linearised(theta, members)
 
     def residuals(self, run: int) -> dict[str, np.ndarray]:
         """Of a run by channel, in units of sigma, at theta; NaN where a sample is missing."""
@@ -89,10 +87,9 @@ def for_runs(fit, runs: Measurements | Sequence[Measurements], fitted: bool = Fa
     asked = fit.asked
     checked = as_runs(asked.scene, runs)
     unknowns = unknowns_of(asked.scene, checked, asked.free)
-    with reference_parameters(asked.scene):
-        of_runs = asked.scene, checked, unknowns.layout, asked.simulation, None
-        lanes = Piecewise(*of_runs, unknowns, asked.shooting) if fitted and asked.shooting is not None else Lanes(*of_runs)
-        problem = Problem(asked.scene, checked, unknowns, lanes, asked.loss)
+    of_runs = asked.scene, checked, unknowns.layout, asked.simulation, None
+    lanes = Piecewise(*of_runs, unknowns, asked.shooting) if fitted and asked.shooting is not None else Lanes(*of_runs)
+    problem = Problem(asked.scene, checked, unknowns, lanes, asked.loss)
     if problem.with_memory:
         problem.tau = np.array([[float(fit.correlation_time[name]) for name in problem.with_memory]])
     return TakenUp(asked, problem, unknowns.guess[None].copy(), Limits(*unknowns.ends, unknowns.fixed.copy(), unknowns.sizes))

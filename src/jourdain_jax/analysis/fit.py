@@ -29,7 +29,6 @@ from jourdain_jax.analysis.shooting import MultipleShooting, check_shooting
 from jourdain_jax.analysis.shooting_steps import cutoff_of, shot
 from jourdain_jax.analysis.starts import check_first_guess, check_starts
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
-from jourdain_jax.build.reference_parameters import reference_parameters
 from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import as_names
@@ -39,6 +38,7 @@ from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
 _SPANS = (1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4)  # shares of the span that a fit grows over
+_PATIENCE = 3  # steps within which a fit of whole runs is to make F far smaller, or spans grow
 _STEPS, _ROUGHLY = 8, 1.0  # tried on each of them, and their tolerance
 _FOLLOWED = 100.0  # times the squares that noise leaves, up to which a motion is followed, and a longer span can be next
 _SOME = 12  # steps between two estimates of correlation times
@@ -144,30 +144,29 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
     check_shooting(shooting, runs)
     free = free if isinstance(free, Mapping) else tuple(as_names(free))
     unknowns = unknowns_of(scene, runs, free)
-    with reference_parameters(scene):
-        check_starts(scene, runs, unknowns)
-        members = _repeats(runs) if repeats else None
-        _check_enough(runs, unknowns, repeats)
-        asked = Asked(scene, free, simulation, loss or LEAST_SQUARES, control, shooting)
-        of_runs = scene, runs, unknowns.layout, simulation, members
-        pieces = None if shooting is None else Piecewise(*of_runs, unknowns, shooting)
-        problem = Problem(scene, runs, unknowns, Lanes(*of_runs) if pieces is None else pieces, asked.loss)
-        theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
-        limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
-        if pieces is None:
-            found = _minimum(problem, theta, limits, control, one_will_do=members is None)
-        else:
-            found = shot(problem, pieces, theta, limits, control)
-        if not all(np.isfinite(trace[0][1][0]) for trace in found.trace):
-            check_first_guess(scene, runs, unknowns)
-        same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
-        if pieces is not None and not members:
-            pieces.keep(int(np.argmin(found.at.cost)))
-        if pieces is not None:
-            control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.theta))))
-            asked = replace(asked, control=control)
-        found = _with_memory(problem, found if members else found.lowest(), limits, control)
-        return _result(problem, found, limits, asked, errors, guesses, same, None if pieces is None else pieces.told())
+    check_starts(scene, runs, unknowns)
+    members = _repeats(runs) if repeats else None
+    _check_enough(runs, unknowns, repeats)
+    asked = Asked(scene, free, simulation, loss or LEAST_SQUARES, control, shooting)
+    of_runs = scene, runs, unknowns.layout, simulation, members
+    pieces = None if shooting is None else Piecewise(*of_runs, unknowns, shooting)
+    problem = Problem(scene, runs, unknowns, Lanes(*of_runs) if pieces is None else pieces, asked.loss)
+    theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
+    limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
+    if pieces is None:
+        found = _minimum(problem, theta, limits, control, one_will_do=members is None)
+    else:
+        found = shot(problem, pieces, theta, limits, control)
+    if not all(np.isfinite(trace[0][1][0]) for trace in found.trace):
+        check_first_guess(scene, runs, unknowns)
+    same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
+    if pieces is not None and not members:
+        pieces.keep(int(np.argmin(found.at.cost)))
+    if pieces is not None:
+        control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.theta))))
+        asked = replace(asked, control=control)
+    found = _with_memory(problem, found if members else found.lowest(), limits, control)
+    return _result(problem, found, limits, asked, errors, guesses, same, None if pieces is None else pieces.told())
 
 
 def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
@@ -177,7 +176,8 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
     a short span does not tell stays near the first guess. After a few steps, what is far off gives way to growing spans, and goes on only where these do not
     lead to small residuals either. `one_will_do`: spans grow only where no theta led to a minimum with small residuals.
     """
-    samples, few = problem.samples, replace(control, most_steps=min(_STEPS, control.most_steps))
+    samples = problem.samples
+    few = replace(control, most_steps=min(_STEPS, control.most_steps), patience=_PATIENCE, near=0.5 * _POOR * samples)
     rest = replace(control, most_steps=control.most_steps - few.most_steps)
     in_parts = samples > 0 and not (one_will_do and len(theta) > 1)
     found = minimise(problem.linearised, theta, limits, few if in_parts else control, _WHOLE)
@@ -199,7 +199,7 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
     problem.begun, problem.shares = theta, np.ones(len(theta))
     while (some := np.flatnonzero(place < len(_SPANS))).size:
         problem.shares[poor[some]] = np.array(_SPANS)[place[some]]
-        grown = of(poor[some], begin[some], replace(few, tolerance=_ROUGHLY))
+        grown = of(poor[some], begin[some], replace(few, tolerance=_ROUGHLY, patience=None))
         begin[some], steps[some] = grown.theta, steps[some] + grown.steps
         for i, (_, costs), k in zip(some.tolist(), (of_one[0] for of_one in grown.trace), place[some].tolist(), strict=True):
             trace[i] += ((f"the first {_SPANS[k]:.3g} of each run", costs),)

@@ -25,6 +25,7 @@ from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.nodes import begin, ended
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
 from jourdain_jax.analysis.unknowns import Layout
+from jourdain_jax.build.reference import Reference
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.integrators.forward_mode import simulate_forward
 from jourdain_jax.motion.quick_compilation import quickly_compiled
@@ -198,7 +199,8 @@ class _Group:
         self._rows, self._own_rows = (np.concatenate(parts, axis=2) for parts in columns)
         self._rows = self._rows[:, 0]
         marks = [_Number.of(x, k >= common, id(x) in repeated) if _is_array(x) else x for k, x in enumerate(leaves)]
-        self._run = _program(treedef, tuple(marks), layout)
+        reference = Reference.where_free(scene, {place.name for place in layout.shared if not place.of_sensor})
+        self._run = _program(reference, treedef, tuple(marks), layout)
         self.weights = {name: np.array([run.weights[name] for run in filled]) for name in filled[0].weights}  # (runs, *members, times, *channel)
         self._t0, self._ts = np.array([run.t0 for run in filled]), np.array([run.ts for run in filled])
         self.channels, end = {}, 0
@@ -289,10 +291,10 @@ class _Number(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def _program(treedef, leaves: tuple, layout: Layout) -> Callable:
+def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Callable:
     """[J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns; compiled once.
 
-    `treedef`, `leaves`: of scene, options and run, with a `_Number` in place of each array.
+    `reference`: of the scene; `treedef`, `leaves`: of scene, options and run, with a `_Number` in place of each array.
     """
     own = layout.sizes[1]
 
@@ -312,7 +314,8 @@ def _program(treedef, leaves: tuple, layout: Layout) -> Callable:
             r = jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
             return r, r
 
-        J, r = jax.jacfwd(flat, has_aux=True)(row[begin:])
+        with reference.stands_in():
+            J, r = jax.jacfwd(flat, has_aux=True)(row[begin:])
         return jnp.concatenate([J, r[:, None]], axis=1)
 
     return quickly_compiled(jax.vmap(lane, (None, 0)), jax.jit)

@@ -3,10 +3,12 @@
     A = d phi/du,   beta = dv/du,   gamma = d omega/du,   M = sum m beta' beta + gamma' I gamma
     q <- q - G+ g(q),   G = dg/dq,           u <- u - M^-1 A' (A M^-1 A')+ phi(u)
 
-A scene is traced once for it: nested transformations would trace it a dozen times.
+A scene is traced once per class for it, and what is looked at stands ready as nodes of its graph: other values of parameters are other inputs of that graph.
 """
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -18,13 +20,94 @@ from jourdain_jax.build.probed import Probed, generic_inputs
 from jourdain_jax.build.row_lengths import speed_scales
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.program.analyticity import CALLS, NONANALYTIC, decided_by, depend_on, passes
-from jourdain_jax.program.derivative import columns, derivatives, jacobian
+from jourdain_jax.program.derivative import derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph
 from jourdain_jax.program.identity_test import identity_probes, is_combination, on_rows
+from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
 # What poses and rows decide, and a motion can hardly be integrated without: where calls compute it, states far off are asked. Of loads nothing is believed.
 _MOTION = frozenset({"rows", "poses", "inertias", "coordinate rates", "rows at rest", "motion at rest", "inertia", "nonlinear"})
+
+
+MOST_GRAPHS = 64  # that are kept
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """The graph of a class of scenes, with what is looked at as nodes."""
+
+    traced: TracedScene
+    rows: list[dict[int, int]]  # d phi/du, each row by the nodes of the speeds
+    velocities: list[dict[int, int]]  # d (v, omega)/du
+    closures: list[int]  # geometric rows and unit norms
+    of_closures: list[dict[int, int]]  # their derivatives with respect to q
+    phi_at_rest: np.ndarray
+    motion_at_rest: np.ndarray
+    timed: dict[str, list[int]]
+    inertia_rates: list[int]
+    potential_rates: list[int]
+    row_rates: list[int]
+    in_calls: frozenset[str]  # what passes calls of JAX
+    nonanalytic: frozenset[str]  # what passes an operation that is not analytic
+
+    @property
+    def graph(self) -> Graph:
+        """The graph."""
+        return self.traced.graph
+
+
+@partial(once_per_class, most=MOST_GRAPHS)
+def looked_at(scene: Scene) -> LookedAt:
+    """What is looked at of a class of scenes."""
+    traced = traced_scene(scene)
+    g, at, u = traced.graph, traced.at, traced.u.tolist()
+    flat = [*at.phi.tolist(), *at.v.ravel().tolist(), *at.omega.ravel().tolist()]
+    by_speed, rows = jacobian(g, flat, u), len(at.phi)
+    at_rest = np.split(np.array(g.substituted([*flat, *at.qdot.tolist()], dict.fromkeys(u, g.zero)), np.int64), [rows])
+    weights = [*at.mass.tolist(), *at.inertia.ravel().tolist()]
+    poses = [*at.position.ravel().tolist(), *at.orientation.ravel().tolist()]
+    by_time = {"rows": [*at.phi.tolist(), *at.closure.tolist()], "poses": poses, "inertias": weights, "coordinate rates": at.qdot.tolist()}
+    timed = {name: derivatives(g, nodes, {traced.t: g.one}) for name, nodes in by_time.items()} | traced.particulars.explicit
+    along_motion = {traced.t: g.one} | dict(zip(traced.q.tolist(), at.qdot.tolist(), strict=True))
+    changed = {n: g.mul(n, n) for n in traced.inputs.tolist()}
+    inertia_rates, potential_rates = derivatives(g, weights, along_motion), derivatives(g, traced.particulars.potentials.tolist(), changed)
+    row_rates = derivatives(g, at.phi.tolist(), changed)
+    vanishing = {"rows at rest": at_rest[0], "motion at rest": at_rest[1], "inertia": inertia_rates, "rows of inputs": row_rates}
+    vanishing |= {f"potential {k}": [rate] for k, rate in enumerate(potential_rates)} | timed
+    vanishing["rank"] = [*at_rest[0].tolist(), *(node for row in by_speed[:rows] for node in row.values())]
+    closures = [*at.closure.tolist(), *_norms(scene, traced)]
+    return LookedAt(
+        traced=traced,
+        rows=by_speed[:rows],
+        velocities=by_speed[rows:],
+        closures=closures,
+        of_closures=jacobian(g, closures, traced.q.tolist()),
+        phi_at_rest=at_rest[0],
+        motion_at_rest=at_rest[1],
+        timed=timed,
+        inertia_rates=inertia_rates,
+        potential_rates=potential_rates,
+        row_rates=row_rates,
+        in_calls=_passing(CALLS, traced, vanishing, by_speed[:rows]),
+        nonanalytic=_passing(NONANALYTIC, traced, vanishing, by_speed[:rows]),
+    )
+
+
+def _norms(scene: Scene, traced: TracedScene) -> list[int]:
+    """Of quaternions, as rows."""
+    g, quaternions = traced.graph, [traced.q[first : first + 4].tolist() for first, _ in scene.coordinates.quaternions]
+    return [g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)) for wxyz in quaternions]
+
+
+def _passing(kinds, traced: TracedScene, vanishing: dict, rows: list[dict[int, int]]) -> frozenset[str]:
+    """What passes an operation of these kinds; "nonlinear" where the rows do so with the speeds."""
+    g, u = traced.graph, traced.u.tolist()
+    entries = [node for row in rows for node in row.values()]
+    bent = any(a and b for a, b in zip(depend_on(g, entries, u), passes(g, entries, kinds), strict=True))
+    nonlinear = {"nonlinear"} if bent or decided_by(g, traced.at.phi.tolist(), u, kinds) else set()
+    return frozenset(name for name, nodes in vanishing.items() if any(passes(g, _flat(nodes), kinds))) | nonlinear
 
 
 def probed_on_graph(scene: Scene, t, q, u, u_other, generic, far: int = 0) -> Probed:
@@ -32,12 +115,12 @@ def probed_on_graph(scene: Scene, t, q, u, u_other, generic, far: int = 0) -> Pr
 
     The last `far` states are meant to be far from the domain. `Unsupported` where a call has no derivative in JAX.
     """
-    return _AtStates(traced_scene(scene), scene, t, q, u, generic_inputs(scene), generic, far).probed(u_other)
+    return _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), generic, far).probed(u_other)
 
 
 def sampled_on_graph(scene: Scene, t, q, u) -> tuple[np.ndarray, np.ndarray, Assembled]:
     """Coordinates and speeds put on the rows, and how well that went for the coordinates."""
-    at = _AtStates(traced_scene(scene), scene, t, q, u, np.zeros(len(scene.inputs)), np.ones(len(q), bool))
+    at = _AtStates(looked_at(scene), scene, t, q, u, np.zeros(len(scene.inputs)), np.ones(len(q), bool))
     return at.real(at.q), at.real(at.speeds_on_rows()), at.found
 
 
@@ -46,14 +129,11 @@ def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
 
     `(A_s, phi_s(0)) = x' (A_k, phi_k(0))`, the residual of least squares being no more than the round-off of either side.
     """
-    at = _AtStates(traced_scene(scene), scene, t, q, u, generic_inputs(scene), np.ones(len(t), bool))
-    graph, traced, speeds = at.graph, at.traced, at.traced.u.tolist()
+    at = _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), np.ones(len(t), bool))
+    graph, traced = at.graph, at.traced
     attitudes = {f"q_{first + i}": int(traced.q[first + i]) for first, _ in scene.coordinates.quaternions for i in range(4)}
-    generic = on_rows(
-        identity_probes(at.values, attitudes), at.values, [*traced.at.closure.tolist(), *at.norms()], {f"q_{i}": n for i, n in enumerate(traced.q.tolist())}
-    )
-    at_rest = graph.substituted(traced.at.phi.tolist(), dict.fromkeys(speeds, graph.zero))
-    columns_of_rows = [*columns(graph, traced.at.phi.tolist(), speeds), at_rest]
+    generic = on_rows(identity_probes(at.values, attitudes), at.values, at.nodes.closures, {f"q_{i}": n for i, n in enumerate(traced.q.tolist())})
+    columns_of_rows = [[row.get(n, graph.zero) for row in at.nodes.rows] for n in traced.u.tolist()] + [at.nodes.phi_at_rest.tolist()]
     found = generic([n for column in columns_of_rows for n in column])
     shape = len(columns_of_rows), len(traced.at.phi), -1
     A, E = (np.moveaxis(np.reshape(x, shape), (2, 1), (0, 1)) for x in (np.asarray(found), found.error))
@@ -64,8 +144,8 @@ def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
 class _AtStates:
     """Values on the graph at the probed states."""
 
-    def __init__(self, traced: TracedScene, scene: Scene, t, q, u, inputs, generic, far: int = 0):
-        self.traced, self.graph, self.scene = traced, traced.graph, scene
+    def __init__(self, nodes: LookedAt, scene: Scene, t, q, u, inputs, generic, far: int = 0):
+        self.nodes, self.traced, self.graph, self.scene = nodes, nodes.traced, nodes.graph, scene
         self.inputs = np.tile(inputs, (len(t), 1))
         self.t, self.u, self.generic, self.far = t, u, generic, far
         self.q_beyond, self.found = np.array(q, float), self._assembled(q)
@@ -79,51 +159,26 @@ class _AtStates:
 
     def probed(self, u_other) -> Probed:
         """All that is looked at."""
-        g, at, traced = self.graph, self.traced.at, self.traced
-        u = traced.u.tolist()
-        flat = [*at.phi.tolist(), *at.v.ravel().tolist(), *at.omega.ravel().tolist()]
-        by_speed, rows = jacobian(g, flat, u), len(at.phi)
-        still = dict.fromkeys(u, g.zero)
-        at_rest = np.split(g.substituted([*flat, *at.qdot.tolist()], still), [rows])
-        weights = [*at.mass.tolist(), *at.inertia.ravel().tolist()]
-        poses = [*at.position.ravel().tolist(), *at.orientation.ravel().tolist()]
-        by_time = {"rows": [*at.phi.tolist(), *at.closure.tolist()], "poses": poses, "inertias": weights, "coordinate rates": at.qdot.tolist()}
-        timed = {name: derivatives(g, nodes, {traced.t: g.one}) for name, nodes in by_time.items()} | traced.particulars.explicit
-        directional_derivative = {traced.t: g.one} | dict(zip(traced.q.tolist(), at.qdot.tolist(), strict=True))
-        changed = {n: g.mul(n, n) for n in traced.inputs.tolist()}
-        inertia_rates, potential_rates = derivatives(g, weights, directional_derivative), derivatives(g, traced.particulars.potentials.tolist(), changed)
-        row_rates = derivatives(g, at.phi.tolist(), changed)
-        vanishing = {"rows at rest": at_rest[0], "motion at rest": at_rest[1], "inertia": inertia_rates, "rows of inputs": row_rates}
-        vanishing |= {f"potential {k}": [rate] for k, rate in enumerate(potential_rates)} | timed
-        vanishing["rank"] = [*at_rest[0], *(node for row in by_speed[:rows] for node in row.values())]
-        in_calls = self._passing(CALLS, vanishing, by_speed[:rows])
+        nodes = self.nodes
         return Probed(
             q=self.real(self.q),
             error=self.found.error,
             position_error=self.found.position_error,
             outside=self.found.outside,
-            A=self.real(self._matrices(self.values, by_speed[:rows], u)),
-            A_beyond=self.real(self._matrices(self._probes(self.q_beyond, self.u), by_speed[:rows], u)),
-            A_other=self.real(self._matrices(self._probes(self.q, u_other), by_speed[:rows], u)),
-            M=self.real(self._mass_matrix(by_speed[rows:])),
-            phi_at_rest=self.real(self._at(at_rest[0])),
-            motion_at_rest=self.real(self._at(at_rest[1])),
-            timed=jax.tree.map(self._at, timed, is_leaf=lambda x: isinstance(x, list)),
-            inertia_rates=self._at(inertia_rates),
-            potential_rates=self._at(potential_rates),
-            row_rates_of_inputs=self._at(row_rates),
-            numbers=jax.tree.map(lambda nodes: self.real(self._at(nodes)), traced.particulars.numbers),
-            unproved=self._passing(NONANALYTIC, vanishing, by_speed[:rows]) | (in_calls - _MOTION),
-            in_calls=in_calls & _MOTION,
+            A=self.real(self._row_matrices(self.values)),
+            A_beyond=self.real(self._row_matrices(self._probes(self.q_beyond, self.u))),
+            A_other=self.real(self._row_matrices(self._probes(self.q, u_other))),
+            M=self.real(self._mass_matrix()),
+            phi_at_rest=self.real(self._at(nodes.phi_at_rest)),
+            motion_at_rest=self.real(self._at(nodes.motion_at_rest)),
+            timed=jax.tree.map(self._at, nodes.timed, is_leaf=lambda x: isinstance(x, list)),
+            inertia_rates=self._at(nodes.inertia_rates),
+            potential_rates=self._at(nodes.potential_rates),
+            row_rates_of_inputs=self._at(nodes.row_rates),
+            numbers=jax.tree.map(lambda of: self.real(self._at(of)), self.traced.particulars.numbers),
+            unproved=nodes.nonanalytic | (nodes.in_calls - _MOTION),
+            in_calls=nodes.in_calls & _MOTION,
         )
-
-    def _passing(self, kinds, vanishing: dict, by_speed: list[dict[int, int]]) -> frozenset[str]:
-        """What passes an operation of these kinds; "nonlinear" where the rows do so with the speeds."""
-        g, u = self.graph, self.traced.u.tolist()
-        entries = [node for row in by_speed for node in row.values()]
-        bent = any(a and b for a, b in zip(depend_on(g, entries, u), passes(g, entries, kinds), strict=True))
-        nonlinear = {"nonlinear"} if bent or decided_by(g, self.traced.at.phi.tolist(), u, kinds) else set()
-        return frozenset(name for name, nodes in vanishing.items() if any(passes(g, _flat(nodes), kinds))) | nonlinear
 
     def _at(self, nodes) -> np.ndarray:
         """Values of nodes, with a leading axis of states."""
@@ -143,26 +198,29 @@ class _AtStates:
             found[:, i, j] = _values(probes, nodes)
         return found
 
-    def _mass_matrix(self, by_speed: list[dict[int, int]]) -> np.ndarray:
-        """`M = sum m beta' beta + gamma' I gamma`, from the entries of beta and gamma."""
-        partial = self._matrices(self.values, by_speed, self.traced.u.tolist())
-        beta, gamma = np.split(partial, 2, axis=1)
+    def _row_matrices(self, probes: Probes) -> np.ndarray:
+        """A at these probes."""
+        return self._matrices(probes, self.nodes.rows, self.traced.u.tolist())
+
+    def _mass_matrix(self) -> np.ndarray:
+        """`M = sum m beta' beta + gamma' I gamma`."""
+        beta, gamma = np.split(self._matrices(self.values, self.nodes.velocities, self.traced.u.tolist()), 2, axis=1)
         mass, inertia = self._at(self.traced.at.mass), self._at(self.traced.at.inertia)
         turned = np.einsum("sbij,sbjk->sbik", inertia, gamma.reshape(*inertia.shape[:-1], -1)).reshape(gamma.shape)
         return np.swapaxes(beta, 1, 2) @ (np.repeat(mass, 3, axis=1)[..., None] * beta) + np.swapaxes(gamma, 1, 2) @ turned
 
     def speeds_on_rows(self) -> np.ndarray:
         """`u <- u - M^-1 A' (A M^-1 A')+ phi`, in scaled speeds."""
-        at, columns, u = self.traced.at, self.traced.u.tolist(), np.array(self.u, float)
+        at, u = self.traced.at, np.array(self.u, float)
         if not at.phi.size:
             return u
-        M = self._mass_matrix(jacobian(self.graph, [*at.v.ravel().tolist(), *at.omega.ravel().tolist()], columns))
+        M = self._mass_matrix()
         c = speed_scales(M)
         metric = np.stack([_inverse_root(m) for m in c[:, :, None] * M * c[:, None]])  # L'^-1
-        entries, moving, typical = jacobian(self.graph, at.phi.tolist(), columns), np.arange(len(u)), None
+        moving, typical = np.arange(len(u)), None
         for _ in range(ITERATIONS):
             probes = self._probes(self.q[moving], u[moving], moving)
-            weighted = self._matrices(probes, entries, columns) * c[moving, None] @ metric[moving]
+            weighted = self._row_matrices(probes) * c[moving, None] @ metric[moving]
             typical = typical_lengths(np.linalg.norm(weighted, axis=2)) if typical is None else typical
             x = shortest(weighted, _values(probes, at.phi), typical)
             shift = c[moving] * np.einsum("sij,sj->si", metric[moving], x)
@@ -172,21 +230,15 @@ class _AtStates:
                 break
         return u
 
-    def norms(self) -> list[int]:
-        """Of quaternions, as rows."""
-        g, quaternions = self.graph, [self.traced.q[first : first + 4].tolist() for first, _ in self.scene.coordinates.quaternions]
-        return [g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)) for wxyz in quaternions]
-
     def _assembled(self, q) -> Assembled:
         """Coordinates on geometric rows and unit norms, inside the domain where that can be."""
-        g, q, norms = self.graph, np.array(q, float), self.norms()
+        q = np.array(q, float)
         for first, _ in self.scene.coordinates.quaternions:
             length = np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
             q[:, first : first + 4] /= np.where(length == 0, 1.0, length)
         if not self.traced.at.closure.size:
             return without_rows(q)
-        rows, columns = [*self.traced.at.closure.tolist(), *norms], self.traced.q.tolist()
-        entries = jacobian(g, rows, columns)
+        rows, entries, columns = self.nodes.closures, self.nodes.of_closures, self.traced.q.tolist()
 
         def look(q, which):
             probes = self._probes(q, self.u[which], which)

@@ -35,12 +35,12 @@ def scaled_states(found: Probed, typical: np.ndarray) -> Scaled:
     return Scaled(A / np.where(length > 0, length, 1), length[..., 0], c[:, :, None] * found.M * c[:, None], c)
 
 
-def rank_of(A: np.ndarray, error: float) -> int:
-    """Rank of scaled rows, by the cut-off that the accelerations use, or by the `error` of the configuration they belong to."""
+def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarray, "states"]) -> list[int]:
+    """Ranks of scaled rows, by the cut-off that the accelerations use, or by the error of the configuration they belong to."""
     if not A.size:
-        return 0
+        return [0] * len(A)
     sigma = np.linalg.svd(A, compute_uv=False)
-    return int(np.sum(sigma > max(rank_cutoff(A.dtype), ERRORS * error) * sigma[0]))
+    return np.sum(sigma > np.maximum(rank_cutoff(A.dtype), ERRORS * errors)[:, None] * sigma[:, :1], axis=1).tolist()
 
 
 def redundant_rows(
@@ -59,7 +59,7 @@ def redundant_rows(
         if len(kept) in ranks:
             break  # somewhere those that are left are independent
         rest = [i for i in kept if i != s]
-        if not all(rank_of(A[rest], error) == r for A, error, r in zip(found.A, errors, ranks, strict=True)):
+        if ranks_of(found.A[:, rest], errors) != ranks:
             continue
         if everywhere is None:
             everywhere = jax.tree.map(lambda *x: np.concatenate(x), jax.tree.map(lambda x: x[generic], found), far())
@@ -73,8 +73,8 @@ def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarr
     tiny, made = np.finfo(found.A.dtype).tiny, []
     lengths = np.maximum(found.lengths, tiny)
     usual = np.median(lengths, axis=0)
-    for A, length in zip(found.A, lengths, strict=True):
-        if rank_of(A, 0.0) == rank:
+    for A, length, its_rank in zip(found.A, lengths, ranks_of(found.A, np.zeros(len(found.A))), strict=True):
+        if its_rank == rank:
             c = A[s] @ np.linalg.pinv(A[rest], rcond=rank_cutoff(A.dtype))
             given = np.linalg.norm(A[s] - c @ A[rest]) < np.sqrt(np.finfo(A.dtype).eps)
             made.append(c * (length[s] / usual[s]) / (length[rest] / usual[rest]) if given else np.full(len(rest), np.inf))

@@ -21,6 +21,7 @@ from jourdain_jax.equations.kinematics import coordinate_rates, pose_at
 from jourdain_jax.equations.rows import names_of_position_rows, position_residual
 from jourdain_jax.program.roughness import may_bend
 from jourdain_jax.scene.bodies import RigidBody
+from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.spline import smooth_through_samples
 
@@ -57,6 +58,7 @@ def check_smoothness(scene: Scene, q: np.ndarray, u: np.ndarray) -> None:
             raise ValueError(_said(scene, name, "at several places on its way"))
 
 
+@once_per_class
 def _may_bend(scene: Scene) -> bool:
     """Whether anything decides between branches on the way from t and q."""
     parameters, size = len(jax.tree.leaves(scene)), (len(scene.coordinate_names), len(scene.speed_names))

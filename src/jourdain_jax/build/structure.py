@@ -16,7 +16,7 @@ from jaxtyping import Float
 from jourdain_jax.build.plausibility import implausible
 from jourdain_jax.build.probed import TIMED, Probed
 from jourdain_jax.build.probed_on_graph import follow_from_others, probed_on_graph
-from jourdain_jax.build.rank import Scaled, rank_of, redundant_rows, scaled_states
+from jourdain_jax.build.rank import Scaled, ranks_of, redundant_rows, scaled_states
 from jourdain_jax.build.reference_parameters import once_per_values, without_collecting
 from jourdain_jax.build.row_lengths import speed_scales, typical_row_lengths
 from jourdain_jax.build.sampling import no_numbers, random_states, states_near_what_was_seen, symmetric_configurations, usable_states
@@ -65,6 +65,13 @@ class Structure:
     times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric rows
     coordinates: np.ndarray = field(compare=False, repr=False)  # of the same; random ones first
     random: int  # how many of them are random ones
+
+    @property
+    def decisions(self) -> tuple:
+        """What decides how a motion of the scene is integrated; what is left describes the scene."""
+        of_rows = self.row_names, self.rank, self.redundant_rows, self.may_set_in, self.affine, self.homogeneous, self.rows_of_inputs
+        of_speeds = self.independent, self.chosen_by_user, self.well_conditioned, self.typical_pivot >= WELL_CONDITIONED
+        return *of_rows, *of_speeds, self.timed, self.driven, self.massless, self.varying_inertia, self.potentials_of_inputs
 
     @property
     def rheonomic(self) -> bool:
@@ -173,6 +180,11 @@ def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
     return _whatever_its_faults(scene).plain_row_lengths * (TRACED if is_traced(scene) else 1.0)
 
 
+def decisions_of(scene: Scene) -> tuple:
+    """`Structure.decisions` of a scene, whatever its faults."""
+    return _whatever_its_faults(scene).decisions
+
+
 def rows_are_affine(scene: Scene) -> bool:
     """Whether all rows are linear or affine in the speeds."""
     return _whatever_its_faults(scene).affine
@@ -225,7 +237,7 @@ def _probed_structure(scene: Scene) -> Structure:
     beyond = found.A_beyond[generic]
     t, u, generic, found = jax.tree.map(lambda x: x[usable], (t, u, generic, found))
     scaled = scaled_states(found, typical)
-    ranks = [rank_of(A, error) for A, error in zip(scaled.A, found.error, strict=True)]
+    ranks = ranks_of(scaled.A, found.error)
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     if not faults:  # a negative mass is named as such
         _check_inertia(scene, jax.tree.map(lambda x: x[generic & (np.array(ranks) == rank)], scaled), rank)
@@ -233,7 +245,8 @@ def _probed_structure(scene: Scene) -> Structure:
     candidates = scaled.A[[r == rank for r in ranks]]  # at isolated losses of rank no partition of generic size exists
     if independent is None:
         independent, by_user = _choose(candidates, count, rank), False
-    pivots = _pivots(candidates, [i for i in range(count) if i not in independent], rank)
+    dependent = [i for i in range(count) if i not in independent]
+    pivots = _pivots(candidates, dependent, rank)
     full_everywhere, eps, unproved = all(r == rank for r in ranks), float(np.finfo(found.A.dtype).eps), found.unproved
     redundant = redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
     return Structure(
@@ -246,7 +259,7 @@ def _probed_structure(scene: Scene) -> Structure:
         else (),
         rank_losses=tuple(_describe(scene, c) for c, r in zip(found.q, ranks, strict=True) if r < rank),
         independent=independent,
-        worst_pivot=_worst(candidates, [i for i in range(count) if i not in independent], rank) if full_everywhere else 0.0,
+        worst_pivot=_worst(candidates, dependent, rank, pivots) if full_everywhere else 0.0,
         typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
         affine="nonlinear" not in unproved and not _exceeds(found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None]),
         # near round-off: work that turns out as zero does less harm than work left out
@@ -339,13 +352,13 @@ def _pivots(scaled: np.ndarray, dependent: list[int], rank: int) -> np.ndarray:
     return np.linalg.svd(scaled[:, :, dependent], compute_uv=False)[:, rank - 1]
 
 
-def _worst(scaled: np.ndarray, dependent: list[int], rank: int) -> float:
-    """The smallest pivot over the domain: zero where the determinant of A_z changes sign between probes, for it vanishes in between."""
+def _worst(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.ndarray) -> float:
+    """The smallest of the pivots over the domain: zero where the determinant of A_z changes sign between probes, for it vanishes in between."""
     if rank and scaled.shape[1] == rank:
         signs = np.linalg.slogdet(scaled[:, :, dependent])[0]
         if signs.min(initial=0.0) < 0 < signs.max(initial=0.0):
             return 0.0
-    return float(_pivots(scaled, dependent, rank).min(initial=1.0))
+    return float(pivots.min(initial=1.0))
 
 
 def _choose(scaled: np.ndarray, count: int, rank: int) -> tuple[int, ...]:
@@ -357,7 +370,8 @@ def _choose(scaled: np.ndarray, count: int, rank: int) -> tuple[int, ...]:
         subsets = list({_greedy(A, rank) for A in scaled})
 
     def merit(dependent, probes):
-        return round(_worst(probes, list(dependent), rank), 6), round(float(np.median(_pivots(probes, list(dependent), rank))), 6)
+        pivots = _pivots(probes, list(dependent), rank)
+        return round(_worst(probes, list(dependent), rank, pivots), 6), round(float(np.median(pivots)), 6)
 
     some = scaled[:: max(1, len(scaled) // 40)]
     best = sorted(subsets, key=lambda dependent: merit(dependent, some), reverse=True)[:_SHORTLIST]

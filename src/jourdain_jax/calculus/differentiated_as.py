@@ -17,7 +17,7 @@ class Rules(NamedTuple):
 
     serve: Callable[..., bool]  # (*perturbed): whether they serve, given for each array of the arguments whether it varies
     push: Callable  # (arguments, tangents): tangents of the result
-    pull: Callable  # (perturbed, arguments, cotangents): cotangents of those arguments that vary
+    pull: Callable  # (perturbed, arguments, result, cotangents): cotangents of those arguments that vary
 
 
 def differentiated_as(differentiable: Callable, quick: Callable, kind: Literal["forward", "reverse"], rules: Rules | None = None) -> Callable:
@@ -87,13 +87,13 @@ def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
     @own.def_fwd
     def forth(perturbed, arguments):
         found = own(arguments)
-        return found, eqx.filter_eval_shape(lambda: found)
+        return found, found
 
     @own.def_bwd
-    def back(shapes, cotangents, perturbed, arguments):
-        g = jax.tree.map(_filled, shapes, cotangents, is_leaf=lambda x: x is None)
+    def back(found, cotangents, perturbed, arguments):
+        g = jax.tree.map(_filled, found, cotangents, is_leaf=lambda x: x is None)
         if rules is not None and rules.serve(*perturbed):
-            return rules.pull(perturbed, arguments, g)
+            return rules.pull(perturbed, arguments, found, g)
         moving, fixed = eqx.partition(arguments, perturbed)
         _, pull = eqx.filter_vjp(lambda moving: differentiable(*eqx.combine(moving, fixed)), moving)
         return pull(g)[0]
@@ -101,8 +101,8 @@ def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
     return lambda *arguments: own(arguments)
 
 
-def _filled(shape, cotangent):
+def _filled(found, cotangent):
     """Zeros in place of a cotangent that is missing; none where there can be none."""
-    if cotangent is None and shape is not None and jnp.issubdtype(shape.dtype, jnp.inexact):
-        return jnp.zeros(shape.shape, shape.dtype)
+    if cotangent is None and found is not None and jnp.issubdtype(found.dtype, jnp.inexact):
+        return jnp.zeros_like(found)
     return cotangent

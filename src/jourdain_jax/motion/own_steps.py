@@ -17,6 +17,7 @@ from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.setup import Begun, Setup, Solved
+from jourdain_jax.motion.trajectories import results
 
 
 def solved_by_own_steps(setup: Setup, begun: Begun) -> Solved:
@@ -102,41 +103,56 @@ def _rules(setup: Setup, mapped: Callable) -> Rules:
     """Derivatives by machine code; `mapped`: of a function of one motion, that of all lanes."""
 
     def serve(varies: Setup, begun: Begun) -> bool:
-        of_times = varies.ts, varies.t0, varies.t1, varies.tolerances, varies.dt0, begun.args[-1]
         of_samples = [channel for channel in (*varies.inputs.channels, *begun.args[2].channels) if isinstance(channel, Sampled)]
         reason = native_motion.reason_against_derivatives(setup.field, setup.inputs, bool(setup.options.event_names))
-        return not any(jax.tree.leaves((of_times, of_samples))) and not reason
+        return not any(jax.tree.leaves(of_samples)) and not reason
 
     def push(arguments, along):
         return mapped(_pushed)(*arguments, *along)
 
-    def pull(perturbed, arguments, g):
-        return mapped(partial(_pulled, perturbed))(*arguments, g)
+    def pull(perturbed, arguments, found, g):
+        return mapped(partial(_pulled, perturbed))(*arguments, found, g)
 
     return Rules(serve, push, pull)
 
 
 def _pushed(setup: Setup, begun: Begun, along: Setup, d: Begun) -> PyTree:
-    """Tangents of the motion, along those of its start and of what the rates are given."""
+    """Tangents of the motion, along those of its start, of its times, and of what the rates are given; tolerances and the first step change nothing."""
     motion = _motion(setup, begun)
     dy0 = jax.tree.map(lambda x, dx: jnp.zeros_like(x) if dx is None else dx, begun.y0, d.y0)
-    return native_motion.tangents(motion, dy0, _known(d.args), partial(_as_solved, motion.goals))
+    of_times = along.ts, along.t0, along.t1, d.args[-1]
+    times = None
+    if any(x is not None for x in of_times):
+        like = setup.ts, setup.t0, setup.t1, setup.t0
+        ts, t0, t1, origin = (jnp.zeros_like(x) if dx is None else dx for x, dx in zip(like, of_times, strict=True))
+        times = native_motion.AlongTimes(_since(t0, ts, t1), origin)
+    return native_motion.tangents(motion, dy0, _known(d.args), times, _as_solved)
 
 
-def _pulled(perturbed: tuple, setup: Setup, begun: Begun, g: Solved) -> tuple:
-    """Cotangents of what varies, from those of the motion."""
+def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solved) -> tuple:
+    """Cotangents of what varies, from those of the motion that was found."""
+    motion = _motion(setup, begun)
     states = jax.tree.map(lambda g: jnp.concatenate([g, jnp.zeros((1, *g.shape[1:]))]), g.ys)  # nobody asks for the last one: it is that of the end
-    asked = [bool(varies) for varies in _known(perturbed[1].args)]
-    by_start, by_known = native_motion.cotangents(_motion(setup, begun), asked, states, g.y_end, g.t_end)
+    varies, asked = perturbed[0], [bool(varies) for varies in _known(perturbed[1].args)]
+    by_start, by_known = native_motion.cotangents(motion, asked, states, g.y_end, g.t_end)
     none_else = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
-    field, scene, inputs, fixed, origin = none_else[1].args
+    by_setup, (field, scene, inputs, fixed, origin) = none_else[0], none_else[1].args
+    if varies.ts or varies.t0 or varies.t1 or perturbed[1].args[-1]:
+        ys, reached = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), (found.ys, found.reached), (found.y_end, found.t_end == motion.goals[-1]))
+        event = (found.code == results.EVENT) & (found.accepted > 0)
+        of_motion = native_motion.Stopped(ys, reached, found.t_end, event)
+        times = native_motion.cotangents_of_times(motion, of_motion, by_start, states, g.y_end, g.t_end)
+        goals = times.goals.at[:-1].add(g.ts)
+        given = {"ts": goals[:-1], "t0": -jnp.sum(goals), "t1": goals[-1]}
+        by_setup = by_setup._replace(**{name: by for name, by in given.items() if getattr(varies, name)})
+        origin = times.origin if perturbed[1].args[-1] else None
     y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)
     constant = [i for i, channel in enumerate(inputs.channels) if isinstance(channel, Constant)]
     if constant:
         given = [by_known[len(fixed) + i] for i in constant]
         inputs = eqx.tree_at(lambda x: [x.channels[i].value for i in constant], inputs, given, is_leaf=lambda x: x is None)
     args = field, scene, inputs, tuple(by_known[: len(fixed)]), origin
-    return none_else[0], eqx.tree_at(lambda b: (b.y0, b.args), none_else[1], (y0, args), is_leaf=lambda x: x is None)
+    return by_setup, eqx.tree_at(lambda b: (b.y0, b.args), none_else[1], (y0, args), is_leaf=lambda x: x is None)
 
 
 def _known(args: tuple) -> list:
@@ -147,7 +163,11 @@ def _known(args: tuple) -> list:
 
 def _goals(setup: Setup, ts) -> Float[Array, "times *lanes"]:
     """Times since the start to go to."""
-    return jnp.concatenate([ts, setup.t1[None]]) - setup.t0
+    return _since(setup.t0, ts, setup.t1)
+
+
+def _since(t0, ts, t1) -> Float[Array, "times *lanes"]:
+    return jnp.concatenate([ts, t1[None]]) - t0
 
 
 def _as_solved(goals, ys: PyTree, reached, end: erk_loop.Progress) -> Solved:

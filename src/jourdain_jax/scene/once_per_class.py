@@ -11,8 +11,11 @@ from jourdain_jax.scene.scene import Scene
 MOST_CASES = 1024  # that are kept of one function
 
 
-def once_per_class(describe: Callable) -> Callable:
-    """A function of a scene (and of what else tells its cases apart) that depends on its class and the shapes of its parameters only: worked out once."""
+def once_per_class(describe: Callable, most: int = MOST_CASES) -> Callable:
+    """A function of a scene (and of what else tells its cases apart) that depends on its class and the shapes of its parameters only: worked out once.
+
+    `most`: cases that are kept.
+    """
     known: dict = {}
 
     @wraps(describe)
@@ -20,7 +23,7 @@ def once_per_class(describe: Callable) -> Callable:
         leaves, treedef = jax.tree.flatten(scene)
         key = (treedef, tuple(np.shape(x) for x in leaves), jax.config.jax_enable_x64, case)
         if key not in known:
-            if len(known) >= MOST_CASES:
+            if len(known) >= most:
                 known.pop(next(iter(known)))  # the oldest
             known[key] = describe(scene, *case)
         return known[key]

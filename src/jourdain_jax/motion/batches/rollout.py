@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from tqdm import tqdm
 
-from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.build.reference import Reference
 from jourdain_jax.motion.arguments import check_options
 from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.inputs import as_inputs
@@ -35,7 +35,7 @@ from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.numbers import checked_real, described, is_traced
-from jourdain_jax.scene.parameters import parameter_faults, parameters_of
+from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
@@ -178,12 +178,10 @@ def rollout(
     if is_traced((scene, fixed, varied, parameters, options)):
         return Rollout(_together(scene, fixed, _with_arrays(options), varied, parameters))  # being differentiated or batched: one piece, no host loop
     pieces = []
-    sound = _sound_lane(scene, parameters)
     bar = tqdm(total=count, unit="lane", disable=not (count > chunk if progress is None else progress))
     for first in range(0, count, chunk):
         index = np.minimum(np.arange(first, first + chunk), count - 1)  # the last chunk is filled up with copies of its last lane
-        with reference_parameters(sound):
-            piece = _together(scene, fixed, _with_arrays(options), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+        piece = _together(scene, fixed, _with_arrays(options), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
         kept = min(chunk, count - first)
         pieces.append(jax.tree.map(lambda x, kept=kept: np.asarray(x)[:kept], piece))
         bar.update(kept)
@@ -196,8 +194,7 @@ def rollout(
             chosen, changed = np.flatnonzero(again == way), options | retry_options(way, options)
             for first in range(0, len(chosen), chunk):
                 index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
-                with reference_parameters(sound):
-                    new = _together(scene, fixed, _with_arrays(changed), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+                new = _together(scene, fixed, _with_arrays(changed), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
                 lanes, ways[way] = _replaced(lanes, mark_retried(new, way), index), tuple(getattr(new, name) for name in WAYS)
     continued = np.flatnonzero(np.asarray(lanes.fallback) & results.FULL_STATE)
     return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(continued.tolist()), tuple(sorted(ways.items())))
@@ -216,15 +213,6 @@ def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:
     check_span(t0, t1)
     if ts is not None:
         check_times(ts, t0, t1)
-
-
-def _sound_lane(scene: Scene, parameters: dict) -> Scene:
-    """The scene of the first lane whose parameters are right: what holds of its class is probed near its numbers."""
-    for lane in range(min(16, *(len(value) for value in parameters.values())) if parameters else 0):
-        own = scene.replace(**{name: value[lane] for name, value in parameters.items()})
-        if not any(bool(fault) for fault in parameter_faults(own).values()):
-            return own
-    return scene
 
 
 def _next_retries(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int[np.ndarray, "lanes"]:
@@ -261,16 +249,16 @@ def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajec
 def _together(scene, fixed, options, varied, parameters) -> Trajectory:
     """All given lanes in lockstep; compiled once for scenes and lanes of one shape."""
     compiled = _compiled_dense if _form(scene, options).lowered is None else _compiled_lowered
-    return compiled(options["inputs"].programs)(scene, fixed, options, varied, parameters)
+    return compiled(options["inputs"].programs)(Reference(scene), scene, fixed, options, varied, parameters)
 
 
-def _lanes_in_lockstep(scene, fixed, options, varied, parameters) -> Trajectory:
-
+def _lanes_in_lockstep(reference: Reference, scene, fixed, options, varied, parameters) -> Trajectory:
     def lane(varied, parameters):
         own = scene.replace(**parameters) if parameters else scene
         return set_up(own, varied if isinstance(varied, State) else {**fixed, **varied}, **options)
 
-    return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
+    with reference.stands_in():
+        return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
 
 
 _compiled_dense, _compiled_lowered = (for_programs(_lanes_in_lockstep, compiled_by) for compiled_by in (by_itself, quickly_compiled))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.motion.integrators.erk_loop import method_of
-from jourdain_jax.motion.native import back, loop, samples
+from jourdain_jax.motion.native import back, loop, samples, slopes
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.taylor import TaylorSteps
@@ -60,6 +60,14 @@ def kernel_back(form: Form, solver: type[diffrax.AbstractERK], asked: tuple[int,
     method, count = method_of(solver()), form.layout.y + len(asked)
     of_samples = samples.arguments(form.layout)
     called = _called(lambda lanes, threads: back.written(form, method, lanes, host.fuses(), threads, asked), lambda *_: ((count,),), of_samples)
+    return lambda *arguments: called(*arguments)[0]
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def kernel_of_rates(form: Form) -> Callable:
+    """A function of samples, rows as those of a start, and their times as an array of one: the rates of the states in these rows."""
+    count, of_samples = form.layout.y, samples.arguments(form.layout)
+    called = _called(lambda lanes, threads: slopes.written(form, lanes, host.fuses(), threads), lambda *_: ((count,),), of_samples)
     return lambda *arguments: called(*arguments)[0]
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import jax
@@ -13,10 +13,11 @@ from jourdain_jax.motion.inputs import Constant, Inputs, Sampled
 from jourdain_jax.motion.integrators.erk_loop import ended
 from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
 from jourdain_jax.motion.native.functions import Form, event_program, outputs_of
-from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel, kernel_back
+from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel, kernel_back, kernel_of_rates
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.pulled import pulled_program, steps_of
 from jourdain_jax.motion.native.taylor import rates_of
+from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.native import ffi, host, series
@@ -144,17 +145,47 @@ def integrate(motion: Motion) -> tuple[Integrated, Bool[Array, "times"], Progres
     return _unpacked(own.layout, motion.goals, *own.run(*_samples(motion), jnp.concatenate([_packed(motion.y0), *_rows(motion)]), motion.goals))
 
 
-def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, of: Callable) -> PyTree:
-    """The tangents of `of` what `integrate` returns; `dy0`, `dknown`: of the state, and of each of the numbers that the rates are given, None: zero."""
+class Stopped(NamedTuple):
+    """A motion as its derivatives with respect to times see it."""
+
+    ys: Integrated  # at the goals, the last of which is the end
+    reached: Bool[Array, "times"]
+    t: Float[Array, ""]  # of the end
+    event: Bool[Array, ""]  # whether a stop event ended it on its way
+
+
+class AlongTimes(NamedTuple):
+    """Of what the times of a motion depend on: tangents or cotangents."""
+
+    goals: Float[Array, "times"]  # times since the start
+    origin: Float[Array, ""]  # the start
+
+
+def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, times: AlongTimes | None, of: Callable) -> PyTree:
+    """The tangents of `of` the goals and what `integrate` returns.
+
+    `dy0`, `dknown`: of the state, and of each of the numbers that the rates are given, None: zero; `times`: of the times, None where none varies.
+    """
     moving = tuple(i for i, d in enumerate(dknown) if d is not None)
-    own = kernel(_form_of(motion, moving), motion.solver, motion.order)
+    own, d_start = kernel(_form_of(motion, moving), motion.solver, motion.order), _packed(dy0)
+    if times is not None:
+        d_start = d_start - _scaled(_rates(motion, motion.y0, jnp.zeros(())), times.origin)
     layout, (progress, limits, known) = own.layout, _rows(motion)
     more = [jnp.asarray(dknown[i], jnp.float64)[None] for i in moving]
-    states, end = own.run(*_samples(motion), jnp.concatenate([_packed(motion.y0), _packed(dy0), progress, jnp.zeros(1), limits, known, *more]), motion.goals)
+    states, end = own.run(*_samples(motion), jnp.concatenate([_packed(motion.y0), d_start, progress, jnp.zeros(1), limits, known, *more]), motion.goals)
     n, plain = layout.y, replace(layout, moving=None)
-    primals = states[:, :n], jnp.concatenate([end[:n], end[2 * n : -2], end[-1:]])
-    along = jnp.zeros_like(primals[1]).at[:n].set(end[n : 2 * n]).at[plain.rows["t"].start].set(end[layout.rows["dt"].start])
-    return jax.jvp(lambda *found: of(*_unpacked(plain, motion.goals, *found)), primals, (states[:, n:], along))[1]
+    primals = motion.goals, states[:, :n], jnp.concatenate([end[:n], end[2 * n : -2], end[-1:]])
+    d_goals, d_states, d_y, d_t = jnp.zeros_like(motion.goals), states[:, n:], end[n : 2 * n], end[layout.rows["dt"].start]
+    if times is not None:
+        d_goals = times.goals
+        ys, reached, last = _unpacked(plain, *primals)
+        at = _on_times(motion, Stopped(ys, reached, last.t, (last.code == results.EVENT) & (last.accepted > 0)))
+        absolute = jnp.where(at.by_goal, times.goals + times.origin, jnp.where(at.event, 0.0, times.origin))
+        d_states = d_states + jax.vmap(_scaled)(at.slopes, absolute)
+        d_y = d_y + _scaled(at.slopes[-1], absolute[-1])
+        d_t = jnp.where(at.event, d_t - times.origin, jnp.where(at.by_goal[-1], times.goals[-1], 0.0))
+    along = jnp.zeros_like(primals[2]).at[:n].set(d_y).at[plain.rows["t"].start].set(d_t)
+    return jax.jvp(lambda goals, *found: of(goals, *_unpacked(plain, goals, *found)), primals, (d_goals, d_states, along))[1]
 
 
 def cotangents(motion: Motion, asked: Sequence[bool], ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> tuple[Integrated, list]:
@@ -165,6 +196,45 @@ def cotangents(motion: Motion, asked: Sequence[bool], ys: Integrated, y_end: Int
     found = kernel_back(form, motion.solver, which)(*_samples(motion), starts, jax.vmap(_packed)(ys), ends, motion.goals)
     known = dict(zip(which, found[form.layout.y :], strict=True))
     return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
+
+
+def cotangents_of_times(motion: Motion, found: Stopped, by_start: Integrated, ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> AlongTimes:
+    """Cotangents of the times, from those of the start (as `cotangents` has it), of the states and of the end; `found`: the motion."""
+    at = _on_times(motion, found)
+    by_states = jnp.sum(jax.vmap(_scaled)(at.slopes, jax.vmap(_packed)(ys)), axis=1)
+    by_end = jnp.sum(_scaled(at.slopes[-1], _packed(y_end)))
+    goals = jnp.where(at.by_goal, by_states, 0.0).at[-1].add(jnp.where(at.by_goal[-1], by_end + t_end, 0.0))
+    of_event = jnp.sum(jnp.where(at.by_goal, by_states, 0.0)) - t_end
+    origin = jnp.where(at.event, of_event, jnp.sum(by_states) + by_end)
+    return AlongTimes(goals, origin - jnp.sum(_scaled(_rates(motion, motion.y0, jnp.zeros(())), _packed(by_start))))
+
+
+class _OnTimes(NamedTuple):
+    """How the states at the goals, the last of which is the end, depend on times.
+
+    In absolute time, with f the rates and Phi the derivative of the flow, a state changes by `Phi (dy_0 - f_0 dt_0) + f dt`. Its time t is the goal where
+    that was reached, is found by the loop itself where a stop event ended the motion before, and lies at a number after the start otherwise.
+    """
+
+    slopes: Float[Array, "times y"]
+    by_goal: Bool[Array, "times"]  # whether the time is the goal
+    event: Bool[Array, ""]
+
+
+def _on_times(motion: Motion, found: Stopped) -> _OnTimes:
+    by_goal = found.reached & ~(found.event & (motion.goals == found.t))
+    at = jnp.where(by_goal, motion.goals, found.t)
+    return _OnTimes(jax.vmap(partial(_rates, motion))(found.ys, at), by_goal, found.event)
+
+
+def _rates(motion: Motion, y: Integrated, t: Float[Array, ""]) -> Float[Array, "y"]:
+    progress, limits, known = _rows(motion)
+    return kernel_of_rates(_form_of(motion))(*_samples(motion), jnp.concatenate([_packed(y), progress.at[0].set(t), limits, known]), t[None])
+
+
+def _scaled(slope: Float[Array, "y"], by: Float[Array, "..."]) -> Float[Array, "y"]:
+    """Their product; zero, whatever the slope, where it is multiplied by zero."""
+    return jnp.where(by == 0.0, 0.0, slope * by)
 
 
 def _rows(motion: Motion) -> tuple[Array, Array, Array]:

@@ -1,0 +1,153 @@
+"""Derivatives with respect to the times of a motion by machine code: against a closed form, XLA and differences, up to events and of motions that fail."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.motion.integrators import erk_loop
+from jourdain_jax.native import host
+
+pytestmark = pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against())
+
+FORWARD = diffrax.ForwardMode()
+MODES = {"jacfwd": FORWARD, "jacrev": None}
+
+
+class Driven(jj.Scene):
+    """A particle on a spring whose push changes with time, by a formula and by an input, and a wall at x = -1.2."""
+
+    stiffness: float = jj.parameter(6.0, unit="N/m", positive=True)
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("push")
+    example = {"x": 1.1, "x_rate": 0.7}
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.5, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        push = motion.inputs.push + jnp.cos(2.0 * motion.t) - 0.3 * motion.u.x_rate
+        return (jj.generalized_force(motion, x_rate=push - self.stiffness * motion.q.x),)
+
+    def events(self, motion):
+        return {"wall": 1.2 + motion.q.x}
+
+
+PUSH = jj.Sampled([0.0, 0.5, 0.8, 1.5, 4.0], [0.3, 0.1, 0.9, -0.4, 0.2])
+DISC = jj.models.TiltingDisc()
+CASES = {
+    "driven": (Driven(), None, {"inputs": {"push": PUSH}, "events": False}),
+    "driven, backwards": (Driven(), None, {"inputs": {"push": PUSH}, "events": False}),
+    "driven, up to a wall": (Driven(), None, {"inputs": {"push": PUSH}}),
+    "driven, by Taylor series": (Driven(), None, {"solver": jj.Taylor()}),
+    "disc that falls": (DISC, {"lean": 0.6, "spin_rate": -0.1}, {}),
+    "disc with a quaternion, projected": (jj.models.MODELS["tilting-disc-quaternion"](), None, {"formulation": jj.Formulation("full"), "events": False}),
+}
+TIMES = jnp.array([0.2, 0.45, 0.71, 1.3])  # start, two that are saved, end
+BACK = jnp.array([2.0, 1.9, 1.2, 0.6])
+
+
+def _seen(name: str, times, backend: str = "native", adjoint=None, **options):
+    """What a motion from the first of the times to the last shows: states at those between, the end with its time and the work done until then."""
+    scene, start, given = CASES[name]
+    options = {"rtol": 1e-11, "atol": 1e-11} | given | options
+    start = scene.example if start is None else start
+    motion = jj.simulate(scene, start, t0=times[0], ts=times[1:-1], t1=times[-1], backend=backend, adjoint=adjoint, **options)
+    saved = jnp.where(motion.ts * jnp.sign(times[-1] - times[0]) <= motion.t_end * jnp.sign(times[-1] - times[0]), motion.q[:, 0], 0.0)
+    work = jnp.zeros(0) if motion.work is None else motion.work[:1]
+    return jnp.concatenate([saved, motion.u[:1, 0], work, motion.q_end, motion.u_end, motion.t_end[None]])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_derivatives_with_respect_to_times_are_differences(name):
+    times, h = BACK if "backwards" in name else TIMES, 1e-4
+    seen, steps = jax.jit(jax.vmap(lambda t: _seen(name, t))), h * np.eye(4)
+    near = np.asarray(seen(jnp.concatenate([times + k * steps for k in (-2, -1, 1, 2)]))).reshape(4, 4, -1)
+    differences = np.einsum("k,kij->ji", [1.0, -8.0, 8.0, -1.0], near) / (12.0 * h)
+    for mode, adjoint in MODES.items():
+        found = np.asarray(jax.jit(getattr(jax, mode)(lambda t, adjoint=adjoint: _seen(name, t, adjoint=adjoint)))(times))
+        np.testing.assert_allclose(found, differences, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if "Taylor" not in name])
+def test_derivatives_with_respect_to_times_are_those_of_xla(name):
+    times = BACK if "backwards" in name else TIMES
+    found, expected = (np.asarray(jax.jit(jax.jacfwd(lambda t, b=b: _seen(name, t, b, FORWARD)))(times)) for b in ("native", "xla"))
+    np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7)
+    assert np.any(expected != 0)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_start_and_its_time_move_along_the_motion_together(mode):
+    """From any of its states, each at its own time, a motion ends in the same one: the flow's derivative of the rate at the start is that of its time."""
+    scene, options = Driven(), {"inputs": {"push": PUSH}, "events": False, "rtol": 1e-12, "atol": 1e-12, "adjoint": MODES[mode]}
+    on_the_way = jj.simulate(scene, Driven.example, t0=0.2, ts=[0.6], **options)
+    q, u = on_the_way.q[0, 0], on_the_way.u[0, 0]
+    rate = jnp.asarray(jj.accelerations(scene, 0.6, q[None], u[None], inputs={"push": PUSH(0.6)}).udot)[0]
+
+    def end(s):
+        motion = jj.simulate(scene, {"x": q + s * u, "x_rate": u + s * rate}, t0=0.6 + s, ts=[1.9], **options)
+        return motion.q_end[0], motion.u_end[0]
+
+    np.testing.assert_allclose(getattr(jax, mode)(end)(0.0), (0.0, 0.0), atol=1e-9)
+
+
+def test_no_derivative_with_respect_to_a_time_goes_through_the_loop_of_xla(monkeypatch):
+    monkeypatch.setattr(erk_loop, "integrate", lambda *a: pytest.fail("the loop of XLA was traced"))
+    for mode, adjoint in MODES.items():
+        getattr(jax, mode)(lambda t, adjoint=adjoint: _seen("driven, up to a wall", t, adjoint=adjoint, max_steps=4321))(TIMES)
+
+
+LANES = TIMES + 0.05 * np.random.default_rng(0).uniform(-1, 1, size=(11, 4))
+
+
+@pytest.mark.parametrize(
+    ("derivative", "adjoint"),
+    [
+        (lambda f: jax.jit(jax.vmap(jax.grad(f)))(LANES), None),
+        (lambda f: jax.jit(jax.grad(lambda x: jnp.sum(jnp.sin(jax.vmap(f)(x)))))(LANES), None),
+        (lambda f: jax.jit(jax.vmap(jax.jacfwd(f)))(LANES), FORWARD),
+        (lambda f: jax.jit(lambda x, v: jax.jvp(jax.vmap(f), (x,), (v,)))(LANES, LANES), FORWARD),
+        (lambda f: jax.jit(jax.jacfwd(jax.jacfwd(f)))(TIMES), FORWARD),
+    ],
+    ids=["vmap of grad", "grad of vmap", "vmap of jacfwd", "jvp of vmap", "jacfwd of jacfwd"],
+)
+def test_nested_derivatives_with_respect_to_times_are_those_of_xla(derivative, adjoint):
+    ours, theirs = (derivative(lambda t, b=backend: jnp.sum(_seen("driven, up to a wall", t, b, adjoint) ** 2)) for backend in ("native", "xla"))
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_motion_that_fails_ends_at_a_number_after_its_start(mode):
+    def end(t0, span, **options):
+        motion = jj.simulate(Driven(), Driven.example, t0=t0, t1=t0 + span, ts=t0 + jnp.array([0.5, 1.0]) * span, events=False, adjoint=MODES[mode], **options)
+        return jnp.concatenate([motion.q_end, motion.u_end, motion.t_end[None]])
+
+    span = float(end(0.2, 3.0, max_steps=5)[-1]) - 0.2
+    assert 0.0 < span < 3.0
+    found, expected = (getattr(jax, mode)(lambda t0, x=x: end(t0, x[0], max_steps=x[1]))(0.2) for x in ((3.0, 5), (span, 4321)))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_motion_that_starts_beyond_an_event_ends_where_and_when_it_starts(mode):
+    def end(t):
+        motion = jj.simulate(Driven(), {"x": -1.3, "x_rate": 0.2}, t0=t[0], ts=t[1:], adjoint=MODES[mode])
+        return jnp.concatenate([motion.q_end, motion.u_end, motion.t_end[None]])
+
+    found = getattr(jax, mode)(end)(jnp.array([0.2, 0.5]))
+    np.testing.assert_array_equal(found, [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_parameters_and_times_vary_together(mode):
+    def f(x, backend):
+        scene = Driven(stiffness=x[0])
+        return jj.simulate(scene, {"x": x[1], "x_rate": 0.7}, t0=x[2], ts=x[3:], backend=backend, adjoint=MODES[mode], rtol=1e-11, atol=1e-11).q[:, 0]
+
+    x = jnp.array([6.0, 1.1, 0.1, 0.4, 0.9])
+    found, expected = (jax.jit(getattr(jax, mode)(lambda x, b=b: f(x, b)))(x) for b in ("native", "xla"))
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
