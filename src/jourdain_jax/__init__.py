@@ -148,6 +148,7 @@ __all__ = [
     "Lowered",
     "MeanGradients",
     "Measurements",
+    "MultipleShooting",
     "Multipliers",
     "MuntheKaas",
     "Normal",

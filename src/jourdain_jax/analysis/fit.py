@@ -166,6 +166,8 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
         control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.theta))))
         asked = replace(asked, control=control)
     found = _with_memory(problem, found if members else found.lowest(), limits, control)
+    if pieces is not None:
+        found.converged &= pieces.closed(np.arange(len(found.converged)))
     return _result(problem, found, limits, asked, errors, guesses, same, None if pieces is None else pieces.told())
 
 

@@ -22,7 +22,9 @@ from jourdain_jax.motion.inputs import Inputs, Sampled
 
 @dataclass(frozen=True)
 class MultipleShooting:
-    """Fit each run in pieces with starts of their own, which end where the next one begins: `jj.fit(..., shooting=jj.MultipleShooting(duration=0.5))`.
+    """Fit each run in pieces with starts of their own, which end where the next one begins.
+
+        jj.fit(guess, run, free=("mass", "length"), shooting=jj.MultipleShooting(duration=0.5))
 
     - `duration`: about how long a piece is, s: a time over which neighbouring motions part by a factor of two to five.
     - `pieces`: how many pieces each run has; give one of the two.
