@@ -62,6 +62,16 @@ def test_spans_that_a_motion_follows_already_are_left_out(monkeypatch):
     np.testing.assert_allclose(quick.values, every.values, atol=1e-3 * every.standard_errors.min())
 
 
+def test_whole_runs_that_lead_nowhere_are_given_up_soon(monkeypatch):
+    quick = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
+    monkeypatch.setattr("jourdain_jax.analysis.fit._PATIENCE", None)
+    patient = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
+    assert quick.grown
+    assert patient.grown
+    assert len(quick.trace[0][1]) < len(patient.trace[0][1])
+    np.testing.assert_allclose(quick.values, patient.values, atol=1e-3 * patient.standard_errors.min())
+
+
 def test_a_fit_that_is_far_off_goes_on_where_growing_spans_do_not_help(monkeypatch):
     measured = data(0, more=0.05)  # no parameters give this
     monkeypatch.setattr("jourdain_jax.analysis.fit._STEPS", 1)

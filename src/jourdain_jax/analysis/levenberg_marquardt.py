@@ -2,6 +2,7 @@
 
 minimise F(theta), low <= theta <= high;      near theta   F + g' d + |J d|^2 / 2
 step       (J'J + lambda D^2) d = - g          D: lengths of the columns of J;  unknowns that would pass a bound end there, and the others are solved for again
+patience   where F is large, and has not become far smaller within so many steps, no more are tried: the member has neither converged nor is it stuck
 converged  the undamped step is at most `tolerance` standard errors long, |J d|, and moves no unknown by more than that fraction of its size;
            or a step is at whose end it will be a tenth of that, as far as it shrank from the last one to this one: the end is then known without evaluation
 
@@ -26,6 +27,7 @@ _SURELY = 0.1  # times the tolerance: what the next step is to be below, where i
 _SHORT, _FAST = 0.01, 0.1  # standard errors, of a step after which the next may be foretold; by what factor steps shrink then
 _ERROR = 1e-6  # relative, of F: smaller changes may be errors of the simulation
 _TINY = sys.float_info.min
+SLOW = 0.25  # of F: what it is to fall to
 RELEASES = 8  # times that unknowns which would pass a bound are put there and the others solved for again
 
 
@@ -82,6 +84,8 @@ class Control:
     tolerance: float
     most_steps: int
     cutoff: float
+    patience: int | None = None  # steps within which F is to fall to `SLOW` of what it was; None: any number
+    near: float = 0.0  # F below which it may fall as slowly as it does
 
 
 @dataclass
@@ -182,6 +186,9 @@ def minimise(
         lost = [paces[b].damping > MOST for b in here]
         if True in lost:
             stuck[going[lost]], going = True, going[np.logical_not(lost)]
+        if control.patience is not None and (few := [b for b in going.tolist() if len(costs[b]) > control.patience]):
+            slow = [b for b in few if costs[b][-1] > max(control.near, SLOW * costs[b][-1 - control.patience])]
+            going = going[~np.isin(going, slow)]
     trace = np.empty(count, object)
     trace[:] = [((what, tuple(of_one)),) for of_one in costs]
     return Minimum(theta, at, converged, stuck, steps, np.zeros(count, bool), trace)
