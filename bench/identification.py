@@ -647,10 +647,19 @@ def chaotic(count: int) -> list[Figure]:
             inside += [bool(one[name].low < x < one[name].high) for name, x in true.items()]
             apart.append(float(one.shooting.continuity))
         model = f"chaotic double pendulum, {span:g} s"
-        good = lambda fits: np.mean([bool(one.converged and one.reduced_chi_square < 1.3) for one, _ in fits])  # noqa: E731
         figures += [
-            figure("share of first guesses off by up to half that lead to the minimum, by growing spans", model, good(whole)),
-            figure("the same, by multiple shooting in pieces of 0.5 s", model, good(pieces), 0.95, at_least=True),
+            figure(
+                "share of first guesses off by up to half that lead to the minimum, by growing spans",
+                model,
+                np.mean([one.reduced_chi_square < 1.3 for one, _ in whole]),
+            ),
+            figure(
+                "the same, by multiple shooting in pieces of 0.5 s",
+                model,
+                np.mean([bool(x.converged and x.reduced_chi_square < 1.3) for x, _ in pieces]),
+                0.95,
+                at_least=True,
+            ),
             figure("95 % intervals of these that hold the truth", model, np.mean(inside)),
             figure("largest jump between their pieces, tolerances of the simulation", model, max(apart), 1),
             figure("time of a warm fit by multiple shooting over one by growing spans, medians", model, _warm(pieces) / _warm(whole)),
