@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 from linkages import Parallelogram, SliderCrank, Windows, bennett, bricard
 from small_scenes import DiscWithHeightRow
 
@@ -108,3 +109,31 @@ def test_steady_motions_keep_the_coordinates_on_which_nothing_depends():
     found = jj.steady(jj.models.VerticalDisc(), {"x": 5.0, "heading": 0.7, "heading_rate": 0.2, "roll_rate": 3.0})
     assert bool(found.converged)
     assert (float(found["x"]), float(found["y"]), float(found["heading"])) == (5.0, 0.0, 0.7)
+
+
+@pytest.mark.parametrize(
+    "scene", [jj.models.ChaplyginSleigh(), pytest.param(jj.models.DoublePendulumRods(), marks=pytest.mark.slow)], ids=["sleigh", "pendulum of rods"]
+)
+def test_a_start_whose_rows_determine_its_speeds_has_the_derivatives_of_the_nearest_one(scene):
+    """Speeds that rows determine are solved for without a metric; where a scene has none to spare, the nearest state is that one, to second order."""
+    first, privileged = scene.coordinate_names.entries[-1], [scene.speed_names.entries[i] for i in structure_of(scene).independent]
+    given = {first: jnp.asarray(0.3)} | {name: jnp.asarray(0.5 + k) for k, name in enumerate(privileged)}
+    numbers, restored = ravel_pytree((jax.tree.map(jnp.asarray, scene), given))
+
+    def seen(state):
+        return jnp.sum(jnp.sin(jnp.arange(1.0, state.u.size + 1) * state.u)) + state.q @ state.q
+
+    def determined(x):
+        scene, given = restored(x)
+        return seen(jj.start(scene, **given))
+
+    def nearest(x):
+        scene, given = restored(x)
+        q, u, _ = scene.named(**given)
+        return seen(jj.consistent(scene, 0.0, q, u, held=tuple(given)))
+
+    def derivatives(f):
+        return jax.jit(lambda x: (f(x), jax.jacfwd(f)(x), jax.grad(f)(x), jax.jacfwd(jax.grad(f))(x)))
+
+    for found, expected in zip(derivatives(determined)(numbers), derivatives(nearest)(numbers), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)

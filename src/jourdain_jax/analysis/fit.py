@@ -35,6 +35,7 @@ from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
 _SPANS = (1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4)  # shares of the span that a fit grows over
+_PATIENCE = 3  # steps within which a fit of whole runs is to make F far smaller, or spans grow
 _STEPS, _ROUGHLY = 8, 1.0  # tried on each of them, and their tolerance
 _FOLLOWED = 100.0  # times the squares that noise leaves, up to which a motion is followed, and a longer span can be next
 _SOME = 12  # steps between two estimates of correlation times
@@ -158,7 +159,8 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
     a short span does not tell stays near the first guess. After a few steps, what is far off gives way to growing spans, and goes on only where these do not
     lead to small residuals either. `one_will_do`: spans grow only where no theta led to a minimum with small residuals.
     """
-    samples, few = problem.samples, replace(control, most_steps=min(_STEPS, control.most_steps))
+    samples = problem.samples
+    few = replace(control, most_steps=min(_STEPS, control.most_steps), patience=_PATIENCE, near=0.5 * _POOR * samples)
     rest = replace(control, most_steps=control.most_steps - few.most_steps)
     in_parts = samples > 0 and not (one_will_do and len(theta) > 1)
     found = minimise(problem.linearised, theta, limits, few if in_parts else control, _WHOLE)
@@ -180,7 +182,7 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
     problem.begun, problem.shares = theta, np.ones(len(theta))
     while (some := np.flatnonzero(place < len(_SPANS))).size:
         problem.shares[poor[some]] = np.array(_SPANS)[place[some]]
-        grown = of(poor[some], begin[some], replace(few, tolerance=_ROUGHLY))
+        grown = of(poor[some], begin[some], replace(few, tolerance=_ROUGHLY, patience=None))
         begin[some], steps[some] = grown.theta, steps[some] + grown.steps
         for i, (_, costs), k in zip(some.tolist(), (of_one[0] for of_one in grown.trace), place[some].tolist(), strict=True):
             trace[i] += ((f"the first {_SPANS[k]:.3g} of each run", costs),)

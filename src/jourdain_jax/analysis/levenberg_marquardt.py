@@ -2,11 +2,13 @@
 
 minimise F(theta), low <= theta <= high;      near theta   F + g' d + |J d|^2 / 2
 step       (J'J + lambda D^2) d = - g          D: lengths of the columns of J;  unknowns that would pass a bound end there, and the others are solved for again
+patience   where F is large, and has not become far smaller within so many steps, no more are tried: the member has neither converged nor is it stuck
 converged  the undamped step is at most `tolerance` standard errors long, |J d|, and moves no unknown by more than that fraction of its size;
            or a step is at whose end it will be a tenth of that, as far as it shrank from the last one to this one: the end is then known without evaluation
 
 Several problems of one shape (`members`) go side by side; those that have ended cost nothing.
-Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105.
+Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105; near the minimum slopes in place of values:
+W. W. Hager and H. Zhang, SIAM J. Optim. 16 (2005) 170.
 """
 
 import math
@@ -23,7 +25,9 @@ FIRST, LEAST, MOST = 1e-3, 1e-9, 1e9  # damping lambda: at first, at least, and 
 FASTEST = 10.0  # factor by which damping falls after a good step
 _SURELY = 0.1  # times the tolerance: what the next step is to be below, where it is not looked at
 _SHORT, _FAST = 0.01, 0.1  # standard errors, of a step after which the next may be foretold; by what factor steps shrink then
+_ERROR = 1e-6  # relative, of F: smaller changes may be errors of the simulation
 _TINY = sys.float_info.min
+SLOW = 0.25  # of F: what it is to fall to
 RELEASES = 8  # times that unknowns which would pass a bound are put there and the others solved for again
 
 
@@ -80,6 +84,8 @@ class Control:
     tolerance: float
     most_steps: int
     cutoff: float
+    patience: int | None = None  # steps within which F is to fall to `SLOW` of what it was; None: any number
+    near: float = 0.0  # F below which it may fall as slowly as it does
 
 
 @dataclass
@@ -153,7 +159,8 @@ def minimise(
             if not going.size:
                 break
         steps[going] += 1
-        promised = -np.sum(arrow.gradient * d, axis=1) - 0.5 * change
+        fall = -np.sum(arrow.gradient * d, axis=1)  # of F along the step, at its begin
+        promised = fall - 0.5 * change
         here = going.tolist()
         shrank = [paces[b].shrinkage(length) for b, length in zip(here, np.sqrt(change).tolist(), strict=True)]
         if min(shrank) < 1:
@@ -166,9 +173,11 @@ def minimise(
                     costs[b].append(float(at.cost[b]))
                 if not going.size:
                     break
-                d, x, promised, here = d[~last], x[~last], promised[~last], going.tolist()
+                d, x, fall, promised, here = d[~last], x[~last], fall[~last], promised[~last], going.tolist()
         trial = evaluate(x + d, going)
-        better = [paces[b].tried(costs[b][-1] - cost, by, control.tolerance) for b, cost, by in zip(here, trial.cost.tolist(), promised.tolist(), strict=True)]
+        slopes = 0.5 * (fall - np.sum(trial.arrow.gradient * d, axis=1))
+        of_each = zip(here, trial.cost.tolist(), promised.tolist(), slopes.tolist(), strict=True)
+        better = [paces[b].tried(costs[b][-1], cost, by, slope, control.tolerance) for b, cost, by, slope in of_each]
         chosen = np.array(better)
         theta[going[chosen]] = (x + d)[chosen]
         at = at.replaced(going, trial, chosen)
@@ -177,6 +186,9 @@ def minimise(
         lost = [paces[b].damping > MOST for b in here]
         if True in lost:
             stuck[going[lost]], going = True, going[np.logical_not(lost)]
+        if control.patience is not None and (few := [b for b in going.tolist() if len(costs[b]) > control.patience]):
+            slow = [b for b in few if costs[b][-1] > max(control.near, SLOW * costs[b][-1 - control.patience])]
+            going = going[~np.isin(going, slow)]
     trace = np.empty(count, object)
     trace[:] = [((what, tuple(of_one)),) for of_one in costs]
     return Minimum(theta, at, converged, stuck, steps, np.zeros(count, bool), trace)
@@ -198,18 +210,23 @@ class _Pace:
             return 1.0
         return length / max(before[1], _TINY)
 
-    def tried(self, found: float, promised: float, tolerance: float) -> bool:
-        """Whether a step is taken that lowered F by `found` (not finite: the motion failed) where the linear problem `promised` so much."""
-        # near the minimum the simulation's own error decides whether F falls
-        level = promised < 100 * tolerance**2 and abs(found) < tolerance
-        if not (math.isfinite(found) and (found > 1e-4 * promised or level)):
+    def tried(self, before: float, after: float, promised: float, by_slopes: float, tolerance: float) -> bool:
+        """Whether a step is taken from F of `before` to `after` (not finite: the motion failed) where the linear problem `promised` it to fall by so much.
+
+        Near the minimum the simulation's own error decides whether F falls: it jumps where a motion takes one step more. There the slopes of F at both ends
+        of the step tell it to more digits: `by_slopes`.
+        """
+        found = before - after
+        if abs(found) < _ERROR * abs(before) or (promised < 100 * tolerance**2 and abs(found) < tolerance):
+            found = by_slopes
+        if not (math.isfinite(found) and found > 1e-4 * promised):
             # after a step that failed, damping falls slowly: in a curved valley every other step would fail
             self.damping, self.growth, self.fall, self.lengths = max(self.damping * self.growth, LEAST), 2 * self.growth, 2.0, ()
             return False
         ratio = found / max(promised, _TINY)
         # it rises where steps overshoot: where residuals stay large, undamped ones go to and fro along what shows least
         change = 1 / self.fall if ratio > 0.9 else 3.0 if ratio < 0.6 else 1.0
-        self.damping = LEAST if level else max(self.damping * change, LEAST)
+        self.damping = max(self.damping * change, LEAST)
         self.growth, self.fall = 4.0, min(1.5 * self.fall, FASTEST)
         return True
 

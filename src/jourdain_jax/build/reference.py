@@ -2,14 +2,16 @@
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import MISSING, fields
+from dataclasses import fields
+from functools import lru_cache
+from numbers import Real
 
 import jax
 import numpy as np
 
-from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.build.reference_parameters import reference_parameters, with_reference_parameters
 from jourdain_jax.build.structure import decisions_of
-from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.scene.numbers import real_type
 from jourdain_jax.scene.scene import Scene
 
 
@@ -17,35 +19,41 @@ class Reference:
     """A scene whose numbers stand in for traced parameters of its class; a static argument of what is compiled.
 
     Two are equal where their scenes lead to the same decisions (`Structure.decisions`): then one program serves both. So what a call runs is decided by its own
-    arguments, and not by which call was the first. Of a scene that is traced itself, the class's defaults stand in, unless a call further out has said more.
+    arguments, and not by which call was the first. Of parameters that are traced already, the class's defaults stand in.
     """
 
     @staticmethod
     def where_free(scene: Scene, free: Collection[str]) -> "Reference":
         """That of a scene some of whose parameters, `free`, are going to change: the defaults of its class stand in for these, where it has states there."""
-        defaults = {
-            f.name: f.default for f in fields(scene) if f.name in free and f.default is not MISSING and np.shape(f.default) == np.shape(getattr(scene, f.name))
-        }
+        leaves, treedef = jax.tree.flatten(scene)
+        for place, default in _defaults(treedef, frozenset(free)):
+            if np.shape(default) == np.shape(leaves[place]):
+                leaves[place] = default
         try:
-            return Reference(scene.replace(**defaults))
-        except (TypeError, ValueError):  # no numbers, or no state of the scene is found there
+            return Reference(jax.tree.unflatten(treedef, leaves))
+        except (TypeError, ValueError):  # no state of the scene is found there
             return Reference(scene)
 
     def __init__(self, scene: Scene):
-        self._scene = None if is_traced(scene) else scene
-        self._key = None if self._scene is None else (jax.tree.structure(scene), decisions_of(scene), jax.config.jax_enable_x64)
+        self._scene = with_reference_parameters(scene)
+        self._key = jax.tree.structure(scene), decisions_of(self._scene), jax.config.jax_enable_x64
 
     @contextmanager
     def stands_in(self) -> Iterator[None]:
         """Inside, its numbers stand in."""
-        if self._scene is None:
+        with reference_parameters(self._scene):
             yield
-        else:
-            with reference_parameters(self._scene):
-                yield
 
     def __hash__(self):
         return hash(self._key)
 
     def __eq__(self, other):
         return isinstance(other, Reference) and self._key == other._key
+
+
+@lru_cache(maxsize=256)
+def _defaults(treedef, free: frozenset[str]) -> tuple[tuple[int, np.ndarray], ...]:
+    """Which leaves of a scene these parameters are, and the defaults of its class for them."""
+    places = jax.tree.unflatten(treedef, range(treedef.num_leaves))  # no new scene by its class: that takes half a millisecond
+    named = {f.name: f.default for f in fields(places) if f.name in free and isinstance(getattr(places, f.name), int)}
+    return tuple((getattr(places, name), np.asarray(x, real_type())) for name, x in named.items() if isinstance(x, Real | np.ndarray | jax.Array))

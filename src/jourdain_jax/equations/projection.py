@@ -6,8 +6,10 @@ Each is iterated until nothing changes any more, in a way that can be differenti
 derivative with it. Rows affine in the speeds are met by one step. Unit norms of quaternions count as position rows here.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.fixed_point import fixed_point
@@ -69,19 +71,23 @@ def project_speeds(
     u: Float[Array, "speeds"],
     inputs=None,
     *,
-    free: Bool[Array, "speeds"] | None = None,
+    free: Bool[Array | np.ndarray, "speeds"] | None = None,
     iterations: int = 8,
     cutoff: float | None = None,
     typical=None,
     affine: bool = False,
+    determined: bool = False,
 ) -> Float[Array, "speeds"]:
     """Speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are `free` move.
 
     Rows count as dependent below `cutoff` (default: `rank_cutoff`). `typical`: lengths of the rows in scaled speeds by which one counts as vanishing,
     from `usual_rows` (default: none does, unless it is zero). `affine`: rows are, in the speeds, so that one step is exact; `iterations` do not count then.
+    `determined`: rows are affine and determine all speeds that are `free`, so that no metric is needed; `typical` is then in plain speeds.
     """
     if jax.eval_shape(lambda s, q, u: velocity_residual(s, 0.0, q, u), scene, q, u).shape[0] == 0:
         return u
+    if determined:
+        return _determined_speeds((scene, t, q, u, inputs), free=free, typical=typical)
     free = jnp.ones(u.shape, bool) if free is None else free
     M = mass_matrix_at(scene, t, q)
     c = speed_scale(M)
@@ -105,3 +111,32 @@ def project_speeds(
     phi, change = towards_rows(u)
     u = u + change(phi)
     return u + jax.lax.stop_gradient(change(velocity_residual(scene, t, q, u, inputs)))  # round-off, of which no derivative is wanted
+
+
+@eqx.filter_custom_jvp
+def _determined_speeds(state: tuple, *, free, typical) -> Float[Array, "speeds"]:
+    """Speeds on affine rows that determine those which are free; `state`: scene, time, coordinates, speeds, inputs."""
+    return _on_rows(state, free, typical)[0]
+
+
+@_determined_speeds.def_jvp
+def _determined_speeds_jvp(primals, tangents, *, free, typical):
+    """Of `phi = 0`, as of any root: `du = -A+ dphi`, with the derivative of the rows at speeds that are held."""
+    ((scene, t, q, u, inputs),), ((*along, du, dinputs),) = primals, tangents
+    u, P = _on_rows((scene, t, q, u, inputs), free, typical)
+    du = jnp.zeros_like(u) if du is None else jnp.where(free, 0.0, du)
+    tangents = (*along, du, dinputs)
+    moving, fixed = eqx.partition((scene, t, q, u, inputs), jax.tree.map(lambda d: d is not None, tangents, is_leaf=lambda d: d is None))
+    dphi = jax.jvp(lambda moving: velocity_residual(*eqx.combine(moving, fixed)), (moving,), (tangents,))[1]
+    return u, du - P @ dphi
+
+
+def _on_rows(state: tuple, free, typical) -> tuple[Float[Array, "speeds"], Float[Array, "speeds rows"]]:
+    """Those speeds, and what takes a residual of rows to the change of speeds that makes it."""
+    scene, t, q, u, inputs = state
+    A = jnp.where(free, jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u), 0.0)
+    d = row_scale(A, typical)
+    P = jnp.where(free[:, None], pseudo_inverse(d[:, None] * A) * d, 0.0)  # what is held does not move by round-off either
+    for _ in range(2):  # once more for round-off
+        u = u - P @ velocity_residual(scene, t, q, u, inputs)
+    return u, P

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.sampling import NoStateFoundError, seen_on_rows
-from jourdain_jax.build.structure import Structure, closure_lengths, rows_are_affine, structure_of, usual_rows
+from jourdain_jax.build.structure import Structure, closure_lengths, plain_row_lengths, rows_are_affine, structure_of, usual_rows
 from jourdain_jax.calculus.damped import damped_root
 from jourdain_jax.calculus.reals import Number, Numbers
 from jourdain_jax.eager.eager import eval_numpy
@@ -97,9 +97,12 @@ def _free(names: tuple[str, ...], held: tuple[str, ...]) -> Bool[np.ndarray, "en
     return np.array([name not in held for name in names], bool)
 
 
-def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable) -> State:
-    """The nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`."""
-    arguments = (scene, t, q, u, inputs, free_q, free_u, _usual(scene))
+def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable, determined: bool = False) -> State:
+    """The nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`.
+
+    `determined`: rows determine the speeds that are free.
+    """
+    arguments = (scene, t, q, u, inputs, free_q, free_u, _usual(scene, determined))
     if not nothing_is_traced() and is_traced(arguments):
         return _put_onto_constraints(*arguments, guesses()).state
     # numbers are put onto the rows at once, also where a function around this call is being traced; elsewhere that would compile constants one by one
@@ -131,19 +134,21 @@ class _Usual(eqx.Module):
     """Sizes by which rows and coordinates are measured, and of what kind rows are."""
 
     closures: Float[np.ndarray, "closures"]
-    rows: Float[np.ndarray, "rows"]
+    rows: Float[np.ndarray, "rows"]  # in scaled speeds; where rows determine the speeds that are free, in the speeds as they are
     width: Float[np.ndarray, "coordinates"]  # of the domain
     affine: bool = eqx.field(static=True)  # rows are, in the speeds
+    determined: bool = eqx.field(static=True)  # rows determine the speeds that are free
 
 
-def _worked_out(scene: Scene) -> _Usual:
+def _worked_out(scene: Scene, determined: bool) -> _Usual:
     low, high = coordinate_bounds(scene)
     width = np.where(high > low, high - low, 1.0).astype(real_type())
     try:
-        return _Usual(closure_lengths(scene), usual_rows(scene).lengths, width, rows_are_affine(scene))
+        rows = plain_row_lengths(scene) if determined else usual_rows(scene).lengths
+        return _Usual(closure_lengths(scene), rows, width, rows_are_affine(scene), determined)
     except ValueError:  # of a scene that is wrong in itself; said where its structure is asked for
         norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
-        return _Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, False)
+        return _Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, False, False)
 
 
 _usual = once_per_values(_worked_out, of_traced=_worked_out)
@@ -163,7 +168,7 @@ def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: 
         other_q, other = jax.lax.cond(eqxi.unvmap_any(lost), lambda: _searched(scene, t, q, free, usual, guesses), lambda: (near_q, guess))
         better = lost & (_left(scene, t, other_q) <= _left(scene, t, near_q))
         near_q, guess = jnp.where(better, other_q, near_q), jnp.where(better, other, guess)
-    near_u = project_speeds(scene, t, near_q, u, inputs, free=jnp.asarray(free_u), typical=usual.rows, affine=usual.affine)
+    near_u = project_speeds(scene, t, near_q, u, inputs, free=jnp.asarray(free_u), typical=usual.rows, affine=usual.affine, determined=usual.determined)
     left = jnp.concatenate([closure_residual(scene, t, near_q), velocity_residual(scene, t, near_q, near_u, inputs)])
     finite = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left])))
     moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
@@ -233,7 +238,9 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs: Float[Arra
         _check_finite({**values, "t0": t0})
     known = _structure(scene, t, q, free_q)
     free_u = _free(scene.speed_names.entries, (*given, *_resting(scene, known, given)))
-    state = _consistent(scene, t, q, u, _as_input_vector(scene, inputs, q.dtype), free_q, free_u, lambda: _guesses(scene, known, q, free_q))
+    determined = known.affine and not any(free_u[i] for i in known.independent)
+    guesses = lambda: _guesses(scene, known, q, free_q)  # noqa: E731
+    state = _consistent(scene, t, q, u, _as_input_vector(scene, inputs, q.dtype), free_q, free_u, guesses, determined)
     _check_residual(scene, state, inputs, given)
     return state
 
