@@ -209,7 +209,8 @@ class NormalForms:
             if square is None:
                 found = ((rest, 1.0),)
             else:
-                at, terms = rest.index(square), {}
+                terms: Polynomial = {}
+                at = rest.index(square)
                 rest = rest[:at] + rest[at + 2 :]
                 for n, c in self._squares[square].items():
                     for k, factor in self._reduced(tuple(sorted(rest + n))):
