@@ -25,7 +25,7 @@ from jourdain_jax.equations.projection import closure_residual, position_error_o
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs, inputs_at
-from jourdain_jax.motion.quick_compilation import nothing_is_traced, quickly_compiled
+from jourdain_jax.motion.quick_compilation import RUN_SELDOM, nothing_is_traced, quickly_compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
@@ -210,7 +210,7 @@ def _tolerance(dtype) -> float:
     return 1e3 * float(np.finfo(dtype).eps) ** 0.5
 
 
-_compiled_projection = quickly_compiled(_put_onto_constraints, run_seldom=True)  # one program for every choice of what is held
+_compiled_projection = quickly_compiled(_put_onto_constraints, options=RUN_SELDOM)  # one program for every choice of what is held
 _uncompiled_projection = eval_numpy(_put_onto_constraints)
 
 
