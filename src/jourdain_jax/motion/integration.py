@@ -9,19 +9,22 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
 
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.diffrax_steps import solved_by_diffrax
 from jourdain_jax.motion.energy_check import conserves, energies_near, energy_lost
 from jourdain_jax.motion.input_programs import for_programs
+from jourdain_jax.motion.inputs import inputs_at
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.solver_choice import marked_inputs, marked_outputs, time_origin
 from jourdain_jax.motion.own_steps import lanes_solved_by_own_steps, reason_against_machine_code, solved_by_own_steps
 from jourdain_jax.motion.quick_compilation import QUICK, RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.setup import Begun, Setup, Solved
 from jourdain_jax.motion.span import times_fit
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.start import State, consistent, moved_onto_rows
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import Integrated
@@ -31,12 +34,22 @@ from jourdain_jax.scene.scene import Scene
 
 def integrate(setup: Setup) -> Trajectory:
     """The motion of one setup."""
-    return _compiled(setup.inputs.programs)(setup)
+    run = _compiled(setup.inputs.programs)
+    motion, arrived = run(setup)
+    if setup.usual is None or np.asarray(arrived):
+        return motion
+    found = consistent(setup.scene, setup.t0, setup.start.q, setup.start.u, inputs_at(setup.inputs, setup.t0))  # by a search, which takes long to compile
+    return run(setup._replace(start=found, usual=None))[0]
 
 
-def _one_motion(setup: Setup) -> Trajectory:
+def _one_motion(setup: Setup) -> tuple[Trajectory, Bool[Array, ""]]:
+    """The motion, and whether its start came onto the rows."""
+    arrived = jnp.array(True)
+    if setup.usual is not None:
+        found = moved_onto_rows(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0), setup.usual)
+        setup, arrived = setup._replace(start=found.state, usual=None), found.arrived
     begun, fitting = _begin(setup), setup.fitting()
-    return _finish(setup, fitting, begun, _solved(fitting, begun))
+    return _finish(setup, fitting, begun, _solved(fitting, begun)), arrived
 
 
 def _compiler_options(setup: Setup) -> dict | None:
