@@ -3,8 +3,8 @@
     python bench/identification.py [--quick] [--only NAME ...] [--json FILE]
 
 Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), unstable (100 first guesses of a bicycle below its weave
-speed), chaotic (100 of a double pendulum, the run as a whole and in pieces), coverage, three (coverage of three models, unknown starts and sigmas, white
-noise and AR(1) noise), nuts (sampling by BlackJAX), disturbed (a motion with process noise), design (a start that tells more), windows (57 runs of the
+speed), chaotic (100 of a double pendulum, by growing spans and by multiple shooting), coverage, three (coverage of three models, unknown starts and sigmas,
+white noise and AR(1) noise), nuts (sampling by BlackJAX), disturbed (a motion with process noise), design (a start that tells more), windows (57 runs of the
 steer-by-wire bicycle with an unknown start each; the data are in `data/sbw_bicycle`), logs (what halves of these runs say of each other, with and without
 delays of the sensors, a lag of the motor and a memory of the noise). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves
 out windows and logs, with fewer repeats. Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
@@ -572,20 +572,49 @@ def unstable_run(seed: int) -> tuple[WhippleBicycle, jj.Measurements]:
     return guess, jj.Measurements(ts, values, sigma, start=begin, unknown_start=("lean", "lean_rate", "steer", "steer_rate"))
 
 
+def timed(*arguments, **options) -> tuple[jj.Fit, float]:
+    """A fit with its standard errors, and its processor time, s."""
+    begin = time.process_time()
+    found = jj.fit(*arguments, rtol=1e-8, atol=1e-8, **options)
+    found.standard_errors  # noqa: B018  (worked out when asked for)
+    return found, time.process_time() - begin
+
+
 def unstable(count: int) -> list[Figure]:
     """A roll inertia, the trail, a mass and four start values of a bicycle whose motion grows a hundredfold, from first guesses off by up to half."""
-    found = [jj.fit(*unstable_run(seed), ("IBxx", "c", "mB"), rtol=1e-8, atol=1e-8) for seed in range(count)]
-    least = min(float(one.chi_square) for one in found if np.isfinite(one.chi_square))
-    right = [bool(one.chi_square < least + 0.1) for one in found]
+    ways = {"growing": {}, "pieces": {"shooting": jj.MultipleShooting(duration=1.0)}}
+    fits = {way: [timed(*unstable_run(seed), ("IBxx", "c", "mB"), **how) for seed in range(count)] for way, how in ways.items()}
+    found = {way: [one for one, _ in some] for way, some in fits.items()}
+    least = min(float(one.chi_square) for some in found.values() for one in some if np.isfinite(one.chi_square))
+    right = {way: [bool(one.chi_square < least + 0.1) for one in some] for way, some in found.items()}
+    model = "bicycle at 3.6 m/s, 10 s"
     return [
-        figure("share of first guesses off by up to half that lead to the minimum", "bicycle at 3.6 m/s, 10 s", np.mean(right), 0.95, at_least=True),
+        figure("share of first guesses off by up to half that lead to the minimum", model, np.mean(right["growing"]), 0.95, at_least=True),
         figure(
             "share of them without growing spans (single shooting)",
-            "bicycle at 3.6 m/s, 10 s",
-            np.mean([x and not bool(y.grown) for x, y in zip(right, found, strict=True)]),
+            model,
+            np.mean([x and not bool(y.grown) for x, y in zip(right["growing"], found["growing"], strict=True)]),
         ),
-        figure("of the others, without a warning", "bicycle at 3.6 m/s, 10 s", sum(not x and not y.warning for x, y in zip(right, found, strict=True)), 0),
+        figure(
+            "share of them by multiple shooting, pieces of 1 s",
+            model,
+            np.mean([x and bool(y.converged) for x, y in zip(right["pieces"], found["pieces"], strict=True)]),
+            0.95,
+            at_least=True,
+        ),
+        figure(
+            "of the others, without a warning",
+            model,
+            sum(not x and not y.warning for way in ways for x, y in zip(right[way], found[way], strict=True)),
+            0,
+        ),
+        figure("time of a warm fit by multiple shooting over one by growing spans, medians", model, _warm(fits["pieces"]) / _warm(fits["growing"])),
     ]
+
+
+def _warm(fits: list[tuple[jj.Fit, float]]) -> float:
+    """The median time of all but the first."""
+    return float(np.median([seconds for _, seconds in fits[1:]]))
 
 
 # A chaotic double pendulum. --------------------------------------------------------------------------------------------
@@ -605,37 +634,37 @@ def chaotic_run(seed: int, span: float) -> tuple[jj.models.DoublePendulumAngles,
     return guess, true, jj.Measurements(ts, values, sigma, start=begin, unknown_start=tuple(begin))
 
 
-def in_pieces(run: jj.Measurements, samples: int) -> list[jj.Measurements]:
-    """The run as runs of so many intervals each, one after another, whose starts are unknown; first guesses of these from a parabola through five samples."""
-    ts, found = np.asarray(run.ts), []
-    for first in range(0, len(ts) - 1, samples):
-        part = slice(first, first + samples + 1)
-        t, begin = ts[part], {}
-        for name, x in run.values.items():
-            _, begin[f"{name}_rate"], begin[name] = np.polyfit(t[:5] - t[0], x[part][:5], 2)
-        pieces = {name: x[part] for name, x in run.values.items()}
-        found.append(jj.Measurements(t, pieces, dict(run.sigma), start=begin, unknown_start=dict.fromkeys(begin, jj.unbounded(1.0))))
-    return found
-
-
 def chaotic(count: int) -> list[Figure]:
-    """Whole runs of a chaotic double pendulum, by growing spans; and as pieces of half a second, whose starts are unknown."""
-    found = []
+    """Whole runs of a chaotic double pendulum, by growing spans and by multiple shooting."""
+    figures = []
     for span in (5.0, 10.0, 20.0):
-        whole, pieces, inside = [], [], []
+        whole, pieces, inside, apart = [], [], [], []
         for seed in range(count):
             guess, true, run = chaotic_run(seed, span)
-            one, cut = (jj.fit(guess, data, tuple(true), rtol=1e-8, atol=1e-8) for data in (run, in_pieces(run, 10)))
-            whole.append(bool(one.reduced_chi_square < 1.3))
-            pieces.append(bool(cut.converged and cut.reduced_chi_square < 1.3))
-            inside += [bool(cut[name].low < x < cut[name].high) for name, x in true.items()]
+            whole.append(timed(guess, run, tuple(true)))
+            one, seconds = timed(guess, run, tuple(true), shooting=jj.MultipleShooting(duration=0.5))
+            pieces.append((one, seconds))
+            inside += [bool(one[name].low < x < one[name].high) for name, x in true.items()]
+            apart.append(float(one.shooting.continuity))
         model = f"chaotic double pendulum, {span:g} s"
-        found += [
-            figure("share of first guesses off by up to half that lead to the minimum, the run as a whole", model, np.mean(whole)),
-            figure("the same, the run in pieces of 0.5 s with unknown starts", model, np.mean(pieces)),
+        figures += [
+            figure(
+                "share of first guesses off by up to half that lead to the minimum, by growing spans",
+                model,
+                np.mean([one.reduced_chi_square < 1.3 for one, _ in whole]),
+            ),
+            figure(
+                "the same, by multiple shooting in pieces of 0.5 s",
+                model,
+                np.mean([bool(x.converged and x.reduced_chi_square < 1.3) for x, _ in pieces]),
+                0.95,
+                at_least=True,
+            ),
             figure("95 % intervals of these that hold the truth", model, np.mean(inside)),
+            figure("largest jump between their pieces, tolerances of the simulation", model, max(apart), 1),
+            figure("time of a warm fit by multiple shooting over one by growing spans, medians", model, _warm(pieces) / _warm(whole)),
         ]
-    return found
+    return figures
 
 
 def main() -> None:

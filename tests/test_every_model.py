@@ -86,16 +86,16 @@ SLOW_BACKWARDS = {"whipple-bicycle"}  # a minute for the compiler
 
 
 def short_motion(name: str, *, projection: bool):
-    """`(x, reverse) -> q, u at the end of two steps`, where x holds parameters, speeds at the start and the end of the span; and x.
+    """`(x, reverse) -> q, u at the end of two steps`, where x holds parameters and speeds at the start; and x.
 
     Every step is accepted, whatever its error, and the first is shorter than half of the span: so the derivatives are those of the steps to round-off.
     """
     scene = MODELS[name]()
     start = jj.start(scene, **scene.example)
-    flat, unravel = ravel_pytree(({key: value for key, value, _ in parameters_of(scene)}, start.u, jnp.array(0.02)))
+    flat, unravel = ravel_pytree(({key: value for key, value, _ in parameters_of(scene)}, start.u))
 
     def end(x, reverse: bool):
-        parameters, u, duration = unravel(x)
+        parameters, u = unravel(x)
         options = {
             "rtol": 1e3,
             "atol": 1e3,
@@ -106,7 +106,7 @@ def short_motion(name: str, *, projection: bool):
         }
         adjoint = None if reverse else diffrax.ForwardMode()
         begun = eqx.tree_at(lambda s: s.u, start, u)
-        motion = jj.simulate(scene.replace(**parameters), begun, ts=start.t + duration[None], adjoint=adjoint, **options)
+        motion = jj.simulate(scene.replace(**parameters), begun, ts=start.t + jnp.array([0.02]), adjoint=adjoint, **options)
         return jnp.concatenate([motion.q_end, motion.u_end])
 
     return end, jnp.where(flat == 0, 0.01, flat)

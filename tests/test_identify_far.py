@@ -148,3 +148,26 @@ def test_an_unstable_motion_is_fitted_over_growing_spans(seed, monkeypatch):
     exact = jj.models.WhippleBicycle()
     for name in ("IBxx", "c", "mB"):
         assert abs(found[name].value - float(getattr(exact, name))) < 4 * found[name].standard_error
+
+
+class Resting(jj.Scene):
+    """A mass that stays where it is."""
+
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+
+@pytest.mark.parametrize(("curvature", "large"), [(3.0, 100.0), (5.0, 4.0)])
+def test_a_minimum_that_undamped_steps_overshoot_is_found(curvature, large):
+    """F = (x - 0.1)^2 + (R + a x^2 + a x^3 / 3)^2: at the minimum its second derivative is `curvature` times that of the linear problem."""
+    a = (curvature - 1) / 2 / large
+    sensors = {"curved": jj.Sensor(lambda motion: large + a * motion.q.x**2 + a * motion.q.x**3 / 3)}
+    run = jj.Measurements(jnp.ones(1), {"x": [0.1], "curved": [0.0]}, 1.0, start={"x": 0.3}, unknown_start=("x",), sensors=sensors, t0=0.0)
+    found = jj.fit(Resting(), run, ())
+    slope = np.polynomial.Polynomial([-0.1, 1.0]) + np.polynomial.Polynomial([large, 0.0, a, a / 3]) * np.polynomial.Polynomial([0.0, 2 * a, a])
+    least = min(slope.roots()[np.abs(slope.roots().imag) < 1e-9].real, key=abs)
+    assert found.converged
+    assert found.steps < 90
+    assert abs(found["run 0: x"].value - least) < 5e-4 * found["run 0: x"].standard_error

@@ -7,23 +7,27 @@ converged  the undamped step is at most `tolerance` standard errors long, |J d|,
            or a step is at whose end it will be a tenth of that, as far as it shrank from the last one to this one: the end is then known without evaluation
 
 Several problems of one shape (`members`) go side by side; those that have ended cost nothing.
-Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105.
+Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105; near the minimum slopes in place of values:
+W. W. Hager and H. Zhang, SIAM J. Optim. 16 (2005) 170.
 """
 
 import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow
+from jourdain_jax.analysis.joined import JoinedArrow
 
 FIRST, LEAST, MOST = 1e-3, 1e-9, 1e9  # damping lambda: at first, at least, and where no step is found
 FASTEST = 10.0  # factor by which damping falls after a good step
 _SURELY = 0.1  # times the tolerance: what the next step is to be below, where it is not looked at
 _SHORT, _FAST = 0.01, 0.1  # standard errors, of a step after which the next may be foretold; by what factor steps shrink then
+_ERROR = 1e-6  # relative, of F: smaller changes may be errors of the simulation
 _TINY = sys.float_info.min
 SLOW = 0.25  # of F: what it is to fall to
 RELEASES = 8  # times that unknowns which would pass a bound are put there and the others solved for again
@@ -34,7 +38,7 @@ class Linearised:
     """Value and slopes at some theta, of each member."""
 
     cost: Float[np.ndarray, "members"]  # F; not finite where the motion fails
-    arrow: Arrow  # J and residuals with J'r = dF/dtheta
+    arrow: Any  # J and residuals with J'r = dF/dtheta: an `Arrow`; a `JoinedArrow` where pieces of runs have gaps
     rows: np.ndarray  # (members, runs) of [J r] with the run's own unknowns first, (samples, width); None where another run had failed
     sigma: Float[np.ndarray, "members channels"]  # of channels whose noise is estimated
 
@@ -144,20 +148,21 @@ def minimise(
             break
         arrow, x = (at.arrow, theta) if going.size == count else (at.arrow.at(going), theta[going])
         size, damping = limits.size(x), np.array([paces[b].damping for b in going.tolist()])
-        scaling = _scaling(arrow, size)
-        d = _step(arrow, x, scaling, damping, limits, control.cutoff)
+        scaling = column_scaling(arrow, size)
+        d = damped_step(arrow, x, scaling, damping, limits, control.cutoff)
         change = arrow.change(d)
         done = _is_small(change, size, d, control)
         if True in done.tolist():
             if (done & (damping > LEAST)).any():
-                undamped = _step(arrow, x, scaling, np.full(going.size, LEAST), limits, control.cutoff)
+                undamped = damped_step(arrow, x, scaling, np.full(going.size, LEAST), limits, control.cutoff)
                 done &= _is_small(arrow.change(undamped), size, undamped, control)
             converged[going[done]] = True
             going, size, d, x, change, arrow = going[~done], size[~done], d[~done], x[~done], change[~done], arrow.at(~done)
             if not going.size:
                 break
         steps[going] += 1
-        promised = -np.sum(arrow.gradient * d, axis=1) - 0.5 * change
+        fall = -np.sum(arrow.gradient * d, axis=1)  # of F along the step, at its begin
+        promised = fall - 0.5 * change
         here = going.tolist()
         shrank = [paces[b].shrinkage(length) for b, length in zip(here, np.sqrt(change).tolist(), strict=True)]
         if min(shrank) < 1:
@@ -170,9 +175,11 @@ def minimise(
                     costs[b].append(float(at.cost[b]))
                 if not going.size:
                     break
-                d, x, promised, here = d[~last], x[~last], promised[~last], going.tolist()
+                d, x, fall, promised, here = d[~last], x[~last], fall[~last], promised[~last], going.tolist()
         trial = evaluate(x + d, going)
-        better = [paces[b].tried(costs[b][-1] - cost, by, control.tolerance) for b, cost, by in zip(here, trial.cost.tolist(), promised.tolist(), strict=True)]
+        slopes = 0.5 * (fall - np.sum(trial.arrow.gradient * d, axis=1))
+        of_each = zip(here, trial.cost.tolist(), promised.tolist(), slopes.tolist(), strict=True)
+        better = [paces[b].tried(costs[b][-1], cost, by, slope, control.tolerance) for b, cost, by, slope in of_each]
         chosen = np.array(better)
         theta[going[chosen]] = (x + d)[chosen]
         at = at.replaced(going, trial, chosen)
@@ -205,30 +212,35 @@ class _Pace:
             return 1.0
         return length / max(before[1], _TINY)
 
-    def tried(self, found: float, promised: float, tolerance: float) -> bool:
-        """Whether a step is taken that lowered F by `found` (not finite: the motion failed) where the linear problem `promised` so much."""
-        # near the minimum the simulation's own error decides whether F falls
-        level = promised < 100 * tolerance**2 and abs(found) < tolerance
-        if not (math.isfinite(found) and (found > 1e-4 * promised or level)):
+    def tried(self, before: float, after: float, promised: float, by_slopes: float, tolerance: float) -> bool:
+        """Whether a step is taken from F of `before` to `after` (not finite: the motion failed) where the linear problem `promised` it to fall by so much.
+
+        Near the minimum the simulation's own error decides whether F falls: it jumps where a motion takes one step more. There the slopes of F at both ends
+        of the step tell it to more digits: `by_slopes`.
+        """
+        found = before - after
+        if abs(found) < _ERROR * abs(before) or (promised < 100 * tolerance**2 and abs(found) < tolerance):
+            found = by_slopes
+        if not (math.isfinite(found) and found > 1e-4 * promised):
             # after a step that failed, damping falls slowly: in a curved valley every other step would fail
             self.damping, self.growth, self.fall, self.lengths = max(self.damping * self.growth, LEAST), 2 * self.growth, 2.0, ()
             return False
         ratio = found / max(promised, _TINY)
         # it rises where steps overshoot: where residuals stay large, undamped ones go to and fro along what shows least
         change = 1 / self.fall if ratio > 0.9 else 3.0 if ratio < 0.6 else 1.0
-        self.damping = LEAST if level else max(self.damping * change, LEAST)
+        self.damping = max(self.damping * change, LEAST)
         self.growth, self.fall = 4.0, min(1.5 * self.fall, FASTEST)
         return True
 
 
-def _scaling(arrow: Arrow, size: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members unknowns"]:
+def column_scaling(arrow: Arrow | JoinedArrow, size: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members unknowns"]:
     """D: lengths of the columns of J, and something positive for those that are zero."""
     norms = arrow.column_norms
     D = np.maximum(norms, 1e-8 * (norms * size).max(axis=1, keepdims=True) / size)
     return np.where(D > 0, D, 1.0)
 
 
-def _step(arrow: Arrow, theta, D, damping, limits: Limits, cutoff: float) -> np.ndarray:
+def damped_step(arrow: Arrow | JoinedArrow, theta, D, damping, limits: Limits, cutoff: float) -> np.ndarray:
     """The damped step within the bounds."""
     g = arrow.gradient
     held = limits.fixed | ((theta <= limits.low) & (g >= 0)) | ((theta >= limits.high) & (g <= 0))

@@ -157,7 +157,8 @@ def _damped(rows: _Rows, q: np.ndarray, which: np.ndarray) -> np.ndarray:
 
 def _damped_step(J: np.ndarray, f: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """`-J' (J J' + damping)^-1 f` at every state."""
-    system = J @ np.swapaxes(J, 1, 2) + damping[:, None, None] * np.eye(J.shape[1])
+    system, diagonal = J @ np.swapaxes(J, 1, 2), np.arange(J.shape[1])
+    system[:, diagonal, diagonal] += damping[:, None]
     return -np.einsum("smn,sm->sn", J, np.linalg.solve(system, f[..., None])[..., 0])
 
 

@@ -9,9 +9,9 @@ from numbers import Real
 import jax
 import numpy as np
 
-from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.build.reference_parameters import reference_parameters, with_reference_parameters
 from jourdain_jax.build.structure import decisions_of
-from jourdain_jax.scene.numbers import is_traced, real_type
+from jourdain_jax.scene.numbers import real_type
 from jourdain_jax.scene.scene import Scene
 
 
@@ -19,7 +19,7 @@ class Reference:
     """A scene whose numbers stand in for traced parameters of its class; a static argument of what is compiled.
 
     Two are equal where their scenes lead to the same decisions (`Structure.decisions`): then one program serves both. So what a call runs is decided by its own
-    arguments, and not by which call was the first. Of a scene that is traced itself, the class's defaults stand in, unless a call further out has said more.
+    arguments, and not by which call was the first. Of parameters that are traced already, the class's defaults stand in.
     """
 
     @staticmethod
@@ -35,17 +35,14 @@ class Reference:
             return Reference(scene)
 
     def __init__(self, scene: Scene):
-        self._scene = None if is_traced(scene) else scene
-        self._key = None if self._scene is None else (jax.tree.structure(scene), decisions_of(scene), jax.config.jax_enable_x64)
+        self._scene = with_reference_parameters(scene)
+        self._key = jax.tree.structure(scene), decisions_of(self._scene), jax.config.jax_enable_x64
 
     @contextmanager
     def stands_in(self) -> Iterator[None]:
         """Inside, its numbers stand in."""
-        if self._scene is None:
+        with reference_parameters(self._scene):
             yield
-        else:
-            with reference_parameters(self._scene):
-                yield
 
     def __hash__(self):
         return hash(self._key)

@@ -65,11 +65,11 @@ def applied(equation, inputs) -> list[np.ndarray]:
         return _while(equation, inputs)
     if name in _CONTROL:
         return _CONTROL[name](params, inputs)
-    if name in _ENTRYWISE:
-        with_type = _ENTRYWISE[name](*inputs)
+    if name in ENTRYWISE:
+        with_type = ENTRYWISE[name](*inputs)
         return [np.asarray(with_type, equation.outvars[0].aval.dtype)]
-    if name in _RULES and not any(params.get(flag) for flag in _WITHOUT_RULE):
-        result = _RULES[name](equation, *inputs)
+    if name in RULES and not any(params.get(flag) for flag in _WITHOUT_RULE):
+        result = RULES[name](equation, *inputs)
         if result is not None:
             return result if isinstance(result, list) else [result]
     with jax.ensure_compile_time_eval():
@@ -159,7 +159,7 @@ _CONTROL: dict[str, Callable] = {
 
 # Primitives.
 
-_ENTRYWISE: dict[str, Callable] = {
+ENTRYWISE: dict[str, Callable] = {
     **VALUES,
     "add_any": np.add,
     "square": np.square,
@@ -174,7 +174,7 @@ _ENTRYWISE: dict[str, Callable] = {
     "unvmap_any": np.any,
     "convert_element_type": lambda x: x,
 }
-del _ENTRYWISE["select"], _ENTRYWISE["round"]
+del ENTRYWISE["select"], ENTRYWISE["round"]
 
 
 def _round(equation, x):
@@ -309,7 +309,7 @@ def _reduced(function: Callable, of_nothing=None) -> Callable:
 
 
 _WITHOUT_RULE = ("conjugate_a",)  # variants of `triangular_solve` that are left to JAX
-_RULES: dict[str, Callable] = {
+RULES: dict[str, Callable] = {
     "dot_general": _dot_general,
     "broadcast_in_dim": _broadcast_in_dim,
     "reshape": lambda e, x, *_: x.reshape(e.outvars[0].aval.shape),

@@ -17,11 +17,12 @@ from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.build.trace import event_values, named_values, traced_scene
 from jourdain_jax.dynamics.accelerations import bare_accelerations
 from jourdain_jax.eager.eager import eval_numpy
+from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import minimal_accelerations
-from jourdain_jax.equations.reductions import NullSpaceQR
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT, NullSpaceQR
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
-from jourdain_jax.lowering.elimination import pivots_ok
+from jourdain_jax.lowering.elimination import pivots_ok, usual
 from jourdain_jax.lowering.far import full_turns, on_velocity_rows
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered import Lowered, Stage
@@ -29,7 +30,7 @@ from jourdain_jax.lowering.massless import may_be_massless
 from jourdain_jax.lowering.mismatch import diagnose_mismatch
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
-from jourdain_jax.program.identity_test import IdentityProbes, equal
+from jourdain_jax.program.identity_test import IdentityProbes, alike, equal
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -44,6 +45,7 @@ MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
 LARGE = 5000  # operations: above, fewer ways are tried, and fewer probes compared with the dense path
 FEW = 6  # of these probes
+CLEARLY = 100.0  # times as large as the smallest pivot that serves: one that serves whatever is usual
 TO_DENSE = {"float64": 1e-8, "float32": 1e-3}  # between the program (in double precision) and the dense path at the probes, relative to the size of each rate
 AGREEMENT = 1e-9  # between programs at the probes, relative to the size of each rate
 SHARED = 0.01  # of these, relative to the largest rate at a probe, whose round-off elimination spreads over all
@@ -238,9 +240,8 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
     q, u, inputs = (np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0)) for p, n in zip("qui", sizes, strict=True))
     usable = np.all(np.isfinite(values), axis=0)
     large = builder.graph.operations(_rates(found)) > LARGE
-    alone = large or bool(builder.graph.calls(_rates(found)))  # callbacks may know no batches
     chosen = np.flatnonzero(usable)[:FEW] if large else np.arange(probes.count)
-    *dense, dense_events = _dense_rates(independent, bool(builder.dependent), alone)(*jax.tree.map(lambda x: x[chosen], (parameters, t, q, u, inputs)))
+    *dense, dense_events = _dense_rates(independent, bool(builder.dependent))(*jax.tree.map(lambda x: x[chosen], (parameters, t, q, u, inputs)))
     expected, values = np.concatenate(dense, axis=1).T, values[:, chosen]
     names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in independent)]
     usable = usable[chosen] & np.all(np.isfinite(expected), axis=0)
@@ -257,29 +258,19 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
 
 
 @lru_cache(maxsize=64)
-def _dense_rates(independent: tuple[int, ...], eliminates: bool, one_by_one: bool):
-    """`(scene, t, q, u, inputs) -> qdot, ydot, event values` by dense matrices, for many states and parameters, uncompiled.
-
-    `one_by_one`: what JAX traces serves one state at a time, which halves the time that tracing takes.
-    """
+def _dense_rates(independent: tuple[int, ...], eliminates: bool):
+    """`(scene, t, q, u, inputs) -> qdot, ydot, event values` by dense matrices, for many states and parameters, uncompiled."""
     columns = np.array(independent, np.int32)  # also for a precision that is switched afterwards
 
-    def one(scene, t, q, y, inputs):
+    def one(scene, t, q, u, inputs):
+        y = u[columns]
         if eliminates:
             _, motion, found = minimal_accelerations(scene, independent, t, q, y, inputs)
         else:
             motion, found = motion_at(scene, t, q, y, inputs), bare_accelerations(scene, t, q, y, inputs, reduction=NullSpaceQR())
         return motion.qdot.array, found.udot[columns], event_values(scene, motion)
 
-    if not one_by_one:
-        return eval_numpy(lambda scene, t, q, u, inputs: jax.vmap(one)(scene, t, q, u[:, columns], inputs))
-    single = eval_numpy(one)
-
-    def each(scene, t, q, u, inputs):
-        found = [single(jax.tree.map(lambda x, k=k: x[k], scene), t[k], q[k], u[k, columns], inputs[k]) for k in range(len(t))]
-        return jax.tree.map(lambda *x: np.stack(x), *found)
-
-    return each
+    return eval_numpy(one, uncompiled_lanes)
 
 
 def _rates(found: Equations) -> list[int]:
@@ -337,13 +328,28 @@ def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expec
         elsewhere = generic.exchanged([f"q_{i}" for i in group])
         return bool(np.all(equal(elsewhere(equations.ydot), here, regular & pivots_ok(equations.pivots, elsewhere))))
 
+    def surely_changed(groups) -> np.ndarray:
+        """Which groups a few probes show to count, those of all groups evaluated together: in a long chain nearly all do."""
+        at = np.flatnonzero(regular)[:FEW]
+        if len(groups) < FEW or not at.size or builder.graph.calls(equations.ydot):
+            return np.zeros(len(groups), bool)
+        elsewhere = generic.exchanged_in_turn([[f"q_{i}" for i in group] for group in groups], at)
+        then, lanes = elsewhere(equations.ydot), np.tile(at, len(groups))
+        before = here[:, lanes]
+        before.error = here.error[:, lanes]
+        sizes = np.abs(elsewhere(equations.pivots))
+        far_from_singular = np.all(sizes > CLEARLY * SMALLEST_PIVOT * usual(np.abs(generic(equations.pivots)))[:, None], axis=0)
+        return np.any(~alike(then, before, far_from_singular), axis=0).reshape(len(groups), -1).any(axis=1)
+
     def regular_at_reference(group) -> bool:
         values = _values(accelerations, probes.with_inputs({f"q_{i}": np.full(probes.count, reference[i]) for i in group}))
         return _enough(np.all(np.isfinite(values) & np.isfinite(at_probes), axis=0))
 
-    held: list[int] = []
-    for group in [*single, *attitudes]:
-        if used.isdisjoint(q[list(group)].tolist()) or (unchanged(group) and regular_at_reference(group)):
+    groups = [*single, *attitudes]
+    held = [i for group in groups if used.isdisjoint(q[list(group)].tolist()) for i in group]
+    groups = [group for group in groups if group[0] not in held]
+    for group, counts in zip(groups, surely_changed(groups), strict=True):
+        if not counts and unchanged(group) and regular_at_reference(group):
             held += group
     return tuple(sorted(held))
 

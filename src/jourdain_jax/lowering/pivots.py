@@ -52,6 +52,8 @@ class Pivots:
         self._given = [list(row) for row in A]
         self._tall = len(self.rows) > len(self.columns)
         self._sizes: dict[int, np.ndarray] = {}  # of what a row was made of
+        self._entries: dict[int, list[int]] = {}  # columns of a row that hold something
+        self._determinants: dict[tuple[int, int, int, int], int | None] = {}  # of two rows and columns, where it serves as a pivot
         self._combined: list[Pivot] = []  # by columns, since a determinant is known
         self._determinant: int | None = None
 
@@ -67,16 +69,23 @@ class Pivots:
                     continue
                 if self._tall:
                     self._sizes[other] = self._size(other) + np.abs(self._at([factor])[0]) * self._size(r)
-                for k in (k for k in self.columns if A[r][k] != graph.zero):
+                for k in self._in_row(r):
                     A[other][k] = graph.sub(A[other][k], graph.mul(factor, A[r][k]))
+                self._entries.pop(other, None)
                 self.right[other] = [graph.sub(a, graph.mul(factor, b)) for a, b in zip(self.right[other], self.right[r], strict=True)]
+
+    def _in_row(self, row: int) -> list[int]:
+        """The columns left in which a row holds something, in order."""
+        if row not in self._entries:
+            self._entries[row] = [k for k, n in enumerate(self.A[row]) if n != self.graph.zero]
+        return [k for k in self._entries[row] if k in self.columns]
 
     def best(self) -> Pivot:
         """The next pivot. Rows may be combined for it."""
         graph, A, rows = self.graph, self.A, self.rows
         if self._determinant is not None:
             return self._by_column(None)
-        places = [(r, c) for r in sorted(rows) for c in sorted(self.columns) if A[r][c] != graph.zero]
+        places = [(r, c) for r in sorted(rows) for c in self._in_row(r)]
         if not places:
             raise ZeroDivisionError("the rows are dependent")
         nodes = [A[r][c] for r, c in places]
@@ -164,15 +173,20 @@ class Pivots:
 
     def _best_pair(self) -> Pivot | None:
         """Two rows and columns whose determinant depends on parameters alone, with the least fill-in; None where there are none."""
-        graph, A, probes = self.graph, self.A, self.probes
-        used = {r: {c for c in self.columns if A[r][c] != graph.zero} for r in self.rows}
-        users = {c: [r for r in sorted(self.rows) if c in used[r]] for c in self.columns}
+        graph, A = self.graph, self.A
+        used = {r: set(self._in_row(r)) for r in self.rows}
+        users: dict[int, list[int]] = {c: [] for c in self.columns}
+        for r in sorted(self.rows):
+            for c in used[r]:
+                users[c].append(r)
         found = []
         for r, s in sorted({pair for c in self.columns for pair in combinations(users[c], 2)}):
             for c, d in combinations(sorted(used[r] & used[s]), 2):
-                both = graph.mul(A[r][c], A[s][d]), graph.mul(A[r][d], A[s][c])
-                determinant = self.forms.simplified(graph.sub(*both))
-                if not graph.varies[determinant] and np.all(np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(both)), axis=0)):
+                entries = A[r][c], A[s][d], A[r][d], A[s][c]
+                if entries not in self._determinants:
+                    self._determinants[entries] = self._determinant_of(*entries)
+                determinant = self._determinants[entries]
+                if determinant is not None:
                     fill = (len(used[r] | used[s]) - 2) * len({*users[c], *users[d]} - {r, s})
                     found.append((fill, r, s, c, d, determinant))
         if not found:
@@ -180,6 +194,14 @@ class Pivots:
         _, r, s, c, d, determinant = min(found)
         over = [graph.div(n, determinant) for n in (A[s][d], A[r][d], A[s][c], A[r][c])]
         return Pivot((r, s), (c, d), ((over[0], graph.neg(over[1])), (graph.neg(over[2]), over[3])), determinant)
+
+    def _determinant_of(self, a: int, b: int, c: int, d: int) -> int | None:
+        """a b - c d, where it depends on parameters alone and is not small; None otherwise."""
+        graph, probes = self.graph, self.probes
+        both = graph.mul(a, b), graph.mul(c, d)
+        determinant = self.forms.simplified(graph.sub(*both))
+        serves = not graph.varies[determinant] and np.all(np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(both)), axis=0))
+        return determinant if serves else None
 
     # rows combined
 
@@ -241,6 +263,7 @@ class Pivots:
             row[r] = [self.forms.simplified(graph.add(graph.mul(first, x), graph.mul(second, y))) for x, y in pairs]
             row[s] = [self.forms.simplified(graph.sub(graph.mul(b, x), graph.mul(a, y))) for x, y in pairs]
         A[r][c], A[s][c] = squares, graph.zero
+        self._entries.clear()
         return self._single(r, c, graph.call("sqrt", squares))
 
     def _orthogonal(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
@@ -260,6 +283,7 @@ class Pivots:
                 row[r] = [self.forms.simplified(graph.sub(x, graph.mul(factor, p))) for x, p in zip(row[r], row[new], strict=True)]
             A[r][c] = graph.zero
         A[new][c] = squares
+        self._entries.clear()
         self.rows.add(new)
         self._tall = True
         return self._single(new, c, graph.call("sqrt", squares))

@@ -49,19 +49,20 @@ class Probes:
             longer = np.empty((2 * (len(row) + len(wanted)), self.count))
             longer[: len(row)] = self._table[: len(row)]
             self._table = longer
-        table = self._table
+        table, functions, place = self._table, self._functions, len(row) - 1
         with np.errstate(all="ignore"):
             for node in wanted:
-                op, place = graph.op[node], len(row)
-                if op in ARRAYS:
+                op = graph.op[node]
+                place += 1
+                if op in functions:
+                    table[place] = functions[op](*[table[row[a]] for a in graph.args[node]])
+                elif op in ARRAYS:
                     args = [self._arrays[a] if graph.op[a] in ARRAYS else table[row[a]] for a in graph.args[node]]
                     self._arrays[node] = self._of_arrays[op](graph.value[node], *args)
                 elif op == "entry":
                     table[place] = self._of_arrays[op](graph.value[node], self._arrays[graph.args[node][0]])
                 elif op == "const":
                     table[place] = self._constant(graph.value[node])
-                elif op == "input":
+                else:  # an input
                     table[place] = self.inputs[graph.value[node]]
-                else:
-                    table[place] = self._functions[op](*(table[row[a]] for a in graph.args[node]))
                 row[node] = place

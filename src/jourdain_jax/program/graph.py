@@ -104,7 +104,10 @@ class Graph:
 
     def _without_wave(self, a: int, b: int) -> int | None:
         """x of a = sin(w)^2 x, b = cos(w)^2 x or the reverse; None where the products are not of this kind."""
-        left, right = Counter(self._factors(a)), Counter(self._factors(b))
+        factors = self._factors(a), self._factors(b)
+        if len(factors[0]) != len(factors[1]):
+            return None
+        left, right = map(Counter, factors)
         more, less = left - right, right - left
         if len(more) != 1 or len(less) != 1:
             return None
@@ -301,12 +304,12 @@ class Graph:
     def needed(self, outputs: Iterable[int], known) -> list[int]:
         """What must be computed for the outputs where the nodes in `known` are known, in order."""
         seen: set[int] = set()
-        stack = [n for n in outputs if n not in known]
+        stack, args = list(outputs), self.args
         while stack:
             node = stack.pop()
-            if node not in seen:
+            if node not in seen and node not in known:
                 seen.add(node)
-                stack.extend(a for a in self.args[node] if a not in known)
+                stack += args[node]
         return sorted(seen)  # arguments are older than what uses them
 
     def fixed(self, outputs: Iterable[int]) -> tuple[int, ...]:

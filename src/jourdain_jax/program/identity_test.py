@@ -40,11 +40,11 @@ class Bounded(np.ndarray):
 class IdentityProbes:
     """Values of the nodes of a graph at generic inputs, with bounds of their round-off."""
 
-    def __init__(self, graph: Graph, inputs: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray | float]):
+    def __init__(self, graph: Graph, inputs: Mapping[str, np.ndarray], errors: Mapping[str, np.ndarray | float], radix: np.ndarray | None = None):
         self.graph, self.inputs, self._errors = graph, dict(inputs), dict(errors)
         self.count = max((np.size(x) for x in self.inputs.values()), default=1)
         both = {name: np.concatenate([np.broadcast_to(x, self.count), np.broadcast_to(self._errors.get(name, 0.0), self.count)]) for name, x in inputs.items()}
-        radix = np.random.default_rng(4).uniform(*RADIX, self.count)
+        self._radix = radix = np.random.default_rng(4).uniform(*RADIX, self.count) if radix is None else radix
         # the bounds follow the values in one array, as if they were further probes
         self._both = Probes(graph, both, _SCALARS, _ARRAYS, lambda value: _moderate(value, radix))
 
@@ -67,16 +67,30 @@ class IdentityProbes:
 
         return self.with_inputs({name: next_one(self.inputs[name]) for name in names}, {name: next_one(self._errors.get(name, 0.0)) for name in names})
 
+    def exchanged_in_turn(self, groups: Sequence[Collection[str]], at: np.ndarray) -> Self:
+        """The probes numbered `at` as `exchanged` makes them, group of names after group."""
+
+        def in_turn(name, x):
+            x = np.broadcast_to(x, self.count)
+            return np.concatenate([(np.roll(x, 1) if name in group else x)[at] for group in groups])
+
+        inputs = {name: in_turn(name, x) for name, x in self.inputs.items()}
+        return type(self)(self.graph, inputs, {name: in_turn(name, x) for name, x in self._errors.items()}, np.tile(self._radix[at], len(groups)))
+
 
 def equal(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
     """Of each pair of rows, values of expressions at generic probes, whether they are equal but for round-off, at those that are `regular`."""
+    finite = np.isfinite(SURE * (a.error + b.error)) & regular & np.isfinite(np.asarray(b))
+    return np.all(alike(a, b, regular), axis=1) & (np.count_nonzero(finite, axis=1) >= FEWEST)
+
+
+def alike(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
+    """Whether no probe tells values from each other, of each pair of rows at each of the probes."""
     bound = SURE * (a.error + b.error)
     said = np.isfinite(bound) & regular
     a, b = np.asarray(a), np.asarray(b)
-    finite = said & np.isfinite(b)
     with np.errstate(invalid="ignore"):
-        alike = (a == b) | (np.abs(a - b) <= bound) | ~said | ~(np.isfinite(b) | np.isfinite(a))
-    return np.all(alike, axis=1) & (np.count_nonzero(finite, axis=1) >= FEWEST)
+        return (a == b) | (np.abs(a - b) <= bound) | ~said | ~(np.isfinite(b) | np.isfinite(a))
 
 
 def unaffected(probes: IdentityProbes, nodes: list[int], replacement: Mapping[int, int]) -> dict[int, int]:

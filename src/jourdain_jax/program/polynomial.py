@@ -39,6 +39,8 @@ class NormalForms:
         self._expanded: dict[int, Polynomial | None] = {graph.zero: {}}
         self._squares: dict[int, Polynomial] = dict(squares or {})
         self._simplified: dict[int, int] = {}
+        self._reductions: dict[Monomial, tuple[tuple[Monomial, float], ...]] = {}
+        self._known_squares = -1  # how many the reductions are made with
 
     def simplified(self, node: int) -> int:
         """The node in normal form where that takes fewer operations, otherwise the node with its parts simplified."""
@@ -183,21 +185,39 @@ class NormalForms:
         """p q, with squares replaced."""
         if len(p) * len(q) > 8 * self.most_terms:
             raise TooLarge
+        if self._known_squares != len(self._squares):
+            self._known_squares = len(self._squares)
+            self._reductions.clear()
         result: Polynomial = {}
+        reductions = self._reductions
         for m, a in p.items():
             for n, b in q.items():
-                monomial = self._cancelled(tuple(sorted(m + n))) if m and n else m or n
-                square = next((x for x, y in itertools.pairwise(monomial) if x == y and x in self._squares), None)
-                if square is None:
-                    _put(result, monomial, a * b)
-                else:
-                    at = monomial.index(square)
-                    rest: Polynomial = {monomial[:at] + monomial[at + 2 :]: a * b}
-                    for k, c in self.product(rest, self._squares[square]).items():
-                        _put(result, k, c)
+                monomial = tuple(sorted(m + n)) if m and n else m or n
+                c, found = a * b, reductions.get(monomial)
+                for k, factor in self._reduced(monomial) if found is None else found:
+                    _put(result, k, c * factor)
         if len(result) > self.most_terms:
             raise TooLarge
         return result
+
+    def _reduced(self, monomial: Monomial) -> tuple[tuple[Monomial, float], ...]:
+        """The terms of a monomial with squares replaced and without pairs x, 1/x; kept until further squares are known."""
+        found = self._reductions.get(monomial)
+        if found is None:
+            rest = self._cancelled(monomial)
+            square = next((x for x, y in itertools.pairwise(rest) if x == y and x in self._squares), None)
+            if square is None:
+                found = ((rest, 1.0),)
+            else:
+                terms: Polynomial = {}
+                at = rest.index(square)
+                rest = rest[:at] + rest[at + 2 :]
+                for n, c in self._squares[square].items():
+                    for k, factor in self._reduced(tuple(sorted(rest + n))):
+                        _put(terms, k, c * factor)
+                found = tuple(terms.items())
+            self._reductions[monomial] = found
+        return found
 
     def _cancelled(self, monomial: Monomial) -> Monomial:
         """Without pairs x, 1/x."""
