@@ -167,8 +167,8 @@ def yet_to_be_moved(scene: Scene, start: State) -> Usual:
 
 def moved_onto_rows(scene: Scene, t, start: State, inputs, usual: Usual) -> Found:
     """The state on the rows nearest to `start`, by Newton's method alone, as a part of a larger compiled function."""
-    every = (np.ones(names.shape, bool) for names in (start.q, start.u))
-    return _put_onto_constraints(scene, t, start.q, start.u, inputs, *every, usual, None)
+    every_q, every_u = np.ones(start.q.shape, bool), np.ones(start.u.shape, bool)
+    return _put_onto_constraints(scene, t, start.q, start.u, inputs, every_q, every_u, usual, None)
 
 
 def _can_search(scene: Scene) -> bool:
