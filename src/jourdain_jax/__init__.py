@@ -40,6 +40,7 @@ from jourdain_jax.analysis.planning import PlannedInformation, planned_informati
 from jourdain_jax.analysis.ranges import bounds, positive, unbounded
 from jourdain_jax.analysis.report import Report, report
 from jourdain_jax.analysis.sensors import Actuator, Sensor
+from jourdain_jax.analysis.shooting import MultipleShooting
 from jourdain_jax.analysis.steady import SteadyMotion, steady
 from jourdain_jax.analysis.verification import Verification
 from jourdain_jax.analysis.verify import verify
@@ -147,6 +148,7 @@ __all__ = [
     "Lowered",
     "MeanGradients",
     "Measurements",
+    "MultipleShooting",
     "Multipliers",
     "MuntheKaas",
     "Normal",

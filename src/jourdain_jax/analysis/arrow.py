@@ -124,11 +124,7 @@ class Arrow:
         if m:
             upper, rest = eliminated(local, np.sqrt(damping)[:, None, None] * D_l)
             shared = np.concatenate([shared, rest], axis=1)
-        # in unknowns times D, by singular values: (S^2 + lambda) ds = - S U' c
-        U, S, Vt = np.linalg.svd(shared[..., :-1] / D_s[:, None], full_matrices=False)
-        shows = S[:, :1] * cutoff < S  # the first is the largest
-        weight = np.where(shows, S / (S**2 + damping[:, None] + ~shows), 0.0)
-        ds = -((weight * (shared[:, None, :, -1] @ U)[:, 0])[:, None] @ Vt)[:, 0] / D_s
+        ds = by_singular_values(shared, D_s, damping, cutoff)
         if m:
             right = -(upper[..., -1:] + upper[..., m:-1] @ ds[:, None, :, None])
             ds = np.concatenate([ds, np.linalg.solve(upper[..., :m], right).reshape(len(ds), -1)], axis=1)
@@ -159,6 +155,14 @@ def eliminated(local: np.ndarray, below: Float[np.ndarray, "members runs local"]
     added = np.concatenate([below[..., None] * np.eye(m), np.zeros((members, runs, m, width - m))], axis=-1)
     R = np.linalg.qr(np.concatenate([local, added], axis=2), mode="r")
     return R[:, :, :m], R[:, :, m:, m:].reshape(members, -1, width - m)
+
+
+def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: Float[np.ndarray, "members"], cutoff: float) -> Float[np.ndarray, "members shared"]:
+    """The damped step of the shared unknowns, in unknowns times D: (S^2 + lambda) ds = - S U' c; what does not show stays as it is."""
+    U, S, Vt = np.linalg.svd(shared[..., :-1] / D[:, None], full_matrices=False)
+    shows = S[:, :1] * cutoff < S  # the first is the largest
+    weight = np.where(shows, S / (S**2 + damping[:, None] + ~shows), 0.0)
+    return -((weight * (shared[:, None, :, -1] @ U)[:, 0])[:, None] @ Vt)[:, 0] / D
 
 
 def arrow(triangles: Float[np.ndarray, "members runs width width"], local: int) -> Arrow:

@@ -12,8 +12,10 @@ from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearise
 from jourdain_jax.analysis.likelihood import as_runs
 from jourdain_jax.analysis.losses import Loss
 from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
+from jourdain_jax.analysis.shooting import MultipleShooting
 from jourdain_jax.analysis.unknowns import unknowns_of
 from jourdain_jax.scene.scene import Scene
 
@@ -29,6 +31,7 @@ class Asked:
     simulation: dict
     loss: Loss
     control: Control
+    shooting: MultipleShooting | None
 
 
 @dataclass
@@ -63,23 +66,30 @@ class TakenUp:
 
 def taken_up(fit, data: Measurements | Sequence[Measurements]) -> TakenUp:
     """A `Fit` of one experiment where it ended, with residuals and derivatives computed anew. ValueError where `data` are not what it was fitted to."""
-    again = for_runs(fit, data)
+    again = for_runs(fit, data, fitted=True)
     unknowns = again.problem.unknowns
     if unknowns.labels != fit.labels:
         raise ValueError(f"`data` have the unknowns {', '.join(unknowns.labels)}, expected those of the fit: {', '.join(fit.labels)}")
     again.theta[0, unknowns.estimated] = fit.values
+    if isinstance(again.problem.lanes, Piecewise):
+        again.problem.lanes.put_nodes(again.theta, fit.shooting)
     pairs = [(np.nan_to_num(r), np.nan_to_num(again.residuals(run).get(name, np.nan))) for run, of in enumerate(fit.residuals) for name, r in of.items()]
     if not all(a.shape == b.shape and np.max(np.abs(a - b), initial=0.0) < _SAME for a, b in pairs):
         raise ValueError("`data` are not those of the fit: its residuals are others there; give the runs that it was fitted to")
     return again
 
 
-def for_runs(fit, runs: Measurements | Sequence[Measurements]) -> TakenUp:
-    """The problem of a `Fit` for these runs, at the first guesses; ValueError where they do not fit the scene."""
+def for_runs(fit, runs: Measurements | Sequence[Measurements], fitted: bool = False) -> TakenUp:
+    """The problem of a `Fit` for these runs, at the first guesses; ValueError where they do not fit the scene.
+
+    `fitted`: they are those of the fit, in pieces where it was found so.
+    """
     asked = fit.asked
     checked = as_runs(asked.scene, runs)
     unknowns = unknowns_of(asked.scene, checked, asked.free)
-    problem = Problem(asked.scene, checked, unknowns, Lanes(asked.scene, checked, unknowns.layout, asked.simulation, None), asked.loss)
+    of_runs = asked.scene, checked, unknowns.layout, asked.simulation, None
+    lanes = Piecewise(*of_runs, unknowns, asked.shooting) if fitted and asked.shooting is not None else Lanes(*of_runs)
+    problem = Problem(asked.scene, checked, unknowns, lanes, asked.loss)
     if problem.with_memory:
         problem.tau = np.array([[float(fit.correlation_time[name]) for name in problem.with_memory]])
     return TakenUp(asked, problem, unknowns.guess[None].copy(), Limits(*unknowns.ends, unknowns.fixed.copy(), unknowns.sizes))

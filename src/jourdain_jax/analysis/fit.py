@@ -20,10 +20,13 @@ from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, 
 from jourdain_jax.analysis.likelihood import as_runs
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.piecewise import Piecewise, Shot
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.profile import limits_at_bounds
 from jourdain_jax.analysis.ranges import Range
+from jourdain_jax.analysis.shooting import MultipleShooting, check_shooting
+from jourdain_jax.analysis.shooting_steps import cutoff_of, shot
 from jourdain_jax.analysis.starts import check_first_guess, check_starts
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.calculus.guards import DifferentiationModeError
@@ -57,6 +60,7 @@ def fit(
     loss: Loss | None = None,
     errors: str = "sigmas",
     guesses: int = 1,
+    shooting: MultipleShooting | None = None,
     **simulation,
 ) -> Fit:
     """Estimate the `free` parameters of a scene, unknown initial values of its runs and numbers of their sensors, from measurements.
@@ -76,12 +80,14 @@ def fit(
       (the sandwich of clusters, which needs five runs or more), which holds whatever the noise within a run, also where the scene is not quite right.
     - `guesses`: how many first guesses are tried side by side: that of the scene and the runs, and others on a Latin hypercube over the bounds of all
       unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` says how many led to it.
+    - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with
+      starts of their own, and continuity between them is an equation. What is minimised stays the same.
     - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events are ignored.
 
-    Where that finds no minimum, or one whose residuals are far beyond their sigmas, the fit is made once more over growing spans: the first 1/32 of each
-    run, then more of it, as far as the motion that was found follows the data, with the first guess as a weak prior (known to its own size). So unstable
-    motions are fitted
-    that no first guess would follow to their end. The lower minimum counts, and `Fit.grown` says which one it was.
+    Where that finds no minimum, or one whose residuals are far beyond their sigmas, the fit is made once more over growing spans (unless `shooting` is
+    given): the first 1/32 of each run, then more of it, as far as the motion that was found follows the data, with the first guess as a weak prior (known to
+    its own size). So unstable motions are fitted that no first guess would follow to their end. The lower minimum counts, and `Fit.grown` says which one it
+    was.
 
     **Returns** a `Fit`: estimates with covariance and 95 % intervals (sigmas that were given are taken as known), residuals, the fitted
     scene, and in words what the measurements cannot tell. An unknown at its bound has a one-sided interval, by profile likelihood. `converged` is False
@@ -102,7 +108,7 @@ def fit(
     """
     if isinstance(guesses, bool) or not isinstance(guesses, int | np.integer) or guesses < 1:
         raise ValueError(f"`guesses` is {guesses!r}, expected a whole number of at least 1: how many first guesses to begin from")
-    return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, repeats=False, guesses=int(guesses))
+    return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, False, int(guesses), shooting)
 
 
 def fit_batch(
@@ -123,10 +129,10 @@ def fit_batch(
     `max_iterations`, `loss`, `errors` and `simulation` as in `fit`. **Returns** a `Fit` whose arrays have the leading axis; a repeat that fails has
     `converged` False and harms no other. **Raises** as `fit`.
     """
-    return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, repeats=True)
+    return _fit(scene, data, free, simulation, Control(tolerance, max_iterations, cutoff), loss, errors, True)
 
 
-def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | None, errors: str, repeats: bool, guesses: int = 1) -> Fit:
+def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | None, errors: str, repeats: bool, guesses: int = 1, shooting=None) -> Fit:
     scene = as_scene(scene)
     if is_traced((scene, data, control.tolerance, control.cutoff, simulation)):
         raise DifferentiationModeError(
@@ -135,21 +141,34 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
         )
     runs = as_runs(scene, data, repeats=repeats)
     _check_choices(runs, loss, errors)
+    check_shooting(shooting, runs)
     free = free if isinstance(free, Mapping) else tuple(as_names(free))
     unknowns = unknowns_of(scene, runs, free)
     check_starts(scene, runs, unknowns)
     members = _repeats(runs) if repeats else None
     _check_enough(runs, unknowns, repeats)
-    asked = Asked(scene, free, simulation, loss or LEAST_SQUARES, control)
-    problem = Problem(scene, runs, unknowns, Lanes(scene, runs, unknowns.layout, simulation, members), asked.loss)
+    asked = Asked(scene, free, simulation, loss or LEAST_SQUARES, control, shooting)
+    of_runs = scene, runs, unknowns.layout, simulation, members
+    pieces = None if shooting is None else Piecewise(*of_runs, unknowns, shooting)
+    problem = Problem(scene, runs, unknowns, Lanes(*of_runs) if pieces is None else pieces, asked.loss)
     theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
     limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
-    found = _minimum(problem, theta, limits, control, one_will_do=members is None)
+    if pieces is None:
+        found = _minimum(problem, theta, limits, control, one_will_do=members is None)
+    else:
+        found = shot(problem, pieces, theta, limits, control)
     if not all(np.isfinite(trace[0][1][0]) for trace in found.trace):
         check_first_guess(scene, runs, unknowns)
     same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
+    if pieces is not None and not members:
+        pieces.keep(int(np.argmin(found.at.cost)))
+    if pieces is not None:
+        control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.theta))))
+        asked = replace(asked, control=control)
     found = _with_memory(problem, found if members else found.lowest(), limits, control)
-    return _result(problem, found, limits, asked, errors, guesses, same)
+    if pieces is not None:
+        found.converged &= pieces.closed(np.arange(len(found.converged)))
+    return _result(problem, found, limits, asked, errors, guesses, same, None if pieces is None else pieces.told())
 
 
 def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
@@ -253,7 +272,7 @@ def _check_enough(runs: Sequence[Measurements], unknowns: Unknowns, repeats: boo
         )
 
 
-def _result(problem: Problem, found: Minimum, limits: Limits, asked: Asked, errors: str, guesses: int, agreeing: np.ndarray) -> Fit:
+def _result(problem: Problem, found: Minimum, limits: Limits, asked: Asked, errors: str, guesses: int, agreeing: np.ndarray, how: Shot | None) -> Fit:
     unknowns, single, control = problem.unknowns, problem.lanes.members is None, asked.control
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places = unknowns.estimated
@@ -271,6 +290,7 @@ def _result(problem: Problem, found: Minimum, limits: Limits, asked: Asked, erro
         units=unknowns.units,
         cutoff=control.cutoff,
         errors=errors,
+        shooting=how,
         trace=found.trace[0] if single else (),
         asked=asked,
         work_out=partial(statistics, problem, found, limits, control, errors, limit),

@@ -19,6 +19,7 @@ from jourdain_jax.analysis.information import Information, hidden_combinations
 from jourdain_jax.analysis.informed import informed
 from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
 from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.piecewise import Shot
 from jourdain_jax.analysis.profile import FAR_BEYOND
 from jourdain_jax.analysis.weak_directions import weak_combinations
 from jourdain_jax.build.plausibility import impossible_bodies
@@ -72,6 +73,7 @@ class Fit(Printed):
     units: tuple[str, ...]
     cutoff: float
     errors: str  # whence standard errors come: "sigmas" or "runs"
+    shooting: Shot | None  # how it was found by multiple shooting
     trace: tuple[tuple[str, tuple[float, ...]], ...]  # what was minimised, and F at first and after each step tried; none of a batch
     asked: Asked  # the arguments of `fit`
     work_out: Callable[[], Statistics]
@@ -228,6 +230,11 @@ class Fit(Printed):
         if self.stuck:
             found.append(
                 "no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere"
+            )
+        elif self.shooting is not None and self.shooting.continuity > 1:
+            found.append(
+                f"pieces of runs do not join: states jump by up to {float(self.shooting.continuity):.2g} tolerances of the simulation; take shorter pieces, or "
+                "start nearer"
             )
         elif not self.converged:
             found.append("no minimum was found; raise `max_iterations`, or start nearer to it")

@@ -16,6 +16,9 @@ def text(fit) -> str:
     lines += [f"WARNING: {sentence}" for sentence in fit.warnings]
     if fit.grown:
         lines.append("found over growing spans: the first guess led elsewhere")
+    if fit.shooting is not None:
+        pieces = " + ".join(map(str, fit.shooting.pieces[:MOST_NAMED])) + (" + ..." if len(fit.shooting.pieces) > MOST_NAMED else "")
+        lines.append(f"found by multiple shooting in {pieces} pieces, which join to {float(fit.shooting.continuity):.1g} of the simulation's tolerance")
     if fit.guesses > 1:
         lines.append(f"{int(fit.agreeing)} of {fit.guesses} first guesses led to this minimum")
     if fit.errors == "runs":

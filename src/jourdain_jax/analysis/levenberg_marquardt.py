@@ -15,11 +15,13 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow
+from jourdain_jax.analysis.joined import JoinedArrow
 
 FIRST, LEAST, MOST = 1e-3, 1e-9, 1e9  # damping lambda: at first, at least, and where no step is found
 FASTEST = 10.0  # factor by which damping falls after a good step
@@ -36,7 +38,7 @@ class Linearised:
     """Value and slopes at some theta, of each member."""
 
     cost: Float[np.ndarray, "members"]  # F; not finite where the motion fails
-    arrow: Arrow  # J and residuals with J'r = dF/dtheta
+    arrow: Any  # J and residuals with J'r = dF/dtheta: an `Arrow`; a `JoinedArrow` where pieces of runs have gaps
     rows: np.ndarray  # (members, runs) of [J r] with the run's own unknowns first, (samples, width); None where another run had failed
     sigma: Float[np.ndarray, "members channels"]  # of channels whose noise is estimated
 
@@ -146,13 +148,13 @@ def minimise(
             break
         arrow, x = (at.arrow, theta) if going.size == count else (at.arrow.at(going), theta[going])
         size, damping = limits.size(x), np.array([paces[b].damping for b in going.tolist()])
-        scaling = _scaling(arrow, size)
-        d = _step(arrow, x, scaling, damping, limits, control.cutoff)
+        scaling = column_scaling(arrow, size)
+        d = damped_step(arrow, x, scaling, damping, limits, control.cutoff)
         change = arrow.change(d)
         done = _is_small(change, size, d, control)
         if True in done.tolist():
             if (done & (damping > LEAST)).any():
-                undamped = _step(arrow, x, scaling, np.full(going.size, LEAST), limits, control.cutoff)
+                undamped = damped_step(arrow, x, scaling, np.full(going.size, LEAST), limits, control.cutoff)
                 done &= _is_small(arrow.change(undamped), size, undamped, control)
             converged[going[done]] = True
             going, size, d, x, change, arrow = going[~done], size[~done], d[~done], x[~done], change[~done], arrow.at(~done)
@@ -231,14 +233,14 @@ class _Pace:
         return True
 
 
-def _scaling(arrow: Arrow, size: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members unknowns"]:
+def column_scaling(arrow: Arrow | JoinedArrow, size: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members unknowns"]:
     """D: lengths of the columns of J, and something positive for those that are zero."""
     norms = arrow.column_norms
     D = np.maximum(norms, 1e-8 * (norms * size).max(axis=1, keepdims=True) / size)
     return np.where(D > 0, D, 1.0)
 
 
-def _step(arrow: Arrow, theta, D, damping, limits: Limits, cutoff: float) -> np.ndarray:
+def damped_step(arrow: Arrow | JoinedArrow, theta, D, damping, limits: Limits, cutoff: float) -> np.ndarray:
     """The damped step within the bounds."""
     g = arrow.gradient
     held = limits.fixed | ((theta <= limits.low) & (g >= 0)) | ((theta >= limits.high) & (g <= 0))

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.correlated_noise import Chains, whitened
 from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.nodes import begin, ended
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
 from jourdain_jax.analysis.unknowns import Layout
 from jourdain_jax.build.reference import Reference
@@ -54,17 +55,18 @@ class Run(NamedTuple):
     correlation_time: dict[str, Float[Array | np.ndarray, ""]]  # s, of channels whose noise has a memory
 
     def residuals(self, scene: Scene, simulate: Callable, simulation: dict) -> dict[str, Float[Array | np.ndarray, "..."]]:
-        """`(reading - value) / sigma` by channel."""
+        """`(reading - value) / sigma` by channel; of a piece of a run also the state at its end."""
         inputs = self.inputs
         for drive in self.drives.values():
             inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
-        motion = simulate(scene, self.start, t0=self.t0, ts=self.ts if self.grid is None else self.grid, inputs=inputs, events=False, work=False, **simulation)
+        ts = self.ts if self.grid is None else self.grid
+        motion = simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, events=False, work=False, **simulation)
         states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
         found = {}
         for name, weight in self.weights.items():
             sensor = self.sensors.get(name, ideal(name))
             found[name] = jnp.where(weight > 0, (sensor.shown(sensor.quantity(motion, states), self.grid, self.ts) - self.values[name]) * weight, 0.0)
-        return found
+        return found | ended(motion, self.start)
 
     def at(self, layout: Layout, shared, local) -> "Run":
         """The run with these unknowns."""

@@ -7,6 +7,7 @@ sigma^2 = mean w^2 of each channel whose sigma is not known; mean, s: of priors
 
 import math
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits,
 from jourdain_jax.analysis.levenberg_marquardt import Linearised
 from jourdain_jax.analysis.losses import Loss
 from jourdain_jax.analysis.measurements import Measurements
-from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
 
@@ -24,9 +24,9 @@ _NODES = np.linspace(-3.2, 3.2, 9)  # of arcsin rho, in its standard deviations:
 
 
 class Problem:
-    """Residuals with their derivatives, of any members at any numbers."""
+    """Residuals with their derivatives, of any members at any numbers. `lanes`: `Lanes`, or what predicts runs as they do (`Piecewise`)."""
 
-    def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Lanes, loss: Loss):
+    def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Any, loss: Loss):
         self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
         self.shares: np.ndarray | None = None  # of each run's span, from its start, by member: samples beyond do not count
@@ -55,19 +55,19 @@ class Problem:
         with np.errstate(over="ignore", invalid="ignore"):
             for b, j, plain in evaluated:
                 if runs == 1:  # all unknowns are shared
-                    plain = plain[..., [*range(m, m + p), *range(m), -1]]
+                    plain = plain[..., [*range(m, m + p), *range(m), *range(m + p, plain.shape[-1])]]
                 whole = self.lanes.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
                 if self.shares is not None:
                     whole = np.where(self.lanes.within(j, self.shares[members[b]])[..., None], whole, 0.0)
                 for k, rows in enumerate(self._kinds(int(j[0]), whole)):
                     r = rows[..., -1]
-                    triangles[b, j, k] = triangle(self.loss.weighted(rows, r))
+                    triangles[b, j, k] = triangle(closed(self.loss.weighted(rows, r), m + p))
                     if k:
                         squares[b, j, k] = np.sum(r**2, axis=1)
                     else:
                         costs[b, j] = self.loss.value(r)
                 for place, one in zip(zip(b.tolist(), j.tolist(), strict=True), plain, strict=True):
-                    kept[place] = one
+                    kept[place] = one if one.shape[-1] == m + p + 1 else np.delete(one, m + p, axis=1)
                 if count == 1 and runs > 1 and not math.isfinite(triangles[b, j].sum()):  # whatever the other runs say
                     triangles.fill(np.nan)
                     break
@@ -210,3 +210,10 @@ class Problem:
         channels = self.lanes.channels(run)
         known = [whole[:, where] for name, where in channels.items() if name not in self.estimated]
         return [np.concatenate([whole[:, :0], *known], axis=1), *(whole[:, channels.get(name, slice(0))] for name in self.estimated)]
+
+
+def closed(rows: np.ndarray, unknowns: int) -> np.ndarray:
+    """[J r] from [J g r], where pieces of a run do not join yet: g is what r will have changed by, to first order, once they do."""
+    if rows.shape[-1] == unknowns + 1:
+        return rows
+    return np.concatenate([rows[..., :unknowns], rows[..., unknowns:-1] + rows[..., -1:]], axis=-1)

@@ -1,0 +1,310 @@
+"""The predictions of runs that are cut into pieces, each with a start of its own; and those of the whole runs, condensed from them.
+
+    joined      all starts s_i of pieces are unknowns, continuity is a residual of some width: (x(t_i+1; s_i, theta) - s_i+1) / width
+    condensed   continuity is solved for, to first order:   ds_i+1 = A_i ds_i + B_i dtheta + c_i,     c_i = x(t_i+1; s_i, theta) - s_i+1
+                ds_i = L_i (dx_0, dtheta) + g_i             leaves the unknowns of a fit without pieces, x_0: those of the start of the run
+
+Once pieces join (c = 0), residuals and derivatives are those of the whole run. Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jourdain_jax.analysis.joined import JoinedArrow
+from jourdain_jax.analysis.levenberg_marquardt import Linearised
+from jourdain_jax.analysis.losses import Loss
+from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.nodes import NODE
+from jourdain_jax.analysis.predictions import Lanes
+from jourdain_jax.analysis.problem import Problem, closed
+from jourdain_jax.analysis.ranges import Range, unbounded
+from jourdain_jax.analysis.shooting import MultipleShooting, ends_of_pieces, in_pieces
+from jourdain_jax.analysis.unknowns import Layout, Place, Unknowns
+from jourdain_jax.motion.setup import TOLERANCE
+from jourdain_jax.scene.scene import Scene
+
+_CLOSINGS = 8  # times at most that pieces are joined anew, to first order, at numbers that stay
+_FREE = unbounded(1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """How a fit was found by multiple shooting."""
+
+    pieces: tuple[int, ...]  # of each run
+    continuity: Float[np.ndarray, "*repeats"]  # the largest jump from one piece to the next, in tolerances of the simulation, atol + rtol |x|
+    sizes: Float[np.ndarray, "states"]  # of coordinates and speeds
+    nodes: tuple[Float[np.ndarray, "*repeats nodes states"], ...]  # states (q, u) at which the pieces of each run meet
+
+
+class PieceLanes:
+    """Lanes of all pieces, which keep the states at their ends aside."""
+
+    def __init__(self, lanes: Lanes, pieces: int, states: int):
+        self._lanes, self._pieces, self._states = lanes, pieces, states
+        self.members, self.counted, self.whitened, self.channels = lanes.members, lanes.counted, lanes.whitened, lanes.channels
+        self.within, self.log_widths, self.by_channel = lanes.within, lanes.log_widths, lanes.by_channel
+        self.rows = np.empty((0, pieces), object)  # (members, pieces) of [J r]
+        self.ends = np.zeros((0, pieces, states, 0))  # [J x] of the states at the ends
+
+    def evaluate(self, shared, local, members):
+        """As of `Lanes`."""
+        self.rows = np.empty((len(members), self._pieces), object)
+        self.ends = np.full((len(members), self._pieces, self._states, local.shape[-1] + shared.shape[-1] + 1), np.nan)
+        for b, j, plain in self._lanes.evaluate(shared, local, members):
+            self.ends[b, j] = plain[:, -self._states :]
+            for place, one in zip(zip(b.tolist(), j.tolist(), strict=True), plain[:, : -self._states], strict=True):
+                self.rows[place] = one
+            yield b, j, plain[:, : -self._states]
+
+
+class Piecewise:
+    """Lanes of whole runs that are worked out in pieces; what `Lanes` offers, and the same with nodes as unknowns."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        runs: tuple[Measurements, ...],
+        layout: Layout,
+        simulation: dict,
+        members: int | None,
+        unknowns: Unknowns,
+        shooting: MultipleShooting,
+    ):
+        self.scene, self.runs, self.unknowns = scene, runs, unknowns
+        self.states = len(scene.coordinate_names) + len(scene.speed_names)
+        self.ends_of = [ends_of_pieces(run, shooting, index) for index, run in enumerate(runs)]
+        parts = [in_pieces(run, ends, self.states, members is not None) for run, ends in zip(runs, self.ends_of, strict=True)]
+        self.parts = tuple(piece for of_run in parts for piece in of_run)
+        if all(len(of_run) == 1 for of_run in parts):
+            raise ValueError("`shooting` leaves each run in one piece only; give a shorter `duration`, or leave out `shooting`")
+        self.run_of = np.repeat(np.arange(len(runs)), [len(of_run) for of_run in parts])  # of each piece
+        self.follows = np.concatenate([[False], np.diff(self.run_of) == 0])
+        p, m = layout.sizes
+        self.own, self.shared = m, p
+        self.layout = Layout(layout.shared, (*layout.local, Place(NODE, (self.states,), m)))
+        self._carried = np.array([k for place in layout.local if place.of_sensor for k in range(place.begin, place.end)], int)  # the same in all pieces
+        self.lanes = PieceLanes(Lanes(scene, self.parts, self.layout, simulation, members), len(self.parts), self.states)
+        self._whole = Lanes(scene, runs, layout, simulation, members)
+        self.members, self.lengths = members, self._whole.lengths
+        self.counted, self.whitened, self.channels = self._whole.counted, self._whole.whitened, self._whole.channels
+        self.within, self.log_widths, self.by_channel = self._whole.within, self._whole.log_widths, self._whole.by_channel
+        self._places = [self._places_of(i) for i in range(len(self.parts))]
+        self.node_sizes = np.ones(self.states)
+        self.tolerance = float(simulation.get("rtol", TOLERANCE)), float(simulation.get("atol", TOLERANCE))
+        self.local, self.theta = np.zeros((0, len(self.parts), m + self.states)), np.zeros((0, p + len(runs) * m))  # where the pieces are, by member
+        self.closing, self.share = True, np.ones(0)  # whether pieces are joined at each evaluation; else what share of their gaps goes, by member
+
+    # With nodes as unknowns. ----------------------------------------------------------------------------------------
+
+    def problem(self, loss: Loss) -> Problem:
+        """The problem of pieces whose starts have nothing to do with each other."""
+        return Problem(self.scene, self.parts, self._unknowns_of_pieces(), self.lanes, loss)
+
+    def _unknowns_of_pieces(self) -> Unknowns:
+        whole, m, p, count = self.unknowns, self.own, self.shared, len(self.parts)
+
+        def each(of_run: Sequence, of_node, of_later) -> list:
+            found = list(of_run[:p])
+            for i, run in enumerate(self.run_of.tolist()):
+                own = list(of_run[p + run * m : p + (run + 1) * m])
+                if self.follows[i]:
+                    own = [x if k in self._carried else of_later for k, x in enumerate(own)]
+                found += [*own, *([of_node] * self.states if self.follows[i] else [of_later] * self.states)]
+            return found
+
+        ranges: list[Range] = each(whole.ranges, None, _FREE)
+        scales = [unbounded(float(size)) for size in self.node_sizes]
+        ranges = [scales[(k - p - m) % (m + self.states)] if found is None else found for k, found in enumerate(ranges)]
+        no_prior = np.full((count, m + self.states), np.nan)
+        prior = []
+        for of_run in (whole.prior_mean, whole.prior_sigma):
+            own = no_prior.copy()
+            own[~self.follows, :m] = of_run[p:].reshape(len(self.runs), m)  # not once more for each piece
+            prior.append(np.concatenate([of_run[:p], own.ravel()]))
+        fixed = np.array(each(whole.fixed.tolist(), False, True), bool)
+        return Unknowns(self.layout, count, self.spread(whole.guess[None])[0], fixed, tuple(ranges), (), (), *prior)
+
+    def spread(self, theta: Float[np.ndarray, "members places"]) -> Float[np.ndarray, "members all_places"]:
+        """Unknowns of whole runs as those of all pieces, with nodes at zero."""
+        shared, own = self.unknowns.split(theta)
+        of_pieces = np.zeros((len(theta), len(self.parts), self.own + self.states))
+        of_pieces[..., : self.own] = own[:, self.run_of]
+        later = np.setdiff1d(np.arange(self.own), self._carried)
+        of_pieces[:, self.follows[:, None] & np.isin(np.arange(self.own + self.states), later)] = 0.0
+        return np.concatenate([shared, of_pieces.reshape(len(theta), -1)], axis=1)
+
+    def joined(self, problem: Problem, theta: np.ndarray, members: np.ndarray, width: float) -> Linearised:
+        """What is minimised with the starts of all pieces as unknowns: their gaps are residuals of this width, in sizes of the states."""
+        at = problem.linearised(theta, members)
+        m, carried = self.own, self._carried
+        local = problem.unknowns.split(theta)[1]
+        count, pieces, M = local.shape
+        joins = np.zeros((count, pieces, self.states + carried.size, 2 * M + self.shared + 1))
+        with np.errstate(invalid="ignore"):
+            for i in np.flatnonzero(self.follows) - 1:
+                end, join = self.lanes.ends[:, i], joins[:, i]
+                join[:, : self.states, :M], join[:, : self.states, 2 * M : -1] = end[..., :M], end[..., M:-1]
+                join[:, : self.states, -1] = end[..., -1] - local[:, i + 1, m:]
+                join[:, range(self.states), range(M + m, 2 * M)] = -1.0
+                rows = range(self.states, joins.shape[2])
+                join[:, rows, carried], join[:, rows, M + carried], join[:, rows, -1] = 1.0, -1.0, local[:, i, carried] - local[:, i + 1, carried]
+            sizes = np.concatenate([self.node_sizes, self.unknowns._least[self.shared :][carried]]) if carried.size else self.node_sizes
+            joins = joins / (width * sizes)[:, None]
+        joins[~np.isfinite(at.cost)] = 0.0
+        finite = np.isfinite(joins.sum(axis=(1, 2, 3)))
+        joins[~finite] = 0.0
+        cost = np.where(finite, at.cost + 0.5 * np.sum(joins[..., -1] ** 2, axis=(1, 2)), np.inf)
+        return replace(at, cost=cost, arrow=JoinedArrow(at.arrow, joins, self.follows))
+
+    # Condensed. -----------------------------------------------------------------------------------------------------
+
+    def put(self, theta: Float[np.ndarray, "members all_places"]) -> Float[np.ndarray, "members places"]:
+        """Puts the pieces of all members where they are here; the unknowns of the whole runs."""
+        shared, local = theta[:, : self.shared], theta[:, self.shared :].reshape(len(theta), len(self.parts), -1)
+        self.local = local.copy()
+        self.theta = np.concatenate([shared, local[:, ~self.follows, : self.own].reshape(len(theta), -1)], axis=1)
+        count, pieces, M = local.shape
+        self._rows = np.empty((count, pieces), object)
+        self._slopes, self._gaps = np.zeros((count, pieces, M, self.own + self.shared)), np.zeros((count, pieces, M))
+        self.jumps, self.share = np.full((count, pieces, self.states), np.inf), np.ones(count)
+        return self.theta.copy()
+
+    def put_nodes(self, theta: Float[np.ndarray, "members places"], found: Shot) -> None:
+        """Puts the pieces where another fit of the same runs ended."""
+        self.node_sizes = found.sizes
+        whole = self.spread(theta)
+        local = whole[:, self.shared :].reshape(len(theta), len(self.parts), -1)  # a view
+        local[:, self.follows, self.own :] = np.concatenate(found.nodes)
+        self.put(whole)
+
+    def told(self) -> Shot:
+        """How the pieces join where they are."""
+        single, members = self.members is None, np.arange(len(self.local))
+        one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
+        nodes = self.local[..., self.own :]
+        return Shot(
+            pieces=tuple(np.bincount(self.run_of).tolist()),
+            continuity=one(self.continuity(members)),
+            sizes=self.node_sizes,
+            nodes=tuple(one(nodes[:, (self.run_of == run) & self.follows]) for run in range(len(self.runs))),
+        )
+
+    def keep(self, member: int) -> None:
+        """Of all members, this one only."""
+        for name in ("local", "theta", "_rows", "_slopes", "_gaps", "jumps", "share"):
+            setattr(self, name, getattr(self, name)[[member]])
+
+    def evaluate(self, shared, local, members):
+        """As of `Lanes`; pieces move along with the unknowns, to first order. Unless `closing`, rows are [J g r]: r will have changed by g once pieces join."""
+        theta = np.concatenate([shared, local.reshape(len(shared), -1)], axis=1)
+        here, failed = np.arange(len(members)), np.zeros(len(members), bool)
+        for _ in range(_CLOSINGS if self.closing else 1):
+            some = here[~failed]
+            if self.closing:
+                some = some[~((theta[some] == self.theta[members[some]]).all(axis=1) & self.closed(members[some]))]
+            if not some.size:
+                break
+            failed[some] = ~self._move(theta[some], members[some])
+        for run in range(len(self.runs)):
+            rows = self._condensed(run, members, failed)
+            yield here, np.full(len(here), run), closed(rows, self.own + self.shared) if self.closing else rows
+
+    def change(self, problem: Problem, sigma: np.ndarray, d: np.ndarray, members: np.ndarray) -> Float[np.ndarray, "members"]:
+        """By how much a step with its gaps closed changes all residuals, |J ds_i + S dtheta|, in units of sigma."""
+        d_shared, d_own = self.unknowns.split(d)
+        whole = np.concatenate([d_own[:, self.run_of], np.broadcast_to(d_shared[:, None], (len(d), len(self.parts), self.shared))], axis=2)
+        ds = (self._slopes[members] @ whole[..., None])[..., 0] + self._gaps[members]
+        squares = np.zeros(len(d))
+        for b, member in enumerate(members.tolist()):
+            for i in range(len(self.parts)):
+                rows = self._rows[member, i]
+                moved = rows[:, :-1] @ np.concatenate([ds[b, i], d_shared[b]])
+                for name, where in self.lanes.channels(i).items():
+                    by = sigma[b, problem.estimated.index(name)] if name in problem.estimated else 1.0
+                    squares[b] += np.sum((moved[where] / by) ** 2)
+        return np.sqrt(squares)
+
+    def growth(self, members: np.ndarray) -> Float[np.ndarray, "members"]:
+        """By what factor small changes of the unknowns grow from the first node to where they are largest, in sizes of states and unknowns."""
+        shared, own = self.unknowns.split(self.unknowns.sizes(self.theta[members]))
+        sizes = np.concatenate([own[:, self.run_of], np.broadcast_to(shared[:, None], (len(shared), len(self.parts), self.shared))], axis=2)
+        slopes = self._slopes[members][:, :, self.own :] * sizes[:, :, None] / self.node_sizes[:, None]
+        lengths = np.sqrt(np.sum(slopes**2, axis=(2, 3)))[:, self.follows]
+        return np.maximum(np.max(lengths, axis=1) / np.maximum(np.min(lengths, axis=1), np.finfo(float).tiny), 1.0)
+
+    def closed(self, members: np.ndarray) -> Bool[np.ndarray, "members"]:
+        """Whether the pieces join, to the tolerance of the simulation."""
+        return self.continuity(members) <= 1.0
+
+    def continuity(self, members: np.ndarray) -> Float[np.ndarray, "members"]:
+        """The largest jump from one piece to the next, in tolerances of the simulation, `atol + rtol |x|`."""
+        rtol, atol = self.tolerance
+        allowed = atol + rtol * np.maximum(np.abs(self.local[members][..., self.own :]), self.node_sizes)
+        return np.max(np.abs(self.jumps[members]) / allowed, axis=(1, 2), initial=0.0)
+
+    def _move(self, theta: np.ndarray, members: np.ndarray) -> Bool[np.ndarray, "members"]:
+        """Pieces of some members to other unknowns; which of them do not fail there. The others stay."""
+        p, m, M = self.shared, self.own, self.own + self.states
+        shared, own = self.unknowns.split(theta)
+        d_shared, d_own = self.unknowns.split(theta - self.theta[members])
+        d = np.concatenate([d_own[:, self.run_of], np.broadcast_to(d_shared[:, None], (len(theta), len(self.parts), p))], axis=2)
+        local = self.local[members] + (self._slopes[members] @ d[..., None])[..., 0] + self.share[members][:, None, None] * self._gaps[members]
+        local[:, ~self.follows, :m] = own
+        for _ in self.lanes.evaluate(shared, local, members):
+            pass
+        rows_of, ends = self.lanes.rows, self.lanes.ends
+        slopes, gaps, jumps = np.zeros((len(theta), len(self.parts), M, m + p)), np.zeros(local.shape), np.zeros((*local.shape[:2], self.states))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i in range(len(self.parts)):
+                if not self.follows[i]:
+                    slopes[:, i, range(m), range(m)] = 1.0
+                    continue
+                before, end = slopes[:, i - 1], ends[:, i - 1]
+                jumps[:, i] = end[..., -1] - local[:, i, m:]
+                # ds_i = A ds_i-1 + B dtheta + c
+                slopes[:, i, m:] = end[..., :M] @ before
+                slopes[:, i, m:, m:] += end[..., M:-1]
+                gaps[:, i, m:] = (end[..., :M] @ gaps[:, i - 1, :, None])[..., 0] + jumps[:, i]
+                slopes[:, i, self._carried] = before[:, self._carried]
+                gaps[:, i, self._carried] = gaps[:, i - 1, self._carried] + local[:, i - 1, self._carried] - local[:, i, self._carried]
+            good = np.isfinite(slopes.sum(axis=(1, 2, 3)) + gaps.sum(axis=(1, 2)))
+        for b in np.flatnonzero(good):
+            good[b] = all(np.isfinite(rows.sum()) for rows in rows_of[b])
+        here = members[good]
+        self.local[here], self.theta[here], self._slopes[here], self._gaps[here] = local[good], theta[good], slopes[good], gaps[good]
+        self.jumps[here], self._rows[here] = jumps[good], rows_of[good]
+        return good
+
+    def _condensed(self, run: int, members: np.ndarray, failed: np.ndarray) -> Float[np.ndarray, "members samples width"]:
+        p, m, M = self.shared, self.own, self.own + self.states
+        length = max(where.stop for where in self.channels(run).values())
+        found = np.zeros((len(members), length, m + p + 2))
+        for i in np.flatnonzero(self.run_of == run):
+            of_piece, of_run = self._places[i]
+            for b, member in enumerate(members.tolist()):
+                if failed[b]:
+                    found[b] = np.nan
+                    continue
+                rows = self._rows[member, i][of_piece]
+                J = rows[:, :M] @ self._slopes[member, i]
+                J[:, m:] += rows[:, M:-1]
+                found[b, of_run] = np.concatenate([J, (rows[:, :M] @ self._gaps[member, i])[:, None], rows[:, -1:]], axis=1)
+        return found
+
+    def _places_of(self, piece: int) -> tuple[np.ndarray, np.ndarray]:
+        """Of the residuals of a piece those that belong to its run, and their places there."""
+        run = int(self.run_of[piece])
+        before = piece - int(np.flatnonzero(self.run_of == run)[0])
+        first, last = self.ends_of[run][before : before + 2]
+        times = last - first + (last == self.ends_of[run][-1])
+        of_piece, of_run = [], []
+        for name, where in self.lanes.channels(piece).items():
+            shape = self.runs[run].values[name].shape[1 if self.members is None else 2 :]
+            count = int(np.prod(shape)) * times
+            of_piece.append(where.start + np.arange(count))
+            of_run.append(self.channels(run)[name].start + int(np.prod(shape)) * first + np.arange(count))
+        return np.concatenate(of_piece), np.concatenate(of_run)

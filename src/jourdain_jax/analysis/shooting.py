@@ -1,0 +1,122 @@
+"""Multiple shooting: how a run is cut into pieces, each with a start of its own, which continuity joins again.
+
+    piece i of a run from t_i to t_i+1      state at its begin s_i,   motion x(t; s_i, theta),      s_0: the start of the run
+    continuity                              x(t_i+1; s_i, theta) = s_i+1                            as an equation, not as something measured
+
+Over a short piece a motion depends on its unknowns almost linearly, however unstable or chaotic it is over the whole run.
+Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102; H. G. Bock, E. Kostina and J. P. Schlöder, GAMM-Mitteilungen 30 (2007) 376.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Int
+
+from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.nodes import LAST, NODE
+from jourdain_jax.calculus.reals import Number, checked_real
+from jourdain_jax.motion.inputs import Inputs, Sampled
+
+
+@dataclass(frozen=True)
+class MultipleShooting:
+    """Fit each run in pieces with starts of their own, which end where the next one begins.
+
+        jj.fit(guess, run, free=("mass", "length"), shooting=jj.MultipleShooting(duration=0.5))
+
+    - `duration`: about how long a piece is, s: a time over which neighbouring motions part by a factor of two to five.
+    - `pieces`: how many pieces each run has; give one of the two.
+
+    Pieces begin at samples. For motions that are unstable or chaotic over the whole run: steps are those of a problem that is almost linear. What is
+    minimised, and its minimum, are those of a fit without `shooting`.
+
+    **Raises** ValueError unless one of the two is given, a finite duration above zero or two pieces or more; when used, for a run with too few samples.
+    """
+
+    pieces: int | None = None
+    duration: float | None = None  # s
+
+    def __post_init__(self):
+        if (self.pieces is None) == (self.duration is None):
+            raise ValueError("`MultipleShooting` expects one of `pieces` (how many each run has) and `duration` (of a piece, in s), such as `duration=0.5`")
+        if self.pieces is not None and (isinstance(self.pieces, bool) or not isinstance(self.pieces, int | np.integer) or self.pieces < 2):
+            raise ValueError(f"`pieces` of `MultipleShooting` is {self.pieces!r}, expected a whole number of two or more; for one piece leave out `shooting`")
+        if self.duration is not None:
+            number: Number = checked_real(self.duration, "`duration` of `MultipleShooting`", (), advice="give a time in s")
+            if not (np.isfinite(number) and number > 0):
+                raise ValueError(f"`duration` of `MultipleShooting` is {self.duration} s, expected a finite time above zero")
+
+
+def ends_of_pieces(run: Measurements, shooting: MultipleShooting, index: int) -> Int[np.ndarray, "ends"]:
+    """Samples at which pieces begin, and the last sample. ValueError where there are fewer intervals than pieces."""
+    ts = np.asarray(run.ts)
+    count = len(ts) - 1
+    pieces = shooting.pieces
+    if pieces is not None:
+        if pieces > count:
+            raise ValueError(f"run {index} has {len(ts)} samples, too few for {pieces} pieces, each of which has an interval or more; ask for at most {count}")
+        return np.round(np.linspace(0, count, pieces + 1)).astype(int)
+    at = float(run.t0) + shooting.duration * np.arange(1, max(1, round((ts[-1] - float(run.t0)) / shooting.duration)))
+    after = np.clip(np.searchsorted(ts, at), 1, count)
+    nearest = np.where(at - ts[after - 1] < ts[after] - at, after - 1, after)
+    return np.unique([0, *nearest[(nearest > 0) & (nearest < count)], count])
+
+
+def in_pieces(run: Measurements, ends: Int[np.ndarray, "ends"], states: int, repeats: bool) -> list[Measurements]:
+    """The pieces of a run that was `checked`; all but the first begin at a node of so many numbers. A sample at which two meet belongs to the later one."""
+    found = []
+    for first, last in pairwise(ends):
+        here = slice(first, last + 1)
+        along = (slice(None), here) if repeats else here
+        values = {name: np.array(x[along], float) for name, x in run.values.items()}
+        for x in values.values():
+            if last != ends[-1]:
+                x[(slice(None), -1) if repeats else -1] = np.nan
+        begins = first == ends[0]
+        piece = object.__new__(type(run))
+        t0, length = run.t0 if begins else np.asarray(run.ts[first]), np.array(float(last - first))
+        own = {
+            "ts": run.ts[here],
+            "t0": t0,
+            "values": values,
+            "sigma": {name: x if x.ndim == 0 else x[here] for name, x in run.sigma.items()},
+            "start": (run.start if begins else {NODE: np.zeros(states)}) | {LAST: length},
+            "unknown_start": run.unknown_start if begins else {},
+            "inputs": _cut(run, float(t0), float(run.ts[last])),
+        }
+        vars(piece).update(vars(run) | own)
+        found.append(piece)
+    return found
+
+
+def _cut(run: Measurements, t0: float, t1: float) -> "dict | Inputs | None":
+    """The inputs with the knots about this span only; those of actuators stay whole, since their numbers may move them."""
+    if not isinstance(run.inputs, Inputs):
+        return run.inputs
+    driven = {drive.index for drive in run.drives.values()}
+    channels = [x if k in driven or not isinstance(x, Sampled) else _between(x, t0, t1) for k, x in enumerate(run.inputs.channels)]
+    return Inputs(tuple(channels))
+
+
+def _between(sampled: Sampled, t0: float, t1: float) -> Sampled:
+    ts = np.asarray(sampled.ts)
+    first, last = max(int(np.searchsorted(ts, t0, "right")) - 1, 0), min(int(np.searchsorted(ts, t1)), len(ts) - 1)
+    last = max(last, first)
+    return Sampled(ts[first : last + 1], np.asarray(sampled.values)[first : last + 1])
+
+
+def check_shooting(shooting, runs: Sequence[Measurements]) -> None:
+    """ValueError for what is no `MultipleShooting`, and for sensors that show what was before: a piece does not know it."""
+    if shooting is None:
+        return
+    if not isinstance(shooting, MultipleShooting):
+        raise ValueError(f"`shooting` is {shooting!r}, expected `jj.MultipleShooting(duration=...)`, `jj.MultipleShooting(pieces=...)`, or None")
+    for index, run in enumerate(runs):
+        for name, reading in run.readings.items():
+            if reading.is_late:
+                raise ValueError(
+                    f"sensor `{name}` of run {index} has a delay or a lag, which `shooting` does not know: at the begin of a piece it shows what was before; "
+                    "shift its times by the delay, or leave out `shooting`"
+                )

@@ -1,0 +1,150 @@
+"""The minimum of a fit by multiple shooting: first with gaps between pieces that may be wide, then with none.
+
+1. nodes from what was measured (`first_nodes`)
+2. the gaps c_i as residuals of a width that falls, by Levenberg-Marquardt: minimise F + sum (c_i / width)^2 / 2
+3. c_i = 0 as equations, by sequential quadratic programming with the Hessian of Gauss and Newton (the generalised Gauss-Newton method):
+   minimise |r + J d|^2 / 2 over the unknowns of the whole run, d = (dx_0, dtheta), with ds_i = L_i d + g_i; a full step unless it goes far
+
+Converged: the step changes the residuals by at most `tolerance` in all, no unknown by more than that fraction, and pieces join to the simulation's tolerance.
+Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102; H. G. Bock, E. Kostina and J. P. Schlöder, GAMM-Mitteilungen 30 (2007) 376.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from jourdain_jax.analysis.first_nodes import first_nodes, goes_on
+from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, column_scaling, damped_step, minimise
+from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.piecewise import Piecewise
+from jourdain_jax.analysis.problem import Problem
+from jourdain_jax.motion.start import start as consistent_start
+
+WIDTHS = (0.1, 0.01)  # of gaps, in sizes of the states
+_TINY = 1e-4  # size of a coordinate or speed that hardly is, of the largest one
+LEAST_CUTOFF = 1e-14  # round-off of singular values, relative to the largest
+_UNDAMPED = 1e-24  # damping that only keeps what is held from being singular
+_ROUGHLY, _STEPS = 1.0, 15  # tolerance with gaps, and steps tried at most with each width
+_FAR = 2.0  # sigmas by which a step may change residuals, rms
+_SHORTEST = 1e-3  # share of a step
+_SMALL = 0.01  # size of a state that hardly changes, of its largest magnitude
+
+
+def shot(problem: Problem, lanes: Piecewise, theta: Float[np.ndarray, "members places"], limits: Limits, control: Control) -> Minimum:
+    """The minimum from each `theta`; `problem`: that of whole runs, with these lanes."""
+    pieces, begin = _begun(problem, lanes, theta)
+    unknowns = pieces.unknowns
+    wide = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
+    steps, traces = np.zeros(len(theta), int), [()] * len(theta)
+    roughly = replace(control, tolerance=_ROUGHLY, most_steps=min(_STEPS, control.most_steps))
+    for width in WIDTHS:
+        what = f"pieces with gaps of {width:g}"
+        found = minimise(lambda x, members, w=width: lanes.joined(pieces, x, members, w), begin, wide, roughly, what)
+        begin, steps = found.theta, steps + found.steps
+        traces = [before + own for before, own in zip(traces, found.trace, strict=True)]
+    closed = _closed(problem, lanes, lanes.put(begin), limits, control)
+    trace = np.empty(len(theta), object)
+    trace[:] = [before + own for before, own in zip(traces, closed.trace, strict=True)]
+    return replace(closed, steps=closed.steps + steps, trace=trace)
+
+
+def _begun(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> tuple[Problem, np.ndarray]:
+    """The problem of pieces with all their starts as unknowns, and first guesses of these."""
+    m, single, count, coordinates = lanes.own, lanes.members is None, len(theta), len(problem.scene.coordinate_names)
+    nodes, starts = np.zeros((count, len(lanes.parts), lanes.states)), np.zeros((len(lanes.parts), lanes.states))
+    for run, data in enumerate(problem.runs):
+        q, u = _start(problem, data, theta[0], run)
+        starts[lanes.run_of == run] = np.concatenate([q, u])
+        for b in range(1 if single else count):
+            nodes[slice(None) if single else b, lanes.run_of == run] = first_nodes(problem.scene, data, lanes.ends_of[run], q, u, None if single else b)
+    guess = lanes.spread(theta)
+    local = guess[:, lanes.shared :].reshape(count, len(lanes.parts), -1)  # a view
+    local[:, lanes.follows, m:] = nodes[:, lanes.follows]
+    _put_starts(problem, lanes, local, nodes)
+    for _ in lanes.lanes.evaluate(guess[:, : lanes.shared], local, np.arange(count)):
+        pass
+    changes = lanes.lanes.ends[..., -1] - nodes
+    failed = ~np.isfinite(changes).all(axis=2)
+    changes[failed] = 0.0
+    for run in range(len(problem.runs)):
+        here = np.flatnonzero(lanes.run_of == run)
+        still = (np.ptp(nodes[:, here, :coordinates], axis=(0, 1)) == 0) & goes_on(problem.scene, starts[here[0], :coordinates])
+        nodes[:, here[1:, None], np.flatnonzero(still)] += np.cumsum(changes[:, here[:-1, None], np.flatnonzero(still)], axis=1)
+    nodes = np.where(failed[..., None], starts, nodes)  # a piece whose motion fails begins as its run does
+    local[:, lanes.follows, m:] = nodes[:, lanes.follows]
+    # sizes of coordinates and speeds: how they differ from node to node, and change over a piece
+    sizes = np.maximum(np.std(nodes, axis=(0, 1)), np.sqrt(np.mean(changes**2, axis=(0, 1))))
+    sizes = np.maximum(sizes, _SMALL * np.max(np.abs(nodes), axis=(0, 1)))
+    of_q = np.arange(lanes.states) < coordinates
+    least = np.where(of_q, np.max(sizes[of_q], initial=0.0), np.max(sizes[~of_q], initial=0.0))
+    lanes.node_sizes = np.where(least > 0, np.maximum(sizes, _TINY * least), 1.0)
+    return lanes.problem(problem.loss), guess
+
+
+def _start(problem: Problem, data: Measurements, theta: np.ndarray, run: int) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates and speeds of the start of a run at the first guess."""
+    shared, own = problem.unknowns.split(theta)
+    layout = problem.unknowns.layout
+    state = consistent_start(layout.scene(problem.scene, shared), t0=data.t0, inputs=data.inputs, **layout.start(data.start, own[run]))
+    return np.asarray(state.q), np.asarray(state.u)
+
+
+def _put_starts(problem: Problem, lanes: Piecewise, local: np.ndarray, nodes: np.ndarray) -> None:
+    """Unknown start values of runs as they were measured, where that is within their bounds and nothing is known of them beforehand."""
+    unknowns, scene = problem.unknowns, problem.scene
+    (low, high), p, m = unknowns.ends, lanes.shared, lanes.own
+    for run, first in enumerate(np.flatnonzero(~lanes.follows).tolist()):
+        q, u = np.split(nodes[:, first], [len(scene.coordinate_names)], axis=-1)
+        for place in unknowns.layout.local:
+            if place.of_sensor:
+                continue
+            where = np.arange(place.begin, place.end)
+            at = p + run * m + where
+            names, x = (scene.coordinate_names, q) if place.name in scene.coordinate_names else (scene.speed_names, u)
+            value = names.view(x)[place.name].reshape(len(x), -1)
+            free = ~unknowns.fixed[at] & ~np.isfinite(unknowns.prior_mean[at]) & (value > low[at]) & (value < high[at])
+            local[:, first, where] = np.where(free, value, local[:, first, where])
+
+
+def _closed(problem: Problem, lanes: Piecewise, theta: np.ndarray, limits: Limits, control: Control) -> Minimum:
+    """By sequential quadratic programming, from where the pieces are."""
+    lanes.closing = False
+    count = len(theta)
+    at = problem.linearised(theta, np.arange(count))
+    converged, stuck, steps = np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, int)
+    costs, shares = [[cost] for cost in at.cost.tolist()], np.ones(count)
+    going = np.flatnonzero(np.isfinite(at.cost))
+    far = _FAR * np.sqrt(max(problem.samples, 1))
+    for _ in range(control.most_steps):
+        if not going.size:
+            break
+        arrow, x, size = at.arrow.at(going), theta[going], limits.size(theta[going])
+        d = damped_step(arrow, x, column_scaling(arrow, size), np.full(going.size, _UNDAMPED), limits, cutoff_of(lanes, control, going))
+        length = lanes.change(problem, at.sigma[going], d, going)
+        done = lanes.closed(going) & (length <= control.tolerance) & (np.abs(d) <= control.tolerance * size).all(axis=1)
+        converged[going[done]] = True
+        going, d, x, length = going[~done], d[~done], x[~done], length[~done]
+        if not going.size:
+            break
+        steps[going] += 1
+        share = np.minimum(shares[going], far / np.maximum(length, far))
+        lanes.share[going] = share
+        trial = problem.linearised(x + share[:, None] * d, going)
+        good = np.isfinite(trial.cost)
+        theta[going[good]] = (x + share[:, None] * d)[good]
+        at = at.replaced(going, trial, good)
+        shares[going] = np.where(good, np.minimum(2 * shares[going], 1.0), 0.25 * share)
+        for b in going.tolist():
+            costs[b].append(float(at.cost[b]))
+        lost = shares[going] < _SHORTEST
+        stuck[going[lost]], going = True, going[~lost]
+    lanes.closing, lanes.share = True, np.ones(count)
+    trace = np.empty(count, object)
+    trace[:] = [(("pieces that join", tuple(of_one)),) for of_one in costs]
+    return Minimum(theta, at, converged, stuck, steps, np.zeros(count, bool), trace)
+
+
+def cutoff_of(lanes: Piecewise, control: Control, members: np.ndarray) -> float:
+    """The fraction of the largest singular value below which one counts as zero: less, where the largest has grown along the motion and the others have not."""
+    return max(control.cutoff / float(np.max(lanes.growth(members))), LEAST_CUTOFF)

@@ -1,0 +1,209 @@
+"""Fits by multiple shooting: they find what a fit without pieces finds where that works, and more."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.analysis.arrow import Arrow
+from jourdain_jax.analysis.joined import JoinedArrow
+
+FREE = ("mass2", "length1", "length2")
+TIGHT = {"rtol": 1e-8, "atol": 1e-8}
+
+
+def pendulum(span, seed=0, off=0.5):
+    """A chaotic double pendulum, 20 samples a second with 1 % noise: a first guess that is off by up to so much, the truth, and the run."""
+    truth, ts, generator = jj.models.DoublePendulumAngles(), np.linspace(0.0, span, round(20 * span) + 1), np.random.default_rng(seed)
+    start = {"theta1": 2.0, "theta2": 2.5, "theta1_rate": 0.0, "theta2_rate": 0.0}
+    motion = jj.simulate(truth, start, ts=ts, rtol=1e-9, atol=1e-9)
+    sigma = {name: 0.01 * float(np.std(motion[name])) for name in ("theta1", "theta2")}
+    values = {name: np.asarray(motion[name]) + s * generator.normal(size=len(ts)) for name, s in sigma.items()}
+    guess = truth.replace(**{name: getattr(truth, name) * (1 + generator.uniform(-off, off)) for name in FREE})
+    begin = {name: x + (x or 3.0) * generator.uniform(-off, off) for name, x in start.items()}
+    return guess, truth, jj.Measurements(ts, values, sigma, start=begin, unknown_start=tuple(begin))
+
+
+class Oscillator(jj.Scene):
+    mass: object = jj.parameter(2.0, positive=True)
+    damping: object = jj.parameter(0.1, positive=True)
+    stiffness: object = jj.parameter(18.0, positive=True)
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("force")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.force - self.stiffness * motion.q.x - self.damping * motion.u.x_rate),)
+
+
+def oscillations(channel="x", sigma=0.01, **options):
+    """Three runs of unequal length under one sampled force; the third has a known start."""
+    generator, ts = np.random.default_rng(0), np.linspace(0.0, 4.0, 41)
+    force = options.pop("force", jj.Sampled(np.linspace(-1.0, 5.0, 61), generator.normal(size=61)))
+    command, found = force.command if isinstance(force, jj.Actuator) else force, []
+    for count, x, guess in ((41, 0.5, 0.4), (31, -0.2, -0.3), (23, 0.3, 0.3)):
+        motion = jj.simulate(Oscillator(), {"x": x, "x_rate": 0.3}, ts=ts[:count], inputs={"force": command})
+        values = {channel: np.asarray(motion["x"]) + 0.01 * generator.normal(size=count)}
+        start, unknown = {"x": guess, "x_rate": 0.3}, () if x == guess else ("x", "x_rate")
+        found.append(jj.Measurements(ts[:count], values, sigma, start=start, unknown_start=unknown, inputs={"force": force}, **options))
+    return found
+
+
+def same(scene, data, free, pieces=4, **options):
+    """The fit of the same runs with and without pieces, after a look at whether they agree."""
+    whole = jj.fit(scene, data, free, **TIGHT, **options)
+    cut = jj.fit(scene, data, free, shooting=jj.MultipleShooting(pieces=pieces), **TIGHT, **options)
+    assert whole.converged
+    assert cut.converged
+    assert cut.shooting.continuity <= 1
+    np.testing.assert_allclose(cut.values, whole.values, atol=1e-3 * np.min(np.where(whole.standard_errors > 0, whole.standard_errors, np.inf)), rtol=1e-4)
+    np.testing.assert_allclose(cut.standard_errors, whole.standard_errors, rtol=1e-4)
+    np.testing.assert_allclose(cut.chi_square, whole.chi_square, rtol=1e-5)
+    for a, b in zip(cut.residuals, whole.residuals, strict=True):
+        for name in b:
+            np.testing.assert_allclose(a[name], b[name], atol=1e-3)
+    return whole, cut
+
+
+def test_a_chaotic_motion_is_found_from_afar_with_the_intervals_of_single_shooting():
+    guess, truth, run = pendulum(5.0, seed=2)
+    found = jj.fit(guess, run, FREE, shooting=jj.MultipleShooting(duration=0.5), **TIGHT)
+    assert found.converged
+    assert not found.warnings
+    assert found.shooting.pieces == (10,)
+    assert found.shooting.continuity <= 1
+    assert "found by multiple shooting in 10 pieces" in str(found)
+    near = jj.fit(found.scene, jj.Measurements(run.ts, run.values, run.sigma, start=found.starts[0], unknown_start=tuple(run.start)), FREE, **TIGHT)
+    assert near.converged
+    assert not near.grown
+    np.testing.assert_allclose(found.values, near.values, atol=1e-2 * near.standard_errors.min())
+    np.testing.assert_allclose(found.standard_errors, near.standard_errors, rtol=1e-3)
+    assert all(abs(found[name].value - float(getattr(truth, name))) < 4 * found[name].standard_error for name in FREE)
+
+
+def test_pieces_that_cannot_join_in_time_are_no_result():
+    guess, _, run = pendulum(5.0, seed=2)
+    found = jj.fit(guess, run, FREE, shooting=jj.MultipleShooting(duration=0.5), max_iterations=1, **TIGHT)
+    assert not found.converged
+    assert found.shooting.continuity > 1
+    assert "do not join" in found.warning
+    assert "NOT CONVERGED" in str(found)
+
+
+def test_a_step_of_joined_pieces_is_that_of_dense_least_squares():
+    g, (runs, m, p) = np.random.default_rng(0), (5, 3, 2)
+    pieces = Arrow(g.normal(size=(2, runs, m, m + p + 1)), g.normal(size=(2, 4, p + 1)), np.zeros((2, runs, p)))
+    follows = np.array([False, True, True, False, True])
+    joins = g.normal(size=(2, runs, 2, 2 * m + p + 1)) * np.append(follows[1:], False)[:, None, None]
+    arrow, D, damping = JoinedArrow(pieces, joins, follows), g.uniform(0.5, 2.0, (2, p + runs * m)), np.array([0.3, 1e-3])
+    held, moved = np.zeros((2, p + runs * m), bool), np.zeros((2, p + runs * m))
+    held[0, [1, 4]], moved[0, [1, 4]] = True, [0.2, -0.1]
+    step = arrow.step(damping, D, held, moved, 1e-12)
+    for b in range(2):
+        rows = [np.concatenate([pieces.shared[b, :, :p], np.zeros((4, runs * m)), pieces.shared[b, :, p:]], axis=1)]
+        for i in range(runs):
+            for block, width in ((pieces.local[b, i], m), (joins[b, i], 2 * m)):
+                if width == 2 * m and not (i + 1 < runs and follows[i + 1]):
+                    continue
+                row = np.zeros((len(block), p + runs * m + 1))
+                row[:, p + i * m : p + i * m + width], row[:, :p], row[:, -1] = block[:, :width], block[:, width:-1], block[:, -1]
+                rows.append(row)
+        dense = np.concatenate(rows)
+        J, r, free = dense[:, :-1], dense[:, -1] + dense[:, :-1] @ moved[b], ~held[b]
+        right = np.linalg.solve(J[:, free].T @ J[:, free] + damping[b] * np.diag(D[b, free] ** 2), -J[:, free].T @ r)
+        np.testing.assert_allclose(step[b, free], right, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(step[b, held[b]], moved[b, held[b]])
+        np.testing.assert_allclose(arrow.change(step)[b], np.sum((J @ step[b]) ** 2))
+        np.testing.assert_allclose(arrow.gradient[b], J.T @ dense[:, -1], atol=1e-10)
+        np.testing.assert_allclose(arrow.column_norms[b], np.linalg.norm(J, axis=0))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "expects one of `pieces`"),
+        ({"pieces": 4, "duration": 1.0}, "expects one of `pieces`"),
+        ({"pieces": 1}, "two or more"),
+        ({"duration": 0.0}, "above zero"),
+        ({"duration": np.nan}, "above zero"),
+    ],
+)
+def test_pieces_that_make_no_sense_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        jj.MultipleShooting(**options)
+
+
+def test_what_pieces_cannot_do_is_said():
+    guess, _, run = pendulum(0.5)
+    with pytest.raises(ValueError, match="run 0 has 11 samples, too few for 20 pieces"):
+        jj.fit(guess, run, FREE, shooting=jj.MultipleShooting(pieces=20))
+    with pytest.raises(ValueError, match="one piece only"):
+        jj.fit(guess, run, FREE, shooting=jj.MultipleShooting(duration=2.0))
+    late = jj.Measurements(run.ts, run.values, run.sigma, start=dict(run.start), sensors={"theta1": jj.Sensor("theta1", lag=0.01)})
+    with pytest.raises(ValueError, match="`theta1` of run 0 has a delay or a lag"):
+        jj.fit(guess, late, FREE, shooting=jj.MultipleShooting(pieces=2))
+
+
+SENSOR = {"bias": jj.Estimate(0.0, per_run=True), "gain": jj.Estimate(1.0, prior=jj.Normal(1.0, 0.05))}
+CASES = {
+    "several runs": ({}, ("stiffness", "damping"), {}),
+    "a bound and a prior": ({}, {"stiffness": jj.Normal(16.0, 0.1), "damping": jj.bounds(0.2, 1.0)}, {}),
+    "a robust loss": ({}, ("stiffness", "damping"), {"loss": jj.huber()}),
+    "numbers of sensors": ({"channel": "enc", "sigma": None, "sensors": {"enc": jj.Sensor("x", **SENSOR)}}, ("stiffness", "damping"), {}),
+    "noise with a memory": ({"correlation_time": 0.1}, ("stiffness", "damping"), {}),
+    "noise with an unknown memory": ({"correlation_time": None}, ("stiffness", "damping"), {}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_pieces_change_no_estimate_and_no_interval(case):
+    options, free, more = CASES[case]
+    same(Oscillator(stiffness=15.0, damping=0.3), oscillations(**options), free, **more)
+
+
+def test_an_actuator_is_estimated_in_pieces_too():
+    command = jj.Sampled(np.linspace(-1.0, 5.0, 61), np.random.default_rng(0).normal(size=61))
+    drive = jj.Actuator(command, gain=jj.Estimate(1.2), delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.2)))
+    same(Oscillator(stiffness=15.0), oscillations(force=drive), ("stiffness", "damping"))
+
+
+def test_repeats_and_other_first_guesses_lead_to_the_same():
+    runs = oscillations()
+    one = jj.fit(Oscillator(stiffness=15.0), runs[0], ("stiffness", "damping"), shooting=jj.MultipleShooting(pieces=4))
+    four = jj.fit(Oscillator(stiffness=15.0), runs[0], ("stiffness", "damping"), guesses=4, shooting=jj.MultipleShooting(pieces=4))
+    assert four.agreeing >= 3
+    np.testing.assert_allclose(four.values, one.values, atol=1e-2 * one.standard_errors.min())
+
+
+def test_a_fit_in_pieces_is_taken_up_again(tmp_path):
+    run, other, _ = oscillations()
+    found = jj.fit(Oscillator(stiffness=15.0), run, ("stiffness", "damping"), shooting=jj.MultipleShooting(duration=1.0))
+    whole = jj.fit(Oscillator(stiffness=15.0), run, ("stiffness", "damping"))
+    for name, profile in found.profiles(run).items():
+        np.testing.assert_allclose([profile.low, profile.high], [whole.profiles(run)[name].low, whole.profiles(run)[name].high], rtol=1e-3)
+    found.report(tmp_path / "fit.html", run, held_out=other)
+    assert "multiple shooting" in str(found)
+
+
+def test_pieces_begin_on_geometric_rows():
+    scene, ts = jj.models.DoublePendulumRods(), np.linspace(0.0, 2.0, 41)
+    motion, noise = jj.simulate(scene, ts=ts), np.random.default_rng(0)
+    values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=41) for name in scene.coordinate_names}
+    same(scene.replace(mass2=0.9), jj.Measurements(ts, values, 0.01, start=dict(scene.example)), ("mass2", "gravity"))
+
+
+def test_pieces_begin_on_velocity_rows():
+    scene, ts = jj.models.ChaplyginSleigh(offset=0.25), np.linspace(0.0, 4.0, 41)
+    motion, noise = jj.simulate(scene, {"x_rate": -0.6, "heading_rate": 0.9}, ts=ts), np.random.default_rng(0)
+    values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=41) for name in ("x", "y")}
+    start = {"heading": 0.0, "x_rate": -0.5, "heading_rate": 0.8}
+    same(scene.replace(offset=0.2), jj.Measurements(ts, values, 0.01, start=start, unknown_start=tuple(start)), ("offset",))
+
+
+def test_pieces_of_a_body_that_turns_begin_at_unit_quaternions():
+    scene, ts = jj.models.FreeRigidBody(), np.linspace(0.0, 4.0, 41)
+    motion, noise = jj.simulate(scene, ts=ts), np.random.default_rng(0)
+    values = {"attitude": np.asarray(motion["attitude"]) + 0.01 * noise.normal(size=(41, 4))}
+    same(scene.replace(i1=1.05 * scene.i1), jj.Measurements(ts, values, 0.01, start=dict(scene.example)), ("i1",))
