@@ -5,9 +5,9 @@
 Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), unstable (100 first guesses of a bicycle below its weave
 speed), chaotic (100 of a double pendulum, by growing spans and by multiple shooting), coverage, three (coverage of three models, unknown starts and sigmas,
 white noise and AR(1) noise), nuts (sampling by BlackJAX), disturbed (a motion with process noise), design (a start that tells more), windows (57 runs of the
-steer-by-wire bicycle with an unknown start each; the data are in `data/sbw_bicycle`), logs (what halves of these runs say of each other, with and without
-delays of the sensors, a lag of the motor and a memory of the noise). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves
-out windows and logs, with fewer repeats. Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
+steer-by-wire bicycle with an unknown start each; the data are in `notebooks/data`), logs (what halves of these runs say of each other: numbers of the notebook
+on them). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs, with fewer repeats. Times are processor time,
+the least of some repeats, in turn; those of the windows are wall time of a fresh process.
 """
 
 import argparse
@@ -28,7 +28,8 @@ import numpy as np
 import jourdain_jax as jj
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 
-WINDOWS = Path(__file__).parent / "data" / "sbw_bicycle" / "windows.csv.gz"
+NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
+WINDOWS = NOTEBOOKS / "data" / "steer_by_wire" / "windows.csv.gz"
 START = {"lean": 0.3, "spin_rate": -3.0}
 SIGMA = {"lean": 0.005, "x": 0.005}
 DISC_DELAY = 0.03  # s
@@ -474,86 +475,32 @@ def of_windows() -> list[Figure]:
     ]
 
 
-class FlatFrame(SteerByWire):
-    """A bicycle with a rear frame that is nearly flat: IByy, which does not enter the equations of an upright bicycle, follows IBxx and IBzz."""
+def logs() -> list[Figure]:
+    """Odd and even windows, each half by itself, as the notebook on them has it: how far apart, how well each predicts the other, whether bodies can be."""
+    import contextlib
+    import runpy
 
-    def bodies(self, t, q):
-        return SteerByWire.bodies(self.replace(IByy=0.95 * (self.IBxx + self.IBzz)), t, q)
+    import matplotlib as mpl
 
-
-# every fit puts the damping of lean at its bound, zero: it is left out
-FOR_LOGS = {name: kind for name, kind in FREE.items() if name != "lean_damping"}
-MOTOR_LAG = 0.05  # s, of the steer motor behind its command: by hand, from these logs
-# what these runs hardly tell has a prior about the nominal value, whose width is a guess: 10 % for the gain and the trail, 30 % for the moments of inertia
-WITH_PRIORS = FOR_LOGS | {
-    name: jj.Estimate(range=FOR_LOGS[name], prior=jj.Normal({"gain": 1.0}.get(name, NOMINAL.get(name)), share * abs(NOMINAL.get(name, 1.0))))
-    for name, share in {"gain": 0.1, "c": 0.1, "zB": 0.1, "IBxx": 0.3, "IBzz": 0.3, "IBxz": 0.3, "IHzz": 0.3}.items()
-}
-MOST_DELAY = 0.1  # s: no sample is used that is earlier
-
-
-def with_sensors(run: jj.Measurements, sensors: dict, actuator: dict, correlation_time: float | None = 0.0) -> jj.Measurements:
-    """A window with these numbers of its sensors and of the steer motor, less its first samples."""
-    values = {name: np.where(np.asarray(run.ts) < MOST_DELAY - 1e-9, np.nan, np.asarray(x)) for name, x in run.values.items()}
-    inputs = {"steer_torque": jj.Actuator(run.inputs["steer_torque"], **actuator)}
-    made = {name: jj.Sensor(**numbers) for name, numbers in sensors.items()}
-    known = {"start": run.start, "unknown_start": run.unknown_start, "inputs": inputs, "sensors": made}
-    return jj.Measurements(run.ts, values, dict(run.sigma), **known, correlation_time=correlation_time)
-
-
-def rms(found: jj.Fit, channel: str, sigma: float) -> float:
-    """Of all residuals of a channel, in its unit."""
-    r = np.concatenate([run[channel] for run in found.residuals])
-    return sigma * float(np.sqrt(np.nanmean(r**2)))
-
-
-def held_out(half: jj.Fit, runs: list[jj.Measurements], sensors: dict, actuator: dict) -> float:
-    """Lean-rate rms of runs that had no part in a fit: of them the starts alone are estimated."""
-    value = lambda name: float(half[name].value)  # noqa: E731
-    known = {c: {n: value(f"{c}.{n}") if isinstance(x, jj.Estimate) else x for n, x in numbers.items()} for c, numbers in sensors.items()}
-    motor = {n: value(f"steer_torque.{n}") if isinstance(x, jj.Estimate) else x for n, x in actuator.items()}
-    found = jj.fit(half.scene, [with_sensors(run, known, motor) for run in runs], (), rtol=1e-6, atol=1e-6)
-    return rms(found, "lean_rate", 0.03)
-
-
-def logs(first: int = 0) -> list[Figure]:
-    """Odd and even windows, each half by itself: how far apart, how well each predicts the other, and whether its bodies can be."""
-    delay = jj.Estimate(0.01, range=jj.bounds(0.0, MOST_DELAY))
-    late = {"lean_rate": {"delay": delay}, "steer_rate": {"delay": delay}}
-    runs, found = windows(), []
-    cases = (
-        ("ideal sensors", {}, {}, 0.0, FOR_LOGS),
-        ("delays of both sensors", late, {}, 0.0, FOR_LOGS),
-        ("delays of both sensors, motor lag", late, {"lag": MOTOR_LAG}, 0.0, FOR_LOGS),
-        ("delays of both sensors, motor lag, noise with a memory, priors", late, {"lag": MOTOR_LAG}, None, WITH_PRIORS),
-    )
-    for what, sensors, actuator, memory, free in cases[first:]:
-        halves = []
-        for half in (runs[::2], runs[1::2]):
-            data = [with_sensors(run, sensors, actuator, memory) for run in half]
-            halves.append(jj.fit(FlatFrame(**NOMINAL, lean_damping=0.0), data, free, rtol=1e-6, atol=1e-6, errors="runs"))
-        shared = [label for label in halves[0].labels if not label.startswith("run ")]
-        for half in halves:
-            print("  " + "; ".join(f"{name} {float(half[name].value):.4g} +- {float(half[name].standard_error):.2g}" for name in shared))
-            print("\n".join(f"  {warning}" for warning in half.warnings))
-            print("  correlation times, s: " + (", ".join(f"{name} {float(tau):.3g}" for name, tau in half.correlation_time.items()) or "none"), flush=True)
-        apart = {n: abs(float(halves[0][n].value - halves[1][n].value)) / np.hypot(*(float(h[n].standard_error) for h in halves)) for n in shared}
-        print("  apart, standard errors: " + ", ".join(f"{name} {x:.1f}" for name, x in apart.items()))
-        out = max(held_out(a, b, sensors, actuator) for a, b in ((halves[0], runs[1::2]), (halves[1], runs[::2])))
-        model = f"steer-by-wire bicycle, {what}"
-        found += [
-            figure("lean-rate rms on held-out windows, rad/s", model, out, 0.027),
-            figure("bodies that cannot be, of both halves", model, sum(len(half.impossible) for half in halves), 0),
-            figure("halves differ by, standard errors (from how runs differ)", model, float(np.nanmax(list(apart.values()))), 3),
-            figure("estimates that have no standard error in one half", model, float(sum(not np.isfinite(x) for x in apart.values()))),
-            figure(
-                "largest correlation of neighbouring residuals, whitened where their noise has a memory",
-                model,
-                max(rho for half in halves for rho, _ in half.autocorrelation.values()),
-            ),
-            figure("halves converged, of two", model, sum(bool(half.converged) for half in halves), 2, at_least=True),
-        ]
-    return found
+    mpl.use("agg")
+    begin = time.process_time()
+    with contextlib.chdir(NOTEBOOKS):
+        told = runpy.run_path("06_steer_by_wire.py")
+    halves, rms, out, model = told["halves"].values(), told["rms"], told["out"].values(), "steer-by-wire bicycle"
+    return [
+        figure("lean-rate rms on held-out windows, rad/s", model, max(rms(left["lean_rate"]) for left in out), 0.027),
+        figure("steer-rate rms on held-out windows, rad/s", model, max(rms(left["steer_rate"]) for left in out)),
+        figure("lean-rate rms by the authors' numbers, rad/s", model, rms(told["plain"]["lean_rate"])),
+        figure("bodies that cannot be, of both halves", model, sum(len(half.impossible) for half in halves), 0),
+        figure("halves differ by, standard errors (from how runs differ)", model, max(told["apart"].values()), 3),
+        figure("correlation of neighbouring residuals of lean rate", model, max(told["neighbours"](left["lean_rate"]) for left in out)),
+        figure("correlation of neighbouring residuals of steer rate", model, max(told["neighbours"](left["steer_rate"]) for left in out)),
+        figure("halves converged, of two", model, sum(bool(half.converged) for half in halves), 2, at_least=True),
+        figure("steps, the most of both", model, max(int(half.steps) for half in halves), 50),
+        figure("frequency of weave from 3 m/s on, off that of damped exponentials, rad/s", model, float(told["from_3"][:, 0].max())),
+        figure("the same by the authors' numbers, the least", model, float(told["from_3"][:, 1].min())),
+        figure("processor time of the notebook, s", model, time.process_time() - begin),
+    ]
 
 
 # A bicycle below its weave speed. --------------------------------------------------------------------------------------

@@ -128,7 +128,17 @@ def crane() -> type[jj.Scene]:
     return Crane
 
 
-def test_what_a_batch_or_a_fit_runs_is_not_decided_by_the_call_before_it():
+def batch(scene, ts, start) -> list:
+    return np.asarray(jj.rollout(scene, {**start, "x": jnp.array([0.1, 0.2])}, ts=ts, progress=False)["y"]).tolist()
+
+
+def fitted(scene, ts, start) -> list:
+    data = jj.Measurements(ts, {"x": 0.1 + ts, "z": 0.02 * ts}, 0.01, start=start)
+    return np.asarray(jj.fit(scene, data, free={"arm": None}, max_iterations=2).values).tolist()
+
+
+@pytest.mark.parametrize("run", [batch, fitted])
+def test_what_a_batch_or_a_fit_runs_is_not_decided_by_the_call_before_it(run):
     ts = jnp.linspace(0.0, 1.0, 6)
     start = {"x": 0.1, "x_rate": 1.0, "y_rate": 0.5}
     found = []
@@ -136,10 +146,7 @@ def test_what_a_batch_or_a_fit_runs_is_not_decided_by_the_call_before_it():
         kind, of = crane(), {}
         for arm, rope in order:
             scene = kind(arm, rope)
-            lanes = jj.rollout(scene, {**start, "x": jnp.array([0.1, 0.2])}, ts=ts, progress=False)
-            data = jj.Measurements(ts, {"x": 0.1 + ts, "z": 0.02 * ts}, 0.01, start=start)
-            fit = jj.fit(scene, data, free={"arm": None}, max_iterations=2)
-            of[arm, rope] = jj.build(scene).freedoms.privileged, np.asarray(lanes["y"]).tolist(), np.asarray(fit.values).tolist()
+            of[arm, rope] = jj.build(scene).freedoms.privileged, run(scene, ts, start)
         found.append(of)
     assert found[0] == found[1]
     assert len({privileged for privileged, *_ in found[0].values()}) == 2

@@ -1,5 +1,6 @@
 """Values that some state on the rows has are a start: what was not given is found, and where it was not found near the reference, the state says so."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,7 @@ from small_scenes import DiscWithHeightRow
 import jourdain_jax as jj
 from jourdain_jax.build.sampling import NoStateFoundError
 from jourdain_jax.build.structure import structure_of
+from jourdain_jax.motion.trajectories import results
 
 SCENES = {
     "disc with quaternion": jj.models.TiltingDiscQuaternion(),
@@ -137,3 +139,14 @@ def test_a_start_whose_rows_determine_its_speeds_has_the_derivatives_of_the_near
 
     for found, expected in zip(derivatives(determined)(numbers), derivatives(nearest)(numbers), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_state_that_newtons_method_does_not_bring_onto_the_rows_is_searched_for_and_then_named():
+    """Both masses in the support: no row says where to go, in the program that integrates as little as in the search after it."""
+    scene = SCENES["pendulum of rods"]
+    start = eqx.tree_at(lambda s: s.q, jj.start(scene, **scene.example), jnp.zeros(4))
+    motion = jj.simulate(scene, start, t1=0.1)
+    assert int(motion.result) == results.INCONSISTENT_START
+    sound = jj.simulate(scene, eqx.tree_at(lambda s: s.q, start, jnp.array([0.6, -0.8, 0.6, -1.7])), t1=0.1)  # the lower rod is too long
+    assert int(sound.result) == results.SUCCESS
+    assert 0.01 < float(sound.moved_q) < 0.1

@@ -1,5 +1,6 @@
 """The notebooks run from their text sources, each to its checked number, and the executed copies beside them are of the same text."""
 
+import shutil
 from pathlib import Path
 
 import jupytext
@@ -12,9 +13,12 @@ SOURCES = sorted(FOLDER.glob("*.py"))
 
 
 # what these show is also looked at in `test_bicycle_job.py`, `test_bicycle_stability.py` and `test_studies.py`
-@pytest.mark.parametrize("source", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * path.stem.startswith(("02", "04", "05"))) for path in SOURCES])
+@pytest.mark.parametrize(
+    "source", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * path.stem.startswith(("02", "04", "05", "06"))) for path in SOURCES]
+)
 def test_a_notebook_runs_to_its_end(source, tmp_path, monkeypatch):
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel then shows its figures in the notebook
+    shutil.copytree(FOLDER / "data", tmp_path / "data")
     notebook = jupytext.read(source)
     NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}).execute()
     pictures = [o for cell in notebook.cells if cell.cell_type == "code" for o in cell.outputs if "image/png" in o.get("data", {})]

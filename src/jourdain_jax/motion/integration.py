@@ -9,19 +9,22 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
 
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.diffrax_steps import solved_by_diffrax
 from jourdain_jax.motion.energy_check import conserves, energies_near, energy_lost
-from jourdain_jax.motion.input_programs import by_itself, for_programs
+from jourdain_jax.motion.input_programs import for_programs
+from jourdain_jax.motion.inputs import inputs_at
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.solver_choice import marked_inputs, marked_outputs, time_origin
 from jourdain_jax.motion.own_steps import lanes_solved_by_own_steps, reason_against_machine_code, solved_by_own_steps
-from jourdain_jax.motion.quick_compilation import quickly_compiled
+from jourdain_jax.motion.quick_compilation import QUICK, RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.setup import Begun, Setup, Solved
 from jourdain_jax.motion.span import times_fit
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.start import State, consistent, moved_onto_rows
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import Integrated
@@ -31,20 +34,34 @@ from jourdain_jax.scene.scene import Scene
 
 def integrate(setup: Setup) -> Trajectory:
     """The motion of one setup."""
-    if setup.field.lowered is None:
-        return _integrate_dense(setup.inputs.programs)(setup)
-    return (_integrate_lowered if reason_against_machine_code(setup) else _around_machine_code)(setup.inputs.programs)(setup)
+    run = _compiled(setup.inputs.programs)
+    motion, arrived = run(setup)
+    if setup.usual is None or np.asarray(arrived):
+        return motion
+    found = consistent(setup.scene, setup.t0, setup.start.q, setup.start.u, inputs_at(setup.inputs, setup.t0))  # by a search, which takes long to compile
+    return run(setup._replace(start=found, usual=None))[0]
 
 
-def _one_motion(setup: Setup) -> Trajectory:
+def _one_motion(setup: Setup) -> tuple[Trajectory, Bool[Array, ""]]:
+    """The motion, and whether its start came onto the rows."""
+    arrived = jnp.array(True)
+    if setup.usual is not None:
+        found = moved_onto_rows(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0), setup.usual)
+        setup, arrived = setup._replace(start=found.state, usual=None), found.arrived
     begun, fitting = _begin(setup), setup.fitting()
-    return _finish(setup, fitting, begun, _solved(fitting, begun))
+    return _finish(setup, fitting, begun, _solved(fitting, begun)), arrived
 
 
-_integrate_dense, _integrate_lowered = (for_programs(_one_motion, compiled_by) for compiled_by in (by_itself, quickly_compiled))
-# The steps are no part of it: XLA compiles the rest for a disc in 0.6 s of processor time instead of 1.0, for a bicycle in 1.4 instead of 3.0; a motion with
-# 201 saved times takes 0.34 ms instead of 0.27, and 2.10 instead of 2.05.
-_around_machine_code = for_programs(_one_motion, partial(quickly_compiled, run_seldom=True))
+def _compiler_options(setup: Setup) -> dict | None:
+    """Those that save most for what is compiled; the arrays of the setup are not looked at."""
+    if setup.field.lowered is None:
+        return None
+    # The steps by machine code are no part of it: XLA compiles the rest for a disc in 0.6 s of processor time instead of 1.0, for a bicycle in 1.4 instead of
+    # 3.0; a motion with 201 saved times takes 0.34 ms instead of 0.27, and 2.10 instead of 2.05.
+    return QUICK if reason_against_machine_code(setup) else RUN_SELDOM
+
+
+_compiled = for_programs(_one_motion, partial(quickly_compiled, options=_compiler_options))
 
 
 def integrate_lanes(setups: Setup) -> Trajectory:

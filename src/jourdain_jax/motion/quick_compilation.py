@@ -12,13 +12,16 @@ import equinox as eqx
 import jax
 from jax.extend.core import get_opaque_trace_state
 
-_OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+RUN_SELDOM: dict[str, Any] = QUICK | {"xla_backend_optimization_level": 0}  # where a function's costs are those of its compilation
 MOST_STRUCTURES = 1024  # of arguments, arrays left out, for which one function is kept compiled
-_RUN_SELDOM: dict[str, Any] = _OPTIONS | {"xla_backend_optimization_level": 0}
 
 
-def compiled(f: Callable, **options) -> Callable:
-    """As `equinox.filter_jit`, at a tenth of its costs per call; what was compiled is dropped with the function that is returned. `options`: of `jax.jit`."""
+def compiled(f: Callable, compiler_options: dict | Callable | None = None) -> Callable:
+    """As `equinox.filter_jit`, at a tenth of its costs per call; what was compiled is dropped with the function that is returned.
+
+    `compiler_options`: as of `jax.jit`, or a function that chooses them, called once for arguments of one structure, with a mark in place of each array.
+    """
 
     @lru_cache(maxsize=MOST_STRUCTURES)
     def program(treedef, others) -> Callable:
@@ -27,7 +30,8 @@ def compiled(f: Callable, **options) -> Callable:
             return found, _Kept(kept)
 
         on_arrays.__name__ = getattr(f, "__name__", "on_arrays")
-        return jax.jit(on_arrays, **options)
+        chosen = compiler_options(*jax.tree.unflatten(treedef, others)) if callable(compiler_options) else compiler_options
+        return jax.jit(on_arrays, compiler_options=chosen)
 
     def run(*arguments):
         arrays, structure = _parted(arguments)
@@ -62,12 +66,12 @@ def _whole(arrays, treedef, rest):
     return jax.tree.unflatten(treedef, [next(left) if x is _AN_ARRAY else x for x in rest])
 
 
-def quickly_compiled(f: Callable, compiler: Callable = compiled, run_seldom: bool = False) -> Callable:
-    """`f`, compiled by `compiler`; on a CPU with the quick options, but for calls inside another transformation: JAX takes options of whole programs only.
+def quickly_compiled(f: Callable, compiler: Callable = compiled, options: dict | Callable = QUICK) -> Callable:
+    """`f`, compiled by `compiler`; on a CPU with these options, but for calls inside another transformation: JAX takes options of whole programs only.
 
-    `run_seldom`: what `f` costs is its compilation.
+    `options`: as the compiler takes them.
     """
-    plain, quick = compiler(f), compiler(f, compiler_options=_RUN_SELDOM if run_seldom else _OPTIONS)
+    plain, quick = compiler(f), compiler(f, compiler_options=options)
 
     def run(*arguments):
         return (quick if jax.default_backend() == "cpu" and nothing_is_traced() else plain)(*arguments)

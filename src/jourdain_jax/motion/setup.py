@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jourdain_jax.motion.integrators.knots import knots_between
 from jourdain_jax.motion.integrators.solver_choice import steps_are_given
 from jourdain_jax.motion.span import fitting_times
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.start import State, Usual
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
@@ -79,6 +79,7 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     tolerances: tuple  # rtol, atol
     dt0: Float[Array | np.ndarray, "*lanes"] | float
     options: Options
+    usual: Usual | None = None  # by which the start is yet to be put onto the rows, in the program that integrates; None: it is on them
 
     def fitting(self) -> "Setup":
         """The setup with times that serve any loop, also where its own do not go together."""

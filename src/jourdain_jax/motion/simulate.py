@@ -26,11 +26,12 @@ from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import marked
 from jourdain_jax.motion.own_steps import reason_against_machine_code, reason_against_series
+from jourdain_jax.motion.quick_compilation import nothing_is_traced
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Options, Setup
 from jourdain_jax.motion.span import span_and_start
-from jourdain_jax.motion.start import State, consistent
+from jourdain_jax.motion.start import State, consistent, yet_to_be_moved
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
@@ -158,8 +159,9 @@ def _set_up(
     )
     tolerances = tuple((jnp if is_traced(x) else np).asarray(x, start.q.dtype) for x in (rtol, atol))  # arrays: another tolerance is no other program
     first_step = _first_step(solver, dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
-    start = _on_constraints(scene, t0, start, inputs, made_here) if formulation.projects else start
-    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, options)
+    later = yet_to_be_moved(scene, start) if formulation.projects and not made_here and nothing_is_traced() else None
+    start = _on_constraints(scene, t0, start, inputs, made_here) if formulation.projects and later is None else start
+    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, options, later)
     if backend == "native" and (reason := reason_against_machine_code(setup)):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
     if order is not None and (reason := reason_against_series(setup, order)):

@@ -25,7 +25,7 @@ from jourdain_jax.equations.projection import closure_residual, position_error_o
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs, inputs_at
-from jourdain_jax.motion.quick_compilation import nothing_is_traced, quickly_compiled
+from jourdain_jax.motion.quick_compilation import RUN_SELDOM, nothing_is_traced, quickly_compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
@@ -123,42 +123,59 @@ def _as_input_vector(scene: Scene, inputs, dtype):
     return inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, dtype)
 
 
-class _Found(eqx.Module):
-    """A state; its residual is infinite where a number is not finite."""
+class Found(eqx.Module):
+    """A state on the rows; its residual is infinite where a number is not finite."""
 
     state: State
     arrived: Bool[Array, ""]  # whether the coordinates did, and are within reach of the domain
 
 
-class _Usual(eqx.Module):
+class Usual(eqx.Module):
     """Sizes by which rows and coordinates are measured, and of what kind rows are."""
 
-    closures: Float[np.ndarray, "closures"]
-    rows: Float[np.ndarray, "rows"]  # in scaled speeds; where rows determine the speeds that are free, in the speeds as they are
-    width: Float[np.ndarray, "coordinates"]  # of the domain
+    closures: Float[Array | np.ndarray, "closures"]
+    rows: Float[Array | np.ndarray, "rows"]  # in scaled speeds; where rows determine the speeds that are free, in the speeds as they are
+    width: Float[Array | np.ndarray, "coordinates"]  # of the domain
     affine: bool = eqx.field(static=True)  # rows are, in the speeds
     determined: bool = eqx.field(static=True)  # rows determine the speeds that are free
 
 
-def _worked_out(scene: Scene, determined: bool) -> _Usual:
+def _worked_out(scene: Scene, determined: bool) -> Usual:
     low, high = coordinate_bounds(scene)
     width = np.where(high > low, high - low, 1.0).astype(real_type())
     try:
         rows = plain_row_lengths(scene) if determined else usual_rows(scene).lengths
-        return _Usual(closure_lengths(scene), rows, width, rows_are_affine(scene), determined)
+        return Usual(closure_lengths(scene), rows, width, rows_are_affine(scene), determined)
     except ValueError:  # of a scene that is wrong in itself; said where its structure is asked for
         norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
-        return _Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, False, False)
+        return Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, False, False)
 
 
-_usual = once_per_values(_worked_out, of_traced=_worked_out)
+def _as_arrays(scene: Scene, determined: bool) -> Usual:
+    with jax.ensure_compile_time_eval():
+        return jax.tree.map(jnp.asarray, _worked_out(scene, determined))  # kept, and handed over in a fifth of the time that arrays of NumPy take
+
+
+_usual = once_per_values(_as_arrays, of_traced=_worked_out)
+
+
+def yet_to_be_moved(scene: Scene, start: State) -> Usual:
+    """What `moved_onto_rows` needs of a scene whose numbers are known; a ValueError where the state is none of this scene."""
+    as_coordinates(scene, start.q), as_speeds(scene, start.u)
+    return _usual(scene, False)
+
+
+def moved_onto_rows(scene: Scene, t, start: State, inputs, usual: Usual) -> Found:
+    """The state on the rows nearest to `start`, by Newton's method alone, as a part of a larger compiled function."""
+    every_q, every_u = np.ones(start.q.shape, bool), np.ones(start.u.shape, bool)
+    return _put_onto_constraints(scene, t, start.q, start.u, inputs, every_q, every_u, usual, None)
 
 
 def _can_search(scene: Scene) -> bool:
     return bool(names_of_position_rows(scene) or scene.coordinates.quaternions)
 
 
-def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: _Usual, guesses) -> _Found:
+def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: Usual, guesses) -> Found:
     """q and u on the constraints; no search where `guesses` is None."""
     q, u, free = jnp.asarray(q), jnp.asarray(u), jnp.asarray(free_q)
     near_q, guess = project_positions(scene, t, q, free=free, typical=usual.closures), jnp.zeros((), jnp.int32)
@@ -174,7 +191,7 @@ def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: 
     moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
     names = scene.coordinate_names, scene.speed_names
     state = State(jnp.asarray(t), near_q, near_u, moved_q, moved_u, jnp.where(finite, residual, jnp.inf), names, guess.astype(q.dtype))
-    return _Found(state, arrived)
+    return Found(state, arrived)
 
 
 def _left(scene: Scene, t, q) -> Float[Array, ""]:
@@ -183,13 +200,13 @@ def _left(scene: Scene, t, q) -> Float[Array, ""]:
     return jnp.where(left < _tolerance(q.dtype), 0.0, left)
 
 
-def _arrived(scene: Scene, t, q, near_q, usual: _Usual) -> Bool[Array, ""]:
+def _arrived(scene: Scene, t, q, near_q, usual: Usual) -> Bool[Array, ""]:
     """Whether the rows are met, without running far away."""
     close = jnp.all(jnp.abs(near_q - q) <= FAR * usual.width)  # never where it is not a number
     return jax.lax.stop_gradient(close & (_left(scene, t, near_q) == 0))
 
 
-def _searched(scene: Scene, t, q, free, usual: _Usual, guesses) -> tuple[Float[Array, "coordinates"], Int[Array, ""]]:
+def _searched(scene: Scene, t, q, free, usual: Usual, guesses) -> tuple[Float[Array, "coordinates"], Int[Array, ""]]:
     """Coordinates from the first guess that leads to the rows, q itself counting as the first; and its number."""
     size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
     here, still, at = jax.lax.stop_gradient((q, scene, t))
@@ -210,7 +227,7 @@ def _tolerance(dtype) -> float:
     return 1e3 * float(np.finfo(dtype).eps) ** 0.5
 
 
-_compiled_projection = quickly_compiled(_put_onto_constraints, run_seldom=True)  # one program for every choice of what is held
+_compiled_projection = quickly_compiled(_put_onto_constraints, options=RUN_SELDOM)  # one program for every choice of what is held
 _uncompiled_projection = eval_numpy(_put_onto_constraints)
 
 

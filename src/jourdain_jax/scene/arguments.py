@@ -6,6 +6,7 @@ Kinds and shapes are known while a function is traced: no compiled program conta
 from collections.abc import Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -51,6 +52,8 @@ def as_speeds(scene: Scene, u, what: str = "u") -> Float[Array, "speeds"]:
 
 
 def _as_vector(scene: Scene, what: str, x, names: Names) -> Array:
+    if isinstance(x, jax.Array) and x.shape == (len(names),) and x.dtype == real_type() and not x.weak_type:
+        return x  # as it should be, in a twentieth of the time of what follows
     listed = ", ".join(names.entries)
     if isinstance(x, Mapping):
         raise ValueError(f"`{what}` of `{type(scene).__name__}` is a dictionary, expected a vector of {listed}; `jj.start(scene, **values)` makes one by name")
