@@ -29,7 +29,7 @@ from jourdain_jax.dynamics.power import power_of_nonconservative
 from jourdain_jax.dynamics.reactions import row_reactions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import gibbs_equations
-from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, partial_velocities, velocities
+from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, partial_velocities, shapes_along_motion, velocities
 from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
 from jourdain_jax.equations.reductions import diagnosed
 from jourdain_jax.equations.rows import names_of_rows
@@ -175,15 +175,13 @@ def _newton(scene: Scene, found: dict) -> Check:
 
 def _acts_on_speeds(scene: Scene) -> bool:
     """Whether loads act directly on speeds, or a potential is given as a function of coordinates: then bodies do not show all forces."""
-    q, u, _ = scene.named()
     flags: list[bool] = []
 
-    def look(scene):
-        motion = motion_at(scene, 0.0, q, u)
+    def look(scene, motion):
         flags.append(potential_of(scene, motion.pose()) is not None)
         flags.extend(bool(load.generalized) for load in loads_of(scene, motion))
 
-    jax.eval_shape(look, scene)
+    shapes_along_motion(look, scene)
     return any(flags)
 
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.explicit_power import explicit_rate, forces_for_potentials, power_of_loads
 from jourdain_jax.build.structure import Structure, structure_of
-from jourdain_jax.equations.kinematics import inertias, motion_at
+from jourdain_jax.equations.kinematics import inertias, motion_at, shapes_along_motion
 from jourdain_jax.equations.reductions import Accelerations, Reduced
 from jourdain_jax.equations.virtual_power import newton_residual, potential_energy
 from jourdain_jax.scene.motion_state import Motion
@@ -60,11 +60,10 @@ def _rows_work(structure: Structure) -> bool:
 def _some_load_has_no_potential(scene: Scene) -> bool:
     flags: list[bool] = []
 
-    def look(scene):
-        q, u, _ = scene.named()
-        flags.extend(load.potential is None for load in loads_of(scene, motion_at(scene, 0.0, q, u)))
+    def look(scene, motion):
+        flags.extend(load.potential is None for load in loads_of(scene, motion))
 
-    jax.eval_shape(look, scene)
+    shapes_along_motion(look, scene)
     return any(flags)
 
 

@@ -7,6 +7,9 @@
 Source: Wang and Pao (2003), sections III and V.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,6 +21,7 @@ from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_speeds, as_time
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose, Motion, Pose
+from jourdain_jax.scene.numbers import real_type
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import bodies_of, coordinate_rates_of
 
@@ -58,6 +62,12 @@ def motion_at(scene: Scene, t, q, u, inputs=None) -> Motion:
         name: BodyMotion(name, pose.body, rates[name].body.position, _space_angular_velocity(pose.body, rates[name].body)) for name, pose in poses.items()
     }
     return Motion(t, scene.coordinate_names.view(q), scene.speed_names.view(u), scene.coordinate_names.view(qdot), scene.inputs.view(inputs), bodies)
+
+
+def shapes_along_motion(look: Callable[[Scene, Motion], Any], scene: Scene):
+    """Shapes of what `look(scene, motion)` returns, by tracing it at no state in particular: at numbers, JAX would compile operation by operation."""
+    numbers = [jax.ShapeDtypeStruct(shape, real_type()) for shape in ((), (len(scene.coordinate_names),), (len(scene.speed_names),))]
+    return jax.eval_shape(lambda scene, t, q, u: look(scene, motion_at(scene, t, q, u)), scene, *numbers)
 
 
 def _space_angular_velocity(body, rate) -> Float[Array, "3"]:

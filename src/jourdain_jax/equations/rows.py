@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.rotations import skew
-from jourdain_jax.equations.kinematics import motion_at, pose_at
+from jourdain_jax.equations.kinematics import motion_at, pose_at, shapes_along_motion
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
@@ -129,19 +129,17 @@ def _velocity_residual(scene: Scene, t: Float[Array, ""], q, u, inputs):
 @once_per_class
 def names_of_rows(scene: Scene) -> tuple[str, ...]:
     """Names of all rows, in order, without evaluating them."""
-    q, u, _ = scene.named()
-    return _names(lambda s: velocity_rows(s, motion_at(s, 0.0, q, u)), scene)
+    return _names(velocity_rows, scene)
 
 
 @once_per_class
 def names_of_position_rows(scene: Scene) -> tuple[str, ...]:
     """Names of the geometric rows, in order; they come first among all rows."""
-    q, _, _ = scene.named()
-    return _names(lambda s: position_rows(s, pose_at(s, jnp.zeros(()), q)), scene)
+    return _names(lambda scene, motion: position_rows(scene, motion.pose()), scene)
 
 
 def _names(rows, scene: Scene) -> tuple[str, ...]:
-    """Names of `rows(scene)` by tracing. They are noted inside, because JAX returns dictionaries sorted by name."""
+    """Names of `rows(scene, motion)` by tracing. They are noted inside, because JAX returns dictionaries sorted by name."""
     names: list[str] = []
-    jax.eval_shape(lambda s: names.extend(row_names(rows(s))), scene)
+    shapes_along_motion(lambda scene, motion: names.extend(row_names(rows(scene, motion))), scene)
     return tuple(names)

@@ -5,12 +5,15 @@ XLA's newer fusion emitters on the CPU take up to twice as long to compile a sca
 """
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
 import jax
 from jax.extend.core import get_opaque_trace_state
+
+from jourdain_jax.build.reference_parameters import without_collecting
 
 QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
 RUN_SELDOM: dict[str, Any] = QUICK | {"xla_backend_optimization_level": 0}  # where a function's costs are those of its compilation
@@ -35,7 +38,10 @@ def compiled(f: Callable, compiler_options: dict | Callable | None = None) -> Ca
 
     def run(*arguments):
         arrays, structure = _parted(arguments)
-        found, kept = program(*structure)(arrays)
+        before = program.cache_info().misses
+        wanted = program(*structure)
+        with without_collecting() if program.cache_info().misses > before else nullcontext():  # what is traced makes millions of objects
+            found, kept = wanted(arrays)
         return _whole(found, *kept.value)
 
     return run

@@ -152,8 +152,9 @@ def _worked_out(scene: Scene, determined: bool) -> Usual:
 
 
 def _as_arrays(scene: Scene, determined: bool) -> Usual:
+    found = _worked_out(scene, determined)  # on NumPy; what it traces must not be computed at once
     with jax.ensure_compile_time_eval():
-        return jax.tree.map(jnp.asarray, _worked_out(scene, determined))  # kept, and handed over in a fifth of the time that arrays of NumPy take
+        return jax.tree.map(jnp.asarray, found)  # kept, and handed over in a fifth of the time that arrays of NumPy take
 
 
 _usual = once_per_values(_as_arrays, of_traced=_worked_out)

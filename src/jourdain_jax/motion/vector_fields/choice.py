@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from jourdain_jax.build.reference_parameters import once_per_values
@@ -11,6 +10,7 @@ from jourdain_jax.build.usual_lengths import usual_lengths
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.dynamics.accelerations import as_reduction
 from jourdain_jax.dynamics.power import needs_work
+from jourdain_jax.equations.kinematics import shapes_along_motion
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
 from jourdain_jax.equations.rows import names_of_position_rows
@@ -116,4 +116,4 @@ def _default_reduction(structure: Structure, independent: tuple[int, ...] | None
 @once_per_class
 def _is_closed(scene: Scene) -> bool:
     """Whether there are geometric rows or quaternion norms to keep."""
-    return jax.eval_shape(lambda s: closure_residual(s, 0.0, s.named()[0]), scene).shape[0] > 0
+    return shapes_along_motion(lambda scene, motion: closure_residual(scene, motion.t, motion.q.array), scene).shape[0] > 0
