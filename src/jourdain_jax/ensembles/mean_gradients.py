@@ -100,7 +100,7 @@ def _check_shared(task: Task, shared: Sequence[str]) -> None:
 
 
 def _of_block(task: Task, columns: Sequence[str]):
-    """Columns by name -> outputs (lanes, outputs), their derivatives by each column (columns, lanes, outputs), and how lanes ended (lanes,)."""
+    """Columns by name -> outputs (lanes, outputs), their derivatives with respect to each column (columns, lanes, outputs), and how lanes ended (lanes,)."""
 
     def outputs(drawn: Mapping):
         parameters = {name: column for name, column in drawn.items() if not name.endswith(AT_START)}
