@@ -160,9 +160,9 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
     if not all(np.isfinite(trace[0][1][0]) for trace in found.trace):
         check_first_guess(scene, runs, unknowns)
     same = np.zeros(members, int) if members else np.asarray(found.agreeing(_SAME))
-    if pieces is not None and not members:
-        pieces.keep(int(np.argmin(found.at.cost)))
     if pieces is not None:
+        if not members:
+            pieces.keep(int(np.argmin(found.at.cost)))
         control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.theta))))
         asked = replace(asked, control=control)
     found = _with_memory(problem, found if members else found.lowest(), limits, control)

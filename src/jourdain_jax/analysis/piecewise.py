@@ -152,7 +152,7 @@ class Piecewise:
                 join[:, range(self.states), range(M + m, 2 * M)] = -1.0
                 rows = range(self.states, joins.shape[2])
                 join[:, rows, carried], join[:, rows, M + carried], join[:, rows, -1] = 1.0, -1.0, local[:, i, carried] - local[:, i + 1, carried]
-            sizes = np.concatenate([self.node_sizes, self.unknowns._least[self.shared :][carried]]) if carried.size else self.node_sizes
+            sizes = np.concatenate([self.node_sizes, self.unknowns.least[self.shared :][carried]]) if carried.size else self.node_sizes
             joins = joins / (width * sizes)[:, None]
         joins[~np.isfinite(at.cost)] = 0.0
         finite = np.isfinite(joins.sum(axis=(1, 2, 3)))

@@ -116,12 +116,13 @@ class Unknowns:
         return np.array([r.low for r in self.ranges]), np.array([r.high for r in self.ranges])
 
     @cached_property
-    def _least(self) -> np.ndarray:
+    def least(self) -> np.ndarray:
+        """The magnitude of each where it is near zero."""
         return np.array([r.least_size(x) for r, x in zip(self.ranges, self.guess.tolist(), strict=True)])
 
     def sizes(self, theta: Float[np.ndarray, "*members places"]) -> Float[np.ndarray, "*members places"]:
         """The magnitude against which changes of each are measured: its own; near zero a typical one."""
-        return np.asarray(np.maximum(np.abs(theta), self._least))
+        return np.asarray(np.maximum(np.abs(theta), self.least))
 
     def first_guesses(self, count: int) -> Float[np.ndarray, "guesses places"]:
         """The first guess, and others on a Latin hypercube over the ranges; always the same ones."""

@@ -21,10 +21,10 @@ class Rules(NamedTuple):
 
 
 def differentiated_as(differentiable: Callable, quick: Callable, kind: Literal["forward", "reverse"], rules: Rules | None = None) -> Callable:
-    """`quick`, which JAX cannot differentiate, with derivatives by `rules` where they serve, and otherwise those of `differentiable`, which computes the same.
+    """A function that runs `quick`, which JAX cannot differentiate. Its derivatives are by `rules` where these serve, otherwise those of `differentiable`.
 
-    Both take trees of arrays and of anything else, and return trees of arrays. `kind`: the mode of differentiation of `differentiable`. The rules are for
-    first derivatives; those of higher order, of what the rules compute, are again those of `differentiable`.
+    Both compute the same; they take trees of arrays and of anything else, and return trees of arrays. `kind`: the mode of differentiation of `differentiable`.
+    The rules are for first derivatives; those of higher order, of what the rules compute, are again those of `differentiable`.
     """
     return (_forward if kind == "forward" else _reverse)(differentiable, quick, rules)
 
