@@ -78,7 +78,6 @@ from jourdain_jax.lowering.built import Built, build
 from jourdain_jax.lowering.lower import NotLowered, lower
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.batches.rollout import Rollout, rollout
-from jourdain_jax.motion.formulation import Formulation
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
 from jourdain_jax.motion.integrators.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
@@ -94,6 +93,7 @@ from jourdain_jax.motion.trajectories.results import SimulationError
 from jourdain_jax.motion.trajectories.storage import load_rollout, load_trajectory, save
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.trajectories.versions import version_of as _version_of
+from jourdain_jax.motion.vector_fields.choice import Formulation
 from jourdain_jax.plotting.animation import animate
 from jourdain_jax.plotting.quantities import plot
 from jourdain_jax.plotting.show import View, show

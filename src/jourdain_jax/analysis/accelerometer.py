@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import checked_real, described
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.numbers import checked_real, described
 from jourdain_jax.scene.scene import Scene
 
 

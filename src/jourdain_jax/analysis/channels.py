@@ -13,10 +13,10 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.program.calls import description
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.what_is_read import is_function, is_read_by
 

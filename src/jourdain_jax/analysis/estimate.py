@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jourdain_jax.analysis.ranges import Range
-from jourdain_jax.scene.numbers import checked_known, described
+from jourdain_jax.calculus.reals import checked_known, described
 
 
 @dataclass(frozen=True)

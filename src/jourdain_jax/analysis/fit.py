@@ -30,9 +30,9 @@ from jourdain_jax.analysis.shooting_steps import cutoff_of, shot
 from jourdain_jax.analysis.starts import check_first_guess, check_starts
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.calculus.guards import DifferentiationModeError
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import as_names
-from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 

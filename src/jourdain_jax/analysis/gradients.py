@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.verification import DIFFERENCE_STEP, Check, central_difference, check
 from jourdain_jax.build.structure import plain_row_lengths, usual_rows
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
-from jourdain_jax.calculus.reals import as_real
+from jourdain_jax.calculus.reals import as_real, described
 from jourdain_jax.dynamics.accelerations import reductions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
@@ -18,7 +18,6 @@ from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.reductions import reduce
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.equations.virtual_power import equations_and_rows
-from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
 
 

@@ -14,9 +14,9 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.correlated_noise import log_density
 from jourdain_jax.analysis.measurements import Measurements, checked
 from jourdain_jax.analysis.predictions import Run, equal_runs
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import as_scene
-from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
 
 

@@ -25,10 +25,10 @@ from jourdain_jax.analysis.starts import check_starts
 from jourdain_jax.analysis.transforms import Transforms
 from jourdain_jax.analysis.unknowns import Layout, unknowns_of
 from jourdain_jax.build.reference_parameters import reference_parameters
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import as_names, nearest
-from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 

@@ -15,10 +15,9 @@ from jourdain_jax.analysis.channels import channel, motion_shape
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.sensors import Actuator, Drive, Reading, Sensor, latest, numbers_of
-from jourdain_jax.calculus.reals import Number
+from jourdain_jax.calculus.reals import Number, checked_unless_traced, described, is_traced
 from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
-from jourdain_jax.scene.numbers import checked_unless_traced, described, is_traced
 from jourdain_jax.scene.scene import Scene, entries_named
 
 _NO_INPUTS = Inputs(())

@@ -19,10 +19,10 @@ from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.lagged import filtered, filtered_held, held, read
 from jourdain_jax.analysis.ranges import positive, unbounded
+from jourdain_jax.calculus.reals import checked_real, described, is_traced
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.numbers import checked_real, described, is_traced
 
 NUMBERS = {"gain": 1.0, "bias": 0.0, "delay": 0.0, "lag": 0.0}  # and those of an ideal sensor
 UNITS = {"gain": "", "bias": "", "delay": "s", "lag": "s"}

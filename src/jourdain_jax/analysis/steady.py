@@ -18,7 +18,7 @@ from jourdain_jax.analysis.tangent import flow_of, privileged_speeds
 from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.trace import traced_scene
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
-from jourdain_jax.calculus.reals import Number, Numbers
+from jourdain_jax.calculus.reals import Number, Numbers, described
 from jourdain_jax.dynamics.cyclic import ignorable_coordinates
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import names_of_position_rows
@@ -26,7 +26,6 @@ from jourdain_jax.motion.start import State
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.names import as_names, nearest
-from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines

@@ -11,7 +11,7 @@ import numpy as np
 
 from jourdain_jax.build.reference_parameters import reference_parameters, with_reference_parameters
 from jourdain_jax.build.structure import decisions_of
-from jourdain_jax.scene.numbers import real_type
+from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.scene.scene import Scene
 
 

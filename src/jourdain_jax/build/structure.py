@@ -21,11 +21,11 @@ from jourdain_jax.build.reference_parameters import once_per_values, without_col
 from jourdain_jax.build.row_lengths import speed_scales, typical_row_lengths
 from jourdain_jax.build.sampling import no_numbers, random_states, states_near_what_was_seen, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import check_smoothness
+from jourdain_jax.calculus.reals import described, is_traced
 from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, names_of_rows
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import as_names
-from jourdain_jax.scene.numbers import described, is_traced
 from jourdain_jax.scene.scene import Scene
 
 RANDOM_PROBES = 24

@@ -60,6 +60,13 @@ def checked_known(value, what: str, shape: tuple[int, ...] | None = None, *, adv
     return array.astype(real_type())
 
 
+def checked_unless_traced(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str):
+    """`value` in the default float: on NumPy where it is known, also inside `jit`; a JAX array where it is traced. A ValueError as of `checked_real`."""
+    if is_traced(value):
+        return checked_real(value, what, shape, advice=advice).astype(real_type())
+    return checked_known(value, what, shape, advice=advice)
+
+
 def _check(array, what: str, shape: tuple[int, ...] | None, advice: str) -> None:
     if array.dtype.kind not in "iuf" and not jnp.issubdtype(array.dtype, jnp.integer) and not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(f"{what} is of type {array.dtype}, expected real numbers; {advice}")

@@ -28,13 +28,13 @@ import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
 from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Smallest
 from jourdain_jax.ensembles.result import StudyResult, load_study, merge_studies
 from jourdain_jax.ensembles.study import Study
 from jourdain_jax.models.registry import model
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import described
 
 ACTIONS = ("status", "resume", "export", "merge")
 VARYING: dict[str, Callable] = {"normal": Normal, "uniform": Uniform, "log-normal": LogNormal, "log-uniform": LogUniform}

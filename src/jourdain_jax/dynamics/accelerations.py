@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.structure import structure_of, usual_rows
+from jourdain_jax.calculus.reals import checked_real, described
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.reductions import (
@@ -27,7 +28,6 @@ from jourdain_jax.equations.rows import ConstraintRows, UsualRows, position_resi
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
 from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import checked_real, described
 from jourdain_jax.scene.scene import Scene
 
 

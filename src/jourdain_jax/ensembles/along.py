@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.scene.numbers import described
 
 FOR_EXTREMES, FOR_INTEGRALS = 5, 4  # values that a polynomial goes through
 FINE = 33  # places at which the polynomial is looked at

@@ -10,13 +10,13 @@ import threading
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.ensembles.deadly_lanes import without_deadly_lanes
 from jourdain_jax.ensembles.optional import cluster_by
 from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
 from jourdain_jax.ensembles.workers import keep_to_share, sent_to_others
-from jourdain_jax.scene.numbers import described
 
 AHEAD = 2  # chunks per thread of a worker: one under way, one that waits for it
 

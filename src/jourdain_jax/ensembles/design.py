@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.ensembles.distributions import Distribution, Levels
 from jourdain_jax.ensembles.optional import special_functions
 from jourdain_jax.ensembles.samplers import MOST_SOBOL, SAMPLERS
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.printing import Printed
 
 GRID, TABLE = "grid", "table"

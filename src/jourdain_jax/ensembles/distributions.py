@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import checked_known
 from jourdain_jax.ensembles.optional import special_functions
-from jourdain_jax.scene.numbers import checked_known
 
 
 class Distribution:

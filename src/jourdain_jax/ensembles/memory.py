@@ -15,7 +15,7 @@ import os
 import re
 from typing import Any
 
-from jourdain_jax.scene.numbers import described
+from jourdain_jax.calculus.reals import described
 
 COMPILED = 500e6  # bytes for compilers and what they compile; the disc takes 220 MB, the bicycle 400 MB
 IMPORTED = 240e6  # bytes that a process holds with this package and before it computes

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.build.event_names import names_of_events
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.ensembles.along import integral, largest, sampled
 from jourdain_jax.motion.trajectories.results import EVENT
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.ensembles.cluster import on_cluster
 from jourdain_jax.ensembles.design import Design
 from jourdain_jax.ensembles.distributions import Distribution, Levels
@@ -18,10 +19,9 @@ from jourdain_jax.ensembles.result import StudyResult
 from jourdain_jax.ensembles.run import bounded, in_this_process, run
 from jourdain_jax.ensembles.task import AT_START, SAVES, Task
 from jourdain_jax.ensembles.workers import in_processes
-from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
+from jourdain_jax.motion.arguments import as_end, check_span, check_times, saved_times
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene

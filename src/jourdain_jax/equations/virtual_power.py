@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
@@ -35,7 +36,6 @@ from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import described
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import loads_of, potential_of
 

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import checked_real, described
 from jourdain_jax.importers.formulas import Formulas, sympy_package
 from jourdain_jax.importers.identifiers import class_name, identifiers
 from jourdain_jax.importers.scene_class import Parameter, scene_class
@@ -17,7 +18,6 @@ from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import checked_real, described
 from jourdain_jax.scene.scene import Scene
 
 

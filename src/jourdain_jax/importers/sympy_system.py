@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.importers.formulas import sympy_package
-from jourdain_jax.scene.numbers import described
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.names import as_names
-from jourdain_jax.scene.numbers import described
 
 Element = ElementTree.Element
 

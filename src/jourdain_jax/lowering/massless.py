@@ -7,7 +7,7 @@ import numpy as np
 
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.structure import Structure, structure_of
-from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.scene.scene import Scene
 
 

@@ -16,9 +16,9 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, Primitive, Var, jaxpr_as_fun
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.quick_compilation import compiled
 from jourdain_jax.program.calls import description
-from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.what_is_read import WhatIsRead, is_function, is_read_by
 
 MOST_PROGRAMS = 64  # kept, so that equal ones are one object

@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import as_real, real_type
+from jourdain_jax.calculus.reals import as_real, checked_real, checked_unless_traced, described, is_traced, real_type
 from jourdain_jax.motion.input_programs import FunctionOfTime, by_itself, for_programs, traced
 from jourdain_jax.scene.arguments import ChangingInputs
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import checked_real, checked_unless_traced, described, is_traced
 from jourdain_jax.scene.scene import Scene
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool
 
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
+from jourdain_jax.motion.arguments import times_fit
 from jourdain_jax.motion.diffrax_steps import solved_by_diffrax
 from jourdain_jax.motion.energy_check import conserves, energies_near, energy_lost
 from jourdain_jax.motion.input_programs import for_programs
@@ -23,7 +24,6 @@ from jourdain_jax.motion.integrators.solver_choice import marked_inputs, marked_
 from jourdain_jax.motion.own_steps import lanes_solved_by_own_steps, reason_against_machine_code, solved_by_own_steps
 from jourdain_jax.motion.quick_compilation import QUICK, RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.setup import Begun, Setup, Solved
-from jourdain_jax.motion.span import times_fit
 from jourdain_jax.motion.start import State, consistent, moved_onto_rows
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory

@@ -5,8 +5,8 @@ from functools import wraps
 
 import jax
 
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.scene.numbers import is_traced
 
 
 def nan_is_a_mark():

@@ -13,7 +13,6 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.motion.formulation import as_formulation
 from jourdain_jax.motion.integrators.radau import RadauIIA
 from jourdain_jax.motion.integrators.solver_choice import may_be_full
 from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS, implicit_steps, is_stiff
@@ -21,6 +20,7 @@ from jourdain_jax.motion.integrators.taylor import Taylor
 from jourdain_jax.motion.setup import MOST_STEPS
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.motion.vector_fields.choice import as_formulation
 from jourdain_jax.motion.vector_fields.field import VectorField
 
 Motions = TypeVar("Motions", bound=Trajectory)

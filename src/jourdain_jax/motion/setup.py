@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jourdain_jax.motion.arguments import fitting_times
 from jourdain_jax.motion.integrators.knots import knots_between
 from jourdain_jax.motion.integrators.solver_choice import steps_are_given
-from jourdain_jax.motion.span import fitting_times
 from jourdain_jax.motion.start import State, Usual
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene

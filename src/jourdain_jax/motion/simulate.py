@@ -16,9 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.build.event_names import names_of_events
-from jourdain_jax.calculus.reals import Number
-from jourdain_jax.motion.arguments import check_options
-from jourdain_jax.motion.formulation import Formulation, as_formulation
+from jourdain_jax.calculus.reals import Number, is_traced
+from jourdain_jax.motion.arguments import check_options, span_and_start
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
@@ -30,12 +29,10 @@ from jourdain_jax.motion.quick_compilation import nothing_is_traced
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Options, Setup
-from jourdain_jax.motion.span import span_and_start
 from jourdain_jax.motion.start import State, consistent, yet_to_be_moved
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.vector_fields.choice import vector_field
+from jourdain_jax.motion.vector_fields.choice import Formulation, as_formulation, vector_field
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
-from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 

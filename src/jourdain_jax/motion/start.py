@@ -19,7 +19,7 @@ from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.sampling import NoStateFoundError, seen_on_rows
 from jourdain_jax.build.structure import Structure, closure_lengths, plain_row_lengths, rows_are_affine, structure_of, usual_rows
 from jourdain_jax.calculus.damped import damped_root
-from jourdain_jax.calculus.reals import Number, Numbers
+from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, is_traced, real_type
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.projection import closure_residual, position_error_of_rows, project_positions, project_speeds
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
@@ -29,7 +29,6 @@ from jourdain_jax.motion.quick_compilation import RUN_SELDOM, nothing_is_traced,
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import checked_unless_traced, is_traced, real_type
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene, vectors_named
 from jourdain_jax.scene.tracebacks import shown_from_users_lines

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
 from jourdain_jax.plotting.looks import Look, looks_of
 from jourdain_jax.plotting.solids import parts_of, rgb
-from jourdain_jax.scene.numbers import described
 
 FRAMES = 60
 _LIGHT = np.array([0.1, -0.6, 0.79])  # unit vector towards the light

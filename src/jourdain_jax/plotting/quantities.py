@@ -5,13 +5,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
 from jourdain_jax.plotting.units import checked_units
 from jourdain_jax.scene.names import UnknownNameError, nearest
-from jourdain_jax.scene.numbers import described
 
 ENERGIES = ("energy", "kinetic energy", "potential energy")
 _DARK, _PALE = 0.4, 0.2  # opacity of the narrowest band, and of the others

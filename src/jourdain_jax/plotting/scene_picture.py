@@ -4,12 +4,12 @@ from itertools import groupby
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.start import start
 from jourdain_jax.plotting.looks import looks_at
 from jourdain_jax.plotting.solids import parts_in_space
 from jourdain_jax.plotting.still import VIEWS, lit
 from jourdain_jax.plotting.still_axes import GRID, GROUND, SHADOW, camera_at
-from jourdain_jax.scene.numbers import is_traced
 
 _WIDE, _HIGH, _RIM = 300, 190, 6  # pixels
 

@@ -11,11 +11,11 @@ from importlib import resources
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.page_data import page_data
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import described
 
 LANES = 12  # of a rollout, at most
 

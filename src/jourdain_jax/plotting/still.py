@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
 from jourdain_jax.plotting.looks import Drawn, looks_of
 from jourdain_jax.plotting.solids import Part, parts_in_space, shaded
 from jourdain_jax.plotting.still_axes import Camera, camera_at, draw_floor, draw_plane
-from jourdain_jax.scene.numbers import described
 
 VIEWS = {"above": (90.0, -90.0), "side": (0.0, -90.0), "space": (28.0, -60.0)}  # elevation and azimuth, degrees
 _PATH = (0.27, 0.27, 0.27)  # the colour of paths

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.names import UnknownNameError, nearest
-from jourdain_jax.scene.numbers import described
 
 # one of these units, in those of SI
 TIMES = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.scene.numbers import checked_real
+from jourdain_jax.calculus.reals import checked_real
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 

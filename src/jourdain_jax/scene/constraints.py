@@ -8,10 +8,9 @@ Geometric rows are functions of a `Pose` and vanish; the engine differentiates t
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Number, Vector, checked_real, described
+from jourdain_jax.calculus.reals import Number, Vector, checked_real, described, is_traced
 from jourdain_jax.calculus.rotations import vee
 from jourdain_jax.scene.motion_state import BodyMotion, BodyPose
-from jourdain_jax.scene.numbers import is_traced
 
 
 def _point(position: Vector, what: str) -> Float[Array, "3"]:

@@ -12,11 +12,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import checked_real, described, is_traced
 from jourdain_jax.scene.bodies import RigidBody, _axis_index
 from jourdain_jax.scene.contact_points import Ball, Ellipsoid, Shape, Wheel, touch
 from jourdain_jax.scene.grounds import Cylinder, Ground, Plane, Sphere, positive_length
 from jourdain_jax.scene.motion_state import BodyPose
-from jourdain_jax.scene.numbers import checked_real, described, is_traced
 
 _HEIGHTS = ("coordinates", "row")
 

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import described, real_type
 from jourdain_jax.calculus.rotations import quaternion_rate
 from jourdain_jax.scene.names import Named, nearest
-from jourdain_jax.scene.numbers import described, real_type
 
 
 @dataclass(frozen=True)

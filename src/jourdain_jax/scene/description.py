@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import described, is_traced
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import as_names, nearest
-from jourdain_jax.scene.numbers import described, is_traced
 
 METHODS = (
     "bodies",

@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import Vector, as_real
-from jourdain_jax.scene.numbers import checked_real, described, is_traced
+from jourdain_jax.calculus.reals import Vector, as_real, checked_real, described, is_traced
 
 _SIDES = ("inside", "outside")
 _UNIT = 1e-4  # a typed unit vector may have a few digits; a mistake is larger

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jourdain_jax.calculus.reals import as_real
-from jourdain_jax.scene.numbers import described
+from jourdain_jax.calculus.reals import as_real, described
 
 
 def _as_leaf(value):

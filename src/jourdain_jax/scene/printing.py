@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import jax
 
-from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.scene.parameters import parameters_of
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.scene.numbers import checked_real, is_traced
+from jourdain_jax.calculus.reals import checked_real, is_traced
 
 
 class Spline(eqx.Module):

@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from jourdain_jax.scene.numbers import described
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.what_is_read import WhatIsRead, is_function, is_read_by
 
 

@@ -8,12 +8,12 @@ from typing import get_args
 
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import checked_real, described
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
-from jourdain_jax.scene.numbers import checked_real, described
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 

@@ -14,7 +14,8 @@ from jaxtyping import Array, Float, Int
 from tqdm import tqdm
 
 from jourdain_jax.build.reference import Reference
-from jourdain_jax.motion.arguments import check_options
+from jourdain_jax.calculus.reals import checked_real, described, is_traced
+from jourdain_jax.motion.arguments import as_end, check_options, check_span, check_times, saved_times
 from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import integrate_lanes
@@ -25,7 +26,6 @@ from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.retries import lost_codes, mark_retried, next_retry, retry_options
 from jourdain_jax.motion.setup import TOLERANCE
 from jourdain_jax.motion.simulate import default_solver, set_up, warn_float32
-from jourdain_jax.motion.span import as_end, check_span, check_times, saved_times
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.trajectories import labelled, results
 from jourdain_jax.motion.trajectories.sketch import sketch_of_lanes
@@ -34,7 +34,6 @@ from jourdain_jax.motion.vector_fields.choice import vector_field
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import checked_real, described, is_traced
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene

@@ -13,10 +13,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.field import VectorField
-from jourdain_jax.scene.numbers import is_traced
 
 OUT_OF_STEPS = (results.MAX_STEPS, results.SHRANK)
 _SHARE = 10  # a step of the implicit solver costs tens of explicit ones: it gets a tenth of the number

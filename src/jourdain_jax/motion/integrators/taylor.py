@@ -4,8 +4,7 @@ import math
 
 import equinox as eqx
 
-from jourdain_jax.calculus.reals import Number
-from jourdain_jax.scene.numbers import is_traced
+from jourdain_jax.calculus.reals import Number, is_traced
 
 LEAST, MOST = 4, 30
 _UNKNOWN = 1e-12  # the tolerance that the order is for where it is traced

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.rows import UsualRows
@@ -17,7 +18,6 @@ from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.trajectories.over_times import Record, accelerations_over_times, contact_forces_over_times, energies, invariants, residuals
 from jourdain_jax.motion.trajectories.results import FALLBACKS
-from jourdain_jax.scene.numbers import is_traced
 
 
 class Energies(eqx.Module):

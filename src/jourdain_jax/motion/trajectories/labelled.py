@@ -9,9 +9,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.trajectories.over_times import Record
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.parameters import parameters_of
 
 CODES = ("success", "event", "max_steps", "step_too_small", "not_finite", "inconsistent_start", "singular_partition", "bad_parameter", "bad_start",

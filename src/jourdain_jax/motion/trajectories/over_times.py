@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.structure import structure_of, usual_rows
+from jourdain_jax.calculus.reals import checked_real, is_traced
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions, contact_forces, row_reactions
 from jourdain_jax.equations.kinematics import motion_at
@@ -18,7 +19,6 @@ from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.numbers import checked_real, is_traced
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import invariants_of
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.build.plausibility import body_faults
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.motion.inputs import Inputs, inputs_at
@@ -17,7 +18,6 @@ from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, ene
 from jourdain_jax.motion.trajectories.sketch import sketch
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import UnknownNameError, nearest
-from jourdain_jax.scene.numbers import is_traced
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.printing import preformatted, shapes_of
 from jourdain_jax.scene.scene import Scene

@@ -1,22 +1,25 @@
-"""Which form of the state is integrated, given what was asked."""
+"""Which equations are integrated, given what was asked: the form of the state, how accelerations are found, what keeps the state on its constraints."""
 
-from typing import Any
+from dataclasses import replace
+from typing import Any, Literal
 
+import equinox as eqx
 import jax.numpy as jnp
 
 from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.structure import WELL_CONDITIONED, Structure, structure_of
 from jourdain_jax.build.usual_lengths import usual_lengths
 from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
-from jourdain_jax.dynamics.accelerations import as_reduction
+from jourdain_jax.calculus.reals import described
+from jourdain_jax.dynamics.accelerations import Baumgarte, as_reduction
 from jourdain_jax.dynamics.power import needs_work
+from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import shapes_along_motion
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
 from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.formulation import Formulation, as_formulation
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.vector_fields.by_matrices import Full, Minimal
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
@@ -25,7 +28,65 @@ from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
+_STATES = ("auto", "minimal", "full")
 _BACKENDS = ("auto", "native", "xla", "dense")
+
+
+class Formulation(eqx.Module):
+    """Which equations `simulate` integrates. The default takes what serves the scene.
+
+    - `state`: "minimal", coordinates q and privileged speeds y; "full", coordinates and all speeds u; "auto" (default), the minimal one where the
+      privileged speeds are well conditioned over the scene's domain and the rows are linear or affine.
+    - `reduction`: how accelerations are found, a name or an object as in `accelerations` (default: the scene's scalar program where there is one).
+    - `stabilisation`: what keeps the state on rows that its form does not keep by itself, the start included: "projection" (default) puts it back after
+      each step; `jj.Baumgarte(alpha, beta)` adds its terms to the rows, for comparison; None leaves it alone.
+
+    ValueError for anything else.
+
+    **Examples**
+
+        rods = jj.models.DoublePendulumRods()
+        dense = jj.Formulation("full", reduction="kkt")                # all speeds, multipliers from one linear system
+        motion = jj.simulate(rods, t1=0.2, formulation=dense)
+        print(motion.state_form, motion.reduction)
+    """
+
+    state: Literal["auto", "minimal", "full"] = eqx.field(static=True, default="auto")
+    reduction: Reduction | GibbsAppell | str | None = None
+    stabilisation: Baumgarte | Literal["projection"] | None = "projection"
+
+    def __check_init__(self) -> None:
+        if self.state not in _STATES:
+            raise ValueError(f"unknown state form `{self.state}`; {nearest(str(self.state), _STATES)}")
+        stabilisation = self.stabilisation
+        if not (stabilisation is None or isinstance(stabilisation, Baumgarte) or (isinstance(stabilisation, str) and stabilisation == "projection")):
+            raise ValueError(f'`stabilisation` is {described(stabilisation)}, expected "projection", `jj.Baumgarte(alpha, beta)` or None')
+
+    @property
+    def projects(self) -> bool:
+        """Whether the state is put back onto the constraints after each step."""
+        return isinstance(self.stabilisation, str)
+
+    @property
+    def baumgarte(self) -> Baumgarte | None:
+        """The terms added to the rows; None where there are none."""
+        return self.stabilisation if isinstance(self.stabilisation, Baumgarte) else None
+
+    def with_state(self, state: Literal["auto", "minimal", "full"]) -> "Formulation":
+        """This formulation with another form of the state."""
+        return replace(self, state=state)
+
+
+_DEFAULT = Formulation()
+
+
+def as_formulation(formulation) -> Formulation:
+    """The formulation, the default one for None; ValueError for anything else."""
+    if formulation is None:
+        return _DEFAULT
+    if not isinstance(formulation, Formulation):
+        raise ValueError(f"`formulation` is {described(formulation)}, expected `jj.Formulation(state, reduction, stabilisation)` or None")
+    return formulation
 
 
 def vector_field(scene: Scene, formulation: Formulation | None = None, work: bool = True, backend: str = "auto", inputs=None) -> VectorField:
