@@ -1,6 +1,7 @@
 """Machine code of our own against the same by XLA: single operations, programs, motions, derivatives, and when it is not taken."""
 
 import diffrax
+import evaluated_natively
 import jax
 import jax.numpy as jnp
 import mpmath
@@ -14,7 +15,7 @@ from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.own_steps import reason_against_machine_code
 from jourdain_jax.motion.simulate import set_up
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native import evaluation, ffi, host
+from jourdain_jax.native import ffi, host
 from jourdain_jax.program import emit
 from jourdain_jax.program.graph import Graph
 
@@ -65,7 +66,7 @@ def test_single_operations_are_those_of_xla_also_of_what_is_no_usual_number():
     random = np.random.default_rng(0)
     points = np.array([(x, y) for x in SPECIAL for y in SPECIAL])
     points = np.concatenate([points, random.normal(size=(999, 2)) * 10.0 ** random.integers(-8, 5, size=(999, 2)), random.uniform(-3, 3, size=(1002, 2))])
-    found = np.asarray(evaluation.function(graph, outputs, inputs)(points))
+    found = np.asarray(evaluated_natively.function(graph, outputs, inputs)(points))
     expected = emit.run(graph, outputs, dict(zip(inputs, jnp.asarray(points.T), strict=True)))
     for op, ours, theirs in zip(ONE + TWO, found.T, expected, strict=True):
         theirs = np.asarray(theirs, float)
@@ -84,7 +85,7 @@ def test_functions_of_our_own_are_right_to_a_unit_of_round_off(op):
     random = np.random.default_rng(1)
     values = {"exp": random.uniform(-700, 700, 300), "log": 10.0 ** random.uniform(-300, 300, 300), "logistic": random.uniform(-30, 30, 300)}
     points = np.concatenate([values.get(op, random.normal(size=300) * 10.0 ** random.integers(-6, 20, size=300)), [1.0, 1 + 1e-9, 0.5]])
-    found = np.asarray(evaluation.function(graph, [graph.call(op, x)], [x])(points[:, None]))[:, 0]
+    found = np.asarray(evaluated_natively.function(graph, [graph.call(op, x)], [x])(points[:, None]))[:, 0]
     function = (lambda x: 1 / (1 + mpmath.exp(-x))) if op == "logistic" else getattr(mpmath, op)
     with mpmath.workdps(60):
         exact = [function(mpmath.mpf(float(x))) for x in points]
@@ -121,7 +122,7 @@ def test_random_programs_have_the_values_of_xla(seed):
     random = np.random.default_rng(seed)
     graph, outputs, inputs = _random_program(random, 60)
     points = random.normal(size=(101, 4))
-    found = np.asarray(evaluation.function(graph, outputs, inputs)(points))
+    found = np.asarray(evaluated_natively.function(graph, outputs, inputs)(points))
     values = emit.run(graph, outputs, dict(zip(inputs, jnp.asarray(points.T), strict=True)))
     # each operation by itself amplifies what round-off its arguments have: compared where another round-off of the inputs changes little
     nearby = emit.run(graph, outputs, dict(zip(inputs, jnp.asarray(points.T * (1 + 1e-13)), strict=True)))
@@ -146,7 +147,7 @@ def test_rates_are_those_of_xla_at_random_states(name):
     y = u[:, np.array(program.independent, int)]
     given = jnp.concatenate([*(jnp.full((1000, 1), x) for x in fixed), jnp.zeros((1000, 1)), q, y, jnp.zeros((1000, len(inputs)))], axis=1)
     outputs = [*program.qdot, *program.ydot]
-    found = np.asarray(evaluation.function(program.graph, outputs, program.variables)(given))
+    found = np.asarray(evaluated_natively.function(program.graph, outputs, program.variables)(given))
     rates = jax.jit(lambda q, y: program.rates(fixed, 0.0, tuple(q), tuple(y), inputs)[:2])
     expected = np.stack([np.broadcast_to(x, 1000) for part in rates(q.T, y.T) for x in part], axis=1)
     good = np.isfinite(expected).all(axis=1)
