@@ -7,7 +7,10 @@ holds `xla_backend_extra_options`. The last two take effect if JAX has not compu
 
 import os as _os
 
-import jax as _jax
+from jourdain_jax.calculus.collecting import without_collecting as _without_collecting
+
+with _without_collecting():
+    import jax as _jax
 
 if _os.environ.get("JAX_ENABLE_X64", "1").lower() not in ("0", "false", "off"):
     _jax.config.update("jax_enable_x64", True)
@@ -23,92 +26,93 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _option = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1048576"
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
 
-from jourdain_jax import models
-from jourdain_jax.analysis.accelerometer import Accelerometer
-from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
-from jourdain_jax.analysis.estimate import Estimate
-from jourdain_jax.analysis.filtering import filtered_log_likelihood
-from jourdain_jax.analysis.fit import fit, fit_batch
-from jourdain_jax.analysis.fit_result import Fit
-from jourdain_jax.analysis.gradients import derivative_exists
-from jourdain_jax.analysis.likelihood import log_likelihood
-from jourdain_jax.analysis.linearize import Linearization, linearize
-from jourdain_jax.analysis.log_density import LogDensity, log_density
-from jourdain_jax.analysis.losses import huber, student_t
-from jourdain_jax.analysis.measurements import Measurements
-from jourdain_jax.analysis.planning import PlannedInformation, planned_information
-from jourdain_jax.analysis.ranges import bounds, positive, unbounded
-from jourdain_jax.analysis.report import Report, report
-from jourdain_jax.analysis.sensors import Actuator, Sensor
-from jourdain_jax.analysis.shooting import MultipleShooting
-from jourdain_jax.analysis.steady import SteadyMotion, steady
-from jourdain_jax.analysis.verification import Verification
-from jourdain_jax.analysis.verify import verify
-from jourdain_jax.build.sampling import sample_states
-from jourdain_jax.build.structure import structure_of
-from jourdain_jax.calculus.guards import DifferentiationModeError
-from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
-from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
-from jourdain_jax.ensembles.design import Design
-from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
-from jourdain_jax.ensembles.files import InUseError
-from jourdain_jax.ensembles.mean_gradients import MeanGradients
-from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Quantity, Smallest
-from jourdain_jax.ensembles.result import StudyResult, load_study, merge_studies
-from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
-from jourdain_jax.ensembles.study import Study
-from jourdain_jax.equations.gibbs_appell import GibbsAppell, gibbs_equations, gibbs_function
-from jourdain_jax.equations.instant import constraint_rows
-from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
-from jourdain_jax.equations.lagrange import lagrange_equations
-from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, NullSpaceSVD, Privileged, UdwadiaKalaba
-from jourdain_jax.equations.rows import position_residual, velocity_residual
-from jourdain_jax.equations.virtual_power import (
-    generalized_forces,
-    kinetic_energy,
-    newton_residual,
-    potential_energy,
-    unconstrained_equations,
-    virtual_power,
-)
-from jourdain_jax.importers.mjcf import from_mjcf
-from jourdain_jax.importers.sympy_scene import from_sympy
-from jourdain_jax.importers.urdf import from_urdf
-from jourdain_jax.lowering.built import Built, build
-from jourdain_jax.lowering.lower import NotLowered, lower
-from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.batches.rollout import Rollout, rollout
-from jourdain_jax.motion.inputs import Sampled
-from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
-from jourdain_jax.motion.integrators.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
-from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
-from jourdain_jax.motion.integrators.munthe_kaas import MuntheKaas
-from jourdain_jax.motion.integrators.radau import RadauIIA
-from jourdain_jax.motion.integrators.taylor import Taylor
-from jourdain_jax.motion.sensitivity import SensitivityWarning
-from jourdain_jax.motion.simulate import simulate
-from jourdain_jax.motion.start import State, consistent, start
-from jourdain_jax.motion.trajectories.diagnostics import diagnose
-from jourdain_jax.motion.trajectories.results import SimulationError
-from jourdain_jax.motion.trajectories.storage import load_rollout, load_trajectory, save
-from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.motion.trajectories.versions import version_of as _version_of
-from jourdain_jax.motion.vector_fields.choice import Formulation
-from jourdain_jax.plotting.animation import animate
-from jourdain_jax.plotting.quantities import plot
-from jourdain_jax.plotting.show import View, show
-from jourdain_jax.scene.bodies import Particle, RigidBody
-from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
-from jourdain_jax.scene.contacts import Contact, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
-from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, speeds
-from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
-from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
-from jourdain_jax.scene.motion_state import fixed_point
-from jourdain_jax.scene.parameters import parameter
-from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
-from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.spline import Spline
-from jourdain_jax.scene.visuals import Visual
+with _without_collecting():
+    from jourdain_jax import models
+    from jourdain_jax.analysis.accelerometer import Accelerometer
+    from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
+    from jourdain_jax.analysis.estimate import Estimate
+    from jourdain_jax.analysis.filtering import filtered_log_likelihood
+    from jourdain_jax.analysis.fit import fit, fit_batch
+    from jourdain_jax.analysis.fit_result import Fit
+    from jourdain_jax.analysis.gradients import derivative_exists
+    from jourdain_jax.analysis.likelihood import log_likelihood
+    from jourdain_jax.analysis.linearize import Linearization, linearize
+    from jourdain_jax.analysis.log_density import LogDensity, log_density
+    from jourdain_jax.analysis.losses import huber, student_t
+    from jourdain_jax.analysis.measurements import Measurements
+    from jourdain_jax.analysis.planning import PlannedInformation, planned_information
+    from jourdain_jax.analysis.ranges import bounds, positive, unbounded
+    from jourdain_jax.analysis.report import Report, report
+    from jourdain_jax.analysis.sensors import Actuator, Sensor
+    from jourdain_jax.analysis.shooting import MultipleShooting
+    from jourdain_jax.analysis.steady import SteadyMotion, steady
+    from jourdain_jax.analysis.verification import Verification
+    from jourdain_jax.analysis.verify import verify
+    from jourdain_jax.build.sampling import sample_states
+    from jourdain_jax.build.structure import structure_of
+    from jourdain_jax.calculus.guards import DifferentiationModeError
+    from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
+    from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
+    from jourdain_jax.ensembles.design import Design
+    from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
+    from jourdain_jax.ensembles.files import InUseError
+    from jourdain_jax.ensembles.mean_gradients import MeanGradients
+    from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Quantity, Smallest
+    from jourdain_jax.ensembles.result import StudyResult, load_study, merge_studies
+    from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
+    from jourdain_jax.ensembles.study import Study
+    from jourdain_jax.equations.gibbs_appell import GibbsAppell, gibbs_equations, gibbs_function
+    from jourdain_jax.equations.instant import constraint_rows
+    from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
+    from jourdain_jax.equations.lagrange import lagrange_equations
+    from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, NullSpaceSVD, Privileged, UdwadiaKalaba
+    from jourdain_jax.equations.rows import position_residual, velocity_residual
+    from jourdain_jax.equations.virtual_power import (
+        generalized_forces,
+        kinetic_energy,
+        newton_residual,
+        potential_energy,
+        unconstrained_equations,
+        virtual_power,
+    )
+    from jourdain_jax.importers.mjcf import from_mjcf
+    from jourdain_jax.importers.sympy_scene import from_sympy
+    from jourdain_jax.importers.urdf import from_urdf
+    from jourdain_jax.lowering.built import Built, build
+    from jourdain_jax.lowering.lower import NotLowered, lower
+    from jourdain_jax.lowering.lowered import Lowered
+    from jourdain_jax.motion.batches.rollout import Rollout, rollout
+    from jourdain_jax.motion.inputs import Sampled
+    from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
+    from jourdain_jax.motion.integrators.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
+    from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
+    from jourdain_jax.motion.integrators.munthe_kaas import MuntheKaas
+    from jourdain_jax.motion.integrators.radau import RadauIIA
+    from jourdain_jax.motion.integrators.taylor import Taylor
+    from jourdain_jax.motion.sensitivity import SensitivityWarning
+    from jourdain_jax.motion.simulate import simulate
+    from jourdain_jax.motion.start import State, consistent, start
+    from jourdain_jax.motion.trajectories.diagnostics import diagnose
+    from jourdain_jax.motion.trajectories.results import SimulationError
+    from jourdain_jax.motion.trajectories.storage import load_rollout, load_trajectory, save
+    from jourdain_jax.motion.trajectories.trajectory import Trajectory
+    from jourdain_jax.motion.trajectories.versions import version_of as _version_of
+    from jourdain_jax.motion.vector_fields.choice import Formulation
+    from jourdain_jax.plotting.animation import animate
+    from jourdain_jax.plotting.quantities import plot
+    from jourdain_jax.plotting.show import View, show
+    from jourdain_jax.scene.bodies import Particle, RigidBody
+    from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
+    from jourdain_jax.scene.contacts import Contact, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
+    from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, speeds
+    from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
+    from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
+    from jourdain_jax.scene.motion_state import fixed_point
+    from jourdain_jax.scene.parameters import parameter
+    from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
+    from jourdain_jax.scene.scene import Scene
+    from jourdain_jax.scene.spline import Spline
+    from jourdain_jax.scene.visuals import Visual
 
 __version__ = _version_of("jourdain-jax")
 

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.calculus.reals import Number, checked_real
+from jourdain_jax.calculus.reals import Number, checked_known
 
 _FAR = 5.0  # a factor by which a first guess may be off
 
@@ -57,7 +57,7 @@ def bounds(low: Number, high: Number) -> Range:
     Raises ValueError unless both are finite and low < high.
     """
     for name, end in (("low end", low), ("high end", high)):
-        checked_real(end, f"{name} of `bounds`", ())
+        checked_known(end, f"{name} of `bounds`", ())
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
         raise ValueError(f"bounds({low}, {high}): expected finite numbers low < high; for one bound at zero use `positive()`, for none `unbounded()`")
     return Range("bounds", float(low), float(high))
@@ -69,7 +69,7 @@ def unbounded(scale: Number | None = None) -> Range:
     Raises ValueError unless the scale is positive and finite.
     """
     if scale is not None:
-        checked_real(scale, "`scale` of `unbounded`", ())
+        checked_known(scale, "`scale` of `unbounded`", ())
     if scale is not None and not (np.isfinite(scale) and scale > 0):
         raise ValueError(f"unbounded({scale}): expected a positive scale, a typical change in the unit of the unknown")
     return Range("unbounded", scale=None if scale is None else float(scale))

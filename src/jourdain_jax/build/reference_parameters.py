@@ -4,7 +4,6 @@ What holds of a scene at every state, such as the rank of its rows and which spe
 by evaluating the scene at a few states, which takes numbers for its parameters.
 """
 
-import gc
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -17,18 +16,6 @@ import numpy as np
 from jourdain_jax.scene.scene import Scene
 
 MOST_CASES = 1024  # that are kept of one function
-
-
-@contextmanager
-def without_collecting() -> Iterator[None]:
-    """Garbage collection off: what is built meanwhile is many small objects, nearly all of which stay, and looking through them takes a tenth of the time."""
-    on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if on:
-            gc.enable()
 
 
 def once_per_values(probe, of_traced: Callable | None = None):

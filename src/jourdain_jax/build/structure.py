@@ -17,10 +17,11 @@ from jourdain_jax.build.plausibility import implausible
 from jourdain_jax.build.probed import TIMED, Probed
 from jourdain_jax.build.probed_on_graph import follow_from_others, probed_on_graph
 from jourdain_jax.build.rank import Scaled, ranks_of, redundant_rows, scaled_states
-from jourdain_jax.build.reference_parameters import once_per_values, without_collecting
+from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.row_lengths import speed_scales, typical_row_lengths
 from jourdain_jax.build.sampling import no_numbers, random_states, states_near_what_was_seen, symmetric_configurations, usable_states
 from jourdain_jax.build.smoothness import check_smoothness
+from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.reals import described, is_traced
 from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, names_of_rows
 from jourdain_jax.program.graph import Unsupported

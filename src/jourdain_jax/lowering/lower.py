@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.reference_parameters import with_reference_parameters, without_collecting
+from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.sampling import random_states
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.build.trace import event_values, named_values, traced_scene
+from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.dynamics.accelerations import bare_accelerations
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.eager.lanes import uncompiled_lanes

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 from jax.extend.core import get_opaque_trace_state
 
-from jourdain_jax.build.reference_parameters import without_collecting
+from jourdain_jax.calculus.collecting import without_collecting
 
 QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
 RUN_SELDOM: dict[str, Any] = QUICK | {"xla_backend_optimization_level": 0}  # where a function's costs are those of its compilation
