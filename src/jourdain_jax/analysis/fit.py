@@ -6,7 +6,7 @@ by Levenberg-Marquardt. Jacobians come by forward mode through the simulation, r
 Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), chapter 3.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -52,7 +52,7 @@ _TURNS, _SETTLED = 20, 1e-3  # of correlation times and unknowns at most; change
 def fit(
     scene: Scene | BuiltFor,
     data: Measurements | Sequence[Measurements],
-    free: "Mapping[str, Range | Estimate | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | Callable | None] | Iterable[str]" = (),
     *,
     cutoff: float = 1e-6,
     tolerance: float = 1e-4,
@@ -69,7 +69,8 @@ def fit(
     - `scene`: its parameters are fixed, or first guesses where they are free.
     - `data`: one run or several, each with its own times, channels, start and inputs.
     - `free`: parameter names, or name -> `bounds(low, high)`, `positive()`, `unbounded()` or None (positive where the parameter
-      is declared so), a prior `Normal(mean, sigma)`, or an `Estimate`. The measured sigmas of a bicycle are such priors:
+      is declared so), a prior `Normal(mean, sigma)`, or an `Estimate`. A function of the scene ties a parameter to others:
+      `free={"radius": None, "inertia": lambda scene: 0.5 * scene.mass * scene.radius**2}`. The measured sigmas of a bicycle are such priors:
       `free=measured_bicycle("Browser").prior`. What `unknown_start`, sensors and actuators of the runs name is free as well.
     - `cutoff`: singular values of the scaled Jacobian below this fraction of the largest count as zero (`Information`). Keep it
       well above the relative accuracy of the simulation.
@@ -114,7 +115,7 @@ def fit(
 def fit_batch(
     scene: Scene | BuiltFor,
     data: Measurements | Sequence[Measurements],
-    free: "Mapping[str, Range | Estimate | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | Callable | None] | Iterable[str]" = (),
     *,
     cutoff: float = 1e-6,
     tolerance: float = 1e-4,
@@ -293,6 +294,7 @@ def _result(problem: Problem, found: Minimum, limits: Limits, asked: Asked, erro
         shooting=how,
         trace=found.trace[0] if single else (),
         asked=asked,
+        layout=unknowns.layout,
         work_out=partial(statistics, problem, found, limits, control, errors, limit),
     )
     if problem.with_memory:  # its motions are needed, in the context that is here

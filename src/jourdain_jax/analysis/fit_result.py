@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.asked import Asked, taken_up
+from jourdain_jax.analysis.derived import derived, standard_errors
 from jourdain_jax.analysis.fit_page import fit_page
 from jourdain_jax.analysis.fit_pictures import interval_widths
 from jourdain_jax.analysis.fit_statistics import Statistics
@@ -21,9 +22,11 @@ from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Shot
 from jourdain_jax.analysis.profile import FAR_BEYOND
+from jourdain_jax.analysis.unknowns import Layout
 from jourdain_jax.analysis.weak_directions import weak_combinations
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
+from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
@@ -76,6 +79,7 @@ class Fit(Printed):
     shooting: Shot | None  # how it was found by multiple shooting
     trace: tuple[tuple[str, tuple[float, ...]], ...]  # what was minimised, and F at first and after each step tried; none of a batch
     asked: Asked  # the arguments of `fit`
+    layout: Layout
     work_out: Callable[[], Statistics]
 
     @cached_property
@@ -275,6 +279,32 @@ class Fit(Printed):
     def residual_summary(self) -> tuple[ChannelResiduals, ...]:
         """Count, mean, rms and largest residual per run and channel."""
         return tuple(_summary(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
+
+    def derived(self, function: Callable[[Scene], Array], unit: str = "") -> Estimated:
+        """A number, or an array of them, that follows from the parameters, with its standard error and 95 % interval.
+
+            found.derived(lambda scene: scene.mass * scene.offset**2, "kg m^2")
+
+        y = f(scene), var(y) = g' C g with g = d y / d theta and C the covariance of the estimates: to first order (the delta method). So a combination is
+        told whose parts the data do not tell apart. NaN where it depends on a direction that does not show, or on an unknown at its bound.
+
+        - `function`: plain JAX, of a scene. `unit`: of the result, for print.
+
+        Of a batch, everything has a leading axis `repeats`. ValueError where the function returns no numbers.
+        """
+        shared = self.layout.sizes[0]
+        value, slopes = derived(self.asked.scene, self.layout, function, self.values[..., :shared])
+        sizes, at_bound, quantiles = (x[..., :shared] for x in (self.sizes, self.at_bound, self.statistics.quantiles))
+        error = standard_errors(self.information, slopes, sizes, at_bound, self.cutoff)
+        of_numbers = quantiles.reshape(*quantiles.shape[:-1], *(1,) * (slopes.ndim - quantiles.ndim), shared)
+        reach = error * np.max(np.where(slopes != 0, of_numbers, 0.0), axis=-1, initial=0.0)
+        return Estimated(value, error, np.asarray(value - reach), np.asarray(value + reach), unit)
+
+    @property
+    def tied(self) -> dict[str, Estimated]:
+        """The parameters that follow from others by the functions in `free`, as `derived` tells them."""
+        units = {name: about["unit"] for name, _, about in parameters_of(self.asked.scene)}
+        return {tie.name: self.derived(lambda scene, name=tie.name: getattr(scene, name), units[tie.name]) for tie in self.layout.ties}
 
     def profiles(self, data: Measurements | Sequence[Measurements], names: str | Iterable[str] = ()) -> dict[str, Profile]:
         """The profile likelihood of the unknowns in `names` (default: all that are not of one run alone), by name: how far each may be moved, all others

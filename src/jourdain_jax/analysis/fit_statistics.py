@@ -31,6 +31,7 @@ class Statistics:
     low: Float[np.ndarray, "*repeats unknowns"]
     high: Float[np.ndarray, "*repeats unknowns"]
     at_bound: Bool[np.ndarray, "*repeats unknowns"]
+    quantiles: Float[np.ndarray, "*repeats unknowns"]  # q
     information: Information
     residuals: tuple[dict[str, Float[np.ndarray, "..."]], ...]
     whitened: tuple[dict[str, Float[np.ndarray, "..."]], ...]
@@ -59,12 +60,11 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
         return information(arrow, size, places, bound, fails, control.cutoff, False).standard_errors, moved[:, places]
 
     more, doubt = (one(x) for x in problem.doubt(theta, elsewhere))
-    reach = _normal_or_t(doubt, (samples - known.rank)[..., None] if problem.all_estimated else np.inf) * np.sqrt(1 + more)
+    quantiles = _normal_or_t(doubt, (samples - known.rank)[..., None] if problem.all_estimated else np.inf) * np.sqrt(1 + more)
     known = known.times(one(problem.inflation(residuals, samples, known.rank)))
-    reach = reach * known.standard_errors
     if errors == "runs":
-        known = known.between_runs(one(found.at.arrow.scores))
-        reach = students_t_95(len(problem.runs) - 1) * known.standard_errors
+        known, quantiles = known.between_runs(one(found.at.arrow.scores)), students_t_95(len(problem.runs) - 1)
+    reach = quantiles * known.standard_errors
     values = one(theta[:, places])
     shared, local = unknowns.split(theta)
     scene = unknowns.layout.scene(problem.scene, one(shared))
@@ -78,6 +78,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
         low=np.where(values <= low, low, np.where(values >= high, limit, np.maximum(values - reach, low))),
         high=np.where(values >= high, high, np.where(values <= low, limit, np.minimum(values + reach, high))),
         at_bound=one(bound[:, places]),
+        quantiles=np.broadcast_to(quantiles, reach.shape),
         information=known,
         residuals=residuals,
         whitened=white,

@@ -26,11 +26,8 @@ def text(fit) -> str:
     lines += [f"sigma of `{name}`, estimated: {float(sigma):.4g}" for name, sigma in fit.sigma.items()]
     lines += [f"correlation time of the noise of `{name}`, estimated: {float(tau):.4g} s" for name, tau in fit.correlation_time.items()]
     rows = [("unknown", "unit", "estimate", "std. error", "95 % interval")]
-    for name, e in fit.estimates.items():
-        error = f"{e.standard_error:.2g}" if np.isfinite(e.standard_error) else "-"
-        interval = f"[{e.low:.6g}, {e.high:.6g}]" if not np.isnan(e.low + e.high) else "none"
-        interval += " (one-sided, at its bound)" if fit.at_bound[fit.labels.index(name)] else ""
-        rows.append((name, e.unit, f"{e.value:.6g}", error, interval))
+    rows += [_row(name, e, " (one-sided, at its bound)" if at_bound else "") for (name, e), at_bound in zip(fit.estimates.items(), fit.at_bound, strict=True)]
+    rows += [_row(name, e, " (tied)") for name, e in fit.tied.items() if e.value.ndim == 0]
     lines += table(rows)
     if fit.not_identifiable:
         lines.append(f"singular values below {fit.cutoff:g} of the largest count as zero:")
@@ -41,6 +38,12 @@ def text(fit) -> str:
     for s in fit.residual_summary():
         rows.append((str(s.run), s.channel, str(s.samples), f"{s.mean:.2g}", f"{s.rms:.3g}", f"{s.largest:.3g}"))
     return "\n".join(lines + table(rows))
+
+
+def _row(name: str, e, remark: str) -> tuple[str, ...]:
+    error = f"{e.standard_error:.2g}" if np.isfinite(e.standard_error) else "-"
+    interval = f"[{e.low:.6g}, {e.high:.6g}]" if not np.isnan(e.low + e.high) else "none"
+    return name, e.unit, f"{e.value:.6g}", error, interval + remark
 
 
 def batch_text(fit) -> str:

@@ -37,9 +37,15 @@ class Information:
     follow: Float[np.ndarray, "*members runs own shared"]  # G
     estimated: tuple[int, ...]  # places of the unknowns among those of all runs
 
-    @cached_property
+    @property
     def covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
         """Of all unknowns, in their units; NaN where not identifiable."""
+        both = self.identifiable[..., :, None] & self.identifiable[..., None, :]
+        return np.where(both, self.whole_covariance, np.nan)
+
+    @cached_property
+    def whole_covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
+        """Of all unknowns, in their units, along the directions that show."""
         runs, m, p = self.follow.shape[-3:]
         G = np.concatenate([np.broadcast_to(np.eye(p), (*self.shared.shape[:-2], p, p)), -self.follow.reshape(*self.follow.shape[:-3], runs * m, p)], axis=-2)
         whole = G @ self.shared @ np.swapaxes(G, -1, -2)
@@ -47,9 +53,7 @@ class Information:
             block = slice(p + i * m, p + (i + 1) * m)
             whole[..., block, block] += self.own[..., i, :, :]
         places = np.array(self.estimated, int)
-        found = whole[..., places[:, None], places]
-        both = self.identifiable[..., :, None] & self.identifiable[..., None, :]
-        return np.where(both, found, np.nan)
+        return whole[..., places[:, None], places]
 
     def times(self, factor: Float[np.ndarray, "*members"]) -> "Information":
         """With all covariances multiplied by this factor."""

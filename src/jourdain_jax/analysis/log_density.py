@@ -6,7 +6,7 @@ L: `log_likelihood`; x: one real number for each unknown (`transforms`); centre,
 Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 1.8 and 12.4.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 
 import equinox as eqx
@@ -152,7 +152,7 @@ class LogDensity(eqx.Module):
 def log_density(
     scene: Scene | BuiltFor,
     data: Measurements | Sequence[Measurements],
-    free: "Mapping[str, Range | Estimate | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | Callable | None] | Iterable[str]" = (),
     **simulation,
 ) -> LogDensity:
     """The posterior density of the unknowns of `fit`, as a function of a vector of any real numbers, for samplers such as those of BlackJAX and NumPyro.

@@ -85,7 +85,7 @@ class Piecewise:
         self.follows = np.concatenate([[False], np.diff(self.run_of) == 0])
         p, m = layout.sizes
         self.own, self.shared = m, p
-        self.layout = Layout(layout.shared, (*layout.local, Place(NODE, (self.states,), m)))
+        self.layout = replace(layout, local=(*layout.local, Place(NODE, (self.states,), m)))
         self._carried = np.array([k for place in layout.local if place.of_sensor for k in range(place.begin, place.end)], int)  # the same in all pieces
         self.lanes = PieceLanes(Lanes(scene, self.parts, self.layout, simulation, members), len(self.parts), self.states)
         self._whole = Lanes(scene, runs, layout, simulation, members)

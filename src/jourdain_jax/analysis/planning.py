@@ -6,7 +6,7 @@ Unknown start values are among theta; log det F of those unknowns that are asked
 Source: A. C. Atkinson, A. N. Donev and R. D. Tobias, Optimum Experimental Designs, with SAS (2007), chapters 9 and 10 (D- and D_s-optimality).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -72,7 +72,7 @@ class PlannedInformation(Printed, eqx.Module):
 def planned_information(
     scene: Scene | BuiltFor,
     plan: Measurements | Sequence[Measurements],
-    free: "Mapping[str, Range | Estimate | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | Callable | None] | Iterable[str]" = (),
     **simulation,
 ) -> PlannedInformation:
     """What runs that are planned will tell of the unknowns, taken at the values that the scene has.

@@ -199,7 +199,7 @@ class _Group:
         self._rows, self._own_rows = (np.concatenate(parts, axis=2) for parts in columns)
         self._rows = self._rows[:, 0]
         marks = [_Number.of(x, k >= common, id(x) in repeated) if _is_array(x) else x for k, x in enumerate(leaves)]
-        reference = Reference.where_free(scene, {place.name for place in layout.shared if not place.of_sensor})
+        reference = Reference.where_free(scene, layout.parameters)
         self._run = _program(reference, treedef, tuple(marks), layout)
         self.weights = {name: np.array([run.weights[name] for run in filled]) for name in filled[0].weights}  # (runs, *members, times, *channel)
         self._t0, self._ts = np.array([run.t0 for run in filled]), np.array([run.ts for run in filled])

@@ -4,8 +4,8 @@ theta = (shared, own of run 0, own of run 1, ...), every run with a place for ea
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import jax
@@ -17,6 +17,7 @@ from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.ranges import Range, positive, unbounded
 from jourdain_jax.analysis.sensors import UNITS, default_range
+from jourdain_jax.analysis.ties import Tie, tied_by
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -43,15 +44,21 @@ class Place:
 
 @dataclass(frozen=True)
 class Layout:
-    """Names and shapes of the shared unknowns and of those of each run; hashable."""
+    """Names and shapes of the shared unknowns and of those of each run, and the parameters that follow from them; hashable."""
 
     shared: tuple[Place, ...]
     local: tuple[Place, ...]
+    ties: tuple[Tie, ...] = ()
 
     @property
     def sizes(self) -> tuple[int, int]:
         """How many are shared, and how many each run has."""
         return self.shared[-1].end if self.shared else 0, self.local[-1].end if self.local else 0
+
+    @property
+    def parameters(self) -> set[str]:
+        """Names of the parameters that differ from those of the scene."""
+        return {place.name for place in self.shared if not place.of_sensor} | {tie.name for tie in self.ties}
 
     def scene(self, scene: Scene, shared: Float[Array | np.ndarray, "*members shared"]) -> Scene:
         """The scene with these shared unknowns."""
@@ -64,6 +71,12 @@ class Layout:
         for place in self.shared:
             if not place.of_sensor:
                 found[_leaf(treedef, place.name)] = place.of(shared)
+        for tie in self.ties:
+            # a member's parameters have its axes in front, those that all share have none
+            function, axes = tie.value, [0 if np.ndim(x) > np.ndim(own) else None for x, own in zip(found, leaves, strict=True)]
+            for _ in shared.shape[:-1]:
+                function = jax.vmap(function, in_axes=(axes,))
+            found[_leaf(treedef, tie.name)] = function(found)
         return found
 
     def start(self, start: dict, local: Float[Array | np.ndarray, "*members local"]) -> dict:
@@ -153,20 +166,25 @@ class _Entry:
     prior: tuple[float, float] | None = None
 
 
-def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, Range | Estimate | None] | Iterable[str]") -> Unknowns:
+def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, Range | Estimate | Callable | None] | Iterable[str]") -> Unknowns:
     """The unknowns that `free`, the runs' `unknown_start` and their sensors and actuators name.
+
+    A parameter for which `free` gives a function of the scene is no unknown: it follows from the others (`ties`).
 
     Raises ValueError for unknown names, for guesses outside their bounds, for a parameter of each run, for an estimate that runs share but state differently,
     and where nothing is free.
     """
     parameters = {name: (value, about) for name, value, about in parameters_of(scene)}
     entries: list[_Entry] = []
-    shared, local = _Places(), _Places()
+    shared, local, functions = _Places(), _Places(), {}
     for name, given in (free if isinstance(free, Mapping) else dict.fromkeys(as_names(free))).items():
         if name not in parameters:
             raise ValueError(f"`free` names `{name}`, which is no parameter of `{type(scene).__name__}`; {nearest(name, parameters)}")
         if isinstance(given, Estimate) and given.per_run:
             raise ValueError(f"`free` asks for a `{name}` of each run, but all runs share the scene; leave out `per_run`, or fit the runs one by one")
+        if callable(given):
+            functions[name] = given
+            continue
         value, about = parameters[name]
         default = positive() if about["positive"] or about["non_negative"] else unbounded()
         entries.append(_entry(name, about["unit"], given, default, np.asarray(value)))
@@ -187,10 +205,14 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
         raise ValueError(f"nothing is free; name parameters in `free` ({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
     free_ones = [entry for entry in entries if not entry.fixed]
     each = lambda of: np.array([x for entry in entries for x in [of(entry)] * entry.guess.size])  # noqa: E731
+    guess = np.concatenate([np.ravel(entry.guess) for entry in entries]).astype(float)
+    layout = Layout(tuple(shared.found), tuple(local.found))
+    for name, function in functions.items():
+        layout = replace(layout, ties=(*layout.ties, tied_by(name, function, layout.scene(scene, guess[: layout.sizes[0]]))))
     return Unknowns(
-        layout=Layout(tuple(shared.found), tuple(local.found)),
+        layout=layout,
         runs=len(runs),
-        guess=np.concatenate([np.ravel(entry.guess) for entry in entries]).astype(float),
+        guess=guess,
         fixed=each(lambda entry: entry.fixed),
         ranges=tuple(entry.range for entry in entries for _ in range(entry.guess.size)),
         labels=tuple(entry.label + "".join(f"[{i}]" for i in index) for entry in free_ones for index in np.ndindex(entry.guess.shape)),
@@ -249,7 +271,10 @@ def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _
     elif hasattr(given, "mean") and hasattr(given, "sigma"):
         estimate = Estimate(prior=given)
     else:
-        raise ValueError(f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, `Normal(...)`, `Estimate(...)` or None")
+        raise ValueError(
+            f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, `Normal(...)`, `Estimate(...)` or None; "
+            "for a parameter that follows from others, a function of the scene"
+        )
     guess = value if estimate.guess is None else np.asarray(estimate.guess, float)
     if guess.shape != value.shape:
         raise ValueError(f"first guess of `{label}` has shape {guess.shape}, expected {value.shape}; leave it out for the value that is there")

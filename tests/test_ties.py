@@ -1,0 +1,137 @@
+"""Parameters that follow from others in a fit, and numbers that follow from what was found."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.analysis.ties import tied_by
+
+Sleigh = jj.models.ChaplyginSleigh
+START, TIMES = {"x_rate": 0.6, "heading_rate": 0.9}, np.linspace(0.0, 2.0, 21)
+TRUTH = Sleigh(mass=2.0, offset=0.25, inertia=0.25)
+TIED = {"offset": jj.bounds(0.05, 1.0), "inertia": lambda scene: 0.5 * scene.mass * scene.offset}
+
+
+def measured(seed: int, repeats: tuple[int, ...] = ()) -> jj.Measurements:
+    motion, noise = jj.simulate(TRUTH, START, ts=TIMES), np.random.default_rng(seed)
+    values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=(*repeats, TIMES.size)) for name in ("x", "heading")}
+    return jj.Measurements(TIMES, values, 0.01, start=START)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return measured(0)
+
+
+@pytest.fixture(scope="module")
+def found(data):
+    return jj.fit(Sleigh(mass=2.0), data, free=TIED)
+
+
+def test_a_tied_parameter_follows_and_its_interval_with_it(found):
+    assert found.labels == ("offset",)
+    assert found.converged
+    tied, offset = found.tied["inertia"], found["offset"]
+    np.testing.assert_allclose(found.scene.inertia, found.scene.offset, rtol=1e-15)  # 0.5 * 2 kg * offset
+    for name in ("value", "standard_error", "low", "high"):
+        np.testing.assert_allclose(getattr(tied, name), getattr(offset, name), rtol=1e-12)
+    assert tied.unit == "kg m^2"
+    assert "(tied)" in str(found)
+
+
+def test_the_fit_is_at_the_greatest_likelihood_along_the_tie(found, data):
+    def along(offset):
+        return float(jj.log_likelihood(Sleigh(mass=2.0, offset=offset, inertia=offset), data))
+
+    best, step = float(found.scene.offset), float(found["offset"].standard_error)
+    below, at, above = (along(best + k * step) for k in (-1, 0, 1))
+    assert abs(above - below) < 0.02 * (2 * at - above - below)  # the parabola's top is within a hundredth of a standard error
+    np.testing.assert_allclose(2 * at - above - below, 1.0, rtol=0.05)  # one standard error is half a unit down to either side
+
+
+def test_a_density_has_the_slope_along_the_tie(data):
+    density = jj.log_density(Sleigh(mass=2.0), data, free={"offset": jj.unbounded(0.1), "inertia": TIED["inertia"]})
+    step = 1e-5
+    slope = [float(density(density.unconstrain({"offset": 0.3 + k * step}))) for k in (-1, 1)]
+    found = jax.grad(density)(density.unconstrain({"offset": 0.3}))
+    np.testing.assert_allclose(found[0], (slope[1] - slope[0]) / (2 * step), rtol=1e-6)
+    np.testing.assert_allclose(density.scene_at(density.unconstrain({"offset": 0.3})).inertia, 0.3, rtol=1e-14)
+
+
+def test_ties_of_a_batch_and_in_pieces_are_those_of_one_fit(found, data):
+    batch = jj.fit_batch(Sleigh(mass=2.0), measured(0, (3,)), free=TIED)
+    np.testing.assert_allclose(batch.scene.inertia, batch.scene.offset, rtol=1e-15)
+    np.testing.assert_allclose(batch.tied["inertia"].standard_error, batch["offset"].standard_error, rtol=1e-12)
+    pieces = jj.fit(Sleigh(mass=2.0), data, free=TIED, shooting=jj.MultipleShooting(pieces=2))
+    np.testing.assert_allclose(pieces.scene.inertia, found.scene.inertia, rtol=1e-4)
+
+
+def test_ties_follow_from_ties_before_them(data):
+    free = {"offset": None, "inertia": lambda scene: scene.offset * 1.0, "mass": lambda scene: 8.0 * scene.inertia}
+    density = jj.log_density(Sleigh(), data, free=free)
+    scene = density.scene_at(density.unconstrain({"offset": 0.3}))
+    np.testing.assert_allclose(scene.mass, 8.0 * scene.offset, rtol=1e-15)
+
+
+def test_a_new_function_that_does_the_same_is_the_same_tie():
+    scene = Sleigh()
+    one, same, other = (tied_by("inertia", lambda s, k=k: k * s.mass, scene) for k in (2.0, 2.0, 3.0))
+    assert one == same
+    assert hash(one) == hash(same)
+    assert one != other
+
+
+@pytest.mark.parametrize(
+    ("function", "expected"),
+    [
+        (lambda scene: jnp.array([1.0, 2.0]) * scene.mass, r"`inertia` returns an array of shape \(2,\), expected \(\)"),
+        (lambda scene: -scene.mass, "at the first guess the function in `free` of `inertia` gives a value that is not allowed"),
+        (lambda scene: scene.mass / (scene.mass - 1.0), "not allowed: .*`inertia`"),
+        (lambda scene: "heavy", "returns .*heavy.*, expected a number"),
+    ],
+)
+def test_a_function_that_gives_no_such_parameter_is_refused(data, function, expected):
+    with pytest.raises(ValueError, match=expected):
+        jj.fit(Sleigh(mass=1.0), data, free={"offset": None, "inertia": function})
+
+
+def test_ties_alone_are_nothing_to_fit(data):
+    with pytest.raises(ValueError, match="nothing is free"):
+        jj.fit(Sleigh(), data, free={"inertia": lambda scene: scene.mass})
+
+
+def test_a_combination_is_told_whose_parts_are_not(data):
+    together = jj.fit(Sleigh(mass=2.0), data, free=("mass", "inertia", "offset"))
+    known = jj.fit(Sleigh(mass=2.0), data, free=("inertia", "offset"))
+    ratio = together.derived(lambda scene: scene.inertia / scene.mass, "m^2")
+    assert np.isnan(together["inertia"].standard_error)
+    np.testing.assert_allclose(ratio.value, known["inertia"].value / 2.0, rtol=1e-5)
+    np.testing.assert_allclose(ratio.standard_error, known["inertia"].standard_error / 2.0, rtol=1e-3)
+    np.testing.assert_allclose((ratio.high - ratio.low) / 2, 1.959963985 * ratio.standard_error, rtol=1e-8)
+    several = together.derived(lambda scene: jnp.stack([scene.mass, scene.offset, scene.offset**2]))
+    assert np.isnan(several.standard_error[0])
+    np.testing.assert_allclose(several.standard_error[1], together["offset"].standard_error, rtol=1e-9)
+    np.testing.assert_allclose(several.standard_error[2], 2 * together["offset"].value * together["offset"].standard_error, rtol=1e-9)
+
+
+def test_a_derived_number_of_a_batch_spreads_as_its_error_says():
+    many = jj.fit_batch(TRUTH, measured(1, (400,)), free=("inertia", "offset"))
+    good = many.derived(lambda scene: scene.inertia * scene.offset**2)
+    assert good.value.shape == good.standard_error.shape == (400,)
+    truth = 0.25 * 0.25**2
+    covered = (good.low <= truth) & (truth <= good.high)
+    assert 0.92 <= covered.mean() <= 0.98  # 95 % of 400, within three standard deviations
+
+
+def test_a_derived_number_at_a_bound_has_no_interval(data):
+    found = jj.fit(Sleigh(mass=2.0, offset=0.5), data, free=TIED | {"offset": jj.bounds(0.3, 1.0)})
+    assert found.at_bound[0]
+    assert np.isnan(found.derived(lambda scene: 2 * scene.offset).standard_error)
+    assert found.derived(lambda scene: 2 * scene.mass).standard_error == 0
+
+
+def test_derived_numbers_must_be_numbers(found):
+    with pytest.raises(ValueError, match=r"the function returns .*offset.*, expected a number"):
+        found.derived(lambda scene: "offset")
