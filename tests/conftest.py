@@ -4,33 +4,31 @@
 """
 
 import gc
+import importlib.metadata
 import os
 from pathlib import Path
 
-import jaxlib
+import pytest
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 # Most of the time of a test is spent compiling. With less effort on machine code the same tests take half as long; the flags belong to the
 # tested version of jaxlib (another one might not know them). Timings are taken in `bench/`, with none of this.
-if jaxlib.__version__.startswith("0.10."):
+if importlib.metadata.version("jaxlib").startswith("0.10."):
     quick = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
     os.environ.setdefault("XLA_FLAGS", f"{quick} --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1")
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # no line numbers for each operation of a program
 
-import jax
-import pytest
-from jaxtyping import install_import_hook
-
-# Before any import of the package: every annotated function of these layers is then checked, shapes and dtypes included. Not in the layers whose small
+# Every annotated function of these layers is checked, shapes and dtypes included. Not in the layers whose small
 # functions are called a million times while scenes are traced: there it takes a tenth of the time of all tests.
 LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", "bicycle", "plotting", "cli")
-if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":
-    install_import_hook([f"jourdain_jax.{layer}" for layer in LAYERS], "beartype.beartype")
-
 
 # What takes longest for its number of tests, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
-LONGEST = ("every_model", "simulate", "kept_parts", "contacts_on_surfaces", "generated_scenes", "identify", "structure_preserving", "stiff", "rollout", "power")
-LONGEST += ("traced_parameters", "float32", "notebooks", "bicycle_job", "bicycle_stability", "atlas", "readme")
+LONGEST = """
+identify simulate every_model mutants sensors native quality along_batches lowering what_probes_do_not_show stiff readme linearize kept_parts build
+contacts_on_surfaces study_faults generated_scenes watched_between_saves studies from_sympy atlas rattleback feasible_starts knots log_density
+native_derivatives power program events_in_one_step probed cluster malformed_inputs rollout fit_profiles call_costs labelled whipple_bicycle
+structure_preserving traced_parameters notebooks bicycle_stability
+"""
 
 
 SLOW = frozenset(line for line in (Path(__file__).parent / "slow.txt").read_text().splitlines() if not line.startswith("#"))
@@ -42,9 +40,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.nodeid.removeprefix("tests/") in SLOW:
             item.add_marker(pytest.mark.slow)
-    last = len(LONGEST)
-    order = {f"test_{name}": place for place, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: order.get(item.path.stem, last))
+    order = {f"test_{name}": place for place, name in enumerate(LONGEST.split())}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
@@ -60,17 +57,25 @@ def _compiled_programs_are_dropped():
     yield
     maps = Path("/proc/self/maps")
     if not maps.exists() or maps.read_bytes().count(b"\n") > 35_000:
+        import jax
+
         jax.clear_caches()
         gc.collect()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Keep compiled programs in pytest's cache, so that a second run does not compile again; keep the order of files above for pytest-xdist."""
-    config.option.loadscopereorder = False  # it would hand out files by their number of tests
+    """In a process that runs tests: run-time checks, and compiled programs kept in pytest's cache, so that a second run does not compile again."""
+    config.option.loadscopereorder = False  # pytest-xdist would hand out files by their number of tests, and not in the order above
+    if config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput"):
+        return  # this process hands out tests: workers start seconds sooner if it does not import JAX first
+    import jax
+    from jaxtyping import install_import_hook
+
+    if os.environ.get("JOURDAIN_JAX_NO_TYPE_CHECKS") != "1":
+        install_import_hook([f"jourdain_jax.{layer}" for layer in LAYERS], "beartype.beartype")  # before any import of the package
     if not config.pluginmanager.hasplugin("cacheprovider"):
         return
-    compiled: Path = config.cache.mkdir("jax_compilation")
-    jax.config.update("jax_compilation_cache_dir", str(compiled))
+    jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax_compilation")))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 

@@ -29,7 +29,7 @@ def bicycles():
     """The benchmark bicycle linearised at v = 0, 1 ... 10 m/s, one after the other: a batch of them would be compiled for one use."""
     bicycle = WhippleBicycle()
     found = [linearize(bicycle, _running(bicycle, v), ("lean", "steer"), dependent=("pitch",)) for v in SPEEDS]
-    return jax.tree.map(lambda *x: jnp.stack(x), *found)
+    return jax.tree.map(lambda *x: np.stack(x), *found)
 
 
 def _lane(batch, i):
