@@ -51,6 +51,16 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     gc.set_threshold(50_000, 20, 20)
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _findings_are_not_kept():
+    """What tests look at is found now, not read from a disk."""
+    from jourdain_jax.build import kept_findings
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kept_findings, "name_of", lambda *_: None)
+        yield
+
+
 @pytest.fixture(autouse=True, scope="module")
 def _compiled_programs_are_dropped():
     """Compiled programs hold memory maps, of which a process may have 65530 on Linux: without this a long run aborts inside the compiler."""

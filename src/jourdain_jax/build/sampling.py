@@ -29,6 +29,11 @@ def seen_on_rows(scene: Scene, q: np.ndarray) -> None:
     _seen.setdefault(type(scene), np.asarray(q, float))
 
 
+def seen_of(scene: Scene) -> np.ndarray | None:
+    """The configuration that was given for scenes of this class, if there is one."""
+    return _seen.get(type(scene))
+
+
 def states_near_what_was_seen(scene: Scene, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """States near a configuration that was given for this class of scenes, not yet on the rows; None where there is none."""
     if type(scene) not in _seen or len(_seen[type(scene)]) != len(scene.coordinate_names):

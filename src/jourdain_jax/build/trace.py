@@ -117,15 +117,21 @@ def event_values(scene: Scene, motion: Motion) -> Float[Array, "events"]:
 
 
 @dataclass
-class TracedScene:
-    """A graph with the scene's inputs and its quantities at the level of velocities, as arrays of nodes."""
+class Variables:
+    """A graph and a scene's inputs of it, as nodes and arrays of nodes."""
 
     graph: Graph
     t: int
     q: np.ndarray
     u: np.ndarray
     inputs: np.ndarray
-    parameters: list[np.ndarray]  # nodes, one array per leaf of the scene
+    parameters: list[np.ndarray]  # one array per leaf of the scene
+
+
+@dataclass
+class TracedScene(Variables):
+    """A graph with the scene's inputs and its quantities at the level of velocities, as arrays of nodes."""
+
     at: VelocityQuantities
     particulars: Particulars
     effects: str  # what in the scene does more than compute, as printing does; nothing: no part of it

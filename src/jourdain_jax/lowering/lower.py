@@ -11,11 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.build.kept_findings import kept_of_scene
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.sampling import random_states
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.build.trace import event_values, named_values, traced_scene
 from jourdain_jax.calculus.collecting import without_collecting
+from jourdain_jax.calculus.plain_text import as_text
 from jourdain_jax.dynamics.accelerations import bare_accelerations
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.eager.lanes import uncompiled_lanes
@@ -25,6 +27,7 @@ from jourdain_jax.equations.reductions import SMALLEST_PIVOT, NullSpaceQR
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
 from jourdain_jax.lowering.elimination import pivots_ok, usual
 from jourdain_jax.lowering.far import full_turns, on_velocity_rows
+from jourdain_jax.lowering.kept_programs import program_as_text, program_from_text
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.lowered import Lowered, Stage
 from jourdain_jax.lowering.massless import may_be_massless
@@ -106,9 +109,21 @@ class _Key:
 def _lowered(key: _Key) -> Lowered | NotLowered:
     try:
         with without_collecting(), np.errstate(all="ignore"):  # what is no number at a probe does not count there
-            return _built(key)
+            return _built_or_kept(key)
     except NotLowered as reason:
         return NotLowered(str(reason))  # kept without its traceback
+
+
+def _built_or_kept(key: _Key) -> Lowered:
+    """The program from the disk, or built and kept there; always put together from its text, so that both are the same."""
+    begin, built = time.perf_counter(), []
+
+    def text() -> bytes:
+        built.append(_built(key))
+        return program_as_text(built[0])
+
+    found = kept_of_scene("program", key.scene, text, key.structure.potentials_of_inputs, as_text(vars(key.structure)), key.every_speed, key.massless)
+    return program_from_text(found, time.perf_counter() - begin) if found else built[0]
 
 
 def _built(key: _Key) -> Lowered:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
-from jourdain_jax.build.trace import TracedScene
+from jourdain_jax.build.trace import Variables
 from jourdain_jax.build.usual_lengths import usual
 from jourdain_jax.lowering import export
 from jourdain_jax.lowering.jacobian import differentiable
@@ -36,7 +36,7 @@ class Lowered:
     Compared by identity, so that it can be a static argument of compiled functions.
     """
 
-    traced: TracedScene
+    traced: Variables
     scene_name: str
     parameters: tuple[str, ...]  # names of the scene's leaves
     units: tuple[str, ...]  # of them, empty where none is stated

@@ -1,7 +1,8 @@
-"""Machine code kept on disk between processes, in the folder of JAX's compilation cache where one is set, otherwise in the user's cache.
+"""Machine code, and what was found of scenes, kept on disk between processes: in the folder of JAX's compilation cache where one is set, otherwise in
+the user's cache.
 
-A file is named by what its code was made from; it begins with a digest of the code, so that one that is torn or changed is made again. It is written beside
-and moved to its place, so that many processes may write the same one.
+A file is named by what its content was made from; it begins with a digest of the content, so that one that is torn or changed is made again. It is
+written beside and moved to its place, so that many processes may write the same one.
 """
 
 import hashlib
@@ -29,7 +30,10 @@ def folder() -> Path | None:
 
 
 def kept(name: str, make: Callable[[], bytes]) -> bytes:
-    """What `make` returns, from the file of this name where it is whole, otherwise made and kept there; a disk that refuses is no error."""
+    """What `make` returns, from the file of this name where it is whole, otherwise made and kept there; a disk that refuses is no error.
+
+    What is empty is not kept.
+    """
     place = folder()
     if place is None:
         return make()
@@ -39,9 +43,11 @@ def kept(name: str, make: Callable[[], bytes]) -> bytes:
     except OSError:
         text = b""
     digest, code = text[:_DIGEST], text[_DIGEST:]
-    if text and hashlib.sha256(code).digest() == digest:
+    if code and hashlib.sha256(code).digest() == digest:
         return code
     code = make()
+    if not code:
+        return code
     try:
         place.mkdir(parents=True, exist_ok=True)
         _make_room(place)

@@ -39,6 +39,14 @@ class Graph:
         self._known: dict = {}
         self.zero, self.one = self.const(0.0), self.const(1.0)
 
+    @staticmethod
+    def of_rows(rows: Iterable[tuple]) -> "Graph":
+        """The graph of nodes given as (operation, arguments, value, whether it varies); the first two are the numbers zero and one."""
+        graph = Graph()
+        for op, args, value, varies in rows:
+            graph._node(op, args, value, varies)
+        return graph
+
     def _node(self, op: str, args: tuple[int, ...] = (), value=None, varies: bool | None = None) -> int:
         key = (op, args, value)
         node = self._known.get(key)

@@ -79,7 +79,7 @@ def _run(graph: Graph, jaxpr, constants, arguments) -> list[Value]:
 def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
     """Results of one equation."""
     refuse(name, equation)
-    if graph.keeps_rules and (rule := _own_rule(name, equation.params)) and any(isinstance(x, Nodes) for x in inputs):
+    if graph.keeps_rules and (rule := own_rule(name, equation.params)) and any(isinstance(x, Nodes) for x in inputs):
         raise Unsupported(rule)
     inner = inner_jaxpr(name, equation.params)
     if inner is not None:
@@ -133,7 +133,7 @@ def inner_jaxpr(name: str, params):
     return None
 
 
-def _own_rule(name: str, params) -> str:
+def own_rule(name: str, params) -> str:
     """What has a derivative that the graph does not know; nothing for functions of this package, whose rules are those of what they compute.
 
     Those of JAX are not: `softplus` and `sinc` compute with branches, which hide their derivatives where two of them meet.
