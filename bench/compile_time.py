@@ -2,9 +2,9 @@
 
     taskset -c 0 python bench/compile_time.py [MODEL ...] [--quick] [--json FILE]
 
-Every model is measured in two fresh processes that share one compile cache, empty at first: the first process fills it ("cold", writing
-included), the second reads it ("warm cache"). Both find the package as bytecode, as it lies on a user's machine: a process before them writes it, where
-PYTHONDONTWRITEBYTECODE is set here too. In seconds of processor time, one after another in each process:
+Every model is measured in two fresh processes that share one cache, empty at first: of JAX's programs, and of our machine code, structures and scalar
+programs. The first process fills it ("cold", writing included), the second reads it ("warm cache"). Both find the package as bytecode, as it lies on a
+user's machine: a process before them writes it, where PYTHONDONTWRITEBYTECODE is set here too. In seconds of processor time, one after another in each process:
 
     import      jax and the package
     structure   probing of rank, privileged velocities and kinds of rows

@@ -245,12 +245,13 @@ def compilation(quick: bool) -> Iterator[Figure]:
             yield figure(f"trace and compile one motion, {way}, s", name, seconds[way])
         yield figure("trace and compile one motion, native / XLA", name, seconds["native"] / seconds["XLA"], 1.0)
         for way in WAYS:
-            laps = [float(_output(COLD, name, way)) for _ in range(1 if quick else 3)]
+            laps = [float(_output(COLD, name, way, JOURDAIN_JAX_CACHE="0")) for _ in range(1 if quick else 3)]
             yield figure(f"fresh process to the end of a first motion, {way}, s", name, min(laps))
 
 
-def _output(program: str, *arguments: str) -> str:
-    return subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True).stdout.split()[-1]
+def _output(program: str, *arguments: str, **environment: str) -> str:
+    done = subprocess.run([sys.executable, "-c", program, *arguments], env=os.environ | environment, capture_output=True, text=True, check=True)
+    return done.stdout.split()[-1]
 
 
 def main() -> None:
