@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.calculus.reals import checked_unless_traced, described, is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, inputs_at
 from jourdain_jax.motion.start import State, named_start
-from jourdain_jax.scene.arguments import as_input_vector
 from jourdain_jax.scene.scene import Scene
 
 DEFAULT_SAMPLES = 201
@@ -43,7 +42,7 @@ def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None) -
             f"`{what}` is {described(given)}, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None for the "
             "scene's example"
         )
-    return named_start(scene, scene.example if given is None else given, t0, as_input_vector(scene, inputs))
+    return named_start(scene, scene.example if given is None else given, t0, inputs)
 
 
 def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, switches: dict | None = None, **objects) -> None:

@@ -246,10 +246,11 @@ def start(scene: Scene | BuiltFor, *, t0: Number = 0.0, inputs=None, **values) -
     return named_start(scene, values, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)))
 
 
-def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs: Float[Array | np.ndarray, "inputs"]) -> State:
-    """A start from a dictionary of `values`, as of `start`, and the `inputs` at time `t0` as a vector."""
+def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs) -> State:
+    """A start from a dictionary of `values`, as of `start`, and the `inputs` at time `t0`: a vector, or by name (None: zero)."""
     scene = as_scene(scene)
     q, u, given = vectors_named(scene, values)
+    inputs = _as_input_vector(scene, inputs, q.dtype)
     t, free_q = _as_time(t0), _free(scene.coordinate_names.entries, given)
     if is_traced(q, u, t) or not (np.isfinite(q).all() and np.isfinite(u).all() and np.isfinite(t)):
         _check_finite({**values, "t0": t0})
@@ -257,7 +258,7 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs: Float[Arra
     free_u = _free(scene.speed_names.entries, (*given, *_resting(scene, known, given)))
     determined = known.affine and not any(free_u[i] for i in known.independent)
     guesses = lambda: _guesses(scene, known, q, free_q)  # noqa: E731
-    state = _consistent(scene, t, q, u, _as_input_vector(scene, inputs, q.dtype), free_q, free_u, guesses, determined)
+    state = _consistent(scene, t, q, u, inputs, free_q, free_u, guesses, determined)
     _check_residual(scene, state, inputs, given)
     return state
 
