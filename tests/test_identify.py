@@ -23,7 +23,7 @@ from jourdain_jax.analysis.ranges import bounds, unbounded
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
 from jourdain_jax.models.rattleback import Rattleback
-from jourdain_jax.motion.integrators.forward_mode import simulate_forward
+from jourdain_jax.motion.integrators.forward_mode import simulate_alongside, simulate_forward
 
 REPEATS = 200
 SIGMA = 0.02  # m, rad
@@ -359,7 +359,7 @@ def noisy(seed: int, sigma=(0.01, 0.02), outlier=0.0, ts=TS, memory=0.0, **optio
 
 def test_no_number_of_the_method_recompiles_and_a_new_lambda_per_run_is_one_channel(monkeypatch):
     traces = []
-    monkeypatch.setattr(predictions, "simulate_forward", lambda *a, **k: traces.append(1) or simulate_forward(*a, **k))
+    monkeypatch.setattr(predictions, "simulate_alongside", lambda *a, **k: traces.append(1) or simulate_alongside(*a, **k))
 
     def run(x0):
         x, _ = cart_motion(TS, x0, 0.0, 0.0)

@@ -8,6 +8,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop
+from jourdain_jax.motion.integrators.forward_mode import simulate_alongside, simulate_forward
 from jourdain_jax.native import host
 from jourdain_jax.program import emit
 from jourdain_jax.program.derivative import cotangents, jacobian
@@ -220,3 +221,21 @@ def test_both_modes_of_a_model_agree(name):
 def test_tangents_of_a_model_are_those_of_xla(name):
     found, expected = (_slope(name, backend, FORWARD) for backend in ("native", "xla"))
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.max(np.abs(expected)))
+
+
+def test_values_and_all_directions_of_a_jacobian_come_from_one_run():
+    def places(simulate):
+        def of(x):
+            scene = jj.models.TiltingDisc(radius=x[0], gravity=x[1])
+            q = simulate(scene, {"lean": x[2], "spin_rate": -3.0}, ts=jnp.linspace(0.0, 0.5, 6), events=False, work=False).q
+            return q, q
+
+        return jax.jacfwd(of, has_aux=True)
+
+    xs, runs = jnp.array([[0.5, 9.81, 0.3], [0.55, 9.0, 0.2]]), {}
+    for simulate in (simulate_alongside, simulate_forward):
+        runs[simulate] = str(jax.make_jaxpr(places(simulate))(xs[0])).count("ffi_call[")
+    assert runs[simulate_alongside] == runs[simulate_forward] - 1
+    for of in (lambda f: f(xs[0]), lambda f: jax.jit(jax.vmap(f))(xs)):  # one motion, and lanes
+        for one, other in zip(of(places(simulate_alongside)), of(places(simulate_forward)), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)

@@ -14,7 +14,7 @@ import pytest
 import jourdain_jax as jj
 from jourdain_jax.analysis import predictions
 from jourdain_jax.analysis.lagged import filtered, read
-from jourdain_jax.motion.integrators.forward_mode import simulate_forward
+from jourdain_jax.motion.integrators.forward_mode import simulate_alongside
 from jourdain_jax.native import host
 
 REPEATS = 200
@@ -279,7 +279,7 @@ def test_machine_code_serves_sensors_and_gives_what_xla_gives():
 
 def test_other_numbers_of_a_sensor_compile_nothing(monkeypatch):
     traces = []
-    monkeypatch.setattr(predictions, "simulate_forward", lambda *a, **k: traces.append(1) or simulate_forward(*a, **k))
+    monkeypatch.setattr(predictions, "simulate_alongside", lambda *a, **k: traces.append(1) or simulate_alongside(*a, **k))
     for seed, delay in ((5, 0.05), (6, 0.03)):
         found = jj.fit(Cart(mass=1.8), [run(seed, delay=jj.Estimate(delay, range=jj.bounds(0.0, 0.15)), gain=1.0 + 0.1 * seed)], ("mass",))
         assert found.converged

@@ -28,7 +28,7 @@ from jourdain_jax.analysis.unknowns import Layout
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled
-from jourdain_jax.motion.integrators.forward_mode import simulate_forward
+from jourdain_jax.motion.integrators.forward_mode import simulate_alongside
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.scene.scene import Scene
 
@@ -310,7 +310,7 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
         (scene, simulation), run = jax.tree.unflatten(treedef, [found[k] if isinstance(leaf, _Number) else leaf for k, leaf in enumerate(leaves)])
 
         def flat(x):
-            residuals = run.at(layout, x[own:], x[:own]).residuals(layout.scene(scene, x[own:]), simulate_forward, simulation)
+            residuals = run.at(layout, x[own:], x[:own]).residuals(layout.scene(scene, x[own:]), simulate_alongside, simulation)
             r = jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
             return r, r
 

@@ -16,8 +16,9 @@ class Rules(NamedTuple):
     """Derivatives of the function that runs, by itself; trees of tangents and cotangents have None where there is none."""
 
     serve: Callable[..., bool]  # (*perturbed): whether they serve, given for each array of the arguments whether it varies
-    push: Callable  # (arguments, tangents): tangents of the result
+    push: Callable  # (arguments, tangents): the result and its tangents
     pull: Callable  # (perturbed, arguments, result, cotangents): cotangents of those arguments that vary
+    together: bool = False  # whether `push` gives the result as well where tangents are asked for, to the first order, by `jvp` and `jacfwd` alone
 
 
 def differentiated_as(differentiable: Callable, quick: Callable, kind: Literal["forward", "reverse"], rules: Rules | None = None) -> Callable:
@@ -55,8 +56,12 @@ def _forward(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
 
             def pushed_by_rules(leaves, *along):
                 given = jax.tree.unflatten(treedef, [dict(zip(moving, along, strict=True)).get(i) for i in range(len(leaves))])
-                return _with_tangents(rules.push(eqx.combine(jax.tree.unflatten(treedef, leaves), rest), given))
+                found, rates = rules.push(eqx.combine(jax.tree.unflatten(treedef, leaves), rest), given)
+                return (found, rates) if rules.together else _with_tangents(rates)
 
+            if rules.together:
+                found, rates = pushed_by_rules(leaves, *along)
+                return lanes_first(found), _without_gaps(found, lanes_first(_with_tangents(rates)))
             found = own(*leaves)
             rates = _forward(lambda *x: _with_tangents(pushed(*x)[1]), pushed_by_rules, None)(list(leaves), *along)
             return found, _without_gaps(found, rates)

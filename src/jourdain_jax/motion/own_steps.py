@@ -16,7 +16,7 @@ from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
 from jourdain_jax.motion.native import native_motion
-from jourdain_jax.motion.setup import Begun, Setup, Solved
+from jourdain_jax.motion.setup import Alongside, Begun, Setup, Solved
 from jourdain_jax.motion.trajectories import results
 
 
@@ -113,11 +113,11 @@ def _rules(setup: Setup, mapped: Callable) -> Rules:
     def pull(perturbed, arguments, found, g):
         return mapped(partial(_pulled, perturbed))(*arguments, found, g)
 
-    return Rules(serve, push, pull)
+    return Rules(serve, push, pull, isinstance(setup.options.adjoint, Alongside))
 
 
-def _pushed(setup: Setup, begun: Begun, along: Setup, d: Begun) -> PyTree:
-    """Tangents of the motion, along those of its start, of its times, and of what the rates are given; tolerances and the first step change nothing."""
+def _pushed(setup: Setup, begun: Begun, along: Setup, d: Begun) -> tuple[Solved, PyTree]:
+    """The motion and its tangents, along those of its start, of its times, and of what the rates are given; tolerances and the first step change nothing."""
     motion = _motion(setup, begun)
     dy0 = jax.tree.map(lambda x, dx: jnp.zeros_like(x) if dx is None else dx, begun.y0, d.y0)
     of_times = along.ts, along.t0, along.t1, d.args[-1]

@@ -22,7 +22,13 @@ from jourdain_jax.scene.scene import Scene
 
 TOLERANCE, MOST_STEPS = 1e-8, 100_000  # of `simulate`, where nothing else is asked for
 OWN_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
-OWN_ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode)
+
+
+class Alongside(diffrax.ForwardMode):
+    """Forward mode for first derivatives that are asked for together with the values: our own loop gives both in one run."""
+
+
+OWN_ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, Alongside)
 
 
 class Options(eqx.Module):

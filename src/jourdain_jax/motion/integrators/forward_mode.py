@@ -3,6 +3,7 @@
 import diffrax
 
 from jourdain_jax.motion.batches.rollout import Rollout, rollout
+from jourdain_jax.motion.setup import Alongside
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
@@ -11,6 +12,11 @@ from jourdain_jax.scene.scene import Scene
 def simulate_forward(scene: Scene, start=None, **options) -> Trajectory:
     """`simulate` with `adjoint=diffrax.ForwardMode()`: differentiable by jvp and jacfwd, to any order."""
     return simulate(scene, start, adjoint=diffrax.ForwardMode(), **options)
+
+
+def simulate_alongside(scene: Scene, start=None, **options) -> Trajectory:
+    """`simulate_forward` for first derivatives, by `jvp` and `jacfwd` (not `linearize`): where machine code serves, one run gives values and tangents."""
+    return simulate(scene, start, adjoint=Alongside(), **options)
 
 
 def rollout_forward(scene: Scene, starts=None, **options) -> Rollout:

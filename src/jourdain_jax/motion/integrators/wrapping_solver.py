@@ -61,6 +61,7 @@ def for_adjoint(solver: diffrax.AbstractSolver, adjoint: diffrax.AbstractAdjoint
     if isinstance(vars(solver).get("solver"), diffrax.AbstractSolver):
         return eqx.tree_at(lambda s: s.solver, solver, for_adjoint(solver.solver, adjoint))
     kinds = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}
-    if type(adjoint) in kinds and getattr(solver, "scan_kind", "none of its own") is None:
-        return eqx.tree_at(lambda s: s.scan_kind, solver, kinds[type(adjoint)], is_leaf=lambda x: x is None)
+    kind = next((kind for of, kind in kinds.items() if isinstance(adjoint, of)), None)
+    if kind is not None and getattr(solver, "scan_kind", "none of its own") is None:
+        return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
     return solver

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.motion.integrators.erk_loop import method_of
 from jourdain_jax.motion.native import back, loop, samples, slopes
 from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.layout import Layout
+from jourdain_jax.motion.native.layout import PROGRESS, Layout
 from jourdain_jax.motion.native.taylor import TaylorSteps
 from jourdain_jax.native import ffi, host
 
@@ -29,6 +29,7 @@ class Kernel(NamedTuple):
 
     form: Form
     run: Callable
+    along: Callable  # (*samples, starts, goals, tangents): states and the end, their tangents and that of the time of the end, all in one run
 
     @property
     def layout(self) -> Layout:
@@ -48,7 +49,29 @@ def kernel(form: Form, solver: type[diffrax.AbstractERK], order: int | None = No
         return tuple(called(*arguments))
 
     called = _called(lambda lanes, threads: loop.written(form, method, lanes, host.fuses(), threads), shapes, samples.arguments(layout))
-    return Kernel(form, run)
+    return Kernel(form, run, _along(layout, run))
+
+
+def _along(layout: Layout, run: Callable) -> Callable:
+    """`run` of a form with tangents, given rows of starts as without, and tangents of the state and of what is known; values have lanes where starts do."""
+
+    @jax.custom_batching.custom_vmap
+    def along(*arguments):
+        *of_samples, starts, goals, tangents = arguments
+        n, rest = layout.y, layout.y + len(PROGRESS)
+        rows = [starts[:n], tangents[:n], starts[n:rest], jnp.zeros(1), starts[rest:], tangents[n:]]
+        states, end = run(*of_samples, jnp.concatenate(rows), goals)
+        plain = jnp.concatenate([end[:n], end[2 * n : -2], end[-1:]])
+        return states[:, :n], plain, states[:, n:], end[n : 2 * n], end[-2]
+
+    @along.def_vmap
+    def along_many(count: int, batched: list[bool], *arguments):
+        found = jax.vmap(along.fun, [0 if has_axis else None for has_axis in batched], axis_size=count)(*arguments)
+        if any(batched[:-1]):
+            return found, (True,) * len(found)
+        return (*(x[0] for x in found[:2]), *found[2:]), (False, False, True, True, True)  # all directions have the values of one motion
+
+    return along
 
 
 @lru_cache(maxsize=MOST_KERNELS)

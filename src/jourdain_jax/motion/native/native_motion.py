@@ -161,8 +161,8 @@ class AlongTimes(NamedTuple):
     origin: Float[Array, ""]  # the start
 
 
-def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, times: AlongTimes | None, of: Callable) -> PyTree:
-    """The tangents of `of` the goals and what `integrate` returns.
+def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, times: AlongTimes | None, of: Callable) -> tuple[PyTree, PyTree]:
+    """`of` the goals and what `integrate` returns, and its tangents; one run gives both.
 
     `dy0`, `dknown`: of the state, and of each of the numbers that the rates are given, None: zero; `times`: of the times, None where none varies.
     """
@@ -172,10 +172,10 @@ def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, times: AlongTime
         d_start = d_start - _scaled(_rates(motion, motion.y0, jnp.zeros(())), times.origin)
     layout, (progress, limits, known) = own.layout, _rows(motion)
     more = [jnp.asarray(dknown[i], jnp.float64)[None] for i in moving]
-    states, end = own.run(*_samples(motion), jnp.concatenate([_packed(motion.y0), d_start, progress, jnp.zeros(1), limits, known, *more]), motion.goals)
-    n, plain = layout.y, replace(layout, moving=None)
-    primals = motion.goals, states[:, :n], jnp.concatenate([end[:n], end[2 * n : -2], end[-1:]])
-    d_goals, d_states, d_y, d_t = jnp.zeros_like(motion.goals), states[:, n:], end[n : 2 * n], end[layout.rows["dt"].start]
+    plain = replace(layout, moving=None)
+    starts = jnp.concatenate([_packed(motion.y0), progress, limits, known])
+    states, end, d_states, d_y, d_t = own.along(*_samples(motion), starts, motion.goals, jnp.concatenate([d_start, *more]))
+    primals, d_goals = (motion.goals, states, end), jnp.zeros_like(motion.goals)
     if times is not None:
         d_goals = times.goals
         ys, reached, last = _unpacked(plain, *primals)
@@ -184,8 +184,8 @@ def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, times: AlongTime
         d_states = d_states + jax.vmap(_scaled)(at.slopes, absolute)
         d_y = d_y + _scaled(at.slopes[-1], absolute[-1])
         d_t = jnp.where(at.event, d_t - times.origin, jnp.where(at.by_goal[-1], times.goals[-1], 0.0))
-    along = jnp.zeros_like(primals[2]).at[:n].set(d_y).at[plain.rows["t"].start].set(d_t)
-    return jax.jvp(lambda goals, *found: of(goals, *_unpacked(plain, goals, *found)), primals, (d_goals, d_states, along))[1]
+    along = jnp.zeros_like(end).at[: layout.y].set(d_y).at[plain.rows["t"].start].set(d_t)
+    return jax.jvp(lambda goals, *found: of(goals, *_unpacked(plain, goals, *found)), primals, (d_goals, d_states, along))
 
 
 def cotangents(motion: Motion, asked: Sequence[bool], ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> tuple[Integrated, list]:
