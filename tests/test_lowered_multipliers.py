@@ -11,8 +11,8 @@ import pytest
 from tolerances import tolerance
 
 import jourdain_jax as jj
-from jourdain_jax.build.reference_parameters import without_collecting
 from jourdain_jax.build.structure import LONG, structure_of
+from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.trajectories import results
