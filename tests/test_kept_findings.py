@@ -16,7 +16,6 @@ from jourdain_jax.lowering import kept_programs, lower
 from jourdain_jax.models import MODELS
 
 name_of = kept_findings.name_of  # as it is when no test has begun
-FEW = ("tilting-disc", "rattleback", "pendulum-chain", "vertical-disc", "suslov", "tilting-disc-quaternion")
 
 
 @pytest.fixture
@@ -38,7 +37,7 @@ def _program(scene) -> tuple:
     return as_text(vars(known)), as_text(graph), {name: as_text(value) for name, value in told.items() if name != "seconds"}
 
 
-@pytest.mark.parametrize("name", FEW)
+@pytest.mark.parametrize("name", MODELS)
 def test_structure_and_program_are_the_same_when_they_are_read(folder, monkeypatch, name):
     found = _program(MODELS[name]())
     monkeypatch.setattr(lower, "_built", _never)

@@ -41,6 +41,11 @@ def test_a_tied_parameter_follows_and_its_interval_with_it(found):
     assert "(tied)" in str(found)
 
 
+def test_the_page_of_a_fit_tells_tied_parameters(found, tmp_path):
+    found.report(tmp_path / "fit.html")
+    assert f"<td>inertia (tied)</td><td>kg m^2</td><td>{found.scene.inertia:.6g}</td>" in (tmp_path / "fit.html").read_text()
+
+
 def test_the_fit_is_at_the_greatest_likelihood_along_the_tie(found, data):
     def along(offset):
         return float(jj.log_likelihood(Sleigh(mass=2.0, offset=offset, inertia=offset), data))

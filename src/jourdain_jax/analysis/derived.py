@@ -3,7 +3,7 @@
     y = f(scene),     var(y) = g' C g,     g = d y / d theta,     interval y -+ q sqrt(var(y))      C: covariance of the estimates
 
 A number can be told although its parts cannot: it has a standard error where g has no part in the directions that do not show.
-Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), section 5.1 (the delta method).
+Source: C. R. Rao, Linear Statistical Inference and Its Applications, 2nd ed. (1973), section 6a.2 (the delta method).
 """
 
 from collections.abc import Callable

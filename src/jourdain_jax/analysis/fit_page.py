@@ -87,20 +87,17 @@ def _summary(fit) -> list[str]:
     return [f"<p>{about}</p>", *(f'<p class="warning">{_words(sentence)}</p>' for sentence in fit.warnings)]
 
 
+def _estimate(name: str, e) -> list[str]:
+    return [name, e.unit, f"{e.value:.6g}", _number(e.standard_error, ".2g"), _number(e.low), _number(e.high)]
+
+
 def _estimates(fit, profiles: Mapping[str, Profile], bootstrap) -> str:
     heads = ["unknown", "unit", "estimate", "std. error", "low", "high"]
     heads += ["profile", "low (profile)", "high (profile)"] if profiles else []
     heads += ["low (bootstrap)", "high (bootstrap)"] if bootstrap is not None else []
     rows = []
     for i, (name, e) in enumerate(fit.estimates.items()):
-        row = [
-            name + (" (at its bound)" if fit.at_bound[i] else ""),
-            e.unit,
-            f"{e.value:.6g}",
-            _number(e.standard_error, ".2g"),
-            _number(e.low),
-            _number(e.high),
-        ]
+        row = _estimate(name + (" (at its bound)" if fit.at_bound[i] else ""), e)
         if profiles:
             one = profiles.get(name)
             row += ["-"] * 3 if one is None else [one.kind, *(_end(x, closed) for x, closed in zip((one.low, one.high), one.is_closed, strict=True))]
@@ -108,6 +105,8 @@ def _estimates(fit, profiles: Mapping[str, Profile], bootstrap) -> str:
             drawn = np.asarray(bootstrap.values)[np.asarray(bootstrap.converged), i]
             row += [f"{x:.6g}" for x in np.quantile(drawn, (0.025, 0.975))] if drawn.size else ["-", "-"]
         rows.append(tuple(row))
+    tied = [_estimate(f"{name} (tied)", e) for name, e in fit.tied.items() if e.value.ndim == 0]
+    rows += [(*row, *["-"] * (len(heads) - len(row))) for row in tied]
     more = ""
     if bootstrap is not None:
         good = int(np.sum(bootstrap.converged))

@@ -288,9 +288,10 @@ class Fit(Printed):
         y = f(scene), var(y) = g' C g with g = d y / d theta and C the covariance of the estimates: to first order (the delta method). So a combination is
         told whose parts the data do not tell apart. NaN where it depends on a direction that does not show, or on an unknown at its bound.
 
-        - `function`: plain JAX, of a scene. `unit`: of the result, for print.
+        - `function`: plain JAX, of a scene; it returns an array of any shape. `unit`: of the result, for print.
 
-        Of a batch, everything has a leading axis `repeats`. ValueError where the function returns no numbers.
+        **Returns** value, standard error and ends of the interval in that shape, of a batch with a leading axis `repeats`. **Raises** ValueError where the
+        function returns no numbers. Source: C. R. Rao, Linear Statistical Inference and Its Applications, 2nd ed. (1973), section 6a.2.
         """
         shared = self.layout.sizes[0]
         value, slopes = derived(self.asked.scene, self.layout, function, self.values[..., :shared])
