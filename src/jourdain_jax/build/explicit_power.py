@@ -10,9 +10,10 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.equations.kinematics import coordinate_rates
 from jourdain_jax.equations.virtual_power import potential_energy, resultants
 from jourdain_jax.scene.loads import Load
@@ -71,11 +72,5 @@ def explicit_rate(scene: Scene, motion: Motion, potential: Callable) -> Float[Ar
 
 def _only_what_is_needed(f: Callable, *like) -> Callable:
     """`f` without what its result does not depend on: forces that the same loads state need not have a derivative."""
-    closed = jax.make_jaxpr(f)(*like)
-    needed, kept = {v for v in closed.jaxpr.outvars if not isinstance(v, Literal)}, []
-    for equation in reversed(closed.jaxpr.eqns):
-        if not needed.isdisjoint(equation.outvars):
-            kept.append(equation)
-            needed.update(v for v in equation.invars if not isinstance(v, Literal))
-    pruned = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr.replace(eqns=kept[::-1]), closed.consts))
+    pruned = jaxpr_as_fun(needed_only(jax.make_jaxpr(f)(*like)))
     return lambda *given: pruned(*given)[0]

@@ -63,7 +63,7 @@ def _may_bend(scene: Scene) -> bool:
     """Whether anything decides between branches on the way from t and q."""
     parameters, size = len(jax.tree.leaves(scene)), (len(scene.coordinate_names), len(scene.speed_names))
     variables = (parameters, parameters + 1)
-    closed, shape = jaxpr_of_scene(scene)
+    closed, shape = jaxpr_of_scene(scene, ())
     at = shape[0]
     wanted = jax.tree.leaves(jax.tree.map(lambda x: any(x is y for y in (at.position, at.orientation, at.closure, at.qdot)), shape))
     if not any(bent and asked for bent, asked in zip(may_bend(closed, variables), wanted, strict=True)):

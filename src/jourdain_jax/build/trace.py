@@ -156,7 +156,7 @@ def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
 
 
 @once_per_class
-def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...] = ()):
+def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
     """A jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u and inputs, and their shapes.
 
     `of_inputs`: numbers of the loads whose potential depends on inputs.

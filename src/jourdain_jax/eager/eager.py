@@ -13,15 +13,12 @@ from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.eager.numpy_backend import uncompiled
 
 
-def eval_numpy(f: Callable, run_by: Callable = uncompiled) -> Callable:
-    """`f` run at once on concrete arguments, uncompiled: NumPy arrays out, also while something else is being traced.
-
-    `run_by=uncompiled_lanes`: `f` of one lane, for arrays with an axis of lanes first.
-    """
+def eval_numpy(f: Callable) -> Callable:
+    """`f` run at once on concrete arguments, uncompiled: NumPy arrays out, also while something else is being traced."""
 
     @lru_cache(maxsize=32)
     def program(treedef, rest, x64):
-        return run_by(lambda numbers: f(*eqx.combine(numbers, jax.tree.unflatten(treedef, rest))))
+        return uncompiled(lambda numbers: f(*eqx.combine(numbers, jax.tree.unflatten(treedef, rest))))
 
     @wraps(f)
     def run(*arguments):

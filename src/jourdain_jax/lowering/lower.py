@@ -15,16 +15,12 @@ from jourdain_jax.build.kept_findings import kept_of_scene
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.sampling import random_states
 from jourdain_jax.build.structure import Structure, structure_of
-from jourdain_jax.build.trace import event_values, named_values, traced_scene
+from jourdain_jax.build.trace import named_values, traced_scene
 from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.plain_text import as_text
-from jourdain_jax.dynamics.accelerations import bare_accelerations
-from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.eager.lanes import uncompiled_lanes
-from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.equations.minimal import minimal_accelerations
-from jourdain_jax.equations.reductions import SMALLEST_PIVOT, NullSpaceQR
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
+from jourdain_jax.lowering.dense_rates import dense_rates
 from jourdain_jax.lowering.elimination import pivots_ok, usual
 from jourdain_jax.lowering.far import full_turns, on_velocity_rows
 from jourdain_jax.lowering.kept_programs import program_as_text, program_from_text
@@ -188,7 +184,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     if fewest > MOST_OPERATIONS:
         raise NotLowered(f"its scalar program has {fewest} operations, more than {MOST_OPERATIONS}")
     expected = _values(best, probes)
-    _check_against_dense(scene, builder, best, expected)
+    _check_against_dense(scene, structure, builder, best, expected)
     held = _ignorable(scene, builder, best, expected)
     stages = [Stage("scalar program: structural zeros and ones removed, repeated parts shared", fewest)]
     plainly_held = graph.operations(_rates(builder.build(Strategy(first, held=held)))) if held else fewest
@@ -244,7 +240,7 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     )
 
 
-def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations, values: np.ndarray) -> None:
+def _check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGraph, found: Equations, values: np.ndarray) -> None:
     """The scalar program against JAX's own derivatives and a dense solution, at the probes; the reason, with a name, where they differ."""
     probes, independent = builder.probes, tuple(builder.independent)
     leaves, treedef = jax.tree.flatten(scene)
@@ -257,8 +253,8 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
     usable = np.all(np.isfinite(values), axis=0)
     large = builder.graph.operations(_rates(found)) > LARGE
     chosen = np.flatnonzero(usable)[:FEW] if large else np.arange(probes.count)
-    *dense, dense_events = _dense_rates(independent, bool(builder.dependent))(*jax.tree.map(lambda x: x[chosen], (parameters, t, q, u, inputs)))
-    expected, values = np.concatenate(dense, axis=1).T, values[:, chosen]
+    dense = dense_rates(scene, structure, independent, *jax.tree.map(lambda x: x[chosen], (parameters, t, q, u, inputs)))
+    expected, values = np.concatenate([dense.qdot, dense.ydot], axis=1).T, values[:, chosen]
     names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in independent)]
     usable = usable[chosen] & np.all(np.isfinite(expected), axis=0)
     error = np.max(np.abs(values - expected)[:, usable] / _sizes(expected[:, usable]), axis=1, initial=0.0)
@@ -269,24 +265,8 @@ def _check_against_dense(scene: Scene, builder: AppellOnGraph, found: Equations,
         worst = names[int(np.argmax(error))]
         culprit = diagnose_mismatch(scene, builder.traced, probes, limit, parameters, t, q, u, inputs)
         raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: {culprit}")
-    if found.events and not np.allclose(probes(found.events)[:, chosen][:, usable], dense_events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
+    if found.events and not np.allclose(probes(found.events)[:, chosen][:, usable], dense.events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
         raise NotLowered("the value of a stop event differs from the dense path")
-
-
-@lru_cache(maxsize=64)
-def _dense_rates(independent: tuple[int, ...], eliminates: bool):
-    """`(scene, t, q, u, inputs) -> qdot, ydot, event values` by dense matrices, for many states and parameters, uncompiled."""
-    columns = np.array(independent, np.int32)  # also for a precision that is switched afterwards
-
-    def one(scene, t, q, u, inputs):
-        y = u[columns]
-        if eliminates:
-            _, motion, found = minimal_accelerations(scene, independent, t, q, y, inputs)
-        else:
-            motion, found = motion_at(scene, t, q, y, inputs), bare_accelerations(scene, t, q, y, inputs, reduction=NullSpaceQR())
-        return motion.qdot.array, found.udot[columns], event_values(scene, motion)
-
-    return eval_numpy(one, uncompiled_lanes)
 
 
 def _rates(found: Equations) -> list[int]:

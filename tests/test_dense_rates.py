@@ -1,0 +1,50 @@
+"""The dense rates that scalar programs are compared with are those of `jj.accelerations`, state by state; they are NaN where these are not determined."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.build.structure import structure_of
+from jourdain_jax.lowering.dense_rates import dense_rates
+
+STATES = 4
+
+
+class Polar(jj.Scene):
+    """A particle in polar coordinates."""
+
+    coordinates = jj.coordinates("r angle")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(2.0, jnp.stack([q.r * jnp.cos(q.angle), q.r * jnp.sin(q.angle), 0.0 * q.r]))}
+
+
+def rates(scene, independent, t, q, u, inputs):
+    """Dense rates at some states of a scene, each with the scene's own parameters."""
+    parameters = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x, float), (len(t), *np.shape(x))), scene)
+    return dense_rates(scene, structure_of(scene), independent, parameters, t, q, u, inputs)
+
+
+@pytest.mark.parametrize(
+    ("name", "every_speed"),
+    [("two-wheel-axle-redundant", False), ("two-wheel-axle-redundant", True), ("ball-on-turntable", False), ("double-pendulum-rods", True)],
+)
+def test_they_are_those_of_the_accelerations(name, every_speed):
+    scene = jj.models.MODELS[name]()
+    independent = tuple(range(len(scene.speed_names))) if every_speed else structure_of(scene).independent
+    t, q, u = jj.sample_states(scene, STATES)
+    inputs = np.random.default_rng(0).normal(size=(STATES, len(scene.inputs)))
+    found = rates(scene, independent, t, q, u, inputs)
+    for k in range(STATES):
+        udot = jj.accelerations(scene, t[k], q[k], u[k], inputs[k]).udot
+        np.testing.assert_allclose(found.ydot[k], udot[np.array(independent)], rtol=1e-9, atol=1e-9 * (1 + np.max(np.abs(udot))))
+        np.testing.assert_allclose(found.qdot[k], jj.coordinate_rates(scene, t[k], q[k], u[k]), rtol=1e-12, atol=1e-12)
+
+
+def test_they_are_nan_where_a_speed_has_no_inertia():
+    q = np.array([[0.0, 0.3], [2.0, 0.3]])
+    found = rates(Polar(), (0, 1), np.zeros(2), q, np.array([[1.0, 0.5], [1.0, 0.5]]), np.zeros((2, 0)))
+    assert np.all(np.isnan(found.ydot[0]))
+    np.testing.assert_allclose(found.ydot[1], [2.0 * 0.5**2, -2 * 1.0 * 0.5 / 2.0], rtol=1e-12)
