@@ -32,7 +32,6 @@ import jourdain_jax as jj
 from jourdain_jax.motion.batches.lockstep import TOGETHER, in_blocks
 from jourdain_jax.motion.integration import _begin
 from jourdain_jax.motion.integrators import integrands
-from jourdain_jax.motion.own_steps import lanes_solved_by_own_steps, solved_by_own_steps
 from jourdain_jax.motion.setup import Begun, Setup
 from jourdain_jax.motion.simulate import set_up
 
@@ -42,6 +41,7 @@ SPANS = {"tilting-disc": 5.0, "chaplygin-sleigh": 5.0, "whipple-bicycle": 2.0}  
 LANES, REPEATS, TOLERANCE = 128, 7, 1e-8
 MOST_STEPS = 256  # of diffrax: what its checkpoints and its record of steps are made for
 EARNED = 1.2
+ADJOINTS = {"reverse": diffrax.RecursiveCheckpointAdjoint, "forward": diffrax.ForwardMode}
 
 
 def lanes_of(name: str, adjoint: diffrax.AbstractAdjoint) -> tuple[Setup, Begun]:
@@ -61,7 +61,7 @@ def solved_by_plain_diffrax(setup: Setup, begun: Begun):
     rtol, atol = setup.tolerances
     return diffrax.diffeqsolve(
         diffrax.ODETerm(integrands.rates),
-        setup.options.solver,
+        diffrax.Dopri8(),
         setup.t0,
         setup.t1,
         setup.dt0,
@@ -69,7 +69,7 @@ def solved_by_plain_diffrax(setup: Setup, begun: Begun):
         begun.args,
         saveat=diffrax.SaveAt(t1=True),
         stepsize_controller=diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm),
-        adjoint=setup.options.adjoint,
+        adjoint=ADJOINTS[setup.integrator.mode](),
         max_steps=MOST_STEPS,
         throw=False,
     ).ys
@@ -89,7 +89,8 @@ def apart(setups: Setup) -> Setup:
 def end_states(loop: str, blocks: bool) -> Callable:
     """A function of setups and starts to end states."""
     if loop == "ours":
-        solve = lanes_solved_by_own_steps if blocks else lambda *lanes: one_by_one(solved_by_own_steps, *lanes)
+        solved, lanes_solved = (lambda setup, begun, of=of: getattr(setup.integrator, of)(setup, begun) for of in ("solved", "lanes_solved"))
+        solve = lanes_solved if blocks else lambda *lanes: one_by_one(solved, *lanes)
         return lambda *lanes: solve(*lanes).y_end
     if blocks:
         return lambda setups, begun: in_blocks(eqx.filter_vmap(solved_by_plain_diffrax), TOGETHER, apart(setups), begun)
@@ -119,7 +120,7 @@ def ratios(quick: bool) -> Iterator[dict]:
     """Time of diffrax over ours."""
     for name in ("tilting-disc",) if quick else SPANS:
         for kind in ("solve",) if quick else ("solve", "forward", "reverse"):
-            lanes = lanes_of(name, diffrax.RecursiveCheckpointAdjoint() if kind == "reverse" else diffrax.ForwardMode())
+            lanes = lanes_of(name, ADJOINTS["reverse" if kind == "reverse" else "forward"]())
             for blocks in (False, True):
                 runs = {loop: compiled(kind, end_states(loop, blocks), *lanes) for loop in ("ours", "diffrax")}
                 ours, theirs = (np.concatenate([np.ravel(x) for x in jax.tree.leaves(run())]) for run in runs.values())

@@ -26,7 +26,6 @@ from baselines import disc_run, heyoka_lowered
 from baselines.timing import least_processor_time
 
 import jourdain_jax as jj
-from jourdain_jax.motion.own_steps import reason_against_machine_code
 from jourdain_jax.motion.simulate import set_up
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 
@@ -86,7 +85,7 @@ def batches(quick: bool) -> Iterator[Figure]:
     lanes = 128 if quick else LANES
     for name, span, more in MOTIONS[: 1 if quick else None]:
         scene = jj.models.MODELS[name]()
-        assert not (reason := reason_against_machine_code(set_up(scene))), reason
+        assert not (reason := set_up(scene).reason_against_machine_code), reason
         starts = spread_starts(scene, lanes)
         for alone, who in ((False, f"batch of {lanes}"), (True, "alone")):
             who = who if more else f"{who}, default options"

@@ -23,7 +23,7 @@ from jourdain_jax.analysis.ranges import bounds, unbounded
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
 from jourdain_jax.models.rattleback import Rattleback
-from jourdain_jax.motion.integrators.forward_mode import simulate_alongside
+from jourdain_jax.motion.forward_mode import simulate_alongside
 
 REPEATS = 200
 SIGMA = 0.02  # m, rad

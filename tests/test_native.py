@@ -12,7 +12,6 @@ import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop
 from jourdain_jax.motion.native import kernel as kernels
 from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.own_steps import reason_against_machine_code
 from jourdain_jax.motion.simulate import set_up
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.native import ffi, host
@@ -324,18 +323,18 @@ def test_modes_of_differentiation_that_do_not_work_are_named(adjoint, mode):
 
 def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
     disc, bicycle = jj.models.TiltingDisc(), jj.models.MODELS["whipple-bicycle"]()
-    assert reason_against_machine_code(set_up(disc)) == ""
-    assert reason_against_machine_code(set_up(disc, backend="xla")) == "another backend was asked for"
-    assert "diffrax" in reason_against_machine_code(set_up(disc, solver=diffrax.Heun()))
-    assert "scalar program" in reason_against_machine_code(set_up(disc, formulation=jj.Formulation(reduction="kkt")))
-    assert "function of time" in reason_against_machine_code(set_up(bicycle, inputs={"steer_torque": lambda t: jnp.sin(t)}))
+    assert set_up(disc).reason_against_machine_code == ""
+    assert set_up(disc, backend="xla").reason_against_machine_code == "another backend was asked for"
+    assert "diffrax" in set_up(disc, solver=diffrax.Heun()).reason_against_machine_code
+    assert "scalar program" in set_up(disc, formulation=jj.Formulation(reduction="kkt")).reason_against_machine_code
+    assert "function of time" in set_up(bicycle, inputs={"steer_torque": lambda t: jnp.sin(t)}).reason_against_machine_code
     monkeypatch.setattr(host, "reason_against", lambda: "llvmlite is not installed")
-    assert reason_against_machine_code(set_up(disc)) == "llvmlite is not installed"
+    assert set_up(disc).reason_against_machine_code == "llvmlite is not installed"
     monkeypatch.setattr(host, "reason_against", lambda: "")
     ffi.version.cache_clear()
     monkeypatch.setattr(jax.ffi, "include_dir", lambda: "/nowhere")
     with pytest.warns(UserWarning, match="interface of this jaxlib is not known"):
-        assert "interface" in reason_against_machine_code(set_up(disc))
+        assert "interface" in set_up(disc).reason_against_machine_code
     ffi.version.cache_clear()
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
+from jourdain_jax.motion.forward_mode import simulate_alongside, simulate_forward
 from jourdain_jax.motion.integrators import erk_loop
-from jourdain_jax.motion.integrators.forward_mode import simulate_alongside, simulate_forward
 from jourdain_jax.native import host
 from jourdain_jax.program import emit
 from jourdain_jax.program.derivative import cotangents, jacobian

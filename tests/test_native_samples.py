@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.motion.own_steps import reason_against_machine_code
 from jourdain_jax.motion.simulate import set_up
 from jourdain_jax.motion.trajectories import results
 
@@ -137,6 +136,6 @@ class Until(Pushed):
 
 
 def test_it_is_said_which_inputs_machine_code_does_not_take():
-    assert reason_against_machine_code(set_up(Pushed(), {"x": 0.1}, inputs=inputs())) == ""
-    assert "function of time" in reason_against_machine_code(set_up(Pushed(), {"x": 0.1}, inputs={"pull": jnp.sin}))
-    assert "event" in reason_against_machine_code(set_up(Until(), {"x": 0.1}, inputs=inputs()))
+    assert set_up(Pushed(), {"x": 0.1}, inputs=inputs()).reason_against_machine_code == ""
+    assert "function of time" in set_up(Pushed(), {"x": 0.1}, inputs={"pull": jnp.sin}).reason_against_machine_code
+    assert "event" in set_up(Until(), {"x": 0.1}, inputs=inputs()).reason_against_machine_code

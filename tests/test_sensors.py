@@ -14,7 +14,7 @@ import pytest
 import jourdain_jax as jj
 from jourdain_jax.analysis import predictions
 from jourdain_jax.analysis.lagged import filtered, read
-from jourdain_jax.motion.integrators.forward_mode import simulate_alongside
+from jourdain_jax.motion.forward_mode import simulate_alongside
 from jourdain_jax.native import host
 
 REPEATS = 200

@@ -29,8 +29,8 @@ from jourdain_jax.analysis.sensors import Reading, ideal
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_speeds
 from jourdain_jax.calculus.reals import checked_unless_traced, is_traced
 from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.motion.forward_mode import simulate_forward
 from jourdain_jax.motion.inputs import Inputs, inputs_at
-from jourdain_jax.motion.integrators.forward_mode import simulate_forward
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.arguments import BuiltFor, as_scene

@@ -23,7 +23,7 @@ from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.reference_parameters import reference_parameters, with_reference_parameters
 from jourdain_jax.calculus.reals import is_traced
-from jourdain_jax.motion.integrators.forward_mode import simulate_forward
+from jourdain_jax.motion.forward_mode import simulate_forward
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
 from jourdain_jax.scene.printing import Printed

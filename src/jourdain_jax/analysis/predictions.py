@@ -27,8 +27,8 @@ from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
 from jourdain_jax.analysis.unknowns import Layout
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.motion.forward_mode import simulate_alongside
 from jourdain_jax.motion.inputs import Inputs, Sampled
-from jourdain_jax.motion.integrators.forward_mode import simulate_alongside
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.scene.scene import Scene
 

@@ -20,7 +20,7 @@ import numpy as np
 from jourdain_jax.ensembles.distributions import Distribution
 from jourdain_jax.ensembles.outputs import OfEvent
 from jourdain_jax.ensembles.task import AT_START, Task
-from jourdain_jax.motion.integrators.forward_mode import rollout_forward
+from jourdain_jax.motion.forward_mode import rollout_forward
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.sensitivity import SensitivityWarning
 from jourdain_jax.motion.trajectories import results

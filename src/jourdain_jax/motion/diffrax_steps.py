@@ -1,6 +1,9 @@
 """diffrax as an integrator: for every solver, controller and adjoint but those of our own loop."""
 
+from typing import ClassVar, Literal
+
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
@@ -13,73 +16,100 @@ from jourdain_jax.motion.integrators.solver_choice import controller_of, since
 from jourdain_jax.motion.integrators.step_to_times import merged, step_to_times
 from jourdain_jax.motion.integrators.wrapping_solver import for_adjoint
 from jourdain_jax.motion.integrators.zero_tangents import ZeroTangentIfNonfinite
-from jourdain_jax.motion.setup import Begun, Setup, Solved
+from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
 
 
-def solved_by_diffrax(setup: Setup, begun: Begun) -> Solved:
-    """One motion by diffrax."""
-    field, options, args, y0 = setup.field, setup.options, begun.args, begun.y0
-    origin = args[4]
-    t0, t1, ts, knots = setup.t0 - origin, setup.t1 - origin, setup.ts - origin, setup.knots
-    names, (rtol, atol) = options.event_names, setup.tolerances
-    landings = jnp.append(ts if options.saveat is None else ts[:0], t1)
-    landings = landings if knots is None else merged(landings, knots + t0, jnp.sign(t1 - t0))
-    controller = controller_of(options.solver, options.controller, landings)
-    land = (options.saveat is None or knots is not None) and controller is None
-    controller = options.controller if controller is None else controller
-    if controller is None:
-        controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, force_dtmin=False)
-    saveat = diffrax.SaveAt(ts=ts) if options.saveat is None else since(options.saveat, origin)
-    solver = for_adjoint(options.solver, options.adjoint)
-    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    rates, project = (ZeroTangentIfNonfinite(f, t0, y0) if implicit else f for f in (integrands.rates, integrands.project))
-    solver = GuardedSolver(with_tolerances(solver, controller), project if field.projects else None, integrands.pivots if field.has_pivots else None)
-    term = diffrax.ODETerm(rates)
-    solution = diffrax.diffeqsolve(
-        term,
-        Remembering(solver, integrands.events) if names else solver,
-        t0,
-        t1,
-        setup.dt0,
-        y0,
-        args,
-        saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)], solver_state=True),
-        stepsize_controller=step_to_times(landings, controller) if land else controller,
-        adjoint=options.adjoint,
-        event=diffrax.Event(_an_event) if names else None,
-        max_steps=options.max_steps + (0 if knots is None else len(knots)),
-        throw=False,
-    )
-    t_end, y_end = solution.ts[1][0], jax.tree.map(lambda x: x[0], solution.ys[1])
-    code = jnp.where(solution.result == diffrax.RESULTS.max_steps_reached, results.MAX_STEPS, results.STEP_TOO_SMALL)
-    code = jnp.where(solution.result == diffrax.RESULTS.successful, results.SUCCESS, code)
-    unsolved = (solution.result == diffrax.RESULTS.nonlinear_divergence) | (solution.result == diffrax.RESULTS.nonlinear_max_steps_reached)
-    # a step that was not solved is no step: the times at its end were not reached
-    reached = jnp.isfinite(solution.ts[0]) & ~(unsolved & ((solution.ts[0] - t_end) * jnp.sign(t1 - t0) >= 0))
-    seen = (solution.solver_state[2] if names else solution.solver_state)[1]
-    if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):  # others cannot reject a step
-        code = jnp.where((seen.projected > results.MOST_PROJECTED) & (code == results.SUCCESS), results.OFF_CONSTRAINTS, code)
-    code, event = jnp.where(unsolved, results.UNSOLVED_STEP, code), jnp.full_like(code, -1, jnp.int32)
-    if names:
-        happened = solution.event_mask
-        t_last, y_last, _ = solution.solver_state
-        located = locate(solver, term, integrands.events, (t_last * jnp.sign(t1 - t0), y_last), t_end, y_end, args, happened)
-        t_end, y_end, event = located.t, located.y, located.event
-        code = jnp.where(happened, jnp.where(located.solved, results.EVENT, results.UNSOLVED_STEP), code)
-    return Solved(
-        ts=solution.ts[0],
-        ys=solution.ys[0],
-        reached=reached,
-        t_end=t_end,
-        y_end=y_end,
-        code=code,
-        event=event,
-        accepted=solution.stats["num_accepted_steps"],
-        rejected=solution.stats["num_rejected_steps"],
-        last_step=jnp.full_like(t_end, jnp.nan),
-        pivot=seen.pivot,
-    )
+class Diffrax(Integrator):
+    """`diffrax.diffeqsolve`."""
+
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController | None
+    adjoint: diffrax.AbstractAdjoint
+    saveat: diffrax.SaveAt | None
+    max_steps: int = eqx.field(static=True)
+    event_names: tuple[str, ...] = eqx.field(static=True)
+    projects_saved: ClassVar[bool] = False
+
+    @property
+    def name(self) -> str:
+        """The solver, as it stands in a trajectory."""
+        return type(self.solver).__name__
+
+    @property
+    def mode(self) -> Literal["forward", "reverse", "any"]:
+        """The mode of differentiation that the adjoint supports."""
+        if isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint):
+            return "reverse"
+        return "forward" if isinstance(self.adjoint, diffrax.ForwardMode) else "any"
+
+    def reason_against_machine_code(self, setup: Setup) -> str:
+        """It has none."""
+        return "a solver, a controller or an adjoint of diffrax was asked for"
+
+    def solved(self, setup: Setup, begun: Begun) -> Solved:
+        """One motion."""
+        field, args, y0 = setup.field, begun.args, begun.y0
+        origin = args[4]
+        t0, t1, ts, knots = setup.t0 - origin, setup.t1 - origin, setup.ts - origin, setup.knots
+        names, (rtol, atol) = self.event_names, setup.tolerances
+        landings = jnp.append(ts if self.saveat is None else ts[:0], t1)
+        landings = landings if knots is None else merged(landings, knots + t0, jnp.sign(t1 - t0))
+        controller = controller_of(self.solver, self.controller, landings)
+        land = (self.saveat is None or knots is not None) and controller is None
+        controller = self.controller if controller is None else controller
+        if controller is None:
+            controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, force_dtmin=False)
+        saveat = diffrax.SaveAt(ts=ts) if self.saveat is None else since(self.saveat, origin)
+        solver = for_adjoint(self.solver, self.adjoint)
+        implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+        rates, project = (ZeroTangentIfNonfinite(f, t0, y0) if implicit else f for f in (integrands.rates, integrands.project))
+        solver = GuardedSolver(with_tolerances(solver, controller), project if field.projects else None, integrands.pivots if field.has_pivots else None)
+        term = diffrax.ODETerm(rates)
+        solution = diffrax.diffeqsolve(
+            term,
+            Remembering(solver, integrands.events) if names else solver,
+            t0,
+            t1,
+            setup.dt0,
+            y0,
+            args,
+            saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)], solver_state=True),
+            stepsize_controller=step_to_times(landings, controller) if land else controller,
+            adjoint=self.adjoint,
+            event=diffrax.Event(_an_event) if names else None,
+            max_steps=self.max_steps + (0 if knots is None else len(knots)),
+            throw=False,
+        )
+        t_end, y_end = solution.ts[1][0], jax.tree.map(lambda x: x[0], solution.ys[1])
+        code = jnp.where(solution.result == diffrax.RESULTS.max_steps_reached, results.MAX_STEPS, results.STEP_TOO_SMALL)
+        code = jnp.where(solution.result == diffrax.RESULTS.successful, results.SUCCESS, code)
+        unsolved = (solution.result == diffrax.RESULTS.nonlinear_divergence) | (solution.result == diffrax.RESULTS.nonlinear_max_steps_reached)
+        # a step that was not solved is no step: the times at its end were not reached
+        reached = jnp.isfinite(solution.ts[0]) & ~(unsolved & ((solution.ts[0] - t_end) * jnp.sign(t1 - t0) >= 0))
+        seen = (solution.solver_state[2] if names else solution.solver_state)[1]
+        if not isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):  # others cannot reject a step
+            code = jnp.where((seen.projected > results.MOST_PROJECTED) & (code == results.SUCCESS), results.OFF_CONSTRAINTS, code)
+        code, event = jnp.where(unsolved, results.UNSOLVED_STEP, code), jnp.full_like(code, -1, jnp.int32)
+        if names:
+            happened = solution.event_mask
+            t_last, y_last, _ = solution.solver_state
+            located = locate(solver, term, integrands.events, (t_last * jnp.sign(t1 - t0), y_last), t_end, y_end, args, happened)
+            t_end, y_end, event = located.t, located.y, located.event
+            code = jnp.where(happened, jnp.where(located.solved, results.EVENT, results.UNSOLVED_STEP), code)
+        return Solved(
+            ts=solution.ts[0],
+            ys=solution.ys[0],
+            reached=reached,
+            t_end=t_end,
+            y_end=y_end,
+            code=code,
+            event=event,
+            accepted=solution.stats["num_accepted_steps"],
+            rejected=solution.stats["num_rejected_steps"],
+            last_step=jnp.full_like(t_end, jnp.nan),
+            pivot=seen.pivot,
+        )
 
 
 def _an_event(t, y, args, *, terms, **kwargs) -> Bool[Array, ""]:

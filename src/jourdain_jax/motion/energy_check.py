@@ -26,7 +26,7 @@ def conserves(setup: Setup) -> bool:
 
     Integrated work is no part of the check: it may be the small rest of large powers, whose errors nothing at the ends of steps bounds.
     """
-    by_tolerance = setup.options.controller is None and not isinstance(setup.options.solver, FixedStepSolver)
+    by_tolerance = setup.integrator.controller is None and not isinstance(setup.integrator.solver, FixedStepSolver)
     return by_tolerance and not needs_work(setup.scene, structure_of(setup.scene))
 
 

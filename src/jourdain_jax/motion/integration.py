@@ -15,13 +15,11 @@ from jaxtyping import Array, Bool
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.arguments import times_fit
-from jourdain_jax.motion.diffrax_steps import solved_by_diffrax
 from jourdain_jax.motion.energy_check import conserves, energies_near, energy_lost
 from jourdain_jax.motion.input_programs import for_programs
 from jourdain_jax.motion.inputs import inputs_at
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.solver_choice import marked_inputs, marked_outputs, time_origin
-from jourdain_jax.motion.own_steps import lanes_solved_by_own_steps, reason_against_machine_code, solved_by_own_steps
 from jourdain_jax.motion.quick_compilation import QUICK, RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.setup import Begun, Setup, Solved
 from jourdain_jax.motion.start import State, consistent, moved_onto_rows
@@ -49,7 +47,7 @@ def _one_motion(setup: Setup) -> tuple[Trajectory, Bool[Array, ""]]:
         found = moved_onto_rows(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0), setup.usual)
         setup, arrived = setup._replace(start=found.state, usual=None), found.arrived
     begun, fitting = _begin(setup), setup.fitting()
-    return _finish(setup, fitting, begun, _solved(fitting, begun)), arrived
+    return _finish(setup, fitting, begun, setup.integrator.solved(fitting, begun)), arrived
 
 
 def _compiler_options(setup: Setup) -> dict | None:
@@ -58,7 +56,7 @@ def _compiler_options(setup: Setup) -> dict | None:
         return None
     # The steps by machine code are no part of it: XLA compiles the rest for a disc in 0.6 s of processor time instead of 1.0, for a bicycle in 1.4 instead of
     # 3.0; a motion with 201 saved times takes 0.34 ms instead of 0.27, and 2.10 instead of 2.05.
-    return QUICK if reason_against_machine_code(setup) else RUN_SELDOM
+    return QUICK if setup.reason_against_machine_code else RUN_SELDOM
 
 
 _compiled = for_programs(_one_motion, partial(quickly_compiled, options=_compiler_options))
@@ -67,34 +65,24 @@ _compiled = for_programs(_one_motion, partial(quickly_compiled, options=_compile
 def integrate_lanes(setups: Setup) -> Trajectory:
     """The motions of all lanes: `lockstep.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
     begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
-    if setups.options.by_own_steps and setups.field.lowered is not None:
-        solved = lanes_solved_by_own_steps(fitting, begun)
-    else:
-        # lanes often share their times: what XLA knows to be the same in all of them it moves through diffrax's `nextafter`, one operation per pass
-        times = jax.lax.optimization_barrier((fitting.t0, fitting.t1, fitting.dt0))
-        timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.dt0), fitting, times)
-        solved = eqx.filter_vmap(_solved)(timed, begun)
+    solved = setups.integrator.lanes_solved(fitting, begun)
     return eqx.filter_vmap(_finish)(setups, fitting, begun, solved)
 
 
 def _begin(setup: Setup) -> Begun:
     timely = times_fit(setup.ts, setup.t0, setup.t1)
     right, start = _without_faults(setup.scene, setup.t0, setup.start)
-    scene, start, inputs = marked_inputs(setup.options.adjoint, (setup.scene, start, setup.inputs))
+    scene, start, inputs = marked_inputs(setup.integrator.mode, (setup.scene, start, setup.inputs))
     field = setup.field
-    args = field, scene, inputs, field.fixed(scene), time_origin(setup.options.controller, setup.t0)
+    args = field, scene, inputs, field.fixed(scene), time_origin(setup.integrator.controller, setup.t0)
     return Begun(right, timely, start, args, field.pack(start.q, start.u))
 
 
-def _solved(setup: Setup, begun: Begun) -> Solved:
-    return (solved_by_own_steps if setup.options.by_own_steps else solved_by_diffrax)(setup, begun)
-
-
 def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Trajectory:
-    t0, field, options, adjoint = setup.t0, setup.field, setup.options, setup.options.adjoint
+    t0, field, integrator = setup.t0, setup.field, setup.integrator
     start, args = begun.start, begun.args
     _, scene, inputs, fixed, origin = args
-    solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, marked_outputs(adjoint, (solved.ys, solved.y_end)))
+    solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, marked_outputs(integrator.mode, (solved.ys, solved.y_end)))
     moving = field.projects
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
     direction = jnp.sign(setup.t1 - t0)
@@ -103,7 +91,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     def saved_state(tau, y, valid):
         # what was never reached holds anything: compute at the end state instead, then mark
         tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
-        y = integrands.project(tau, y, args) if moving and not options.by_own_steps else y
+        y = integrands.project(tau, y, args) if moving and not integrator.projects_saved else y
         t = origin + tau
         seen = field.observed(scene, fixed, t, y, inputs(t))
         work = None if y.work is None else y.work + field.stored(scene, t, seen.q, inputs(t)) - stored_first
@@ -120,7 +108,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     code = jnp.where(results.is_success(solved.code) & lost, results.ENERGY_LOST, solved.code)
     return Trajectory(
         scene=setup.scene,
-        ts=given.ts if options.saveat is None else origin + solved.ts,
+        ts=given.ts if integrator.saveat is None else origin + solved.ts,
         q=q[1:-1],
         u=u[1:-1],
         work=None if work is None else work[1:-1],
@@ -144,10 +132,10 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         smallest_pivot=pivot,
         inputs=inputs,
         state_form=field.name,
-        reduction=field.reduction_name if reason_against_machine_code(setup) else f"{field.reduction_name} to machine code",
-        solver=type(options.solver).__name__ if options.order is None else "Taylor",
+        reduction=field.reduction_name if setup.reason_against_machine_code else f"{field.reduction_name} to machine code",
+        solver=integrator.name,
         projected=moving,
-        event_names=options.event_names,
+        event_names=integrator.event_names,
     )
 
 

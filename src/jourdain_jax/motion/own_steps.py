@@ -4,8 +4,10 @@ One motion, or lanes side by side: those of a scalar program in blocks of `locks
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
+from typing import ClassVar, Literal
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,40 +18,78 @@ from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
 from jourdain_jax.motion.native import native_motion
-from jourdain_jax.motion.setup import Alongside, Begun, Setup, Solved
+from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
 
-
-def solved_by_own_steps(setup: Setup, begun: Begun) -> Solved:
-    """One motion by our own loop."""
-    if reason_against_machine_code(setup):
-        return _by_xla(setup, begun)
-    return differentiated_as(_by_xla, _by_machine_code, setup.options.kind, _rules(setup, lambda f: f))(setup, begun)
+_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
 
 
-def lanes_solved_by_own_steps(setups: Setup, begun: Begun) -> Solved:
-    """Lanes of a scalar program by our own loop; all arrays have a leading axis of lanes."""
-    program = setups.field.lowered
-    assert program is not None
-    blocks = partial(in_blocks, _lanes_by_xla, width(program))
-    if reason_against_machine_code(setups):
-        return blocks(setups, begun)
-    return differentiated_as(blocks, eqx.filter_vmap(_by_machine_code), setups.options.kind, _rules(setups, eqx.filter_vmap))(setups, begun)
+class Alongside(diffrax.ForwardMode):
+    """Forward mode for first derivatives that are asked for together with the values: one run gives both."""
 
 
-def reason_against_machine_code(setup: Setup) -> str:
-    """Why the loop over steps is one of XLA's and not machine code of our own, in words; empty where it is."""
-    if not setup.options.native:
-        return "another backend was asked for"
-    if not setup.options.by_own_steps:
-        return "a solver, a controller or an adjoint of diffrax was asked for"
-    return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(setup.options.event_names))
+_ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, Alongside)
+
+
+class OwnSteps(Integrator):
+    """Our own loop, with a solver's tableau or by Taylor series; a static object, the same for all calls with these options."""
+
+    solver: type[diffrax.AbstractERK] = eqx.field(static=True)
+    mode: Literal["forward", "reverse"] = eqx.field(static=True)
+    alongside: bool = eqx.field(static=True)  # whether values and tangents come from one run
+    max_steps: int = eqx.field(static=True)
+    event_names: tuple[str, ...] = eqx.field(static=True)
+    native: bool = eqx.field(static=True)  # whether machine code may integrate
+    order: int | None = eqx.field(static=True)  # of Taylor series, by which machine code steps in place of the solver's tableau
+    controller: ClassVar[None] = None
+    saveat: ClassVar[None] = None
+    projects_saved: ClassVar[bool] = True
+
+    @property
+    def name(self) -> str:
+        """The solver, as it stands in a trajectory."""
+        return self.solver.__name__ if self.order is None else "Taylor"
+
+    def reason_against_machine_code(self, setup: Setup) -> str:
+        """Why the loop over steps is one of XLA's, in words; empty where it is none."""
+        if not self.native:
+            return "another backend was asked for"
+        return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names))
+
+    def solved(self, setup: Setup, begun: Begun) -> Solved:
+        """One motion."""
+        return self._by_either(_by_xla, lambda f: f, setup, begun)
+
+    def lanes_solved(self, setups: Setup, begun: Begun) -> Solved:
+        """Lanes: those of a scalar program in blocks; all arrays have a leading axis of lanes."""
+        if (program := setups.field.lowered) is None:
+            return super().lanes_solved(setups, begun)
+        return self._by_either(partial(in_blocks, _lanes_by_xla, width(program)), eqx.filter_vmap, setups, begun)
+
+    def _by_either(self, by_xla: Callable, mapped: Callable, setup: Setup, begun: Begun) -> Solved:
+        """By machine code where that serves; `mapped`: of a function of one motion, that of all lanes."""
+        if setup.reason_against_machine_code:
+            return by_xla(setup, begun)
+        return differentiated_as(by_xla, mapped(_by_machine_code), self.mode, _rules(setup, mapped, self.alongside))(setup, begun)
+
+
+_once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
+
+
+def own_steps(solver, controller, adjoint, saveat, **static) -> OwnSteps | None:
+    """Our own loop where it has such a solver and such an adjoint (None: the default one), and nothing else was stated."""
+    if controller is not None or saveat is not None or type(solver) not in _SOLVERS:
+        return None
+    if adjoint is not None and (type(adjoint) not in _ADJOINTS or getattr(adjoint, "checkpoints", None) is not None):
+        return None
+    mode: Literal["forward", "reverse"] = "forward" if isinstance(adjoint, diffrax.ForwardMode) else "reverse"
+    return _once(type(solver), mode, isinstance(adjoint, Alongside), **static)
 
 
 def reason_against_series(setup: Setup, order: int) -> str:
     """Why machine code does not integrate by Taylor series of an order, in words; empty where it can."""
-    reason = reason_against_machine_code(setup)
-    return reason or native_motion.reason_against_series(setup.field, setup.inputs, bool(setup.options.event_names), order)
+    reason = setup.reason_against_machine_code
+    return reason or native_motion.reason_against_series(setup.field, setup.inputs, bool(setup.integrator.event_names), order)
 
 
 def _by_xla(setup: Setup, begun: Begun) -> Solved:
@@ -63,13 +103,13 @@ def _lanes_by_xla(setups: Setup, begun: Begun) -> Solved:
 
 
 def _loop(setup: Setup, y0, args, ts, knots) -> Solved:
-    field, options = setup.field, setup.options
+    field, own = setup.field, _own(setup)
     goals = _goals(setup, ts)
     problem = erk_loop.Problem(
         rates=integrands.rates,
         args=args,
         project=integrands.project if field.projects else None,
-        events=integrands.events if options.event_names else None,
+        events=integrands.events if own.event_names else None,
         norm=integrands.state_norm,
         rtol=jnp.broadcast_to(setup.tolerances[0], setup.t0.shape),
         atol=jnp.broadcast_to(setup.tolerances[1], setup.t0.shape),
@@ -78,7 +118,7 @@ def _loop(setup: Setup, y0, args, ts, knots) -> Solved:
         knots=knots,
         rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
     )
-    ys, reached, end = erk_loop.integrate(problem, erk_loop.method_of(options.solver), y0, jnp.zeros_like(setup.t0), goals, setup.dt0, options.kind)
+    ys, reached, end = erk_loop.integrate(problem, erk_loop.method_of(own.solver()), y0, jnp.zeros_like(setup.t0), goals, setup.dt0, own.mode)
     return _as_solved(goals, ys, reached, end)
 
 
@@ -88,23 +128,28 @@ def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
 
 
 def _motion(setup: Setup, begun: Begun) -> native_motion.Motion:
-    options, knots = setup.options, setup.knots
+    own, knots = _own(setup), setup.knots
     rtol, atol = setup.tolerances
     control = native_motion.Control(rtol, atol, setup.shortest, setup.dt0, _most_steps(setup, knots))
-    return native_motion.Motion(begun.args, type(options.solver), options.order, bool(options.event_names), begun.y0, _goals(setup, setup.ts), knots, control)
+    return native_motion.Motion(begun.args, own.solver, own.order, bool(own.event_names), begun.y0, _goals(setup, setup.ts), knots, control)
+
+
+def _own(setup: Setup) -> OwnSteps:
+    assert isinstance(setup.integrator, OwnSteps)
+    return setup.integrator
 
 
 def _most_steps(setup: Setup, knots) -> int:
     """Steps that end at knots do not count."""
-    return setup.options.max_steps + (0 if knots is None else len(knots))
+    return setup.integrator.max_steps + (0 if knots is None else len(knots))
 
 
-def _rules(setup: Setup, mapped: Callable) -> Rules:
+def _rules(setup: Setup, mapped: Callable, alongside: bool) -> Rules:
     """Derivatives by machine code; `mapped`: of a function of one motion, that of all lanes."""
 
     def serve(varies: Setup, begun: Begun) -> bool:
         of_samples = [channel for channel in (*varies.inputs.channels, *begun.args[2].channels) if isinstance(channel, Sampled)]
-        reason = native_motion.reason_against_derivatives(setup.field, setup.inputs, bool(setup.options.event_names))
+        reason = native_motion.reason_against_derivatives(setup.field, setup.inputs, bool(setup.integrator.event_names))
         return not any(jax.tree.leaves(of_samples)) and not reason
 
     def push(arguments, along):
@@ -113,7 +158,7 @@ def _rules(setup: Setup, mapped: Callable) -> Rules:
     def pull(perturbed, arguments, found, g):
         return mapped(partial(_pulled, perturbed))(*arguments, found, g)
 
-    return Rules(serve, push, pull, isinstance(setup.options.adjoint, Alongside))
+    return Rules(serve, push, pull, alongside)
 
 
 def _pushed(setup: Setup, begun: Begun, along: Setup, d: Begun) -> tuple[Solved, PyTree]:

@@ -14,7 +14,6 @@ Forward mode has tangents d instead, of the states saved and of the start, and s
 
 import warnings
 
-import diffrax
 import equinox as eqx
 import jax
 import numpy as np
@@ -113,7 +112,7 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory:
     """`integrate(setup)`; its derivative, taken outside of `jit`, warns where the motion amplifies errors too much."""
     if nothing_is_traced() or not is_traced(setup):
         return integrate(setup)
-    forward = isinstance(setup.options.adjoint, diffrax.ForwardMode)
+    forward = setup.integrator.mode == "forward"
     start, (rtol, atol) = setup.start, setup.tolerances
     known = _known((start.q, start.u, rtol, atol))
     if known is None:

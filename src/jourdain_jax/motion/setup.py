@@ -4,11 +4,13 @@ Time counts from the start, tau = t - t0: far from zero a clock has few digits, 
 Rates, projection and events are given tau, and the scene and its inputs t0 + tau.
 """
 
+import abc
 from operator import attrgetter
 from typing import Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
@@ -21,43 +23,10 @@ from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
 TOLERANCE, MOST_STEPS = 1e-8, 100_000  # of `simulate`, where nothing else is asked for
-OWN_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
-
-
-class Alongside(diffrax.ForwardMode):
-    """Forward mode for first derivatives that are asked for together with the values: our own loop gives both in one run."""
-
-
-OWN_ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, Alongside)
-
-
-class Options(eqx.Module):
-    """How to integrate; what is a number of its own in every call stands in the `Setup`."""
-
-    solver: diffrax.AbstractSolver
-    controller: diffrax.AbstractStepSizeController | None  # None: the default one
-    adjoint: diffrax.AbstractAdjoint
-    max_steps: int = eqx.field(static=True)
-    saveat: diffrax.SaveAt | None  # None: at the times asked for, at each of which a step ends
-    event_names: tuple[str, ...] = eqx.field(static=True)
-    native: bool = eqx.field(static=True, default=True)  # whether machine code of our own may integrate it
-    order: int | None = eqx.field(static=True, default=None)  # of Taylor series, by which machine code steps in place of the solver's tableau
-
-    @property
-    def by_own_steps(self) -> bool:
-        """Whether our own explicit Runge-Kutta loop integrates it: it has a solver, a controller and an adjoint of its own, and nothing else was stated."""
-        plain = self.controller is None and self.saveat is None
-        checkpoints = isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint) and self.adjoint.checkpoints is not None
-        return plain and not checkpoints and type(self.solver) in OWN_SOLVERS and type(self.adjoint) in OWN_ADJOINTS
-
-    @property
-    def kind(self) -> Literal["forward", "reverse"]:
-        """The mode of differentiation of our own loop."""
-        return "forward" if isinstance(self.adjoint, diffrax.ForwardMode) else "reverse"
 
 
 class Solved(eqx.Module):
-    """What either loop finds."""
+    """What an integrator finds."""
 
     ts: Float[Array, "times *lanes"]  # as t_end, since the start
     ys: PyTree
@@ -72,6 +41,37 @@ class Solved(eqx.Module):
     pivot: Float[Array, "*lanes"]  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was watched
 
 
+class Integrator(eqx.Module):
+    """How a motion is integrated: by our own steps (`motion/own_steps.py`) or by diffrax (`motion/diffrax_steps.py`).
+
+    What is a number of its own in every call stands in the `Setup`.
+    """
+
+    max_steps: eqx.AbstractVar[int]
+    event_names: eqx.AbstractVar[tuple[str, ...]]
+    solver: eqx.AbstractVar[diffrax.AbstractSolver | type]
+    controller: eqx.AbstractVar[diffrax.AbstractStepSizeController | None]  # None: the default one
+    saveat: eqx.AbstractVar[diffrax.SaveAt | None]  # None: at the times asked for, at each of which a step ends
+    name: eqx.AbstractVar[str]  # of the solver, as it stands in a trajectory
+    mode: eqx.AbstractVar[Literal["forward", "reverse", "any"]]  # of differentiation, that the adjoint supports
+    projects_saved: eqx.AbstractClassVar[bool]  # whether the states that it returns are on the rows
+
+    @abc.abstractmethod
+    def reason_against_machine_code(self, setup: "Setup") -> str:
+        """Why the loop over steps is one of XLA's and not machine code of our own, in words; empty where it is."""
+
+    @abc.abstractmethod
+    def solved(self, setup: "Setup", begun: "Begun") -> Solved:
+        """One motion."""
+
+    def lanes_solved(self, setups: "Setup", begun: "Begun") -> Solved:
+        """Lanes; all arrays have a leading axis of lanes."""
+        # lanes often share their times: what XLA knows to be the same in all of them it moves through diffrax's `nextafter`, one operation per pass
+        times = jax.lax.optimization_barrier((setups.t0, setups.t1, setups.dt0))
+        timed = eqx.tree_at(lambda s: (s.t0, s.t1, s.dt0), setups, times)
+        return eqx.filter_vmap(self.solved)(timed, begun)
+
+
 class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     """A motion to be integrated; in a batch all arrays have a leading axis of lanes."""
 
@@ -84,13 +84,18 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     field: VectorField
     tolerances: tuple  # rtol, atol
     dt0: Float[Array | np.ndarray, "*lanes"] | float
-    options: Options
+    integrator: Integrator
     usual: Usual | None = None  # by which the start is yet to be put onto the rows, in the program that integrates; None: it is on them
 
     def fitting(self) -> "Setup":
         """The setup with times that serve any loop, also where its own do not go together."""
         of = attrgetter("ts", "t0", "t1", "dt0")
         return eqx.tree_at(of, self, fitting_times(*of(self)))
+
+    @property
+    def reason_against_machine_code(self) -> str:
+        """Why the loop over steps is one of XLA's and not machine code of our own, in words; empty where it is."""
+        return self.integrator.reason_against_machine_code(self)
 
     @property
     def shortest(self) -> Float[Array, "*lanes"]:
@@ -100,7 +105,7 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     @property
     def knots(self) -> Float[Array, "knots"] | None:
         """Times since the start at which steps must end for the inputs' sake."""
-        if steps_are_given(self.options.controller):
+        if steps_are_given(self.integrator.controller):
             return None
         return knots_between((self.inputs, self.scene), self.tolerances[0], self.t0, self.t1, self.ts)
 

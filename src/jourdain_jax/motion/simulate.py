@@ -6,7 +6,6 @@ domain and the rows are linear or affine; otherwise the full one (coordinates an
 
 import inspect
 import warnings
-from functools import lru_cache
 
 import diffrax
 import equinox as eqx
@@ -15,20 +14,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.event_names import names_of_events
 from jourdain_jax.calculus.reals import Number, is_traced
 from jourdain_jax.motion.arguments import check_options, span_and_start
+from jourdain_jax.motion.diffrax_steps import Diffrax
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
 from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import marked
-from jourdain_jax.motion.own_steps import reason_against_machine_code, reason_against_series
+from jourdain_jax.motion.own_steps import own_steps, reason_against_series
 from jourdain_jax.motion.quick_compilation import nothing_is_traced
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
-from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Options, Setup
+from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Setup
 from jourdain_jax.motion.start import State, consistent, yet_to_be_moved
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.choice import Formulation, as_formulation, vector_field
@@ -37,7 +36,6 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 _REVERSE, _LOOSE, _TIGHT = diffrax.RecursiveCheckpointAdjoint(), diffrax.Tsit5(), diffrax.Dopri8()  # made once: each takes a tenth of a millisecond
-_options = lru_cache(maxsize=64)(Options)  # where nothing was chosen
 _OFF = 1e4  # units of round-off: a residual that is more
 
 
@@ -144,22 +142,19 @@ def _set_up(
     start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs)
     field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
     warn_float32(start.q.dtype, rtol)
-    options = (Options if any(x is not None for x in objects.values()) else _options)(
-        solver=(default_solver(rtol) if order is None else _TIGHT) if solver is None else solver,
-        controller=stepsize_controller,
-        adjoint=_REVERSE if adjoint is None else adjoint,
-        max_steps=max_steps,
-        saveat=None if saveat is None else _checked_saveat(saveat),
-        event_names=names_of_events(scene) if events else (),
-        native=backend in ("auto", "native"),
-        order=order,
-    )
+    if solver is None:
+        solver = default_solver(rtol) if order is None else _TIGHT
+    static = {"max_steps": max_steps, "event_names": field.event_names if events else ()}
+    integrator = own_steps(solver, stepsize_controller, adjoint, saveat, **static, native=backend in ("auto", "native"), order=order)
+    if integrator is None:
+        adjoint = _REVERSE if adjoint is None else adjoint
+        integrator = Diffrax(solver, stepsize_controller, adjoint, None if saveat is None else _checked_saveat(saveat), **static)
     tolerances = tuple((jnp if is_traced(x) else np).asarray(x, start.q.dtype) for x in (rtol, atol))  # arrays: another tolerance is no other program
     first_step = _first_step(solver, dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
     later = yet_to_be_moved(scene, start) if formulation.projects and not made_here and nothing_is_traced() else None
     start = _on_constraints(scene, t0, start, inputs, made_here) if formulation.projects and later is None else start
-    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, options, later)
-    if backend == "native" and (reason := reason_against_machine_code(setup)):
+    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, integrator, later)
+    if backend == "native" and (reason := setup.reason_against_machine_code):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
     if order is not None and (reason := reason_against_series(setup, order)):
         raise ValueError(f"solver=jj.Taylor() cannot integrate `{type(scene).__name__}`: {reason}; leave `solver` away, or use solver=diffrax.Dopri8()")

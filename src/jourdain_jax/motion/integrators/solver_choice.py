@@ -66,11 +66,11 @@ def steps_are_given(controller) -> bool:
     return isinstance(controller, diffrax.StepTo)
 
 
-def marked_inputs(adjoint, tree):
-    """Inputs of the integration: forward mode through a reverse-only `adjoint` raises our own error."""
-    return reverse_only(tree) if isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) else tree
+def marked_inputs(mode: str, tree):
+    """Inputs of the integration: forward mode raises our own error where the adjoint supports reverse mode alone."""
+    return reverse_only(tree) if mode == "reverse" else tree
 
 
-def marked_outputs(adjoint, tree):
-    """Outputs of the integration: reverse mode, which comes to them first, through a forward-only `adjoint` raises our own error."""
-    return forward_only(tree) if isinstance(adjoint, diffrax.ForwardMode) else tree
+def marked_outputs(mode: str, tree):
+    """Outputs of the integration: reverse mode, which comes to them first, raises our own error where the adjoint supports forward mode alone."""
+    return forward_only(tree) if mode == "forward" else tree

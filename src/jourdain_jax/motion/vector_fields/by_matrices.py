@@ -128,6 +128,7 @@ def full_without_projection(field: VectorField, scene: Scene, own_equations: str
         projects_positions=False,
         projects_speeds=False,
         of_inputs=field.of_inputs,
+        event_names=field.event_names,
         stabilisation=field.stabilisation if isinstance(field, ByMatrices) else None,
         usual=usual_lengths(scene),
         inputs_in_rows=isinstance(field, ByMatrices) and field.inputs_in_rows,

@@ -52,7 +52,7 @@ class ByProgram(VectorField):
         return self.program.energy_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
-        """Values of the stop events, sorted by name; lanes only where `lowers_events`."""
+        """Values of the stop events, in the order of their names; lanes only where `lowers_events`."""
         if self.program.events:
             return self.program.event_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
         return super().events(scene, fixed, t, y, inputs)

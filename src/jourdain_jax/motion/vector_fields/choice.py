@@ -6,6 +6,7 @@ from typing import Any, Literal
 import equinox as eqx
 import jax.numpy as jnp
 
+from jourdain_jax.build.event_names import names_of_events
 from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.structure import WELL_CONDITIONED, Structure, structure_of
 from jourdain_jax.build.usual_lengths import usual_lengths
@@ -115,6 +116,7 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
         "projects_positions": formulation.projects and _is_closed(scene),
         "projects_speeds": formulation.projects and not minimal and bool(structure.row_names),
         "of_inputs": structure.potentials_of_inputs,
+        "event_names": names_of_events(scene),
     }
     if program is not None:
         return ByProgram(**common, program=program, affine=structure.affine)

@@ -53,6 +53,7 @@ class VectorField(eqx.Module):
     projects_positions: bool = eqx.field(static=True)
     projects_speeds: bool = eqx.field(static=True)
     of_inputs: tuple[int, ...] = eqx.field(static=True)  # numbers of the loads whose potential depends on inputs
+    event_names: tuple[str, ...] = eqx.field(static=True)  # sorted
 
     @property
     def name(self) -> str:
@@ -117,7 +118,7 @@ class VectorField(eqx.Module):
         """What is looked at where a state is saved."""
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
-        """Values of the stop events, sorted by name; lanes only where `lowers_events`."""
+        """Values of the stop events, in the order of their names; lanes only where `lowers_events`."""
         return event_values(scene, motion_at(scene, t, *self.unpack(scene, fixed, t, y, inputs), inputs))
 
     def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
