@@ -1,6 +1,7 @@
 """Numbers as a user writes them (plain, of NumPy, in a list), made into floating-point arrays."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +63,7 @@ def checked_known(value, what: str, shape: tuple[int, ...] | None = None, *, adv
 
 def checked_unless_traced(value, what: str, shape: tuple[int, ...] | None = None, *, advice: str):
     """`value` in the default float: on NumPy where it is known, also inside `jit`; a JAX array where it is traced. A ValueError as of `checked_real`."""
-    if is_traced(value):
+    if type(value) is not float and is_traced(value):
         return checked_real(value, what, shape, advice=advice).astype(real_type())
     return checked_known(value, what, shape, advice=advice)
 
@@ -91,4 +92,16 @@ def described(value) -> str:
 
 def is_traced(*trees) -> bool:
     """Whether any leaf is being traced, so that its number is not known."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+    return any(is_traced_type(type(leaf)) for leaf in jax.tree.leaves(trees))
+
+
+@lru_cache(maxsize=1024)
+def is_traced_type(kind: type) -> bool:
+    """Whether what is of this type is being traced; asking a class of JAX takes ten times as long as looking this up."""
+    return issubclass(kind, jax.core.Tracer)
+
+
+@lru_cache(maxsize=1024)
+def is_array_type(kind: type) -> bool:
+    """Whether what is of this type is an array of JAX or NumPy, as by `equinox.is_array`."""
+    return issubclass(kind, jax.Array | jax.core.Tracer | np.ndarray | np.generic)

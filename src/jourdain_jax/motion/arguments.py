@@ -48,6 +48,8 @@ def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None) -
 def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, switches: dict | None = None, **objects) -> None:
     """ValueError for tolerances that are no positive numbers, and for `solver`, `adjoint`, ... that are no objects of their kind (None is let pass)."""
     for name, value in (("rtol", rtol), ("atol", atol)):
+        if type(value) is float and 0 < value < np.inf:
+            continue
         number = checked_unless_traced(value, f"`{name}`", (), advice="give one number, such as 1e-8")
         if not is_traced(number) and not 0 < float(number) < np.inf:
             raise ValueError(f"`{name}` is {float(number):g}, expected a positive finite number; give a tolerance such as 1e-8")

@@ -14,6 +14,7 @@ import jax
 from jax.extend.core import get_opaque_trace_state
 
 from jourdain_jax.calculus.collecting import without_collecting
+from jourdain_jax.calculus.reals import is_array_type
 
 QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
 RUN_SELDOM: dict[str, Any] = QUICK | {"xla_backend_optimization_level": 0}  # where a function's costs are those of its compilation
@@ -59,11 +60,7 @@ _AN_ARRAY = object()
 def _parted(tree) -> tuple[list, tuple]:
     """The arrays of a tree, and what is left of it."""
     leaves, treedef = jax.tree.flatten(tree)
-    are = [eqx.is_array(x) for x in leaves]
-    return [x for x, is_one in zip(leaves, are, strict=True) if is_one], (
-        treedef,
-        tuple(_AN_ARRAY if is_one else x for x, is_one in zip(leaves, are, strict=True)),
-    )
+    return [x for x in leaves if is_array_type(type(x))], (treedef, tuple(_AN_ARRAY if is_array_type(type(x)) else x for x in leaves))
 
 
 def _whole(arrays, treedef, rest):

@@ -151,8 +151,12 @@ def _set_up(
         integrator = Diffrax(solver, stepsize_controller, adjoint, None if saveat is None else _checked_saveat(saveat), **static)
     tolerances = tuple((jnp if is_traced(x) else np).asarray(x, start.q.dtype) for x in (rtol, atol))  # arrays: another tolerance is no other program
     first_step = _first_step(solver, dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
-    later = yet_to_be_moved(scene, start) if formulation.projects and not made_here and nothing_is_traced() else None
-    start = _on_constraints(scene, t0, start, inputs, made_here) if formulation.projects and later is None else start
+    later = None
+    if formulation.projects:
+        if not made_here and nothing_is_traced():
+            later = yet_to_be_moved(scene, start)
+        else:
+            start = _on_constraints(scene, t0, start, inputs, made_here)
     setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, integrator, later)
     if backend == "native" and (reason := setup.reason_against_machine_code):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
@@ -162,9 +166,9 @@ def _set_up(
 
 
 def _first_step(solver, dt0, t0, t1):
-    if isinstance(solver, FixedStepSolver) and dt0 is not None:
-        return jnp.abs(dt0) * jnp.sign(t1 - t0)
-    return 1e-4 * (t1 - t0) if dt0 is None else jnp.asarray(dt0, jnp.result_type(t0))
+    if dt0 is None:
+        return 1e-4 * (t1 - t0)
+    return jnp.abs(dt0) * jnp.sign(t1 - t0) if isinstance(solver, FixedStepSolver) else jnp.asarray(dt0, jnp.result_type(t0))
 
 
 def _checked_saveat(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
@@ -207,7 +211,7 @@ def default_solver(rtol: Number) -> diffrax.AbstractERK:
 
 def warn_float32(dtype, rtol) -> None:
     """A warning where the precision does not hold the tolerance."""
-    if dtype == jnp.float32 and not isinstance(rtol, jax.core.Tracer) and rtol < 1e-5:
+    if dtype == np.float32 and not isinstance(rtol, jax.core.Tracer) and rtol < 1e-5:
         warnings.warn(
             f"rtol = {rtol} asks for more digits than float32 has; set jax.config.update('jax_enable_x64', True), or loosen rtol and atol to 1e-5",
             stacklevel=3,

@@ -15,7 +15,7 @@ from jourdain_jax.scene.scene import Scene
 
 def fitted(solver, scene: Scene, field: VectorField, asked: str) -> VectorField:
     """The form of the state that the solver integrates; a ValueError where it does not apply to the scene. `asked`: the `state` of its `Formulation`."""
-    return solver.fitted(scene, field, asked) if isinstance(solver, FixedStepSolver | MuntheKaas) else field
+    return field if solver is None or not isinstance(solver, FixedStepSolver | MuntheKaas) else solver.fitted(scene, field, asked)
 
 
 def may_be_full(solver) -> bool:
@@ -25,7 +25,7 @@ def may_be_full(solver) -> bool:
 
 def check_solver(solver, controller, dt0, saveat) -> None:
     """ValueError for options that do not go with a structure-preserving solver; others pass."""
-    if not isinstance(solver, FixedStepSolver | MuntheKaas):
+    if solver is None or not isinstance(solver, FixedStepSolver | MuntheKaas):
         return
     name = type(solver).__name__
     if saveat is not None and saveat.subs.ts is not None:
