@@ -38,7 +38,7 @@ class Diffrax(Integrator):
 
     @property
     def mode(self) -> Literal["forward", "reverse", "any"]:
-        """The mode of differentiation that the adjoint supports."""
+        """The mode of differentiation that it supports."""
         if isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint):
             return "reverse"
         return "forward" if isinstance(self.adjoint, diffrax.ForwardMode) else "any"

@@ -35,7 +35,7 @@ class OwnSteps(Integrator):
     """Our own loop, with a solver's tableau or by Taylor series; a static object, the same for all calls with these options."""
 
     solver: type[diffrax.AbstractERK] = eqx.field(static=True)
-    mode: Literal["forward", "reverse"] = eqx.field(static=True)
+    kind: Literal["forward", "reverse"] = eqx.field(static=True)  # of derivatives
     alongside: bool = eqx.field(static=True)  # whether values and tangents come from one run
     max_steps: int = eqx.field(static=True)
     event_names: tuple[str, ...] = eqx.field(static=True)
@@ -49,6 +49,11 @@ class OwnSteps(Integrator):
     def name(self) -> str:
         """The solver, as it stands in a trajectory."""
         return self.solver.__name__ if self.order is None else "Taylor"
+
+    @property
+    def mode(self) -> Literal["forward", "reverse"]:
+        """The mode of differentiation that it supports."""
+        return self.kind
 
     def reason_against_machine_code(self, setup: Setup) -> str:
         """Why the loop over steps is one of XLA's, in words; empty where it is none."""
@@ -82,8 +87,8 @@ def own_steps(solver, controller, adjoint, saveat, **static) -> OwnSteps | None:
         return None
     if adjoint is not None and (type(adjoint) not in _ADJOINTS or getattr(adjoint, "checkpoints", None) is not None):
         return None
-    mode: Literal["forward", "reverse"] = "forward" if isinstance(adjoint, diffrax.ForwardMode) else "reverse"
-    return _once(type(solver), mode, isinstance(adjoint, Alongside), **static)
+    kind = "forward" if isinstance(adjoint, diffrax.ForwardMode) else "reverse"
+    return _once(type(solver), kind, isinstance(adjoint, Alongside), **static)
 
 
 def reason_against_series(setup: Setup, order: int) -> str:

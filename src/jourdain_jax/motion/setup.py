@@ -52,9 +52,17 @@ class Integrator(eqx.Module):
     solver: eqx.AbstractVar[diffrax.AbstractSolver | type]
     controller: eqx.AbstractVar[diffrax.AbstractStepSizeController | None]  # None: the default one
     saveat: eqx.AbstractVar[diffrax.SaveAt | None]  # None: at the times asked for, at each of which a step ends
-    name: eqx.AbstractVar[str]  # of the solver, as it stands in a trajectory
-    mode: eqx.AbstractVar[Literal["forward", "reverse", "any"]]  # of differentiation, that the adjoint supports
     projects_saved: eqx.AbstractClassVar[bool]  # whether the states that it returns are on the rows
+
+    @property
+    @abc.abstractmethod
+    def name(self) -> str:
+        """The solver, as it stands in a trajectory."""
+
+    @property
+    @abc.abstractmethod
+    def mode(self) -> Literal["forward", "reverse", "any"]:
+        """The mode of differentiation that it supports."""
 
     @abc.abstractmethod
     def reason_against_machine_code(self, setup: "Setup") -> str:
