@@ -13,6 +13,8 @@ from jourdain_jax.build.probed_on_graph import sampled_on_graph
 from jourdain_jax.scene.scene import Scene
 
 SYMMETRIC_PROBES = 200
+SYMMETRIC_NUMBERS = 12_000  # in their coordinates together, at most: chains of hundreds of bodies are looked at in fewer symmetric configurations,
+FEWEST_SYMMETRIC = 24  # but in so many
 FEW_INSIDE = 8  # random states inside the domain: with fewer, those nearest to it are used as well
 NEARLY_INSIDE = 0.05  # of the width of the domain
 
@@ -120,15 +122,19 @@ def usable_states(scene: Scene, found: Assembled | Probed, generic: np.ndarray) 
 
 
 def symmetric_configurations(scene: Scene) -> np.ndarray:
-    """Zero, and right angles (within the domain) in one or two coordinates."""
+    """Zero, and right angles (within the domain) in one or two coordinates; of many coordinates, in some of them one by one."""
     low, high = coordinate_bounds(scene)
     reference = scene.coordinates.reference()
     attitude = {i + k for i, _ in scene.coordinates.quaternions for k in range(4)}
     turns = [(i, a) for i in range(len(low)) if i not in attitude for a in (np.pi / 2, -np.pi / 2) if low[i] <= a <= high[i]]
-    pairs = sorted(itertools.combinations(turns, 2), key=lambda pair: pair[0][1] != pair[1][1])  # equal angles first: headings of one axle
-    chosen = [(), *((turn,) for turn in turns), *pairs]
+    most = max(FEWEST_SYMMETRIC, min(SYMMETRIC_PROBES, SYMMETRIC_NUMBERS // max(1, len(low))))
+    if len(turns) < most:
+        pairs = sorted(itertools.combinations(turns, 2), key=lambda pair: pair[0][1] != pair[1][1])  # equal angles first: headings of one axle
+        chosen = [(), *((turn,) for turn in turns), *pairs]
+    else:
+        chosen = [(), *((turns[k],) for k in np.linspace(0, len(turns) - 1, most - 1).astype(int))]
     configurations = []
-    for turned in chosen[:SYMMETRIC_PROBES]:
+    for turned in chosen[:most]:
         q = np.where([i in attitude for i in range(len(low))], reference, np.clip(reference, low, high))
         for i, angle in turned:
             q[i] = angle

@@ -19,7 +19,7 @@ from jourdain_jax.build.trace import TracedScene, VelocityQuantities
 from jourdain_jax.lowering.elimination import eliminate, pivots_ok, solve_symmetric
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.multipliers import projected_coordinates
-from jourdain_jax.program.derivative import columns, derivatives, directional_derivative
+from jourdain_jax.program.derivative import columns, derivatives, directional_derivative, jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.identity_test import IdentityProbes, equal, identity_probes, on_rows, unaffected
 from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
@@ -272,12 +272,13 @@ class _Kinematics:
         put = self._cut(levels)
         self._put = put
 
-        directions = {}
+        # velocities are cut in every direction, and move in few of them
+        directions: dict = {None: self._cut([(at.v, None), (at.turning, None), (at.orientation, None), (at.position, None)])}
         for k, column in enumerate(by_speed):
             parts = self._parts(column)
-            direction = self._cut([(at.v, parts[0]), (at.turning, turn(parts)), (at.orientation, None), (at.position, None)])
-            directions[k] = direction | {self.u[k]: g.one}
-        A = [[row.get(k, g.zero) for k in directions] for row in directional_derivative(g, self.phi, directions)]
+            direction = self._cut([(at.v, parts[0]), (at.turning, turn(parts))])
+            directions[k] = {n: rate for n, rate in direction.items() if rate != g.zero} | {self.u[k]: g.one}
+        A = [[row.get(k, g.zero) for k in range(len(self.u))] for row in directional_derivative(g, self.phi, directions)]
         A = np.reshape(self._at(g.substituted([n for row in A for n in row], put)), (len(A), len(self.u))).tolist()
         phi_0 = self._at(g.substituted(self.phi, dict.fromkeys(self.u, g.zero)))
         self._solve(A, phi_0)
@@ -293,12 +294,11 @@ class _Kinematics:
         known = lambda nodes: self._simple(g.substituted(nodes, put_z))  # noqa: E731
         drift, at_fixed_speeds = known(drift), known(at_fixed_speeds)
         zdot = self._simple([row[0] for row in eliminate(g, self._A_z, [[g.neg(d)] for d in drift], build.probes, build.far).solution])
-        dependent = [by_speed[k] for k in build.dependent]
-        partial = [
-            self._simple([g.add(d, g.total(g.mul(row[i], by_z[n]) for row, by_z in zip(self.B, dependent, strict=True))) for n, d in enumerate(by_speed[y])])
-            for i, y in enumerate(build.independent)
-        ]
-        rates = self._simple([g.add(a, g.total(g.mul(r, by_z[n]) for r, by_z in zip(zdot, dependent, strict=True))) for n, a in enumerate(at_fixed_speeds)])
+        moved = [[(j, column[n]) for j, column in enumerate(by_speed[k] for k in build.dependent) if column[n] != g.zero] for n in range(len(simple))]
+        through_z = lambda z, n: g.total(g.mul(z[j], by_z) for j, by_z in moved[n])  # noqa: E731
+        columns_of_B = list(zip(*self.B, strict=True)) if self.B else [() for _ in build.independent]
+        partial = [self._simple([g.add(d, through_z(B, n)) for n, d in enumerate(by_speed[y])]) for y, B in zip(build.independent, columns_of_B, strict=True)]
+        rates = self._simple([g.add(a, through_z(zdot, n)) for n, a in enumerate(at_fixed_speeds)])
         self._quantities()
         self._shape(known(simple), partial, rates)
 
@@ -335,6 +335,8 @@ class _Kinematics:
         return columns(self.graph, nodes, variables)
 
     def _turned(self, R, w) -> list[int]:
+        if all(n == self.graph.zero for n in w):
+            return list(w)
         return [self.graph.dot(R[3 * i : 3 * i + 3], w) for i in range(3)]
 
     def _smaller(self, a, b) -> list[int]:
@@ -358,9 +360,9 @@ class _Kinematics:
         g, traced = self.graph, self.build.traced
         moving = {int(n): rate for n, rate in zip(traced.q, qdot, strict=True)}
         rates = derivatives(g, nodes, {traced.t: g.one} | {n: r for n, r in moving.items() if n not in self.held})
-        for n in self.held:
-            by_held = self._at(derivatives(g, raw, {n: g.one}))
-            rates = [g.add(r, g.mul(moving[n], d)) for r, d in zip(rates, by_held, strict=True)]
+        for k, by_held in enumerate(jacobian(g, raw, list(self.held)) if self.held else ()):
+            slopes = self._at([by_held[n] for n in self.held if n in by_held])
+            rates[k] = g.total([rates[k], *(g.mul(moving[n], d) for n, d in zip((n for n in self.held if n in by_held), slopes, strict=True))])
         return self._simple(rates)
 
     def _velocities(self, replacement) -> tuple[list[int], list[int]]:

@@ -43,6 +43,7 @@ LEAST_PROBES = 12  # at which programs can be compared, where so many were found
 MOST_OPERATIONS = 20_000
 MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
+NOT_SMALL = 4000  # operations: holding ignorable coordinates leaves no small program of so many
 LARGE = 5000  # operations: above, fewer ways are tried, and fewer probes compared with the dense path
 FEW = 6  # of these probes
 CLEARLY = 100.0  # times as large as the smallest pivot that serves: one that serves whatever is usual
@@ -177,19 +178,20 @@ def _probes(scene: Scene, structure: Structure, graph) -> Probes:
 
 def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: float) -> Lowered:
     graph, probes = builder.graph, builder.probes
-    plain = {explicit: builder.build(Strategy(explicit)) for explicit in ((True,) if builder.multiplied else (False, True))}
-    counts = {explicit: graph.operations(_rates(found)) for explicit, found in plain.items()}
-    first = min(plain)
-    best, fewest, way = plain[first], counts[first], Strategy(first)
+    first = Strategy(explicit=bool(builder.multiplied))
+    best, way = builder.build(first), first
+    fewest = graph.operations(_rates(best))
     if fewest > MOST_OPERATIONS:
         raise NotLowered(f"its scalar program has {fewest} operations, more than {MOST_OPERATIONS}")
     expected = _values(best, probes)
     _check_against_dense(scene, structure, builder, best, expected)
     held = _ignorable(scene, builder, best, expected)
     stages = [Stage("scalar program: structural zeros and ones removed, repeated parts shared", fewest)]
-    plainly_held = graph.operations(_rates(builder.build(Strategy(first, held=held)))) if held else fewest
-    stages.append(Stage("ignorable coordinates held in the accelerations", plainly_held))
-    for strategy in _strategies(held, plainly_held < SMALL, None if builder.multiplied else counts[True] / max(1, counts[False])):
+    plainly_held = fewest
+    if held and fewest < NOT_SMALL:
+        plainly_held = graph.operations(_rates(builder.build(replace(first, held=held))))
+        stages.append(Stage("ignorable coordinates held in the accelerations", plainly_held))
+    for strategy in _strategies(builder, held, plainly_held < SMALL, fewest):
         candidate = builder.build(strategy)
         count = graph.operations(graph.with_quotients(_rates(candidate)))
         if count < fewest and _agree(_values(candidate, probes), expected):
@@ -273,19 +275,19 @@ def _rates(found: Equations) -> list[int]:
     return [*found.qdot, *found.ydot]
 
 
-def _strategies(held: tuple[int, ...], small: bool, explicit_to_implicit: float | None) -> Iterator[Strategy]:
-    """What is worth trying; `explicit_to_implicit`: operations without normal forms, None where rows are kept by multipliers.
+def _strategies(builder: AppellOnGraph, held: tuple[int, ...], small: bool, plainly: int) -> Iterator[Strategy]:
+    """What is worth trying; `plainly`: operations without normal forms.
 
     Over all models, with all speeds and without, nothing else took fewer operations (twelve were tried).
     """
-    if explicit_to_implicit is None:
+    if builder.multiplied:
         yield Strategy(True, MOST_TERMS, MOST_TERMS if small else 0, held=held)
     elif small:
         yield Strategy(False, MOST_TERMS, MOST_TERMS, held=held)
         yield Strategy(False, MOST_TERMS, MOST_TERMS, by_determinants=True, held=held)
     else:
         yield Strategy(False, MOST_TERMS, held=held)
-        if explicit_to_implicit <= 1.35:
+        if plainly <= LARGE and builder.graph.operations(_rates(builder.build(Strategy(True)))) <= 1.35 * plainly:
             yield Strategy(True, MOST_TERMS, held=held)
 
 

@@ -41,6 +41,14 @@ class Pivot:
     watched: int  # must not vanish
 
 
+@dataclass(frozen=True)
+class _Entry:
+    """What a place promises as a pivot."""
+
+    worst: float  # of its row, at the worst probe
+    fixed: bool  # it depends on parameters alone
+
+
 class Pivots:
     """The system `A x = right` while it is eliminated, and the choice of the next pivot. `probes`: of the domain; `far`: at full turns of all angles."""
 
@@ -53,6 +61,7 @@ class Pivots:
         self._tall = len(self.rows) > len(self.columns)
         self._sizes: dict[int, np.ndarray] = {}  # of what a row was made of
         self._entries: dict[int, list[int]] = {}  # columns of a row that hold something
+        self._judged: dict[int, dict[int, _Entry]] = {}
         self._determinants: dict[tuple[int, int, int, int], int | None] = {}  # of two rows and columns, where it serves as a pivot
         self._combined: list[Pivot] = []  # by columns, since a determinant is known
         self._determinant: int | None = None
@@ -63,6 +72,8 @@ class Pivots:
         self.rows -= set(pivot.rows)
         self.columns -= set(pivot.columns)
         for other in sorted(self.rows):
+            if all(A[other][c] == graph.zero for c in pivot.columns):
+                continue
             factors = products(graph, [A[other][c] for c in pivot.columns], zip(*pivot.inverse, strict=True))
             for factor, r in zip(factors, pivot.rows, strict=True):
                 if factor == graph.zero:
@@ -71,8 +82,14 @@ class Pivots:
                     self._sizes[other] = self._size(other) + np.abs(self._at([factor])[0]) * self._size(r)
                 for k in self._in_row(r):
                     A[other][k] = graph.sub(A[other][k], graph.mul(factor, A[r][k]))
-                self._entries.pop(other, None)
+                self._changed(other)
                 self.right[other] = [graph.sub(a, graph.mul(factor, b)) for a, b in zip(self.right[other], self.right[r], strict=True)]
+
+    def _changed(self, *rows: int) -> None:
+        """Some rows were changed; all of them, where none is named."""
+        for row in rows or list(self._entries):
+            self._entries.pop(row, None)
+            self._judged.pop(row, None)
 
     def _in_row(self, row: int) -> list[int]:
         """The columns left in which a row holds something, in order."""
@@ -85,30 +102,39 @@ class Pivots:
         graph, A, rows = self.graph, self.A, self.rows
         if self._determinant is not None:
             return self._by_column(None)
-        places = [(r, c) for r in sorted(rows) for c in self._in_row(r)]
-        if not places:
+        judged = [(r, c, entry) for r in sorted(rows) for c, entry in self._judged_row(r).items()]
+        if not judged:
             raise ZeroDivisionError("the rows are dependent")
-        nodes = [A[r][c] for r, c in places]
-        in_row, in_column = Counter(r for r, _ in places), Counter(c for _, c in places)
-        worst = _smallest(self.probes(nodes), places, self._sizes_at(places, self.probes.count))
-        fixed = [self._is_fixed(n) and w > 0 for n, w in zip(nodes, worst, strict=True)]
-        good = [k for k in range(len(places)) if fixed[k] or worst[k] > GOOD]
+        in_row, in_column = Counter(r for r, _, _ in judged), Counter(c for _, c, _ in judged)
 
-        def cost(k):
-            r, c = places[k]
+        def cost(place):
+            r, c, entry = place
             fill = (in_row[r] - 1) * (in_column[c] - 1)
-            return fill, not fixed[k], graph.operations([nodes[k]]) if len(rows) <= FEW else 0, -worst[k]
+            return fill, not entry.fixed, graph.operations([A[r][c]]) if len(rows) <= FEW else 0, -entry.worst
 
-        good.sort(key=cost)
-        if good and fixed[good[0]]:
-            return self._single(*places[good[0]])
+        good = [place for place in judged if place[2].fixed or place[2].worst > GOOD]
+        if good:
+            r, c, entry = min(good, key=cost)
+            if entry.fixed:
+                return self._single(r, c)
         pair = self._best_pair()
         if pair is not None:
             return pair
-        serving = next((k for k in good if fixed[k] or self._serves_everywhere(places[k])), None)
+        good.sort(key=cost)
+        serving = next(((r, c) for r, c, entry in good if entry.fixed or self._serves_everywhere((r, c))), None)
         if serving is not None:
-            return self._single(*places[serving])
-        return self._by_column(places[good[0] if good else int(np.argmax(worst))])
+            return self._single(*serving)
+        r, c, _ = good[0] if good else max(judged, key=lambda place: place[2].worst)
+        return self._by_column((r, c))
+
+    def _judged_row(self, row: int) -> dict[int, "_Entry"]:
+        """The entries of a row by column, judged; kept until the row changes."""
+        if row not in self._judged or not self.columns.issuperset(self._judged[row]):
+            columns = self._in_row(row)
+            nodes, places = [self.A[row][c] for c in columns], [(row, c) for c in columns]
+            worst = _smallest(self.probes(nodes), places, self._sizes_at(places, self.probes.count)) if columns else ()
+            self._judged[row] = {c: _Entry(w, bool(w > 0) and self._is_fixed(n)) for c, n, w in zip(columns, nodes, worst, strict=True)}
+        return self._judged[row]
 
     def _is_fixed(self, node: int) -> bool:
         """Whether a node depends on parameters alone, none of which turns it through zero."""
@@ -263,7 +289,7 @@ class Pivots:
             row[r] = [self.forms.simplified(graph.add(graph.mul(first, x), graph.mul(second, y))) for x, y in pairs]
             row[s] = [self.forms.simplified(graph.sub(graph.mul(b, x), graph.mul(a, y))) for x, y in pairs]
         A[r][c], A[s][c] = squares, graph.zero
-        self._entries.clear()
+        self._changed()
         return self._single(r, c, graph.call("sqrt", squares))
 
     def _orthogonal(self, c: int, users: list[int], weights: list[float], squares: int) -> Pivot:
@@ -283,7 +309,7 @@ class Pivots:
                 row[r] = [self.forms.simplified(graph.sub(x, graph.mul(factor, p))) for x, p in zip(row[r], row[new], strict=True)]
             A[r][c] = graph.zero
         A[new][c] = squares
-        self._entries.clear()
+        self._changed()
         self.rows.add(new)
         self._tall = True
         return self._single(new, c, graph.call("sqrt", squares))

@@ -293,6 +293,8 @@ class Graph:
     def substituted(self, outputs: Iterable[int], replacement: Mapping[int, int]) -> list[int]:
         """The outputs with some nodes replaced by others."""
         outputs = list(outputs)
+        if not replacement:
+            return outputs
         new: dict[int, int] = {}
         for node in self.reachable(outputs):
             if node in replacement:
