@@ -79,8 +79,8 @@ with _without_collecting():
     from jourdain_jax.importers.sympy_scene import from_sympy
     from jourdain_jax.importers.urdf import from_urdf
     from jourdain_jax.lowering.built import Built, build
-    from jourdain_jax.lowering.lower import NotLowered, lower
-    from jourdain_jax.lowering.lowered import Lowered
+    from jourdain_jax.lowering.lower import lower
+    from jourdain_jax.lowering.lowered import Lowered, NotLowered
     from jourdain_jax.motion.batches.rollout import Rollout, rollout
     from jourdain_jax.motion.inputs import Sampled
     from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient

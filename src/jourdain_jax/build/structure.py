@@ -5,8 +5,6 @@ well at random states are singular; all are projected onto the geometric rows. P
 parameters are traced (numbers near the class's defaults stand in), so that the choice is static.
 """
 
-import itertools
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -15,6 +13,7 @@ from jaxtyping import Float
 
 from jourdain_jax.build.kept_findings import kept_of_scene
 from jourdain_jax.build.plausibility import implausible
+from jourdain_jax.build.privileged import best_privileged, pivots_at, privileged_by_user, worst_pivot
 from jourdain_jax.build.probed import TIMED, Probed
 from jourdain_jax.build.probed_on_graph import follow_from_others, probed_on_graph
 from jourdain_jax.build.rank import Scaled, ranks_of, redundant_rows, scaled_states
@@ -24,11 +23,10 @@ from jourdain_jax.build.sampling import no_numbers, random_states, states_near_w
 from jourdain_jax.build.smoothness import check_smoothness
 from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.plain_text import as_text, from_text
-from jourdain_jax.calculus.reals import described, is_traced
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, names_of_rows
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
-from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.scene import Scene
 
 RANDOM_PROBES = 24
@@ -36,8 +34,6 @@ WELL_CONDITIONED = 0.02  # smallest singular value of the scaled A_z over all pr
 LONG = 24  # dependent speeds: of a chain of n rows that each hold two neighbours that value falls as 1/n, although no pivot does
 TRACED = 1e-3  # of the typical lengths of rows, where parameters are traced
 FAR, FAR_PROBES = 100.0, 16  # where calls hide what they do: further states, at times (s), coordinates and speeds up to this
-_EXHAUSTIVE = 3000
-_SHORTLIST = 40
 
 
 @dataclass(frozen=True)
@@ -244,12 +240,12 @@ def _probed_structure(scene: Scene) -> Structure:
     rank = max((r for r, is_generic in zip(ranks, generic, strict=True) if is_generic), default=0)
     if not faults:  # a negative mass is named as such
         _check_inertia(scene, jax.tree.map(lambda x: x[generic & (np.array(ranks) == rank)], scaled), rank)
-    independent, by_user = _user_choice(scene, count - rank), True
+    independent, by_user = privileged_by_user(scene, count - rank), True
     candidates = scaled.A[[r == rank for r in ranks]]  # at isolated losses of rank no partition of generic size exists
     if independent is None:
-        independent, by_user = _choose(candidates, count, rank), False
+        independent, by_user = best_privileged(candidates, count, rank), False
     dependent = [i for i in range(count) if i not in independent]
-    pivots = _pivots(candidates, dependent, rank)
+    pivots = pivots_at(candidates, dependent, rank)
     full_everywhere, eps, unproved = all(r == rank for r in ranks), float(np.finfo(found.A.dtype).eps), found.unproved
     redundant = redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
     return Structure(
@@ -262,7 +258,7 @@ def _probed_structure(scene: Scene) -> Structure:
         else (),
         rank_losses=tuple(_describe(scene, c) for c, r in zip(found.q, ranks, strict=True) if r < rank),
         independent=independent,
-        worst_pivot=_worst(candidates, dependent, rank, pivots) if full_everywhere else 0.0,
+        worst_pivot=worst_pivot(candidates, dependent, rank, pivots) if full_everywhere else 0.0,
         typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
         affine="nonlinear" not in unproved and not _exceeds(found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None]),
         # near round-off: work that turns out as zero does less harm than work left out
@@ -330,65 +326,3 @@ def _far_rows(scene: Scene, typical: np.ndarray, t, q, u) -> Scaled:
 def _describe(scene: Scene, q: np.ndarray) -> str:
     values = [f"{name} = {value:.4g}" for name, value in zip(scene.coordinate_names.entries, q, strict=True) if abs(value) > 1e-12]
     return ", ".join(values) or "all coordinates zero"
-
-
-def _user_choice(scene: Scene, freedoms: int) -> tuple[int, ...] | None:
-    if scene.privileged is None:
-        return None
-    if not isinstance(scene.privileged, str | Iterable):
-        raise ValueError(f"`privileged` of `{type(scene).__name__}` is {described(scene.privileged)}, expected names of speeds")
-    chosen = tuple(scene.speed_names.index(name, f"privileged speed of `{type(scene).__name__}`:") for name in as_names(scene.privileged))
-    if len(set(chosen)) != len(chosen):
-        raise ValueError(f"`privileged` of `{type(scene).__name__}` names a speed twice ({', '.join(as_names(scene.privileged))}); name independent ones")
-    if len(chosen) != freedoms:
-        raise ValueError(
-            f"`privileged` of `{type(scene).__name__}` names {len(chosen)} speeds, but the scene has {freedoms} degrees of freedom; "
-            f"name {freedoms} independent speeds"
-        )
-    return chosen
-
-
-def _pivots(scaled: np.ndarray, dependent: list[int], rank: int) -> np.ndarray:
-    """Smallest singular value of A_z at every probe."""
-    if rank == 0:
-        return np.ones(len(scaled))
-    return np.linalg.svd(scaled[:, :, dependent], compute_uv=False)[:, rank - 1]
-
-
-def _worst(scaled: np.ndarray, dependent: list[int], rank: int, pivots: np.ndarray) -> float:
-    """The smallest of the pivots over the domain: zero where the determinant of A_z changes sign between probes, for it vanishes in between."""
-    if rank and scaled.shape[1] == rank:
-        signs = np.linalg.slogdet(scaled[:, :, dependent])[0]
-        if signs.min(initial=0.0) < 0 < signs.max(initial=0.0):
-            return 0.0
-    return float(pivots.min(initial=1.0))
-
-
-def _choose(scaled: np.ndarray, count: int, rank: int) -> tuple[int, ...]:
-    """The independent speeds whose complement has the largest worst pivot over all probes (the largest typical one among equals)."""
-    if rank == 0:
-        return tuple(range(count))
-    subsets = list(itertools.islice(itertools.combinations(range(count), rank), _EXHAUSTIVE + 1))
-    if len(subsets) > _EXHAUSTIVE:
-        subsets = list({_greedy(A, rank) for A in scaled})
-
-    def merit(dependent, probes):
-        pivots = _pivots(probes, list(dependent), rank)
-        return round(_worst(probes, list(dependent), rank, pivots), 6), round(float(np.median(pivots)), 6)
-
-    some = scaled[:: max(1, len(scaled) // 40)]
-    best = sorted(subsets, key=lambda dependent: merit(dependent, some), reverse=True)[:_SHORTLIST]
-    dependent = max(best, key=lambda dependent: merit(dependent, scaled))
-    return tuple(i for i in range(count) if i not in dependent)
-
-
-def _greedy(A: np.ndarray, rank: int) -> tuple[int, ...]:
-    """Columns chosen one after another by largest remaining length (pivoted QR)."""
-    remaining, chosen = A.copy(), []
-    for _ in range(rank):
-        lengths = np.linalg.norm(remaining, axis=0)
-        k = int(np.argmax(lengths))
-        chosen.append(k)
-        e = remaining[:, k] / lengths[k]
-        remaining = remaining - np.outer(e, e @ remaining)
-    return tuple(sorted(chosen))

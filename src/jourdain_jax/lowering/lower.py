@@ -18,42 +18,30 @@ from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.build.trace import named_values, traced_scene
 from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.plain_text import as_text
-from jourdain_jax.equations.reductions import SMALLEST_PIVOT
-from jourdain_jax.lowering.appell import AppellOnGraph, Equations, Strategy
-from jourdain_jax.lowering.dense_rates import dense_rates
-from jourdain_jax.lowering.elimination import pivots_ok, usual
+from jourdain_jax.lowering.appell import AppellOnGraph, Strategy
+from jourdain_jax.lowering.comparison import agree, check_against_dense, rates_of, values_at
 from jourdain_jax.lowering.far import full_turns, on_velocity_rows
+from jourdain_jax.lowering.ignorable import ignorable
 from jourdain_jax.lowering.kept_programs import program_as_text, program_from_text
 from jourdain_jax.lowering.kept_rows import KeptRows
-from jourdain_jax.lowering.lowered import Lowered, Stage
+from jourdain_jax.lowering.lowered import Lowered, NotLowered, Stage
 from jourdain_jax.lowering.massless import may_be_massless
-from jourdain_jax.lowering.mismatch import diagnose_mismatch
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
-from jourdain_jax.program.identity_test import IdentityProbes, alike, equal
+from jourdain_jax.program.identity_test import IdentityProbes, equal
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 PROBES = 56  # at most
 USUAL_STATES = 16  # at which a motion finds out what is usual for its parameters
-LEAST_PROBES = 12  # at which programs can be compared, where so many were found
 # Of the program before simplification; beyond, the dense path is taken. There XLA needs a minute more for the program than for dense matrices (24 joint angles,
 # 20,762 operations: 71 and 7.5 s), though an evaluation takes 0.15 of the time (in a batch 0.22). Below, the dense path lost everywhere (bench/README.md).
 MOST_OPERATIONS = 20_000
 MOST_TERMS = 200  # of one normal form
 SMALL = 1000  # operations: below, further ways are tried
+LARGE = 5000  # operations: above, the explicit way is not tried
 NOT_SMALL = 4000  # operations: holding ignorable coordinates leaves no small program of so many
-LARGE = 5000  # operations: above, fewer ways are tried, and fewer probes compared with the dense path
-FEW = 6  # of these probes
-CLEARLY = 100.0  # times as large as the smallest pivot that serves: one that serves whatever is usual
-TO_DENSE = {"float64": 1e-8, "float32": 1e-3}  # between the program (in double precision) and the dense path at the probes, relative to the size of each rate
-AGREEMENT = 1e-9  # between programs at the probes, relative to the size of each rate
-SHARED = 0.01  # of these, relative to the largest rate at a probe, whose round-off elimination spreads over all
-
-
-class NotLowered(Exception):
-    """Why a scene is not lowered."""
 
 
 def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLowered:
@@ -180,21 +168,21 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     graph, probes = builder.graph, builder.probes
     first = Strategy(explicit=bool(builder.multiplied))
     best, way = builder.build(first), first
-    fewest = graph.operations(_rates(best))
+    fewest = graph.operations(rates_of(best))
     if fewest > MOST_OPERATIONS:
         raise NotLowered(f"its scalar program has {fewest} operations, more than {MOST_OPERATIONS}")
-    expected = _values(best, probes)
-    _check_against_dense(scene, structure, builder, best, expected)
-    held = _ignorable(scene, builder, best, expected)
+    expected = values_at(best, probes)
+    check_against_dense(scene, structure, builder, best, expected)
+    held = ignorable(scene, builder, best, expected)
     stages = [Stage("scalar program: structural zeros and ones removed, repeated parts shared", fewest)]
     plainly_held = fewest
     if held and fewest < NOT_SMALL:
-        plainly_held = graph.operations(_rates(builder.build(replace(first, held=held))))
+        plainly_held = graph.operations(rates_of(builder.build(replace(first, held=held))))
         stages.append(Stage("ignorable coordinates held in the accelerations", plainly_held))
     for strategy in _strategies(builder, held, plainly_held < SMALL, fewest):
         candidate = builder.build(strategy)
-        count = graph.operations(graph.with_quotients(_rates(candidate)))
-        if count < fewest and _agree(_values(candidate, probes), expected):
+        count = graph.operations(graph.with_quotients(rates_of(candidate)))
+        if count < fewest and agree(values_at(candidate, probes), expected):
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
     put_back = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
@@ -242,39 +230,6 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
     )
 
 
-def _check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGraph, found: Equations, values: np.ndarray) -> None:
-    """The scalar program against JAX's own derivatives and a dense solution, at the probes; the reason, with a name, where they differ."""
-    probes, independent = builder.probes, tuple(builder.independent)
-    leaves, treedef = jax.tree.flatten(scene)
-    columns = [[probes.inputs[f"p{k}_{i}"] for i in range(np.size(leaf))] for k, leaf in enumerate(leaves)]
-    values_of = [np.stack(c, -1) if c else np.zeros((probes.count, 0)) for c in columns]  # a parameter may have no entries
-    parameters = jax.tree.unflatten(treedef, [x.reshape(-1 if x.size else probes.count, *np.shape(leaf)) for x, leaf in zip(values_of, leaves, strict=True)])
-    t = np.broadcast_to(probes.inputs["t_0"], probes.count)
-    sizes = (len(scene.coordinate_names), len(scene.speed_names), len(scene.inputs))
-    q, u, inputs = (np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0)) for p, n in zip("qui", sizes, strict=True))
-    usable = np.all(np.isfinite(values), axis=0)
-    large = builder.graph.operations(_rates(found)) > LARGE
-    chosen = np.flatnonzero(usable)[:FEW] if large else np.arange(probes.count)
-    dense = dense_rates(scene, structure, independent, *jax.tree.map(lambda x: x[chosen], (parameters, t, q, u, inputs)))
-    expected, values = np.concatenate([dense.qdot, dense.ydot], axis=1).T, values[:, chosen]
-    names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in independent)]
-    usable = usable[chosen] & np.all(np.isfinite(expected), axis=0)
-    error = np.max(np.abs(values - expected)[:, usable] / _sizes(expected[:, usable]), axis=1, initial=0.0)
-    if not _enough(usable):
-        raise NotLowered("its scalar program serves at too few of the probed states")
-    limit = TO_DENSE[jnp.result_type(float).name]
-    if np.max(error) > limit:
-        worst = names[int(np.argmax(error))]
-        culprit = diagnose_mismatch(scene, builder.traced, probes, limit, parameters, t, q, u, inputs)
-        raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: {culprit}")
-    if found.events and not np.allclose(probes(found.events)[:, chosen][:, usable], dense.events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
-        raise NotLowered("the value of a stop event differs from the dense path")
-
-
-def _rates(found: Equations) -> list[int]:
-    return [*found.qdot, *found.ydot]
-
-
 def _strategies(builder: AppellOnGraph, held: tuple[int, ...], small: bool, plainly: int) -> Iterator[Strategy]:
     """What is worth trying; `plainly`: operations without normal forms.
 
@@ -287,69 +242,8 @@ def _strategies(builder: AppellOnGraph, held: tuple[int, ...], small: bool, plai
         yield Strategy(False, MOST_TERMS, MOST_TERMS, by_determinants=True, held=held)
     else:
         yield Strategy(False, MOST_TERMS, held=held)
-        if plainly <= LARGE and builder.graph.operations(_rates(builder.build(Strategy(True)))) <= 1.35 * plainly:
+        if plainly <= LARGE and builder.graph.operations(rates_of(builder.build(Strategy(True)))) <= 1.35 * plainly:
             yield Strategy(True, MOST_TERMS, held=held)
-
-
-def _values(found: Equations, probes: Probes) -> np.ndarray:
-    """Rates at all probes, NaN where a pivot is small: there the program does not serve."""
-    return np.where(pivots_ok(found.pivots, probes), probes(_rates(found)), np.nan)
-
-
-def _agree(values: np.ndarray, expected: np.ndarray) -> bool:
-    """Whether two programs agree wherever the second serves."""
-    usable = np.all(np.isfinite(expected), axis=0)
-    return bool(_enough(usable) and np.all(np.abs(values - expected)[:, usable] <= AGREEMENT * _sizes(expected[:, usable])))
-
-
-def _sizes(rates: np.ndarray) -> np.ndarray:
-    """To which the errors of rates (first axis) at probes are related: the usual size of each, in its own unit."""
-    usual = np.max(np.abs(rates), axis=1, keepdims=True, initial=0.0)
-    return usual + SHARED * np.max(np.abs(rates), axis=0, initial=0.0) + np.finfo(float).tiny
-
-
-def _enough(usable: np.ndarray) -> bool:
-    """Whether a program serves at enough of the probed states; of long chains only some are assembled."""
-    return int(np.count_nonzero(usable)) >= min(LEAST_PROBES, max(4, len(usable) // 2))
-
-
-def _ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:
-    """Coordinates (quaternions as a whole) whose value the privileged accelerations do not depend on anywhere."""
-    probes, generic, q = builder.probes, builder.identity_probes, builder.traced.q
-    attitudes = [tuple(range(first, first + 4)) for first, _ in scene.coordinates.quaternions]
-    single = [(i,) for i in range(len(q)) if not any(i in attitude for attitude in attitudes)]
-    at_probes, reference = expected[len(equations.qdot) :], scene.coordinates.reference()
-    accelerations = replace(equations, qdot=[])
-    used, here, regular = set(builder.graph.reachable(equations.ydot)), generic(equations.ydot), pivots_ok(equations.pivots, generic)
-
-    def unchanged(group) -> bool:
-        elsewhere = generic.exchanged([f"q_{i}" for i in group])
-        return bool(np.all(equal(elsewhere(equations.ydot), here, regular & pivots_ok(equations.pivots, elsewhere))))
-
-    def surely_changed(groups) -> np.ndarray:
-        """Which groups a few probes show to count, those of all groups evaluated together: in a long chain nearly all do."""
-        at = np.flatnonzero(regular)[:FEW]
-        if len(groups) < FEW or not at.size or builder.graph.calls(equations.ydot):
-            return np.zeros(len(groups), bool)
-        elsewhere = generic.exchanged_in_turn([[f"q_{i}" for i in group] for group in groups], at)
-        then, lanes = elsewhere(equations.ydot), np.tile(at, len(groups))
-        before = here[:, lanes]
-        before.error = here.error[:, lanes]
-        sizes = np.abs(elsewhere(equations.pivots))
-        far_from_singular = np.all(sizes > CLEARLY * SMALLEST_PIVOT * usual(np.abs(generic(equations.pivots)))[:, None], axis=0)
-        return np.any(~alike(then, before, far_from_singular), axis=0).reshape(len(groups), -1).any(axis=1)
-
-    def regular_at_reference(group) -> bool:
-        values = _values(accelerations, probes.with_inputs({f"q_{i}": np.full(probes.count, reference[i]) for i in group}))
-        return _enough(np.all(np.isfinite(values) & np.isfinite(at_probes), axis=0))
-
-    groups = [*single, *attitudes]
-    held = [i for group in groups if used.isdisjoint(q[list(group)].tolist()) for i in group]
-    groups = [group for group in groups if group[0] not in held]
-    for group, counts in zip(groups, surely_changed(groups), strict=True):
-        if not counts and unchanged(group) and regular_at_reference(group):
-            held += group
-    return tuple(sorted(held))
 
 
 def _some_states(graph: Graph, probes: Probes, nodes) -> dict[int, np.ndarray]:

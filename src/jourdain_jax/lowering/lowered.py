@@ -21,6 +21,10 @@ from jourdain_jax.scene.scene import Scene
 MOST_TYPESET = 100  # operations of a program whose equations a notebook shows
 
 
+class NotLowered(Exception):
+    """Why a scene is not lowered."""
+
+
 @dataclass(frozen=True)
 class Stage:
     """One step of lowering, for the summary."""

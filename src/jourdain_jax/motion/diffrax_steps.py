@@ -1,12 +1,21 @@
-"""diffrax as an integrator: for every solver, controller and adjoint but those of our own loop."""
+"""diffrax as an integrator: for every solver, controller and adjoint but those of our own loop.
 
+An implicit solver tries steps into states where rates are not numbers: beyond a stop event, or out of the domain of a program. The step is refused and its
+derivative dropped; but the derivative of its inner solve would have been an error, or 0 * NaN in reverse mode. Where a value f is not finite,
+
+    df := 0,   linearised at a reference state instead, so that no NaN arises on the way back either
+
+and f itself stays as it is, so that what fails shows.
+"""
+
+from collections.abc import Callable
 from typing import ClassVar, Literal
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.event_location import Remembering, locate, with_tolerances
@@ -15,7 +24,6 @@ from jourdain_jax.motion.integrators.guarded_solver import GuardedSolver
 from jourdain_jax.motion.integrators.solver_choice import controller_of, since
 from jourdain_jax.motion.integrators.step_to_times import merged, step_to_times
 from jourdain_jax.motion.integrators.wrapping_solver import for_adjoint
-from jourdain_jax.motion.integrators.zero_tangents import ZeroTangentIfNonfinite
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
 
@@ -117,3 +125,29 @@ def _an_event(t, y, args, *, terms, **kwargs) -> Bool[Array, ""]:
     direction = terms.contr(0.0, 1.0)  # diffrax counts time along the direction of the motion
     known = jnp.all(jnp.stack([jnp.all(jnp.isfinite(part)) for part in jax.tree.leaves((y.q, y.v))]))
     return known & ~no_event(integrands.events(t * direction, y, args))
+
+
+class ZeroTangentIfNonfinite(eqx.Module):
+    """`function(t, y, args)`, with derivative zero where its value is not finite; `t`, `y`: a state at which it is."""
+
+    function: Callable
+    t: Float[Array, ""]
+    y: PyTree
+
+    def __call__(self, t, y, args):
+        return _flat(t, y, args, jax.lax.stop_gradient((self.t, self.y)), self.function)
+
+
+@eqx.filter_custom_jvp
+def _flat(t, y, args, reference, function):
+    return function(t, y, args)
+
+
+@_flat.def_jvp
+def _flat_jvp(primals, tangents):
+    t, y, args, reference, function = primals
+    value = function(t, y, args)
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(value)]))
+    at = jax.tree.map(lambda x, safe: jnp.where(finite, x, safe), (t, y), reference)
+    _, slope = eqx.filter_jvp(function, (*at, args), tangents[:3])
+    return value, jax.tree.map(lambda d: jnp.where(finite, d, jnp.zeros_like(d)), slope)

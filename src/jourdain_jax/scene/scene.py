@@ -2,16 +2,17 @@
 them and what holds them. Everything else (velocities, partial velocities, mass matrix, rows) comes by automatic differentiation.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import ClassVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_unless_traced, is_traced, real_type
+from jourdain_jax.calculus.reals import checked_unless_traced, described, is_traced, real_type
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.coordinates import Coordinates, Names
@@ -21,9 +22,8 @@ from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
 from jourdain_jax.scene.printing import scene_html
-from jourdain_jax.scene.static_callables import hold_functions
 from jourdain_jax.scene.visuals import Visual
-from jourdain_jax.scene.what_is_read import WhatIsRead, is_read_by
+from jourdain_jax.scene.what_is_read import WhatIsRead, is_function, is_read_by
 
 
 class _SceneClass(type(eqx.Module)):  # type: ignore[misc]
@@ -226,3 +226,41 @@ def _vector(entries: list) -> Float[Array | np.ndarray, "entries"]:
     if is_traced(entries):
         return jnp.stack([jnp.asarray(value, real_type()) for value in entries])
     return np.array([value if type(value) is float else np.asarray(value) for value in entries], real_type())  # at once: no small programs to compile
+
+
+class HeldFunction(eqx.Module):
+    """A function that JAX takes for part of the structure of the scene, as it takes a static field."""
+
+    function: Callable[..., Any] = eqx.field(static=True)
+    read: WhatIsRead
+
+    def __init__(self, function: Callable[..., Any]):
+        self.function = function
+        self.read = is_read_by(function) if is_function(function) else is_read_by()
+
+    def __call__(self, *args, **kwargs):
+        """What the function returns."""
+        return self.function(*args, **kwargs)
+
+
+def hold_functions(scene) -> None:
+    """Holds the functions in a scene that is being built, however deep in its fields; a ValueError for texts, which nothing can hold but a static field."""
+
+    def held(leaf):
+        return HeldFunction(leaf) if callable(leaf) else leaf
+
+    static = tuple(value for field in fields(scene) if field.metadata.get("static") and is_function(value := getattr(scene, field.name)))
+    object.__setattr__(scene, "_read", is_read_by(type(scene), *static))
+    for field in fields(scene):
+        if field.metadata.get("static") or field.metadata.get("parameter"):
+            continue
+        value = getattr(scene, field.name)
+        leaves = jax.tree.leaves(value)
+        text = next((leaf for leaf in leaves if isinstance(leaf, str)), None)
+        if text is not None:
+            raise ValueError(
+                f"field `{field.name}` of `{type(scene).__name__}` holds {described(text)}, expected numbers; "
+                f"for what is no number write `{field.name}: str = eqx.field(static=True, default={text!r})`"
+            )
+        if any(callable(leaf) for leaf in leaves):
+            object.__setattr__(scene, field.name, jax.tree.map(held, value))

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 
 from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
-from jourdain_jax.motion.integrators.even_steps import EvenSteps
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
 from jourdain_jax.motion.integrators.munthe_kaas import MuntheKaas
+from jourdain_jax.motion.integrators.step_to_times import EvenSteps
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.scene import Scene
 

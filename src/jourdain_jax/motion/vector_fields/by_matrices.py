@@ -49,7 +49,7 @@ class ByMatrices(VectorField):
         return Integrated(q, project_speeds(scene, t, q, y.v, inputs, iterations=2, cutoff=self.cutoff, typical=self.usual.rows.lengths), y.work)
 
 
-class Minimal(ByMatrices):
+class MinimalByMatrices(ByMatrices):
     """Coordinates and privileged speeds."""
 
     independent: tuple[int, ...] = eqx.field(static=True)
@@ -77,7 +77,7 @@ class Minimal(ByMatrices):
         return Integrated(motion.qdot.array, v, self.power(scene, motion, found)), known.split.orientation()[None]
 
 
-class Full(ByMatrices):
+class FullByMatrices(ByMatrices):
     """Coordinates and all speeds."""
 
     may_branch: bool = eqx.field(static=True)  # where geometric rows lose rank, a cut-off leaves one out, and branches cross
@@ -119,9 +119,9 @@ class Full(ByMatrices):
         return rates, jnp.where(found.pivot > undecided(found.pivot.dtype), 1.0, -1.0).astype(found.pivot.dtype)[None]
 
 
-def full_without_projection(field: VectorField, scene: Scene, own_equations: str) -> Full:
+def full_without_projection(field: VectorField, scene: Scene, own_equations: str) -> FullByMatrices:
     """The full state in place of another form, for a solver that keeps it on the rows by `own_equations`."""
-    return Full(
+    return FullByMatrices(
         independent=None,
         reduction=field.reduction,
         with_work=field.with_work,

@@ -22,7 +22,7 @@ from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.inputs import as_inputs
-from jourdain_jax.motion.vector_fields.by_matrices import Full, Minimal
+from jourdain_jax.motion.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.names import nearest
@@ -122,8 +122,8 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
         return ByProgram(**common, program=program, affine=structure.affine)
     common |= {"stabilisation": formulation.baumgarte, "usual": usual_lengths(scene), "inputs_in_rows": inputs_in_rows, "cutoff": cutoff}
     if minimal:
-        return Minimal(**common)
-    return Full(**common, may_branch=cutoff is not None and isinstance(reduction, NullSpaceQR) and bool(names_of_position_rows(scene)))
+        return MinimalByMatrices(**common)
+    return FullByMatrices(**common, may_branch=cutoff is not None and isinstance(reduction, NullSpaceQR) and bool(names_of_position_rows(scene)))
 
 
 def _without_parts(scene: Scene, state, stabilisation, work: bool, backend: str, constant: bool) -> VectorField:

@@ -1,0 +1,77 @@
+"""When two programs, or a program and dense matrices, have the same rates: at probes, relative to the usual size of each rate, where both serve."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.build.structure import Structure
+from jourdain_jax.lowering.appell import AppellOnGraph, Equations
+from jourdain_jax.lowering.dense_rates import dense_rates
+from jourdain_jax.lowering.elimination import pivots_ok
+from jourdain_jax.lowering.lowered import NotLowered
+from jourdain_jax.lowering.mismatch import diagnose_mismatch
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.scene.scene import Scene
+
+LEAST_PROBES = 12  # at which programs can be compared, where so many were found
+LARGE = 5000  # operations: above, fewer probes are compared with the dense path
+FEW = 6  # of these probes
+TO_DENSE = {"float64": 1e-8, "float32": 1e-3}  # between the program (in double precision) and the dense path at the probes, relative to the size of each rate
+AGREEMENT = 1e-9  # between programs at the probes, relative to the size of each rate
+SHARED = 0.01  # of these, relative to the largest rate at a probe, whose round-off elimination spreads over all
+
+
+def rates_of(found: Equations) -> list[int]:
+    """The nodes of qdot and ydot."""
+    return [*found.qdot, *found.ydot]
+
+
+def values_at(found: Equations, probes: Probes) -> np.ndarray:
+    """Rates at all probes, NaN where a pivot is small: there the program does not serve."""
+    return np.where(pivots_ok(found.pivots, probes), probes(rates_of(found)), np.nan)
+
+
+def agree(values: np.ndarray, expected: np.ndarray) -> bool:
+    """Whether two programs agree wherever the second serves."""
+    usable = np.all(np.isfinite(expected), axis=0)
+    return bool(enough(usable) and np.all(np.abs(values - expected)[:, usable] <= AGREEMENT * _sizes(expected[:, usable])))
+
+
+def _sizes(rates: np.ndarray) -> np.ndarray:
+    """To which the errors of rates (first axis) at probes are related: the usual size of each, in its own unit."""
+    usual = np.max(np.abs(rates), axis=1, keepdims=True, initial=0.0)
+    return usual + SHARED * np.max(np.abs(rates), axis=0, initial=0.0) + np.finfo(float).tiny
+
+
+def enough(usable: np.ndarray) -> bool:
+    """Whether a program serves at enough of the probed states; of long chains only some are assembled."""
+    return int(np.count_nonzero(usable)) >= min(LEAST_PROBES, max(4, len(usable) // 2))
+
+
+def check_against_dense(scene: Scene, structure: Structure, builder: AppellOnGraph, found: Equations, values: np.ndarray) -> None:
+    """The scalar program against JAX's own derivatives and a dense solution, at the probes; the reason, with a name, where they differ."""
+    probes, independent = builder.probes, tuple(builder.independent)
+    leaves, treedef = jax.tree.flatten(scene)
+    columns = [[probes.inputs[f"p{k}_{i}"] for i in range(np.size(leaf))] for k, leaf in enumerate(leaves)]
+    values_of = [np.stack(c, -1) if c else np.zeros((probes.count, 0)) for c in columns]  # a parameter may have no entries
+    parameters = jax.tree.unflatten(treedef, [x.reshape(-1 if x.size else probes.count, *np.shape(leaf)) for x, leaf in zip(values_of, leaves, strict=True)])
+    t = np.broadcast_to(probes.inputs["t_0"], probes.count)
+    sizes = (len(scene.coordinate_names), len(scene.speed_names), len(scene.inputs))
+    q, u, inputs = (np.stack([probes.inputs[f"{p}_{i}"] for i in range(n)], -1) if n else np.zeros((len(t), 0)) for p, n in zip("qui", sizes, strict=True))
+    usable = np.all(np.isfinite(values), axis=0)
+    large = builder.graph.operations(rates_of(found)) > LARGE
+    chosen = np.flatnonzero(usable)[:FEW] if large else np.arange(probes.count)
+    dense = dense_rates(scene, structure, independent, *jax.tree.map(lambda x: x[chosen], (parameters, t, q, u, inputs)))
+    expected, values = np.concatenate([dense.qdot, dense.ydot], axis=1).T, values[:, chosen]
+    names = [*scene.coordinate_names.entries, *(scene.speed_names.entries[i] for i in independent)]
+    usable = usable[chosen] & np.all(np.isfinite(expected), axis=0)
+    error = np.max(np.abs(values - expected)[:, usable] / _sizes(expected[:, usable]), axis=1, initial=0.0)
+    if not enough(usable):
+        raise NotLowered("its scalar program serves at too few of the probed states")
+    limit = TO_DENSE[jnp.result_type(float).name]
+    if np.max(error) > limit:
+        worst = names[int(np.argmax(error))]
+        culprit = diagnose_mismatch(scene, builder.traced, probes, limit, parameters, t, q, u, inputs)
+        raise NotLowered(f"the rate of `{worst}` differs from the dense path by {np.max(error):.1e}: {culprit}")
+    if found.events and not np.allclose(probes(found.events)[:, chosen][:, usable], dense.events.T[:, usable], rtol=limit, atol=limit, equal_nan=True):
+        raise NotLowered("the value of a stop event differs from the dense path")

@@ -1,0 +1,54 @@
+"""Which coordinates the privileged accelerations do not depend on, anywhere: they are held at the reference in the program."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from jourdain_jax.equations.reductions import SMALLEST_PIVOT
+from jourdain_jax.lowering.appell import AppellOnGraph, Equations
+from jourdain_jax.lowering.comparison import enough, values_at
+from jourdain_jax.lowering.elimination import pivots_ok, usual
+from jourdain_jax.program.identity_test import alike, equal
+from jourdain_jax.scene.scene import Scene
+
+FEW = 6  # probes that show most coordinates to count
+CLEARLY = 100.0  # times as large as the smallest pivot that serves: one that serves whatever is usual
+
+
+def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:
+    """Coordinates (quaternions as a whole) whose value the privileged accelerations do not depend on anywhere."""
+    probes, generic, q = builder.probes, builder.identity_probes, builder.traced.q
+    attitudes = [tuple(range(first, first + 4)) for first, _ in scene.coordinates.quaternions]
+    single = [(i,) for i in range(len(q)) if not any(i in attitude for attitude in attitudes)]
+    at_probes, reference = expected[len(equations.qdot) :], scene.coordinates.reference()
+    accelerations = replace(equations, qdot=[])
+    used, here, regular = set(builder.graph.reachable(equations.ydot)), generic(equations.ydot), pivots_ok(equations.pivots, generic)
+
+    def unchanged(group) -> bool:
+        elsewhere = generic.exchanged([f"q_{i}" for i in group])
+        return bool(np.all(equal(elsewhere(equations.ydot), here, regular & pivots_ok(equations.pivots, elsewhere))))
+
+    def surely_changed(groups) -> np.ndarray:
+        """Which groups a few probes show to count, those of all groups evaluated together: in a long chain nearly all do."""
+        at = np.flatnonzero(regular)[:FEW]
+        if len(groups) < FEW or not at.size or builder.graph.calls(equations.ydot):
+            return np.zeros(len(groups), bool)
+        elsewhere = generic.exchanged_in_turn([[f"q_{i}" for i in group] for group in groups], at)
+        then, lanes = elsewhere(equations.ydot), np.tile(at, len(groups))
+        before = here[:, lanes]
+        before.error = here.error[:, lanes]
+        sizes = np.abs(elsewhere(equations.pivots))
+        far_from_singular = np.all(sizes > CLEARLY * SMALLEST_PIVOT * usual(np.abs(generic(equations.pivots)))[:, None], axis=0)
+        return np.any(~alike(then, before, far_from_singular), axis=0).reshape(len(groups), -1).any(axis=1)
+
+    def regular_at_reference(group) -> bool:
+        values = values_at(accelerations, probes.with_inputs({f"q_{i}": np.full(probes.count, reference[i]) for i in group}))
+        return enough(np.all(np.isfinite(values) & np.isfinite(at_probes), axis=0))
+
+    groups = [*single, *attitudes]
+    held = [i for group in groups if used.isdisjoint(q[list(group)].tolist()) for i in group]
+    groups = [group for group in groups if group[0] not in held]
+    for group, counts in zip(groups, surely_changed(groups), strict=True):
+        if not counts and unchanged(group) and regular_at_reference(group):
+            held += group
+    return tuple(sorted(held))
