@@ -49,6 +49,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 20)
+    gc.enable()
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -78,6 +79,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.option.loadscopereorder = False  # pytest-xdist would hand out files by their number of tests, and not in the order above
     if config.getoption("dist", "no") != "no" and not hasattr(config, "workerinput"):
         return  # this process hands out tests: workers start seconds sooner if it does not import JAX first
+    gc.disable()  # until all tests are collected: what imports make is there for good
     import jax
     from jaxtyping import install_import_hook
 
