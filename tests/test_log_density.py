@@ -67,12 +67,11 @@ def test_density_is_likelihood_times_prior_times_derivative_of_the_transforms():
     z = density.initial + jnp.array([0.1, 0.03, -0.005, 0.002])
     np.testing.assert_allclose(density.constrain(z), constrain(z), rtol=1e-14)
     value, slope = jax.jit(jax.value_and_grad(density))(z)
-    np.testing.assert_allclose(value, expected(z), rtol=1e-8)
-    np.testing.assert_allclose(slope, jax.grad(expected)(z), rtol=2e-6)
     many = z + 1e-3 * jnp.arange(3.0)[:, None]
     values, slopes = jax.jit(jax.vmap(jax.value_and_grad(density)))(many)
-    np.testing.assert_allclose(values, [expected(one) for one in many], rtol=1e-8)
-    np.testing.assert_allclose(slopes, [jax.grad(expected)(one) for one in many], rtol=2e-6)
+    right, right_slopes = jax.jit(jax.vmap(jax.value_and_grad(expected)))(jnp.concatenate([z[None], many]))
+    np.testing.assert_allclose([value, *values], right, rtol=1e-8)
+    np.testing.assert_allclose([slope, *slopes], right_slopes, rtol=2e-6)
 
 
 def test_whitened_density_is_that_of_the_same_unknowns_and_nearly_round():

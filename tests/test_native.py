@@ -1,5 +1,7 @@
 """Machine code of our own against the same by XLA: single operations, programs, motions, derivatives, and when it is not taken."""
 
+import functools
+
 import diffrax
 import evaluated_natively
 import jax
@@ -245,6 +247,21 @@ def test_a_lane_does_not_depend_on_the_number_of_threads(disc_kernel, threads, m
         np.testing.assert_array_equal(found, expected)
 
 
+def test_no_bit_depends_on_the_effort_spent_on_machine_code(disc_kernel, monkeypatch):
+    """What `conftest.py` takes for granted: tests run code made with little effort, users run code made with more."""
+    usual, order, starts, goals = disc_kernel
+    expected = jax.vmap(usual.run)(starts, goals)
+    little, much = ffi.registered, functools.cache(ffi.registered.__wrapped__)
+    names = []
+    monkeypatch.setattr(host, "EFFORT", 2)
+    monkeypatch.setattr(ffi, "registered", lambda text: names.append((little(text), much(text))) or much(text))
+    kernels.kernel.cache_clear()
+    for found, by_little in zip(jax.vmap(kernels.kernel(usual.form, diffrax.Tsit5, order).run)(starts, goals), expected, strict=True):
+        np.testing.assert_array_equal(found, by_little)
+    assert names
+    assert all(one != other for one, other in names)
+
+
 def test_no_lanes_and_axes_of_lanes(disc_kernel):
     kernel, _, starts, goals = disc_kernel
     states, ends = jax.vmap(kernel.run)(starts[:0], goals[:0])
@@ -322,12 +339,12 @@ def test_modes_of_differentiation_that_do_not_work_are_named(adjoint, mode):
 
 
 def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
-    disc, bicycle = jj.models.TiltingDisc(), jj.models.MODELS["whipple-bicycle"]()
+    disc, board = jj.models.TiltingDisc(), jj.models.Snakeboard()
     assert set_up(disc).reason_against_machine_code == ""
     assert set_up(disc, backend="xla").reason_against_machine_code == "another backend was asked for"
     assert "diffrax" in set_up(disc, solver=diffrax.Heun()).reason_against_machine_code
     assert "scalar program" in set_up(disc, formulation=jj.Formulation(reduction="kkt")).reason_against_machine_code
-    assert "function of time" in set_up(bicycle, inputs={"steer_torque": lambda t: jnp.sin(t)}).reason_against_machine_code
+    assert "function of time" in set_up(board, inputs={"steer_torque": lambda t: jnp.sin(t)}).reason_against_machine_code
     monkeypatch.setattr(host, "reason_against", lambda: "llvmlite is not installed")
     assert set_up(disc).reason_against_machine_code == "llvmlite is not installed"
     monkeypatch.setattr(host, "reason_against", lambda: "")

@@ -16,6 +16,7 @@ except ImportError:  # an optional dependency
 llvm: Any = binding
 
 _LANES = (("avx512f", 8), ("avx", 4))  # doubles of a register; else 2, as every 64-bit machine has
+EFFORT = 2  # of LLVM, 0 to 3; no number depends on it: nothing here allows LLVM to round differently. 0 takes a fifth of the time to make, but runs slower
 _lock = threading.Lock()
 _engines: list = []  # what machine code lives in: as long as the process, which may call it
 
@@ -28,7 +29,7 @@ def reason_against() -> str:
     try:
         llvm.initialize_native_target()
         llvm.initialize_native_asmprinter()
-        _machine()
+        _machine(EFFORT)
         libm = ctypes.CDLL(ctypes.util.find_library("m"))
         for name in LIBM:
             llvm.add_symbol(PREFIX + name, ctypes.cast(getattr(libm, name), ctypes.c_void_p).value)
@@ -63,14 +64,14 @@ def fuses() -> bool:
 
 
 @functools.cache
-def _machine():
+def _machine(effort: int):
     target = llvm.Target.from_default_triple()
-    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2, jit=True)
+    return target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=effort, jit=True)
 
 
 def description() -> str:
     """What machine code depends on besides the program."""
-    return f"{llvm.llvm_version_info} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
+    return f"{EFFORT} {llvm.llvm_version_info} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
 
 
 def object_code(text: str) -> bytes:
@@ -78,11 +79,11 @@ def object_code(text: str) -> bytes:
     with _lock:
         module = llvm.parse_assembly(text)
         module.triple = llvm.get_process_triple()
-        options = llvm.create_pipeline_tuning_options(speed_level=2)
+        options = llvm.create_pipeline_tuning_options(speed_level=EFFORT)
         options.loop_vectorization = options.slp_vectorization = False
-        builder = llvm.create_pass_builder(_machine(), options)
+        builder = llvm.create_pass_builder(_machine(EFFORT), options)
         builder.getModulePassManager().run(module, builder)
-        return _machine().emit_object(module)
+        return _machine(EFFORT).emit_object(module)
 
 
 def address(code: bytes, name: str) -> int:
