@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Float, Shaped
 
 
 def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarray, "*batch width width"]:
@@ -23,12 +23,12 @@ def triangle(whole: Float[np.ndarray, "*batch samples width"]) -> Float[np.ndarr
     if whole.shape[-2] < width:
         whole = np.concatenate([whole, np.zeros((*whole.shape[:-2], width - whole.shape[-2], width))], axis=-2)
     reflected, _ = np.linalg.qr(whole, mode="raw")  # as LAPACK leaves it: the transposed triangle, and reflectors beyond its diagonal
-    return np.where(_upper(width), np.swapaxes(reflected, -1, -2)[..., :width, :], 0.0)
+    return reflected[..., :width].swapaxes(-1, -2) * _upper(width)
 
 
 @lru_cache(maxsize=64)
-def _upper(width: int) -> Bool[np.ndarray, "width width"]:
-    return np.triu(np.ones((width, width), bool))
+def _upper(width: int) -> Float[np.ndarray, "width width"]:
+    return np.triu(np.ones((width, width)))
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Arrow:
     def column_norms(self) -> Float[np.ndarray, "members unknowns"]:
         """Length of each column of the Jacobian."""
         _, m, _ = self.counts
-        squares = np.sum(self.shared[..., :-1] ** 2, axis=1)
+        squares = np.einsum("bij,bij->bj", self.shared[..., :-1], self.shared[..., :-1])
         if not m:
             return np.sqrt(squares)
         of_runs = np.sum(self.local[..., :-1] ** 2, axis=2)
@@ -103,7 +103,8 @@ class Arrow:
         """`|J d|^2`."""
         shared, own = self.split(d)
         _, m, _ = self.counts
-        found = np.sum((self.shared[..., :-1] @ shared[..., None]) ** 2, axis=(1, 2))
+        moved = (self.shared[..., :-1] @ shared[..., None])[..., 0]
+        found = np.einsum("bi,bi->b", moved, moved)
         if not m:
             return found
         of_runs = self.local[..., :m] @ own[..., None] + self.local[..., m:-1] @ shared[:, None, :, None]
@@ -112,23 +113,23 @@ class Arrow:
     def step(self, damping: Float[np.ndarray, "members"], D, held, moved, cutoff) -> Float[np.ndarray, "members unknowns"]:
         """The damped step; unknowns that are `held` move by `moved`. D: (members, unknowns), positive."""
         _, m, _ = self.counts
-        local, shared = self.local, self.shared
-        if held.any():
+        local, shared, any_held = self.local, self.shared, held.any()
+        if any_held:
             held_s, held_l = self.split(held)
             ended = self.moved(np.where(held, moved, 0.0))
             local, shared = ended.local, ended.shared
             local[..., :m] *= ~held_l[:, :, None]
             local[..., m:-1] *= ~held_s[:, None, None]
             shared[..., :-1] *= ~held_s[:, None]
-        D_s, D_l = self.split(D)
-        if m:
+        if not m:
+            ds = by_singular_values(shared, D, damping, cutoff)
+        else:
+            D_s, D_l = self.split(D)
             upper, rest = eliminated(local, np.sqrt(damping)[:, None, None] * D_l)
-            shared = np.concatenate([shared, rest], axis=1)
-        ds = by_singular_values(shared, D_s, damping, cutoff)
-        if m:
+            ds = by_singular_values(np.concatenate([shared, rest], axis=1), D_s, damping, cutoff)
             right = -(upper[..., -1:] + upper[..., m:-1] @ ds[:, None, :, None])
             ds = np.concatenate([ds, np.linalg.solve(upper[..., :m], right).reshape(len(ds), -1)], axis=1)
-        return np.where(held, moved, ds)
+        return np.where(held, moved, ds) if any_held else ds
 
 
 def with_prior(arrow: Arrow, theta: Float[np.ndarray, "members unknowns"], mean: np.ndarray, sigma: np.ndarray) -> Arrow:
@@ -160,8 +161,9 @@ def eliminated(local: np.ndarray, below: Float[np.ndarray, "members runs local"]
 def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: Float[np.ndarray, "members"], cutoff: float) -> Float[np.ndarray, "members shared"]:
     """The damped step of the shared unknowns, in unknowns times D: (S^2 + lambda) ds = - S U' c; what does not show stays as it is."""
     U, S, Vt = np.linalg.svd(shared[..., :-1] / D[:, None], full_matrices=False)
-    shows = S[:, :1] * cutoff < S  # the first is the largest
-    weight = np.where(shows, S / (S**2 + damping[:, None] + ~shows), 0.0)
+    hidden = S[:, :1] * cutoff >= S  # the first is the largest
+    weight = S / (S * S + damping[:, None])
+    weight[hidden] = 0.0
     return -((weight * (shared[:, None, :, -1] @ U)[:, 0])[:, None] @ Vt)[:, 0] / D
 
 

@@ -6,6 +6,7 @@ by Levenberg-Marquardt. Jacobians come by forward mode through the simulation, r
 Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), chapter 3.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -222,7 +223,9 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
 
 def _with_memory(problem: Problem, found: Minimum, limits: Limits, control: Control) -> Minimum:
     """The minimum with the correlation times of the noise estimated: these and the unknowns take turns, from what was found as if the noise were white."""
-    going = np.flatnonzero(np.isfinite(found.at.cost)) if problem.with_memory else np.zeros(0, int)
+    if not problem.with_memory:
+        return found
+    going = np.flatnonzero(np.isfinite(found.at.cost))
     some = replace(control, most_steps=min(_SOME, control.most_steps))
     for _ in range(_TURNS):
         if not going.size:
@@ -266,7 +269,7 @@ def _repeats(runs: Sequence[Measurements]) -> int:
 
 
 def _check_enough(runs: Sequence[Measurements], unknowns: Unknowns, repeats: bool) -> None:
-    samples = sum(int(np.prod(values.shape[int(repeats) :])) for run in runs for values in run.values.values()) + len(unknowns.with_prior)
+    samples = sum(math.prod(values.shape[int(repeats) :]) for run in runs for values in run.values.values()) + len(unknowns.with_prior)
     if samples < len(unknowns.labels):
         raise ValueError(
             f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns; measure more, or free fewer of {', '.join(unknowns.labels)}"

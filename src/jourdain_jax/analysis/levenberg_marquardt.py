@@ -161,7 +161,7 @@ def minimise(
             if not going.size:
                 break
         steps[going] += 1
-        fall = -np.sum(arrow.gradient * d, axis=1)  # of F along the step, at its begin
+        fall = -np.einsum("bi,bi->b", arrow.gradient, d)  # of F along the step, at its begin
         promised = fall - 0.5 * change
         here = going.tolist()
         shrank = [paces[b].shrinkage(length) for b, length in zip(here, np.sqrt(change).tolist(), strict=True)]
@@ -177,7 +177,7 @@ def minimise(
                     break
                 d, x, fall, promised, here = d[~last], x[~last], fall[~last], promised[~last], going.tolist()
         trial = evaluate(x + d, going)
-        slopes = 0.5 * (fall - np.sum(trial.arrow.gradient * d, axis=1))
+        slopes = 0.5 * (fall - np.einsum("bi,bi->b", trial.arrow.gradient, d))
         of_each = zip(here, trial.cost.tolist(), promised.tolist(), slopes.tolist(), strict=True)
         better = [paces[b].tried(costs[b][-1], cost, by, slope, control.tolerance) for b, cost, by, slope in of_each]
         chosen = np.array(better)
@@ -188,9 +188,10 @@ def minimise(
         lost = [paces[b].damping > MOST for b in here]
         if True in lost:
             stuck[going[lost]], going = True, going[np.logical_not(lost)]
-        if control.patience is not None and (few := [b for b in going.tolist() if len(costs[b]) > control.patience]):
-            slow = [b for b in few if costs[b][-1] > max(control.near, SLOW * costs[b][-1 - control.patience])]
-            going = going[~np.isin(going, slow)]
+        if control.patience is not None:
+            before = -1 - control.patience
+            slow = [b for b in going.tolist() if len(costs[b]) >= -before and costs[b][-1] > max(control.near, SLOW * costs[b][before])]
+            going = going[~np.isin(going, slow)] if slow else going
     trace = np.empty(count, object)
     trace[:] = [((what, tuple(of_one)),) for of_one in costs]
     return Minimum(theta, at, converged, stuck, steps, np.zeros(count, bool), trace)
@@ -236,7 +237,11 @@ class _Pace:
 def column_scaling(arrow: Arrow | JoinedArrow, size: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members unknowns"]:
     """D: lengths of the columns of J, and something positive for those that are zero."""
     norms = arrow.column_norms
-    D = np.maximum(norms, 1e-8 * (norms * size).max(axis=1, keepdims=True) / size)
+    by_size = norms * size
+    least = 1e-8 * by_size.max(axis=1, keepdims=True)
+    if (by_size > least).all():
+        return norms
+    D = np.maximum(norms, least / size)
     return np.where(D > 0, D, 1.0)
 
 
@@ -244,21 +249,18 @@ def damped_step(arrow: Arrow | JoinedArrow, theta, D, damping, limits: Limits, c
     """The damped step within the bounds."""
     g = arrow.gradient
     held = limits.fixed | ((theta <= limits.low) & (g >= 0)) | ((theta >= limits.high) & (g <= 0))
-    moved = np.zeros_like(theta)
+    moved = np.zeros(theta.shape)
     for _ in range(RELEASES):
         d = arrow.step(damping, D, held, moved, cutoff)
         ended = theta + d
-        low, high = ended < limits.low, ended > limits.high
-        beyond = low | high
-        if not beyond.any():
-            return d
-        within = np.clip(ended, limits.low, limits.high) - theta
-        over = ~held & (within != d) & beyond
+        within = np.minimum(np.maximum(ended, limits.low), limits.high)
+        over = (within != ended) & ~held
         if not over.any():
             return d
-        held, moved = held | over, np.where(over, within, moved)
+        held, moved = held | over, np.where(over, within - theta, moved)
     return np.clip(theta + d, limits.low, limits.high) - theta
 
 
 def _is_small(change, size, d, control: Control) -> Bool[np.ndarray, "members"]:
-    return (change <= control.tolerance**2) & (np.abs(d) <= control.tolerance * size).all(axis=1)
+    small = change <= control.tolerance**2
+    return small & (np.abs(d) <= control.tolerance * size).all(axis=1) if small.any() else small

@@ -36,7 +36,7 @@ TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far be
 MOST_LANES = 64
 AHEAD = 4  # groups of lanes that are begun before the first is read
 FEWEST_INTERVALS = 64  # of a motion that is read between its times
-_WHITE = np.zeros((1, 1))
+_WHITE, _NONE = np.zeros((1, 1)), np.zeros(0)
 FILLED = 1e-6  # of a run's span: between the times that fill up a short one
 
 
@@ -188,17 +188,16 @@ class _Group:
         leaves, treedef = jax.tree.flatten(((scene, simulation), filled[0]))
         # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
         repeated = {id(x) for part in (filled[0].values, filled[0].weights) for x in part.values()} if members is not None else set()
-        of_runs = list(zip(*map(jax.tree.leaves, filled), strict=True))
-        common = len(leaves) - len(of_runs)
-        self._common = np.concatenate([np.zeros(0), *(np.ravel(x) for x in leaves[:common] if _is_array(x))])
-        columns = [[np.zeros((len(filled), count, 0))] for count in (1, members or 1)]
-        for x in of_runs:
-            if _is_array(x[0]):
-                has_members = id(x[0]) in repeated
-                columns[has_members].append(np.array(x).reshape(len(filled), members if has_members else 1, -1))
-        self._rows, self._own_rows = (np.concatenate(parts, axis=2) for parts in columns)
-        self._rows = self._rows[:, 0]
-        marks = [_Number.of(x, k >= common, id(x) in repeated) if _is_array(x) else x for k, x in enumerate(leaves)]
+        of_first = jax.tree.leaves(filled[0])
+        common = len(leaves) - len(of_first)
+        self._common = np.concatenate([_NONE, *(np.ravel(x) for x in leaves[:common] if _is_array(x))])
+        alike = [k for k, x in enumerate(of_first) if _is_array(x) and id(x) not in repeated]
+        by_member = [k for k, x in enumerate(of_first) if id(x) in repeated]
+        of_runs = [of_first, *map(jax.tree.leaves, filled[1:])]
+        self._rows = np.stack([np.concatenate([_NONE, *(np.ravel(run[k]) for k in alike)]) for run in of_runs])
+        count = members or 1
+        self._own_rows = np.stack([np.concatenate([np.zeros((count, 0)), *(run[k].reshape(count, -1) for k in by_member)], axis=1) for run in of_runs])
+        marks = [_Number(x.shape[int(id(x) in repeated) :], x.dtype, k >= common, id(x) in repeated) if _is_array(x) else x for k, x in enumerate(leaves)]
         reference = Reference.where_free(scene, layout.parameters)
         self._run = _program(reference, treedef, tuple(marks), layout)
         self.weights = {name: np.array([run.weights[name] for run in filled]) for name in filled[0].weights}  # (runs, *members, times, *channel)
@@ -284,11 +283,6 @@ class _Number(NamedTuple):
     of_run: bool
     of_member: bool
 
-    @staticmethod
-    def of(x, of_run: bool, of_member: bool) -> "_Number":
-        """That of an array; `of_member`: without its first axis."""
-        return _Number(x.shape[1:] if of_member else x.shape, jax.dtypes.canonicalize_dtype(x.dtype), of_run, of_member)
-
 
 @lru_cache(maxsize=16)
 def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Callable:
@@ -306,7 +300,7 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
                 for k, leaf in enumerate(leaves):
                     if isinstance(leaf, _Number) and leaf[2:] == kind:
                         end = begin + math.prod(leaf.shape)
-                        found[k], begin = vector[begin:end].reshape(leaf.shape).astype(leaf.dtype), end
+                        found[k], begin = vector[begin:end].reshape(leaf.shape).astype(jax.dtypes.canonicalize_dtype(leaf.dtype)), end
         (scene, simulation), run = jax.tree.unflatten(treedef, [found[k] if isinstance(leaf, _Number) else leaf for k, leaf in enumerate(leaves)])
 
         def flat(x):

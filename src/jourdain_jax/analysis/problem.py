@@ -72,9 +72,9 @@ class Problem:
                     triangles.fill(np.nan)
                     break
             cost = costs.sum(axis=1)
-            finite = np.isfinite(triangles.sum(axis=(1, 2, 3, 4)) + cost)
-        if False in finite.tolist():
-            triangles[~finite], cost[~finite] = 0.0, np.inf
+            if not math.isfinite(triangles.sum() + cost.sum()):
+                failed = ~np.isfinite(triangles.sum(axis=(1, 2, 3, 4)) + cost)
+                triangles[failed], cost[failed] = 0.0, np.inf
         together = triangles[:, :, 0]
         if kinds > 1:
             samples = self._counted[members if self.lanes.members else np.zeros(count, int)]
@@ -170,7 +170,7 @@ class Problem:
     def samples(self) -> int:
         """How many samples there are of channels whose sigma is known, in one repeat."""
         channels = [(run, name) for i, run in enumerate(self.runs) for name in run.values if name not in self.estimated]
-        return sum(int(np.prod(np.shape(run.values[name])[int(self.lanes.members is not None) :])) for run, name in channels)
+        return sum(math.prod(np.shape(run.values[name])[int(self.lanes.members is not None) :]) for run, name in channels)
 
     def by_channel(self, run: int, at: Linearised, one: Callable, white: bool = False) -> dict[str, np.ndarray]:
         """Residuals of a run in units of sigma by channel; NaN where a sample is missing, or they were not worked out since another run had failed.

@@ -26,6 +26,8 @@ def limits_at_bounds(evaluate: Callable, found: Minimum, limits: Limits, control
     """
     limit, beyond = np.full(found.theta.shape, np.nan), np.full(found.theta.shape, np.nan)
     bound = ((found.theta <= limits.low) | (found.theta >= limits.high)) & ~limits.fixed
+    if not bound.any():
+        return limit, beyond
     for b, place in np.argwhere(bound & found.converged[:, None]).tolist():
         one = found.theta[b : b + 1]
         others = bound[b : b + 1].copy()

@@ -19,7 +19,6 @@ from jourdain_jax.analysis.ranges import Range, positive, unbounded
 from jourdain_jax.analysis.sensors import UNITS, default_range
 from jourdain_jax.analysis.ties import Tie, tied_by
 from jourdain_jax.scene.names import as_names, nearest
-from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 
@@ -174,7 +173,7 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
     Raises ValueError for unknown names, for guesses outside their bounds, for a parameter of each run, for an estimate that runs share but state differently,
     and where nothing is free.
     """
-    parameters = {name: (value, about) for name, value, about in parameters_of(scene)}
+    parameters = {name: field.metadata for name, field in scene.__dataclass_fields__.items() if field.metadata.get("parameter")}
     entries: list[_Entry] = []
     shared, local, functions = _Places(), _Places(), {}
     for name, given in (free if isinstance(free, Mapping) else dict.fromkeys(as_names(free))).items():
@@ -185,9 +184,9 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
         if callable(given):
             functions[name] = given
             continue
-        value, about = parameters[name]
+        about = parameters[name]
         default = positive() if about["positive"] or about["non_negative"] else unbounded()
-        entries.append(_entry(name, about["unit"], given, default, np.asarray(value)))
+        entries.append(_entry(name, about["unit"], given, default, np.asarray(getattr(scene, name))))
         shared.add(name, entries[-1].guess.shape)
     for label, estimate in _of_all_runs(runs).items():
         if not estimate.per_run:
@@ -204,8 +203,9 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
     if all(entry.fixed for entry in entries):
         raise ValueError(f"nothing is free; name parameters in `free` ({', '.join(f'`{name}`' for name in parameters)}), or `unknown_start` values of a run")
     free_ones = [entry for entry in entries if not entry.fixed]
-    each = lambda of: np.array([x for entry in entries for x in [of(entry)] * entry.guess.size])  # noqa: E731
-    guess = np.concatenate([np.ravel(entry.guess) for entry in entries]).astype(float)
+    counts = [entry.guess.size for entry in entries]
+    each = lambda values: np.array([x for x, count in zip(values, counts, strict=True) for _ in range(count)])  # noqa: E731
+    guess = np.concatenate([entry.guess.ravel() for entry in entries], dtype=float)
     layout = Layout(tuple(shared.found), tuple(local.found))
     for name, function in functions.items():
         layout = replace(layout, ties=(*layout.ties, tied_by(name, function, layout.scene(scene, guess[: layout.sizes[0]]))))
@@ -213,12 +213,12 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
         layout=layout,
         runs=len(runs),
         guess=guess,
-        fixed=each(lambda entry: entry.fixed),
+        fixed=each([entry.fixed for entry in entries]),
         ranges=tuple(entry.range for entry in entries for _ in range(entry.guess.size)),
         labels=tuple(entry.label + "".join(f"[{i}]" for i in index) for entry in free_ones for index in np.ndindex(entry.guess.shape)),
         units=tuple(entry.unit for entry in free_ones for _ in np.ndindex(entry.guess.shape)),
-        prior_mean=each(lambda entry: entry.prior[0] if entry.prior else np.nan),
-        prior_sigma=each(lambda entry: entry.prior[1] if entry.prior else np.nan),
+        prior_mean=each([entry.prior[0] if entry.prior else np.nan for entry in entries]),
+        prior_sigma=each([entry.prior[1] if entry.prior else np.nan for entry in entries]),
     )
 
 

@@ -9,7 +9,7 @@ from numbers import Real
 import jax
 import numpy as np
 
-from jourdain_jax.build.reference_parameters import reference_parameters, with_reference_parameters
+from jourdain_jax.build.reference_parameters import Values, reference_parameters, with_reference_parameters
 from jourdain_jax.build.structure import decisions_of
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.scene.scene import Scene
@@ -29,10 +29,7 @@ class Reference:
         for place, default in _defaults(treedef, frozenset(free)):
             if np.shape(default) == np.shape(leaves[place]):
                 leaves[place] = default
-        try:
-            return Reference(jax.tree.unflatten(treedef, leaves))
-        except (TypeError, ValueError):  # no state of the scene is found there
-            return Reference(scene)
+        return _of_values(Values(leaves, treedef)) or Reference(scene)
 
     def __init__(self, scene: Scene):
         self._scene = with_reference_parameters(scene)
@@ -49,6 +46,15 @@ class Reference:
 
     def __eq__(self, other):
         return isinstance(other, Reference) and self._key == other._key
+
+
+@lru_cache(maxsize=256)
+def _of_values(values: Values) -> Reference | None:
+    """That of a scene; None where no state of it is found."""
+    try:
+        return Reference(values.scene)
+    except (TypeError, ValueError):
+        return None
 
 
 @lru_cache(maxsize=256)

@@ -36,7 +36,7 @@ def once_per_values(probe, of_traced: Callable | None = None):
                     return of_traced(scene, *case)
                 scene = with_reference_parameters(scene)
                 leaves, treedef = jax.tree.flatten(scene)
-            known = _Hashable(scene, leaves, treedef)
+            known = Values(leaves, treedef)
             if all(isinstance(x, jax.Array) for x in leaves):
                 _latest[:] = [known]
         return cached(known, *case)
@@ -44,13 +44,18 @@ def once_per_values(probe, of_traced: Callable | None = None):
     return of
 
 
-class _Hashable:
-    """A scene with the key it is cached by."""
+class Values:
+    """A scene by its class and the numbers of its leaves: what is found about it is cached by these."""
 
-    def __init__(self, scene, leaves, treedef):
-        self.scene, self.leaves, self.structure = scene, leaves, (treedef, jax.config.jax_enable_x64)
+    def __init__(self, leaves: list, treedef):
+        self.leaves, self.structure = leaves, (treedef, jax.config.jax_enable_x64)
         self.key = self.structure, tuple((x.tobytes(), x.shape, x.dtype) for x in map(np.asarray, leaves))
         self._hash = hash(self.key)
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        return jax.tree.unflatten(self.structure[0], self.leaves)
 
     def __hash__(self):
         return self._hash
@@ -59,10 +64,10 @@ class _Hashable:
         return self.key == other.key
 
 
-_latest: list[_Hashable] = []  # a call asks about one scene several times; arrays of JAX never change, and are read for the first of them
+_latest: list[Values] = []  # a call asks about one scene several times; arrays of JAX never change, and are read for the first of them
 
 
-def _asked_about_before(leaves: list, treedef) -> _Hashable | None:
+def _asked_about_before(leaves: list, treedef) -> Values | None:
     """The latest scene, where these are the same objects."""
     for known in _latest:
         if len(known.leaves) == len(leaves) and all(map(is_, known.leaves, leaves)) and known.structure == (treedef, jax.config.jax_enable_x64):
