@@ -95,6 +95,44 @@ def test_whitened_density_is_that_of_the_same_unknowns_and_nearly_round():
     np.testing.assert_allclose(curvatures, [*4 * [-42 / 38], -1.0], atol=0.05)
 
 
+def remembering():
+    return [jj.Measurements(run.ts, run.values, None, start=run.start, unknown_start=run.unknown_start, correlation_time=None) for run in runs()]
+
+
+def test_noise_with_an_unknown_memory_has_the_density_of_its_covariance():
+    data = remembering()
+    density = jj.log_density(Oscillator(), data, FREE)
+    assert density.labels[-2:] == ("x.sigma", "x.correlation_time")
+    assert density.units[-1] == "s"
+    h, ends = TS[1] - TS[0], np.arcsin(np.exp(-np.array([10.0, (TS[1] - TS[0]) / (10 * 4.0)])))
+
+    def expected(z):
+        """Up to a constant: flat in log sigma and in arcsin rho, which is a logistic function of its z."""
+        damping, stiffness, *starts = 2.0 * jax.nn.sigmoid(z[0]), jnp.exp(z[1]), z[2], z[3]
+        sigma, angle = jnp.exp(z[4]), ends[0] + (ends[1] - ends[0]) * jax.nn.sigmoid(z[5])
+        tau = -h / jnp.log(jnp.sin(angle))
+        covariance = sigma**2 * jnp.exp(-jnp.abs(TS[:, None] - TS) / tau)
+        likelihoods = [
+            jax.scipy.stats.multivariate_normal.logpdf(run.values["x"], closed(x, damping, stiffness), covariance) for x, run in zip(starts, data, strict=True)
+        ]
+        slopes = jax.nn.log_sigmoid(z[0]) + jax.nn.log_sigmoid(-z[0]) + z[1] + jax.nn.log_sigmoid(z[5]) + jax.nn.log_sigmoid(-z[5])
+        return sum(likelihoods) - 0.5 * ((stiffness - 5.2) / 0.4) ** 2 + slopes
+
+    first = density.initial
+    other = first + jnp.array([0.1, 0.03, -0.005, 0.002, -0.3, 0.4])
+    np.testing.assert_allclose(density(other) - density(first), expected(other) - expected(first), rtol=1e-8)
+    np.testing.assert_allclose(jax.grad(density)(other), jax.grad(expected)(other), rtol=1e-5)
+    np.testing.assert_allclose(density.unconstrain(density.named(other)), other, rtol=1e-8)
+    fit = jj.fit(Oscillator(), data, FREE)
+    white = density.whitened(fit)
+    middle = white.named(jnp.zeros(6))
+    np.testing.assert_allclose([middle[label] for label in fit.labels], fit.values, rtol=1e-12)
+    point = density.named(other)
+    np.testing.assert_allclose(
+        white(white.unconstrain(point)) - density(other), white(white.unconstrain(middle)) - density(density.unconstrain(middle)), atol=1e-8
+    )
+
+
 def test_transforms_lead_back_and_have_the_derivative_they_say():
     transforms = Transforms([unbounded(), positive(), bounds(-1.0, 3.0)])
     x = jnp.array([[0.3, -2.0, 1.5], [800.0, 3.0, -20.0]])
@@ -117,10 +155,7 @@ def test_failing_motion_has_no_density():
         (lambda d, f: d.unconstrain({"damping": 2.0}), "`damping` is 2, which is at or beyond a bound"),
         (lambda d, f: d(jnp.zeros(3)), r"the vector has shape \(3,\), expected \(4,\)"),
         (lambda d, f: jj.log_density(Oscillator(), runs(), {"damping": None}).whitened(f), "give the fit of the same unknowns"),
-        (
-            lambda d, f: jj.log_density(Oscillator(), [jj.Measurements(TS, {"x": TS}, 0.1, start={"x": 0.1}, correlation_time=None)], ("mass",)),
-            "correlation time",
-        ),
+        (lambda d, f: jj.log_density(Oscillator(), [runs()[0], remembering()[1]], ("mass",)), "None in one run and given in another"),
         (lambda d, f: jj.log_density(Oscillator(), [runs()[0], runs(None)[1]], ("mass",)), "None in one run and given in another"),
         (lambda d, f: jj.log_density(Oscillator(), runs(None), ("damping",), max_steps=3), "the motion fails at the first guess"),
     ],

@@ -35,6 +35,7 @@ with _without_collecting():
     from jourdain_jax.analysis.fit import fit, fit_batch
     from jourdain_jax.analysis.fit_result import Fit
     from jourdain_jax.analysis.gradients import derivative_exists
+    from jourdain_jax.analysis.joint_prior import joint_normal
     from jourdain_jax.analysis.likelihood import log_likelihood
     from jourdain_jax.analysis.linearize import Linearization, linearize
     from jourdain_jax.analysis.log_density import LogDensity, log_density
@@ -220,6 +221,7 @@ __all__ = [
     "huber",
     "inertia_from_log_cholesky",
     "inputs",
+    "joint_normal",
     "kinetic_energy",
     "knife_edge",
     "lagrange_equations",

@@ -132,16 +132,17 @@ class Arrow:
         return np.where(held, moved, ds) if any_held else ds
 
 
-def with_prior(arrow: Arrow, theta: Float[np.ndarray, "members unknowns"], mean: np.ndarray, sigma: np.ndarray) -> Arrow:
-    """With one residual (theta - mean) / sigma more for each unknown that has a mean (not NaN). The scores stay those of the runs."""
-    residual = np.where(np.isnan(mean), 0.0, (theta - mean) / sigma)
-    slope = np.broadcast_to(np.where(np.isnan(mean), 0.0, 1 / sigma), theta.shape)
+def with_prior(
+    arrow: Arrow, residual: Float[np.ndarray, "members unknowns"], mean: np.ndarray, sigma: np.ndarray, M: Float[np.ndarray, "shared shared"]
+) -> Arrow:
+    """With one `residual` (theta - mean) / sigma more for each unknown that has a mean (not NaN); those of shared ones times M. The scores stay."""
+    slope = np.broadcast_to(np.where(np.isnan(mean), 0.0, 1 / sigma), residual.shape)
     (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(slope)
     members, runs, m = r_l.shape
     rows = np.zeros((members, runs, m, arrow.local.shape[-1]))
     rows[..., range(m), range(m)], rows[..., -1] = J_l, r_l
     R = np.linalg.qr(np.concatenate([arrow.local, rows], axis=2), mode="r") if m else arrow.local
-    below = [R[:, :, m:, m:].reshape(members, -1, arrow.shared.shape[-1]), np.concatenate([J_s[..., None] * np.eye(J_s.shape[1]), r_s[..., None]], axis=-1)]
+    below = [R[:, :, m:, m:].reshape(members, -1, arrow.shared.shape[-1]), np.concatenate([M * J_s[:, None], M @ r_s[..., None]], axis=-1)]
     return Arrow(R[:, :, :m], np.linalg.qr(np.concatenate([arrow.shared, *below], axis=1), mode="r"), arrow.scores)
 
 

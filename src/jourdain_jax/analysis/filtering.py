@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.accelerometer import Accelerometer
 from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.joint_prior import Correlated
 from jourdain_jax.analysis.likelihood import as_runs, mapped
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.predictions import Run, equal_runs
@@ -192,7 +193,7 @@ def _check_supported(scene: Scene, runs: Sequence[Measurements]) -> None:
         for name, reading in run.readings.items():
             _check_reading(name, reading, index)
         for name, given in run.unknown_start.items():
-            if not isinstance(given, Estimate) or given.known_before is None:
+            if not isinstance(given, Estimate) or given.known_before is None or isinstance(given.prior, Correlated):
                 raise ValueError(
                     f"start value `{name}` of run {index} is unknown, but nothing says how far off it may be; give `jj.Estimate(prior=jj.Normal(mean, sigma))`"
                 )

@@ -18,7 +18,7 @@ from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.fit_statistics import statistics
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, minimise
-from jourdain_jax.analysis.likelihood import as_runs
+from jourdain_jax.analysis.likelihood import as_runs, in_all_or_none
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Piecewise, Shot
@@ -72,7 +72,8 @@ def fit(
     - `free`: parameter names, or name -> `bounds(low, high)`, `positive()`, `unbounded()` or None (positive where the parameter
       is declared so), a prior `Normal(mean, sigma)`, or an `Estimate`. A function of the scene ties a parameter to others:
       `free={"radius": None, "inertia": lambda scene: 0.5 * scene.mass * scene.radius**2}`. The measured sigmas of a bicycle are such priors:
-      `free=measured_bicycle("Browser").prior`. What `unknown_start`, sensors and actuators of the runs name is free as well.
+      `free=measured_bicycle("Browser").prior`; of parameters that were measured together, `joint_normal(means, covariance)`. What `unknown_start`, sensors
+      and actuators of the runs name is free as well.
     - `cutoff`: singular values of the scaled Jacobian below this fraction of the largest count as zero (`Information`). Keep it
       well above the relative accuracy of the simulation.
     - `tolerance`: the fit has converged when a step changes no residual by more than about this many sigmas, and no unknown by
@@ -247,18 +248,13 @@ def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:
         raise ValueError(
             f'errors="runs" takes standard errors from how runs differ, but there are {len(runs)}; give {_FEWEST_RUNS} or more, or errors="sigmas"'
         )
-    unknown = sorted({name for run in runs for name in run.unknown_sigma})
+    unknown = in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
     if unknown and loss is not None:
         raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a robust loss needs to know what is far out; give a number")
-    for name in unknown:
-        if any(name in run.values and name not in run.unknown_sigma for run in runs):
-            raise ValueError(f"sigma of channel `{name}` is None in one run and given in another; give it in all runs, or in none")
     coloured = sorted({name for run in runs for name in run.correlation_time})
     if coloured and loss is not None:
         raise ValueError(f"the noise of channel `{coloured[0]}` has a correlation time, but a robust loss takes samples as independent; leave out either")
-    for name in sorted({name for run in runs for name in run.unknown_correlation}):
-        if any(name in run.values and name not in run.unknown_correlation for run in runs):
-            raise ValueError(f"the correlation time of channel `{name}` is None in one run and given in another; give it in all runs, or in none")
+    in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
 
 
 def _repeats(runs: Sequence[Measurements]) -> int:

@@ -31,6 +31,15 @@ def as_runs(scene: Scene, data: Measurements | Sequence[Measurements], *, repeat
     return tuple(checked(scene, run, index, repeats) for index, run in enumerate(runs))
 
 
+def in_all_or_none(runs: Sequence[Measurements], what: str, unknown: Callable[[Measurements], tuple[str, ...]]) -> tuple[str, ...]:
+    """Channels of which something is not known; ValueError where it is None in one run and given in another."""
+    names = tuple(sorted({name for run in runs for name in unknown(run)}))
+    for name in names:
+        if any(name in run.values and name not in unknown(run) for run in runs):
+            raise ValueError(f"{what} of channel `{name}` is None in one run and given in another; give it in all runs, or in none")
+    return names
+
+
 def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **simulation) -> Float[Array, ""]:
     """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 

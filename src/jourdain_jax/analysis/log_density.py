@@ -3,6 +3,7 @@
     log p(z) = log L(theta) + sum log prior(theta) + sum log |d theta / dx| + log |det F|,      theta = constrain(x),   x = centre + F z
 
 L: `log_likelihood`; x: one real number for each unknown (`transforms`); centre, F: zero and the identity, or from a fit (`whitened`).
+A correlation time tau stands in theta as arcsin rho, rho = exp(-h / tau), h: the shortest interval, and is even in it (Jeffreys' prior of AR(1) noise).
 Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 1.8 and 12.4.
 """
 
@@ -15,12 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
-from jourdain_jax.analysis.likelihood import as_runs, mapped, of_run
+from jourdain_jax.analysis.likelihood import as_runs, in_all_or_none, mapped, of_run
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.predictions import Run, equal_runs
-from jourdain_jax.analysis.ranges import Range, positive
+from jourdain_jax.analysis.ranges import Range, bounds, positive
 from jourdain_jax.analysis.starts import check_starts
 from jourdain_jax.analysis.transforms import Transforms
 from jourdain_jax.analysis.unknowns import Layout, unknowns_of
@@ -32,11 +34,13 @@ from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
+_INSIDE = 0.02  # of the width of a range: the least distance from its ends of the centre of a whitened density
+
 
 class LogDensity(eqx.Module):
     """`log p(z)` of a vector z of real numbers, up to a constant: call it, under `jit`, `grad` and `vmap` as you like.
 
-    `labels` names the unknowns, as those of a `Fit`; a sigma that is estimated is `"lean.sigma"`.
+    `labels` names the unknowns, as those of a `Fit`; a sigma that is estimated is `"lean.sigma"`, a correlation time `"lean.correlation_time"` (s).
     """
 
     scene: Scene
@@ -47,6 +51,7 @@ class LogDensity(eqx.Module):
     guess: Float[np.ndarray, "unknowns"]  # in their units
     prior_mean: Float[np.ndarray, "unknowns"]
     prior_sigma: Float[np.ndarray, "unknowns"]  # infinite where nothing is known beforehand
+    whitening: Float[np.ndarray, "shared shared"]  # of priors of the first unknowns, which all runs share: see `joint_prior`
     centre: Float[np.ndarray, "unknowns"]
     factor: Float[np.ndarray, "unknowns unknowns"]  # lower triangular
     labels: tuple[str, ...] = eqx.field(static=True)
@@ -54,25 +59,32 @@ class LogDensity(eqx.Module):
     layout: Layout = eqx.field(static=True)
     runs: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # numbers of those of each group
     places: tuple[int, ...] = eqx.field(static=True)  # of those unknowns that are no sigmas
-    sigmas: tuple[str, ...] = eqx.field(static=True)  # channels whose sigma is unknown, last among the unknowns
+    sigmas: tuple[str, ...] = eqx.field(static=True)  # channels whose sigma is unknown, which come after those
+    with_memory: tuple[str, ...] = eqx.field(static=True)  # channels whose correlation time is, last among the unknowns
+    intervals: Float[np.ndarray, "with_memory"]  # s, the shortest of each of these
 
     def __call__(self, z: Float[Array, "unknowns"]) -> Float[Array, ""]:
         """The logarithm of the density; -inf where the motion fails."""
         x = self._spread(self._checked(z))
-        theta = self.transforms.constrain(x)
+        inner = self.transforms.constrain(x)
+        theta = self._told(inner)
         known = jnp.where(np.isfinite(self.prior_sigma), (theta - self.prior_mean) / self.prior_sigma, 0.0)
+        shared = len(self.whitening)
+        known = jnp.concatenate([self.whitening @ known[:shared], known[shared:]])
         logs = self.transforms.log_slopes(x)
         logs = logs - 0.5 * known**2 - jnp.where(np.isfinite(self.prior_sigma), jnp.log(self.prior_sigma * jnp.sqrt(2 * jnp.pi)), 0.0)
         # of a sigma: flat in its logarithm, which is x
-        count = len(self.places)
-        logs = jnp.sum(logs[:count]) + jnp.sum(jnp.log(jnp.diagonal(self.factor)))
+        count, end = len(self.places), len(self.places) + len(self.sigmas)
+        logs = jnp.sum(logs[:count]) + jnp.sum(logs[end:]) + jnp.sum(jnp.log(jnp.diagonal(self.factor))) + np.linalg.slogdet(self.whitening)[1]
         shared, local = self._split(theta)
-        scene, sigma = self.layout.scene(self.scene, shared), dict(zip(self.sigmas, theta[count:], strict=True))
+        scene, sigma = self.layout.scene(self.scene, shared), dict(zip(self.sigmas, theta[count:end], strict=True))
+        tau = dict(zip(self.with_memory, theta[end:], strict=True))
 
         def one(run: Run, local: Float[Array, "local"]) -> Float[Array, ""]:
             here = run.at(self.layout, shared, local)
             weights = {name: weight / sigma[name] if name in sigma else weight for name, weight in here.weights.items()}
-            return of_run(scene, here._replace(weights=weights), simulation=self.simulation)
+            memory = here.correlation_time | {name: tau[name] for name in here.correlation_time if name in tau}
+            return of_run(scene, here._replace(weights=weights, correlation_time=memory), simulation=self.simulation)
 
         with reference_parameters(self.scene):
             return logs + sum(jnp.sum(mapped(one, group, local[np.array(runs)])) for group, runs in zip(self.groups, self.runs, strict=True))
@@ -84,7 +96,7 @@ class LogDensity(eqx.Module):
 
     def constrain(self, z: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
         """The unknowns at z, in their units and in the order of `labels`; of one vector or many."""
-        return self.transforms.constrain(self._spread(self._checked(z)))
+        return self._told(self.transforms.constrain(self._spread(self._checked(z))))
 
     def named(self, z: Float[Array, "*batch unknowns"]) -> dict[str, Float[Array, "*batch"]]:
         """The unknowns at z by name, in their units; of one vector or many."""
@@ -100,7 +112,7 @@ class LogDensity(eqx.Module):
             if name not in self.labels:
                 raise ValueError(f"`{name}` is not among the unknowns; {nearest(name, self.labels)}")
         theta = jnp.stack([jnp.asarray(values.get(label, self.guess[i]), jnp.result_type(float)) for i, label in enumerate(self.labels)])
-        x = self.transforms.unconstrain(theta)
+        x = self.transforms.unconstrain(self._inner(theta))
         if not is_traced(x) and (off := np.flatnonzero(~np.isfinite(np.asarray(x)))).size:
             raise ValueError(f"`{self.labels[off[0]]}` is {float(theta[off[0]]):g}, which is at or beyond a bound of it; give a value inside")
         return jax.scipy.linalg.solve_triangular(self.factor, x - self.centre, lower=True)
@@ -115,21 +127,26 @@ class LogDensity(eqx.Module):
         It is the density of the same unknowns: `constrain` and `named` lead to the same values. Where the fit is at its minimum, z is zero.
         ValueError for a fit of other unknowns, one of a batch, and unknowns that have no standard error, hidden in the data or at a bound.
         """
-        if fit.values.ndim > 1 or fit.labels != self.labels[: len(self.places)] or not set(self.sigmas) <= set(fit.sigma):
+        of_noise = set(self.sigmas) <= set(fit.sigma) and set(self.with_memory) <= set(fit.correlation_time)
+        if fit.values.ndim > 1 or fit.labels != self.labels[: len(self.places)] or not of_noise:
             raise ValueError(f"the fit is of {', '.join(fit.labels)}, the density of {', '.join(self.labels)}; give the fit of the same unknowns and data")
         for label, error in zip(fit.labels, fit.standard_errors, strict=True):
             if not np.isfinite(error):
                 raise ValueError(
                     f"`{label}` has no standard error in the fit, so that nothing is known of its spread; give it a prior, or leave it out of `free`"
                 )
-        theta = np.concatenate([fit.values, [float(fit.sigma[name]) for name in self.sigmas]])
+        noise = [float(fit.sigma[name]) for name in self.sigmas] + [float(fit.correlation_time[name]) for name in self.with_memory]
+        theta = np.array(self._inner(jnp.asarray(np.concatenate([fit.values, noise]))))
+        last = slice(len(theta) - len(self.with_memory), None)
+        low, high = self.transforms.low[last], self.transforms.high[last]
+        theta[last] = np.clip(theta[last], low + _INSIDE * (high - low), high - _INSIDE * (high - low))  # a correlation time may be at an end
         x = self.transforms.unconstrain(jnp.asarray(theta))
         slopes = np.exp(-np.asarray(self.transforms.log_slopes(x)))
         covariance = np.zeros((len(theta), len(theta)))
         covariance[: fit.values.size, : fit.values.size] = fit.covariance
-        for i, name in enumerate(self.sigmas, fit.values.size):
+        for i, name in enumerate((*self.sigmas, *self.with_memory), fit.values.size):
             samples = sum(np.count_nonzero(np.asarray(group.weights[name])) for group in self.groups if name in group.weights)
-            covariance[i, i] = theta[i] ** 2 / (2 * samples)
+            covariance[i, i] = theta[i] ** 2 / (2 * samples) if i < last.start else 1 / samples
         factor = np.linalg.cholesky(slopes[:, None] * covariance * slopes)
         return eqx.tree_at(lambda d: (d.centre, d.factor), self, (np.asarray(x), factor))
 
@@ -141,6 +158,16 @@ class LogDensity(eqx.Module):
 
     def _spread(self, z: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
         return self.centre + z @ self.factor.T
+
+    def _told(self, inner: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+        """The unknowns, from what stands for them between the bounds of their transforms."""
+        end = len(self.labels) - len(self.with_memory)
+        return jnp.concatenate([inner[..., :end], -self.intervals / jnp.log(jnp.sin(inner[..., end:]))], axis=-1)
+
+    def _inner(self, theta: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch unknowns"]:
+        """The inverse of `_told`."""
+        end = len(self.labels) - len(self.with_memory)
+        return jnp.concatenate([theta[..., :end], jnp.arcsin(jnp.exp(-self.intervals / theta[..., end:]))], axis=-1)
 
     def _split(self, theta: Float[Array, "unknowns"]) -> tuple[Float[Array, "shared"], Float[Array, "runs local"]]:
         shared, local = self.layout.sizes
@@ -160,13 +187,14 @@ def log_density(
     **Arguments**
     - `scene`, `data`, `free`, `simulation`: as of `fit`: parameters that are free, start values that are unknown, numbers of sensors and actuators that are
       estimated, and sigmas that are None, which are named `"lean.sigma"`.
-    - Priors: `Normal` where an `Estimate` has one. Otherwise the prior is flat in the unknown itself, between its bounds; flat in the logarithm of a sigma.
+    - Priors: `Normal` where an `Estimate` has one. Otherwise the prior is flat in the unknown itself, between its bounds; flat in the logarithm of a sigma,
+      and in arcsin rho, rho = exp(-h / tau), of a correlation time tau that is None, where h is the shortest interval between samples of its channel.
       A flat prior without bounds has no integral: where the data do not tell an unknown, neither has the posterior, and a sampler runs away.
 
     **Returns** a `LogDensity`: call it with a vector; `initial`, `constrain`, `named` and `unconstrain` lead to and fro. The logarithms of the transforms'
     derivatives are in it. It is a pure function: it works under `jit`, `vmap` and `grad` (reverse mode; forward mode with `adjoint=diffrax.ForwardMode()`).
 
-    **Raises** ValueError as `fit`, and for a correlation time that is None.
+    **Raises** ValueError as `fit`.
 
     **Example**
 
@@ -176,40 +204,41 @@ def log_density(
     """
     scene = as_scene(scene)
     runs = as_runs(scene, data)
-    if unknown := sorted({name for run in runs for name in run.unknown_correlation}):
-        raise ValueError(
-            f"the correlation time of channel `{unknown[0]}` is None, but a density needs to know it; give a number in s, such as the one that `fit` finds"
-        )
-    sigmas = tuple(sorted({name for run in runs for name in run.unknown_sigma}))
-    for name in sigmas:
-        if any(name in run.values and name not in run.unknown_sigma for run in runs):
-            raise ValueError(f"sigma of channel `{name}` is None in one run and given in another; give it in all runs, or in none")
+    sigmas = in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
+    with_memory = in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
+    limits = [correlation_limits([np.asarray(run.ts) for run in runs if name in run.values]) for name in with_memory]
+    intervals = np.array([low / SHORTEST for low, _ in limits])
+    angles = [bounds(*(float(np.arcsin(np.exp(-h / tau))) for tau in ends)) for h, ends in zip(intervals, limits, strict=True)]
     unknowns = unknowns_of(scene, runs, free if isinstance(free, Mapping) else tuple(as_names(free)))
     with reference_parameters(scene):
         if not is_traced((scene, [(run.start, run.t0, run.inputs) for run in runs])):
             check_starts(scene, runs, unknowns)
         grouped = equal_runs(runs)
         guesses = [_rms(scene, [group for _, group in grouped if name in group.weights], name, simulation) for name in sigmas]
+    guesses += (intervals / np.log(2)).tolist()  # neighbouring samples correlate by a half
     places, priors = unknowns.estimated, np.concatenate
-    none = np.full(len(sigmas), np.inf)
-    size = len(places) + len(sigmas)
+    none = np.full(len(guesses), np.inf)
+    size = len(places) + len(guesses)
     return LogDensity(
         scene=scene,
         groups=tuple(group for _, group in grouped),
         simulation=simulation,
         fixed=unknowns.guess,
-        transforms=Transforms([*(unknowns.ranges[place] for place in places), *(positive() for _ in sigmas)]),
+        transforms=Transforms([*(unknowns.ranges[place] for place in places), *(positive() for _ in sigmas), *angles]),
         guess=np.concatenate([unknowns.guess[places], guesses]),
-        prior_mean=np.concatenate([np.nan_to_num(unknowns.prior_mean[places]), np.zeros(len(sigmas))]),
+        prior_mean=np.concatenate([np.nan_to_num(unknowns.prior_mean[places]), np.zeros(len(guesses))]),
         prior_sigma=priors([np.where(np.isfinite(unknowns.prior_mean[places]), unknowns.prior_sigma[places], np.inf), none]),
+        whitening=unknowns.whitening,
         centre=np.zeros(size),
         factor=np.eye(size),
-        labels=(*unknowns.labels, *(f"{name}.sigma" for name in sigmas)),
-        units=(*unknowns.units, *("" for _ in sigmas)),
+        labels=(*unknowns.labels, *(f"{name}.sigma" for name in sigmas), *(f"{name}.correlation_time" for name in with_memory)),
+        units=(*unknowns.units, *("" for _ in sigmas), *("s" for _ in with_memory)),
         layout=unknowns.layout,
         runs=tuple(numbers for numbers, _ in grouped),
         places=tuple(places.tolist()),
         sigmas=sigmas,
+        with_memory=with_memory,
+        intervals=intervals,
     )
 
 

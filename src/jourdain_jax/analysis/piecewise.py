@@ -126,7 +126,7 @@ class Piecewise:
             own[~self.follows, :m] = of_run[p:].reshape(len(self.runs), m)  # not once more for each piece
             prior.append(np.concatenate([of_run[:p], own.ravel()]))
         fixed = np.array(each(whole.fixed.tolist(), False, True), bool)
-        return Unknowns(self.layout, count, self.spread(whole.guess[None])[0], fixed, tuple(ranges), (), (), *prior)
+        return Unknowns(self.layout, count, self.spread(whole.guess[None])[0], fixed, tuple(ranges), (), (), prior[0], prior[1], whole.whitening)
 
     def spread(self, theta: Float[np.ndarray, "members places"]) -> Float[np.ndarray, "members all_places"]:
         """Unknowns of whole runs as those of all pieces, with nodes at zero."""

@@ -117,8 +117,9 @@ def planned_information(
     with reference_parameters(scene):
         J = jax.jacfwd(residuals)(theta[places])
     flat = jnp.concatenate([of.reshape(-1, len(places)) for run in J for of in run.values()])
-    prior = np.where(np.isfinite(unknowns.prior_mean[places]), unknowns.prior_sigma[places], np.inf) ** -2.0
-    return PlannedInformation(flat.T @ flat + jnp.diag(prior), J, unknowns.labels, unknowns.units)
+    prior = np.diag(1 / np.where(np.isfinite(unknowns.prior_mean[places]), unknowns.prior_sigma[places], np.inf))
+    prior[:count] = unknowns.whitening @ prior[:count]  # all that are shared are estimated
+    return PlannedInformation(flat.T @ flat + prior.T @ prior, J, unknowns.labels, unknowns.units)
 
 
 def _values(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> Float[Array, "places"]:

@@ -1,8 +1,8 @@
 """What a fit minimises: residuals of all runs with their derivatives, whitened and weighted, at any numbers.
 
-F = sum rho(w) + sum n log sigma + sum ((theta - mean) / s)^2 / 2        w: whitened residuals (see `correlated_noise`)
+F = sum rho(w) + sum n log sigma + |M (theta - mean) / s|^2 / 2        w: whitened residuals (see `correlated_noise`)
 
-sigma^2 = mean w^2 of each channel whose sigma is not known; mean, s: of priors
+sigma^2 = mean w^2 of each channel whose sigma is not known; mean, s: of priors; M: see `joint_prior`
 """
 
 import math
@@ -85,9 +85,9 @@ class Problem:
         whole = arrow(together, m if runs > 1 else 0)
         if self.shares is not None or self.unknowns.with_prior.size:
             mean, spread = self._known_before(theta, members)
-            with_mean = np.isfinite(mean)
-            cost = cost + 0.5 * np.sum(np.where(with_mean, (theta - np.where(with_mean, mean, 0.0)) / spread, 0.0) ** 2, axis=1)
-            whole = with_prior(whole, theta, mean, spread)
+            r, M = np.where(np.isfinite(mean), (theta - mean) / spread, 0.0), self.unknowns.whitening
+            cost = cost + 0.5 * (np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1))
+            whole = with_prior(whole, r, mean, spread, M)
         return Linearised(cost, whole, kept, sigma)
 
     def is_followed(self, at: Linearised, share: float, most: float) -> np.ndarray:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.joint_prior import Correlated, whitening
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.ranges import Range, positive, unbounded
 from jourdain_jax.analysis.sensors import UNITS, default_range
@@ -111,6 +113,7 @@ class Unknowns:
     units: tuple[str, ...]
     prior_mean: Float[np.ndarray, "places"]  # NaN where nothing is known beforehand
     prior_sigma: Float[np.ndarray, "places"]
+    whitening: Float[np.ndarray, "shared shared"]  # of priors of shared ones: see `joint_prior`
 
     @cached_property
     def with_prior(self) -> np.ndarray:
@@ -162,7 +165,7 @@ class _Entry:
     guess: np.ndarray
     range: Range
     fixed: bool = False
-    prior: tuple[float, float] | None = None
+    prior: Any = None  # with mean and sigma
 
 
 def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, Range | Estimate | Callable | None] | Iterable[str]") -> Unknowns:
@@ -217,8 +220,9 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
         ranges=tuple(entry.range for entry in entries for _ in range(entry.guess.size)),
         labels=tuple(entry.label + "".join(f"[{i}]" for i in index) for entry in free_ones for index in np.ndindex(entry.guess.shape)),
         units=tuple(entry.unit for entry in free_ones for _ in np.ndindex(entry.guess.shape)),
-        prior_mean=each([entry.prior[0] if entry.prior else np.nan for entry in entries]),
-        prior_sigma=each([entry.prior[1] if entry.prior else np.nan for entry in entries]),
+        prior_mean=each([np.nan if entry.prior is None else float(entry.prior.mean) for entry in entries]),
+        prior_sigma=each([np.nan if entry.prior is None else float(entry.prior.sigma) for entry in entries]),
+        whitening=whitening([entry.prior for entry in entries for _ in range(entry.guess.size)][: layout.sizes[0]]),
     )
 
 
@@ -281,4 +285,7 @@ def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _
     found = default if estimate.range is None else estimate.range
     if refusal := found.refusal(guess):
         raise ValueError(f"first guess of `{label}` is {guess}; {refusal}")
-    return _Entry(label, unit, guess, found, prior=estimate.known_before)
+    if isinstance(estimate.prior, Correlated) and (value.shape or label.startswith("run ")):
+        what = f"has {value.size} numbers" if value.shape else "belongs to one run"
+        raise ValueError(f"`{label}` was given a prior of `joint_normal`, but it {what}; such a prior is for parameters of one number that all runs share")
+    return _Entry(label, unit, guess, found, prior=estimate.prior)

@@ -17,6 +17,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.analysis.joint_prior import Correlated, joint_normal
 from jourdain_jax.ensembles.distributions import Normal
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.scene.names import nearest
@@ -58,6 +59,14 @@ class MeasuredBicycle(eqx.Module):
     def prior(self) -> dict[str, Normal]:
         """How the parameters are distributed by their measurement, for `jj.Study(bicycle.scene, vary=bicycle.prior)`: independent, and none without sigma."""
         return {name: Normal(self.values[name], sigma) for name, sigma in self.sigmas.items() if sigma > 0}
+
+    @property
+    def joint_prior(self) -> dict[str, Normal | Correlated]:
+        """What their measurement says of the parameters, with its covariance where that is known: `jj.fit(bicycle.scene, data, free=bicycle.joint_prior)`."""
+        if self.covariance is None:
+            return dict(self.prior)
+        known = np.array([sigma > 0 for sigma in self.sigmas.values()])
+        return dict(joint_normal({name: self.values[name] for name in self.prior}, self.covariance[np.ix_(known, known)]))
 
 
 def measured_bicycle(name: str) -> MeasuredBicycle:

@@ -1,0 +1,116 @@
+"""Priors of parameters that were measured together: the posterior is that of Bayes' theorem, whichever way it is asked."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.analysis.joint_prior import whitening
+from jourdain_jax.bicycle import benchmark_from_measurements, measured_bicycle
+
+TS = np.linspace(0.1, 3.0, 16)
+NAMES, MEAN = ("mass", "stiffness"), {"mass": 2.02, "stiffness": 4.95}
+COVARIANCE = np.array([[0.02**2, 0.9 * 0.02 * 0.05], [0.9 * 0.02 * 0.05, 0.05**2]])
+TOGETHER = jj.joint_normal(MEAN, COVARIANCE)
+APART = {name: jj.Normal(MEAN[name], float(np.sqrt(COVARIANCE[k, k]))) for k, name in enumerate(NAMES)}
+
+
+class Cart(jj.Scene):
+    """`m x'' = - k x + 1`."""
+
+    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
+    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=1.0 - self.stiffness * motion.q.x),)
+
+
+def run():
+    x = np.asarray(jj.simulate(Cart(), {"x": 0.3}, t0=0.0, ts=TS)["x"])
+    return jj.Measurements(TS, {"x": x + 0.01 * np.random.default_rng(3).normal(size=len(TS))}, 0.01, start={"x": 0.3}, t0=0.0)
+
+
+def test_the_estimate_is_where_likelihood_and_prior_balance_and_its_information_is_their_sum():
+    data, free = run(), dict(reversed(TOGETHER.items()))  # the order of the names does not matter
+    found = jj.fit(Cart(), data, free, tolerance=1e-7)
+    at = jnp.array([found[name].value for name in NAMES])
+    slope = jax.grad(lambda x: jj.log_likelihood(Cart(mass=x[0], stiffness=x[1]), data))(at)
+    pull = np.linalg.solve(COVARIANCE, at - np.array(list(MEAN.values())))
+    scale = np.array([found[name].standard_error for name in NAMES])
+    assert np.max(np.abs(scale * pull)) > 0.1  # the prior does pull
+    np.testing.assert_allclose(scale * slope, scale * pull, atol=2e-6)
+    of_data = jj.planned_information(found.scene, data, NAMES).matrix
+    order = [found.labels.index(name) for name in NAMES]
+    np.testing.assert_allclose(found.covariance[np.ix_(order, order)], np.linalg.inv(of_data + np.linalg.inv(COVARIANCE)), rtol=1e-5)
+    planned = jj.planned_information(found.scene, data, TOGETHER).matrix
+    np.testing.assert_allclose(planned - of_data, np.linalg.inv(COVARIANCE), rtol=1e-6)
+
+
+def test_without_correlation_it_is_a_prior_for_each():
+    data, diagonal = run(), jj.joint_normal(MEAN, np.diag(np.diag(COVARIANCE)))
+    together, apart = jj.fit(Cart(), data, diagonal), jj.fit(Cart(), data, APART)
+    np.testing.assert_allclose(together.values, apart.values, rtol=1e-10)
+    np.testing.assert_allclose(together.standard_errors, apart.standard_errors, rtol=1e-8)
+
+
+def test_of_one_of_the_names_the_marginal_counts():
+    together, apart = (jj.fit(Cart(), run(), {"mass": prior["mass"]}) for prior in (TOGETHER, APART))
+    np.testing.assert_allclose(together.values, apart.values, rtol=1e-12)
+
+
+def test_density_has_the_normal_density_of_all_names():
+    data = run()
+    flat, density = (jj.log_density(Cart(), data, free) for free in (dict.fromkeys(NAMES, jj.unbounded()), TOGETHER))
+    points = ({"mass": 2.01, "stiffness": 5.02}, {"mass": 1.97, "stiffness": 4.96})
+
+    def added(point):
+        z = density.unconstrain(point)
+        return density(z) - jnp.sum(density.transforms.log_slopes(z)) - flat(flat.unconstrain(point))
+
+    def stated(point):
+        return jax.scipy.stats.multivariate_normal.logpdf(jnp.array(list(point.values())), jnp.array(list(MEAN.values())), COVARIANCE)
+
+    for point in points:
+        assert added(point) == pytest.approx(float(stated(point)), abs=1e-9)
+
+
+def test_a_combination_that_is_known_exactly():
+    joint = jj.joint_normal({"a": 1.0, "b": 2.0}, [[1.0, 1.0], [1.0, 1.0]])
+    M = whitening(list(joint.values()))
+    assert np.linalg.norm(M @ [1.0, 1.0]) == pytest.approx(1.0, rel=1e-8)  # one sigma of both
+    assert np.linalg.norm(M @ [1.0, -1.0]) == pytest.approx(np.sqrt(2) * 1e4)
+
+
+def test_pendulum_readings_give_a_joint_prior():
+    bicycle = benchmark_from_measurements("Browser")
+    joint = bicycle.joint_prior
+    assert list(joint) == list(bicycle.prior)
+    np.testing.assert_allclose([prior.sigma for prior in joint.values()], [prior.sigma for prior in bicycle.prior.values()], rtol=1e-12)
+    pair = ("IBxx", "IBzz")
+    which, inverse = [list(bicycle.values).index(name) for name in pair], np.linalg.inv(whitening([joint[name] for name in pair]))
+    sigma = np.array([joint[name].sigma for name in pair])
+    np.testing.assert_allclose(sigma[:, None] * (inverse @ inverse.T) * sigma, bicycle.covariance[np.ix_(which, which)], rtol=1e-9)
+    published = measured_bicycle("Browser")
+    assert published.joint_prior == published.prior
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: jj.joint_normal({}, [[1.0]]), "expected a dictionary of name -> mean"),
+        (lambda: jj.joint_normal({"a": 1.0}, [1.0]), r"has shape \(1,\), expected \(1, 1\)"),
+        (lambda: jj.joint_normal({"a": 1.0}, [[np.nan]]), "must be finite"),
+        (lambda: jj.joint_normal({"a": 1.0, "b": 1.0}, [[1.0, 0.0], [0.0, 0.0]]), "the variance of `b` is 0, expected one above zero"),
+        (lambda: jj.joint_normal({"a": 1.0, "b": 1.0}, [[1.0, 0.5], [0.4, 1.0]]), "is not symmetric"),
+        (lambda: jj.joint_normal({"a": 1.0, "b": 1.0}, [[1.0, 2.0], [2.0, 1.0]]), "its correlations have the eigenvalue -1"),
+        (lambda: jj.fit(Cart(), jj.Measurements(TS, {"x": TS}, 0.01, start={"x": 0.3}, unknown_start={"x": TOGETHER["mass"]}, t0=0.0)), "belongs to one run"),
+    ],
+)
+def test_what_is_no_joint_prior_is_refused(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
