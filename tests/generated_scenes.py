@@ -188,10 +188,10 @@ class Generated(jj.Scene):
                 made[f"rim {i}"] = jj.disc_contact(pose[name], size, height="row" if kind == "wheel" else "coordinates")
             elif kind == "ball on a lift":
                 lift = jj.Plane(jnp.stack([o, o, 0.2 * jnp.sin(pose.t)]), velocity=jnp.stack([o + 0.1, o, 0.2 * jnp.cos(pose.t)]))
-                made[f"lift {i}"] = jj.ball_contact(pose[name], size, plane=lift, height="row")
+                made[f"lift {i}"] = jj.ball_contact(pose[name], size, ground=lift, height="row")
             elif kind.startswith("ball"):
                 plane = {"ball on a turntable": jj.Plane(angular_velocity=(0.0, 0.0, 0.7)), "ball on a belt": jj.Plane(velocity=(0.3, -0.2, 0.0))}.get(kind)
-                made[f"ground {i}"] = jj.ball_contact(pose[name], size, plane=plane)
+                made[f"ground {i}"] = jj.ball_contact(pose[name], size, ground=plane)
         return made
 
     def place(self, pose, i: int, local):

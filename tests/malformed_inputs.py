@@ -224,9 +224,9 @@ PARTS: dict[str, Case] = {
     ),
     "jj.disc_contact(bead, 0.5, height='rows')": ("ValueError", "contact height `rows` is unknown; expected `coordinates`"),
     "jj.ball_contact(b, 0.5)": ("ValueError", "the body of a contact is a Bead, expected the pose of a body"),
-    "jj.ball_contact(jj.pose_at(shaped(1.0, jnp.ones(3)), 0.0, two)['bead'], 0.5, plane='ground')": (
+    "jj.ball_contact(jj.pose_at(shaped(1.0, jnp.ones(3)), 0.0, two)['bead'], 0.5, ground='ground')": (
         "ValueError",
-        "`plane` of the contact of `bead` is the text 'ground', expected a `jj.Plane(...)`, or None for z = 0 at rest",
+        "`ground` of the contact of `bead` is the text 'ground', expected a `jj.Plane(...)`",
     ),
     "jj.fixed_point('origin')": ("ValueError", "position of a fixed point is the text 'origin', expected real numbers"),
     "moving['bead'].velocity_at([1.0, 2.0])": ("ValueError", "point of body `bead` has shape (2,), expected (3,); give three components in the inertial frame"),

@@ -29,7 +29,6 @@ BODY = jj.pose_at(Rolls(make_ground=lambda scene, pose: None), 0.0, jnp.array([0
         (lambda: jj.HeightMap(lambda x, y: jnp.stack([x, y])).plane_at((0.0, 0.0, 0.0)), r"h\(x, y\) of a height map has shape \(2,\), expected one number"),
         (lambda: jj.ball_contact(BODY, 0.3, ground=jj.Sphere(0.25, side="inside")), "radius of the contact of `body` is 0.3 m inside a sphere of 0.25 m"),
         (lambda: jj.ball_contact(BODY, 0.3, ground=jj.Cylinder(0.3, (1.0, 0.0, 0.0), side="inside")), "inside a cylinder of 0.3 m, expected a smaller one"),
-        (lambda: jj.ball_contact(BODY, 0.3, ground=jj.Plane(), plane=jj.Plane()), "has both a `ground` and a `plane`, expected one of them"),
         (lambda: jj.ball_contact(BODY, -0.3), "radius of the contact of `body` is -0.3 m, expected a positive number"),
         (lambda: jj.wheel_contact(BODY, 0.3, 0.4), "tyre of the contact of `body` is 0.4 m at a wheel of 0.3 m, expected 0 <= r < R"),
         (lambda: jj.ellipsoid_contact(BODY, (0.1, 0.0, 0.2)), r"semi-axes of the contact of `body` are \[0.1, 0.0, 0.2\] m, expected positive"),

@@ -166,7 +166,7 @@ class BallOnPlane(jj.Scene):
 
     def contacts(self, pose):
         plane = jj.Plane(tilt=self.tilt, velocity=jnp.stack([0.0 * self.drift, self.drift, 0.0 * self.drift]))
-        return {"floor": jj.ball_contact(pose["ball"], self.radius, plane=plane, height="row")}
+        return {"floor": jj.ball_contact(pose["ball"], self.radius, ground=plane, height="row")}
 
 
 @pytest.mark.parametrize(("tilt", "drift"), [(0.0, 0.0), (0.3, 0.0), (0.3, 0.7)])

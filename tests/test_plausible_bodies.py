@@ -73,7 +73,7 @@ class BallOnPlate(jj.Scene):
         o = 0.0 * pose.t
         velocity = jnp.stack([o, o + self.belt, o + self.stated_rise])
         plate = jj.Plane(jnp.stack([o, o, self.rise * pose.t]), self.turn * pose.t, velocity, jnp.stack([o, o + self.stated_turn, o]))
-        return {"plate": jj.ball_contact(pose["ball"], 0.1, plane=plate, height="row")}
+        return {"plate": jj.ball_contact(pose["ball"], 0.1, ground=plate, height="row")}
 
 
 @pytest.mark.parametrize("motion", [{}, {"belt": 1.0}, {"rise": 0.3, "stated_rise": 0.3}, {"turn": 0.2, "stated_turn": 0.2}])

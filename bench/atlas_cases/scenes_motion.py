@@ -199,4 +199,4 @@ class SwitchedTurntable(jj.Scene):
 
     def contacts(self, pose):
         turning = -2.0 * jnp.tanh(3.0 * (pose.t - 1.0))
-        return {"table": jj.ball_contact(pose["ball"], 0.05, plane=jj.Plane(angular_velocity=turning * jnp.array([0.0, 0.0, 1.0])))}
+        return {"table": jj.ball_contact(pose["ball"], 0.05, ground=jj.Plane(angular_velocity=turning * jnp.array([0.0, 0.0, 1.0])))}

@@ -5,7 +5,7 @@ from functools import cached_property
 from itertools import chain
 
 from jourdain_jax.build.event_names import names_of_events, names_of_invariants
-from jourdain_jax.build.structure import Structure, structure_of
+from jourdain_jax.build.structure import structure_of
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
@@ -134,7 +134,7 @@ def build(scene: Scene | BuiltFor) -> Built:
     program = found if isinstance(found, Lowered) else None
     return Built(
         scene=scene,
-        rows=_rows(known),
+        rows=Rows(known.row_names, known.rank, known.redundant_rows, known.may_set_in, known.rank_losses, known.affine, known.homogeneous),
         freedoms=Freedoms(
             tuple(names[i] for i in known.independent),
             tuple(name for i, name in enumerate(names) if i not in known.independent),
@@ -149,7 +149,3 @@ def build(scene: Scene | BuiltFor) -> Built:
         state="minimal" if known.has_minimal_state else "full",
         events=names_of_events(scene),
     )
-
-
-def _rows(known: Structure) -> Rows:
-    return Rows(known.row_names, known.rank, known.redundant_rows, known.may_set_in, known.rank_losses, known.affine, known.homogeneous)

@@ -61,7 +61,7 @@ class BallOnTurntable(Scene):
     def contacts(self, pose):
         normal = self._axes()[2]
         table = Plane(tilt=self.tilt, angular_velocity=self.turn_rate * normal)
-        return {"table": ball_contact(pose["ball"], self.radius, plane=table)}
+        return {"table": ball_contact(pose["ball"], self.radius, ground=table)}
 
     def visuals(self, pose):
         axes, width = self._axes().T, 0.2 * self.radius

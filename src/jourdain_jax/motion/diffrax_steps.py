@@ -41,12 +41,10 @@ class Diffrax(Integrator):
 
     @property
     def name(self) -> str:
-        """The solver, as it stands in a trajectory."""
         return type(self.solver).__name__
 
     @property
     def mode(self) -> Literal["forward", "reverse", "any"]:
-        """The mode of differentiation that it supports."""
         if isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint):
             return "reverse"
         return "forward" if isinstance(self.adjoint, diffrax.ForwardMode) else "any"
@@ -56,7 +54,6 @@ class Diffrax(Integrator):
         return "a solver, a controller or an adjoint of diffrax was asked for"
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
-        """One motion."""
         field, args, y0 = setup.field, begun.args, begun.y0
         origin = args[4]
         t0, t1, ts, knots = setup.t0 - origin, setup.t1 - origin, setup.ts - origin, setup.knots

@@ -47,12 +47,10 @@ class OwnSteps(Integrator):
 
     @property
     def name(self) -> str:
-        """The solver, as it stands in a trajectory."""
         return self.solver.__name__ if self.order is None else "Taylor"
 
     @property
     def mode(self) -> Literal["forward", "reverse"]:
-        """The mode of differentiation that it supports."""
         return self.kind
 
     def reason_against_machine_code(self, setup: Setup) -> str:
@@ -62,7 +60,6 @@ class OwnSteps(Integrator):
         return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names))
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
-        """One motion."""
         return self._by_either(_by_xla, lambda f: f, setup, begun)
 
     def lanes_solved(self, setups: Setup, begun: Begun) -> Solved:

@@ -55,7 +55,7 @@ class Contact(eqx.Module):
             advice = "; write ground=..." if isinstance(plane, get_args(Ground)) else ""
             raise ValueError(f"`plane` of the contact of `{self.body}` is {described(plane)}, expected a `jj.Plane(...)`, or None for z = 0 at rest{advice}")
         if ground is not None:
-            _checked_ground(ground, "ground", self.body)
+            _checked_ground(ground, self.body)
         if shape is not None and not isinstance(shape, get_args(Shape)):
             advice = "leave it away, and state the body's look in `visuals`"
             raise ValueError(f"`shape` of the contact of `{self.body}` is {described(shape)}, expected what `ball_contact` and its like fill in; {advice}")
@@ -77,21 +77,20 @@ def ball_contact(
     *,
     centre=None,
     ground: Ground | None = None,
-    plane: Plane | None = None,
     height: str = "coordinates",
     carried: tuple[str, ...] | None = None,
 ) -> Contact:
     """Rolling of a ball on a ground, without slip; the contact point is `c - a n`.
 
     - `body`: `pose["name"]`; `radius` a in m. `centre` c (3,) of the ball in m, body frame (default: the mass centre).
-    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest); `plane`: another word for it.
+    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
     - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
       `height="coordinates"`.
 
     Two velocity rows (m/s), along the ground's tangents. ValueError for an unknown height, or a ball that does not fit into the cylinder or sphere.
     """
-    ground = _checked(body, ground, plane, height)
+    ground = _checked(body, ground, height)
     radius = positive_length(radius, f"radius of the contact of `{body.name}`")
     _room(body, ground, radius, "radius")
     return _rolling(body, Ball(_centre(body, centre), radius), ground, height, carried)
@@ -103,7 +102,6 @@ def ellipsoid_contact(
     *,
     centre=None,
     ground: Ground | None = None,
-    plane: Plane | None = None,
     height: str = "coordinates",
     carried: tuple[str, ...] | None = None,
 ) -> Contact:
@@ -111,14 +109,14 @@ def ellipsoid_contact(
 
     - `body`: `pose["name"]`; `semi_axes` (a, b, c) in m, along the axes of its body frame. `centre` (3,) of the ellipsoid in m, body frame (default: the
       mass centre).
-    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest); `plane`: another word for it.
+    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
     - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
       `height="coordinates"`.
 
     Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown height. On all but planes the point is found by Newton's method.
     """
-    ground = _checked(body, ground, plane, height)
+    ground = _checked(body, ground, height)
     semi_axes = checked_real(semi_axes, f"semi-axes of the contact of `{body.name}`", (3,), advice="give three lengths, m")
     if not is_traced(semi_axes) and not np.all(np.asarray(semi_axes) > 0):
         raise ValueError(f"semi-axes of the contact of `{body.name}` are {np.asarray(semi_axes).tolist()} m, expected positive numbers; give three lengths")
@@ -132,7 +130,6 @@ def disc_contact(
     axis: str = "y",
     centre=None,
     ground: Ground | None = None,
-    plane: Plane | None = None,
     height: str = "coordinates",
     carried: tuple[str, ...] | None = None,
 ) -> Contact:
@@ -142,14 +139,14 @@ def disc_contact(
     a disc lying flat.
 
     - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z". `centre` c (3,) in m, body frame (default: the mass centre).
-    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest); `plane`: another word for it.
+    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
     - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
       `height="coordinates"`.
 
     Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown axis or height. On a plane and a sphere the point is in closed form.
     """
-    return _wheel(body, radius, None, axis, centre, _checked(body, ground, plane, height), height, carried)
+    return _wheel(body, radius, None, axis, centre, _checked(body, ground, height), height, carried)
 
 
 def wheel_contact(
@@ -160,7 +157,6 @@ def wheel_contact(
     axis: str = "y",
     centre=None,
     ground: Ground | None = None,
-    plane: Plane | None = None,
     height: str = "coordinates",
     carried: tuple[str, ...] | None = None,
 ) -> Contact:
@@ -171,7 +167,7 @@ def wheel_contact(
 
     - `body`: `pose["name"]`; `radius` R and `tyre` r in m, `0 <= r < R`; `axis`: the body axis k, "x", "y" or "z". `centre` c (3,) in m, body frame
       (default: the mass centre).
-    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest); `plane`: another word for it.
+    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
     - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
     - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
       `height="coordinates"`.
@@ -179,7 +175,7 @@ def wheel_contact(
     Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown axis or height. On a plane and a sphere the point is in closed form.
     """
     tyre = checked_real(tyre, "tyre of a wheel's contact", ())
-    return _wheel(body, radius, tyre, axis, centre, _checked(body, ground, plane, height), height, carried)
+    return _wheel(body, radius, tyre, axis, centre, _checked(body, ground, height), height, carried)
 
 
 def _wheel(body, radius, tyre, axis, centre, ground, height, carried) -> Contact:
@@ -204,25 +200,20 @@ def _centre(body: BodyPose, centre) -> Float[Array, "3"]:
     return body.place(checked_real(centre, f"centre of the contact of `{body.name}`", (3,), advice="give three components in its body frame, m"))
 
 
-def _checked(body, ground, plane, height: str) -> Ground:
+def _checked(body, ground, height: str) -> Ground:
     """The ground of the contact of a body that can roll; a ValueError otherwise."""
     _checked_height(height)
     if not isinstance(body, BodyPose):
         raise ValueError(f'the body of a contact is {described(body)}, expected the pose of a body; write pose["name"]')
     if not isinstance(body.body, RigidBody):
         raise ValueError(f"body `{body.name}` of a contact is a particle, which cannot roll; make it a `jj.RigidBody`")
-    if ground is not None and plane is not None:
-        raise ValueError(f"the contact of `{body.name}` has both a `ground` and a `plane`, expected one of them; leave one away")
-    name, given = ("plane", plane) if ground is None else ("ground", ground)
-    if given is None:
-        return Plane()
-    return _checked_ground(given, name, body.name)
+    return Plane() if ground is None else _checked_ground(ground, body.name)
 
 
-def _checked_ground(given, name: str, body: str) -> Ground:
+def _checked_ground(given, body: str) -> Ground:
     if not isinstance(given, get_args(Ground)):
-        known = "`jj.Plane(...)`" if name == "plane" else "`jj.Plane(...)`, `jj.Cylinder`, `jj.Sphere`, `jj.Surface` or `jj.HeightMap`"
-        raise ValueError(f"`{name}` of the contact of `{body}` is {described(given)}, expected a {known}, or None for z = 0 at rest")
+        known = "`jj.Plane(...)`, `jj.Cylinder`, `jj.Sphere`, `jj.Surface` or `jj.HeightMap`"
+        raise ValueError(f"`ground` of the contact of `{body}` is {described(given)}, expected a {known}, or None for z = 0 at rest")
     return given
 
 

@@ -217,7 +217,8 @@ def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:
 def _next_retries(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int[np.ndarray, "lanes"]:
     """In which ways each lane is run again, those it was run in already included; AS_ASKED: it is not."""
     own_times = isinstance(starts, State) and options.get("t0") is None
-    begun = np.broadcast_to(np.asarray(starts.t if own_times else _first_time(options)), lanes.result.shape)
+    first = 0.0 if options.get("t0") is None else options["t0"]
+    begun = np.broadcast_to(np.asarray(starts.t if own_times else first), lanes.result.shape)
     found = np.full(lanes.result.shape, results.AS_ASKED)
     for tried in np.unique(lanes.fallback).tolist():
         field = _form(scene, options | retry_options(tried, options))
@@ -275,10 +276,6 @@ def _with_arrays(options: dict) -> dict:
     real = jnp.result_type(float)
     warn_float32(real, options["rtol"])
     return options | {name: checked_real(value, f"`{name}`", None if name == "ts" else ()).astype(real) for name, value in numbers.items()}
-
-
-def _first_time(options: dict):
-    return 0.0 if options.get("t0") is None else options["t0"]
 
 
 def _lanes(scene: Scene, starts, parameters: dict):

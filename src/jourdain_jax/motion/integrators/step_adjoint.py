@@ -34,7 +34,7 @@ def step_vjp(problem_of: Callable[[PyTree], Problem], shared: PyTree, method: Me
     by_t_1 = jnp.zeros_like(t_1)
     by_shared = jax.tree.map(jnp.zeros_like, shared)
     if problem.project is not None:
-        by_t_1, g, by_shared = jax.vjp(lambda t, y, shared: _projected(problem_of(shared), t, y), t_1, y_1, shared)[1](g)
+        by_t_1, g, by_shared = jax.vjp(lambda t, y, shared: (p := problem_of(shared)).project(t, y, p.args), t_1, y_1, shared)[1](g)
 
     def stage(carry, row):
         G, by_shared, by_t, by_h = carry
@@ -58,10 +58,6 @@ def step_vjp(problem_of: Callable[[PyTree], Problem], shared: PyTree, method: Me
 def product(g: PyTree, f: PyTree, lane_axes: int) -> Float[Array, "*lanes"]:
     """Sum of g f over all but the last axes."""
     return sum(jnp.sum(a * b, axis=tuple(range(a.ndim - lane_axes))) for a, b in zip(jax.tree.leaves(g), jax.tree.leaves(f), strict=True))
-
-
-def _projected(problem: Problem, t, y: PyTree) -> PyTree:
-    return problem.project(t, y, problem.args)
 
 
 def _rates(problem: Problem, t, y: PyTree) -> PyTree:

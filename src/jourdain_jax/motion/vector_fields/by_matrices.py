@@ -42,7 +42,6 @@ class ByMatrices(VectorField):
         return rate_of_work(scene, motion, found, self.of_inputs) if self.with_work else None
 
     def project(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
-        """The state put back onto geometric rows, quaternion norms and (full state) velocity rows."""
         q = project_positions(scene, t, y.q, iterations=2, typical=self.usual.closures) if self.projects_positions else y.q
         if not self.projects_speeds:
             return Integrated(q, y.v, y.work)
@@ -60,7 +59,6 @@ class MinimalByMatrices(ByMatrices):
         return True
 
     def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
-        """Coordinates and all speeds."""
         return y.q, speeds_from_privileged(scene, self.independent, t, y.q, y.v, inputs)
 
     def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
@@ -85,7 +83,6 @@ class FullByMatrices(ByMatrices):
 
     @property
     def reduction_name(self) -> str:
-        """Name of the reduction, as it stands in a trajectory."""
         if self.own_equations:
             return f"none, {self.own_equations}"
         return super().reduction_name if self.cutoff is None else f"{super().reduction_name}, cut-off {self.cutoff:.0e}"
@@ -101,7 +98,6 @@ class FullByMatrices(ByMatrices):
         return self.may_branch
 
     def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
-        """Coordinates and all speeds."""
         return y.q, y.v
 
     def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:

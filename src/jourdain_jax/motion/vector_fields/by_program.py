@@ -22,12 +22,10 @@ class ByProgram(VectorField):
 
     @property
     def reduction_name(self) -> str:
-        """Name of the reduction, as it stands in a trajectory."""
         return f"{super().reduction_name}, lowered"
 
     @property
     def lowers_events(self) -> bool:
-        """Whether stop events are part of the scalar program."""
         return bool(self.program.events)
 
     @property
@@ -40,7 +38,6 @@ class ByProgram(VectorField):
         return self.program.fixed_values(scene)
 
     def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
-        """Coordinates and all speeds."""
         return y.q, self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
 
     def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
@@ -48,11 +45,9 @@ class ByProgram(VectorField):
         return Observed(y.q, *self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs))
 
     def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
-        """Kinetic and potential energy, J; numbers to differentiation."""
         return self.program.energy_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
-        """Values of the stop events, in the order of their names; lanes only where `lowers_events`."""
         if self.program.events:
             return self.program.event_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
         return super().events(scene, fixed, t, y, inputs)
