@@ -68,6 +68,11 @@ def checked_unless_traced(value, what: str, shape: tuple[int, ...] | None = None
     return checked_known(value, what, shape, advice=advice)
 
 
+def as_array(x, dtype):
+    """An array of this type: on NumPy where its numbers are known, of JAX where they are traced."""
+    return (jnp if is_traced_type(type(x)) else np).asarray(x, dtype)
+
+
 def _check(array, what: str, shape: tuple[int, ...] | None, advice: str) -> None:
     if array.dtype.kind not in "iuf" and not jnp.issubdtype(array.dtype, jnp.integer) and not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(f"{what} is of type {array.dtype}, expected real numbers; {advice}")

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.reals import checked_unless_traced, described, is_traced, real_type
+from jourdain_jax.calculus.reals import as_array, checked_unless_traced, described, is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, inputs_at
 from jourdain_jax.motion.start import State, named_start
 from jourdain_jax.scene.scene import Scene
@@ -97,7 +97,7 @@ def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs):
         ts = t0 + (t1 - t0) * _EVEN  # of known ends: nothing to compile
     elif not is_traced(ts, t0, t1):
         check_times(ts, t0, t1)
-    return start, *((jnp if is_traced(x) else np).asarray(x, real) for x in (t0, ts, t1))
+    return start, *(as_array(x, real) for x in (t0, ts, t1))
 
 
 def as_end(name: str, value):

@@ -60,7 +60,7 @@ _AN_ARRAY = object()
 def _parted(tree) -> tuple[list, tuple]:
     """The arrays of a tree, and what is left of it."""
     leaves, treedef = jax.tree.flatten(tree)
-    return [x for x in leaves if is_array_type(type(x))], (treedef, tuple(_AN_ARRAY if is_array_type(type(x)) else x for x in leaves))
+    return [x for x in leaves if is_array_type(type(x))], (treedef, tuple([_AN_ARRAY if is_array_type(type(x)) else x for x in leaves]))
 
 
 def _whole(arrays, treedef, rest):

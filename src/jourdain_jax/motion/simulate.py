@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.calculus.reals import Number, is_traced
+from jourdain_jax.calculus.reals import Number, as_array, is_traced
 from jourdain_jax.motion.arguments import check_options, span_and_start
 from jourdain_jax.motion.diffrax_steps import Diffrax
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
@@ -149,7 +149,7 @@ def _set_up(
     if integrator is None:
         adjoint = _REVERSE if adjoint is None else adjoint
         integrator = Diffrax(solver, stepsize_controller, adjoint, None if saveat is None else _checked_saveat(saveat), **static)
-    tolerances = tuple((jnp if is_traced(x) else np).asarray(x, start.q.dtype) for x in (rtol, atol))  # arrays: another tolerance is no other program
+    tolerances = tuple(as_array(x, start.q.dtype) for x in (rtol, atol))  # arrays: another tolerance is no other program
     first_step = _first_step(solver, dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
     later = None
     if formulation.projects:

@@ -21,7 +21,7 @@ from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileg
 from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.inputs import as_inputs
+from jourdain_jax.motion.inputs import Inputs, as_inputs
 from jourdain_jax.motion.vector_fields.by_matrices import FullByMatrices, MinimalByMatrices
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import VectorField
@@ -92,9 +92,10 @@ def as_formulation(formulation) -> Formulation:
 
 def vector_field(scene: Scene, formulation: Formulation | None = None, work: bool = True, backend: str = "auto", inputs=None) -> VectorField:
     """What is integrated of a scene; the arguments are those of `simulate`."""
-    formulation, constant = as_formulation(formulation), as_inputs(scene, inputs).constant
-    if formulation.reduction is None and formulation.baumgarte is None and isinstance(backend, str):
-        return _once(scene, formulation.state, formulation.stabilisation, work, backend, constant)
+    formulation, constant = as_formulation(formulation), (inputs if isinstance(inputs, Inputs) else as_inputs(scene, inputs)).constant
+    stabilisation = formulation.stabilisation
+    if formulation.reduction is None and not isinstance(stabilisation, Baumgarte) and isinstance(backend, str):
+        return _once(scene, formulation.state, stabilisation, work, backend, constant)
     return _vector_field(scene, formulation, work, backend, constant)
 
 
