@@ -24,10 +24,10 @@ LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", 
 
 # What takes longest for its number of tests, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
 LONGEST = """
-identify simulate every_model mutants sensors native quality along_batches lowering what_probes_do_not_show stiff readme linearize kept_parts build
-contacts_on_surfaces study_faults generated_scenes watched_between_saves studies from_sympy atlas rattleback feasible_starts knots log_density
-native_derivatives power program events_in_one_step probed cluster malformed_inputs rollout fit_profiles call_costs labelled whipple_bicycle
-structure_preserving traced_parameters notebooks bicycle_stability
+identify native sensors mutants linearize native_derivatives call_costs feasible_starts simulate what_probes_do_not_show studies readme from_sympy stiff
+lowering malformed_inputs build labelled fit_profiles rollout program knots power log_density whipple_bicycle events_in_one_step along_batches study_faults
+every_model probed kept_parts bicycle_stability generated_scenes contacts_on_surfaces watched_between_saves traced_parameters quality structure_preserving
+rattleback atlas cluster notebooks
 """
 
 
