@@ -22,6 +22,7 @@ from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows
 from jourdain_jax.native import disk
 from jourdain_jax.program.interpret import inner_jaxpr, own_rule
+from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
@@ -43,19 +44,36 @@ def kept_of_scene(kind: str, scene: Scene, find: Callable[[], bytes], of_inputs:
 
 def name_of(kind: str, scene: Scene, of_inputs: tuple[int, ...], more: tuple) -> str | None:
     """The name of what is found of a scene (arguments as of `kept_of_scene`); None where something in the scene has no name of its own."""
-    closed, shape = jaxpr_of_scene(scene, of_inputs)
-    labels = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(shape)]
     leaves = [(jax.tree_util.keystr(path), np.asarray(x)) for path, x in jax.tree_util.tree_leaves_with_path(scene)]
     names = scene.coordinate_names.entries, scene.speed_names.entries, scene.inputs.entries, scene.coordinates.quaternions
     named_rows = names_of_rows(scene), names_of_position_rows(scene), [(name, str(about.get("unit"))) for name, _, about in parameters_of(scene)]
     stated = type(scene).__name__, scene.conventions, scene.privileged, coordinate_bounds(scene), speed_bounds(scene), float(scene.example_span), seen_of(scene)
+    traced = _digest_of_trace(scene, of_inputs)
+    if traced is None:
+        return None
     try:
-        digest = hashlib.sha256(_source())
-        for part in _parts((kind, jax.__version__, np.__version__, real_type(), closed, labels, leaves, names, named_rows, stated, more)):
-            digest.update(part)
+        digest = _digest(_source(), (kind, jax.__version__, np.__version__, real_type(), traced, leaves, names, named_rows, stated, more))
     except _Nameless:
         return None
-    return f"{kind}_{digest.hexdigest()[:32]}"
+    return f"{kind}_{digest.hex()[:32]}"
+
+
+@once_per_class
+def _digest_of_trace(scene: Scene, of_inputs: tuple[int, ...]) -> bytes | None:
+    """Of what was traced of a scene; None where something in it has no name of its own."""
+    closed, shape = jaxpr_of_scene(scene, of_inputs)
+    labels = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(shape)]
+    try:
+        return _digest(b"", (closed, labels))
+    except _Nameless:
+        return None
+
+
+def _digest(begun: bytes, x) -> bytes:
+    digest = hashlib.sha256(begun)
+    for part in _parts(x):
+        digest.update(part)
+    return digest.digest()
 
 
 @cache

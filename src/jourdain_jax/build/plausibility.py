@@ -19,7 +19,7 @@ from jourdain_jax.scene.motion_state import Pose
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of
 
-_TOLERANCE = 1e-4  # relative: constants may be typed with a few digits, mistakes are larger
+TOLERANCE = 1e-4  # relative: constants may be typed with a few digits, mistakes are larger
 _ROUNDED = 1e-2  # relative: of thin wheels the last moment is the sum of the others, and published moments have three digits
 
 
@@ -94,7 +94,7 @@ def impossible_bodies(scene: Scene, q) -> tuple[str, ...]:
         if inertia is not None:
             found.append(_of_inertia(what, inertia[None]))
             least, middle, largest = np.linalg.eigvalsh(inertia)
-            if least > _TOLERANCE * largest and largest > (1 + _ROUNDED) * (least + middle):
+            if least > TOLERANCE * largest and largest > (1 + _ROUNDED) * (least + middle):
                 found.append(
                     f"{what} has principal moments of inertia {least:.4g}, {middle:.4g} and {largest:.4g} kg m^2, the last above the sum of the others: no "
                     "distribution of mass has them; bound the parameters of its inertia, or free fewer"
@@ -112,7 +112,7 @@ def _is_negative(I) -> Bool[Array, ""]:
     """Whether a symmetric matrix has an eigenvalue below zero: by its principal minors."""
     I = jax.lax.stop_gradient(I)
     size = jnp.max(jnp.abs(I))
-    I = I / jnp.where(size > 0, size, 1.0) + _TOLERANCE * jnp.eye(3, dtype=I.dtype)
+    I = I / jnp.where(size > 0, size, 1.0) + TOLERANCE * jnp.eye(3, dtype=I.dtype)
     minors = [I[i, i] for i in range(3)] + [I[i, i] * I[j, j] - I[i, j] * I[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
     whole = sum(I[0, i] * (I[1, (i + 1) % 3] * I[2, (i + 2) % 3] - I[1, (i + 2) % 3] * I[2, (i + 1) % 3]) for i in range(3))
     return jnp.any(jnp.stack([*minors, whole]) < 0)
@@ -146,10 +146,10 @@ def _of_mass(what: str, mass: np.ndarray) -> str:
 def _of_inertia(what: str, I: np.ndarray) -> str:
     I = _finite(I)
     size = np.max(np.abs(I), axis=(1, 2), initial=np.finfo(float).tiny)
-    if np.any(np.max(np.abs(I - np.swapaxes(I, 1, 2)), axis=(1, 2), initial=0.0) > _TOLERANCE * size):
+    if np.any(np.max(np.abs(I - np.swapaxes(I, 1, 2)), axis=(1, 2), initial=0.0) > TOLERANCE * size):
         return f"{what} has an inertia that is not symmetric; give the same products of inertia above and below the diagonal"
     least = np.linalg.eigvalsh(I)[:, 0]
-    if np.any(least < -_TOLERANCE * size):
+    if np.any(least < -TOLERANCE * size):
         return f"{what} has a principal moment of inertia of {least.min():.4g} kg m^2, expected none below zero; check signs and products of inertia"
     return ""
 
@@ -157,7 +157,7 @@ def _of_inertia(what: str, I: np.ndarray) -> str:
 def _of_orientation(what: str, R: np.ndarray) -> str:
     R = _finite(R)
     off = np.max(np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)), initial=0.0)
-    if off > _TOLERANCE:
+    if off > TOLERANCE:
         return (
             f"{what} has an orientation R that is no rotation: R' R differs from the identity by {off:.2g}; build it from jj.rot_x, jj.rot_y, jj.rot_z "
             "or jj.quaternion_to_matrix"
@@ -169,7 +169,7 @@ def _of_orientation(what: str, R: np.ndarray) -> str:
 
 def _of_plane(what: str, speeds: np.ndarray) -> str:
     by_pose, by_velocity, size = _finite(speeds).T
-    off = np.abs(by_pose - by_velocity) - _TOLERANCE * size
+    off = np.abs(by_pose - by_velocity) - TOLERANCE * size
     if not np.any(off > 0):
         return ""
     k = int(np.argmax(off))
@@ -186,12 +186,12 @@ def _of_normal(what: str, squares: np.ndarray) -> str:
             "a surface needs a gradient that does not vanish, coordinates a `domain` that lies near it"
         )
     off = np.max(np.abs(np.sqrt(_finite(squares)[:, 0]) - 1), initial=0.0)
-    return f"{what} has a normal whose length differs from 1 by {off:.2g}, expected a unit vector; divide it by its length" if off > _TOLERANCE else ""
+    return f"{what} has a normal whose length differs from 1 by {off:.2g}, expected a unit vector; divide it by its length" if off > TOLERANCE else ""
 
 
 def _of_gap(what: str, gaps: np.ndarray) -> str:
     gap, size = _finite(gaps).T
-    off = np.abs(gap) - _TOLERANCE * size
+    off = np.abs(gap) - TOLERANCE * size
     if not np.any(off > 0):
         return ""
     k = int(np.argmax(off))

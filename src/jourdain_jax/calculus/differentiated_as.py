@@ -136,5 +136,6 @@ lanes_first_p.multiple_results = True
 lanes_first_p.def_impl(lambda *values: list(values))
 lanes_first_p.def_abstract_eval(lambda *avals: list(avals))
 ad.primitive_jvps[lanes_first_p] = lambda primals, tangents: (lanes_first_p.bind(*primals), list(tangents))
+ad.primitive_transposes[lanes_first_p] = lambda cotangents, *values: list(cotangents)
 batching.primitive_batchers[lanes_first_p] = _batched
 mlir.register_lowering(lanes_first_p, mlir.lower_fun(lambda *values: list(values), multiple_results=True))

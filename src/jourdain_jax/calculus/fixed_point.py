@@ -11,21 +11,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-_QUIET = 2  # steps in a row
-_ROUND_OFF = 1e3  # units of it, relative to 1 + |x|: a change
+QUIET = 2  # steps in a row
+ROUND_OFF = 1e3  # units of it, relative to 1 + |x|: a change
 
 
 def fixed_point(step: Callable, x: Float[Array, "entries"], most: int) -> Float[Array, "entries"]:
     """x after at most so many steps; what is not a number has settled."""
-    if most <= _QUIET:
+    if most <= QUIET:
         return jax.lax.scan(lambda x, _: (step(x), None), x, length=most)[0]
 
     def once(carry, _):
         x, quiet = carry
-        going = quiet < _QUIET
+        going = quiet < QUIET
         new = jax.lax.cond(eqxi.unvmap_any(going), step, lambda x: x, x)
         old_value, value = jax.lax.stop_gradient((x, new))
-        changed = jnp.any(jnp.abs(value - old_value) > _ROUND_OFF * jnp.finfo(x.dtype).eps * (1 + jnp.abs(old_value)))
-        return (jnp.where(going, new, x), jnp.where(going & changed, 0, jnp.minimum(quiet + 1, _QUIET))), None
+        changed = jnp.any(jnp.abs(value - old_value) > ROUND_OFF * jnp.finfo(x.dtype).eps * (1 + jnp.abs(old_value)))
+        return (jnp.where(going, new, x), jnp.where(going & changed, 0, jnp.minimum(quiet + 1, QUIET))), None
 
     return jax.lax.scan(once, (x, jnp.zeros((), jnp.int32)), length=most)[0][0]

@@ -20,6 +20,8 @@ from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene
 
+MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS = 25, 8
+
 
 def closure_residual(scene: Scene, t, q) -> Float[Array, "closures"]:
     """Geometric rows, and `(|quaternion|^2 - 1)/2` of every quaternion."""
@@ -28,7 +30,7 @@ def closure_residual(scene: Scene, t, q) -> Float[Array, "closures"]:
 
 
 def project_positions(
-    scene: Scene, t, q: Float[Array, "coordinates"], *, free: Bool[Array, "coordinates"] | None = None, iterations: int = 25, typical=None
+    scene: Scene, t, q: Float[Array, "coordinates"], *, free: Bool[Array, "coordinates"] | None = None, iterations: int = MOST_MOVES_OF_POSITIONS, typical=None
 ) -> Float[Array, "coordinates"]:
     """Coordinates on the geometric rows, near q; only coordinates that are `free` move. At most so many `iterations`.
 
@@ -49,12 +51,6 @@ def project_positions(
     return fixed_point(step, q, iterations)
 
 
-def position_error_of_rows(scene: Scene, t, q) -> Float[Array, ""]:
-    """Largest residual of the geometric rows; infinite where it is not a number."""
-    position_error = jnp.max(jnp.abs(closure_residual(scene, t, q)), initial=0.0)
-    return jnp.where(jnp.isfinite(position_error), position_error, jnp.inf)
-
-
 def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "coordinates"]:
     """Where there are unit norms only, what the iteration converges to: `q / |q|` of every quaternion."""
     for first, _ in scene.coordinates.quaternions:
@@ -72,7 +68,7 @@ def project_speeds(
     inputs=None,
     *,
     free: Bool[Array | np.ndarray, "speeds"] | None = None,
-    iterations: int = 8,
+    iterations: int = MOST_MOVES_OF_SPEEDS,
     cutoff: float | None = None,
     typical=None,
     affine: bool = False,

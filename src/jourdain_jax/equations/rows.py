@@ -126,20 +126,23 @@ def _velocity_residual(scene: Scene, t: Float[Array, ""], q, u, inputs):
     return flatten_rows(velocity_rows(scene, motion_at(scene, t, q, u, inputs)), q.dtype)
 
 
-@once_per_class
 def names_of_rows(scene: Scene) -> tuple[str, ...]:
     """Names of all rows, in order, without evaluating them."""
-    return _names(velocity_rows, scene)
+    return _names(scene)[0]
+
+
+def names_of_position_rows(scene: Scene) -> tuple[str, ...]:
+    """Names of the geometric rows, in order; they come first among all rows."""
+    return _names(scene)[1]
 
 
 @once_per_class
-def names_of_position_rows(scene: Scene) -> tuple[str, ...]:
-    """Names of the geometric rows, in order; they come first among all rows."""
-    return _names(lambda scene, motion: position_rows(scene, motion.pose()), scene)
+def _names(scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of all rows and of the geometric ones by tracing. They are noted inside, because JAX returns dictionaries sorted by name."""
+    names: list[tuple[str, ...]] = []
 
+    def look(scene: Scene, motion: Motion) -> None:
+        names[:] = [tuple(row_names(rows)) for rows in (velocity_rows(scene, motion), position_rows(scene, motion.pose()))]
 
-def _names(rows, scene: Scene) -> tuple[str, ...]:
-    """Names of `rows(scene, motion)` by tracing. They are noted inside, because JAX returns dictionaries sorted by name."""
-    names: list[str] = []
-    shapes_along_motion(lambda scene, motion: names.extend(row_names(rows(scene, motion))), scene)
-    return tuple(names)
+    shapes_along_motion(look, scene)
+    return names[0], names[1]

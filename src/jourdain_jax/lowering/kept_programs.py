@@ -8,6 +8,7 @@ from jourdain_jax.build.trace import Variables
 from jourdain_jax.calculus.plain_text import as_text, from_text
 from jourdain_jax.lowering.lowered import Lowered, Stage
 from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.part import part
 
 _NODES = ("qdot", "ydot", "z", "pivots", "sizes", "guards", "events", "energies", "projected_q", "projected_u", "fixed")  # fields that are tuples of nodes
 _OTHERS = {"traced", "power", "stages", "usual", "states"}
@@ -21,10 +22,8 @@ def program_as_text(found: Lowered) -> bytes:
     needed = [*variables, *outputs, *power, *found.usual, *found.usual.values(), *found.states]
     if graph.calls(needed):
         return b""
-    kept = [graph.zero, graph.one, *(n for n in graph.reachable(needed) if n > graph.one)]  # in the old order, so that no sum is turned round
-    place = {n: k for k, n in enumerate(kept)}
-    rows = [(graph.op[n], [place[a] for a in graph.args[n]], graph.value[n], graph.varies[n]) for n in kept]
-    nodes = np.array([place.get(n, -1) for n in range(len(graph.op))], np.int64)
+    rows, nodes = part(graph, needed)
+    place = nodes.tolist()
     told = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in _OTHERS}
     told |= {name: tuple(place[n] for n in told[name]) for name in _NODES}
     told["power"] = None if found.power is None else place[found.power]

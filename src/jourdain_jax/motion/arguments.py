@@ -30,10 +30,11 @@ _KINDS = {
 }
 
 
-def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None) -> State:
+def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None, native: bool | None = None) -> State:
     """A state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
 
     `inputs`: the scene's inputs at that instant, a vector or by name (default: zero); they count where velocity rows depend on them.
+    `native`: whether machine code of our own may put it onto the rows, as in `put_on_rows`.
     """
     if isinstance(given, State):
         return given
@@ -42,7 +43,7 @@ def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None) -
             f"`{what}` is {described(given)}, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None for the "
             "scene's example"
         )
-    return named_start(scene, scene.example if given is None else given, t0, inputs)
+    return named_start(scene, scene.example if given is None else given, t0, inputs, native)
 
 
 def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, switches: dict | None = None, **objects) -> None:
@@ -79,7 +80,7 @@ def _meant(value, kind: type) -> str:
     return f"diffrax.{members[near[0]]}()" if near else ""
 
 
-def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs):
+def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs, native: bool | None = None):
     """The start as a state (with the inputs at t0), t0, the times to save at, t1; a ValueError where they are known and do not go together."""
     real = real_type()
     if isinstance(start, State) and start.q.ndim != 1:
@@ -90,7 +91,7 @@ def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs):
         t0 = as_end("t", start.t if isinstance(start, State) else 0.0)
     if t1 is None:
         t1 = t0 + scene.example_span if ts is None else ts[-1]
-    start = as_state(scene, start, t0=t0, inputs=None if isinstance(start, State) else inputs_at(inputs, t0))
+    start = as_state(scene, start, t0=t0, inputs=None if isinstance(start, State) else inputs_at(inputs, t0), native=native)
     if not is_traced(t0, t1):
         check_span(t0, t1)
     if ts is None:

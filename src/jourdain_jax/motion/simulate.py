@@ -28,7 +28,7 @@ from jourdain_jax.motion.quick_compilation import nothing_is_traced
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Setup
-from jourdain_jax.motion.start import State, consistent, yet_to_be_moved
+from jourdain_jax.motion.start import State, put_on_rows, yet_to_be_moved
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.choice import Formulation, as_formulation, vector_field
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
@@ -138,8 +138,10 @@ def _set_up(
     _check_adjoint(adjoint)
     check_solver(solver, stepsize_controller, dt0, saveat)
     made_here = not isinstance(start, State)
+    by_default = all(x is None for x in objects.values())
+    native = (True if by_default else None) if backend in ("auto", "native") else False  # with what is diffrax's, only numbers: the rest can be exported
     inputs = as_inputs(scene, inputs)
-    start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs)
+    start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs, native=native)
     field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
     warn_float32(start.q.dtype, rtol)
     if solver is None:
@@ -154,9 +156,9 @@ def _set_up(
     later = None
     if formulation.projects:
         if not made_here and nothing_is_traced():
-            later = yet_to_be_moved(scene, start)
+            later = yet_to_be_moved(scene, start, native is not False)
         else:
-            start = _on_constraints(scene, t0, start, inputs, made_here)
+            start = _on_constraints(scene, t0, start, inputs, made_here, native)
     setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, integrator, later)
     if backend == "native" and (reason := setup.reason_against_machine_code):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
@@ -185,16 +187,16 @@ def _check_adjoint(adjoint) -> None:
         )
 
 
-def _on_constraints(scene: Scene, t0, start: State, inputs: Inputs, made_here: bool) -> State:
+def _on_constraints(scene: Scene, t0, start: State, inputs: Inputs, made_here: bool, native: bool | None) -> State:
     """The start on the constraints, with how far it has moved from what was given; one made here is there already, unless what was given kept it off."""
 
     def moved_again(start: State) -> State:
-        state = consistent(scene, t0, start.q, start.u, inputs_at(inputs, t0))
+        state = put_on_rows(scene, t0, start.q, start.u, inputs_at(inputs, t0), native=native)
         moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
         return eqx.tree_at(lambda s: (s.moved_q, s.moved_u), state, tuple(moved))
 
     if not made_here:
-        return consistent(scene, t0, start.q, start.u, inputs_at(inputs, t0))
+        return put_on_rows(scene, t0, start.q, start.u, inputs_at(inputs, t0), native=native)
     if is_traced(start.residual):
         off = start.residual > _OFF * jnp.finfo(start.q.dtype).eps
         # worked out once more on the way back of a derivative: what would be kept for it, of a branch that is rarely taken, costs as much as the start itself

@@ -5,6 +5,7 @@ g(t, q) = 0,  phi(t, q, u) = 0
 
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import lru_cache
 
 import equinox as eqx
@@ -15,16 +16,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.build.domain import coordinate_bounds
-from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.sampling import NoStateFoundError, seen_on_rows
-from jourdain_jax.build.structure import Structure, closure_lengths, plain_row_lengths, rows_are_affine, structure_of, usual_rows
+from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.damped import damped_root
 from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, is_traced, real_type
 from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.projection import closure_residual, position_error_of_rows, project_positions, project_speeds
+from jourdain_jax.equations.projection import closure_residual, project_positions
 from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs, inputs_at
+from jourdain_jax.motion.put_on_rows import Usual, put_positions, put_speeds, usual_sizes
 from jourdain_jax.motion.quick_compilation import RUN_SELDOM, nothing_is_traced, quickly_compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
@@ -80,6 +81,11 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
     Differentiable in any mode. What cannot be met stays in `residual`, which is infinite where numbers are not finite (no error: this also runs
     inside jit and vmap); the quaternion (0, 0, 0, 0) has no direction and stays as it is, with a residual of 1/2. ValueError for wrong shapes.
     """
+    return put_on_rows(scene, t, q, u, inputs, held=held)
+
+
+def put_on_rows(scene: Scene, t, q, u, inputs, *, held: tuple[str, ...] = (), native: bool | None = None) -> State:
+    """As `consistent`; `native`: whether machine code of our own may do it (None: to numbers, so that what is traced can be exported)."""
     t, q, u = _as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     inputs = _as_input_vector(scene, inputs, q.dtype)
     coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
@@ -87,7 +93,7 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
         if name not in coordinates + speeds:
             raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, coordinates + speeds)}")
     free_q, free_u = _free(coordinates, tuple(held)), _free(speeds, tuple(held))
-    return _consistent(scene, t, q, u, inputs, free_q, free_u, lambda: np.zeros((0, q.shape[0]), q.dtype))
+    return _consistent(scene, t, q, u, inputs, free_q, free_u, lambda: np.zeros((0, q.shape[0]), q.dtype), native=native)
 
 
 @lru_cache(maxsize=1024)
@@ -96,19 +102,21 @@ def _free(names: tuple[str, ...], held: tuple[str, ...]) -> Bool[np.ndarray, "en
     return np.array([name not in held for name in names], bool)
 
 
-def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable, determined: bool = False) -> State:
+def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable, *, native: bool | None, determined: bool = False) -> State:
     """The nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`.
 
-    `determined`: rows determine the speeds that are free.
+    `determined`: rows determine the speeds that are free; `native`: as in `put_on_rows`.
     """
-    arguments = (scene, t, q, u, inputs, free_q, free_u, _usual(scene, determined))
-    if not nothing_is_traced() and is_traced(arguments):
+    given = scene, t, q, u, inputs, free_q, free_u
+    traced = not nothing_is_traced() and is_traced(given)
+    arguments = *given, usual_sizes(scene, determined, not traced if native is None else native)
+    if traced:
         return _put_onto_constraints(*arguments, guesses()).state
     # numbers are put onto the rows at once, also where a function around this call is being traced; elsewhere that would compile constants one by one
     with nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval():
         found = _compiled_projection(*arguments, None)
         if not np.asarray(found.arrived) and _can_search(scene):  # rare, and long to compile
-            found = jax.tree.map(jnp.asarray, _uncompiled_projection(*arguments, guesses()))
+            found = jax.tree.map(jnp.asarray, _uncompiled_projection(*given, replace(arguments[-1], program=None), guesses()))
     return found.state
 
 
@@ -129,40 +137,10 @@ class Found(eqx.Module):
     arrived: Bool[Array, ""]  # whether the coordinates did, and are within reach of the domain
 
 
-class Usual(eqx.Module):
-    """Sizes by which rows and coordinates are measured, and of what kind rows are."""
-
-    closures: Float[Array | np.ndarray, "closures"]
-    rows: Float[Array | np.ndarray, "rows"]  # in scaled speeds; where rows determine the speeds that are free, in the speeds as they are
-    width: Float[Array | np.ndarray, "coordinates"]  # of the domain
-    affine: bool = eqx.field(static=True)  # rows are, in the speeds
-    determined: bool = eqx.field(static=True)  # rows determine the speeds that are free
-
-
-def _worked_out(scene: Scene, determined: bool) -> Usual:
-    low, high = coordinate_bounds(scene)
-    width = np.where(high > low, high - low, 1.0).astype(real_type())
-    try:
-        rows = plain_row_lengths(scene) if determined else usual_rows(scene).lengths
-        return Usual(closure_lengths(scene), rows, width, rows_are_affine(scene), determined)
-    except ValueError:  # of a scene that is wrong in itself; said where its structure is asked for
-        norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
-        return Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, False, False)
-
-
-def _as_arrays(scene: Scene, determined: bool) -> Usual:
-    found = _worked_out(scene, determined)  # on NumPy; what it traces must not be computed at once
-    with jax.ensure_compile_time_eval():
-        return jax.tree.map(jnp.asarray, found)  # kept, and handed over in a fifth of the time that arrays of NumPy take
-
-
-_usual = once_per_values(_as_arrays, of_traced=_worked_out)
-
-
-def yet_to_be_moved(scene: Scene, start: State) -> Usual:
+def yet_to_be_moved(scene: Scene, start: State, native: bool) -> Usual:
     """What `moved_onto_rows` needs of a scene whose numbers are known; a ValueError where the state is none of this scene."""
     as_coordinates(scene, start.q), as_speeds(scene, start.u)
-    return _usual(scene, False)
+    return usual_sizes(scene, False, native)
 
 
 def moved_onto_rows(scene: Scene, t, start: State, inputs, usual: Usual) -> Found:
@@ -178,15 +156,16 @@ def _can_search(scene: Scene) -> bool:
 def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: Usual, guesses) -> Found:
     """q and u on the constraints; no search where `guesses` is None."""
     q, u, free = jnp.asarray(q), jnp.asarray(u), jnp.asarray(free_q)
-    near_q, guess = project_positions(scene, t, q, free=free, typical=usual.closures), jnp.zeros((), jnp.int32)
-    arrived = _arrived(scene, t, q, near_q, usual)
+    (near_q, g), guess = put_positions(scene, t, q, free, usual), jnp.zeros((), jnp.int32)
+    arrived = _arrived(q, near_q, g, usual)
     if guesses is not None and _can_search(scene):
         lost = jax.lax.stop_gradient(~arrived)
         other_q, other = jax.lax.cond(eqxi.unvmap_any(lost), lambda: _searched(scene, t, q, free, usual, guesses), lambda: (near_q, guess))
-        better = lost & (_left(scene, t, other_q) <= _left(scene, t, near_q))
-        near_q, guess = jnp.where(better, other_q, near_q), jnp.where(better, other, guess)
-    near_u = project_speeds(scene, t, near_q, u, inputs, free=jnp.asarray(free_u), typical=usual.rows, affine=usual.affine, determined=usual.determined)
-    left = jnp.concatenate([closure_residual(scene, t, near_q), velocity_residual(scene, t, near_q, near_u, inputs)])
+        other_g = closure_residual(scene, t, other_q)
+        better = lost & (_left(other_g) <= _left(g))
+        near_q, g, guess = (jnp.where(better, *pair) for pair in ((other_q, near_q), (other_g, g), (other, guess)))
+    near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(free_u), usual)
+    left = jnp.concatenate([g, phi])
     finite = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left])))
     moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
     names = scene.coordinate_names, scene.speed_names
@@ -194,16 +173,16 @@ def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: 
     return Found(state, arrived)
 
 
-def _left(scene: Scene, t, q) -> Float[Array, ""]:
+def _left(g: Float[Array, "closures"]) -> Float[Array, ""]:
     """Largest residual of the geometric rows that counts: what is no number is infinite, what is round-off is zero."""
-    left = jax.lax.stop_gradient(position_error_of_rows(scene, t, q))
-    return jnp.where(left < _tolerance(q.dtype), 0.0, left)
+    left = jax.lax.stop_gradient(jnp.max(jnp.abs(g), initial=0.0))
+    return jnp.where(left < _tolerance(g.dtype), 0.0, jnp.where(jnp.isfinite(left), left, jnp.inf))
 
 
-def _arrived(scene: Scene, t, q, near_q, usual: Usual) -> Bool[Array, ""]:
+def _arrived(q, near_q, g, usual: Usual) -> Bool[Array, ""]:
     """Whether the rows are met, without running far away."""
     close = jnp.all(jnp.abs(near_q - q) <= FAR * usual.width)  # never where it is not a number
-    return jax.lax.stop_gradient(close & (_left(scene, t, near_q) == 0))
+    return jax.lax.stop_gradient(close & (_left(g) == 0))
 
 
 def _searched(scene: Scene, t, q, free, usual: Usual, guesses) -> tuple[Float[Array, "coordinates"], Int[Array, ""]]:
@@ -246,8 +225,11 @@ def start(scene: Scene | BuiltFor, *, t0: Number = 0.0, inputs=None, **values) -
     return named_start(scene, values, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)))
 
 
-def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs) -> State:
-    """A start from a dictionary of `values`, as of `start`, and the `inputs` at time `t0`: a vector, or by name (None: zero)."""
+def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bool | None = None) -> State:
+    """A start from a dictionary of `values`, as of `start`, and the `inputs` at time `t0`: a vector, or by name (None: zero).
+
+    `native`: as in `put_on_rows`.
+    """
     scene = as_scene(scene)
     q, u, given = vectors_named(scene, values)
     inputs = _as_input_vector(scene, inputs, q.dtype)
@@ -258,7 +240,7 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs) -> State:
     free_u = _free(scene.speed_names.entries, (*given, *_resting(scene, known, given)))
     determined = known.affine and not any(free_u[i] for i in known.independent)
     guesses = lambda: _guesses(scene, known, q, free_q)  # noqa: E731
-    state = _consistent(scene, t, q, u, inputs, free_q, free_u, guesses, determined)
+    state = _consistent(scene, t, q, u, inputs, free_q, free_u, guesses, native=native, determined=determined)
     _check_residual(scene, state, inputs, given)
     return state
 
@@ -271,7 +253,7 @@ def _structure(scene: Scene, t, q, free_q) -> Structure:
         if is_traced((scene, t, q)):
             raise
         near = np.asarray(project_positions(scene, t, as_coordinates(scene, q), free=jnp.asarray(free_q)))
-        if not float(_left(scene, t, jnp.asarray(near))) == 0:
+        if not float(_left(closure_residual(scene, t, jnp.asarray(near)))) == 0:
             raise
         seen_on_rows(scene, near)
         return structure_of(scene)

@@ -38,6 +38,19 @@ def version() -> tuple[int, int] | None:
     return found
 
 
+def reason_against() -> str:
+    """Why no machine code of our own can be called here; empty where it can."""
+    if jax.default_backend() != "cpu":
+        return "it is made for CPUs alone"
+    if host.reason_against():
+        return host.reason_against()
+    if version() is None:
+        return "the foreign function interface of this jaxlib is not known"
+    if not jax.config.jax_enable_x64:
+        return "it is made for double precision alone"
+    return ""
+
+
 def _stated_version() -> tuple[int, int] | None:
     try:
         header = (Path(jax.ffi.include_dir()) / "xla/ffi/api/c_api.h").read_text()
@@ -97,11 +110,11 @@ def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[
 
 
 @functools.cache
-def registered(text: str) -> str:
-    """The name under which JAX calls the handler of a module of LLVM IR."""
-    name = f"jourdain_jax_{hashlib.sha256(f'{host.description()} {text}'.encode()).hexdigest()[:24]}"
+def registered(text: str, seldom: bool = False) -> str:
+    """The name under which JAX calls the handler of a module of LLVM IR; `seldom`: as in `host.object_code`."""
+    name = f"jourdain_jax_{hashlib.sha256(f'{host.description()} {seldom} {text}'.encode()).hexdigest()[:24]}"
     capsule = ctypes.pythonapi.PyCapsule_New
     capsule.restype, capsule.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
-    code = disk.kept(name, lambda: host.object_code(text))
+    code = disk.kept(name, lambda: host.object_code(text, seldom))
     jax.ffi.register_ffi_target(name, capsule(host.address(code, HANDLER), b"xla._CUSTOM_CALL_TARGET", None), platform="cpu")
     return name

@@ -5,7 +5,7 @@ flags that let LLVM change results: every lane is rounded as it is written here,
 """
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -240,11 +240,22 @@ class Writer:
         """A conversion of LLVM, such as `sitofp`."""
         return self.instruction(to, f"{how} {a.type} {a.name} to {to}")
 
+    def spread(self, a: Value) -> Value:
+        """A number in all lanes, given one that is no vector."""
+        first = self.instruction(self.real, f"insertelement {self.real} poison, double {a.name}, i64 0")
+        return self.instruction(self.real, f"shufflevector {self.real} {first.name}, {self.real} poison, <{self.lanes} x i32> zeroinitializer")
+
     def any(self, a: Value) -> Value:
         """Whether a truth value holds in any lane."""
         return self.external(f"llvm.vector.reduce.or.v{self.lanes}i1", "i1", a)
 
     # memory
+
+    def constants(self, name: str, numbers: Iterable[float]) -> Value:
+        """Numbers that stand in the module."""
+        texts = [f"double {self.literal(x, 'double').name}" for x in numbers]
+        self._declared[name] = f"@{name} = internal constant [{len(texts)} x double] [{', '.join(texts)}]"
+        return Value(self, "ptr", f"@{name}")
 
     def room(self, type: str, count: int = 1) -> Value:
         """Memory for some values, one piece per call of the function."""

@@ -5,7 +5,7 @@ not depend on the width.
 """
 
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import NamedTuple
 
 import diffrax
@@ -15,12 +15,12 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.motion.integrators.erk_loop import method_of
 from jourdain_jax.motion.native import back, loop, samples, slopes
+from jourdain_jax.motion.native.called import called
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import PROGRESS, Layout
 from jourdain_jax.motion.native.taylor import TaylorSteps
-from jourdain_jax.native import ffi, host
+from jourdain_jax.native import host
 
-ALONE = 2  # places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
 MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
 
 
@@ -46,9 +46,9 @@ def kernel(form: Form, solver: type[diffrax.AbstractERK], order: int | None = No
         return (arguments[-1].shape[-1], layout.integrated), (layout.returned + 1,)
 
     def run(*arguments: Float[Array, "..."]) -> tuple[Float[Array, "times y"], Float[Array, "ends"]]:
-        return tuple(called(*arguments))
+        return tuple(run_rows(*arguments))
 
-    called = _called(lambda lanes, threads: loop.written(form, method, lanes, host.fuses(), threads), shapes, samples.arguments(layout))
+    run_rows = called(lambda lanes, threads: loop.written(form, method, lanes, host.fuses(), threads), shapes, samples.arguments(layout))
     return Kernel(form, run, _along(layout, run))
 
 
@@ -82,41 +82,13 @@ def kernel_back(form: Form, solver: type[diffrax.AbstractERK], asked: tuple[int,
     """
     method, count = method_of(solver()), form.layout.y + len(asked)
     of_samples = samples.arguments(form.layout)
-    called = _called(lambda lanes, threads: back.written(form, method, lanes, host.fuses(), threads, asked), lambda *_: ((count,),), of_samples)
-    return lambda *arguments: called(*arguments)[0]
+    run_rows = called(lambda lanes, threads: back.written(form, method, lanes, host.fuses(), threads, asked), lambda *_: ((count,),), of_samples)
+    return lambda *arguments: run_rows(*arguments)[0]
 
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel_of_rates(form: Form) -> Callable:
     """A function of samples, rows as those of a start, and their times as an array of one: the rates of the states in these rows."""
     count, of_samples = form.layout.y, samples.arguments(form.layout)
-    called = _called(lambda lanes, threads: slopes.written(form, lanes, host.fuses(), threads), lambda *_: ((count,),), of_samples)
-    return lambda *arguments: called(*arguments)[0]
-
-
-def _called(text: Callable[[int, int], str], shapes: Callable, of_samples: int) -> Callable:
-    """A module of LLVM IR, written for so many lanes and threads, as a function of arrays without lanes; `shapes`: of its results, given the arguments.
-
-    The first arguments are samples, which lanes may share.
-    """
-
-    @cache
-    def name(lanes: int) -> str:
-        return ffi.registered(text(lanes, 1 if lanes == ALONE else host.threads()))
-
-    def call(lanes: int, *arguments):
-        results = tuple(jax.ShapeDtypeStruct((*arguments[-1].shape[:-1], *shape), jnp.float64) for shape in shapes(*arguments))
-        return tuple(jax.ffi.ffi_call(name(lanes), results, vmap_method="broadcast_all")(*arguments))
-
-    @jax.custom_batching.custom_vmap
-    def run(*arguments):
-        return call(ALONE, *arguments)
-
-    @run.def_vmap
-    def run_many(count: int, batched: list[bool], *arguments):
-        stays = [has_axis or k < of_samples for k, has_axis in enumerate(batched)]
-        every = [x if stay else jnp.broadcast_to(x, (count, *x.shape)) for x, stay in zip(arguments, stays, strict=True)]
-        found = call(host.lanes(), *every)
-        return found, (True,) * len(found)
-
-    return run
+    run_rows = called(lambda lanes, threads: slopes.written(form, lanes, host.fuses(), threads), lambda *_: ((count,),), of_samples)
+    return lambda *arguments: run_rows(*arguments)[0]

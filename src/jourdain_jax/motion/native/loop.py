@@ -15,12 +15,12 @@ from jourdain_jax.motion.native.step import IDLE, write_step
 from jourdain_jax.motion.native.taylor import TaylorSteps
 from jourdain_jax.native.ffi import Given, write_handler
 from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.threads import product, share
 
 # words of a job, shared by all threads: the number of lanes, of times, and of the next lane, those of samples, then pointers to the arrays
 COUNT, TIMES, NEXT, FIRST_OF_SAMPLES = range(4)
 FIRST_ARRAY = FIRST_OF_SAMPLES + samples.WORDS
 _STARTS, _GOALS, _STATES, _ENDS = range(FIRST_ARRAY, FIRST_ARRAY + 4)
-MANY = 8  # times as many lanes as side by side make it worth while to start another thread, which takes some 30 us
 
 
 def written(form: Form, method: Method | TaylorSteps, lanes: int, fused: bool, threads: int) -> str:
@@ -56,23 +56,13 @@ def write_job(w: Writer, form: Form, arguments: list[Given], results: list[Value
     for word, pointer in enumerate(arrays):
         w.store(pointer, job, FIRST_ARRAY + word)
     count = w.room("i64")
-    w.store(samples.product(w, times, 1), count)
+    w.store(product(w, times, 1), count)
     w.store(w.load("i64", count), job, COUNT)
     w.store(w.load("i64", times.sizes, times.rank - 1), job, TIMES)
     w.store(w.literal(0, "i64"), job, NEXT)
     if form.sampled:
         samples.store_words(w, w.at(job, FIRST_OF_SAMPLES, "i64"), of_samples)
-    loop, nothing, others, started = Value(w, "ptr", "@loop"), Value(w, "ptr", "null"), w.room("i64", threads), w.room("i64")
-    w.store(w.literal(0, "i64"), started)
-    for more in range(1, threads):
-        with w.when(w.load("i64", count) >= (more + 1) * MANY * w.lanes):
-            number = w.load("i64", started)
-            failed = w.external("pthread_create", "i32", w.at(others, number, "i64"), nothing, loop, job)
-            w.store(number + w.where(failed.equals(0), w.literal(1, "i64"), 0), started)
-    w.call("loop", "ptr", job)
-    if threads > 1:
-        with w.counted(0, w.load("i64", started)) as number:
-            w.external("pthread_join", "i32", w.load("i64", others, number), nothing)
+    share(w, job, w.load("i64", count), threads)
 
 
 def _write_loop(w: Writer, form: Form, method: Method | TaylorSteps) -> None:

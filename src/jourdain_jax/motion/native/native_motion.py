@@ -20,7 +20,7 @@ from jourdain_jax.motion.native.taylor import rates_of
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
-from jourdain_jax.native import ffi, host, series
+from jourdain_jax.native import ffi, series
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.graph import Unsupported
 
@@ -56,14 +56,8 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
     """Why machine code cannot integrate a scene, in words; empty where it can."""
     if not isinstance(field, ByProgram):
         return "the scene has no scalar program"
-    if jax.default_backend() != "cpu":
-        return "it is made for CPUs alone"
-    if host.reason_against():
-        return host.reason_against()
-    if ffi.version() is None:
-        return "the foreign function interface of this jaxlib is not known"
-    if jnp.result_type(float) != jnp.float64:
-        return "it is made for double precision alone"
+    if reason := ffi.reason_against():
+        return reason
     if any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
         return "the scene itself holds samples"
     if not all(isinstance(channel, Constant | Sampled) for channel in inputs.channels):

@@ -9,6 +9,7 @@ times. Knots (`integrators/knots.py`) have the shape (rows, knots). Lanes that s
 from jourdain_jax.motion.native.layout import Lanes, Layout
 from jourdain_jax.native.ffi import Given
 from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.threads import product
 
 WORDS = 6  # of a job: pointers to the tables and the knots, how many there are of each, samples of a table, knots of a row
 _TABLES, _KNOTS, _TABLE_COUNT, _KNOT_COUNT, _SAMPLES, _KNOTS_EACH = range(WORDS)
@@ -17,15 +18,6 @@ _TABLES, _KNOTS, _TABLE_COUNT, _KNOT_COUNT, _SAMPLES, _KNOTS_EACH = range(WORDS)
 def arguments(layout: Layout) -> int:
     """How many arguments of a handler are samples."""
     return 2 if layout.sampled else 0
-
-
-def product(w: Writer, x: Given, but: int) -> Value:
-    """The product of the sizes of all axes but the last ones."""
-    total = w.room("i64")
-    w.store(w.literal(1, "i64"), total)
-    with w.counted(0, x.rank - but) as axis:
-        w.store(w.load("i64", total) * w.load("i64", x.sizes, axis), total)
-    return w.load("i64", total)
 
 
 def store_words(w: Writer, words: Value, given: list[Given]) -> None:

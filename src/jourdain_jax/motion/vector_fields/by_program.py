@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.motion.native import seen
 from jourdain_jax.motion.vector_fields.field import Integrated, Observed, VectorField
 from jourdain_jax.scene.scene import Scene
 
@@ -14,6 +15,7 @@ class ByProgram(VectorField):
 
     program: Lowered = eqx.field(static=True)
     affine: bool = eqx.field(static=True)  # rows are, in the speeds
+    native: bool = eqx.field(static=True, default=False)  # machine code of our own says what is seen of a motion
 
     @property
     def lowered(self) -> Lowered:
@@ -35,16 +37,20 @@ class ByProgram(VectorField):
 
     def fixed(self, scene: Scene) -> tuple:
         """What depends on parameters alone."""
-        return self.program.fixed_values(scene)
+        return seen.fixed_values(self.program, scene) if self.native else self.program.fixed_values(scene)
 
     def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
         return y.q, self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
 
     def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
         """All speeds, and the smallest pivot of the elimination relative to its usual size."""
+        if self.native:
+            return Observed(y.q, *seen.speeds_and_pivot(self.program, fixed, t, y.q, y.v, inputs))
         return Observed(y.q, *self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs))
 
     def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
+        if self.native:
+            return seen.energies(self.program, fixed, t, y.q, y.v, inputs)
         return self.program.energy_values(fixed, t, tuple(y.q), tuple(y.v), inputs)
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:

@@ -15,8 +15,6 @@ from jourdain_jax.calculus.reals import described
 from jourdain_jax.dynamics.accelerations import Baumgarte, as_reduction
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
-from jourdain_jax.equations.kinematics import shapes_along_motion
-from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
 from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.lowering.lower import lowered
@@ -26,7 +24,6 @@ from jourdain_jax.motion.vector_fields.by_matrices import FullByMatrices, Minima
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.names import nearest
-from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
 _STATES = ("auto", "minimal", "full")
@@ -177,7 +174,6 @@ def _default_reduction(structure: Structure, independent: tuple[int, ...] | None
     return Privileged(structure.independent) if program.by_partition else Multipliers()
 
 
-@once_per_class
 def _is_closed(scene: Scene) -> bool:
     """Whether there are geometric rows or quaternion norms to keep."""
-    return shapes_along_motion(lambda scene, motion: closure_residual(scene, motion.t, motion.q.array), scene).shape[0] > 0
+    return bool(names_of_position_rows(scene) or scene.coordinates.quaternions)

@@ -1,0 +1,111 @@
+"""Rows of a class of scenes as a scalar program, by which a start is put onto them and checked: residuals, their derivatives, the mass matrix.
+
+    g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M = sum m beta' beta + gamma' I gamma
+
+Unit norms of quaternions count as geometric rows. The program is kept on disk between processes, as text.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jourdain_jax.build.faults_on_graph import right_on_graph
+from jourdain_jax.build.kept_findings import kept_of_scene
+from jourdain_jax.build.probed_on_graph import LookedAt, looked_at
+from jourdain_jax.build.reference_parameters import with_reference_parameters
+from jourdain_jax.calculus.plain_text import as_text, from_text
+from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.part import part
+from jourdain_jax.scene.once_per_class import once_per_class
+from jourdain_jax.scene.scene import Scene
+
+MOST_PRODUCTS = 20_000  # of entries of velocities in a mass matrix that is written out
+_TEXTLESS = b"none"
+
+
+@dataclass(frozen=True, eq=False)
+class RowProgram:
+    """Nodes of a graph; compared by identity, so that it can be a static argument of compiled functions. Matrices by (row, column), without zeros."""
+
+    graph: Graph
+    parameters: tuple[tuple[int, ...], ...]  # of each leaf of the scene, entry by entry; -1 for what is not needed
+    t: int
+    q: tuple[int, ...]
+    u: tuple[int, ...]
+    inputs: tuple[int, ...]
+    g: tuple[int, ...]
+    G: dict[tuple[int, int], int]
+    phi: tuple[int, ...]
+    A: dict[tuple[int, int], int]
+    M: dict[tuple[int, int], int] | None  # lower triangle; None where it is too large to be written out
+    right: int  # whether parameters and bodies are
+
+
+@once_per_class
+def row_program(scene: Scene) -> RowProgram | None:
+    """The program of a class of scenes; None where a part of it is no scalar program."""
+    scene = with_reference_parameters(scene)
+    found = kept_of_scene("rows", scene, lambda: _as_text(scene))
+    if found == _TEXTLESS:
+        return None
+    rows, *others = from_text(found)
+    return RowProgram(Graph.of_rows(rows), *others)
+
+
+def _as_text(scene: Scene) -> bytes:
+    try:
+        nodes = looked_at(scene)
+    except Unsupported:
+        return _TEXTLESS
+    graph, traced = nodes.graph, nodes.traced
+    q, u = traced.q.tolist(), traced.u.tolist()
+    g, phi = [int(n) for n in nodes.closures], traced.at.phi.tolist()
+    G, A = _entries(nodes.of_closures, q), _entries(nodes.rows, u)
+    M = _mass_matrix(nodes, u)
+    right = right_on_graph(scene, traced)
+    needed = [right, *g, *G.values(), *phi, *A.values(), *({} if M is None else M).values()]
+    if graph.calls(needed):
+        return _TEXTLESS
+    inputs = [traced.t, *q, *u, *traced.inputs.tolist()]
+    rows, place = part(graph, [*needed, *inputs])
+
+    def places(entries: dict) -> dict:
+        return {key: int(place[n]) for key, n in entries.items()}
+
+    def every(nodes) -> list[int]:
+        return [int(place[n]) for n in np.ravel(np.asarray(nodes, int))]
+
+    variables = [every(x) for x in traced.parameters], int(place[traced.t]), *map(every, (traced.q, traced.u, traced.inputs))
+    return as_text([rows, *variables, every(g), places(G), every(phi), places(A), None if M is None else places(M), int(place[right])])
+
+
+def _entries(rows: list[dict[int, int]], variables: list[int]) -> dict[tuple[int, int], int]:
+    place = {n: k for k, n in enumerate(variables)}
+    return {(i, place[n]): node for i, row in enumerate(rows) for n, node in row.items()}
+
+
+def _mass_matrix(nodes: LookedAt, u: list[int]) -> dict[tuple[int, int], int] | None:
+    """`M = sum m beta' beta + gamma' I gamma`, the lower triangle."""
+    if sum(len(row) ** 2 for row in nodes.velocities) > MOST_PRODUCTS:
+        return None
+    graph, at = nodes.graph, nodes.traced.at
+    bodies, place = len(at.mass), {n: k for k, n in enumerate(u)}
+    found: dict[tuple[int, int], int] = {}
+
+    def add(row: dict[int, int], other: dict[int, int], weight: int) -> None:
+        for n, x in row.items():
+            weighted = graph.mul(weight, x)
+            for m, y in other.items():
+                if place[m] <= place[n]:
+                    key = place[n], place[m]
+                    found[key] = graph.add(found.get(key, graph.zero), graph.mul(weighted, y))
+
+    for b in range(bodies):
+        beta, gamma = nodes.velocities[3 * b : 3 * b + 3], nodes.velocities[3 * (bodies + b) : 3 * (bodies + b) + 3]
+        for i in range(3):
+            add(beta[i], beta[i], int(at.mass[b]))
+            for k in range(3):
+                if at.inertia[b, i, k] != graph.zero:
+                    add(gamma[i], gamma[k], int(at.inertia[b, i, k]))
+    at_rest = graph.substituted(list(found.values()), dict.fromkeys(u, graph.zero))
+    return {key: int(node) for key, node in zip(found, at_rest, strict=True) if node != graph.zero}

@@ -1,0 +1,43 @@
+"""Modules of LLVM IR as functions of JAX: arrays without lanes go in, and under `vmap` all lanes go to one call.
+
+Many lanes run side by side in the widest registers; one by itself runs in narrow ones, in which an instruction takes less time. What a lane computes does
+not depend on the width.
+"""
+
+from collections.abc import Callable
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+
+from jourdain_jax.native import ffi, host
+
+ALONE = 2  # places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
+
+
+def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 0, seldom: bool = False) -> Callable:
+    """A module of LLVM IR, written for so many lanes and threads, as a function of arrays without lanes; `shapes`: of its results, given the arguments.
+
+    The first arguments are samples, which lanes may share; `seldom`: as in `host.object_code`.
+    """
+
+    @cache
+    def name(lanes: int) -> str:
+        return ffi.registered(text(lanes, 1 if lanes == ALONE else host.threads()), seldom)
+
+    def call(lanes: int, *arguments):
+        results = tuple(jax.ShapeDtypeStruct((*arguments[-1].shape[:-1], *shape), jnp.float64) for shape in shapes(*arguments))
+        return tuple(jax.ffi.ffi_call(name(lanes), results, vmap_method="broadcast_all")(*arguments))
+
+    @jax.custom_batching.custom_vmap
+    def run(*arguments):
+        return call(ALONE, *arguments)
+
+    @run.def_vmap
+    def run_many(count: int, batched: list[bool], *arguments):
+        stays = [has_axis or k < of_samples for k, has_axis in enumerate(batched)]
+        every = [x if stay else jnp.broadcast_to(x, (count, *x.shape)) for x, stay in zip(arguments, stays, strict=True)]
+        found = call(host.lanes(), *every)
+        return found, (True,) * len(found)
+
+    return run

@@ -1,0 +1,223 @@
+"""Coordinates or speeds put onto rows as machine code: `equations/projection.py` on the scalar program of the rows, lanes side by side.
+
+    x <- x - W (d A W)+ d r(x),   A = dr/dx over what is free,   d: one over the lengths of the rows
+
+r: geometric rows over coordinates, or velocity rows over speeds; W = 1, or W = c L'^-1 with c M c = L L' where speeds are to be nearest in the metric of
+the mass matrix. A lane that nothing changes any more stays as it is.
+"""
+
+import math
+import sys
+from dataclasses import dataclass
+from typing import Literal
+
+from jourdain_jax.build.row_program import RowProgram
+from jourdain_jax.calculus.fixed_point import QUIET, ROUND_OFF
+from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
+from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS
+from jourdain_jax.native.dense import write_cholesky, write_inverted, write_rotated, write_solved, write_triangular
+from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.scalar_program import as_real, unsupported
+from jourdain_jax.native.scalar_program import written as program_written
+from jourdain_jax.native.threads import write_rows
+
+LARGEST_PROGRAM = 10_000  # operations
+MOST_ENTRIES = 20_000  # of a matrix, whose vectors lie on the stack
+_EPS = sys.float_info.epsilon
+
+Kind = Literal["positions", "speeds", "determined speeds"]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What moves onto which rows."""
+
+    program: RowProgram
+    kind: Kind
+    affine: bool = False  # in what moves: one matrix serves, and a second step is for round-off
+
+    @property
+    def moving(self) -> tuple[int, ...]:
+        """Nodes of what moves."""
+        return self.program.q if self.kind == "positions" else self.program.u
+
+    @property
+    def residuals(self) -> tuple[int, ...]:
+        """Nodes of the residuals."""
+        return self.program.g if self.kind == "positions" else self.program.phi
+
+    @property
+    def slopes(self) -> dict[tuple[int, int], int]:
+        """Nodes of their derivatives."""
+        return self.program.G if self.kind == "positions" else self.program.A
+
+    @property
+    def metric(self) -> dict[tuple[int, int], int] | None:
+        """Nodes of the mass matrix; None where no metric is needed."""
+        return self.program.M if self.kind == "speeds" else None
+
+    @property
+    def given(self) -> list[int]:
+        """Nodes of what a lane is given, before what is free and the typical lengths of the rows."""
+        program = self.program
+        parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
+        return [*parameters, program.t, *program.q, *(() if self.kind == "positions" else (*program.u, *program.inputs))]
+
+    def reason_against(self) -> str:
+        """Why this is not written as machine code, in words; empty where it can be."""
+        if self.kind == "speeds" and self.program.M is None:
+            return "the mass matrix is too large"
+        if max((len(self.residuals) + len(self.moving)) * len(self.residuals), len(self.moving) ** 2) > MOST_ENTRIES:
+            return "the rows are too many"
+        nodes = [*self.residuals, *self.slopes.values(), *({} if self.metric is None else self.metric).values()]
+        if self.program.graph.operations(nodes) > LARGEST_PROGRAM:
+            return "the scalar program is too large"
+        return unsupported(self.program.graph, nodes)
+
+
+def written(of: Rows, lanes: int, fused: bool, threads: int) -> str:
+    """The module of LLVM IR: a lane is given `of.given`, what is free, and lengths, and returns what moved, and what is left of the rows."""
+    w, rows, columns = Writer(lanes, fused), len(of.residuals), len(of.moving)
+    _write_values(w, of, "residuals", dict(enumerate(of.residuals)))
+    _write_values(w, of, "slopes", {i * (rows + columns) + k: node for (i, k), node in of.slopes.items()})
+    write_rotated(w, rows, columns)
+    write_inverted(w, rows, columns, rank_cutoff("float64"))
+    write_solved(w, rows, columns)
+    if of.metric is not None:
+        _write_values(w, of, "masses", {i * columns + k: node for (i, k), node in of.metric.items()})
+        write_cholesky(w, columns)
+        write_triangular(w, columns)
+        _write_metric(w, of)
+    _write_factored(w, of)
+    _write_moved(w, of)
+    _write_row(w, of)
+    write_rows(w, len(of.given) + columns + rows, columns + rows, threads)
+    return w.text
+
+
+def _write_values(w: Writer, of: Rows, name: str, nodes: dict[int, int]) -> None:
+    """`name(state, found)`: values of nodes, each at its place in `found`."""
+    with w.function(name, "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
+        known = {n: w.load(w.real, state, k) for k, n in enumerate(of.given)}
+        for place, value in zip(nodes, program_written(w, of.program.graph, nodes.values(), known), strict=True):
+            w.store(as_real(w, value), found, place)
+        w.give()
+
+
+def _cleared(w: Writer, place: Value, count: int) -> None:
+    with w.counted(0, count) as k:
+        w.store(w.number(0.0), place, k)
+
+
+def _write_metric(w: Writer, of: Rows) -> None:
+    """`metric(state, L, c)`: scales of the speeds, and the Cholesky factor of the mass matrix in scaled speeds; the identity among speeds that are held."""
+    n, first_free = len(of.moving), len(of.given)
+    with w.function("metric", "void", {"state": "ptr", "L": "ptr", "c": "ptr"}, attributes="noinline") as (state, L, c):
+        _cleared(w, L, n * n)
+        w.call("masses", "void", state, L)
+        with w.counted(0, n) as i:
+            own = w.load(w.real, L, i * n + i)
+            heavy = own > 0.0
+            w.store(w.where(heavy, w.number(1.0) / w.intrinsic("sqrt", w.where(heavy, own, 1.0)), 1.0), c, i)
+        with w.counted(0, n) as i, w.counted(0, i + 1) as k:
+            scaled = w.load(w.real, c, i) * w.load(w.real, L, i * n + k) * w.load(w.real, c, k)
+            both = (w.load(w.real, state, i + first_free) > 0.0) & (w.load(w.real, state, k + first_free) > 0.0)
+            alone = w.spread(w.converted("uitofp", i.equals(k), "double"))
+            w.store(w.where(both, scaled, alone), L, i * n + k)
+        w.call("cholesky", "void", L)
+        w.give()
+
+
+def _write_factored(w: Writer, of: Rows) -> None:
+    """`factored(state, L, c, B, d, weights)`: the matrix of the rows, turned as by `rotated`, and the scales of the rows."""
+    rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
+    width, first_typical = rows + columns, first_free + columns
+    with w.function("factored", "void", dict.fromkeys(("state", "L", "c", "B", "d", "weights"), "ptr"), attributes="noinline") as (state, L, c, B, d, weights):
+        _cleared(w, B, rows * width)
+        w.call("slopes", "void", state, B)
+        with w.counted(0, rows) as i:
+            row, square = w.at(B, i * width, w.real), w.room(w.real)
+            with w.counted(0, columns) as k:
+                slope = w.load(w.real, row, k)
+                slope = slope if of.metric is None else slope * w.load(w.real, c, k)
+                w.store(w.where(w.load(w.real, state, k + first_free) > 0.0, slope, 0.0), row, k)
+            if of.metric is not None:
+                w.call("forward", "void", L, row)
+            w.store(w.number(0.0), square)
+            with w.counted(0, columns) as k:
+                slope = w.load(w.real, row, k)
+                w.store(w.fma(slope, slope, w.load(w.real, square)), square)
+            length = w.larger(w.intrinsic("sqrt", w.load(w.real, square)), w.load(w.real, state, i + first_typical))
+            there = length > 0.0
+            scale = w.where(there, w.number(1.0) / w.where(there, length, 1.0), 1.0)
+            w.store(scale, d, i)
+            with w.counted(0, columns) as k:
+                w.store(w.load(w.real, row, k) * scale, row, k)
+            w.store(w.number(1.0), row, i + columns)
+        w.call("rotated", "void", B)
+        w.call("inverted", "void", B, weights)
+        w.give()
+
+
+def _write_moved(w: Writer, of: Rows) -> None:
+    """`moved(state, L, c, B, d, weights, x)`: what moves after one step, by the matrix of the rows that was `factored`."""
+    rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
+    first = of.given.index(of.moving[0])
+    arguments = dict.fromkeys(("state", "L", "c", "B", "d", "weights", "x"), "ptr")
+    with w.function("moved", "void", arguments, attributes="noinline") as (state, L, c, B, d, weights, x):
+        left = w.room(w.real, rows)
+        w.call("residuals", "void", state, left)
+        with w.counted(0, rows) as i:
+            w.store(w.load(w.real, left, i) * w.load(w.real, d, i), left, i)
+        w.call("solved", "void", B, weights, left, x)
+        if of.metric is not None:
+            w.call("backward", "void", L, x)
+        with w.counted(0, columns) as k:
+            change = w.load(w.real, x, k)
+            change = change if of.metric is None else change * w.load(w.real, c, k)
+            moves = w.load(w.real, state, k + first_free) > 0.0  # what is held does not move by round-off either
+            w.store(w.load(w.real, state, k + first) - w.where(moves, change, 0.0), x, k)
+        w.give()
+
+
+def _write_row(w: Writer, of: Rows) -> None:
+    """`row(state, found)`: the lanes of a block, from what they are given to what they return."""
+    rows, columns = len(of.residuals), len(of.moving)
+    first = of.given.index(of.moving[0])
+    with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
+        n = columns if of.metric is not None else 0
+        L, c, B, d, weights, x = (w.room(w.real, max(count, 1)) for count in (n * n, n, rows * (rows + columns), rows, rows, columns))
+        if of.metric is not None:
+            w.call("metric", "void", state, L, c)
+        if of.affine:
+            w.call("factored", "void", state, L, c, B, d, weights)
+            for _ in range(2):
+                w.call("moved", "void", state, L, c, B, d, weights, x)
+                with w.counted(0, columns) as k:
+                    w.store(w.load(w.real, x, k), state, k + first)
+        else:
+            _write_iteration(w, of, first, (state, L, c, B, d, weights, x))
+        with w.counted(0, columns) as k:
+            w.store(w.load(w.real, state, k + first), found, k)
+        w.call("residuals", "void", state, w.at(found, columns, w.real))
+        w.give()
+
+
+def _write_iteration(w: Writer, of: Rows, first: int, places: tuple[Value, ...]) -> None:
+    """Steps until they change nothing, as those of `calculus/fixed_point.py`."""
+    state, *factors, x = places
+    columns, quiet, changed = len(of.moving), w.room(w.real), w.room(w.real)
+    w.store(w.number(0.0), quiet)
+    with w.counted(0, MOST_MOVES_OF_POSITIONS if of.kind == "positions" else MOST_MOVES_OF_SPEEDS):
+        going = w.load(w.real, quiet) < float(QUIET)
+        with w.when(w.any(going)):
+            w.call("factored", "void", state, *factors)
+            w.call("moved", "void", state, *factors, x)
+            w.store(w.number(-math.inf), changed)
+            with w.counted(0, columns) as k:
+                old, new = w.load(w.real, state, k + first), w.load(w.real, x, k)
+                beyond = w.magnitude(new - old) > (w.magnitude(old) + 1.0) * (ROUND_OFF * _EPS)
+                w.store(w.where(beyond, 1.0, w.load(w.real, changed)), changed)
+                w.store(w.where(going, new, old), state, k + first)
+            still = w.where(w.load(w.real, changed) > 0.0, 0.0, w.load(w.real, quiet) + 1.0)
+            w.store(w.where(going, still, w.load(w.real, quiet)), quiet)

@@ -1,0 +1,215 @@
+"""What is seen of a motion beside its steps, as machine code: numbers that depend on parameters alone, and all speeds, pivots and energies at saved states.
+
+Each is a function of JAX on one state or scene; under `vmap` all lanes go to one call. Derivatives are those of the same by XLA (`lowering/lowered.py`).
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jourdain_jax.build.row_program import RowProgram
+from jourdain_jax.calculus.differentiated_as import differentiated_as
+from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.motion.native.called import called
+from jourdain_jax.native import host
+from jourdain_jax.native.ir import Value, Writer
+from jourdain_jax.native.math_functions import FUNCTIONS
+from jourdain_jax.native.scalar_program import as_real, unsupported, written
+from jourdain_jax.native.threads import write_rows
+from jourdain_jax.program.graph import Graph
+from jourdain_jax.scene.scene import Scene
+
+MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
+LARGEST_PROGRAM = 10_000  # operations
+_TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"))
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def serves(program: Lowered) -> bool:
+    """Whether all this can be machine code."""
+    graph, nodes = program.graph, [*_seen_nodes(program), *program.fixed, *program.usual.values()]
+    truths = any(_is_truth(graph, n) for n in program.fixed)  # which XLA hands on as such
+    return not truths and graph.operations(nodes) <= LARGEST_PROGRAM and not unsupported(graph, nodes)
+
+
+def _is_truth(graph: Graph, node: int) -> bool:
+    return graph.op[node] in _TRUTHS or (graph.op[node] == "select" and _is_truth(graph, graph.args[node][1]))
+
+
+def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
+    """Those entries of a scene's parameters that have a node; `nodes`: of each leaf, entry by entry, -1 for none."""
+    found = []
+    for leaf, of_leaf in zip(jax.tree.leaves(scene), nodes, strict=True):
+        needed = np.flatnonzero(np.ravel(np.asarray(of_leaf, int)) >= 0)
+        if needed.size:
+            flat = jnp.reshape(jnp.asarray(leaf, jnp.float64), (-1,))
+            found.append(flat if needed.size == flat.shape[0] else flat[needed])
+    return found
+
+
+def fixed_values(program: Lowered, scene: Scene) -> tuple[Float[Array, ""], ...]:
+    """As `Lowered.fixed_values`."""
+    if not program.fixed:
+        return ()
+
+    def by_machine_code(scene: Scene) -> tuple:
+        found = _kernel_of_fixed(program)(jnp.concatenate(entries(scene, _needed(program))))[0]
+        return tuple(jnp.squeeze(x, 0) for x in jnp.split(found, len(program.fixed)))
+
+    return differentiated_as(program.fixed_values, by_machine_code, "forward")(scene)
+
+
+def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+    """As `Lowered.speeds_and_pivot`."""
+
+    def by_xla(fixed, t, q, y, inputs):
+        return program.speeds_and_pivot(fixed, t, tuple(q), tuple(y), inputs)
+
+    def by_machine_code(*state):
+        found = _seen(program, *state)
+        return found[:-3], found[-3]
+
+    return differentiated_as(by_xla, by_machine_code, "forward")(fixed, t, q, y, inputs)
+
+
+def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
+    """As `Lowered.energy_values`."""
+
+    def by_xla(fixed, t, q, y, inputs):
+        return program.energy_values(fixed, t, tuple(q), tuple(y), inputs)
+
+    return differentiated_as(by_xla, lambda *state: _seen(program, *state)[-2:], "forward")(*jax.lax.stop_gradient((fixed, t, q, y, inputs)))
+
+
+def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
+    """Whether parameters are right, and the masses and inertias that they make; as `parameter_faults` and `body_faults`."""
+    parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q]
+    return _kernel_of_right(program)(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, jnp.float64) for x in parts])))[0][0] > 0
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def _kernel_of_right(program: RowProgram):
+    given = [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q]
+
+    def text(lanes: int, threads: int) -> str:
+        w = Writer(lanes, host.fuses())
+        with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
+            known = {n: w.load(w.real, state, k) for k, n in enumerate(given)}
+            w.store(as_real(w, written(w, program.graph, [program.right], known)[0]), found)
+            w.give()
+        write_rows(w, len(given), 1, threads)
+        return w.text
+
+    return called(text, lambda *_: ((1,),), seldom=True)
+
+
+def _seen(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "seen"]:
+    parts = [jnp.stack(fixed)] if fixed else []
+    return _kernel_of_seen(program)(jnp.concatenate([jnp.asarray(x, jnp.float64) for x in (*parts, jnp.asarray(t)[None], q, y, inputs)]))[0]
+
+
+def _seen_nodes(program: Lowered) -> list[int]:
+    return [*program.z, *program.pivots, *program.energies]
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def _kernel_of_seen(program: Lowered):
+    count = len(program.independent) + len(program.dependent) + 3
+    return called(lambda lanes, threads: _text_of_seen(program, lanes, threads, count), lambda *_: ((count,),), seldom=True)
+
+
+def _text_of_seen(program: Lowered, lanes: int, threads: int, count: int) -> str:
+    """`row(state, found)`: all speeds, the smallest pivot relative to its usual size, kinetic and potential energy."""
+    w, given = Writer(lanes, host.fuses()), program.variables
+    with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
+        known = {n: w.load(w.real, state, k) for k, n in enumerate(given)}
+        values = [as_real(w, x) for x in written(w, program.graph, _seen_nodes(program), known)]
+        z, pivots, of_energy = len(program.z), len(program.pivots), len(program.energies)
+        first = len(given) - len(program.inputs) - len(program.independent)
+        every = [*(w.load(w.real, state, first + k) for k in range(len(program.independent))), *values[:z]]
+        for i, k in enumerate(np.argsort([*program.independent, *program.dependent])):
+            w.store(every[k], found, i)
+        sign, pivot = FUNCTIONS["sign"], w.number(1.0)
+        for value, size in zip(values[z : z + pivots], program.sizes, strict=True):
+            ratio = value / known[size]
+            pivot = sign(w, pivot) * sign(w, ratio) * w.smaller(w.magnitude(pivot), w.magnitude(ratio))
+        for i, value in enumerate([pivot, *values[len(values) - of_energy :]]):
+            w.store(value, found, count - 3 + i)
+        w.give()
+    write_rows(w, len(given), count, threads)
+    return w.text
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def _needed(program: Lowered) -> tuple[tuple[int, ...], ...]:
+    """The entries of the scene's parameters on which something that is fixed depends."""
+    needed = set(program.graph.reachable([*program.fixed, *program.usual.values()]))
+    return tuple(tuple(n if n in needed else -1 for n in np.ravel(leaf).tolist()) for leaf in program.traced.parameters)
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def _kernel_of_fixed(program: Lowered):
+    return called(lambda lanes, threads: _text_of_fixed(program, lanes, threads), lambda *_: ((len(program.fixed),),), seldom=True)
+
+
+def _text_of_fixed(program: Lowered, lanes: int, threads: int) -> str:
+    """`row(state, found)`: what depends on parameters alone, after what is usual at the states that were probed."""
+    w, given = Writer(lanes, host.fuses()), [n for leaf in _needed(program) for n in leaf if n >= 0]
+    usual, probes = list(program.usual), len(next(iter(program.states.values()), (None,)))
+    if usual:
+        _write_usual(w, program, given, probes)
+    with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
+        known = {n: w.load(w.real, state, k) for k, n in enumerate(given)}
+        if usual:
+            sizes = w.room(w.real, len(usual))
+            w.call("usual", "void", state, sizes)
+            known |= {n: w.load(w.real, sizes, k) for k, n in enumerate(usual)}
+        for i, value in enumerate(written(w, program.graph, program.fixed, known)):
+            w.store(as_real(w, value), found, i)
+        w.give()
+    write_rows(w, len(given), len(program.fixed), threads)
+    return w.text
+
+
+def _write_usual(w: Writer, program: Lowered, given: list[int], probes: int) -> None:
+    """`usual(state, sizes)`: as `build/usual_lengths.py: usual` of the magnitudes at the probed states; 1 for what vanishes at all of them."""
+    nodes, states = list(program.usual.values()), list(program.states)
+    table = w.constants("probed", (x[p] for p in range(probes) for x in program.states.values())) if states else Value(w, "ptr", "null")
+    with w.function("usual", "void", {"state": "ptr", "sizes": "ptr"}, attributes="noinline") as (state, sizes):
+        seen = w.room(w.real, len(nodes) * probes)
+        known = {n: w.load(w.real, state, k) for k, n in enumerate(given)}
+        with w.counted(0, probes) as p:
+            at = {n: w.spread(w.load("double", table, p * len(states) + k)) for k, n in enumerate(states)}
+            for k, value in enumerate(written(w, program.graph, nodes, known | at)):
+                w.store(w.magnitude(as_real(w, value)), seen, p + k * probes)
+        with w.counted(0, len(nodes)) as k:
+            w.store(_median_or_largest(w, w.at(seen, k * probes, w.real), probes), sizes, k)
+        w.give()
+
+
+def _median_or_largest(w: Writer, seen: Value, count: int) -> Value:
+    """The median of numbers that are not negative, or the largest where that is zero, or 1; what is no number does not count. `seen` is sorted."""
+    numbers, median = w.room(w.real), w.room(w.real)
+    w.store(w.number(0.0), numbers)
+    w.store(w.number(0.0), median)
+    with w.counted(0, count) as i:
+        x = w.load(w.real, seen, i)
+        w.store(w.load(w.real, numbers) + w.where(w.is_nan(x), 0.0, w.number(1.0)), numbers)
+        w.store(w.where(w.is_nan(x), -1.0, x), seen, i)  # first, when sorted
+    with w.counted(0, count) as i, w.counted(0, w.literal(count - 1, "i64") - i) as j:
+        a, b = w.load(w.real, seen, j), w.load(w.real, seen, j + 1)
+        w.store(w.smaller(a, b), seen, j)
+        w.store(w.larger(a, b), seen, j + 1)
+    last = w.number(count - 1.0)
+    middle = last - (w.load(w.real, numbers) - 1.0) * 0.5  # a whole number, or half of one
+    with w.counted(0, count) as i:
+        away = w.magnitude(w.spread(w.converted("sitofp", i, "double")) - middle)
+        share = w.where(away.equals(0.0), 1.0, w.where(away.equals(0.5), 0.5, w.number(0.0)))
+        w.store(w.where(share.equals(0.0), w.load(w.real, median), w.fma(share, w.load(w.real, seen, i), w.load(w.real, median))), median)
+    largest = w.load(w.real, seen, count - 1)
+    size = w.where(w.load(w.real, median) > 0.0, w.load(w.real, median), w.where(largest > 0.0, largest, w.number(0.0)))
+    return w.where(size.equals(0.0), 1.0, size)

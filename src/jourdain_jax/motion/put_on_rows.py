@@ -1,0 +1,116 @@
+"""Coordinates and speeds put onto the rows: by machine code where that serves, by XLA where not, and for derivatives.
+
+g(t, q) = 0,  phi(t, q, u) = 0
+"""
+
+from functools import lru_cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.reference_parameters import once_per_values
+from jourdain_jax.build.row_program import RowProgram, row_program
+from jourdain_jax.build.structure import closure_lengths, plain_row_lengths, rows_are_affine, usual_rows
+from jourdain_jax.calculus.differentiated_as import differentiated_as
+from jourdain_jax.calculus.reals import real_type
+from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
+from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
+from jourdain_jax.motion.native.called import called
+from jourdain_jax.motion.native.onto_rows import Rows, written
+from jourdain_jax.motion.native.seen import entries
+from jourdain_jax.native import ffi, host
+from jourdain_jax.scene.scene import Scene
+
+MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
+
+
+class Usual(eqx.Module):
+    """Sizes by which rows and coordinates are measured, and of what kind rows are."""
+
+    closures: Float[Array | np.ndarray, "closures"]
+    rows: Float[Array | np.ndarray, "rows"]  # in scaled speeds; where rows determine the speeds that are free, in the speeds as they are
+    width: Float[Array | np.ndarray, "coordinates"]  # of the domain
+    affine: bool = eqx.field(static=True)  # rows are, in the speeds
+    determined: bool = eqx.field(static=True)  # rows determine the speeds that are free
+    program: RowProgram | None = eqx.field(static=True)  # by which machine code puts a start onto them; None: XLA does
+
+
+def _worked_out(scene: Scene, determined: bool, native: bool) -> Usual:
+    low, high = coordinate_bounds(scene)
+    width = np.where(high > low, high - low, 1.0).astype(real_type())
+    program = row_program(scene) if native and not ffi.reason_against() else None
+    try:
+        rows = plain_row_lengths(scene) if determined else usual_rows(scene).lengths
+        return Usual(closure_lengths(scene), rows, width, rows_are_affine(scene), determined, program)
+    except ValueError:  # of a scene that is wrong in itself; said where its structure is asked for
+        norms, geometric = len(scene.coordinates.quaternions), len(names_of_position_rows(scene))
+        return Usual(np.zeros(geometric + norms), np.zeros(len(names_of_rows(scene))), width, False, False, None)
+
+
+def _as_arrays(scene: Scene, determined: bool, native: bool) -> Usual:
+    found = _worked_out(scene, determined, native)  # on NumPy; what it traces must not be computed at once
+    with jax.ensure_compile_time_eval():
+        return jax.tree.map(jnp.asarray, found)  # kept, and handed over in a fifth of the time that arrays of NumPy take
+
+
+usual_sizes = once_per_values(_as_arrays, of_traced=_worked_out)
+
+
+def put_positions(scene: Scene, t, q, free, usual: Usual) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
+    """The coordinates on the geometric rows nearest to q, and what is left of the rows."""
+    if usual.program is not None and not usual.program.g:
+        return q, jnp.zeros(0, q.dtype)
+
+    def by_xla(scene, t, q, free, lengths):
+        near_q = project_positions(scene, t, q, free=free, typical=lengths)
+        return near_q, closure_residual(scene, t, near_q)
+
+    def by_machine_code(rows: Rows):
+        return lambda scene, t, q, free, lengths: _put(rows, scene, [t[None], q], free, lengths)
+
+    return _by_either(usual, "positions", False, by_xla, by_machine_code)(scene, jnp.asarray(t), q, free, usual.closures)
+
+
+def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Float[Array, "speeds"], Float[Array, "rows"]]:
+    """The speeds on the velocity rows nearest to u, and what is left of the rows."""
+    affine, determined = usual.affine, usual.determined
+    if usual.program is not None and not usual.program.phi:
+        return u, jnp.zeros(0, u.dtype)
+
+    def by_xla(scene, t, q, u, inputs, free, lengths):
+        near_u = project_speeds(scene, t, q, u, inputs, free=free, typical=lengths, affine=affine, determined=determined)
+        return near_u, velocity_residual(scene, t, q, near_u, inputs)
+
+    def by_machine_code(rows: Rows):
+        return lambda scene, t, q, u, inputs, free, lengths: _put(rows, scene, [t[None], q, u, inputs], free, lengths)
+
+    kind = "determined speeds" if determined else "speeds"
+    return _by_either(usual, kind, affine or determined, by_xla, by_machine_code)(scene, jnp.asarray(t), q, u, inputs, free, usual.rows)
+
+
+def _by_either(usual: Usual, kind, affine: bool, by_xla, by_machine_code):
+    rows = None if usual.program is None else Rows(usual.program, kind, affine)
+    if rows is None or _reason_against(rows):
+        return by_xla
+    return differentiated_as(by_xla, by_machine_code(rows), "forward")
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def _reason_against(rows: Rows) -> str:
+    return rows.reason_against()
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def _kernel(rows: Rows):
+    count = len(rows.moving) + len(rows.residuals)
+    return called(lambda lanes, threads: written(rows, lanes, host.fuses(), threads), lambda *_: ((count,),), seldom=True)
+
+
+def _put(rows: Rows, scene: Scene, state: list, free, lengths) -> tuple[Array, Array]:
+    """What moved, and what is left of the rows; `state`: time, coordinates and so on."""
+    found = _kernel(rows)(jnp.concatenate([jnp.asarray(x, jnp.float64) for x in (*entries(scene, rows.program.parameters), *state, free, lengths)]))[0]
+    return found[: len(rows.moving)], found[len(rows.moving) :]

@@ -1,0 +1,66 @@
+"""Lanes of a batch among threads: this one, and others that it starts and waits for."""
+
+from jourdain_jax.native.ffi import Given, write_handler
+from jourdain_jax.native.ir import Value, Writer
+
+MANY = 8  # times as many lanes as side by side make it worth while to start another thread, which takes some 30 us
+NEXT, COUNT, IN, OUT = range(4)  # words of a job of rows: the number of the next row, how many there are, pointers to those given and to those returned
+
+
+def product(w: Writer, x: Given, but: int) -> Value:
+    """The product of the sizes of all axes but the last ones."""
+    total = w.room("i64")
+    w.store(w.literal(1, "i64"), total)
+    with w.counted(0, x.rank - but) as axis:
+        w.store(w.load("i64", total) * w.load("i64", x.sizes, axis), total)
+    return w.load("i64", total)
+
+
+def share(w: Writer, job: Value, count: Value, threads: int) -> None:
+    """Calls the module's `loop(job)` in so many threads, in fewer where lanes are few."""
+    loop, nothing, others, started = Value(w, "ptr", "@loop"), Value(w, "ptr", "null"), w.room("i64", threads), w.room("i64")
+    w.store(w.literal(0, "i64"), started)
+    for more in range(1, threads):
+        with w.when(count >= (more + 1) * MANY * w.lanes):
+            number = w.load("i64", started)
+            failed = w.external("pthread_create", "i32", w.at(others, number, "i64"), nothing, loop, job)
+            w.store(number + w.where(failed.equals(0), w.literal(1, "i64"), 0), started)
+    w.call("loop", "ptr", job)
+    if threads > 1:
+        with w.counted(0, w.load("i64", started)) as number:
+            w.external("pthread_join", "i32", w.load("i64", others, number), nothing)
+
+
+def write_rows(w: Writer, given: int, returned: int, threads: int) -> None:
+    """A handler that takes rows of `given` numbers to rows of `returned` ones, lanes side by side, by the module's `row(given, returned)`.
+
+    Places for which no row is left work out the last one once more.
+    """
+    with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
+        state, found, who = w.room(w.real, given), w.room(w.real, returned), w.room("i64", w.lanes)
+        rows, results, count = w.load("ptr", job, IN), w.load("ptr", job, OUT), w.load("i64", job, COUNT)
+        with w.repeated() as leave:
+            leave(w.load("i64", job, NEXT) >= count)
+            with w.counted(0, w.lanes) as lane:
+                number = w.counted_up(job, NEXT)
+                w.store(number, who, lane)
+                last = w.where(number < count, number, count - 1)
+                with w.counted(0, given) as row:
+                    w.store(w.load("double", rows, last * given + row), state, row * w.lanes + lane)
+            w.call("row", "void", state, found)
+            with w.counted(0, w.lanes) as lane:
+                number = w.load("i64", who, lane)
+                with w.when(number < count), w.counted(0, returned) as row:
+                    w.store(w.load("double", found, row * w.lanes + lane), results, number * returned + row)
+        w.give(Value(w, "ptr", "null"))
+
+    def body(arguments: list[Given], results: list[Value]) -> None:
+        job, count = w.room("i64", 4), w.room("i64")
+        w.store(product(w, arguments[0], 1), count)
+        w.store(w.literal(0, "i64"), job, NEXT)
+        w.store(w.load("i64", count), job, COUNT)
+        w.store(arguments[0].data, job, IN)
+        w.store(results[0], job, OUT)
+        share(w, job, w.load("i64", count), threads)
+
+    write_handler(w, 1, 1, body)
