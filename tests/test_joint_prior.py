@@ -51,6 +51,18 @@ def test_the_estimate_is_where_likelihood_and_prior_balance_and_its_information_
     np.testing.assert_allclose(planned - of_data, np.linalg.inv(COVARIANCE), rtol=1e-6)
 
 
+def test_it_counts_beside_an_unknown_start_of_one_run_and_of_two():
+    one = run()
+    start = {"x": jj.Estimate(prior=jj.Normal(0.3, 0.01))}
+    data = [jj.Measurements(TS, one.values, 0.01, start={"x": 0.3}, unknown_start=start, t0=0.0)] * 2
+    for count in (1, 2):
+        found = jj.fit(Cart(), data[:count], TOGETHER)
+        planned = jj.planned_information(found.scene, data[:count], TOGETHER)
+        np.testing.assert_allclose(found.covariance, np.linalg.inv(planned.matrix), rtol=5e-3)
+        alone = jj.planned_information(found.scene, data[:count], NAMES).matrix
+        np.testing.assert_allclose((planned.matrix - alone)[:2, :2], np.linalg.inv(COVARIANCE), rtol=1e-6)
+
+
 def test_without_correlation_it_is_a_prior_for_each():
     data, diagonal = run(), jj.joint_normal(MEAN, np.diag(np.diag(COVARIANCE)))
     together, apart = jj.fit(Cart(), data, diagonal), jj.fit(Cart(), data, APART)

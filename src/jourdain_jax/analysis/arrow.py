@@ -139,6 +139,8 @@ def with_prior(
     slope = np.broadcast_to(np.where(np.isnan(mean), 0.0, 1 / sigma), residual.shape)
     (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(slope)
     members, runs, m = r_l.shape
+    every, M = M, np.eye(J_s.shape[1])  # where there is one run, its own unknowns count as shared, after the others
+    M[: len(every), : len(every)] = every
     rows = np.zeros((members, runs, m, arrow.local.shape[-1]))
     rows[..., range(m), range(m)], rows[..., -1] = J_l, r_l
     R = np.linalg.qr(np.concatenate([arrow.local, rows], axis=2), mode="r") if m else arrow.local
