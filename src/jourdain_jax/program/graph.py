@@ -44,7 +44,7 @@ class Graph:
         """The graph of nodes given as (operation, arguments, value, whether it varies); the first two are the numbers zero and one."""
         graph = Graph()
         for op, args, value, varies in rows:
-            graph._node(op, args, value, varies)
+            graph._node(op, args, math.nan if op == "const" and value != value else value, varies)
         return graph
 
     def _node(self, op: str, args: tuple[int, ...] = (), value=None, varies: bool | None = None) -> int:
@@ -65,7 +65,7 @@ class Graph:
     def const(self, value) -> int:
         """A number."""
         value = float(value)
-        return self._node("const", (), 0.0 if value == 0 else value, False)
+        return self._node("const", (), 0.0 if value == 0 else math.nan if value != value else value, False)  # one zero, and one that is no number
 
     def input(self, name: str, varies: bool) -> int:
         """A named input: a parameter, or (`varies`) time, a coordinate, a speed, an input of the scene."""

@@ -53,8 +53,8 @@ def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
 
 def fixed_values(program: Lowered, scene: Scene) -> tuple[Float[Array, ""], ...]:
     """As `Lowered.fixed_values`."""
-    if not program.fixed:
-        return ()
+    if not entries(scene, _needed(program)):
+        return program.fixed_values(scene)
 
     def by_machine_code(scene: Scene) -> tuple:
         found = _kernel_of_fixed(program)(jnp.concatenate(entries(scene, _needed(program))))[0]
