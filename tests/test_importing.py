@@ -7,7 +7,7 @@ PROGRAM = """
 import gc
 import jourdain_jax
 import jax
-assert gc.isenabled()
+assert gc.isenabled() and not gc.get_freeze_count()
 jax.config.update("jax_num_cpu_devices", 3)  # an error where JAX has computed anything
 assert jax.device_count() == 3
 """

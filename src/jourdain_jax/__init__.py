@@ -26,7 +26,7 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _option = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1048576"
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
 
-with _without_collecting():
+with _without_collecting(all_stays=True):
     from jourdain_jax import models
     from jourdain_jax.analysis.accelerometer import Accelerometer
     from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
