@@ -53,7 +53,7 @@ def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
 
 def fixed_values(program: Lowered, scene: Scene) -> tuple[Float[Array, ""], ...]:
     """As `Lowered.fixed_values`."""
-    if not entries(scene, _needed(program)):
+    if not program.fixed or not entries(scene, _needed(program)):  # nothing to hand over, or nothing asked for
         return program.fixed_values(scene)
 
     def by_machine_code(scene: Scene) -> tuple:
