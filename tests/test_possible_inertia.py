@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
+from jourdain_jax.analysis.unknowns import unknowns_of
 
 GENERATOR = np.random.default_rng(0)
 
@@ -77,7 +78,14 @@ def test_a_fit_whose_moments_end_beyond_what_a_body_can_have_ends_at_a_body():
     values = {name: np.asarray(motion[name]) + 0.1 * noise.normal(size=41) for name in ("yaw", "pitch")}
     data = jj.Measurements(ts, values, 0.1, start=start)
     free, body = (jj.fit(scene, data, ("moments",)) for scene in (Turning(), TurningBody()))
+    by_name = jj.fit(Turning(), data, {"body": jj.possible_inertia()})
     assert free.impossible
+    assert not by_name.impossible
+    np.testing.assert_allclose(by_name.scene.moments, jnp.diag(body.scene.inertia()), rtol=1e-6)
+    np.testing.assert_allclose(by_name.tied["moments"].value, by_name.scene.moments)
+    flat = by_name["body second moment[1]"]  # Iyy is at most Ixx + Izz
+    assert flat.value == 0
+    assert 0 < flat.high < 0.2
     assert body.converged
     assert not body.impossible
     moments = np.linalg.eigvalsh(np.asarray(body.scene.inertia()))
@@ -100,3 +108,110 @@ def test_a_fit_whose_moments_end_beyond_what_a_body_can_have_ends_at_a_body():
 def test_impossible_numbers_are_refused_by_name(call, told):
     with pytest.raises(ValueError, match=told):
         call()
+
+
+NUMBERS_OF = [
+    (jj.models.WhippleBicycle(), "rear frame", {"IBxx", "IByy", "IBzz", "IBxz"}, 4),
+    (jj.models.WhippleBicycle(), "rear wheel", {"IRxx", "IRyy"}, 2),
+    (jj.models.Rattleback(), "stone", {"A", "B", "C", "D"}, 4),
+    (jj.models.FreeRigidBody(), "body", {"i1", "i2", "i3"}, 3),
+    (Turning(), "body", {"moments"}, 3),
+]
+
+
+@pytest.mark.parametrize(("scene", "body", "names", "count"), NUMBERS_OF, ids=lambda x: type(x).__name__ if isinstance(x, jj.Scene) else None)
+def test_whatever_the_numbers_of_a_body_are_its_parameters_are_possible(scene, body, names, count):
+    unknowns = unknowns_of(scene, [], {body: jj.possible_inertia()})
+    layout = unknowns.layout
+    assert layout.sizes == (count, 0)
+    assert set(layout.following) == names
+    for name in names:
+        np.testing.assert_allclose(getattr(layout.scene(scene, unknowns.guess), name), getattr(scene, name), rtol=1e-12)
+    positive = unknowns.ends[0] == 0
+    for x in GENERATOR.normal(size=(5, count)) * 2.0:
+        shared = np.where(positive, np.exp(x), x)
+        moved = layout.scene(scene, shared)
+        I = np.asarray(jj.pose_at(moved, 0.0, moved.named()[0]).bodies[body].body.inertia)
+        least, middle, largest = np.linalg.eigvalsh(I)
+        assert least > 0
+        assert largest <= (least + middle) * (1 + 1e-12)
+        np.testing.assert_allclose(np.concatenate(layout.bodies[0].numbers(moved)), shared, rtol=1e-6, atol=1e-6)  # as many as there are parameters
+
+
+def test_a_batch_of_numbers_makes_a_batch_of_parameters():
+    scene = jj.models.WhippleBicycle()
+    free = {"rear wheel": jj.possible_inertia(), "mB": None, "IFxx": lambda scene: 2.0 * scene.IRxx}
+    layout = unknowns_of(scene, [], free).layout
+    shared = GENERATOR.normal(size=(3, 2, 3))
+    many = layout.scene(scene, shared)
+    for index in np.ndindex(3, 2):
+        one = layout.scene(scene, shared[index])
+        for name in ("IRxx", "IRyy", "mB", "IFxx"):
+            np.testing.assert_allclose(getattr(many, name)[index], getattr(one, name), rtol=1e-14)
+
+
+class Planar(Turning):
+    """A body that has one moment of inertia, which is a parameter."""
+
+    def inertia(self):
+        return jnp.array([0.0, 0.0, 1.0]) * self.moments[0]
+
+
+class Uneven(Turning):
+    """A body whose moments are multiples of one parameter."""
+
+    def inertia(self):
+        return jnp.array([1.0, 1.5, 1.0]) * self.moments[0]
+
+
+class Bent(Turning):
+    """A body whose moments are no parameters, but functions of them."""
+
+    def inertia(self):
+        return self.moments**2
+
+
+class Crossed(Turning):
+    """A body with two products of inertia."""
+
+    first: jnp.ndarray = jj.parameter(0.01, unit="kg m^2")
+    second: jnp.ndarray = jj.parameter(0.02, unit="kg m^2")
+
+    def inertia(self):
+        return jnp.diag(self.moments) + self.first * crossing(0, 1) + self.second * crossing(0, 2)
+
+
+class Doubled(Crossed):
+    """A body one of whose moments is a product of inertia, too."""
+
+    def inertia(self):
+        return jnp.diag(self.moments) + self.moments[0] * crossing(0, 1)
+
+
+def crossing(i, j):
+    """Ones at two places of a symmetric matrix."""
+    return jnp.zeros((3, 3)).at[i, j].set(1.0).at[j, i].set(1.0)
+
+
+MOMENTS = {"body": jj.possible_inertia()}
+
+
+@pytest.mark.parametrize(
+    ("scene", "free", "told"),
+    [
+        (Turning(), {"bodi": jj.possible_inertia()}, "`bodi`, which is no body of `Turning`; did you mean `body`"),
+        (jj.models.DoublePendulumRods(), {"first": jj.possible_inertia()}, "that is a particle, which has none"),
+        (Turning(), MOMENTS | {"moments": None}, "`free` has `moments` beside the possible inertia of `body`, which decides `moments`"),
+        (Turning(), MOMENTS | {"moments": lambda scene: scene.moments}, "a function for `moments` beside the possible inertia"),
+        (Turning(moments=jnp.array([0.1, 0.1, 0.3])), MOMENTS, "has the moments of inertia 0.1, 0.1, 0.3 kg m.2, which with its products no body"),
+        (Planar(), MOMENTS, "entry 11 of its inertia, 0 kg m.2, is no parameter; give its parameters ranges or ties"),
+        (Uneven(), MOMENTS, "moments about axes 1 and 2 are different multiples of `moments`"),
+        (Bent(), MOMENTS, "entry 11 of its inertia is made of `moments`, expected one parameter times a constant"),
+        (Crossed(), MOMENTS, "it has 2 products of inertia and 3 moments that differ"),
+        (Doubled(), MOMENTS, "one parameter is a moment and a product"),
+        (jj.models.TiltingDisc(), {"disc": jj.possible_inertia()}, "entry 11 of its inertia is made of `mass`, `radius`"),
+    ],
+)
+def test_an_inertia_that_is_not_made_of_parameters_is_refused_by_name(scene, free, told):
+    with pytest.raises(ValueError, match=told):
+        unknowns_of(scene, [], free)

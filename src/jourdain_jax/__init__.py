@@ -29,6 +29,7 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
 with _without_collecting(all_stays=True):
     from jourdain_jax import models
     from jourdain_jax.analysis.accelerometer import Accelerometer
+    from jourdain_jax.analysis.body_inertia import possible_inertia
     from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
     from jourdain_jax.analysis.estimate import Estimate
     from jourdain_jax.analysis.filtering import filtered_log_likelihood
@@ -246,6 +247,7 @@ __all__ = [
     "pose_at",
     "position_residual",
     "positive",
+    "possible_inertia",
     "potential_energy",
     "quaternion",
     "quaternion_from_axis_angle",

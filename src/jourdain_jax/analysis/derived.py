@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.analysis.information import Information
-from jourdain_jax.analysis.unknowns import Layout
+from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.scene import Scene
 

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from jourdain_jax.analysis.asked import Asked
+from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.fit_statistics import statistics
@@ -53,7 +54,7 @@ _TURNS, _SETTLED = 20, 1e-3  # of correlation times and unknowns at most; change
 def fit(
     scene: Scene | BuiltFor,
     data: Measurements | Sequence[Measurements],
-    free: "Mapping[str, Range | Estimate | Callable | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     *,
     cutoff: float = 1e-6,
     tolerance: float = 1e-4,
@@ -72,8 +73,8 @@ def fit(
     - `free`: parameter names, or name -> `bounds(low, high)`, `positive()`, `unbounded()` or None (positive where the parameter
       is declared so), a prior `Normal(mean, sigma)`, or an `Estimate`. A function of the scene ties a parameter to others:
       `free={"radius": None, "inertia": lambda scene: 0.5 * scene.mass * scene.radius**2}`. The measured sigmas of a bicycle are such priors:
-      `free=measured_bicycle("Browser").prior`; of parameters that were measured together, `joint_normal(means, covariance)`. What `unknown_start`, sensors
-      and actuators of the runs name is free as well.
+      `free=measured_bicycle("Browser").prior`; of parameters that were measured together, `joint_normal(means, covariance)`. The name of a body, with
+      `possible_inertia()`, frees its moments of inertia. What `unknown_start`, sensors and actuators of the runs name is free as well.
     - `cutoff`: singular values of the scaled Jacobian below this fraction of the largest count as zero (`Information`). Keep it
       well above the relative accuracy of the simulation.
     - `tolerance`: the fit has converged when a step changes no residual by more than about this many sigmas, and no unknown by
@@ -117,7 +118,7 @@ def fit(
 def fit_batch(
     scene: Scene | BuiltFor,
     data: Measurements | Sequence[Measurements],
-    free: "Mapping[str, Range | Estimate | Callable | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     *,
     cutoff: float = 1e-6,
     tolerance: float = 1e-4,

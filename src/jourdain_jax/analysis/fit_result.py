@@ -18,11 +18,11 @@ from jourdain_jax.analysis.fit_text import batch_text, text
 from jourdain_jax.analysis.held_out import Prediction, of_fitted, of_held_out
 from jourdain_jax.analysis.information import Information, hidden_combinations
 from jourdain_jax.analysis.informed import informed
+from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Shot
 from jourdain_jax.analysis.profile import FAR_BEYOND
-from jourdain_jax.analysis.unknowns import Layout
 from jourdain_jax.analysis.weak_directions import weak_combinations
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
@@ -303,9 +303,9 @@ class Fit(Printed):
 
     @property
     def tied(self) -> dict[str, Estimated]:
-        """The parameters that follow from others by the functions in `free`, as `derived` tells them."""
+        """The parameters that follow from unknowns, by the functions and the possible inertias in `free`, as `derived` tells them."""
         units = {name: about["unit"] for name, _, about in parameters_of(self.asked.scene)}
-        return {tie.name: self.derived(lambda scene, name=tie.name: getattr(scene, name), units[tie.name]) for tie in self.layout.ties}
+        return {name: self.derived(lambda scene, name=name: getattr(scene, name), units[name]) for name in self.layout.following}
 
     def profiles(self, data: Measurements | Sequence[Measurements], names: str | Iterable[str] = ()) -> dict[str, Profile]:
         """The profile likelihood of the unknowns in `names` (default: all that are not of one run alone), by name: how far each may be moved, all others

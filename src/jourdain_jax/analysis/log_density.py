@@ -16,16 +16,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
+from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood import as_runs, in_all_or_none, mapped, of_run
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.predictions import Run, equal_runs
 from jourdain_jax.analysis.ranges import Range, bounds, positive
 from jourdain_jax.analysis.starts import check_starts
 from jourdain_jax.analysis.transforms import Transforms
-from jourdain_jax.analysis.unknowns import Layout, unknowns_of
+from jourdain_jax.analysis.unknowns import unknowns_of
 from jourdain_jax.build.reference_parameters import reference_parameters
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.simulate import simulate
@@ -179,7 +181,7 @@ class LogDensity(eqx.Module):
 def log_density(
     scene: Scene | BuiltFor,
     data: Measurements | Sequence[Measurements],
-    free: "Mapping[str, Range | Estimate | Callable | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     **simulation,
 ) -> LogDensity:
     """The posterior density of the unknowns of `fit`, as a function of a vector of any real numbers, for samplers such as those of BlackJAX and NumPyro.

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jourdain_jax.analysis.joined import JoinedArrow
+from jourdain_jax.analysis.layout import Layout, Place
 from jourdain_jax.analysis.levenberg_marquardt import Linearised
 from jourdain_jax.analysis.losses import Loss
 from jourdain_jax.analysis.measurements import Measurements
@@ -22,7 +23,7 @@ from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem, closed
 from jourdain_jax.analysis.ranges import Range, unbounded
 from jourdain_jax.analysis.shooting import MultipleShooting, ends_of_pieces, in_pieces
-from jourdain_jax.analysis.unknowns import Layout, Place, Unknowns
+from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.motion.setup import TOLERANCE
 from jourdain_jax.scene.scene import Scene
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.likelihood import as_runs
 from jourdain_jax.analysis.measurements import Measurements
@@ -72,7 +73,7 @@ class PlannedInformation(Printed, eqx.Module):
 def planned_information(
     scene: Scene | BuiltFor,
     plan: Measurements | Sequence[Measurements],
-    free: "Mapping[str, Range | Estimate | Callable | None] | Iterable[str]" = (),
+    free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     **simulation,
 ) -> PlannedInformation:
     """What runs that are planned will tell of the unknowns, taken at the values that the scene has.
@@ -125,7 +126,13 @@ def planned_information(
 def _values(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> Float[Array, "places"]:
     """All unknowns at the values that the scene and the runs have; those of parameters and starts may be traced."""
     shared, local = unknowns.split(unknowns.guess)
-    rows = [jnp.ravel(place.of(shared) if place.of_sensor else getattr(scene, place.name)) for place in unknowns.layout.shared]
+    of_bodies = {label: x for body in unknowns.layout.bodies for label, x in zip(body.labels, body.numbers(scene), strict=True)}
+    of_kind = {
+        "scene": lambda place: getattr(scene, place.name),
+        "sensor": lambda place: place.of(shared),
+        "inertia": lambda place: of_bodies[place.name],
+    }
+    rows = [jnp.ravel(of_kind[place.kind](place)) for place in unknowns.layout.shared]
     for run, own in zip(runs, local, strict=True):
         rows += [jnp.ravel(run.start.get(place.name, place.of(own))) for place in unknowns.layout.local]
     return jnp.concatenate(rows)

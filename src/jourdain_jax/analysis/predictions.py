@@ -21,10 +21,10 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.correlated_noise import Chains, whitened
+from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.nodes import begin, ended
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
-from jourdain_jax.analysis.unknowns import Layout
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.forward_mode import simulate_alongside

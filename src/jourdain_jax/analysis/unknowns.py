@@ -3,101 +3,24 @@
 theta = (shared, own of run 0, own of run 1, ...), every run with a place for each initial value that is unknown in any; where it is known, it is held.
 """
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
+from jourdain_jax.analysis.body_inertia import BodyInertia, PossibleInertia, inertia_of_body
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.joint_prior import Correlated, whitening
+from jourdain_jax.analysis.layout import Kind, Layout, Place
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.ranges import Range, positive, unbounded
 from jourdain_jax.analysis.sensors import UNITS, default_range
-from jourdain_jax.analysis.ties import Tie, tied_by
+from jourdain_jax.analysis.ties import tied_by
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where the entries of a parameter, of an initial value, or of a number of a sensor or actuator, are in a vector of such."""
-
-    name: str  # of a sensor's or actuator's: "gyro.gain"
-    shape: tuple[int, ...]
-    begin: int
-    of_sensor: bool = False  # or of an actuator
-
-    @property
-    def end(self) -> int:
-        """One past the last."""
-        return self.begin + math.prod(self.shape)
-
-    def of(self, vector):
-        """Its numbers in a vector (or in many, with leading axes), in their own shape."""
-        return vector[..., self.begin : self.end].reshape((*vector.shape[:-1], *self.shape))
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Names and shapes of the shared unknowns and of those of each run, and the parameters that follow from them; hashable."""
-
-    shared: tuple[Place, ...]
-    local: tuple[Place, ...]
-    ties: tuple[Tie, ...] = ()
-
-    @property
-    def sizes(self) -> tuple[int, int]:
-        """How many are shared, and how many each run has."""
-        return self.shared[-1].end if self.shared else 0, self.local[-1].end if self.local else 0
-
-    @property
-    def parameters(self) -> set[str]:
-        """Names of the parameters that differ from those of the scene."""
-        return {place.name for place in self.shared if not place.of_sensor} | {tie.name for tie in self.ties}
-
-    def scene(self, scene: Scene, shared: Float[Array | np.ndarray, "*members shared"]) -> Scene:
-        """The scene with these shared unknowns."""
-        leaves, treedef = jax.tree.flatten(scene)
-        return jax.tree.unflatten(treedef, [x if x is own else jnp.asarray(x) for x, own in zip(self.leaves(leaves, treedef, shared), leaves, strict=True)])
-
-    def leaves(self, leaves: list, treedef, shared: Float[Array | np.ndarray, "*members shared"]) -> list:
-        """The leaves of a scene, with these shared unknowns in their places."""
-        found = list(leaves)
-        for place in self.shared:
-            if not place.of_sensor:
-                found[_leaf(treedef, place.name)] = place.of(shared)
-        for tie in self.ties:
-            # a member's parameters have its axes in front, those that all share have none
-            function, axes = tie.value, [0 if np.ndim(x) > np.ndim(own) else None for x, own in zip(found, leaves, strict=True)]
-            for _ in shared.shape[:-1]:
-                function = jax.vmap(function, in_axes=(axes,))
-            found[_leaf(treedef, tie.name)] = function(found)
-        return found
-
-    def start(self, start: dict, local: Float[Array | np.ndarray, "*members local"]) -> dict:
-        """The start of a run with these unknowns of its own."""
-        return start | {place.name: place.of(local) for place in self.local if place.name in start}
-
-    @property
-    def numbers(self) -> bool:
-        """Whether sensors or actuators have any."""
-        return any(place.of_sensor for place in (*self.shared, *self.local))
-
-    def known(self, shared, local) -> dict[str, Array]:
-        """Numbers of sensors and actuators by name, of one run."""
-        return {place.name: place.of(vector) for places, vector in ((self.shared, shared), (self.local, local)) for place in places if place.of_sensor}
-
-
-@lru_cache(maxsize=256)
-def _leaf(treedef, name: str) -> int:
-    """Which leaf of a scene the parameter of this name is."""
-    return getattr(jax.tree.unflatten(treedef, range(treedef.num_leaves)), name)
 
 
 @dataclass(frozen=True)
@@ -168,7 +91,9 @@ class _Entry:
     prior: Any = None  # with mean and sigma
 
 
-def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, Range | Estimate | Callable | None] | Iterable[str]") -> Unknowns:
+def unknowns_of(
+    scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]"
+) -> Unknowns:
     """The unknowns that `free`, the runs' `unknown_start` and their sensors and actuators name.
 
     A parameter for which `free` gives a function of the scene is no unknown: it follows from the others (`ties`).
@@ -179,7 +104,15 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
     parameters = {name: field.metadata for name, field in scene.__dataclass_fields__.items() if field.metadata.get("parameter")}
     entries: list[_Entry] = []
     shared, local, functions = _Places(), _Places(), {}
+    bodies: list[BodyInertia] = []
     for name, given in (free if isinstance(free, Mapping) else dict.fromkeys(as_names(free))).items():
+        if isinstance(given, PossibleInertia):
+            bodies.append(inertia_of_body(scene, name))
+            numbers = zip(bodies[-1].labels, ("kg m^2", ""), (positive(), unbounded(1.0)), bodies[-1].numbers(scene), strict=True)
+            for label, unit, default, guess in numbers:
+                entries.append(_entry(label, unit, None, default, np.asarray(guess)))
+                shared.add(label, guess.shape, "inertia")
+            continue
         if name not in parameters:
             raise ValueError(f"`free` names `{name}`, which is no parameter of `{type(scene).__name__}`; {nearest(name, parameters)}")
         if isinstance(given, Estimate) and given.per_run:
@@ -194,12 +127,12 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
     for label, estimate in _of_all_runs(runs).items():
         if not estimate.per_run:
             entries.append(_of_sensor(label, label, estimate))
-            shared.add(label, entries[-1].guess.shape, of_sensor=True)
+            shared.add(label, entries[-1].guess.shape, "sensor")
     for name in dict.fromkeys(name for run in runs for name in run.unknown_start):
         local.add(name, next(run.start[name].shape for run in runs if name in run.unknown_start))
     for label, estimate in _of_all_runs(runs).items():
         if estimate.per_run:
-            local.add(label, np.shape(estimate.guess), of_sensor=True)
+            local.add(label, np.shape(estimate.guess), "sensor")
     for index, run in enumerate(runs):
         for place in local.found:
             entries.append(_of_run(f"run {index}: {place.name}", place, run))
@@ -209,7 +142,8 @@ def unknowns_of(scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, 
     counts = [entry.guess.size for entry in entries]
     each = lambda values: np.array([x for x, count in zip(values, counts, strict=True) for _ in range(count)])  # noqa: E731
     guess = np.concatenate([entry.guess.ravel() for entry in entries], dtype=float)
-    layout = Layout(tuple(shared.found), tuple(local.found))
+    layout = Layout(tuple(shared.found), tuple(local.found), tuple(bodies))
+    _check_told_once(layout, functions)
     for name, function in functions.items():
         layout = replace(layout, ties=(*layout.ties, tied_by(name, function, layout.scene(scene, guess[: layout.sizes[0]]))))
     return Unknowns(
@@ -232,8 +166,18 @@ class _Places:
     def __init__(self) -> None:
         self.found: list[Place] = []
 
-    def add(self, name: str, shape: tuple[int, ...], of_sensor: bool = False) -> None:
-        self.found.append(Place(name, shape, self.found[-1].end if self.found else 0, of_sensor))
+    def add(self, name: str, shape: tuple[int, ...], kind: Kind = "scene") -> None:
+        self.found.append(Place(name, shape, self.found[-1].end if self.found else 0, kind))
+
+
+def _check_told_once(layout: Layout, functions: Mapping) -> None:
+    """ValueError where a moment of inertia is told twice."""
+    told = {place.name: f"`{place.name}`" for place in layout.shared if place.kind == "scene"} | {name: f"a function for `{name}`" for name in functions}
+    for body in layout.bodies:
+        for entry in body.entries:
+            if entry.name in told:
+                raise ValueError(f"`free` has {told[entry.name]} beside the possible inertia of `{body.body}`, which decides `{entry.name}`; leave one out")
+        told |= {entry.name: f"the possible inertia of `{body.body}`" for entry in body.entries}
 
 
 def _of_all_runs(runs: Sequence[Measurements]) -> dict[str, Estimate]:
