@@ -6,7 +6,7 @@ Every model is measured in two fresh processes that share one cache, empty at fi
 programs. The first process fills it ("cold", writing included), the second reads it ("warm cache"). Both find the package as bytecode, as it lies on a
 user's machine: a process before them writes it, where PYTHONDONTWRITEBYTECODE is set here too. In seconds of processor time, one after another in each process:
 
-    import      jax and the package
+    import      jax, the package and the model, which is made
     structure   probing of rank, privileged velocities and kinds of rows
     lowering    the scalar program, or why there is none
     start       the first consistent start, of the model's example
@@ -35,6 +35,7 @@ begin = clock()
 import json, sys
 import jax, jax.numpy as jnp
 import jourdain_jax as jj
+scene = jj.models.MODELS[sys.argv[1]]()
 laps["import"] = clock() - begin
 
 def lap(name, f):
@@ -50,7 +51,6 @@ def lower():
     except jj.NotLowered:
         return False
 
-scene = jj.models.MODELS[sys.argv[1]]()
 lap("structure", lambda: jj.structure_of(scene) and None)
 lowered = lap("lowering", lower)
 start = lap("start", lambda: jj.start(scene, **scene.example))

@@ -21,7 +21,7 @@ from jourdain_jax.scene.names import Named
 # what a user is handed without having imported it
 HANDED_OUT = (Check, ContactForce, RowReactions, Diagnostics, Energies, Contact, Coordinates, Names, Named, BodyMotion, BodyPose, Motion)
 HANDED_OUT += (Point, Pose)
-PUBLIC = {name: value for name, value in vars(jj).items() if not name.startswith("_") and not inspect.ismodule(value)}
+PUBLIC = {name: value for name, value in inspect.getmembers(jj) if not name.startswith("_") and not inspect.ismodule(value)}
 FUNCTIONS = {name: value for name, value in PUBLIC.items() if inspect.isfunction(value)}
 CLASSES = {value.__name__: value for value in (*PUBLIC.values(), *HANDED_OUT) if inspect.isclass(value)}
 SELF_EVIDENT = {"self", "scene", "t", "q", "u"}

@@ -9,6 +9,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop
+from jourdain_jax.motion.integrators.tableaus import method_of
 from jourdain_jax.motion.trajectories import results
 
 GRAVITY = 9.81
@@ -29,7 +30,7 @@ def stopped(y0, value, *, rates, longest=2.0, solver=None, kind="forward", lanes
         max_steps=max_steps,
     )
     goals = jnp.stack([real(0.5 * longest), real(longest)])
-    method = erk_loop.method_of(diffrax.Dopri8() if solver is None else solver)
+    method = method_of(diffrax.Dopri8() if solver is None else solver)
     return erk_loop.integrate(problem, method, y0, real(0.0), goals, 1e-2, kind)[2]
 
 

@@ -1,18 +1,106 @@
-"""What importing the package does to the process."""
+"""What importing the package does to the process, and what it leaves until it is asked for."""
 
+import ast
+import inspect
+import pickle
 import subprocess
 import sys
+from importlib import import_module
+from pathlib import Path
+
+import diffrax
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.motion.integrators.tableaus import DOPRI5, DOPRI8, TSIT5, as_solver, method_of
 
 PROGRAM = """
 import gc
-import jourdain_jax
+import sys
+import jourdain_jax as jj
 import jax
 assert gc.isenabled() and not gc.get_freeze_count()
 jax.config.update("jax_num_cpu_devices", 3)  # an error where JAX has computed anything
 assert jax.device_count() == 3
+
+disc = jj.models.TiltingDisc()
+assert jj.simulate(disc, jj.start(disc, lean=0.3, spin_rate=-3.0), t1=0.1).result == 0
+left = {"diffrax", "optimistix", "lineax", "tqdm", "jourdain_jax.analysis", "jourdain_jax.ensembles", "jourdain_jax.plotting", "jourdain_jax.models.skate"}
+imported = left & sys.modules.keys()
+assert not imported, imported
+from jourdain_jax import RadauIIA, fit
+import diffrax
+assert issubclass(RadauIIA, diffrax.AbstractSolver)
 """
+PACKAGES = (jj, jj.models)
 
 
-def test_importing_computes_nothing_and_leaves_garbage_collection_on():
+def test_importing_computes_nothing_and_a_motion_imports_what_it_needs():
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def _imports(package) -> dict[str, str]:
+    """The module of each name that the source of a package imports, for the interpreter or for static tools."""
+    nodes = ast.walk(ast.parse(Path(package.__file__).read_text()))
+    froms = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module.startswith("jourdain_jax")]
+    return {alias.asname or alias.name: node.module for node in froms for alias in node.names}
+
+
+@pytest.mark.parametrize("package", PACKAGES, ids=lambda package: package.__name__)
+def test_public_names_are_there_and_those_that_static_tools_see(package):
+    public, imports = set(package.__all__), _imports(package)
+    assert public == {name for name in imports if not name.startswith("_") and name not in ("names_on_first_use", "PLACES")}
+    assert public <= set(dir(package))
+    for name in public:
+        module = import_module(imports[name])
+        assert getattr(package, name) is getattr(module, name, sys.modules.get(f"{module.__name__}.{name}")), name
+    members = dict(inspect.getmembers(package))
+    assert public <= members.keys()
+    with pytest.raises(AttributeError, match=f"module '{package.__name__}' has no attribute 'sledge'"):
+        package.sledge  # noqa: B018
+    with pytest.raises(ImportError, match="cannot import name 'sledge'"):
+        exec(f"from {package.__name__} import sledge")
+    exec(f"from {package.__name__} import *", found := {})
+    assert public <= found.keys()
+
+
+def test_models_are_pickled_by_their_own_modules():
+    for name in ("tilting-disc", "two-wheel-axle-free"):
+        scene = jj.models.model(name)
+        assert pickle.loads(pickle.dumps(type(scene))) is type(scene) is jj.models.MODELS[name]
+        assert repr(pickle.loads(pickle.dumps(scene))) == repr(scene)
+    assert pickle.loads(pickle.dumps(jj.rollout)) is jj.rollout
+
+
+def test_the_registry_holds_all_models():
+    kinds = set(jj.models.MODELS.values())
+    assert {kind.__name__ for kind in kinds} == set(jj.models.__all__) - {"MODELS", "model"}
+    assert len(jj.models.MODELS) == len(kinds) == len(list(jj.models.MODELS))
+    assert "sledge" not in jj.models.MODELS
+    with pytest.raises(KeyError):
+        jj.models.MODELS["sledge"]
+
+
+@pytest.mark.parametrize("method", [TSIT5, DOPRI5, DOPRI8], ids=lambda method: method.name)
+def test_our_tableaus_are_those_of_the_solvers_of_that_name(method):
+    solver = getattr(diffrax, method.name)()
+    tableau = solver.tableau
+    for row, theirs in zip(method.A[1:], tableau.a_lower, strict=True):
+        assert np.array_equal(row[: len(theirs)], theirs)
+        assert not row[len(theirs) :].any()
+    assert np.array_equal(method.b, tableau.b_sol)
+    assert np.array_equal(method.b_error, tableau.b_error)
+    assert np.array_equal(method.c[1:], tableau.c)
+    assert method.order == solver.order(None)
+    assert method_of(solver) is method
+    assert type(as_solver(method)) is type(solver)
+
+
+def test_only_a_solver_itself_has_its_tableau():
+    class Tsit5(diffrax.Tsit5):
+        pass
+
+    assert method_of(Tsit5()) is None
+    assert method_of(diffrax.Bosh3()) is None

@@ -9,6 +9,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop, recorded_adjoint
+from jourdain_jax.motion.integrators.tableaus import method_of
 from jourdain_jax.motion.trajectories import results
 
 LANES = 3
@@ -37,7 +38,7 @@ def pendulum(kind, *, rtol, solver=None, events=False, max_steps=100_000):
             shortest=1e-14 * same,
             max_steps=max_steps,
         )
-        method = erk_loop.method_of(diffrax.Dopri8() if solver is None else solver)
+        method = method_of(diffrax.Dopri8() if solver is None else solver)
         ys, _, end = erk_loop.integrate(problem, method, y0, t0, goals, 1e-3, kind)
         return ys, end.t, end.y, end
 

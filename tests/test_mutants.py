@@ -26,6 +26,7 @@ from jourdain_jax.lowering import appell, kept_rows, lower
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.models import MODELS
 from jourdain_jax.motion.integrators import erk_loop, erk_step, recorded_adjoint, step_adjoint
+from jourdain_jax.motion.integrators.tableaus import method_of
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.program.evaluate import Probes
 
@@ -131,7 +132,7 @@ def loop(kind: str, rates: Callable, *, rtol: float, project=None, events=None, 
             max_steps=2000,
             knots=None if knots is None else jnp.asarray(knots),
         )
-        ys, _, end = erk_loop.integrate(problem, erk_loop.method_of(solver or diffrax.Dopri8()), y0, t0, goals, dt0, kind)
+        ys, _, end = erk_loop.integrate(problem, method_of(solver or diffrax.Dopri8()), y0, t0, goals, dt0, kind)
         return ys, end
 
     return run
@@ -302,7 +303,7 @@ MUTANTS = [
         "margins",
     ),
     Mutant("a wrong weight", erk_step, "stages", "method.A[1:count], method.b]", "method.A[1:count], method.b * (1 + 1e-6)]", STEPS, "closed form"),
-    Mutant("rows of the tableau too small", erk_loop, "method_of", "= row", "= 0.999 * np.asarray(row)", STEPS, "closed form"),
+    Mutant("rows of the tableau too small", erk_step, "stages", "method.A[1:count], method.b]", "0.999 * method.A[1:count], method.b]", STEPS, "closed form"),
     Mutant("the whole step for its error", erk_step, "_tried", "weighted(method.b_error, k)", "weighted(method.b, k)", STEPS, "too many for the order"),
     Mutant("stages at the first time", erk_step, "stages", "t + c * h, treedef", "t + 0 * c * h, treedef", STEPS, "closed form"),
     Mutant("every step accepted", erk_step, "_tried", "(size_of_error <= 1)", "(size_of_error <= 1e30)", STEPS, "closed form"),

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
-from jourdain_jax.motion.integrators.erk_loop import method_of
 from work_precision_cases.curve import TOLERANCES, Curve, NotApplicable, Prepared, Solved
 from work_precision_cases.problem import Problem
 
@@ -27,8 +26,8 @@ def stages(solver) -> int | None:
         solver = solver.solver
     if not isinstance(solver, diffrax.AbstractERK):
         return None
-    method = method_of(solver)
-    return len(method.c) - int(method.last_is_next_first and method.b_error[-1] == 0)
+    tableau = solver.tableau
+    return len(tableau.b_sol) - int(tableau.fsal and tableau.b_error[-1] == 0)
 
 
 def _read(solver) -> Callable[[tuple], Solved]:

@@ -3,11 +3,15 @@
 Importing this package switches JAX to 64-bit floats, unless the environment variable JAX_ENABLE_X64 is set to 0; asks for at least 16
 threads on the CPU, unless PJRT_NPROC or NPROC is set; and lets XLA compile small loops on the CPU into one function each, unless XLA_FLAGS
 holds `xla_backend_extra_options`. The last two take effect if JAX has not computed anything yet.
+
+What a first motion does not need, such as fits, studies and pictures, is imported when it is first asked for.
 """
 
 import os as _os
+import typing as _typing
 
 from jourdain_jax.calculus.collecting import without_collecting as _without_collecting
+from jourdain_jax.calculus.on_first_use import names_on_first_use as _names_on_first_use
 
 with _without_collecting():
     import jax as _jax
@@ -26,8 +30,52 @@ if "xla_backend_extra_options" not in _os.environ.get("XLA_FLAGS", ""):
     _option = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1048576"
     _os.environ["XLA_FLAGS"] = f"{_os.environ.get('XLA_FLAGS', '')} {_option}".strip()
 
-with _without_collecting(all_stays=True):
+with _without_collecting(all_stays=True):  # what a motion needs
     from jourdain_jax import models
+    from jourdain_jax.build.sampling import sample_states
+    from jourdain_jax.build.structure import structure_of
+    from jourdain_jax.calculus.guards import DifferentiationModeError
+    from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
+    from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
+    from jourdain_jax.equations.instant import constraint_rows
+    from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
+    from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, NullSpaceSVD, Privileged, UdwadiaKalaba
+    from jourdain_jax.equations.rows import position_residual, velocity_residual
+    from jourdain_jax.equations.virtual_power import (
+        generalized_forces,
+        kinetic_energy,
+        newton_residual,
+        potential_energy,
+        unconstrained_equations,
+        virtual_power,
+    )
+    from jourdain_jax.lowering.built import Built, build
+    from jourdain_jax.lowering.lower import lower
+    from jourdain_jax.lowering.lowered import Lowered, NotLowered
+    from jourdain_jax.motion.inputs import Sampled
+    from jourdain_jax.motion.integrators.taylor import Taylor
+    from jourdain_jax.motion.sensitivity import SensitivityWarning
+    from jourdain_jax.motion.simulate import simulate
+    from jourdain_jax.motion.start import State, consistent, start
+    from jourdain_jax.motion.trajectories.diagnostics import diagnose
+    from jourdain_jax.motion.trajectories.results import SimulationError
+    from jourdain_jax.motion.trajectories.trajectory import Trajectory
+    from jourdain_jax.motion.trajectories.versions import version_of as _version_of
+    from jourdain_jax.motion.vector_fields.choice import Formulation
+    from jourdain_jax.scene.bodies import Particle, RigidBody
+    from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
+    from jourdain_jax.scene.contacts import Contact, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
+    from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, speeds
+    from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
+    from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
+    from jourdain_jax.scene.motion_state import fixed_point
+    from jourdain_jax.scene.parameters import parameter
+    from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
+    from jourdain_jax.scene.scene import Scene
+    from jourdain_jax.scene.spline import Spline
+    from jourdain_jax.scene.visuals import Visual
+
+if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.analysis.accelerometer import Accelerometer
     from jourdain_jax.analysis.body_inertia import possible_inertia
     from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
@@ -50,11 +98,6 @@ with _without_collecting(all_stays=True):
     from jourdain_jax.analysis.steady import SteadyMotion, steady
     from jourdain_jax.analysis.verification import Verification
     from jourdain_jax.analysis.verify import verify
-    from jourdain_jax.build.sampling import sample_states
-    from jourdain_jax.build.structure import structure_of
-    from jourdain_jax.calculus.guards import DifferentiationModeError
-    from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
-    from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
     from jourdain_jax.ensembles.design import Design
     from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
     from jourdain_jax.ensembles.files import InUseError
@@ -64,58 +107,69 @@ with _without_collecting(all_stays=True):
     from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
     from jourdain_jax.ensembles.study import Study
     from jourdain_jax.equations.gibbs_appell import GibbsAppell, gibbs_equations, gibbs_function
-    from jourdain_jax.equations.instant import constraint_rows
-    from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
     from jourdain_jax.equations.lagrange import lagrange_equations
-    from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, NullSpaceSVD, Privileged, UdwadiaKalaba
-    from jourdain_jax.equations.rows import position_residual, velocity_residual
-    from jourdain_jax.equations.virtual_power import (
-        generalized_forces,
-        kinetic_energy,
-        newton_residual,
-        potential_energy,
-        unconstrained_equations,
-        virtual_power,
-    )
     from jourdain_jax.importers.mjcf import from_mjcf
     from jourdain_jax.importers.sympy_scene import from_sympy
     from jourdain_jax.importers.urdf import from_urdf
-    from jourdain_jax.lowering.built import Built, build
-    from jourdain_jax.lowering.lower import lower
-    from jourdain_jax.lowering.lowered import Lowered, NotLowered
     from jourdain_jax.motion.batches.rollout import Rollout, rollout
-    from jourdain_jax.motion.inputs import Sampled
     from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
     from jourdain_jax.motion.integrators.discrete_lagrange_dalembert import DiscreteLagrangeDAlembert
     from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
     from jourdain_jax.motion.integrators.munthe_kaas import MuntheKaas
     from jourdain_jax.motion.integrators.radau import RadauIIA
-    from jourdain_jax.motion.integrators.taylor import Taylor
-    from jourdain_jax.motion.sensitivity import SensitivityWarning
-    from jourdain_jax.motion.simulate import simulate
-    from jourdain_jax.motion.start import State, consistent, start
-    from jourdain_jax.motion.trajectories.diagnostics import diagnose
-    from jourdain_jax.motion.trajectories.results import SimulationError
     from jourdain_jax.motion.trajectories.storage import load_rollout, load_trajectory, save
-    from jourdain_jax.motion.trajectories.trajectory import Trajectory
-    from jourdain_jax.motion.trajectories.versions import version_of as _version_of
-    from jourdain_jax.motion.vector_fields.choice import Formulation
     from jourdain_jax.plotting.animation import animate
     from jourdain_jax.plotting.quantities import plot
     from jourdain_jax.plotting.show import View, show
-    from jourdain_jax.scene.bodies import Particle, RigidBody
-    from jourdain_jax.scene.constraints import knife_edge, pin, rod, weld
-    from jourdain_jax.scene.contacts import Contact, ball_contact, disc_contact, ellipsoid_contact, wheel_contact
-    from jourdain_jax.scene.coordinates import coordinates, inputs, quaternion, speeds
-    from jourdain_jax.scene.grounds import Cylinder, HeightMap, Plane, Sphere, Surface
-    from jourdain_jax.scene.loads import Load, damper, generalized_force, gravity, point_force, spring, torque
-    from jourdain_jax.scene.motion_state import fixed_point
-    from jourdain_jax.scene.parameters import parameter
-    from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
-    from jourdain_jax.scene.scene import Scene
-    from jourdain_jax.scene.spline import Spline
-    from jourdain_jax.scene.visuals import Visual
 
+_ON_FIRST_USE = {
+    "analysis.accelerometer": "Accelerometer",
+    "analysis.body_inertia": "possible_inertia",
+    "analysis.energy": "Energy EnergyBalance energy energy_balance",
+    "analysis.estimate": "Estimate",
+    "analysis.filtering": "filtered_log_likelihood",
+    "analysis.fit": "fit fit_batch",
+    "analysis.fit_result": "Fit",
+    "analysis.gradients": "derivative_exists",
+    "analysis.joint_prior": "joint_normal",
+    "analysis.likelihood": "log_likelihood",
+    "analysis.linearize": "Linearization linearize",
+    "analysis.log_density": "LogDensity log_density",
+    "analysis.losses": "huber student_t",
+    "analysis.measurements": "Measurements",
+    "analysis.planning": "PlannedInformation planned_information",
+    "analysis.ranges": "bounds positive unbounded",
+    "analysis.report": "Report report",
+    "analysis.sensors": "Actuator Sensor",
+    "analysis.shooting": "MultipleShooting",
+    "analysis.steady": "SteadyMotion steady",
+    "analysis.verification": "Verification",
+    "analysis.verify": "verify",
+    "ensembles.design": "Design",
+    "ensembles.distributions": "Levels LogNormal LogUniform Normal Uniform",
+    "ensembles.files": "InUseError",
+    "ensembles.mean_gradients": "MeanGradients",
+    "ensembles.outputs": "End EventTime Happened Integral Largest LargestMagnitude Quantity Smallest",
+    "ensembles.result": "StudyResult load_study merge_studies",
+    "ensembles.sensitivity": "SobolIndices sobol_indices",
+    "ensembles.study": "Study",
+    "equations.gibbs_appell": "GibbsAppell gibbs_equations gibbs_function",
+    "equations.lagrange": "lagrange_equations",
+    "importers.mjcf": "from_mjcf",
+    "importers.sympy_scene": "from_sympy",
+    "importers.urdf": "from_urdf",
+    "motion.batches.rollout": "Rollout rollout",
+    "motion.integrators.discrete_gradient": "DiscreteGradient",
+    "motion.integrators.discrete_lagrange_dalembert": "DiscreteLagrangeDAlembert",
+    "motion.integrators.implicit_midpoint": "ImplicitMidpoint",
+    "motion.integrators.munthe_kaas": "MuntheKaas",
+    "motion.integrators.radau": "RadauIIA",
+    "motion.trajectories.storage": "load_rollout load_trajectory save",
+    "plotting.animation": "animate",
+    "plotting.quantities": "plot",
+    "plotting.show": "View show",
+}
+__getattr__, __dir__ = _names_on_first_use(globals(), {name: module for module, names in _ON_FIRST_USE.items() for name in names.split()})
 __version__ = _version_of("jourdain-jax")
 
 __all__ = [

@@ -1,60 +1,54 @@
 """All models by name."""
 
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
+from importlib import import_module
 
-from jourdain_jax.models.ball_on_turntable import BallOnTurntable
-from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
-from jourdain_jax.models.double_pendulum_angles import DoublePendulumAngles
-from jourdain_jax.models.double_pendulum_rods import DoublePendulumRods
-from jourdain_jax.models.free_rigid_body import FreeRigidBody
-from jourdain_jax.models.heisenberg_particle import HeisenbergParticle
-from jourdain_jax.models.isokinetic_particle import IsokineticParticle
-from jourdain_jax.models.pendulum_chain import PendulumChain
-from jourdain_jax.models.rattleback import Rattleback
-from jourdain_jax.models.rosenberg_particle import RosenbergParticle
-from jourdain_jax.models.skate import Skate
-from jourdain_jax.models.snakeboard import Snakeboard
-from jourdain_jax.models.spring_and_rod import SpringAndRod
-from jourdain_jax.models.suslov import Suslov
-from jourdain_jax.models.tilting_disc import TiltingDisc
-from jourdain_jax.models.tilting_disc_quaternion import TiltingDiscQuaternion
-from jourdain_jax.models.trailer_chain import TrailerChain
-from jourdain_jax.models.two_wheel_axle import (
-    TwoWheelAxleCoordinates,
-    TwoWheelAxleFree,
-    TwoWheelAxleQuasi,
-    TwoWheelAxleRedundant,
-)
-from jourdain_jax.models.vertical_disc import VerticalDisc
-from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
-MODELS: dict[str, type[Scene]] = {
-    "two-wheel-axle-free": TwoWheelAxleFree,
-    "two-wheel-axle-coordinates": TwoWheelAxleCoordinates,
-    "two-wheel-axle-quasi": TwoWheelAxleQuasi,
-    "two-wheel-axle-redundant": TwoWheelAxleRedundant,
-    "skate": Skate,
-    "chaplygin-sleigh": ChaplyginSleigh,
-    "vertical-disc": VerticalDisc,
-    "tilting-disc": TiltingDisc,
-    "tilting-disc-quaternion": TiltingDiscQuaternion,
-    "rosenberg-particle": RosenbergParticle,
-    "heisenberg-particle": HeisenbergParticle,
-    "ball-on-turntable": BallOnTurntable,
-    "suslov": Suslov,
-    "snakeboard": Snakeboard,
-    "rattleback": Rattleback,
-    "whipple-bicycle": WhippleBicycle,
-    "double-pendulum-rods": DoublePendulumRods,
-    "double-pendulum-angles": DoublePendulumAngles,
-    "free-rigid-body": FreeRigidBody,
-    "spring-and-rod": SpringAndRod,
-    "isokinetic-particle": IsokineticParticle,
-    "trailer-chain": TrailerChain,
-    "pendulum-chain": PendulumChain,
+PLACES = {  # of the classes: modules of this package, which are imported on first use
+    "two-wheel-axle-free": ("two_wheel_axle", "TwoWheelAxleFree"),
+    "two-wheel-axle-coordinates": ("two_wheel_axle", "TwoWheelAxleCoordinates"),
+    "two-wheel-axle-quasi": ("two_wheel_axle", "TwoWheelAxleQuasi"),
+    "two-wheel-axle-redundant": ("two_wheel_axle", "TwoWheelAxleRedundant"),
+    "skate": ("skate", "Skate"),
+    "chaplygin-sleigh": ("chaplygin_sleigh", "ChaplyginSleigh"),
+    "vertical-disc": ("vertical_disc", "VerticalDisc"),
+    "tilting-disc": ("tilting_disc", "TiltingDisc"),
+    "tilting-disc-quaternion": ("tilting_disc_quaternion", "TiltingDiscQuaternion"),
+    "rosenberg-particle": ("rosenberg_particle", "RosenbergParticle"),
+    "heisenberg-particle": ("heisenberg_particle", "HeisenbergParticle"),
+    "ball-on-turntable": ("ball_on_turntable", "BallOnTurntable"),
+    "suslov": ("suslov", "Suslov"),
+    "snakeboard": ("snakeboard", "Snakeboard"),
+    "rattleback": ("rattleback", "Rattleback"),
+    "whipple-bicycle": ("whipple_bicycle", "WhippleBicycle"),
+    "double-pendulum-rods": ("double_pendulum_rods", "DoublePendulumRods"),
+    "double-pendulum-angles": ("double_pendulum_angles", "DoublePendulumAngles"),
+    "free-rigid-body": ("free_rigid_body", "FreeRigidBody"),
+    "spring-and-rod": ("spring_and_rod", "SpringAndRod"),
+    "isokinetic-particle": ("isokinetic_particle", "IsokineticParticle"),
+    "trailer-chain": ("trailer_chain", "TrailerChain"),
+    "pendulum-chain": ("pendulum_chain", "PendulumChain"),
 }
+
+
+class _Models(Mapping[str, type[Scene]]):
+    """The classes by the names of the models; read-only."""
+
+    def __getitem__(self, name: str) -> type[Scene]:
+        module, kind = PLACES[name]
+        return getattr(import_module(f"{__package__}.{module}"), kind)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(PLACES)
+
+    def __len__(self) -> int:
+        return len(PLACES)
+
+
+MODELS = _Models()
 
 
 def model(name: str, **parameters) -> Scene:

@@ -8,13 +8,14 @@ t0 <= ts_1 < ts_2 < ... <= t1,   or the other way round in reversed time
 import difflib
 from collections.abc import Mapping
 
-import diffrax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import as_array, checked_unless_traced, described, is_traced, real_type
 from jourdain_jax.motion.inputs import Inputs, inputs_at
+from jourdain_jax.motion.integrators.of_diffrax import diffrax
+from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.start import State, named_start
 from jourdain_jax.scene.scene import Scene
 
@@ -22,11 +23,11 @@ DEFAULT_SAMPLES = 201
 _EVEN = np.linspace(0.0, 1.0, DEFAULT_SAMPLES)
 _SHORT = 1e-9  # s, a span for motions that are not asked for
 _ROUND_OFF = 4  # units in the last place by which a time at an end of the span may lie beyond it
-_KINDS = {
-    "solver": (diffrax.AbstractSolver, "diffrax.Dopri8()"),
-    "adjoint": (diffrax.AbstractAdjoint, "diffrax.DirectAdjoint()"),
-    "stepsize_controller": (diffrax.AbstractStepSizeController, "diffrax.PIDController(rtol=1e-8, atol=1e-8)"),
-    "saveat": (diffrax.SaveAt, "diffrax.SaveAt(ts=...)"),
+_KINDS = {  # of diffrax, and an example
+    "solver": ("AbstractSolver", "diffrax.Dopri8()"),
+    "adjoint": ("AbstractAdjoint", "diffrax.DirectAdjoint()"),
+    "stepsize_controller": ("AbstractStepSizeController", "diffrax.PIDController(rtol=1e-8, atol=1e-8)"),
+    "saveat": ("SaveAt", "diffrax.SaveAt(ts=...)"),
 }
 
 
@@ -64,8 +65,10 @@ def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, switches: dict
     if max_steps is not None and (not isinstance(max_steps, int | np.integer) or isinstance(max_steps, bool) or max_steps < 1):
         raise ValueError(f"`max_steps` is {max_steps!r}, expected a whole number of at least 1; give the number of steps after which to stop")
     for name, value in objects.items():
-        kind, example = _KINDS[name]
-        if value is not None and not isinstance(value, kind):
+        if value is None or isinstance(value, Method):
+            continue
+        kind, example = getattr(diffrax, _KINDS[name][0]), _KINDS[name][1]
+        if not isinstance(value, kind):
             raise ValueError(f"`{name}` is {described(value)}, expected an object of diffrax; write `{_meant(value, kind) or example}`")
 
 
@@ -75,7 +78,7 @@ def _meant(value, kind: type) -> str:
         return f"diffrax.{value.__name__}()"
     if not isinstance(value, str):
         return ""
-    members = {name.lower(): name for name, member in vars(diffrax).items() if isinstance(member, type) and issubclass(member, kind)}
+    members = {name.lower(): name for name in dir(diffrax) if isinstance(member := getattr(diffrax, name), type) and issubclass(member, kind)}
     near = difflib.get_close_matches(value.lower(), [name for name in members if not name.startswith("abstract")], n=1, cutoff=0.5)
     return f"diffrax.{members[near[0]]}()" if near else ""
 

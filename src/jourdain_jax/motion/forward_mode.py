@@ -3,7 +3,7 @@
 import diffrax
 
 from jourdain_jax.motion.batches.rollout import Rollout, rollout
-from jourdain_jax.motion.own_steps import Alongside
+from jourdain_jax.motion.integrators.alongside import Alongside
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import ClassVar, Literal
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,24 +16,17 @@ from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
+from jourdain_jax.motion.integrators.of_diffrax import alongside, diffrax
+from jourdain_jax.motion.integrators.tableaus import Method, method_of
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
-
-_SOLVERS = (diffrax.Tsit5, diffrax.Dopri5, diffrax.Dopri8)
-
-
-class Alongside(diffrax.ForwardMode):
-    """Forward mode for first derivatives that are asked for together with the values: one run gives both."""
-
-
-_ADJOINTS = (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, Alongside)
 
 
 class OwnSteps(Integrator):
     """Our own loop, with a solver's tableau or by Taylor series; a static object, the same for all calls with these options."""
 
-    solver: type[diffrax.AbstractERK] = eqx.field(static=True)
+    solver: Method = eqx.field(static=True)
     kind: Literal["forward", "reverse"] = eqx.field(static=True)  # of derivatives
     alongside: bool = eqx.field(static=True)  # whether values and tangents come from one run
     max_steps: int = eqx.field(static=True)
@@ -47,7 +39,7 @@ class OwnSteps(Integrator):
 
     @property
     def name(self) -> str:
-        return self.solver.__name__ if self.order is None else "Taylor"
+        return self.solver.name if self.order is None else "Taylor"
 
     @property
     def mode(self) -> Literal["forward", "reverse"]:
@@ -80,12 +72,12 @@ _once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
 
 def own_steps(solver, controller, adjoint, saveat, **static) -> OwnSteps | None:
     """Our own loop where it has such a solver and such an adjoint (None: the default one), and nothing else was stated."""
-    if controller is not None or saveat is not None or type(solver) not in _SOLVERS:
+    method = solver if isinstance(solver, Method) else method_of(solver)
+    if controller is not None or saveat is not None or method is None:
         return None
-    if adjoint is not None and (type(adjoint) not in _ADJOINTS or getattr(adjoint, "checkpoints", None) is not None):
-        return None
-    kind = "forward" if isinstance(adjoint, diffrax.ForwardMode) else "reverse"
-    return _once(type(solver), kind, isinstance(adjoint, Alongside), **static)
+    if adjoint is None or (type(adjoint) is diffrax.RecursiveCheckpointAdjoint and adjoint.checkpoints is None):
+        return _once(method, "reverse", False, **static)
+    return _once(method, "forward", type(adjoint) is alongside.Alongside, **static) if type(adjoint) in (diffrax.ForwardMode, alongside.Alongside) else None
 
 
 def reason_against_series(setup: Setup, order: int) -> str:
@@ -120,7 +112,7 @@ def _loop(setup: Setup, y0, args, ts, knots) -> Solved:
         knots=knots,
         rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
     )
-    ys, reached, end = erk_loop.integrate(problem, erk_loop.method_of(own.solver()), y0, jnp.zeros_like(setup.t0), goals, setup.dt0, own.mode)
+    ys, reached, end = erk_loop.integrate(problem, own.solver, y0, jnp.zeros_like(setup.t0), goals, setup.dt0, own.mode)
     return _as_solved(goals, ys, reached, end)
 
 

@@ -8,14 +8,14 @@ Retries add up, and each is made once: a stiff motion that left the domain runs 
 
 from typing import TypeVar
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.motion.integrators.radau import RadauIIA
+from jourdain_jax.motion.integrators.of_diffrax import radau
 from jourdain_jax.motion.integrators.solver_choice import may_be_full
 from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS, implicit_steps, is_stiff
+from jourdain_jax.motion.integrators.tableaus import DOPRI8
 from jourdain_jax.motion.integrators.taylor import Taylor
 from jourdain_jax.motion.setup import MOST_STEPS
 from jourdain_jax.motion.trajectories import results
@@ -47,8 +47,8 @@ def retry_options(retries: int, options: dict) -> dict:
     """The options of `simulate` that make these retries; `options`: those that were given."""
     full = {"formulation": as_formulation(options.get("formulation")).with_state("full"), "backend": "dense"} if retries & results.FULL_STATE else {}
     if full and isinstance(options.get("solver"), Taylor):  # which dense matrices do not have
-        full["solver"] = diffrax.Dopri8()
-    implicit = {"solver": RadauIIA(), "max_steps": implicit_steps(options.get("max_steps", MOST_STEPS))} if retries & results.IMPLICIT else {}
+        full["solver"] = DOPRI8
+    implicit = {"solver": radau.RadauIIA(), "max_steps": implicit_steps(options.get("max_steps", MOST_STEPS))} if retries & results.IMPLICIT else {}
     return full | implicit
 
 

@@ -8,7 +8,6 @@ import abc
 from operator import attrgetter
 from typing import Literal, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,7 +16,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.motion.arguments import fitting_times
 from jourdain_jax.motion.integrators.knots import knots_between
+from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.solver_choice import steps_are_given
+from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.start import State, Usual
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
@@ -49,9 +50,9 @@ class Integrator(eqx.Module):
 
     max_steps: eqx.AbstractVar[int]
     event_names: eqx.AbstractVar[tuple[str, ...]]
-    solver: eqx.AbstractVar[diffrax.AbstractSolver | type]
-    controller: eqx.AbstractVar[diffrax.AbstractStepSizeController | None]  # None: the default one
-    saveat: eqx.AbstractVar[diffrax.SaveAt | None]  # None: at the times asked for, at each of which a step ends
+    solver: eqx.AbstractVar["diffrax.AbstractSolver | Method"]
+    controller: eqx.AbstractVar["diffrax.AbstractStepSizeController | None"]  # None: the default one
+    saveat: eqx.AbstractVar["diffrax.SaveAt | None"]  # None: at the times asked for, at each of which a step ends
     projects_saved: eqx.AbstractClassVar[bool]  # whether the states that it returns are on the rows
 
     @property

@@ -6,21 +6,22 @@ domain and the rows are linear or affine; otherwise the full one (coordinates an
 
 import inspect
 import warnings
+from typing import TYPE_CHECKING
 
-import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import Number, as_array, is_traced
 from jourdain_jax.motion.arguments import check_options, span_and_start
-from jourdain_jax.motion.diffrax_steps import Diffrax
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.integration import integrate
-from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
-from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted
+from jourdain_jax.motion.integrators.of_diffrax import diffrax
+from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted, takes_even_steps
+from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method, as_solver
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import marked
 from jourdain_jax.motion.own_steps import own_steps, reason_against_series
@@ -35,7 +36,11 @@ from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
-_REVERSE, _LOOSE, _TIGHT = diffrax.RecursiveCheckpointAdjoint(), diffrax.Tsit5(), diffrax.Dopri8()  # made once: each takes a tenth of a millisecond
+if TYPE_CHECKING:
+    from jourdain_jax.motion import diffrax_steps
+else:
+    diffrax_steps = module_on_first_use("jourdain_jax.motion.diffrax_steps")
+
 _OFF = 1e4  # units of round-off: a residual that is more
 
 
@@ -47,13 +52,13 @@ def simulate(
     t0: Number | None = None,
     t1: Number | None = None,
     ts=None,
-    saveat: diffrax.SaveAt | None = None,
+    saveat: "diffrax.SaveAt | None" = None,
     rtol: Number = TOLERANCE,
     atol: Number = TOLERANCE,
-    solver: diffrax.AbstractSolver | Taylor | None = None,
-    stepsize_controller: diffrax.AbstractStepSizeController | None = None,
+    solver: "diffrax.AbstractSolver | Taylor | None" = None,
+    stepsize_controller: "diffrax.AbstractStepSizeController | None" = None,
     dt0: Number | None = None,
-    adjoint: diffrax.AbstractAdjoint | None = None,
+    adjoint: "diffrax.AbstractAdjoint | None" = None,
     max_steps: int = MOST_STEPS,
     formulation: Formulation | None = None,
     backend: str = "auto",
@@ -145,12 +150,13 @@ def _set_up(
     field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
     warn_float32(start.q.dtype, rtol)
     if solver is None:
-        solver = default_solver(rtol) if order is None else _TIGHT
+        solver = default_solver(rtol) if order is None else DOPRI8
     static = {"max_steps": max_steps, "event_names": field.event_names if events else ()}
     integrator = own_steps(solver, stepsize_controller, adjoint, saveat, **static, native=backend in ("auto", "native"), order=order)
     if integrator is None:
-        adjoint = _REVERSE if adjoint is None else adjoint
-        integrator = Diffrax(solver, stepsize_controller, adjoint, None if saveat is None else _checked_saveat(saveat), **static)
+        adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+        saveat = None if saveat is None else _checked_saveat(saveat)
+        integrator = diffrax_steps.Diffrax(as_solver(solver), stepsize_controller, adjoint, saveat, **static)
     tolerances = tuple(as_array(x, start.q.dtype) for x in (rtol, atol))  # arrays: another tolerance is no other program
     first_step = _first_step(solver, dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
     later = None
@@ -170,17 +176,17 @@ def _set_up(
 def _first_step(solver, dt0, t0, t1):
     if dt0 is None:
         return 1e-4 * (t1 - t0)
-    return jnp.abs(dt0) * jnp.sign(t1 - t0) if isinstance(solver, FixedStepSolver) else jnp.asarray(dt0, jnp.result_type(t0))
+    return jnp.abs(dt0) * jnp.sign(t1 - t0) if takes_even_steps(solver) else jnp.asarray(dt0, jnp.result_type(t0))
 
 
-def _checked_saveat(saveat: diffrax.SaveAt) -> diffrax.SaveAt:
+def _checked_saveat(saveat: "diffrax.SaveAt") -> "diffrax.SaveAt":
     if not isinstance(saveat.subs, diffrax.SubSaveAt) or saveat.subs.fn is not diffrax.SubSaveAt(t1=True).fn or saveat.dense:
         raise ValueError("`saveat` must be a plain `diffrax.SaveAt(t0=, t1=, ts=, steps=)`: a trajectory holds whole states; take what you need from it")
     return saveat
 
 
 def _check_adjoint(adjoint) -> None:
-    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if adjoint is not None and isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "`adjoint` is a diffrax.BacksolveAdjoint, which solves the motion backwards: it leaves the constraints and loses digits; use "
             "diffrax.RecursiveCheckpointAdjoint() (the default), diffrax.ForwardMode() or diffrax.DirectAdjoint()"
@@ -204,11 +210,11 @@ def _on_constraints(scene: Scene, t0, start: State, inputs: Inputs, made_here: b
     return moved_again(start) if np.asarray(start.residual) > _OFF * np.finfo(start.q.dtype).eps else start
 
 
-def default_solver(rtol: Number) -> diffrax.AbstractERK:
-    """The solver for this tolerance; a ValueError where it is traced."""
+def default_solver(rtol: Number) -> Method:
+    """The method for this tolerance; a ValueError where it is traced."""
     if is_traced(rtol):
         raise ValueError("`rtol` is traced, and the default solver is chosen by its value; give a `solver` too, such as diffrax.Dopri8()")
-    return _LOOSE if rtol >= 1e-6 else _TIGHT
+    return TSIT5 if rtol >= 1e-6 else DOPRI8
 
 
 def warn_float32(dtype, rtol) -> None:

@@ -8,29 +8,18 @@ other solvers, controllers and ways of saving.
 
 from typing import Literal
 
-import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jourdain_jax.motion.integrators import recorded_adjoint
-from jourdain_jax.motion.integrators.erk_step import RUNNING, Method, Problem, Progress, advanced, begun, running
+from jourdain_jax.motion.integrators.erk_step import RUNNING, Problem, Progress, advanced, begun, running
+from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.trajectories import results
 
 _SHRANK = 0.01  # of the average step: a singularity is near
-
-
-def method_of(solver: diffrax.AbstractERK) -> Method:
-    """The tableau of a diffrax solver."""
-    tableau = solver.tableau
-    stages = len(tableau.b_sol)
-    A = np.zeros((stages, stages))
-    for i, row in enumerate(tableau.a_lower):
-        A[i + 1, : i + 1] = row
-    return Method(A, np.asarray(tableau.b_sol), np.asarray(tableau.b_error), np.concatenate([[0.0], tableau.c]), solver.order(None))
 
 
 def integrate(

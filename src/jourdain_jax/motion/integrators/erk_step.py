@@ -12,50 +12,24 @@ increments are smaller than its last digit stands still while time passes, and n
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.integrators import event_search
 from jourdain_jax.motion.integrators.event_search import Search
+from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.trajectories import results
 
 RUNNING, LOCATING = -1, -2
 NOISE = 0.6  # exponent of round-off: rows shrink to about its power 0.4 before a step passes
 SAFETY, LEAST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
-
-
-@dataclass(frozen=True, eq=False)
-class Method:
-    """A tableau. Its stages run as a loop: one copy of the vector field to compile."""
-
-    A: np.ndarray
-    b: np.ndarray
-    b_error: np.ndarray
-    c: np.ndarray
-    order: int
-
-    @property
-    def last_is_next_first(self) -> bool:
-        """Whether the last stage is taken at y_1."""
-        return bool(np.array_equal(self.A[-1], self.b) and self.c[-1] == 1.0)
-
-    @property
-    def needed(self) -> int:
-        """How many stages a step takes: without a last one that nothing else needs."""
-        return len(self.c) - int(self.last_is_next_first and self.b_error[-1] == 0)
-
-    @property
-    def at_the_end(self) -> int:
-        """The last stage that a step takes, of those at its end (of those at all, where none is)."""
-        return int(max(np.flatnonzero(self.c[: self.needed] == 1.0), default=self.needed - 1))
 
 
 class Progress(eqx.Module):

@@ -1,36 +1,42 @@
 """What a solver and its control of steps ask for besides rates: a form of the state, constant steps, states saved at ends of steps only, a clock."""
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 
 from jourdain_jax.calculus.guards import forward_only, reverse_only
-from jourdain_jax.motion.integrators.discrete_gradient import DiscreteGradient
-from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver
-from jourdain_jax.motion.integrators.munthe_kaas import MuntheKaas
-from jourdain_jax.motion.integrators.step_to_times import EvenSteps
+from jourdain_jax.motion.integrators.of_diffrax import diffrax, discrete_gradient, fixed_step, munthe_kaas, step_to_times
+from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.scene import Scene
 
 
 def fitted(solver, scene: Scene, field: VectorField, asked: str) -> VectorField:
     """The form of the state that the solver integrates; a ValueError where it does not apply to the scene. `asked`: the `state` of its `Formulation`."""
-    return field if solver is None or not isinstance(solver, FixedStepSolver | MuntheKaas) else solver.fitted(scene, field, asked)
+    return solver.fitted(scene, field, asked) if takes_even_steps(solver) or _moves_along_rotations(solver) else field
+
+
+def takes_even_steps(solver) -> bool:
+    """Whether it is a structure-preserving solver, which takes steps of one length."""
+    return not isinstance(solver, Method | None) and isinstance(solver, fixed_step.FixedStepSolver)
+
+
+def _moves_along_rotations(solver) -> bool:
+    return not isinstance(solver, Method | None) and isinstance(solver, munthe_kaas.MuntheKaas)
 
 
 def may_be_full(solver) -> bool:
     """Whether a motion that lost its privileged speeds may go on with the full state."""
-    return not isinstance(solver, DiscreteGradient)
+    return isinstance(solver, Method | None) or not isinstance(solver, discrete_gradient.DiscreteGradient)
 
 
 def check_solver(solver, controller, dt0, saveat) -> None:
     """ValueError for options that do not go with a structure-preserving solver; others pass."""
-    if solver is None or not isinstance(solver, FixedStepSolver | MuntheKaas):
+    if not takes_even_steps(solver) and not _moves_along_rotations(solver):
         return
     name = type(solver).__name__
     if saveat is not None and saveat.subs.ts is not None:
         raise ValueError(f"`{name}` has states at ends of steps only: give times to save at as `ts`, not in `saveat`")
-    if not isinstance(solver, FixedStepSolver):
+    if not takes_even_steps(solver):
         return
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController):
         raise ValueError(
@@ -43,27 +49,24 @@ def check_solver(solver, controller, dt0, saveat) -> None:
 
 def controller_of(solver, controller, ts):
     """Even steps between the times at which steps end for a structure-preserving solver, unless the steps are given otherwise; None: no such choice."""
-    if isinstance(solver, FixedStepSolver) and (controller is None or type(controller) is diffrax.ConstantStepSize):
-        return EvenSteps(ts)
+    if takes_even_steps(solver) and (controller is None or type(controller) is diffrax.ConstantStepSize):
+        return step_to_times.EvenSteps(ts)
     return None
-
-
-_WITHOUT_TIMES = (diffrax.PIDController, diffrax.ConstantStepSize)
 
 
 def time_origin(controller, t0):
     """The time from which times count in the loops: the start, but zero where a `controller` of the user's may hold times of its own."""
-    return t0 if controller is None or type(controller) in _WITHOUT_TIMES else jnp.zeros_like(t0)
+    return t0 if controller is None or type(controller) in (diffrax.PIDController, diffrax.ConstantStepSize) else jnp.zeros_like(t0)
 
 
-def since(saveat: diffrax.SaveAt, origin) -> diffrax.SaveAt:
+def since(saveat: "diffrax.SaveAt", origin) -> "diffrax.SaveAt":
     """With times to save at that count from `origin`."""
     return saveat if saveat.subs.ts is None else eqx.tree_at(lambda saveat: saveat.subs.ts, saveat, saveat.subs.ts - origin)
 
 
 def steps_are_given(controller) -> bool:
     """Whether the user says where each step ends."""
-    return isinstance(controller, diffrax.StepTo)
+    return controller is not None and isinstance(controller, diffrax.StepTo)
 
 
 def marked_inputs(mode: str, tree):

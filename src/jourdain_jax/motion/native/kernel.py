@@ -8,12 +8,11 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.motion.integrators.erk_loop import method_of
+from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native import back, loop, samples, slopes
 from jourdain_jax.motion.native.called import called
 from jourdain_jax.motion.native.functions import Form
@@ -38,9 +37,9 @@ class Kernel(NamedTuple):
 
 
 @lru_cache(maxsize=MOST_KERNELS)
-def kernel(form: Form, solver: type[diffrax.AbstractERK], order: int | None = None) -> Kernel:
-    """The kernel for what is integrated, by the tableau of a solver of diffrax, or by Taylor series up to an order."""
-    method, layout = method_of(solver()) if order is None else TaylorSteps(order), form.layout
+def kernel(form: Form, method: Method, order: int | None = None) -> Kernel:
+    """The kernel for what is integrated, by a tableau, or by Taylor series up to an order."""
+    steps, layout = method if order is None else TaylorSteps(order), form.layout
 
     def shapes(*arguments):
         return (arguments[-1].shape[-1], layout.integrated), (layout.returned + 1,)
@@ -48,7 +47,7 @@ def kernel(form: Form, solver: type[diffrax.AbstractERK], order: int | None = No
     def run(*arguments: Float[Array, "..."]) -> tuple[Float[Array, "times y"], Float[Array, "ends"]]:
         return tuple(run_rows(*arguments))
 
-    run_rows = called(lambda lanes, threads: loop.written(form, method, lanes, host.fuses(), threads), shapes, samples.arguments(layout))
+    run_rows = called(lambda lanes, threads: loop.written(form, steps, lanes, host.fuses(), threads), shapes, samples.arguments(layout))
     return Kernel(form, run, _along(layout, run))
 
 
@@ -75,12 +74,12 @@ def _along(layout: Layout, run: Callable) -> Callable:
 
 
 @lru_cache(maxsize=MOST_KERNELS)
-def kernel_back(form: Form, solver: type[diffrax.AbstractERK], asked: tuple[int, ...]) -> Callable:
+def kernel_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable:
     """A function of samples, the rows of a start, cotangents of the states at the goals and of the end (with its time last), and the goals.
 
     It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given.
     """
-    method, count = method_of(solver()), form.layout.y + len(asked)
+    count = form.layout.y + len(asked)
     of_samples = samples.arguments(form.layout)
     run_rows = called(lambda lanes, threads: back.written(form, method, lanes, host.fuses(), threads, asked), lambda *_: ((count,),), of_samples)
     return lambda *arguments: run_rows(*arguments)[0]

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from jourdain_jax.motion.inputs import Constant, Inputs, Sampled
 from jourdain_jax.motion.integrators.erk_loop import ended
 from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
+from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native.functions import Form, event_program, outputs_of
 from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel, kernel_back, kernel_of_rates
 from jourdain_jax.motion.native.layout import Layout
@@ -43,8 +44,8 @@ class Motion(NamedTuple):
     """What is integrated from where, to which times since the start, and how well."""
 
     args: tuple  # as rates take them
-    solver: type
-    order: int | None  # of Taylor series, in place of the solver's tableau
+    method: Method
+    order: int | None  # of Taylor series, in place of the tableau
     has_events: bool
     y0: Integrated
     goals: Float[Array, "times"]
@@ -135,7 +136,7 @@ def _form_of(motion: Motion, moving: tuple[int, ...] | None = None) -> Form:
 
 def integrate(motion: Motion) -> tuple[Integrated, Bool[Array, "times"], Progress]:
     """As `erk_loop.integrate`, of one motion from time zero."""
-    own = kernel(_form_of(motion), motion.solver, motion.order)
+    own = kernel(_form_of(motion), motion.method, motion.order)
     return _unpacked(own.layout, motion.goals, *own.run(*_samples(motion), jnp.concatenate([_packed(motion.y0), *_rows(motion)]), motion.goals))
 
 
@@ -161,7 +162,7 @@ def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, times: AlongTime
     `dy0`, `dknown`: of the state, and of each of the numbers that the rates are given, None: zero; `times`: of the times, None where none varies.
     """
     moving = tuple(i for i, d in enumerate(dknown) if d is not None)
-    own, d_start = kernel(_form_of(motion, moving), motion.solver, motion.order), _packed(dy0)
+    own, d_start = kernel(_form_of(motion, moving), motion.method, motion.order), _packed(dy0)
     if times is not None:
         d_start = d_start - _scaled(_rates(motion, motion.y0, jnp.zeros(())), times.origin)
     layout, (progress, limits, known) = own.layout, _rows(motion)
@@ -187,7 +188,7 @@ def cotangents(motion: Motion, asked: Sequence[bool], ys: Integrated, y_end: Int
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
     form = _form_of(motion)
     starts, ends = jnp.concatenate([_packed(motion.y0), *_rows(motion)]), jnp.concatenate([_packed(y_end), t_end[None]])
-    found = kernel_back(form, motion.solver, which)(*_samples(motion), starts, jax.vmap(_packed)(ys), ends, motion.goals)
+    found = kernel_back(form, motion.method, which)(*_samples(motion), starts, jax.vmap(_packed)(ys), ends, motion.goals)
     known = dict(zip(which, found[form.layout.y :], strict=True))
     return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
 

@@ -1,0 +1,51 @@
+"""Modules that are imported when something of them is first asked for: what a first motion does not need costs it nothing.
+
+There are two ways, both known to users of Python, and both for names that static tools are told of by a plain import under `if TYPE_CHECKING:`.
+
+    diffrax = module_on_first_use("diffrax")                      in a module: stands for another one; its attributes are those of that
+    __getattr__, __dir__ = names_on_first_use(globals(), {...})   in a package: names of its own that are defined in modules below it (PEP 562)
+
+A class that derives from one of such a module is defined in a module that is imported on first use too. `isinstance(x, diffrax.AbstractSolver)` imports
+diffrax, so `x` is compared with what needs no import first: with None, and with what is ours.
+"""
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+from jourdain_jax.calculus.collecting import without_collecting
+
+
+class _OnFirstUse(ModuleType):
+    """Stands for the module of its name."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(import_module(self.__name__), name)
+
+    def __dir__(self) -> list[str]:
+        return dir(import_module(self.__name__))
+
+
+def module_on_first_use(name: str) -> Any:
+    """What stands for a module: it is imported when one of its attributes is asked for."""
+    return _OnFirstUse(name)
+
+
+def names_on_first_use(package: dict[str, Any], where: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """`__getattr__` and `__dir__` of a package, given its globals, for names that are defined in modules below it: name -> module, such as "analysis.fit".
+
+    A name is looked up once: from then on it is a global of the package as any other.
+    """
+
+    def __getattr__(name: str) -> Any:
+        if name not in where:
+            raise AttributeError(f"module {package['__name__']!r} has no attribute {name!r}")
+        with without_collecting():
+            package[name] = getattr(import_module(f"{package['__name__']}.{where[name]}"), name)
+        return package[name]
+
+    def __dir__() -> list[str]:
+        return sorted({*package, *where})
+
+    return __getattr__, __dir__

@@ -1,0 +1,128 @@
+"""The explicit Runge-Kutta methods of our own loop: their tableaus.
+
+    k_i = f(t + c_i h, y + h sum_j a_ij k_j),   y_1 = y + h sum b_i k_i,   e = h sum (b_i - b^_i) k_i
+
+Tsit5:  Ch. Tsitouras, Computers and Mathematics with Applications 62 (2011) 770, of order 5 with an estimate of order 4
+Dopri5: J. R. Dormand and P. J. Prince, J. Comput. Appl. Math. 6 (1980) 19, of order 5; its estimate is that of L. F. Shampine, Math. Comp. 46 (1986) 135
+Dopri8: P. J. Prince and J. R. Dormand, J. Comput. Appl. Math. 7 (1981) 67, of order 8 with an estimate of order 7
+
+They bear the names of diffrax's solvers, and have their coefficients to the last bit: so a motion is the same by whichever loop, and the default ones need
+no diffrax. The weights of the solution stand as the last row of A too: the last stage of a step is the first of the next one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jourdain_jax.motion.integrators.of_diffrax import diffrax
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """A tableau. Its stages run as a loop: one copy of the vector field to compile."""
+
+    name: str
+    order: int
+    A: np.ndarray
+    b: np.ndarray
+    b_error: np.ndarray
+    c: np.ndarray
+
+    @property
+    def last_is_next_first(self) -> bool:
+        """Whether the last stage is taken at y_1."""
+        return bool(np.array_equal(self.A[-1], self.b) and self.c[-1] == 1.0)
+
+    @property
+    def needed(self) -> int:
+        """How many stages a step takes: without a last one that nothing else needs."""
+        return len(self.c) - int(self.last_is_next_first and self.b_error[-1] == 0)
+
+    @property
+    def at_the_end(self) -> int:
+        """The last stage that a step takes, of those at its end (of those at all, where none is)."""
+        return int(max(np.flatnonzero(self.c[: self.needed] == 1.0), default=self.needed - 1))
+
+
+def _method(name: str, order: int, c: list, rows: list[list], b_hat: list) -> Method:
+    """A method from its nodes and the rows of A, both without those of the first stage, and the weights of its embedded method."""
+    stages = len(c) + 1
+    A = np.zeros((stages, stages))
+    for i, row in enumerate(rows):
+        A[i + 1, : i + 1] = row
+    b = A[-1].copy()
+    return Method(name, order, A, b, b - np.array(b_hat), np.array([0.0, *c]))
+
+
+TSIT5 = _method(
+    "Tsit5",
+    5,
+    [0.161, 0.327, 0.9, 0.9800255409045097, 1.0, 1.0],
+    [
+        [0.161],
+        [-0.008480655492356989, 0.335480655492357],
+        [2.8971530571054935, -6.359448489975075, 4.3622954328695815],
+        [5.325864828439257, -11.748883564062828, 7.4955393428898365, -0.09249506636175525],
+        [5.86145544294642, -12.92096931784711, 8.159367898576159, -0.071584973281401, -0.028269050394068383],
+        [0.09646076681806523, 0.01, 0.4798896504144996, 1.379008574103742, -3.290069515436081, 2.324710524099774],
+    ],
+    [0.09468075576583945, 0.009183565540343254, 0.4877705284247616, 1.234297566930479, -2.7077123499835256, 1.866628418170587, 1 / 66],
+)
+
+DOPRI5 = _method(
+    "Dopri5",
+    5,
+    [1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0],
+    [
+        [1 / 5],
+        [3 / 40, 9 / 40],
+        [44 / 45, -56 / 15, 32 / 9],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656],
+        [35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
+    ],
+    [1951 / 21600, 0.0, 22642 / 50085, 451 / 720, -12231 / 42400, 649 / 6300, 1 / 60],
+)
+
+# fmt: off
+DOPRI8 = _method(
+    "Dopri8",
+    8,
+    [1/18, 1/12, 1/8, 5/16, 3/8, 59/400, 93/200, 5490023248/9719169821, 13/20, 1201146811/1299019798, 1.0, 1.0, 1.0],
+    [
+        [1/18],
+        [1/48, 1/16],
+        [1/32, 0.0, 3/32],
+        [5/16, 0.0, -75/64, 75/64],
+        [3/80, 0.0, 0.0, 3/16, 3/20],
+        [29443841/614563906, 0.0, 0.0, 77736538/692538347, -28693883/1125000000, 23124283/1800000000],
+        [16016141/946692911, 0.0, 0.0, 61564180/158732637, 22789713/633445777, 545815736/2771057229, -180193667/1043307555],
+        [39632708/573591083, 0.0, 0.0, -433636366/683701615, -421739975/2616292301, 100302831/723423059, 790204164/839813087, 800635310/3783071287],
+        [246121993/1340847787, 0.0, 0.0, -37695042795/15268766246, -309121744/1061227803, -12992083/490766935, 6005943493/2108947869, 393006217/1396673457,
+         123872331/1001029789],
+        [-1028468189/846180014, 0.0, 0.0, 8478235783/508512852, 1311729495/1432422823, -10304129995/1701304382, -48777925059/3047939560,
+         15336726248/1032824649, -45442868181/3398467696, 3065993473/597172653],
+        [185892177/718116043, 0.0, 0.0, -3185094517/667107341, -477755414/1098053517, -703635378/230739211, 5731566787/1027545527, 5232866602/850066563,
+         -4093664535/808688257, 3962137247/1805957418, 65686358/487910083],
+        [403863854/491063109, 0.0, 0.0, -5068492393/434740067, -411421997/543043805, 652783627/914296604, 11173962825/925320556, -13158990841/6184727034,
+         3936647629/1978049680, -160528059/685178525, 248638103/1413531060, 0.0],
+        [14005451/335480064, 0.0, 0.0, 0.0, 0.0, -59238493/1068277825, 181606767/758867731, 561292985/797845732, -1041891430/1371343529,
+         760417239/1151165299, 118820643/751138087, -528747749/2220607170, 1/4],
+    ],
+    [13451932/455176623, 0.0, 0.0, 0.0, 0.0, -808719846/976000145, 1757004468/5645159321, 656045339/265891186, -3867574721/1518517206, 465885868/322736535,
+     53011238/667516719, 2/45, 0.0, 0.0],
+)
+# fmt: on
+
+_ALL = {method.name: method for method in (TSIT5, DOPRI5, DOPRI8)}
+
+
+def method_of(solver) -> Method | None:
+    """The method of a solver of diffrax; None where our own loop has no such one."""
+    method = _ALL.get(type(solver).__name__)
+    return method if method is not None and type(solver) is getattr(diffrax, method.name) else None
+
+
+def as_solver(solver):
+    """A method as a solver of diffrax; solvers stay as they are."""
+    return getattr(diffrax, solver.name)() if isinstance(solver, Method) else solver
