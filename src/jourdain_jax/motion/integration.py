@@ -67,10 +67,7 @@ _compiled = for_programs(_one_motion, partial(quickly_compiled, options=_compile
 
 
 def _with_machine_code(setup: Setup) -> Setup:
-    """The setup, where machine code integrates it also with machine code for what is seen of it, if that can be made.
-
-    Not in batches: there XLA, which compiles for longer, sees all states of all lanes in half of the time.
-    """
+    """The setup, where machine code integrates it also with machine code for what is seen of it, if that can be made."""
     field = setup.field
     if setup.reason_against_machine_code or not isinstance(field, ByProgram) or not seen.serves(field.program):
         return setup
@@ -79,6 +76,7 @@ def _with_machine_code(setup: Setup) -> Setup:
 
 def integrate_lanes(setups: Setup) -> Trajectory:
     """The motions of all lanes: `lockstep.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
+    setups = _with_machine_code(setups)
     begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
     solved = setups.integrator.lanes_solved(fitting, begun)
     return eqx.filter_vmap(_finish)(setups, fitting, begun, solved)

@@ -5,7 +5,7 @@ not depend on the width.
 """
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -39,5 +39,18 @@ def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 
         every = [x if stay else jnp.broadcast_to(x, (count, *x.shape)) for x, stay in zip(arguments, stays, strict=True)]
         found = call(host.lanes(), *every)
         return found, (True,) * len(found)
+
+    return run
+
+
+def unless_batched(times: int, function: Callable, by_xla: Callable) -> Callable:
+    """`function`, which `vmap` may batch so many times; in a further one, `by_xla` takes its place, which must return the same."""
+    run = jax.custom_batching.custom_vmap(function)
+
+    @run.def_vmap
+    def in_lanes(count: int, batched: list, *arguments):
+        mapped = partial(jax.vmap, in_axes=jax.tree.map(lambda has_axis: 0 if has_axis else None, tuple(batched)), axis_size=count)
+        found = (unless_batched(times - 1, mapped(function), mapped(by_xla)) if times else mapped(by_xla))(*arguments)
+        return found, jax.tree.map(lambda _: True, found)
 
     return run

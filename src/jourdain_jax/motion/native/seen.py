@@ -1,6 +1,7 @@
 """What is seen of a motion beside its steps, as machine code: numbers that depend on parameters alone, and all speeds, pivots and energies at saved states.
 
-Each is a function of JAX on one state or scene; under `vmap` all lanes go to one call. Derivatives are those of the same by XLA (`lowering/lowered.py`).
+Each is a function of JAX on one state or scene; under `vmap` all lanes go to one call. In batches of motions XLA sees the states: machine code, for which
+rows of numbers are put together, takes twice as long there. Derivatives are those of the same by XLA (`lowering/lowered.py`).
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.differentiated_as import differentiated_as
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.native.called import called
+from jourdain_jax.motion.native.called import called, unless_batched
 from jourdain_jax.native import host
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import FUNCTIONS
@@ -73,7 +74,7 @@ def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Ar
         found = _seen(program, *state)
         return found[:-3], found[-3]
 
-    return differentiated_as(by_xla, by_machine_code, "forward")(fixed, t, q, y, inputs)
+    return differentiated_as(by_xla, unless_batched(1, by_machine_code, by_xla), "forward")(fixed, t, q, y, inputs)
 
 
 def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
@@ -82,7 +83,8 @@ def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
     def by_xla(fixed, t, q, y, inputs):
         return program.energy_values(fixed, t, tuple(q), tuple(y), inputs)
 
-    return differentiated_as(by_xla, lambda *state: _seen(program, *state)[-2:], "forward")(*jax.lax.stop_gradient((fixed, t, q, y, inputs)))
+    by_machine_code = unless_batched(1, lambda *state: _seen(program, *state)[-2:], by_xla)
+    return differentiated_as(by_xla, by_machine_code, "forward")(*jax.lax.stop_gradient((fixed, t, q, y, inputs)))
 
 
 def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
