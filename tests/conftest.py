@@ -24,9 +24,9 @@ LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", 
 
 # What takes longest for its number of tests, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
 LONGEST = """
-identify native sensors mutants linearize native_derivatives call_costs feasible_starts simulate what_probes_do_not_show studies readme from_sympy stiff
-lowering malformed_inputs build labelled fit_profiles rollout program knots power log_density whipple_bicycle events_in_one_step along_batches study_faults
-every_model probed kept_parts bicycle_stability generated_scenes contacts_on_surfaces watched_between_saves traced_parameters quality structure_preserving
+every_model identify native sensors mutants linearize native_derivatives call_costs feasible_starts simulate what_probes_do_not_show studies readme from_sympy
+stiff lowering malformed_inputs build labelled fit_profiles rollout program knots power log_density whipple_bicycle events_in_one_step along_batches
+study_faults probed kept_parts bicycle_stability generated_scenes contacts_on_surfaces watched_between_saves traced_parameters quality structure_preserving
 rattleback atlas cluster notebooks
 """
 

@@ -28,7 +28,8 @@ for code in json.loads(CASES):
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory):
     """What every case is answered with."""
-    source = f"{PRELUDE}\nCASES = {json.dumps(list(TABLE))!r}\n{RUN}"
+    effort = "from jourdain_jax.native import host\nhost.EFFORT = 0"  # of LLVM, as in the other tests
+    source = f"{effort}\n{PRELUDE}\nCASES = {json.dumps(list(TABLE))!r}\n{RUN}"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path), "JAX_PLATFORMS": "cpu"}
     folder = tmp_path_factory.mktemp("malformed")
     run = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, env=environment, cwd=folder)
