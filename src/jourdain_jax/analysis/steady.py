@@ -20,8 +20,8 @@ from jourdain_jax.build.trace import traced_scene
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.calculus.reals import Number, Numbers, described
 from jourdain_jax.dynamics.cyclic import ignorable_coordinates
+from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.projection import closure_residual
-from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.motion.start import State
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene

@@ -19,8 +19,9 @@ from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff, si
 from jourdain_jax.calculus.rotations import quaternion_product
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import coordinate_rates
+from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.reductions import Privileged
-from jourdain_jax.equations.rows import names_of_position_rows, position_residual
+from jourdain_jax.equations.rows import position_residual
 from jourdain_jax.equations.scaling import row_scale, scaled
 from jourdain_jax.equations.virtual_power import equations_and_rows
 from jourdain_jax.motion.start import State

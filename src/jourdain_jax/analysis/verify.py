@@ -31,8 +31,8 @@ from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.gibbs_appell import gibbs_equations
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, partial_velocities, shapes_along_motion, velocities
 from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
+from jourdain_jax.equations.listed import names_of_rows
 from jourdain_jax.equations.reductions import diagnosed
-from jourdain_jax.equations.rows import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import energies_at, equations_and_rows, newton_residual
 from jourdain_jax.motion.arguments import as_state

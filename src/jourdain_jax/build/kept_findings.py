@@ -19,7 +19,7 @@ from jourdain_jax.build.domain import coordinate_bounds, speed_bounds
 from jourdain_jax.build.sampling import seen_of
 from jourdain_jax.build.trace import jaxpr_of_scene
 from jourdain_jax.calculus.reals import real_type
-from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows
+from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.native import disk
 from jourdain_jax.program.interpret import inner_jaxpr, own_rule
 from jourdain_jax.scene.once_per_class import once_per_class

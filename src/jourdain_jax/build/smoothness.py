@@ -17,8 +17,9 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.trace import jaxpr_of_scene
 from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.kinematics import coordinate_rates, pose_at, shapes_along_motion
-from jourdain_jax.equations.rows import names_of_position_rows, position_residual
+from jourdain_jax.equations.kinematics import coordinate_rates, pose_at
+from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows
+from jourdain_jax.equations.rows import position_residual
 from jourdain_jax.program.roughness import may_bend
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.once_per_class import once_per_class
@@ -158,8 +159,7 @@ def _across(q: np.ndarray) -> tuple[tuple, tuple, tuple]:
 
 def _names(scene: Scene) -> list[str]:
     """What each entry belongs to."""
-    bodies = list(shapes_along_motion(lambda scene, motion: motion.bodies, scene))
-    names = [f"the pose of body `{name}`" for name in bodies for _ in range(12)] + [f"row `{name}`" for name in names_of_position_rows(scene)]
+    names = [f"the pose of body `{name}`" for name in names_of_bodies(scene) for _ in range(12)] + [f"row `{name}`" for name in names_of_position_rows(scene)]
     return names + [f"the rate of coordinate `{name}`" for name in scene.coordinate_names.entries]
 
 

@@ -24,7 +24,8 @@ from jourdain_jax.build.smoothness import check_smoothness
 from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.plain_text import as_text, from_text
 from jourdain_jax.calculus.reals import is_traced
-from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, names_of_rows
+from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
+from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.program.graph import Unsupported
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.scene import Scene

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 from jourdain_jax.build.probed import generic_inputs
 from jourdain_jax.build.structure import closure_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.reals import is_traced
-from jourdain_jax.equations.rows import UsualRows, names_of_position_rows, velocity_residual
+from jourdain_jax.equations.listed import names_of_position_rows
+from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.scaling import speed_scale
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene

@@ -7,7 +7,7 @@ import numpy as np
 
 from jourdain_jax.analysis.report import report
 from jourdain_jax.analysis.verify import verify
-from jourdain_jax.build.event_names import names_of_events
+from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.models.registry import MODELS, counts_of, known_model, model
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.motion.start import start

@@ -22,13 +22,12 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.explicit_power import explicit_rate, forces_for_potentials, power_of_loads
 from jourdain_jax.build.structure import Structure, structure_of
-from jourdain_jax.equations.kinematics import inertias, motion_at, shapes_along_motion
+from jourdain_jax.equations.kinematics import inertias, motion_at
+from jourdain_jax.equations.listed import has_load_without_potential
 from jourdain_jax.equations.reductions import Accelerations, Reduced
 from jourdain_jax.equations.virtual_power import newton_residual, potential_energy
 from jourdain_jax.scene.motion_state import Motion
-from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.validated import loads_of
 
 
 class Power(eqx.Module):
@@ -49,22 +48,11 @@ class Power(eqx.Module):
 def needs_work(scene: Scene, structure: Structure) -> bool:
     """Whether anything changes T + V, so that the work done must be integrated beside the motion: any term above that is not zero by structure."""
     by_structure = structure.driven or structure.varying_inertia or _rows_work(structure) or "potential" in structure.timed
-    return by_structure or bool(structure.potentials_of_inputs) or _some_load_has_no_potential(scene)
+    return by_structure or bool(structure.potentials_of_inputs) or has_load_without_potential(scene)
 
 
 def _rows_work(structure: Structure) -> bool:
     return not (structure.affine and structure.homogeneous)
-
-
-@once_per_class
-def _some_load_has_no_potential(scene: Scene) -> bool:
-    flags: list[bool] = []
-
-    def look(scene, motion):
-        flags.extend(load.potential is None for load in loads_of(scene, motion))
-
-    shapes_along_motion(look, scene)
-    return any(flags)
 
 
 def power_of_nonconservative(scene: Scene, t, q, u, inputs, accelerations: Accelerations | Reduced) -> Float[Array, ""]:

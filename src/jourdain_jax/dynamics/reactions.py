@@ -19,8 +19,9 @@ from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
 from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
+from jourdain_jax.equations.listed import names_of_rows
 from jourdain_jax.equations.reductions import Accelerations
-from jourdain_jax.equations.rows import flatten_rows, names_of_rows, velocity_residual, velocity_rows
+from jourdain_jax.equations.rows import flatten_rows, velocity_residual, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.equations.virtual_power import newton_residual, resultants
 from jourdain_jax.scene.bodies import RigidBody

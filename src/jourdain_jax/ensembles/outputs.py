@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.event_names import names_of_events
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.ensembles.along import integral, largest, sampled
+from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.trajectories.results import EVENT
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.names import nearest

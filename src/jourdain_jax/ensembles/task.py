@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.build.event_names import names_of_events
 from jourdain_jax.ensembles.design import Design
 from jourdain_jax.ensembles.identity import digest
 from jourdain_jax.ensembles.outputs import Output
 from jourdain_jax.ensembles.statistics import Grid, counts_of_block, extremes_of_block, sums_of_block
 from jourdain_jax.ensembles.store import Column
+from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.motion.batches.rollout import rollout
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.simulate import simulate

@@ -14,8 +14,9 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.fixed_point import fixed_point
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
+from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.reductions import cholesky
-from jourdain_jax.equations.rows import names_of_position_rows, position_residual, velocity_residual
+from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene

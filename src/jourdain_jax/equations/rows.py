@@ -14,11 +14,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.calculus.rotations import skew
-from jourdain_jax.equations.kinematics import motion_at, pose_at, shapes_along_motion
+from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
-from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, geometric_constraints_of, prescribed_of, velocity_constraints_of
 
@@ -124,25 +123,3 @@ def velocity_residual(scene: Scene, t, q, u, inputs=None) -> Float[Array, "rows"
 @eqx.filter_jit
 def _velocity_residual(scene: Scene, t: Float[Array, ""], q, u, inputs):
     return flatten_rows(velocity_rows(scene, motion_at(scene, t, q, u, inputs)), q.dtype)
-
-
-def names_of_rows(scene: Scene) -> tuple[str, ...]:
-    """Names of all rows, in order, without evaluating them."""
-    return _names(scene)[0]
-
-
-def names_of_position_rows(scene: Scene) -> tuple[str, ...]:
-    """Names of the geometric rows, in order; they come first among all rows."""
-    return _names(scene)[1]
-
-
-@once_per_class
-def _names(scene: Scene) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of all rows and of the geometric ones by tracing. They are noted inside, because JAX returns dictionaries sorted by name."""
-    names: list[tuple[str, ...]] = []
-
-    def look(scene: Scene, motion: Motion) -> None:
-        names[:] = [tuple(row_names(rows)) for rows in (velocity_rows(scene, motion), position_rows(scene, motion.pose()))]
-
-    shapes_along_motion(look, scene)
-    return names[0], names[1]

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 
-from jourdain_jax.build.event_names import names_of_events, names_of_invariants
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.dynamics.power import needs_work
+from jourdain_jax.equations.listed import names_of_events, names_of_invariants
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.scene.arguments import BuiltFor, as_scene

@@ -11,8 +11,8 @@ import numpy as np
 
 from jourdain_jax.build.trace import TracedScene, velocity_quantities
 from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.kinematics import motion_at, shapes_along_motion
-from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows, names_of_rows
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Unsupported
@@ -45,7 +45,7 @@ def _differing(scene: Scene, traced: TracedScene, probes: Probes, limit: float, 
     g, directional_derivative = traced.graph, (1.0, np.cos(1.0 + np.arange(q.shape[1])), np.sin(1.0 + np.arange(u.shape[1])))
     direction = {n: g.const(x) for n, x in zip([traced.t, *traced.q.tolist(), *traced.u.tolist()], np.hstack(directional_derivative).tolist(), strict=True)}
     values, rates = _by_jax(parameters, t, q, u, inputs, directional_derivative)
-    names = shapes_along_motion(lambda scene, motion: motion.bodies, scene)
+    names = names_of_bodies(scene)
     bodies = [f"body `{name}`" for name in names]
     loads, speeds = [f"a load on body `{name}`" for name in names], [f"a load on speed `{name}`" for name in scene.speed_names.entries]
     rows, closures = [f"row `{name}`" for name in names_of_rows(scene)], [f"row `{name}`" for name in names_of_position_rows(scene)]

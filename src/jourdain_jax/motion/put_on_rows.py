@@ -17,8 +17,9 @@ from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.structure import closure_lengths, plain_row_lengths, rows_are_affine, usual_rows
 from jourdain_jax.calculus.differentiated_as import differentiated_as
 from jourdain_jax.calculus.reals import real_type
+from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
-from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
+from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.motion.native.called import called
 from jourdain_jax.motion.native.onto_rows import Rows, written
 from jourdain_jax.motion.native.seen import entries
@@ -54,7 +55,7 @@ def _worked_out(scene: Scene, determined: bool, native: bool) -> Usual:
 def _as_arrays(scene: Scene, determined: bool, native: bool) -> Usual:
     found = _worked_out(scene, determined, native)  # on NumPy; what it traces must not be computed at once
     with jax.ensure_compile_time_eval():
-        return jax.tree.map(jnp.asarray, found)  # kept, and handed over in a fifth of the time that arrays of NumPy take
+        return jax.device_put(found)  # kept, and handed over in a fifth of the time that arrays of NumPy take
 
 
 usual_sizes = once_per_values(_as_arrays, of_traced=_worked_out)

@@ -21,8 +21,9 @@ from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.damped import damped_root
 from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, is_traced, real_type
 from jourdain_jax.eager.eager import eval_numpy
+from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual, project_positions
-from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
+from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs, inputs_at
 from jourdain_jax.motion.put_on_rows import Usual, put_positions, put_speeds, usual_sizes

@@ -24,7 +24,7 @@ from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.newton import newton_root
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.kinematics import motion_at
-from jourdain_jax.equations.rows import names_of_position_rows
+from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step, Stepped
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField

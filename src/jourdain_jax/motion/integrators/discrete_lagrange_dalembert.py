@@ -17,7 +17,8 @@ from jaxtyping import Array, Float
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.newton import newton_root
 from jourdain_jax.equations.lagrange import speeds_are_rates
-from jourdain_jax.equations.rows import names_of_position_rows, names_of_rows, velocity_residual
+from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
+from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.motion.integrators.discrete_lagrangian import RULES, Interval, discrete_momenta, discrete_rows, momentum
 from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step, Stepped
 from jourdain_jax.motion.vector_fields.by_matrices import full_without_projection

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.rotations import quaternion_product, quaternion_rate
-from jourdain_jax.equations.rows import names_of_position_rows
+from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene

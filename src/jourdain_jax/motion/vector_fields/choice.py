@@ -6,7 +6,6 @@ from typing import Any, Literal
 import equinox as eqx
 import jax.numpy as jnp
 
-from jourdain_jax.build.event_names import names_of_events
 from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.structure import WELL_CONDITIONED, Structure, structure_of
 from jourdain_jax.build.usual_lengths import usual_lengths
@@ -15,8 +14,8 @@ from jourdain_jax.calculus.reals import described
 from jourdain_jax.dynamics.accelerations import Baumgarte, as_reduction
 from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
+from jourdain_jax.equations.listed import names_of_events, names_of_position_rows
 from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, Privileged, Reduction
-from jourdain_jax.equations.rows import names_of_position_rows
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.inputs import Inputs, as_inputs

@@ -1,0 +1,63 @@
+"""What a scene consists of, by name, without evaluating it: all of it is found by tracing the scene once, at no state in particular."""
+
+from typing import NamedTuple
+
+from jourdain_jax.equations.kinematics import shapes_along_motion
+from jourdain_jax.equations.rows import position_rows, row_names, velocity_rows
+from jourdain_jax.scene.motion_state import Motion
+from jourdain_jax.scene.once_per_class import once_per_class
+from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.validated import events_of, invariants_of, loads_of
+
+
+class _Listed(NamedTuple):
+    bodies: tuple[str, ...]
+    rows: tuple[str, ...]
+    position_rows: tuple[str, ...]
+    events: tuple[str, ...]
+    has_load_without_potential: bool
+
+
+def names_of_bodies(scene: Scene) -> tuple[str, ...]:
+    """Names of the bodies, sorted."""
+    return _listed(scene).bodies
+
+
+def names_of_rows(scene: Scene) -> tuple[str, ...]:
+    """Names of all rows, in order."""
+    return _listed(scene).rows
+
+
+def names_of_position_rows(scene: Scene) -> tuple[str, ...]:
+    """Names of the geometric rows, in order; they come first among all rows."""
+    return _listed(scene).position_rows
+
+
+def names_of_events(scene: Scene) -> tuple[str, ...]:
+    """Names of the stop events, sorted."""
+    return _listed(scene).events
+
+
+def has_load_without_potential(scene: Scene) -> bool:
+    """Whether some load is given by forces alone."""
+    return _listed(scene).has_load_without_potential
+
+
+@once_per_class
+def names_of_invariants(scene: Scene) -> tuple[str, ...]:
+    """Names of the invariants that the scene states, sorted. A motion needs none: what is wrong with them is said when they are asked for."""
+    return tuple(shapes_along_motion(invariants_of, scene))  # JAX returns dictionaries sorted by name
+
+
+@once_per_class
+def _listed(scene: Scene) -> _Listed:
+    """They are noted inside, because JAX returns arrays only, in dictionaries sorted by name."""
+    noted: list[_Listed] = []
+
+    def look(scene: Scene, motion: Motion) -> None:
+        rows, first = (tuple(row_names(found)) for found in (velocity_rows(scene, motion), position_rows(scene, motion.pose())))
+        without = any(load.potential is None for load in loads_of(scene, motion))
+        noted.append(_Listed(tuple(motion.bodies), rows, first, tuple(sorted(events_of(scene, motion))), without))
+
+    shapes_along_motion(look, scene)
+    return noted[0]
