@@ -12,6 +12,7 @@ from small_scenes import DiscWithHeightRow
 import jourdain_jax as jj
 from jourdain_jax.build.sampling import NoStateFoundError
 from jourdain_jax.build.structure import structure_of
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.motion.trajectories import results
 
 SCENES = {
@@ -135,7 +136,7 @@ def test_a_start_whose_rows_determine_its_speeds_has_the_derivatives_of_the_near
         return seen(jj.consistent(scene, 0.0, q, u, held=tuple(given)))
 
     def derivatives(f):
-        return jax.jit(lambda x: (f(x), jax.jacfwd(f)(x), jax.grad(f)(x), jax.jacfwd(jax.grad(f))(x)))
+        return eval_numpy(lambda x: (f(x), jax.jacfwd(f)(x), jax.grad(f)(x), jax.jacfwd(jax.grad(f))(x)))
 
     for found, expected in zip(derivatives(determined)(numbers), derivatives(nearest)(numbers), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)

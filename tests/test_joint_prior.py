@@ -39,7 +39,7 @@ def test_the_estimate_is_where_likelihood_and_prior_balance_and_its_information_
     data, free = run(), dict(reversed(TOGETHER.items()))  # the order of the names does not matter
     found = jj.fit(Cart(), data, free, tolerance=1e-7)
     at = jnp.array([found[name].value for name in NAMES])
-    slope = jax.grad(lambda x: jj.log_likelihood(Cart(mass=x[0], stiffness=x[1]), data))(at)
+    slope = jax.jit(jax.grad(lambda x: jj.log_likelihood(Cart(mass=x[0], stiffness=x[1]), data)))(at)
     pull = np.linalg.solve(COVARIANCE, at - np.array(list(MEAN.values())))
     scale = np.array([found[name].standard_error for name in NAMES])
     assert np.max(np.abs(scale * pull)) > 0.1  # the prior does pull

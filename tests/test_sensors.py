@@ -6,6 +6,7 @@ A cart with a spring and a damper is linear, so that its readings are sums of ex
 import re
 from pathlib import Path
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -243,20 +244,24 @@ class Swing(jj.Scene):
         return (jj.generalized_force(motion, turn_rate=-self.stiffness * motion.q.turn),)
 
 
-def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_gravity():
+@pytest.mark.parametrize("late", [pytest.param(False, marks=pytest.mark.slow), True], ids=["at once", "late"])
+def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_gravity(late):
     # turn = 0.7 cos(4 t), at 0.2 m: f = (- turn'^2 r, turn'' r, g) in the axes of the arm
     turn, rate = 0.7 * np.cos(4 * TS), -2.8 * np.sin(4 * TS)
     felt = np.stack([-0.2 * rate**2, -16 * 0.2 * turn, 9.81 + 0 * TS], axis=1)
     seen = jj.Accelerometer("arm", (0.2, 0.0, 0.1))
     motion = jj.simulate(Swing(), {"turn": 0.7}, ts=TS, rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(seen.over_times(motion), felt, atol=1e-7)
-    late = (4 * 0.05) ** 6 / 50  # of the reading between times, relative
-    for sensor, missing in ((seen, TS < 0), (jj.Sensor(seen, delay=jj.Estimate(0.03, range=jj.bounds(0.0, 0.1))), TS < 0.1)):
-        shown = felt if sensor is seen else np.stack([np.interp(TS - 0.05, TS, felt[:, i]) for i in range(3)], axis=1)
-        data = jj.Measurements(TS, {"imu": np.where(missing[:, None], np.nan, shown)}, 0.01, start={"turn": 0.7}, sensors={"imu": sensor})
-        found = jj.fit(Swing(stiffness=7.5), data, ("stiffness",))
-        assert found["stiffness"].value == pytest.approx(8.0, rel=1e-5 + late)
-    assert found["imu.delay"].value == pytest.approx(0.05, abs=1e-5)
+    sensor, missing, shown, rough = seen, TS < 0, felt, 0.0
+    if late:
+        sensor, missing = jj.Sensor(seen, delay=jj.Estimate(0.03, range=jj.bounds(0.0, 0.1))), TS < 0.1
+        shown = np.stack([np.interp(TS - 0.05, TS, felt[:, i]) for i in range(3)], axis=1)
+        rough = (4 * 0.05) ** 6 / 50  # of the reading between times, relative
+    data = jj.Measurements(TS, {"imu": np.where(missing[:, None], np.nan, shown)}, 0.01, start={"turn": 0.7}, sensors={"imu": sensor})
+    found = jj.fit(Swing(stiffness=7.5), data, ("stiffness",))
+    assert found["stiffness"].value == pytest.approx(8.0, rel=1e-5 + rough)
+    if late:
+        assert found["imu.delay"].value == pytest.approx(0.05, abs=1e-5)
     bad = jj.Measurements(TS, {"imu": felt}, 0.01, start={"turn": 0.7}, sensors={"imu": jj.Accelerometer("arn")})
     with pytest.raises(ValueError, match="the accelerometer `imu` of run 0 of `Swing` sits on body `arn`, which is not there; did you mean `arm`"):
         jj.fit(Swing(), bad, ("stiffness",))
@@ -275,6 +280,17 @@ def test_machine_code_serves_sensors_and_gives_what_xla_gives():
     native, xla = (jj.fit(Cart(mass=1.8), data, ("mass",), backend=backend) for backend in ("native", "xla"))
     np.testing.assert_allclose(native.values, xla.values, rtol=1e-6)
     np.testing.assert_allclose(native.standard_errors, xla.standard_errors, rtol=1e-5)
+
+
+@pytest.mark.skipif(bool(host.reason_against()), reason="needs llvmlite")
+def test_a_likelihood_with_sensors_is_the_same_by_machine_code_and_by_xla():
+    data = run(4, gain=1.2, delay=0.05)
+
+    def likelihood(mass, backend):
+        return jj.log_likelihood(Cart(mass=mass), data, backend=backend, adjoint=diffrax.ForwardMode())
+
+    native, xla = (jax.jit(lambda m, backend=backend: jax.jvp(lambda m: likelihood(m, backend), (m,), (1.0,)))(1.8) for backend in ("native", "xla"))
+    np.testing.assert_allclose(native, xla, rtol=1e-7)
 
 
 def test_other_numbers_of_a_sensor_compile_nothing(monkeypatch):
