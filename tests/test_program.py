@@ -169,6 +169,17 @@ def test_determinants_cancel_what_is_common(graph):
     assert graph.operations([first]) <= 3
 
 
+def test_a_form_does_not_depend_on_what_was_simplified_before(graph):
+    x, y = _x(graph, "x", "y")
+    generator, nodes, forms = np.random.default_rng(4), [x, y, graph.one], NormalForms(graph, 400)
+    for op in ("sin", "sqrt", "cos", "abs", "sin") * 3:
+        f, g, h = (nodes[i] for i in generator.integers(len(nodes), size=3))
+        nodes += [graph.call(op, graph.add(f, graph.mul(g, h))), graph.div(graph.mul(f, f), graph.add(g, graph.mul(h, h)))]
+        product = graph.mul(graph.mul(nodes[-2], nodes[-1]), graph.mul(nodes[-2], f))
+        expected = NormalForms(graph, 400).simplified(product)
+        assert forms.simplified(product) == expected
+
+
 def test_an_expansion_that_grows_is_left_alone(graph):
     names = _x(graph, *"abcdefgh")
     product = graph.one

@@ -8,7 +8,7 @@ another one, such as a function of Python that a callback runs, makes a scene na
 import enum
 import hashlib
 from collections.abc import Callable, Iterable
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import jax
@@ -27,6 +27,11 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 _READ = ("calculus", "eager", "program", "scene", "equations", "build", "dynamics", "lowering")  # packages whose code decides what is found
+
+
+_SEVERAL = tuple, list  # kept as tuples: a union of types is made anew wherever it stands
+_ARRAYS = np.ndarray, np.generic, jax.Array
+_PLAIN = bool, int, float, str, bytes, np.dtype, enum.Enum, type(None)
 
 
 class _Nameless(Exception):
@@ -91,22 +96,22 @@ def _source() -> bytes:
 
 def _parts(x) -> Iterable[bytes]:
     """What tells an object from others."""
-    if hasattr(x, "jaxpr") and hasattr(x, "consts"):
-        yield from _of_jaxpr(x.jaxpr)
-        yield from _parts(tuple(x.consts))
-    elif hasattr(x, "eqns"):
-        yield from _of_jaxpr(x)
-    elif isinstance(x, np.ndarray | np.generic | jax.Array):
+    if isinstance(x, _SEVERAL):
+        yield f"{len(x)} of {type(x).__name__}: ".encode()
+        for y in x:
+            yield from _parts(y)
+    elif isinstance(x, _ARRAYS):
         x = np.asarray(x)
         if x.dtype.hasobject:
             raise _Nameless
         yield f"array {x.dtype} {x.shape} ".encode() + x.tobytes()
-    elif isinstance(x, tuple | list):
-        yield f"{len(x)} of {type(x).__name__}: ".encode()
-        for y in x:
-            yield from _parts(y)
-    elif isinstance(x, bool | int | float | str | bytes | np.dtype | enum.Enum | None):
+    elif isinstance(x, _PLAIN):
         yield f"{type(x).__name__} {x!r};".encode()
+    elif hasattr(x, "jaxpr") and hasattr(x, "consts"):
+        yield from _of_jaxpr(x.jaxpr)
+        yield from _parts(tuple(x.consts))
+    elif hasattr(x, "eqns"):
+        yield from _of_jaxpr(x)
     else:
         raise _Nameless
 
@@ -123,7 +128,7 @@ def _of_equation(equation, number: dict) -> Iterable[bytes]:
     primitive: Primitive = equation.primitive
     if equation.effects or own_rule(primitive.name, equation.params):
         raise _Nameless
-    yield f"\n{primitive.name} -> {[str(v.aval) for v in equation.outvars]} ".encode()
+    yield f"\n{primitive.name} -> {[_said(v.aval) for v in equation.outvars]} ".encode()
     yield from _atoms(equation.invars, number)
     inner = inner_jaxpr(primitive.name, equation.params)
     if inner is not None:
@@ -134,6 +139,12 @@ def _of_equation(equation, number: dict) -> Iterable[bytes]:
         yield from _parts(value)
 
 
+@lru_cache(maxsize=1024)
+def _said(aval) -> str:
+    """Type and shape as text, which JAX makes anew each time."""
+    return str(aval)
+
+
 def _atoms(atoms, number: dict) -> Iterable[bytes]:
     for atom in atoms:
-        yield from _parts((str(atom.aval), np.asarray(atom.val))) if isinstance(atom, Literal) else (f"{number[atom]},".encode(),)
+        yield from _parts((_said(atom.aval), np.asarray(atom.val))) if isinstance(atom, Literal) else (f"{number[atom]},".encode(),)

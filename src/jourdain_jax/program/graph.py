@@ -57,7 +57,7 @@ class Graph:
             self.op.append(op)
             self.args.append(args)
             self.value.append(value)
-            self.varies.append(any(self.varies[a] for a in args) if varies is None else varies)
+            self.varies.append(any(map(self.varies.__getitem__, args)) if varies is None else varies)
         return node
 
     # leaves
@@ -313,13 +313,14 @@ class Graph:
 
     def needed(self, outputs: Iterable[int], known) -> list[int]:
         """What must be computed for the outputs where the nodes in `known` are known, in order."""
-        seen: set[int] = set()
-        stack, args = list(outputs), self.args
+        args = self.args
+        seen = {node for node in outputs if node not in known}
+        stack = list(seen)
         while stack:
-            node = stack.pop()
-            if node not in seen and node not in known:
-                seen.add(node)
-                stack += args[node]
+            for node in args[stack.pop()]:
+                if node not in seen and node not in known:
+                    seen.add(node)
+                    stack.append(node)
         return sorted(seen)  # arguments are older than what uses them
 
     def fixed(self, outputs: Iterable[int]) -> tuple[int, ...]:

@@ -5,7 +5,6 @@ terms are gathered by their varying part, whose coefficient (a polynomial in par
 factors are taken out greedily (Horner's scheme in several variables).
 """
 
-import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping
 
@@ -40,7 +39,7 @@ class NormalForms:
         self._squares: dict[int, Polynomial] = dict(squares or {})
         self._simplified: dict[int, int] = {}
         self._reductions: dict[Monomial, tuple[tuple[Monomial, float], ...]] = {}
-        self._known_squares = -1  # how many the reductions are made with
+        self._reciprocals: dict[int, int | None] = {}  # x of an atom 1/x, None of any other
 
     def simplified(self, node: int) -> int:
         """The node in normal form where that takes fewer operations, otherwise the node with its parts simplified."""
@@ -185,9 +184,6 @@ class NormalForms:
         """p q, with squares replaced."""
         if len(p) * len(q) > 8 * self.most_terms:
             raise TooLarge
-        if self._known_squares != len(self._squares):
-            self._known_squares = len(self._squares)
-            self._reductions.clear()
         result: Polynomial = {}
         reductions = self._reductions
         for m, a in p.items():
@@ -195,23 +191,25 @@ class NormalForms:
                 monomial = tuple(sorted(m + n)) if m and n else m or n
                 c, found = a * b, reductions.get(monomial)
                 for k, factor in self._reduced(monomial) if found is None else found:
-                    _put(result, k, c * factor)
+                    if k in result:
+                        _put(result, k, c * factor)
+                    else:
+                        result[k] = c * factor
         if len(result) > self.most_terms:
             raise TooLarge
         return result
 
     def _reduced(self, monomial: Monomial) -> tuple[tuple[Monomial, float], ...]:
-        """The terms of a monomial with squares replaced and without pairs x, 1/x; kept until further squares are known."""
+        """The terms of a monomial with squares replaced and without pairs x, 1/x; kept: the square of an atom is known before the atom is part of anything."""
         found = self._reductions.get(monomial)
         if found is None:
             rest = self._cancelled(monomial)
-            square = next((x for x, y in itertools.pairwise(rest) if x == y and x in self._squares), None)
-            if square is None:
+            at = self._first_square(rest)
+            if at is None:
                 found = ((rest, 1.0),)
             else:
                 terms: Polynomial = {}
-                at = rest.index(square)
-                rest = rest[:at] + rest[at + 2 :]
+                square, rest = rest[at], rest[:at] + rest[at + 2 :]
                 for n, c in self._squares[square].items():
                     for k, factor in self._reduced(tuple(sorted(rest + n))):
                         _put(terms, k, c * factor)
@@ -219,12 +217,29 @@ class NormalForms:
             self._reductions[monomial] = found
         return found
 
+    def _first_square(self, monomial: Monomial) -> int | None:
+        """Where an atom comes twice whose square is another polynomial."""
+        before = None
+        for at, atom in enumerate(monomial):
+            if atom == before and atom in self._squares:
+                return at - 1
+            before = atom
+        return None
+
     def _cancelled(self, monomial: Monomial) -> Monomial:
         """Without pairs x, 1/x."""
+        known = self._reciprocals
         for atom in monomial:
-            if self.graph.op[atom] == "div" and self.graph.args[atom][0] == self.graph.one and self.graph.args[atom][1] in monomial:
-                return self._cancelled(_without(_without(monomial, atom), self.graph.args[atom][1]))
+            x = known[atom] if atom in known else self._reciprocal_of(atom)
+            if x is not None and x in monomial:
+                return self._cancelled(_without(_without(monomial, atom), x))
         return monomial
+
+    def _reciprocal_of(self, atom: int) -> int | None:
+        """x of an atom 1/x; None of any other."""
+        graph = self.graph
+        self._reciprocals[atom] = graph.args[atom][1] if graph.op[atom] == "div" and graph.args[atom][0] == graph.one else None
+        return self._reciprocals[atom]
 
     # and back
 
