@@ -63,6 +63,27 @@ def test_values_that_no_state_has_are_refused_with_the_row(name, given, row):
         jj.start(SCENES[name], **given)
 
 
+def test_a_motion_from_named_values_begins_at_their_start(monkeypatch):
+    """On the rows by the program that integrates, unless that takes a search; refused where no state has the values."""
+    disc, crank, times = SCENES["disc with quaternion"], SCENES["slider-crank"], np.array([0.0, 0.01])
+    found = jj.start(crank, x=1.4)
+    whole = dict(zip(crank.coordinate_names.entries, found.q.tolist(), strict=True))
+    assert int(found.guess) > 0
+    for values in ({"x": 1.4}, whole):
+        motion, state = jj.simulate(crank, values, ts=times), jj.start(crank, **values)
+        np.testing.assert_allclose(motion.q[0], state.q, atol=1e-9)
+        np.testing.assert_allclose(float(motion.moved_q), float(state.moved_q), atol=1e-9)
+    with pytest.raises(ValueError, match="contradicts row `rim height`"):
+        jj.simulate(disc, {"z": 0.6}, ts=times)
+    upright = jj.start(disc)
+
+    def fails(*arguments):
+        raise AssertionError("the start was put onto the rows by a program of its own")
+
+    monkeypatch.setattr("jourdain_jax.motion.start._compiled_projection", fails)
+    np.testing.assert_allclose(jj.simulate(disc, {}, ts=times).q[0], upright.q, atol=1e-12)
+
+
 def test_starts_in_lanes_find_what_single_ones_find_and_have_derivatives():
     scene, places = SCENES["slider-crank"], jnp.array([-1.5, -1.2, 1.4, 2.5])
 

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.reals import as_array, checked_unless_traced, described, is_traced, real_type
-from jourdain_jax.motion.inputs import Inputs, inputs_at
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.start import State, named_start
@@ -37,14 +36,17 @@ def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None, n
     `inputs`: the scene's inputs at that instant, a vector or by name (default: zero); they count where velocity rows depend on them.
     `native`: whether machine code of our own may put it onto the rows, as in `put_on_rows`.
     """
-    if isinstance(given, State):
-        return given
+    return given if isinstance(given, State) else named_start(scene, named_values(scene, given, what), t0, inputs, native)
+
+
+def named_values(scene: Scene, given, what: str = "start") -> Mapping:
+    """A dictionary of named values, the scene's example for None; a ValueError for anything else."""
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(
             f"`{what}` is {described(given)}, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None for the "
             "scene's example"
         )
-    return named_start(scene, scene.example if given is None else given, t0, inputs, native)
+    return scene.example if given is None else given
 
 
 def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, switches: dict | None = None, **objects) -> None:
@@ -83,8 +85,8 @@ def _meant(value, kind: type) -> str:
     return f"diffrax.{members[near[0]]}()" if near else ""
 
 
-def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs, native: bool | None = None):
-    """The start as a state (with the inputs at t0), t0, the times to save at, t1; a ValueError where they are known and do not go together."""
+def span_and_times(scene: Scene, start, t0, t1, ts):
+    """t0, the times to save at, t1; a ValueError where they are known and do not go together."""
     real = real_type()
     if isinstance(start, State) and start.q.ndim != 1:
         raise ValueError(f"`start` holds a batch of shape {start.q.shape[:-1]}; use `jj.rollout` or `jax.vmap` for many starts")
@@ -94,14 +96,13 @@ def span_and_start(scene: Scene, start, t0, t1, ts, inputs: Inputs, native: bool
         t0 = as_end("t", start.t if isinstance(start, State) else 0.0)
     if t1 is None:
         t1 = t0 + scene.example_span if ts is None else ts[-1]
-    start = as_state(scene, start, t0=t0, inputs=None if isinstance(start, State) else inputs_at(inputs, t0), native=native)
     if not is_traced(t0, t1):
         check_span(t0, t1)
     if ts is None:
         ts = t0 + (t1 - t0) * _EVEN  # of known ends: nothing to compile
     elif not is_traced(ts, t0, t1):
         check_times(ts, t0, t1)
-    return start, *(as_array(x, real) for x in (t0, ts, t1))
+    return tuple(as_array(x, real) for x in (t0, ts, t1))
 
 
 def as_end(name: str, value):

@@ -19,13 +19,12 @@ from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.arguments import times_fit
 from jourdain_jax.motion.energy_check import conserves, energies_near, energy_lost
 from jourdain_jax.motion.input_programs import for_programs
-from jourdain_jax.motion.inputs import inputs_at
 from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.solver_choice import marked_inputs, marked_outputs, time_origin
 from jourdain_jax.motion.native import seen
 from jourdain_jax.motion.quick_compilation import QUICK, RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.setup import Begun, Setup, Solved
-from jourdain_jax.motion.start import State, consistent, moved_onto_rows
+from jourdain_jax.motion.start import State, moved_onto_rows
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
@@ -34,22 +33,18 @@ from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.scene.parameters import parameter_faults
 
 
-def integrate(setup: Setup) -> Trajectory:
-    """The motion of one setup."""
-    run = _compiled(setup.inputs.programs)
-    motion, arrived = run(setup)
-    if setup.usual is None or np.asarray(arrived):
-        return motion
-    found = consistent(setup.scene, setup.t0, setup.start.q, setup.start.u, inputs_at(setup.inputs, setup.t0))  # by a search, which takes long to compile
-    return run(setup._replace(start=found, usual=None))[0]
+def integrate(setup: Setup) -> Trajectory | None:
+    """The motion of one setup; None where its start was yet to be put onto the rows, and Newton's method alone did not arrive."""
+    motion, arrived = _compiled(setup.inputs.programs)(setup)
+    return motion if isinstance(setup.start, State) or np.asarray(arrived) else None
 
 
 def _one_motion(setup: Setup) -> tuple[Trajectory, Bool[Array, ""]]:
     """The motion, and whether its start came onto the rows."""
     setup, arrived = _with_machine_code(setup), jnp.array(True)
-    if setup.usual is not None:
-        found = moved_onto_rows(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0), setup.usual)
-        setup, arrived = setup._replace(start=found.state, usual=None), found.arrived
+    if not isinstance(setup.start, State):
+        found = moved_onto_rows(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0))
+        setup, arrived = setup._replace(start=found.state), found.arrived
     begun, fitting = _begin(setup), setup.fitting()
     return _finish(setup, fitting, begun, setup.integrator.solved(fitting, begun)), arrived
 

@@ -33,6 +33,6 @@ def marked(integrate, setup):
         return integrate(setup)
     with nan_is_a_mark():
         motion = integrate(setup)
-    if is_traced(motion.result) or int(motion.result) in (results.SUCCESS, results.EVENT):
+    if motion is None or is_traced(motion.result) or int(motion.result) in (results.SUCCESS, results.EVENT):
         return motion
     return integrate(setup)

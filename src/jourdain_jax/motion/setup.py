@@ -19,7 +19,7 @@ from jourdain_jax.motion.integrators.knots import knots_between
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.solver_choice import steps_are_given
 from jourdain_jax.motion.integrators.tableaus import Method
-from jourdain_jax.motion.start import State, Usual
+from jourdain_jax.motion.start import State, Unmoved
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
@@ -85,7 +85,7 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     """A motion to be integrated; in a batch all arrays have a leading axis of lanes."""
 
     scene: Scene
-    start: State
+    start: State | Unmoved
     inputs: PyTree
     t0: Float[Array | np.ndarray, "*lanes"]
     t1: Float[Array | np.ndarray, "*lanes"]
@@ -94,7 +94,6 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
     tolerances: tuple  # rtol, atol
     dt0: Float[Array | np.ndarray, "*lanes"] | float
     integrator: Integrator
-    usual: Usual | None = None  # by which the start is yet to be put onto the rows, in the program that integrates; None: it is on them
 
     def fitting(self) -> "Setup":
         """The setup with times that serve any loop, also where its own do not go together."""

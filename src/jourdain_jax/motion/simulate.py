@@ -16,7 +16,7 @@ import numpy as np
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import Number, as_array, is_traced
-from jourdain_jax.motion.arguments import check_options, span_and_start
+from jourdain_jax.motion.arguments import as_state, check_options, named_values, span_and_times
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
@@ -29,7 +29,7 @@ from jourdain_jax.motion.quick_compilation import nothing_is_traced
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Setup
-from jourdain_jax.motion.start import State, put_on_rows, yet_to_be_moved
+from jourdain_jax.motion.start import State, Unmoved, is_off, named_unmoved, put_on_rows, unmoved
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.choice import Formulation, as_formulation, vector_field
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from jourdain_jax.motion import diffrax_steps
 else:
     diffrax_steps = module_on_first_use("jourdain_jax.motion.diffrax_steps")
-
-_OFF = 1e4  # units of round-off: a residual that is more
 
 
 @shown_from_users_lines
@@ -111,17 +109,26 @@ def simulate(
         slope = jax.grad(lean_at_end)(0.5)
     """
     given = dict(locals())
-    setup = _set_up(**given)
-    motion = warn_if_ill_conditioned(setup, _integrated)
+    setup, motion = _run(given)
     if isinstance(motion.result, jax.core.Tracer):
         return motion
     while retries := next_retry(setup.field, motion, setup.t0, given):
-        setup = _set_up(**(given | retry_options(retries, given)))
-        motion = mark_retried(warn_if_ill_conditioned(setup, _integrated), retries)
+        setup, motion = _run(given | retry_options(retries, given))
+        motion = mark_retried(motion, retries)
     return motion
 
 
-def _integrated(setup: Setup) -> Trajectory:
+def _run(given: dict) -> tuple[Setup, Trajectory]:
+    """What was integrated, and its motion; in the rare case that Newton's method alone does not put the start onto the rows, from one that is searched for."""
+    setup = _set_up(**given)
+    if (motion := warn_if_ill_conditioned(setup, _integrated)) is None:
+        setup = _set_up(**given, searches=True)
+        motion = warn_if_ill_conditioned(setup, _integrated)
+    assert motion is not None
+    return setup, motion
+
+
+def _integrated(setup: Setup) -> Trajectory | None:
     return marked(integrate, setup)
 
 
@@ -134,6 +141,7 @@ def set_up(scene: Scene | BuiltFor, start=None, **options) -> Setup:
 
 def _set_up(
     *, scene, start, t0, t1, ts, saveat, rtol, atol, solver, stepsize_controller, dt0, adjoint, max_steps, formulation, backend, inputs, events, work,
+    searches: bool = False,
 ) -> Setup:  # fmt: skip
     scene, formulation = as_scene(scene), as_formulation(formulation)
     switches = {"events": events, "work": work}
@@ -142,11 +150,11 @@ def _set_up(
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, switches=switches, **objects)
     _check_adjoint(adjoint)
     check_solver(solver, stepsize_controller, dt0, saveat)
-    made_here = not isinstance(start, State)
     by_default = all(x is None for x in objects.values())
     native = (True if by_default else None) if backend in ("auto", "native") else False  # with what is diffrax's, only numbers: the rest can be exported
     inputs = as_inputs(scene, inputs)
-    start, t0, ts, t1 = span_and_start(scene, start, t0, t1, ts, inputs, native=native)
+    t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
+    start = _start(scene, start, t0, inputs, native, formulation.projects, searches)
     field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
     warn_float32(start.q.dtype, rtol)
     if solver is None:
@@ -159,13 +167,7 @@ def _set_up(
         integrator = diffrax_steps.Diffrax(as_solver(solver), stepsize_controller, adjoint, saveat, **static)
     tolerances = tuple(as_array(x, start.q.dtype) for x in (rtol, atol))  # arrays: another tolerance is no other program
     first_step = _first_step(solver, dt0, t0, t1)  # diffrax's own guess costs two more copies of the vector field to compile
-    later = None
-    if formulation.projects:
-        if not made_here and nothing_is_traced():
-            later = yet_to_be_moved(scene, start, native is not False)
-        else:
-            start = _on_constraints(scene, t0, start, inputs, made_here, native)
-    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, integrator, later)
+    setup = Setup(scene, start, inputs, t0, t1, ts, field, tolerances, first_step, integrator)
     if backend == "native" and (reason := setup.reason_against_machine_code):
         raise ValueError(f"backend='native' cannot integrate `{type(scene).__name__}`: {reason}; use backend='auto', which takes what serves")
     if order is not None and (reason := reason_against_series(setup, order)):
@@ -193,21 +195,31 @@ def _check_adjoint(adjoint) -> None:
         )
 
 
-def _on_constraints(scene: Scene, t0, start: State, inputs: Inputs, made_here: bool, native: bool | None) -> State:
-    """The start on the constraints, with how far it has moved from what was given; one made here is there already, unless what was given kept it off."""
+def _start(scene: Scene, given, t0, inputs: Inputs, native: bool | None, projects: bool, searches: bool) -> State | Unmoved:
+    """The start; numbers that are known are put onto the rows by the program that integrates, unless it takes a search."""
+    if projects and not searches and nothing_is_traced():
+        if isinstance(given, State):
+            return unmoved(scene, given, native is not False)
+        return named_unmoved(scene, named_values(scene, given), t0, inputs_at(inputs, t0), native is not False)
+    if isinstance(given, State):
+        return put_on_rows(scene, t0, given.q, given.u, inputs_at(inputs, t0), native=native) if projects else given
+    start = as_state(scene, given, t0=t0, inputs=inputs_at(inputs, t0), native=native)
+    return _moved_again(scene, t0, start, inputs, native) if projects else start
+
+
+def _moved_again(scene: Scene, t0, start: State, inputs: Inputs, native: bool | None) -> State:
+    """The start on the rows, with how far it has moved from what was given; one of named values is there already, unless what was given kept it off."""
 
     def moved_again(start: State) -> State:
         state = put_on_rows(scene, t0, start.q, start.u, inputs_at(inputs, t0), native=native)
         moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
         return eqx.tree_at(lambda s: (s.moved_q, s.moved_u), state, tuple(moved))
 
-    if not made_here:
-        return put_on_rows(scene, t0, start.q, start.u, inputs_at(inputs, t0), native=native)
-    if is_traced(start.residual):
-        off = start.residual > _OFF * jnp.finfo(start.q.dtype).eps
+    off = is_off(start)
+    if is_traced(off):
         # worked out once more on the way back of a derivative: what would be kept for it, of a branch that is rarely taken, costs as much as the start itself
         return jax.lax.cond(eqxi.unvmap_any(off), jax.checkpoint(moved_again), lambda start: start, start)
-    return moved_again(start) if np.asarray(start.residual) > _OFF * np.finfo(start.q.dtype).eps else start
+    return moved_again(start) if np.asarray(off) else start
 
 
 def default_solver(rtol: Number) -> Method:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -37,6 +38,7 @@ from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 FAR = 10.0  # widths of the domain: a coordinate that Newton's method moves by more has run away
 GUESSES = 8  # of each kind
+_OFF = 1e4  # units of round-off: a residual that is more
 NEAR = 0.1  # of the domain: how far the first guesses are from what was given
 
 
@@ -138,16 +140,41 @@ class Found(eqx.Module):
     arrived: Bool[Array, ""]  # whether the coordinates did, and are within reach of the domain
 
 
-def yet_to_be_moved(scene: Scene, start: State, native: bool) -> Usual:
-    """What `moved_onto_rows` needs of a scene whose numbers are known; a ValueError where the state is none of this scene."""
-    as_coordinates(scene, start.q), as_speeds(scene, start.u)
-    return usual_sizes(scene, False, native)
+class Unmoved(NamedTuple):
+    """A start that the compiled function which integrates it puts onto the rows first."""
+
+    q: Float[Array | np.ndarray, "coordinates"]
+    u: Float[Array | np.ndarray, "speeds"]
+    free_q: Bool[np.ndarray, "coordinates"]
+    free_u: Bool[np.ndarray, "speeds"]
+    usual: Usual
 
 
-def moved_onto_rows(scene: Scene, t, start: State, inputs, usual: Usual) -> Found:
-    """The state on the rows nearest to `start`, by Newton's method alone, as a part of a larger compiled function."""
-    every_q, every_u = np.ones(start.q.shape, bool), np.ones(start.u.shape, bool)
-    return _put_onto_constraints(scene, t, start.q, start.u, inputs, every_q, every_u, usual, None)
+def unmoved(scene: Scene, start: State, native: bool) -> Unmoved:
+    """A state of a scene, whose numbers are known; a ValueError where it is none of this scene."""
+    q, u = as_coordinates(scene, start.q), as_speeds(scene, start.u)
+    return Unmoved(q, u, _free(scene.coordinate_names.entries, ()), _free(scene.speed_names.entries, ()), usual_sizes(scene, False, native))
+
+
+def named_unmoved(scene: Scene, values: Mapping, t0, inputs, native: bool) -> Unmoved:
+    """As `named_start` of values that are known, before it is put onto the rows."""
+    named = _named(scene, values, t0, inputs)
+    return Unmoved(named.q, named.u, named.free_q, named.free_u, usual_sizes(scene, named.determined, native))
+
+
+def moved_onto_rows(scene: Scene, t, start: Unmoved, inputs) -> Found:
+    """The state on the rows nearest to `start`, by Newton's method alone, as a part of a larger compiled function.
+
+    Where something is held, it has arrived when nothing but round-off is left of the rows.
+    """
+    found = _put_onto_constraints(scene, t, start.q, start.u, inputs, start.free_q, start.free_u, start.usual, None)
+    holds = ~(jnp.all(start.free_q) & jnp.all(start.free_u))
+    return Found(found.state, found.arrived & ~(holds & is_off(found.state)))
+
+
+def is_off(state: State) -> Bool[Array | np.ndarray, ""]:
+    """Whether more than round-off is left of the rows; also where that is no number."""
+    return ~(state.residual <= _OFF * np.finfo(state.q.dtype).eps)
 
 
 def _can_search(scene: Scene) -> bool:
@@ -232,6 +259,29 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bo
     `native`: as in `put_on_rows`.
     """
     scene = as_scene(scene)
+    named = _named(scene, values, t0, inputs)
+    t, q, u, inputs, free_q, free_u = named[:6]
+    guesses = lambda: _guesses(scene, named.known, q, free_q)  # noqa: E731
+    state = _consistent(scene, t, q, u, inputs, free_q, free_u, guesses, native=native, determined=named.determined)
+    _check_residual(scene, state, inputs, named.given)
+    return state
+
+
+class _Named(NamedTuple):
+    """Named values as vectors, and what of them may move."""
+
+    t: Float[Array | np.ndarray, ""]
+    q: Float[Array | np.ndarray, "coordinates"]
+    u: Float[Array | np.ndarray, "speeds"]
+    inputs: Float[Array | np.ndarray, "inputs"]
+    free_q: Bool[np.ndarray, "coordinates"]
+    free_u: Bool[np.ndarray, "speeds"]
+    determined: bool  # rows determine the speeds that are free
+    known: Structure
+    given: tuple[str, ...]
+
+
+def _named(scene: Scene, values: Mapping, t0, inputs) -> _Named:
     q, u, given = vectors_named(scene, values)
     inputs = _as_input_vector(scene, inputs, q.dtype)
     t, free_q = _as_time(t0), _free(scene.coordinate_names.entries, given)
@@ -240,10 +290,7 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bo
     known = _structure(scene, t, q, free_q)
     free_u = _free(scene.speed_names.entries, (*given, *_resting(scene, known, given)))
     determined = known.affine and not any(free_u[i] for i in known.independent)
-    guesses = lambda: _guesses(scene, known, q, free_q)  # noqa: E731
-    state = _consistent(scene, t, q, u, inputs, free_q, free_u, guesses, native=native, determined=determined)
-    _check_residual(scene, state, inputs, given)
-    return state
+    return _Named(t, q, u, inputs, free_q, free_u, determined, known, given)
 
 
 def _structure(scene: Scene, t, q, free_q) -> Structure:
