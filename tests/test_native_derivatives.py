@@ -107,7 +107,7 @@ def test_lanes_that_fail_or_are_no_numbers_do_not_touch_others(adjoint):
 def test_cotangents_of_a_lane_do_not_depend_on_its_company():
     every = jax.jit(jax.vmap(jax.grad(lambda x: jnp.sum(_ends(x, events=True)))))
     expected = np.asarray(every(LANES))
-    for count in (1, 3, 8, 9):
+    for count in (3, 9):  # fewer than a register holds, and one more than the widest
         order = np.random.default_rng(count).permutation(11)[:count]
         np.testing.assert_allclose(every(LANES[order]), expected[order], rtol=1e-13, atol=1e-14)
 
@@ -145,8 +145,8 @@ def test_derivatives_pass_through_motions_one_after_the_other(adjoint):
 def test_the_loop_of_xla_is_not_traced(adjoint, monkeypatch):
     monkeypatch.setattr(erk_loop, "integrate", lambda *a: pytest.fail("the loop of XLA was traced"))
     mode = jax.grad if adjoint is None else jax.jacfwd
-    mode(lambda x: _ends(x, adjoint=adjoint, max_steps=1234)[2])(X)
-    slope = mode(lambda t: _ends(X, adjoint=adjoint, max_steps=1234, ts=jnp.array([0.1, 0.3, 0.9]) * t, t1=3.0 * t)[2])(1.0)
+    eval_numpy(mode(lambda x: _ends(x, adjoint=adjoint, max_steps=1234)[2]))(X)
+    slope = eval_numpy(mode(lambda t: _ends(X, adjoint=adjoint, max_steps=1234, ts=jnp.array([0.1, 0.3, 0.9]) * t, t1=3.0 * t)[2]))(1.0)
     np.testing.assert_allclose(slope, 3.0 * _exact(X)[3], rtol=1e-8)
 
 
