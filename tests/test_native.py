@@ -12,6 +12,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop
+from jourdain_jax.motion.integrators.tableaus import TSIT5
 from jourdain_jax.motion.native import kernel as kernels
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.simulate import set_up
@@ -210,7 +211,7 @@ def disc_kernel(request):
     form = Form(setup.field.lowered, False, False, True, True, False)
     lean = np.linspace(0.0, 1.5, 100)
     lean[[3, 40, 77]] = 1.7, np.nan, np.inf
-    kernel = kernels.kernel(form, diffrax.Tsit5, request.param)
+    kernel = kernels.kernel(form, TSIT5, request.param)
     layout, fixed = kernel.layout, setup.field.lowered.fixed_values(scene)
     starts = np.zeros((100, layout.given))
     starts[:, 3], starts[:, 5:8] = lean, np.stack([0.5 + lean, 0.2 + np.zeros(100), -3 + 2 * lean], axis=1)
@@ -241,7 +242,7 @@ def test_a_lane_does_not_depend_on_the_number_of_threads(disc_kernel, threads, m
     starts, goals = jnp.tile(starts, (13, 1)), jnp.tile(goals, (13, 1))
     kernels.kernel.cache_clear()
     monkeypatch.setattr(host, "threads", lambda: threads)
-    other = kernels.kernel(usual.form, diffrax.Tsit5, order)
+    other = kernels.kernel(usual.form, TSIT5, order)
     assert other is not usual
     for found, expected in zip(jax.vmap(other.run)(starts, goals), jax.vmap(usual.run)(starts, goals), strict=True):
         np.testing.assert_array_equal(found, expected)
@@ -256,7 +257,7 @@ def test_no_bit_depends_on_the_effort_spent_on_machine_code(disc_kernel, monkeyp
     monkeypatch.setattr(host, "EFFORT", 2)
     monkeypatch.setattr(ffi, "registered", lambda *asked: names.append((little(*asked), much(*asked))) or much(*asked))
     kernels.kernel.cache_clear()
-    for found, by_little in zip(jax.vmap(kernels.kernel(usual.form, diffrax.Tsit5, order).run)(starts, goals), expected, strict=True):
+    for found, by_little in zip(jax.vmap(kernels.kernel(usual.form, TSIT5, order).run)(starts, goals), expected, strict=True):
         np.testing.assert_array_equal(found, by_little)
     assert names
     assert all(one != other for one, other in names)
