@@ -211,6 +211,34 @@ def gradients(quick: bool) -> Iterator[Figure]:
             yield figure(f"gradient by 8 numbers / one solve, {where}", name, best / timed["solve"], AT_MOST[name], 3)
 
 
+NAMED = {
+    "tilting-disc": ({"lean": 0.3, "spin_rate": -3.0}, ("radius", "mass", "gravity"), "lean"),
+    "whipple-bicycle": ({"lean": 0.05, "rear_spin_rate": 15.0, "lean_rate": 0.2}, ("IBxx", "mB", "c"), "lean"),
+}
+
+
+def named_starts(quick: bool) -> Iterator[Figure]:
+    """Derivative of 2 s of a motion by three parameters, its start being named values, which depend on them where they are put onto the rows."""
+    for name, (given, free, seen) in list(NAMED.items())[: 1 if quick else 2]:
+        scene, ts = jj.models.MODELS[name](), jnp.linspace(0.0, 2.0, 41)
+
+        def loss(x, adjoint, scene=scene, given=given, free=free, seen=seen, ts=ts):
+            return jnp.sum(jj.simulate(scene.replace(**dict(zip(free, x, strict=True))), given, ts=ts, adjoint=adjoint)[seen])
+
+        x = jnp.stack([getattr(scene, one) for one in free])
+        jax.block_until_ready(jj.simulate(scene, given, ts=ts).q)  # what is found of the scene is not counted
+        found = {}
+        for way, derivative, adjoint in (("forward", jax.jacfwd, diffrax.ForwardMode()), ("reverse", jax.grad, None)):
+            begin = time.process_time()
+            run = jax.jit(lambda x, derivative=derivative, adjoint=adjoint: derivative(lambda x: loss(x, adjoint))(x)).lower(x).compile()
+            seconds = time.process_time() - begin
+            found[way] = np.asarray(run(x))
+            warm = least_processor_time({way: lambda run=run, x=x: jax.block_until_ready(run(x))}, 7)[way]
+            print(f"  {name}, {way} mode from named values: compiled in {seconds:.1f} s, {1e3 * warm:.3f} ms", flush=True)
+            yield figure(f"trace and compile a derivative from named values, {way} mode, s", name, seconds, *((6, 3) if way == "forward" else (10, 5)))
+        np.testing.assert_allclose(found["forward"], found["reverse"], rtol=1e-5, atol=1e-5 * np.max(np.abs(found["reverse"])))
+
+
 def cold_seconds(name: str, way: str) -> float:
     """From a fresh process to the first trajectory: import, build, probe, compile, run."""
     done = subprocess.run([sys.executable, "-c", COLD, name, way], capture_output=True, text=True, check=True)
@@ -389,7 +417,7 @@ def limit(quick: bool) -> Iterator[Figure]:
                 yield figure(f"time per evaluation, lowered / dense{where}, n = {n}, {program.operations} operations", name, ratio, 1, 0.1)
 
 
-FIGURES = {f.__name__: f for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, cold_starts, growth, kept_parts, limit)}
+FIGURES = {f.__name__: f for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, named_starts, cold_starts, growth, kept_parts, limit)}
 
 
 def main() -> None:

@@ -6,6 +6,9 @@ Each is iterated until nothing changes any more, in a way that can be differenti
 derivative with it. Rows affine in the speeds are met by one step. Unit norms of quaternions count as position rows here.
 """
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -24,14 +27,40 @@ from jourdain_jax.scene.scene import Scene
 MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS = 25, 8
 
 
+class RowFunctions(NamedTuple):
+    """How rows, their slopes and the mass matrix of a scene are evaluated."""
+
+    closures: Callable  # (scene, t, q) -> g, G
+    rows: Callable  # (scene, t, q, u, inputs) -> phi, A
+    masses: Callable  # (scene, t, q) -> M
+
+
 def closure_residual(scene: Scene, t, q) -> Float[Array, "closures"]:
     """Geometric rows, and `(|quaternion|^2 - 1)/2` of every quaternion."""
     norms = [(q[i : i + 4] @ q[i : i + 4] - 1)[None] / 2 for i, _ in scene.coordinates.quaternions]
     return jnp.concatenate([position_residual(scene, t, q), *norms])
 
 
+def _closures(scene: Scene, t, q):
+    return closure_residual(scene, t, q), jax.jacfwd(lambda q: closure_residual(scene, t, q))(q)
+
+
+def _rows(scene: Scene, t, q, u, inputs):
+    return velocity_residual(scene, t, q, u, inputs), jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
+
+
+BY_AUTODIFF = RowFunctions(_closures, _rows, mass_matrix_at)
+
+
 def project_positions(
-    scene: Scene, t, q: Float[Array, "coordinates"], *, free: Bool[Array, "coordinates"] | None = None, iterations: int = MOST_MOVES_OF_POSITIONS, typical=None
+    scene: Scene,
+    t,
+    q: Float[Array, "coordinates"],
+    *,
+    free: Bool[Array, "coordinates"] | None = None,
+    iterations: int = MOST_MOVES_OF_POSITIONS,
+    typical=None,
+    by: RowFunctions = BY_AUTODIFF,
 ) -> Float[Array, "coordinates"]:
     """Coordinates on the geometric rows, near q; only coordinates that are `free` move. At most so many `iterations`.
 
@@ -44,7 +73,7 @@ def project_positions(
     free = jnp.ones(q.shape, bool) if free is None else free
 
     def step(q):
-        residual, G = closure_residual(scene, t, q), jax.jacfwd(lambda q: closure_residual(scene, t, q))(q)
+        residual, G = by.closures(scene, t, q)
         G = jnp.where(free, G, 0.0)
         d = row_scale(G, typical)
         return q - jnp.where(free, pseudo_inverse(d[:, None] * G) @ (d * residual), 0.0)  # what is held does not move by round-off either
@@ -74,6 +103,7 @@ def project_speeds(
     typical=None,
     affine: bool = False,
     determined: bool = False,
+    by: RowFunctions = BY_AUTODIFF,
 ) -> Float[Array, "speeds"]:
     """Speeds on the velocity rows, nearest to u in the metric of the mass matrix; only speeds that are `free` move.
 
@@ -84,16 +114,16 @@ def project_speeds(
     if jax.eval_shape(lambda s, q, u: velocity_residual(s, 0.0, q, u), scene, q, u).shape[0] == 0:
         return u
     if determined:
-        return _determined_speeds((scene, t, q, u, inputs), free=free, typical=typical)
+        return _determined_speeds((scene, t, q, u, inputs), free=free, typical=typical, by=by)
     free = jnp.ones(u.shape, bool) if free is None else free
-    M = mass_matrix_at(scene, t, q)
+    M = by.masses(scene, t, q)
     c = speed_scale(M)
     M = jnp.where(free[:, None] & free, c[:, None] * M * c, jnp.eye(u.shape[0], dtype=u.dtype))
     L, _ = cholesky(M)  # the identity where M is singular: then nearest in the scaled speeds
 
     def towards_rows(u):
         """The residual of rows at u, and the linear function that takes a residual to the change of speeds which removes it."""
-        phi, A = velocity_residual(scene, t, q, u, inputs), jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
+        phi, A = by.rows(scene, t, q, u, inputs)
         weighted = jax.scipy.linalg.solve_triangular(L, jnp.where(free, A * c, 0.0).T, lower=True).T  # A L'^-1
         d = row_scale(weighted, typical)
         P = pseudo_inverse(d[:, None] * weighted, cutoff)
@@ -107,33 +137,33 @@ def project_speeds(
         return fixed_point(step, u, iterations)
     phi, change = towards_rows(u)
     u = u + change(phi)
-    return u + jax.lax.stop_gradient(change(velocity_residual(scene, t, q, u, inputs)))  # round-off, of which no derivative is wanted
+    return u + jax.lax.stop_gradient(change(by.rows(scene, t, q, u, inputs)[0]))  # round-off, of which no derivative is wanted
 
 
 @eqx.filter_custom_jvp
-def _determined_speeds(state: tuple, *, free, typical) -> Float[Array, "speeds"]:
+def _determined_speeds(state: tuple, *, free, typical, by: RowFunctions) -> Float[Array, "speeds"]:
     """Speeds on affine rows that determine those which are free; `state`: scene, time, coordinates, speeds, inputs."""
-    return _on_rows(state, free, typical)[0]
+    return _on_rows(state, free, typical, by)[0]
 
 
 @_determined_speeds.def_jvp
-def _determined_speeds_jvp(primals, tangents, *, free, typical):
+def _determined_speeds_jvp(primals, tangents, *, free, typical, by):
     """Of `phi = 0`, as of any root: `du = -A+ dphi`, with the derivative of the rows at speeds that are held."""
     ((scene, t, q, u, inputs),), ((*along, du, dinputs),) = primals, tangents
-    u, P = _on_rows((scene, t, q, u, inputs), free, typical)
+    u, P = _on_rows((scene, t, q, u, inputs), free, typical, by)
     du = jnp.zeros_like(u) if du is None else jnp.where(free, 0.0, du)
     tangents = (*along, du, dinputs)
     moving, fixed = eqx.partition((scene, t, q, u, inputs), jax.tree.map(lambda d: d is not None, tangents, is_leaf=lambda d: d is None))
-    dphi = jax.jvp(lambda moving: velocity_residual(*eqx.combine(moving, fixed)), (moving,), (tangents,))[1]
+    dphi = jax.jvp(lambda moving: by.rows(*eqx.combine(moving, fixed))[0], (moving,), (tangents,))[1]
     return u, du - P @ dphi
 
 
-def _on_rows(state: tuple, free, typical) -> tuple[Float[Array, "speeds"], Float[Array, "speeds rows"]]:
+def _on_rows(state: tuple, free, typical, by: RowFunctions) -> tuple[Float[Array, "speeds"], Float[Array, "speeds rows"]]:
     """Those speeds, and what takes a residual of rows to the change of speeds that makes it."""
     scene, t, q, u, inputs = state
-    A = jnp.where(free, jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u), 0.0)
+    A = jnp.where(free, by.rows(scene, t, q, u, inputs)[1], 0.0)
     d = row_scale(A, typical)
     P = jnp.where(free[:, None], pseudo_inverse(d[:, None] * A) * d, 0.0)  # what is held does not move by round-off either
     for _ in range(2):  # once more for round-off
-        u = u - P @ velocity_residual(scene, t, q, u, inputs)
+        u = u - P @ by.rows(scene, t, q, u, inputs)[0]
     return u, P

@@ -30,13 +30,13 @@ _KINDS = {  # of diffrax, and an example
 }
 
 
-def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None, native: bool | None = None) -> State:
+def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None, native: bool | None = None, onto_rows: bool = False) -> State:
     """A state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
 
     `inputs`: the scene's inputs at that instant, a vector or by name (default: zero); they count where velocity rows depend on them.
-    `native`: whether machine code of our own may put it onto the rows, as in `put_on_rows`.
+    `native`: whether machine code of our own may put it onto the rows, as in `put_on_rows`. `onto_rows`: as of `named_start`.
     """
-    return given if isinstance(given, State) else named_start(scene, named_values(scene, given, what), t0, inputs, native)
+    return given if isinstance(given, State) else named_start(scene, named_values(scene, given, what), t0, inputs, native, onto_rows)
 
 
 def named_values(scene: Scene, given, what: str = "start") -> Mapping:

@@ -70,14 +70,26 @@ class OwnSteps(Integrator):
 _once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
 
 
-def own_steps(solver, controller, adjoint, saveat, **static) -> OwnSteps | None:
-    """Our own loop where it has such a solver and such an adjoint (None: the default one), and nothing else was stated."""
-    method = solver if isinstance(solver, Method) else method_of(solver)
-    if controller is not None or saveat is not None or method is None:
+def takes(solver, stepsize_controller, adjoint, saveat) -> bool:
+    """Whether our own loop has such a solver and such an adjoint (None: the default ones), and nothing else is stated."""
+    if stepsize_controller is not None or saveat is not None or not (solver is None or isinstance(solver, Method) or method_of(solver) is not None):
+        return False
+    return adjoint is None or _kind(adjoint) is not None
+
+
+def own_steps(solver, stepsize_controller, adjoint, saveat, **static) -> OwnSteps | None:
+    """Our own loop, where it takes these options."""
+    if not takes(solver, stepsize_controller, adjoint, saveat):
         return None
-    if adjoint is None or (type(adjoint) is diffrax.RecursiveCheckpointAdjoint and adjoint.checkpoints is None):
-        return _once(method, "reverse", False, **static)
-    return _once(method, "forward", type(adjoint) is alongside.Alongside, **static) if type(adjoint) in (diffrax.ForwardMode, alongside.Alongside) else None
+    method = solver if isinstance(solver, Method) else method_of(solver)
+    return _once(method, "reverse" if adjoint is None else _kind(adjoint), adjoint is not None and type(adjoint) is alongside.Alongside, **static)
+
+
+def _kind(adjoint) -> Literal["forward", "reverse"] | None:
+    """The mode of derivatives of an adjoint of diffrax; None where ours has no such one."""
+    if type(adjoint) is diffrax.RecursiveCheckpointAdjoint:
+        return "reverse" if adjoint.checkpoints is None else None
+    return "forward" if type(adjoint) in (diffrax.ForwardMode, alongside.Alongside) else None
 
 
 def reason_against_series(setup: Setup, order: int) -> str:

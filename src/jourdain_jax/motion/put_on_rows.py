@@ -3,7 +3,7 @@
 g(t, q) = 0,  phi(t, q, u) = 0
 """
 
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import equinox as eqx
 import jax
@@ -18,11 +18,11 @@ from jourdain_jax.build.structure import closure_lengths, plain_row_lengths, row
 from jourdain_jax.calculus.differentiated_as import differentiated_as
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
-from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds
-from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
 from jourdain_jax.motion.native.called import called
 from jourdain_jax.motion.native.onto_rows import Rows, written
 from jourdain_jax.motion.native.seen import entries
+from jourdain_jax.motion.row_functions import row_functions
 from jourdain_jax.native import ffi, host
 from jourdain_jax.scene.scene import Scene
 
@@ -66,9 +66,9 @@ def put_positions(scene: Scene, t, q, free, usual: Usual) -> tuple[Float[Array, 
     if usual.program is not None and not usual.program.g:
         return q, jnp.zeros(0, q.dtype)
 
-    def by_xla(scene, t, q, free, lengths):
-        near_q = project_positions(scene, t, q, free=free, typical=lengths)
-        return near_q, closure_residual(scene, t, near_q)
+    def by_xla(by: RowFunctions, scene, t, q, free, lengths):
+        near_q = project_positions(scene, t, q, free=free, typical=lengths, by=by)
+        return near_q, by.closures(scene, t, near_q)[0]
 
     def by_machine_code(rows: Rows):
         return lambda scene, t, q, free, lengths: _put(rows, scene, [t[None], q], free, lengths)
@@ -82,9 +82,9 @@ def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Float
     if usual.program is not None and not usual.program.phi:
         return u, jnp.zeros(0, u.dtype)
 
-    def by_xla(scene, t, q, u, inputs, free, lengths):
-        near_u = project_speeds(scene, t, q, u, inputs, free=free, typical=lengths, affine=affine, determined=determined)
-        return near_u, velocity_residual(scene, t, q, near_u, inputs)
+    def by_xla(by: RowFunctions, scene, t, q, u, inputs, free, lengths):
+        near_u = project_speeds(scene, t, q, u, inputs, free=free, typical=lengths, affine=affine, determined=determined, by=by)
+        return near_u, by.rows(scene, t, q, near_u, inputs)[0]
 
     def by_machine_code(rows: Rows):
         return lambda scene, t, q, u, inputs, free, lengths: _put(rows, scene, [t[None], q, u, inputs], free, lengths)
@@ -93,11 +93,17 @@ def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Float
     return _by_either(usual, kind, affine or determined, by_xla, by_machine_code)(scene, jnp.asarray(t), q, u, inputs, free, usual.rows)
 
 
+def functions_of_positions(usual: Usual) -> RowFunctions:
+    """How geometric rows are evaluated where a derivative, or a search, needs them."""
+    served = usual.program is not None and usual.program.g and not _reason_against(Rows(usual.program, "positions"))
+    return row_functions(usual.program) if served else BY_AUTODIFF
+
+
 def _by_either(usual: Usual, kind, affine: bool, by_xla, by_machine_code):
     rows = None if usual.program is None else Rows(usual.program, kind, affine)
     if rows is None or _reason_against(rows):
-        return by_xla
-    return differentiated_as(by_xla, by_machine_code(rows), "forward")
+        return partial(by_xla, BY_AUTODIFF)
+    return differentiated_as(partial(by_xla, row_functions(rows.program)), by_machine_code(rows), "forward")
 
 
 @lru_cache(maxsize=MOST_KERNELS)

@@ -8,8 +8,6 @@ import inspect
 import warnings
 from typing import TYPE_CHECKING
 
-import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,12 +22,12 @@ from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted, 
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method, as_solver
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import marked
-from jourdain_jax.motion.own_steps import own_steps, reason_against_series
+from jourdain_jax.motion.own_steps import own_steps, reason_against_series, takes
 from jourdain_jax.motion.quick_compilation import nothing_is_traced
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Setup
-from jourdain_jax.motion.start import State, Unmoved, is_off, named_unmoved, put_on_rows, unmoved
+from jourdain_jax.motion.start import State, Unmoved, named_unmoved, put_on_rows, unmoved
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.choice import Formulation, as_formulation, vector_field
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
@@ -150,8 +148,8 @@ def _set_up(
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, switches=switches, **objects)
     _check_adjoint(adjoint)
     check_solver(solver, stepsize_controller, dt0, saveat)
-    by_default = all(x is None for x in objects.values())
-    native = (True if by_default else None) if backend in ("auto", "native") else False  # with what is diffrax's, only numbers: the rest can be exported
+    ours = takes(**objects)
+    native = (True if ours else None) if backend in ("auto", "native") else False  # with what is diffrax's, only numbers: the rest can be exported
     inputs = as_inputs(scene, inputs)
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     start = _start(scene, start, t0, inputs, native, formulation.projects, searches)
@@ -203,23 +201,7 @@ def _start(scene: Scene, given, t0, inputs: Inputs, native: bool | None, project
         return named_unmoved(scene, named_values(scene, given), t0, inputs_at(inputs, t0), native is not False)
     if isinstance(given, State):
         return put_on_rows(scene, t0, given.q, given.u, inputs_at(inputs, t0), native=native) if projects else given
-    start = as_state(scene, given, t0=t0, inputs=inputs_at(inputs, t0), native=native)
-    return _moved_again(scene, t0, start, inputs, native) if projects else start
-
-
-def _moved_again(scene: Scene, t0, start: State, inputs: Inputs, native: bool | None) -> State:
-    """The start on the rows, with how far it has moved from what was given; one of named values is there already, unless what was given kept it off."""
-
-    def moved_again(start: State) -> State:
-        state = put_on_rows(scene, t0, start.q, start.u, inputs_at(inputs, t0), native=native)
-        moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
-        return eqx.tree_at(lambda s: (s.moved_q, s.moved_u), state, tuple(moved))
-
-    off = is_off(start)
-    if is_traced(off):
-        # worked out once more on the way back of a derivative: what would be kept for it, of a branch that is rarely taken, costs as much as the start itself
-        return jax.lax.cond(eqxi.unvmap_any(off), jax.checkpoint(moved_again), lambda start: start, start)
-    return moved_again(start) if np.asarray(off) else start
+    return as_state(scene, given, t0=t0, inputs=inputs_at(inputs, t0), native=native, onto_rows=projects)
 
 
 def default_solver(rtol: Number) -> Method:

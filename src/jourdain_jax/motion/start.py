@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.build.domain import coordinate_bounds
+from jourdain_jax.build.held_values import may_contradict
 from jourdain_jax.build.sampling import NoStateFoundError, seen_on_rows
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.damped import damped_root
@@ -27,7 +28,7 @@ from jourdain_jax.equations.projection import closure_residual, project_position
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs, inputs_at
-from jourdain_jax.motion.put_on_rows import Usual, put_positions, put_speeds, usual_sizes
+from jourdain_jax.motion.put_on_rows import Usual, functions_of_positions, put_positions, put_speeds, usual_sizes
 from jourdain_jax.motion.quick_compilation import RUN_SELDOM, nothing_is_traced, quickly_compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
@@ -189,7 +190,7 @@ def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: 
     if guesses is not None and _can_search(scene):
         lost = jax.lax.stop_gradient(~arrived)
         other_q, other = jax.lax.cond(eqxi.unvmap_any(lost), lambda: _searched(scene, t, q, free, usual, guesses), lambda: (near_q, guess))
-        other_g = closure_residual(scene, t, other_q)
+        other_g = functions_of_positions(usual).closures(scene, t, other_q)[0]
         better = lost & (_left(other_g) <= _left(g))
         near_q, g, guess = (jnp.where(better, *pair) for pair in ((other_q, near_q), (other_g, g), (other, guess)))
     near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(free_u), usual)
@@ -218,16 +219,17 @@ def _searched(scene: Scene, t, q, free, usual: Usual, guesses) -> tuple[Float[Ar
     size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
     here, still, at = jax.lax.stop_gradient((q, scene, t))
     every = jnp.where(free, jnp.concatenate([here[None], guesses]), here)
-    G = jax.vmap(jax.jacfwd(lambda q: closure_residual(still, at, q)))(every)
+    by = functions_of_positions(usual)
+    G = jax.vmap(lambda q: by.closures(still, at, q)[1])(every)
     every = jnp.where(jnp.any(G != 0, axis=(0, 1)), every, here)  # coordinates that no row depends on stay
     d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
     tolerance = 16 * float(jnp.finfo(q.dtype).eps)
-    found = jax.vmap(lambda guess: damped_root(lambda q: d * closure_residual(still, at, q), guess, size, tolerance))(every)
+    found = jax.vmap(lambda guess: damped_root(lambda q: d * by.closures(still, at, q)[0], guess, size, tolerance))(every)
     good = found.left <= float(jnp.finfo(q.dtype).eps) ** 0.5
     guess = jnp.where(jnp.any(good), jnp.argmax(good), jnp.argmin(found.left)).astype(jnp.int32)
     begin = jnp.where(free, found.x[guess], q)
     # derivatives come from the last steps of Newton's method; where the rows cannot be met, those would run away
-    return jnp.where(good[guess], project_positions(scene, t, begin, free=free, typical=usual.closures), begin), guess
+    return jnp.where(good[guess], project_positions(scene, t, begin, free=free, typical=usual.closures, by=by), begin), guess
 
 
 def _tolerance(dtype) -> float:
@@ -253,10 +255,11 @@ def start(scene: Scene | BuiltFor, *, t0: Number = 0.0, inputs=None, **values) -
     return named_start(scene, values, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)))
 
 
-def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bool | None = None) -> State:
+def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bool | None = None, onto_rows: bool = False) -> State:
     """A start from a dictionary of `values`, as of `start`, and the `inputs` at time `t0`: a vector, or by name (None: zero).
 
-    `native`: as in `put_on_rows`.
+    `native`: as in `put_on_rows`. `onto_rows`: where given values contradict each other by so little that it passes for round-off of what was typed, they
+    move, too.
     """
     scene = as_scene(scene)
     named = _named(scene, values, t0, inputs)
@@ -264,7 +267,23 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bo
     guesses = lambda: _guesses(scene, named.known, q, free_q)  # noqa: E731
     state = _consistent(scene, t, q, u, inputs, free_q, free_u, guesses, native=native, determined=named.determined)
     _check_residual(scene, state, inputs, named.given)
-    return state
+    return _moved_if_near(scene, state, inputs, native) if onto_rows and may_contradict(scene, named.known, free_q, free_u) else state
+
+
+def _moved_if_near(scene: Scene, start: State, inputs, native: bool | None) -> State:
+    """The start moved onto the rows as a whole, where it is off them by more than round-off, and by less than what counts as a contradiction."""
+    near = is_off(start) & (start.residual < _tolerance(start.q.dtype))
+
+    def moved_again(start: State) -> State:
+        state = put_on_rows(scene, start.t, start.q, start.u, inputs, native=native)
+        moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
+        state = eqx.tree_at(lambda s: (s.moved_q, s.moved_u, s.guess), state, (*moved, start.guess))
+        return jax.tree.map(lambda x, y: jnp.where(near, x, y), state, start)
+
+    if is_traced(near):
+        # worked out once more on the way back of a derivative: what would be kept for it, of a branch that is rarely taken, costs as much as the start itself
+        return jax.lax.cond(eqxi.unvmap_any(near), jax.checkpoint(moved_again), lambda start: start, start)
+    return moved_again(start) if near else start
 
 
 class _Named(NamedTuple):

@@ -1,0 +1,47 @@
+"""Whether rows can be met while some coordinates and speeds keep the values that they are given.
+
+    rank G_f = rank G,   rank A_f = rank A,      G = dg/dq, A = dphi/du, f: their columns of what is free
+
+Then the values cannot contradict each other, but for single configurations.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool
+
+from jourdain_jax.build.reference_parameters import with_reference_parameters
+from jourdain_jax.build.structure import Structure
+from jourdain_jax.eager.eager import eval_numpy
+from jourdain_jax.equations.listed import names_of_position_rows
+from jourdain_jax.equations.projection import closure_residual
+from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.scene.scene import Scene
+
+MOST_STATES = 4  # that are looked at
+
+
+def may_contradict(scene: Scene, known: Structure, free_q: Bool[np.ndarray, "coordinates"], free_u: Bool[np.ndarray, "speeds"]) -> bool:
+    """Whether values that are held, where entries are not free, may contradict each other; `known`: of the scene."""
+    of_speeds = not all(free or k in known.independent for k, free in enumerate(free_u))  # otherwise rows determine the dependent ones
+    of_coordinates = not free_q.all() and bool(names_of_position_rows(scene) or scene.coordinates.quaternions)
+    if not (of_speeds or of_coordinates):
+        return False
+    if of_speeds and not known.affine:
+        return True
+    states = slice(0, min(known.random, MOST_STATES))
+    G, A = _slopes(with_reference_parameters(scene), known.times[states], known.coordinates[states])
+    return (of_coordinates and _loses_rank(G, free_q)) or (of_speeds and _loses_rank(A, free_u))
+
+
+def _loses_rank(matrices, free) -> bool:
+    return any(np.linalg.matrix_rank(one[:, free]) < np.linalg.matrix_rank(one) for one in matrices)
+
+
+@eval_numpy
+def _slopes(scene: Scene, times, coordinates):
+    def at(t, q):
+        u = jnp.zeros(len(scene.speed_names))
+        return jax.jacfwd(lambda q: closure_residual(scene, t, q))(q), jax.jacfwd(lambda u: velocity_residual(scene, t, q, u))(u)
+
+    return jax.vmap(at)(times, coordinates)

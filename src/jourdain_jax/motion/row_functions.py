@@ -1,0 +1,126 @@
+"""Rows and mass matrix of a scene by machine code, as functions that JAX can differentiate: a derivative has two calls in it, in place of the scene itself.
+
+    g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
+    d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs;   J: derived on the graph
+
+Derivatives of higher order are those of the program as XLA runs it.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.build.row_program import RowProgram
+from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
+from jourdain_jax.equations.projection import RowFunctions
+from jourdain_jax.equations.virtual_power import mass_matrix_at
+from jourdain_jax.lowering.jacobian import on_its_own
+from jourdain_jax.motion.native.called import called
+from jourdain_jax.motion.native.seen import entries
+from jourdain_jax.native import host
+from jourdain_jax.native.ir import Writer
+from jourdain_jax.native.scalar_program import as_real, unsupported, written
+from jourdain_jax.native.threads import write_rows
+from jourdain_jax.program.derivative import jacobian
+from jourdain_jax.program.emit import run
+from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.scene.scene import Scene
+
+MOST_KEPT = 64
+LARGEST_PROGRAM = 20_000  # operations of values and derivatives
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def row_functions(program: RowProgram) -> RowFunctions:
+    """g and G, phi and A, and M, by the program."""
+    closures, rows, coordinates, speeds = map(len, (program.g, program.phi, program.q, program.u))
+    parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
+    at = [*parameters, program.t, *program.q]
+    of_closures = _function(program.graph, _places(program.g, program.G, coordinates), closures * (1 + coordinates), at)
+    of_rows = _function(program.graph, _places(program.phi, program.A, speeds), rows * (1 + speeds), [*at, *program.u, *program.inputs])
+    M = {key: node for (i, k), node in (program.M or {}).items() for key in ((i, k), (k, i))}
+    of_masses = None if program.M is None else _function(program.graph, _places((), M, speeds), speeds**2, at)
+
+    def given(scene: Scene, t, *vectors) -> Float[Array, "given"]:
+        parts = *entries(scene, program.parameters), jnp.asarray(t)[None], *vectors
+        return jnp.concatenate([jnp.asarray(x, jnp.float64) for x in parts])
+
+    def closures_at(scene: Scene, t, q):
+        found = of_closures(given(scene, t, q))
+        return found[:closures], found[closures:].reshape(closures, coordinates)
+
+    def rows_at(scene: Scene, t, q, u, inputs):
+        found = of_rows(given(scene, t, q, u, inputs))
+        return found[:rows], found[rows:].reshape(rows, speeds)
+
+    def masses_at(scene: Scene, t, q):
+        return mass_matrix_at(scene, t, q) if of_masses is None else of_masses(given(scene, t, q)).reshape(speeds, speeds)
+
+    return RowFunctions(closures_at, rows_at, masses_at)
+
+
+def _places(vector: Sequence[int], matrix: dict[tuple[int, int], int], columns: int) -> dict[int, int]:
+    """Where the nodes of a vector, and of a matrix after it, are among all numbers; those that have none are zero."""
+    return dict(enumerate(vector)) | {len(vector) + i * columns + k: node for (i, k), node in matrix.items()}
+
+
+def _function(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
+    """Values of nodes, at their places among so many numbers, as a function of the values of the variables."""
+    graph, nodes, variables = on_its_own(graph, list(places.values()), variables)
+    places = dict(zip(places, nodes, strict=True))
+    slopes = _slopes(graph, places, size, variables)
+    by_xla, by_machine_code = _by_xla(graph, places, size, variables), _by_machine_code(graph, places, size, variables)
+
+    def push(arguments, along):
+        (x,), (dx,) = arguments, along
+        return values(x), slopes(x) @ dx
+
+    values = differentiated_as(by_xla, by_machine_code, "forward", None if slopes is None else Rules(lambda *_: True, push, push))
+    return values
+
+
+def _slopes(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array] | None:
+    """J as a function of the variables; None where it is too large, or no machine code."""
+    count, nodes = len(variables), list(places.values())
+    try:
+        rows = jacobian(graph, nodes, variables)
+    except Unsupported:
+        return None
+    entries = {i * count + j: row[n] for i, row in zip(places, rows, strict=True) for j, n in enumerate(variables) if n in row}
+    found = list(entries.values())
+    if unsupported(graph, found) or graph.operations([*nodes, *found]) > LARGEST_PROGRAM:
+        return None
+    of_all = graph, entries, size * count, variables
+    values = differentiated_as(_by_xla(*of_all), _by_machine_code(*of_all), "forward")
+    return lambda x: values(x).reshape(size, count)
+
+
+def _by_xla(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
+    where = np.array(list(places), int)
+
+    def of(x):
+        found = run(graph, places.values(), dict(zip(variables, x, strict=True)))
+        zeros = jnp.zeros(size, x.dtype)
+        return zeros.at[where].set(jnp.stack([jnp.asarray(value, x.dtype) for value in found]), unique_indices=True) if found else zeros
+
+    return of
+
+
+def _by_machine_code(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
+    def text(lanes: int, threads: int) -> str:
+        w = Writer(lanes, host.fuses())
+        with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
+            known = {n: w.load(w.real, state, k) for k, n in enumerate(variables)}
+            with w.counted(0, size) as k:
+                w.store(w.number(0.0), found, k)
+            for k, value in zip(places, written(w, graph, places.values(), known), strict=True):
+                w.store(as_real(w, value), found, k)
+            w.give()
+        write_rows(w, len(variables), size, threads)
+        return w.text
+
+    kernel = called(text, lambda *_: ((size,),), seldom=True)
+    return lambda x: kernel(x)[0]
