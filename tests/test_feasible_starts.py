@@ -135,9 +135,26 @@ def test_steady_motions_keep_the_coordinates_on_which_nothing_depends():
     assert (float(found["x"]), float(found["y"]), float(found["heading"])) == (5.0, 0.0, 0.7)
 
 
-@pytest.mark.parametrize(
-    "scene", [jj.models.ChaplyginSleigh(), pytest.param(jj.models.DoublePendulumRods(), marks=pytest.mark.slow)], ids=["sleigh", "pendulum of rods"]
-)
+class Bowl(jj.Scene):
+    """A particle in a round bowl, which rolls along grooves: a geometric row that the reference is on, and a row of speeds."""
+
+    radius: jnp.ndarray = jj.parameter(1.2, positive=True)
+    slope: jnp.ndarray = jj.parameter(0.4)
+
+    coordinates = jj.coordinates("z y x")
+
+    def bodies(self, t, q):
+        return {"particle": jj.Particle(1.0, jnp.stack([q.x, q.y, q.z]))}
+
+    def geometric_constraints(self, pose):
+        q = pose.q
+        return {"bowl": q.x**2 + q.y**2 + (q.z - self.radius) ** 2 - self.radius**2}
+
+    def velocity_constraints(self, motion):
+        return {"groove": motion.u.y_rate - self.slope * motion.q.x * motion.u.x_rate}
+
+
+@pytest.mark.parametrize("scene", [jj.models.ChaplyginSleigh(), Bowl()], ids=["sleigh", "bowl"])
 def test_a_start_whose_rows_determine_its_speeds_has_the_derivatives_of_the_nearest_one(scene):
     """Speeds that rows determine are solved for without a metric; where a scene has none to spare, the nearest state is that one, to second order."""
     first, privileged = scene.coordinate_names.entries[-1], [scene.speed_names.entries[i] for i in structure_of(scene).independent]
