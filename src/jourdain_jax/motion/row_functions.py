@@ -7,7 +7,8 @@ Derivatives of higher order are those of the program as XLA runs it.
 """
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,29 +38,40 @@ LARGEST_PROGRAM = 20_000  # operations of values and derivatives
 def row_functions(program: RowProgram) -> RowFunctions:
     """g and G, phi and A, and M, by the program."""
     closures, rows, coordinates, speeds = map(len, (program.g, program.phi, program.q, program.u))
-    parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
-    at = [*parameters, program.t, *program.q]
-    of_closures = _function(program.graph, _places(program.g, program.G, coordinates), closures * (1 + coordinates), at)
-    of_rows = _function(program.graph, _places(program.phi, program.A, speeds), rows * (1 + speeds), [*at, *program.u, *program.inputs])
-    M = {key: node for (i, k), node in (program.M or {}).items() for key in ((i, k), (k, i))}
-    of_masses = None if program.M is None else _function(program.graph, _places((), M, speeds), speeds**2, at)
-
-    def given(scene: Scene, t, *vectors) -> Float[Array, "given"]:
-        parts = *entries(scene, program.parameters), jnp.asarray(t)[None], *vectors
-        return jnp.concatenate([jnp.asarray(x, jnp.float64) for x in parts])
 
     def closures_at(scene: Scene, t, q):
-        found = of_closures(given(scene, t, q))
+        found = _of_program(program, "closures")(_given(program, scene, t, q))
         return found[:closures], found[closures:].reshape(closures, coordinates)
 
     def rows_at(scene: Scene, t, q, u, inputs):
-        found = of_rows(given(scene, t, q, u, inputs))
+        found = _of_program(program, "rows")(_given(program, scene, t, q, u, inputs))
         return found[:rows], found[rows:].reshape(rows, speeds)
 
     def masses_at(scene: Scene, t, q):
-        return mass_matrix_at(scene, t, q) if of_masses is None else of_masses(given(scene, t, q)).reshape(speeds, speeds)
+        if program.M is None:
+            return mass_matrix_at(scene, t, q)
+        return _of_program(program, "masses")(_given(program, scene, t, q)).reshape(speeds, speeds)
 
     return RowFunctions(closures_at, rows_at, masses_at)
+
+
+def _given(program: RowProgram, scene: Scene, t, *vectors) -> Float[Array, "given"]:
+    parts = *entries(scene, program.parameters), jnp.asarray(t)[None], *vectors
+    return jnp.concatenate([jnp.asarray(x, jnp.float64) for x in parts])
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def _of_program(program: RowProgram, what: Literal["closures", "rows", "masses"]) -> Callable[[Array], Array]:
+    """A vector and a matrix after it, or a matrix, of what is `_given`."""
+    at = [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q]
+    if what == "closures":
+        columns = len(program.q)
+        return _function(program.graph, _places(program.g, program.G, columns), len(program.g) * (1 + columns), at)
+    columns = len(program.u)
+    if what == "rows":
+        return _function(program.graph, _places(program.phi, program.A, columns), len(program.phi) * (1 + columns), [*at, *program.u, *program.inputs])
+    M = {key: node for (i, k), node in (program.M or {}).items() for key in ((i, k), (k, i))}
+    return _function(program.graph, _places((), M, columns), columns**2, at)
 
 
 def _places(vector: Sequence[int], matrix: dict[tuple[int, int], int], columns: int) -> dict[int, int]:
@@ -71,14 +83,14 @@ def _function(graph: Graph, places: dict[int, int], size: int, variables: Sequen
     """Values of nodes, at their places among so many numbers, as a function of the values of the variables."""
     graph, nodes, variables = on_its_own(graph, list(places.values()), variables)
     places = dict(zip(places, nodes, strict=True))
-    slopes = _slopes(graph, places, size, variables)
+    slopes = cache(lambda: _slopes(graph, places, size, variables))  # derived when the first derivative is asked for
     by_xla, by_machine_code = _by_xla(graph, places, size, variables), _by_machine_code(graph, places, size, variables)
 
     def push(arguments, along):
         (x,), (dx,) = arguments, along
-        return values(x), slopes(x) @ dx
+        return values(x), slopes()(x) @ dx
 
-    values = differentiated_as(by_xla, by_machine_code, "forward", None if slopes is None else Rules(lambda *_: True, push, push))
+    values = differentiated_as(by_xla, by_machine_code, "forward", Rules(lambda *_: slopes() is not None, push, push))
     return values
 
 
