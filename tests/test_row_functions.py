@@ -90,6 +90,15 @@ def test_a_derivative_of_a_named_start_has_no_second_projection_and_no_scene_in_
     assert operations(y_rate=0.0) > 1.3 * operations()
 
 
+@needs_llvmlite
+def test_rows_of_a_large_scene_are_differentiated_by_jax():
+    """A Jacobian of machine code lies on the stack: that of 32 trailers went beyond its end."""
+    small, large = (row_functions(row_program(jj.models.TrailerChain(trailers=n))) for n in (2, 32))
+    assert large.rows is BY_AUTODIFF.rows
+    assert large.masses is BY_AUTODIFF.masses
+    assert small.rows is not BY_AUTODIFF.rows
+
+
 def of_skate(y_rate):
     return jj.simulate(jj.models.Skate(), {"heading": 0.0, "x_rate": 1.0, "y_rate": y_rate, "heading_rate": 0.1}, t1=0.5)
 

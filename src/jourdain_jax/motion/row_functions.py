@@ -16,10 +16,10 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
-from jourdain_jax.equations.projection import RowFunctions
-from jourdain_jax.equations.virtual_power import mass_matrix_at
+from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions
 from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.motion.native.called import called
+from jourdain_jax.motion.native.onto_rows import MOST_ENTRIES
 from jourdain_jax.motion.native.seen import entries
 from jourdain_jax.native import host
 from jourdain_jax.native.ir import Writer
@@ -36,8 +36,9 @@ LARGEST_PROGRAM = 20_000  # operations of values and derivatives
 
 @lru_cache(maxsize=MOST_KEPT)
 def row_functions(program: RowProgram) -> RowFunctions:
-    """g and G, phi and A, and M, by the program."""
+    """g and G, phi and A, and M, by the program; of large scenes by autodiff, since machine code has a Jacobian on the stack."""
     closures, rows, coordinates, speeds = map(len, (program.g, program.phi, program.q, program.u))
+    known = sum(n >= 0 for leaf in program.parameters for n in leaf) + 1 + coordinates
 
     def closures_at(scene: Scene, t, q):
         found = _of_program(program, "closures")(_given(program, scene, t, q))
@@ -48,11 +49,13 @@ def row_functions(program: RowProgram) -> RowFunctions:
         return found[:rows], found[rows:].reshape(rows, speeds)
 
     def masses_at(scene: Scene, t, q):
-        if program.M is None:
-            return mass_matrix_at(scene, t, q)
         return _of_program(program, "masses")(_given(program, scene, t, q)).reshape(speeds, speeds)
 
-    return RowFunctions(closures_at, rows_at, masses_at)
+    return RowFunctions(
+        closures_at if closures * (1 + coordinates) * known <= MOST_ENTRIES else BY_AUTODIFF.closures,
+        rows_at if rows * (1 + speeds) * (known + speeds + len(program.inputs)) <= MOST_ENTRIES else BY_AUTODIFF.rows,
+        masses_at if program.M is not None and speeds**2 * known <= MOST_ENTRIES else BY_AUTODIFF.masses,
+    )
 
 
 def _given(program: RowProgram, scene: Scene, t, *vectors) -> Float[Array, "given"]:
