@@ -39,6 +39,7 @@ def joint_normal(mean: Mapping[str, float], covariance) -> dict[str, Correlated]
     are free, the covariance is that of these. `jj.Estimate(range=..., prior=joint["mass"])` adds a range.
 
     **Raises** ValueError for numbers that are not finite, another shape, a matrix that is not symmetric or no covariance, and a variance that is zero.
+    Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), chapter 14 (prior information as further data).
     """
     if not isinstance(mean, Mapping) or not mean:
         raise ValueError(f'`mean` of `joint_normal` is {described(mean)}, expected a dictionary of name -> mean, such as {{"mass": 20.9, "inertia": 1.64}}')

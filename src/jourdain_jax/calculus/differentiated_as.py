@@ -20,7 +20,7 @@ class Rules(NamedTuple):
 
     serve: Callable[..., bool]  # (*perturbed): whether they serve, given for each array of the arguments whether it varies
     push: Callable  # (arguments, tangents): the result and its tangents
-    pull: Callable  # (perturbed, arguments, result, cotangents): cotangents of those arguments that vary
+    pull: Callable | None = None  # (perturbed, arguments, result, cotangents): cotangents of those arguments that vary; of the reverse kind
     together: bool = False  # whether `push` gives the result as well where tangents are asked for, to the first order, by `jvp` and `jacfwd` alone
 
 

@@ -65,6 +65,7 @@ def project_positions(
     """Coordinates on the geometric rows, near q; only coordinates that are `free` move. At most so many `iterations`.
 
     `typical`: lengths of the rows by which one counts as vanishing, from `closure_lengths` (default: none does, unless it is zero).
+    `by`: how rows are evaluated.
     """
     if jax.eval_shape(lambda s, q: closure_residual(s, 0.0, q), scene, q).shape[0] == 0:
         return q
@@ -110,6 +111,7 @@ def project_speeds(
     Rows count as dependent below `cutoff` (default: `rank_cutoff`). `typical`: lengths of the rows in scaled speeds by which one counts as vanishing,
     from `usual_rows` (default: none does, unless it is zero). `affine`: rows are, in the speeds, so that one step is exact; `iterations` do not count then.
     `determined`: rows are affine and determine all speeds that are `free`, so that no metric is needed; `typical` is then in plain speeds.
+    `by`: how rows and the mass matrix are evaluated.
     """
     if jax.eval_shape(lambda s, q, u: velocity_residual(s, 0.0, q, u), scene, q, u).shape[0] == 0:
         return u

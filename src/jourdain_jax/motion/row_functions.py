@@ -18,13 +18,10 @@ from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions
 from jourdain_jax.lowering.jacobian import on_its_own
-from jourdain_jax.motion.native.called import called
+from jourdain_jax.motion.native.called import nodes_called
 from jourdain_jax.motion.native.onto_rows import MOST_ENTRIES
 from jourdain_jax.motion.native.seen import entries
-from jourdain_jax.native import host
-from jourdain_jax.native.ir import Writer
-from jourdain_jax.native.scalar_program import as_real, unsupported, written
-from jourdain_jax.native.threads import write_rows
+from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph, Unsupported
@@ -87,13 +84,13 @@ def _function(graph: Graph, places: dict[int, int], size: int, variables: Sequen
     graph, nodes, variables = on_its_own(graph, list(places.values()), variables)
     places = dict(zip(places, nodes, strict=True))
     slopes = cache(lambda: _slopes(graph, places, size, variables))  # derived when the first derivative is asked for
-    by_xla, by_machine_code = _by_xla(graph, places, size, variables), _by_machine_code(graph, places, size, variables)
+    by_xla, by_machine_code = _by_xla(graph, places, size, variables), nodes_called(graph, places, size, variables)
 
     def push(arguments, along):
         (x,), (dx,) = arguments, along
         return values(x), slopes()(x) @ dx
 
-    values = differentiated_as(by_xla, by_machine_code, "forward", Rules(lambda *_: slopes() is not None, push, push))
+    values = differentiated_as(by_xla, by_machine_code, "forward", Rules(lambda *_: slopes() is not None, push))
     return values
 
 
@@ -109,7 +106,7 @@ def _slopes(graph: Graph, places: dict[int, int], size: int, variables: Sequence
     if unsupported(graph, found) or graph.operations([*nodes, *found]) > LARGEST_PROGRAM:
         return None
     of_all = graph, entries, size * count, variables
-    values = differentiated_as(_by_xla(*of_all), _by_machine_code(*of_all), "forward")
+    values = differentiated_as(_by_xla(*of_all), nodes_called(*of_all), "forward")
     return lambda x: values(x).reshape(size, count)
 
 
@@ -122,20 +119,3 @@ def _by_xla(graph: Graph, places: dict[int, int], size: int, variables: Sequence
         return zeros.at[where].set(jnp.stack([jnp.asarray(value, x.dtype) for value in found]), unique_indices=True) if found else zeros
 
     return of
-
-
-def _by_machine_code(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
-    def text(lanes: int, threads: int) -> str:
-        w = Writer(lanes, host.fuses())
-        with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
-            known = {n: w.load(w.real, state, k) for k, n in enumerate(variables)}
-            with w.counted(0, size) as k:
-                w.store(w.number(0.0), found, k)
-            for k, value in zip(places, written(w, graph, places.values(), known), strict=True):
-                w.store(as_real(w, value), found, k)
-            w.give()
-        write_rows(w, len(variables), size, threads)
-        return w.text
-
-    kernel = called(text, lambda *_: ((size,),), seldom=True)
-    return lambda x: kernel(x)[0]

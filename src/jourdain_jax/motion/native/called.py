@@ -4,13 +4,18 @@ Many lanes run side by side in the widest registers; one by itself runs in narro
 not depend on the width.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from jourdain_jax.native import ffi, host
+from jourdain_jax.native.ir import Writer
+from jourdain_jax.native.scalar_program import as_real, written
+from jourdain_jax.native.threads import write_rows
+from jourdain_jax.program.graph import Graph
 
 ALONE = 2  # places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
 
@@ -41,6 +46,26 @@ def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 
         return found, (True,) * len(found)
 
     return run
+
+
+def nodes_called(graph: Graph, places: Mapping[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
+    """Values of nodes of a graph, at their places among so many numbers that are zero otherwise, as a function of the values of the variables."""
+
+    def text(lanes: int, threads: int) -> str:
+        w = Writer(lanes, host.fuses())
+        with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
+            known = {n: w.load(w.real, state, k) for k, n in enumerate(variables)}
+            if len(places) < size:
+                with w.counted(0, size) as k:
+                    w.store(w.number(0.0), found, k)
+            for k, value in zip(places, written(w, graph, places.values(), known), strict=True):
+                w.store(as_real(w, value), found, k)
+            w.give()
+        write_rows(w, len(variables), size, threads)
+        return w.text
+
+    kernel = called(text, lambda *_: ((size,),), seldom=True)
+    return lambda x: kernel(x)[0]
 
 
 def unless_batched(times: int, function: Callable, by_xla: Callable) -> Callable:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.differentiated_as import differentiated_as
 from jourdain_jax.lowering.lowered import Lowered
-from jourdain_jax.motion.native.called import called, unless_batched
+from jourdain_jax.motion.native.called import called, nodes_called, unless_batched
 from jourdain_jax.native import host
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import FUNCTIONS
@@ -90,23 +90,13 @@ def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
 def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
     """Whether parameters are right, and the masses and inertias that they make; as `parameter_faults` and `body_faults`."""
     parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q]
-    return _kernel_of_right(program)(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, jnp.float64) for x in parts])))[0][0] > 0
+    return _kernel_of_right(program)(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, jnp.float64) for x in parts])))[0] > 0
 
 
 @lru_cache(maxsize=MOST_KERNELS)
 def _kernel_of_right(program: RowProgram):
     given = [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q]
-
-    def text(lanes: int, threads: int) -> str:
-        w = Writer(lanes, host.fuses())
-        with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
-            known = {n: w.load(w.real, state, k) for k, n in enumerate(given)}
-            w.store(as_real(w, written(w, program.graph, [program.right], known)[0]), found)
-            w.give()
-        write_rows(w, len(given), 1, threads)
-        return w.text
-
-    return called(text, lambda *_: ((1,),), seldom=True)
+    return nodes_called(program.graph, {0: program.right}, 1, given)
 
 
 def _seen(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "seen"]:
