@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Literal
 
 from jourdain_jax.build.row_program import RowProgram
-from jourdain_jax.build.sparse_slopes import Pattern
+from jourdain_jax.build.sparse_slopes import REGULAR, Pattern
 from jourdain_jax.calculus.fixed_point import QUIET, ROUND_OFF
 from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS
 from jourdain_jax.motion.native.rows_in_band import PLACES, sizes, write_eliminated, write_factors, write_solution
@@ -26,6 +26,7 @@ from jourdain_jax.native.threads import write_rows
 LARGEST_PROGRAM = 60_000  # operations
 MOST_ENTRIES = 20_000  # of a matrix, whose vectors lie on the stack
 MOST_IN_BAND = 10_000_000  # of a matrix that is there only where rows in a band are nearly dependent
+CLEARLY = 1e-2  # the square of a cut-off over that of a singular value which surely counts
 _EPS = sys.float_info.epsilon
 
 Kind = Literal["positions", "speeds", "determined speeds"]
@@ -105,7 +106,7 @@ def written(of: Rows, lanes: int, fused: bool, threads: int, cutoff: float) -> s
         _write_factored(w, of)
         _write_moved(w, of)
     else:
-        _write_in_band(w, of, of.in_band)
+        _write_in_band(w, of, of.in_band, min(REGULAR, CLEARLY / cutoff**2))
     _write_row(w, of)
     write_rows(w, len(of.given) + columns + rows, columns + rows, threads)
     return w.text
@@ -196,22 +197,22 @@ def _write_moved(w: Writer, of: Rows) -> None:
         w.give()
 
 
-def _write_in_band(w: Writer, of: Rows, pattern: Pattern) -> None:
-    """`factored` and `moved` as above, of rows whose products lie in a narrow band."""
+def _write_in_band(w: Writer, of: Rows, pattern: Pattern, regular: float) -> None:
+    """`factored` and `moved` as above, of rows whose products lie in a narrow band, where the inverse of these is below `regular`."""
     (rows, columns), first_free, first = pattern.shape, len(of.given), of.given.index(of.moving[0])
     write_eliminated(w, pattern)
     with w.function("factored", "void", dict.fromkeys(("state", *PLACES), "ptr"), attributes="noinline") as (state, *places):
         known = {n: w.load(w.real, state, k) for k, n in enumerate(of.given)}
         slopes = [as_real(w, x) for x in program_written(w, of.program.graph, of.slopes.values(), known)]
         free = [w.load(w.real, state, first_free + k) for k in range(columns)]
-        write_factors(w, pattern, slopes, free, [w.load(w.real, state, first_free + columns + i) for i in range(rows)], places)
+        write_factors(w, pattern, slopes, free, [w.load(w.real, state, first_free + columns + i) for i in range(rows)], places, regular)
         w.give()
     with w.function("moved", "void", dict.fromkeys(("state", *PLACES, "x"), "ptr"), attributes="noinline") as (state, *places, x):
         left, d = w.room(w.real, rows), places[PLACES.index("d")]
         w.call("residuals", "void", state, left)
         with w.counted(0, rows) as i:
             w.store(w.load(w.real, left, i) * w.load(w.real, d, i), left, i)
-        write_solution(w, pattern, places, left, x)
+        write_solution(w, pattern, places, left, x, regular)
         with w.counted(0, columns) as k:
             moves = w.load(w.real, state, k + first_free) > 0.0  # what is held does not move by round-off either
             w.store(w.load(w.real, state, k + first) - w.where(moves, w.load(w.real, x, k), 0.0), x, k)

@@ -8,7 +8,7 @@ Source of the estimate of how large the inverse is: as in `build/sparse_slopes.p
 
 from collections.abc import Sequence
 
-from jourdain_jax.build.sparse_slopes import REGULAR, Band, Pattern
+from jourdain_jax.build.sparse_slopes import Band, Pattern
 from jourdain_jax.native.ir import Value, Writer
 
 PLACES = ("S", "L", "d", "size", "B", "weights")  # entries, band, scales of rows, how large the inverse is, and what the dense way needs
@@ -70,8 +70,10 @@ def write_eliminated(w: Writer, pattern: Pattern) -> None:
         w.give()
 
 
-def write_factors(w: Writer, pattern: Pattern, slopes: Sequence[Value], free: Sequence[Value], typical: Sequence[Value], places: Sequence[Value]) -> None:
-    """Inside a function: from the entries of the rows to the factors of their band, and of the dense matrix where a lane needs it."""
+def write_factors(
+    w: Writer, pattern: Pattern, slopes: Sequence[Value], free: Sequence[Value], typical: Sequence[Value], places: Sequence[Value], regular: float
+) -> None:
+    """Inside a function: from the entries of the rows to the factors of their band, and of the dense matrix for lanes whose inverse is not below `regular`."""
     band, (rows, columns) = _band(pattern), pattern.shape
     S, L, d, size, B, weights = places
     held = [w.where(free[k] > 0.0, x, 0.0) for x, k in zip(slopes, pattern.columns, strict=True)]
@@ -95,7 +97,7 @@ def write_factors(w: Writer, pattern: Pattern, slopes: Sequence[Value], free: Se
     for place, x in sums.items():
         w.store(x, L, place)
     w.call("eliminated", "void", L, size)
-    with w.when(w.any(~(w.load(w.real, size) < REGULAR))):
+    with w.when(w.any(~(w.load(w.real, size) < regular))):
         with w.counted(0, rows * (rows + columns)) as k:
             w.store(w.number(0.0), B, k)
         for e, (i, k) in enumerate(zip(pattern.rows.tolist(), pattern.columns.tolist(), strict=True)):
@@ -106,7 +108,7 @@ def write_factors(w: Writer, pattern: Pattern, slopes: Sequence[Value], free: Se
         w.call("inverted", "void", B, weights)
 
 
-def write_solution(w: Writer, pattern: Pattern, places: Sequence[Value], left: Value, x: Value) -> None:
+def write_solution(w: Writer, pattern: Pattern, places: Sequence[Value], left: Value, x: Value, regular: float) -> None:
     """Inside a function: into x the shortest one with `A x = left`, given the factors."""
     band, (rows, columns) = _band(pattern), pattern.shape
     S, L, _, size, B, weights = places
@@ -122,9 +124,9 @@ def write_solution(w: Writer, pattern: Pattern, places: Sequence[Value], left: V
         found[k] = w.fma(w.load(w.real, S, e), shares[i], found[k])
     for k, value in enumerate(found):
         w.store(value, x, k)
-    regular = w.load(w.real, size) < REGULAR
-    with w.when(w.any(~regular)):
+    serves = w.load(w.real, size) < regular
+    with w.when(w.any(~serves)):
         other = w.room(w.real, columns)
         w.call("solved", "void", B, weights, left, other)
         with w.counted(0, columns) as k:
-            w.store(w.where(regular, w.load(w.real, x, k), w.load(w.real, other, k)), x, k)
+            w.store(w.where(serves, w.load(w.real, x, k), w.load(w.real, other, k)), x, k)
