@@ -199,7 +199,8 @@ def _write_in_band(w: Writer, of: Rows, pattern: Pattern, regular: float) -> Non
     _write_values(w, of, "slopes", dict(enumerate(of.slopes.values())))
     with w.function("factored", "void", dict.fromkeys(("state", *PLACES), "ptr"), attributes="noinline") as (state, *places):
         w.call("slopes", "void", state, places[PLACES.index("S")])
-        write_factors(w, pattern, *(w.at(state, first_free + k, w.real) for k in (0, columns)), places, regular)
+        free, typical = (w.at(state, first_free + k, w.real) for k in (0, columns))
+        write_factors(w, pattern, free, typical, places, regular)
         w.give()
     with w.function("moved", "void", dict.fromkeys(("state", *PLACES, "x"), "ptr"), attributes="noinline") as (state, *places, x):
         left, d = w.room(w.real, rows), places[PLACES.index("d")]
