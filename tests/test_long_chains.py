@@ -3,6 +3,8 @@
 Elimination in a narrow band is compared with dense matrices.
 """
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,10 +17,14 @@ from jourdain_jax.build.row_program import row_program
 from jourdain_jax.calculus import sparse_slopes
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.calculus.sparse_slopes import Pattern
+from jourdain_jax.lowering import ignorable
 from jourdain_jax.models import TrailerChain
 from jourdain_jax.motion import put_on_rows
 from jourdain_jax.motion.native.onto_rows import Rows, written
 from jourdain_jax.native import ffi
+from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.identity_test import identity_probes
 
 native = pytest.mark.skipif(bool(ffi.reason_against()), reason="no machine code here")
 
@@ -124,6 +130,21 @@ def test_machine_code_of_a_chain_grows_with_its_length():
         assert not rows.reason_against()
         lines.append(written(rows, 2, True, 1, rank_cutoff("float64")).count("\n"))
     assert lines[1] < 2.05 * lines[0]
+
+
+def test_what_acts_by_less_than_round_off_is_not_left_out():
+    n = 8
+    graph = Graph()
+    headings = [graph.input(f"q_{i}", True) for i in range(n)]
+    rate = graph.one
+    for q in headings:  # the last one changes the rate by some 1e-5 to the power of the number of those before
+        rate = graph.add(graph.one, graph.mul(graph.const(1e-5), graph.mul(graph.call("cos", q), rate)))
+    states = {f"q_{i}": np.random.default_rng(i).normal(size=12) for i in range(n)}
+    builder = SimpleNamespace(graph=graph, identity_probes=identity_probes(Probes(graph, states), ()))
+    assert ignorable._with_slopes(builder, [rate], headings, np.ones(12, bool)) == set(headings)
+    sine, cosine = (graph.call(name, headings[1]) for name in ("sin", "cos"))
+    none = graph.add(graph.mul(sine, sine), graph.mul(cosine, cosine))
+    assert ignorable._with_slopes(builder, [none], headings[1:2], np.ones(12, bool)) == set()
 
 
 def test_a_motion_finds_the_structure_of_its_scene_once(monkeypatch):

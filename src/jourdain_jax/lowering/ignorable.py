@@ -8,11 +8,32 @@ from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.lowering.appell import AppellOnGraph, Equations
 from jourdain_jax.lowering.comparison import enough, values_at
 from jourdain_jax.lowering.elimination import pivots_ok, usual
-from jourdain_jax.program.identity_test import alike, equal
+from jourdain_jax.lowering.jacobian import on_its_own
+from jourdain_jax.program.derivative import cotangents
+from jourdain_jax.program.identity_test import SURE, alike, equal
 from jourdain_jax.scene.scene import Scene
 
 FEW = 6  # probes that show most coordinates to count
 CLEARLY = 100.0  # times as large as the smallest pivot that serves: one that serves whatever is usual
+
+
+def _with_slopes(builder: AppellOnGraph, ydot: list[int], coordinates: list[int], regular: np.ndarray) -> set[int]:
+    """Coordinates (nodes) in which `sum w ydot` surely has a slope at some generic probe, however small: values do not show what is less than their round-off,
+    as the heading of the last of many trailers. Said of operations alone that are taken for what they are.
+    """
+    graph, generic = builder.graph, builder.identity_probes
+    inputs = [n for n in graph.reachable(ydot) if graph.op[n] == "input"]
+    coordinates = [n for n in coordinates if n in set(inputs) and generic.varies(str(graph.value[n]))]  # others have one value wherever rows are met
+    if not coordinates or graph.calls(ydot):
+        return set()
+    own, outputs, variables = on_its_own(graph, ydot, inputs)
+    weights = [own.const(x) for x in np.random.default_rng(5).uniform(0.5, 1.5, len(outputs))]
+    slopes = cotangents(own, outputs, weights, [variables[inputs.index(n)] for n in coordinates])
+    if not generic.takes_for_what_they_are(own, slopes):
+        return set()
+    found = generic.on_graph(own, {str(own.value[n]): str(graph.value[old]) for n, old in zip(variables, inputs, strict=True)})(slopes)
+    surely = np.any((np.abs(np.asarray(found)) > SURE * found.error) & np.isfinite(found) & regular, axis=1)
+    return {n for n, counts in zip(coordinates, surely, strict=True) if counts}
 
 
 def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expected: np.ndarray) -> tuple[int, ...]:
@@ -49,6 +70,8 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
     held = [i for group in groups if used.isdisjoint(q[list(group)].tolist()) for i in group]
     groups = [group for group in groups if group[0] not in held]
     left = [group for group, counts in zip(groups, surely_changed(groups), strict=True) if not counts]
+    count_little = _with_slopes(builder, equations.ydot, [q[i] for group in left if len(group) == 1 for i in group], regular)
+    left = [group for group in left if q[group[0]] not in count_little]
     together = [i for group in left for i in group]
     if len(left) > FEW and unchanged(together) and regular_at_reference(together):  # what all of them together change nothing of, none does
         return tuple(sorted([*held, *together]))

@@ -61,6 +61,21 @@ class IdentityProbes:
         """Probes at which some inputs, and the bounds of their round-off, are changed and all others are kept."""
         return type(self)(self.graph, self.inputs | dict(changes), self._errors | dict(errors))
 
+    def on_graph(self, graph: Graph, names: Mapping[str, str]) -> Self:
+        """The same probes of another graph; `names`: of its inputs, and of those that they stand for."""
+        errors = {name: self._errors.get(old, 0.0) for name, old in names.items()}
+        return type(self)(graph, {name: self.inputs[old] for name, old in names.items()}, errors, self._radix)
+
+    def varies(self, name: str) -> bool:
+        """Whether an input surely has other values at some probes than at others."""
+        x, error = (np.broadcast_to(x, self.count) for x in (self.inputs[name], self._errors.get(name, 0.0)))
+        return bool(np.any(np.abs(x - np.roll(x, 1)) > SURE * (error + np.roll(error, 1))))
+
+    @staticmethod
+    def takes_for_what_they_are(graph: Graph, nodes: Sequence[int]) -> bool:
+        """Whether no operation that the nodes need is replaced by another function."""
+        return all(graph.op[n] in _KNOWN for n in graph.reachable(nodes))
+
     def exchanged(self, names: Collection[str]) -> Self:
         """Probes at each of which the named inputs have the value that they had at another probe; all others are kept."""
 
