@@ -114,7 +114,7 @@ def _reason_against(rows: Rows) -> str:
 @lru_cache(maxsize=MOST_KERNELS)
 def _kernel(rows: Rows):
     count = len(rows.moving) + len(rows.residuals)
-    return called(lambda lanes, threads: written(rows, lanes, host.fuses(), threads), lambda *_: ((count,),), seldom=True)
+    return called(lambda lanes, threads: written(rows, lanes, host.fuses(), threads), lambda *_: ((count,),), effort=1)
 
 
 def _put(rows: Rows, scene: Scene, state: list, free, lengths) -> tuple[Array, Array]:

@@ -84,7 +84,7 @@ def _function(graph: Graph, places: dict[int, int], size: int, variables: Sequen
     graph, nodes, variables = on_its_own(graph, list(places.values()), variables)
     places = dict(zip(places, nodes, strict=True))
     slopes = cache(lambda: _slopes(graph, places, size, variables))  # derived when the first derivative is asked for
-    by_xla, by_machine_code = _by_xla(graph, places, size, variables), nodes_called(graph, places, size, variables)
+    by_xla, by_machine_code = _by_xla(graph, places, size, variables), nodes_called(graph, places, size, variables, effort=0)
 
     def push(arguments, along):
         (x,), (dx,) = arguments, along
@@ -106,7 +106,7 @@ def _slopes(graph: Graph, places: dict[int, int], size: int, variables: Sequence
     if unsupported(graph, found) or graph.operations([*nodes, *found]) > LARGEST_PROGRAM:
         return None
     of_all = graph, entries, size * count, variables
-    values = differentiated_as(_by_xla(*of_all), nodes_called(*of_all), "forward")
+    values = differentiated_as(_by_xla(*of_all), nodes_called(*of_all, effort=0), "forward")
     return lambda x: values(x).reshape(size, count)
 
 

@@ -20,15 +20,15 @@ from jourdain_jax.program.graph import Graph
 ALONE = 2  # places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
 
 
-def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 0, seldom: bool = False) -> Callable:
+def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 0, effort: int = 2) -> Callable:
     """A module of LLVM IR, written for so many lanes and threads, as a function of arrays without lanes; `shapes`: of its results, given the arguments.
 
-    The first arguments are samples, which lanes may share; `seldom`: as in `host.object_code`.
+    The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`.
     """
 
     @cache
     def name(lanes: int) -> str:
-        return ffi.registered(text(lanes, 1 if lanes == ALONE else host.threads()), seldom)
+        return ffi.registered(text(lanes, 1 if lanes == ALONE else host.threads()), effort)
 
     def call(lanes: int, *arguments):
         results = tuple(jax.ShapeDtypeStruct((*arguments[-1].shape[:-1], *shape), jnp.float64) for shape in shapes(*arguments))
@@ -48,7 +48,7 @@ def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 
     return run
 
 
-def nodes_called(graph: Graph, places: Mapping[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
+def nodes_called(graph: Graph, places: Mapping[int, int], size: int, variables: Sequence[int], effort: int = 1) -> Callable[[Array], Array]:
     """Values of nodes of a graph, at their places among so many numbers that are zero otherwise, as a function of the values of the variables."""
 
     def text(lanes: int, threads: int) -> str:
@@ -64,7 +64,7 @@ def nodes_called(graph: Graph, places: Mapping[int, int], size: int, variables: 
         write_rows(w, len(variables), size, threads)
         return w.text
 
-    kernel = called(text, lambda *_: ((size,),), seldom=True)
+    kernel = called(text, lambda *_: ((size,),), effort=effort)
     return lambda x: kernel(x)[0]
 
 

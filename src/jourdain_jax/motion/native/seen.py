@@ -111,7 +111,7 @@ def _seen_nodes(program: Lowered) -> list[int]:
 @lru_cache(maxsize=MOST_KERNELS)
 def _kernel_of_seen(program: Lowered):
     count = len(program.independent) + len(program.dependent) + 3
-    return called(lambda lanes, threads: _text_of_seen(program, lanes, threads, count), lambda *_: ((count,),), seldom=True)
+    return called(lambda lanes, threads: _text_of_seen(program, lanes, threads, count), lambda *_: ((count,),), effort=1)
 
 
 def _text_of_seen(program: Lowered, lanes: int, threads: int, count: int) -> str:
@@ -145,7 +145,7 @@ def _needed(program: Lowered) -> tuple[tuple[int, ...], ...]:
 
 @lru_cache(maxsize=MOST_KERNELS)
 def _kernel_of_fixed(program: Lowered):
-    return called(lambda lanes, threads: _text_of_fixed(program, lanes, threads), lambda *_: ((len(program.fixed),),), seldom=True)
+    return called(lambda lanes, threads: _text_of_fixed(program, lanes, threads), lambda *_: ((len(program.fixed),),), effort=1)
 
 
 def _text_of_fixed(program: Lowered, lanes: int, threads: int) -> str:
