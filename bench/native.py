@@ -1,6 +1,6 @@
 """Motions by machine code of our own against the same motions by XLA, in one run on one core: batches, alone, cold starts.
 
-    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|heyoka|records|times|watching|calls|compilation ...]
+    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|heyoka|records|times|watching|calls|single|compilation ...]
 
 Writes a list of {"figure", "model", "value", "required", "met"}; `required` is None where a figure is only told. Times of warm motions are processor
 time, the least of some repeats, the two ways in turn; cold ones are wall time of fresh processes.
@@ -37,6 +37,26 @@ import jax, sys; jax.config.update("jax_enable_x64", True)
 import jourdain_jax as jj
 jax.block_until_ready(jj.simulate(jj.models.MODELS[sys.argv[1]](), backend=sys.argv[2].lower()).q)
 print(time.perf_counter() - begin)
+"""
+SINGLE = """
+import functools, json, sys
+import equinox as eqx, jax, jax.numpy as jnp, numpy as np
+import jourdain_jax as jj
+from baselines.timing import least_processor_time
+name, lanes = sys.argv[1], int(sys.argv[2])
+scene, ts = jj.models.MODELS[name](), jnp.linspace(0.1, 2.0, 20)
+start = jj.start(scene)
+near = start.q + 0.01 * jax.random.normal(jax.random.key(0), (lanes, *start.q.shape))
+found = {}
+for who, qs in (("alone", near[0]), ("batch", near)):
+    runs = {}
+    for way in ("native", "xla"):
+        def end(q, way=way):
+            return jj.simulate(scene, eqx.tree_at(lambda s: s.q, start, q), ts=ts, rtol=1e-5, atol=1e-6, work=False, backend=way).q_end
+        runs[way] = functools.partial(lambda run, qs: jax.block_until_ready(run(qs)), jax.jit(end if qs.ndim == 1 else jax.vmap(end)), qs)
+    assert all(run().dtype == jnp.float32 for run in runs.values())
+    found[who] = least_processor_time(runs, 20 if qs.ndim == 1 else 3)
+print(json.dumps(found, separators=(",", ":")))
 """
 Figure = dict
 BARE = {"events": False, "formulation": jj.Formulation(stabilisation=None)}  # as in `lowering.py`
@@ -231,6 +251,19 @@ def calls(quick: bool) -> Iterator[Figure]:
             yield figure(f"called from Python with {way}, ms more", name, 1e3 * (seconds[way] - seconds["jit"]), required)
 
 
+def single(quick: bool) -> Iterator[Figure]:
+    """Motions of 2 s in single precision, in processes of their own: machine code rounds what it is given and returns, XLA all that it computes."""
+    for name in ("tilting-disc", "whipple-bicycle")[: 1 if quick else 2]:
+        lanes = 128 if quick else LANES
+        found = json.loads(_output(SINGLE, name, str(lanes), JAX_ENABLE_X64="0", PYTHONPATH=os.pathsep.join(filter(None, sys.path))))
+        for who, seconds in found.items():
+            what = who if who == "alone" else f"batch of {lanes}"
+            count = 1 if who == "alone" else lanes
+            for way, time_of_all in seconds.items():
+                yield figure(f"single precision, {what}, {way}, us per trajectory", name, 1e6 * time_of_all / count)
+            yield figure(f"single precision, {what}, native / XLA", name, seconds["native"] / seconds["xla"], 1.0)
+
+
 def compilation(quick: bool) -> Iterator[Figure]:
     """The motion alone, lowered and compiled in this process, once the scene is built; fresh processes to the end of a first motion."""
     for name in ("tilting-disc", "whipple-bicycle"):
@@ -258,7 +291,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few lanes, the disc alone")
     parser.add_argument("--json", help="write the figures to this file")
-    parts = {"batches": batches, "heyoka": heyoka, "records": records, "times": times, "watching": watching, "calls": calls, "compilation": compilation}
+    parts = {part.__name__: part for part in (batches, heyoka, records, times, watching, calls, single, compilation)}
     parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="these figures")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)

@@ -16,6 +16,7 @@ from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.structure import closure_lengths, plain_row_lengths, rows_are_affine, usual_rows
 from jourdain_jax.calculus.differentiated_as import differentiated_as
+from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions, project_positions, project_speeds
@@ -112,12 +113,13 @@ def _reason_against(rows: Rows) -> str:
 
 
 @lru_cache(maxsize=MOST_KERNELS)
-def _kernel(rows: Rows):
-    count = len(rows.moving) + len(rows.residuals)
-    return called(lambda lanes, threads: written(rows, lanes, host.fuses(), threads), lambda *_: ((count,),), effort=1)
+def _kernel(rows: Rows, given_in: np.dtype):
+    count, cutoff = len(rows.moving) + len(rows.residuals), rank_cutoff(given_in)
+    return called(lambda lanes, threads: written(rows, lanes, host.fuses(), threads, cutoff), lambda *_: ((count,),), effort=1)
 
 
 def _put(rows: Rows, scene: Scene, state: list, free, lengths) -> tuple[Array, Array]:
     """What moved, and what is left of the rows; `state`: time, coordinates and so on."""
-    found = _kernel(rows)(jnp.concatenate([jnp.asarray(x, jnp.float64) for x in (*entries(scene, rows.program.parameters), *state, free, lengths)]))[0]
+    real, given = real_type(), (*entries(scene, rows.program.parameters), *state, free, lengths)
+    found = _kernel(rows, real)(jnp.concatenate([jnp.asarray(x, real) for x in given]))[0]
     return found[: len(rows.moving)], found[len(rows.moving) :]

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
+from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions
 from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.motion.native.called import nodes_called
@@ -57,7 +58,7 @@ def row_functions(program: RowProgram) -> RowFunctions:
 
 def _given(program: RowProgram, scene: Scene, t, *vectors) -> Float[Array, "given"]:
     parts = *entries(scene, program.parameters), jnp.asarray(t)[None], *vectors
-    return jnp.concatenate([jnp.asarray(x, jnp.float64) for x in parts])
+    return jnp.concatenate([jnp.asarray(x, real_type()) for x in parts])
 
 
 @lru_cache(maxsize=MOST_KEPT)

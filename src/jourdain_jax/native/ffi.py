@@ -2,11 +2,14 @@
 
 Layouts are those of `xla/ffi/api/c_api.h` on 64-bit machines (major version 0). The header that comes with jaxlib says which version it speaks; another
 major version, or a frame with other members, is one that is not known here.
+
+Machine code works on doubles. Arrays in single precision are converted where a call begins and ends, so that their results are rounded once.
 """
 
 import ctypes
 import functools
 import hashlib
+import math
 import re
 import warnings
 from collections.abc import Callable
@@ -24,7 +27,8 @@ _BUFFER = "struct_size extension_start dtype data rank dims"
 _LISTS = "struct_size extension_start size types"
 # places, in words of 8 bytes
 _EXTENSION, _ARGS, _RETS = 1, 9, 14  # of a frame: its extension, its lists of pointers to arguments and results
-_DATA, _RANK, _DIMS = 3, 4, 5  # of a buffer
+_TYPE, _DATA, _RANK, _DIMS = 2, 3, 4, 5  # of a buffer
+_SINGLE = 11  # the type of arrays in single precision
 _KIND, _METADATA = 1, 3  # of an extension
 _MAJOR = 3  # of metadata, with the minor version after it
 
@@ -46,8 +50,6 @@ def reason_against() -> str:
         return host.reason_against()
     if version() is None:
         return "the foreign function interface of this jaxlib is not known"
-    if not jax.config.jax_enable_x64:
-        return "it is made for double precision alone"
     return ""
 
 
@@ -79,10 +81,21 @@ class Given(NamedTuple):
     rank: Value
 
 
+def product(w: Writer, x: Given, but: int) -> Value:
+    """The product of the sizes of all axes but the last ones."""
+    total = w.room("i64")
+    w.store(w.literal(1, "i64"), total)
+    with w.counted(0, x.rank - but) as axis:
+        w.store(w.load("i64", total) * w.load("i64", x.sizes, axis), total)
+    return w.load("i64", total)
+
+
 def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[Given], list[Value]], None]) -> None:
     """A handler that calls `body` with all arguments, and pointers to the data of all results."""
     known = version()
     assert known is not None
+    _write_doubles(w)
+    _write_rounded(w)
     with w.function(HANDLER, "ptr", {"frame": "ptr"}, how="") as (frame,):
         nothing = Value(w, "ptr", "null")
         extension = w.load("ptr", frame, _EXTENSION)
@@ -102,11 +115,61 @@ def write_handler(w: Writer, arguments: int, results: int, body: Callable[[list[
         given, returned = w.load("ptr", frame, _ARGS), w.load("ptr", frame, _RETS)
         inputs = [w.load("ptr", given, k) for k in range(arguments)]
         outputs = [w.load("ptr", returned, k) for k in range(results)]
-        body(
-            [Given(w.load("ptr", x, _DATA), w.load("ptr", x, _DIMS), w.load("i64", x, _RANK)) for x in inputs],
-            [w.load("ptr", x, _DATA) for x in outputs],
-        )
+        failed = w.room("i64")
+        w.store(w.literal(0, "i64"), failed)
+        taken = [w.call("doubles", "ptr", x, w.literal(1, "i1"), failed) for x in inputs]
+        found = [w.call("doubles", "ptr", x, w.literal(0, "i1"), failed) for x in outputs]
+        with w.when(w.load("i64", failed).equals(0)):
+            body([_given(w, x)._replace(data=data) for x, data in zip(inputs, taken, strict=True)], found)
+        for buffers, pointers, are_results in ((inputs, taken, 0), (outputs, found, 1)):
+            for x, data in zip(buffers, pointers, strict=True):
+                w.call("rounded", "void", x, data, w.literal(are_results, "i1"), failed)
         w.give(nothing)
+
+
+def _given(w: Writer, buffer: Value) -> Given:
+    return Given(w.load("ptr", buffer, _DATA), w.load("ptr", buffer, _DIMS), w.load("i64", buffer, _RANK))
+
+
+def _is_single(w: Writer, buffer: Value) -> Value:
+    return w.load("i32", buffer, 2 * _TYPE).equals(_SINGLE)
+
+
+def _write_doubles(w: Writer) -> None:
+    """`doubles(buffer, filled, failed)`: its data; of an array in single precision, memory for as many doubles, `filled` with them or not.
+
+    As `rounded`, it is not optimised: that takes LLVM 20 ms for each kernel, and makes no motion faster by more than noise.
+    """
+    with w.function("doubles", "ptr", {"buffer": "ptr", "filled": "i1", "failed": "ptr"}, attributes="noinline optnone") as (buffer, filled, failed):
+        x, data = _given(w, buffer), w.room("ptr")
+        w.store(x.data, data)
+        with w.when(_is_single(w, buffer)):
+            count = product(w, x, 0)
+            new = w.external("malloc", "ptr", (count + 1) * 8)
+            w.store(new, data)
+            there = w.converted("ptrtoint", new, "i64").differs(0)
+            with w.when(~there):
+                w.store(w.literal(1, "i64"), failed)
+            with w.when(there & filled), w.counted(0, count) as k:
+                w.store(w.converted("fpext", w.load("float", x.data, k), "double"), new, k)
+        w.give(w.load("ptr", data))
+
+
+def _write_rounded(w: Writer) -> None:
+    """`rounded(buffer, doubles, is_result, failed)`: puts a result into an array in single precision, NaN where memory failed, and frees its doubles."""
+    arguments = {"buffer": "ptr", "doubles": "ptr", "is_result": "i1", "failed": "ptr"}
+    with w.function("rounded", "void", arguments, attributes="noinline optnone") as (buffer, doubles, is_result, failed):
+        x = _given(w, buffer)
+        with w.when(_is_single(w, buffer)):
+            there = w.load("i64", failed).equals(0)
+            with w.when(is_result), w.counted(0, product(w, x, 0)) as k:
+                value = w.room("double")
+                w.store(w.literal(math.nan, "double"), value)
+                with w.when(there):
+                    w.store(w.load("double", doubles, k), value)
+                w.store(w.converted("fptrunc", w.load("double", value), "float"), x.data, k)
+            w.external("free", "void", doubles)
+        w.give()
 
 
 @functools.cache

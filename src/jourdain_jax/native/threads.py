@@ -1,19 +1,10 @@
 """Lanes of a batch among threads: this one, and others that it starts and waits for."""
 
-from jourdain_jax.native.ffi import Given, write_handler
+from jourdain_jax.native.ffi import Given, product, write_handler
 from jourdain_jax.native.ir import Value, Writer
 
 MANY = 8  # times as many lanes as side by side make it worth while to start another thread, which takes some 30 us
 NEXT, COUNT, IN, OUT = range(4)  # words of a job of rows: the number of the next row, how many there are, pointers to those given and to those returned
-
-
-def product(w: Writer, x: Given, but: int) -> Value:
-    """The product of the sizes of all axes but the last ones."""
-    total = w.room("i64")
-    w.store(w.literal(1, "i64"), total)
-    with w.counted(0, x.rank - but) as axis:
-        w.store(w.load("i64", total) * w.load("i64", x.sizes, axis), total)
-    return w.load("i64", total)
 
 
 def share(w: Writer, job: Value, count: Value, threads: int) -> None:

@@ -31,7 +31,7 @@ def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 
         return ffi.registered(text(lanes, 1 if lanes == ALONE else host.threads()), effort)
 
     def call(lanes: int, *arguments):
-        results = tuple(jax.ShapeDtypeStruct((*arguments[-1].shape[:-1], *shape), jnp.float64) for shape in shapes(*arguments))
+        results = tuple(jax.ShapeDtypeStruct((*arguments[-1].shape[:-1], *shape), arguments[-1].dtype) for shape in shapes(*arguments))
         return tuple(jax.ffi.ffi_call(name(lanes), results, vmap_method="broadcast_all")(*arguments))
 
     @jax.custom_batching.custom_vmap

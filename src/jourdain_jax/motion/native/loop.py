@@ -13,9 +13,9 @@ from jourdain_jax.motion.native.functions import Form, write_events, write_proje
 from jourdain_jax.motion.native.layout import Lanes
 from jourdain_jax.motion.native.step import IDLE, write_step
 from jourdain_jax.motion.native.taylor import TaylorSteps
-from jourdain_jax.native.ffi import Given, write_handler
+from jourdain_jax.native.ffi import Given, product, write_handler
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.threads import product, share
+from jourdain_jax.native.threads import share
 
 # words of a job, shared by all threads: the number of lanes, of times, and of the next lane, those of samples, then pointers to the arrays
 COUNT, TIMES, NEXT, FIRST_OF_SAMPLES = range(4)

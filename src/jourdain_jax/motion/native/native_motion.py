@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.motion.inputs import Constant, Inputs, Sampled
 from jourdain_jax.motion.integrators.erk_loop import ended
 from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
@@ -166,7 +167,7 @@ def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, times: AlongTime
     if times is not None:
         d_start = d_start - _scaled(_rates(motion, motion.y0, jnp.zeros(())), times.origin)
     layout, (progress, limits, known) = own.layout, _rows(motion)
-    more = [jnp.asarray(dknown[i], jnp.float64)[None] for i in moving]
+    more = [jnp.asarray(dknown[i], real_type())[None] for i in moving]
     plain = replace(layout, moving=None)
     starts = jnp.concatenate([_packed(motion.y0), progress, limits, known])
     states, end, d_states, d_y, d_t = own.along(*_samples(motion), starts, motion.goals, jnp.concatenate([d_start, *more]))
@@ -239,7 +240,7 @@ def _rows(motion: Motion) -> tuple[Array, Array, Array]:
     t, h, code, event = zero, jnp.abs(control.dt0), RUNNING * one, -one
     progress = [t, h, code, zero, zero, event, jnp.inf * one]
     limits = [jnp.sign(goals[-1]), goals[-1], control.rtol, control.atol, control.shortest, control.max_steps * one, origin]
-    known = [jnp.asarray(x, jnp.float64) for x in (*fixed, *inputs(origin))]
+    known = [jnp.asarray(x, real_type()) for x in (*fixed, *inputs(origin))]
     return jnp.stack(progress), jnp.stack(limits), jnp.stack(known) if known else jnp.zeros(0)
 
 

@@ -13,7 +13,6 @@ from typing import Literal
 
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.fixed_point import QUIET, ROUND_OFF
-from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS
 from jourdain_jax.native.dense import write_cholesky, write_inverted, write_rotated, write_solved, write_triangular
 from jourdain_jax.native.ir import Value, Writer
@@ -75,13 +74,16 @@ class Rows:
         return unsupported(self.program.graph, nodes)
 
 
-def written(of: Rows, lanes: int, fused: bool, threads: int) -> str:
-    """The module of LLVM IR: a lane is given `of.given`, what is free, and lengths, and returns what moved, and what is left of the rows."""
+def written(of: Rows, lanes: int, fused: bool, threads: int, cutoff: float) -> str:
+    """The module of LLVM IR: a lane is given `of.given`, what is free, and lengths, and returns what moved, and what is left of the rows.
+
+    `cutoff`: singular values of rows below this share of the largest one count as zero.
+    """
     w, rows, columns = Writer(lanes, fused), len(of.residuals), len(of.moving)
     _write_values(w, of, "residuals", dict(enumerate(of.residuals)))
     _write_values(w, of, "slopes", {i * (rows + columns) + k: node for (i, k), node in of.slopes.items()})
     write_rotated(w, rows, columns)
-    write_inverted(w, rows, columns, rank_cutoff("float64"))
+    write_inverted(w, rows, columns, cutoff)
     write_solved(w, rows, columns)
     if of.metric is not None:
         _write_values(w, of, "masses", {i * columns + k: node for (i, k), node in of.metric.items()})

@@ -7,9 +7,8 @@ times. Knots (`integrators/knots.py`) have the shape (rows, knots). Lanes that s
 """
 
 from jourdain_jax.motion.native.layout import Lanes, Layout
-from jourdain_jax.native.ffi import Given
+from jourdain_jax.native.ffi import Given, product
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.threads import product
 
 WORDS = 6  # of a job: pointers to the tables and the knots, how many there are of each, samples of a table, knots of a row
 _TABLES, _KNOTS, _TABLE_COUNT, _KNOT_COUNT, _SAMPLES, _KNOTS_EACH = range(WORDS)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.differentiated_as import differentiated_as
+from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native.called import called, nodes_called, unless_batched
 from jourdain_jax.native import host
@@ -47,7 +48,7 @@ def entries(scene: Scene, nodes: Sequence[Sequence[int]]) -> list[Array]:
     for leaf, of_leaf in zip(jax.tree.leaves(scene), nodes, strict=True):
         needed = np.flatnonzero(np.ravel(np.asarray(of_leaf, int)) >= 0)
         if needed.size:
-            flat = jnp.reshape(jnp.asarray(leaf, jnp.float64), (-1,))
+            flat = jnp.reshape(jnp.asarray(leaf, real_type()), (-1,))
             found.append(flat if needed.size == flat.shape[0] else flat[needed])
     return found
 
@@ -90,7 +91,7 @@ def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
 def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
     """Whether parameters are right, and the masses and inertias that they make; as `parameter_faults` and `body_faults`."""
     parts = [*entries(scene, program.parameters), jnp.asarray(t)[None], q]
-    return _kernel_of_right(program)(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, jnp.float64) for x in parts])))[0] > 0
+    return _kernel_of_right(program)(jax.lax.stop_gradient(jnp.concatenate([jnp.asarray(x, real_type()) for x in parts])))[0] > 0
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -101,7 +102,7 @@ def _kernel_of_right(program: RowProgram):
 
 def _seen(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "seen"]:
     parts = [jnp.stack(fixed)] if fixed else []
-    return _kernel_of_seen(program)(jnp.concatenate([jnp.asarray(x, jnp.float64) for x in (*parts, jnp.asarray(t)[None], q, y, inputs)]))[0]
+    return _kernel_of_seen(program)(jnp.concatenate([jnp.asarray(x, real_type()) for x in (*parts, jnp.asarray(t)[None], q, y, inputs)]))[0]
 
 
 def _seen_nodes(program: Lowered) -> list[int]:
