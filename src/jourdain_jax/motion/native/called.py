@@ -4,7 +4,7 @@ Many lanes run side by side in the widest registers; one by itself runs in narro
 not depend on the width.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 
 import jax
@@ -48,23 +48,20 @@ def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 
     return run
 
 
-def nodes_called(graph: Graph, places: Mapping[int, int], size: int, variables: Sequence[int], effort: int = 1) -> Callable[[Array], Array]:
-    """Values of nodes of a graph, at their places among so many numbers that are zero otherwise, as a function of the values of the variables."""
+def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1) -> Callable[[Array], Array]:
+    """Values of nodes of a graph as a function of the values of the variables."""
 
     def text(lanes: int, threads: int) -> str:
         w = Writer(lanes, host.fuses())
         with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
             known = {n: w.load(w.real, state, k) for k, n in enumerate(variables)}
-            if len(places) < size:
-                with w.counted(0, size) as k:
-                    w.store(w.number(0.0), found, k)
-            for k, value in zip(places, written(w, graph, places.values(), known), strict=True):
+            for k, value in enumerate(written(w, graph, nodes, known)):
                 w.store(as_real(w, value), found, k)
             w.give()
-        write_rows(w, len(variables), size, threads)
+        write_rows(w, len(variables), len(nodes), threads)
         return w.text
 
-    kernel = called(text, lambda *_: ((size,),), effort=effort)
+    kernel = called(text, lambda *_: ((len(nodes),),), effort=effort)
     return lambda x: kernel(x)[0]
 
 

@@ -97,7 +97,7 @@ def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
 @lru_cache(maxsize=MOST_KERNELS)
 def _kernel_of_right(program: RowProgram):
     given = [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q]
-    return nodes_called(program.graph, {0: program.right}, 1, given)
+    return nodes_called(program.graph, [program.right], given)
 
 
 def _seen(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "seen"]:
