@@ -18,7 +18,7 @@ from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.fit_statistics import statistics
-from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, minimise
+from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum
 from jourdain_jax.analysis.likelihood import as_runs, in_all_or_none
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.measurements import Measurements
@@ -186,11 +186,11 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
     few = replace(control, most_steps=min(_STEPS, control.most_steps), patience=_PATIENCE, near=0.5 * _POOR * samples)
     rest = replace(control, most_steps=control.most_steps - few.most_steps)
     in_parts = samples > 0 and not (one_will_do and len(theta) > 1)
-    found = minimise(problem.linearised, theta, limits, few if in_parts else control, _WHOLE)
+    found = problem.minimum(theta, np.arange(len(theta)), limits, few if in_parts else control, _WHOLE)
     unfinished = ~found.converged & ~found.stuck & in_parts & (rest.most_steps > 0)
 
     def of(members: np.ndarray, begin: np.ndarray, how: Control) -> Minimum:
-        return minimise(lambda x, here: problem.linearised(x, members[here]), begin, limits, how, _WHOLE)
+        return problem.minimum(begin, members, limits, how, _WHOLE)
 
     def far() -> np.ndarray:
         return found.at.cost > 0.5 * _POOR * samples
@@ -210,9 +210,9 @@ def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Con
         for i, (_, costs), k in zip(some.tolist(), (of_one[0] for of_one in grown.trace), place[some].tolist(), strict=True):
             trace[i] += ((f"the first {_SPANS[k]:.3g} of each run", costs),)
         place[some] += 1
+        followed = problem.is_followed(grown.at, np.array(_SPANS), _FOLLOWED)
         for k in range(1, len(_SPANS)):
-            if (place[some] == k).any():
-                place[some] += (place[some] == k) & problem.is_followed(grown.at, _SPANS[k], _FOLLOWED)  # the next one is followed, and left out
+            place[some] += (place[some] == k) & followed[:, k]  # the next one is followed, and left out
     problem.shares = None
     grown = of(poor, begin, control)
     steps, trace = steps + grown.steps, trace + grown.trace
@@ -233,7 +233,7 @@ def _with_memory(problem: Problem, found: Minimum, limits: Limits, control: Cont
         if not going.size:
             break
         changed = problem.restrict(found.theta[going], going)
-        again = minimise(lambda x, here, going=going: problem.linearised(x, going[here]), found.theta[going], limits, some, _WITH_MEMORY)
+        again = problem.minimum(found.theta[going], going, limits, some, _WITH_MEMORY)
         found = found.replaced(going, again)
         going = going[(changed > _SETTLED) | ~again.converged]
     found.converged[going] = False

@@ -6,7 +6,7 @@ Shared unknowns are parameters of the scene, second moments and shears of bodies
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import jax
@@ -30,7 +30,7 @@ class Place:
     begin: int
     kind: Kind = "scene"  # a parameter or an initial value; a number of a sensor or an actuator; of a body's inertia
 
-    @property
+    @cached_property
     def end(self) -> int:
         """One past the last."""
         return self.begin + math.prod(self.shape)
@@ -54,17 +54,17 @@ class Layout:
     bodies: tuple[BodyInertia, ...] = ()
     ties: tuple[Tie, ...] = ()
 
-    @property
+    @cached_property
     def sizes(self) -> tuple[int, int]:
         """How many are shared, and how many each run has."""
         return self.shared[-1].end if self.shared else 0, self.local[-1].end if self.local else 0
 
-    @property
+    @cached_property
     def parameters(self) -> set[str]:
         """Names of the parameters that differ from those of the scene."""
         return {place.name for place in self.shared if place.kind == "scene"} | set(self.following)
 
-    @property
+    @cached_property
     def following(self) -> tuple[str, ...]:
         """Names of the parameters that follow from unknowns: moments of inertia of bodies, and what is tied to others."""
         return tuple(dict.fromkeys([*(entry.name for body in self.bodies for entry in body.entries), *(tie.name for tie in self.ties)]))
@@ -98,7 +98,7 @@ class Layout:
         """The start of a run with these unknowns of its own."""
         return start | {place.name: place.of(local) for place in self.local if place.name in start}
 
-    @property
+    @cached_property
     def numbers(self) -> bool:
         """Whether sensors or actuators have any."""
         return any(place.of_sensor for place in (*self.shared, *self.local))

@@ -15,6 +15,7 @@ import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,10 +26,12 @@ from jourdain_jax.analysis.joined import JoinedArrow
 
 FIRST, LEAST, MOST = 1e-3, 1e-9, 1e9  # damping lambda: at first, at least, and where no step is found
 FASTEST = 10.0  # factor by which damping falls after a good step
-_SURELY = 0.1  # times the tolerance: what the next step is to be below, where it is not looked at
-_SHORT, _FAST = 0.01, 0.1  # standard errors, of a step after which the next may be foretold; by what factor steps shrink then
-_ERROR = 1e-6  # relative, of F: smaller changes may be errors of the simulation
-_TINY = sys.float_info.min
+ENOUGH, WELL, OVER = 1e-4, 0.9, 0.6  # of what was promised: F falls by that much in a step that is taken, in a good one, and in one that overshoots
+LEAST_COLUMN = 1e-8  # of the longest column of J, both times the sizes of their unknowns: what counts as zero
+SURELY = 0.1  # times the tolerance: what the next step is to be below, where it is not looked at
+SHORT, FAST = 0.01, 0.1  # standard errors, of a step after which the next may be foretold; by what factor steps shrink then
+ERROR = 1e-6  # relative, of F: smaller changes may be errors of the simulation
+TINY = sys.float_info.min
 SLOW = 0.25  # of F: what it is to fall to
 RELEASES = 8  # times that unknowns which would pass a bound are put there and the others solved for again
 
@@ -67,6 +70,18 @@ class Linearised:
     @property
     def _arrays(self) -> tuple[np.ndarray, ...]:
         return self.cost, self.rows, self.sigma, *self.arrow.arrays
+
+
+class LinearisedLater(Linearised):
+    """A `Linearised` whose arrow is made when it is first asked for."""
+
+    def __init__(self, cost: np.ndarray, make: Callable[[], Arrow], rows: np.ndarray, sigma: np.ndarray):
+        self.cost, self.rows, self.sigma, self._make = cost, rows, sigma, make
+
+    @cached_property
+    def arrow(self) -> Arrow:  # type: ignore[override]
+        """J and residuals."""
+        return self._make()
 
 
 @dataclass(frozen=True)
@@ -134,16 +149,88 @@ class Minimum:
         return self
 
 
+@dataclass
+class Pace:
+    """Damping of the next step of one member, and how it changes."""
+
+    damping: float = FIRST
+    growth: float = 4.0  # factor by which it grows after a step that failed
+    fall: float = FASTEST  # and falls after a good one
+    lengths: tuple[float, ...] = ()  # |J d| of the last steps, as long as they were taken
+
+    def shrinkage(self, length: float) -> float:
+        """By what factor this step is shorter than the last; one, unless steps have become short so fast that the problem is seen to be linear here."""
+        before, self.lengths = self.lengths, (*self.lengths[-1:], length)
+        if len(before) < 2 or length > SHORT or before[1] > FAST * before[0] or length > FAST * before[1]:
+            return 1.0
+        return length / max(before[1], TINY)
+
+    def tried(self, before: float, after: float, promised: float, by_slopes: float, tolerance: float) -> bool:
+        """Whether a step is taken from F of `before` to `after` (not finite: the motion failed) where the linear problem `promised` it to fall by so much.
+
+        Near the minimum the simulation's own error decides whether F falls: it jumps where a motion takes one step more. There the slopes of F at both ends
+        of the step tell it to more digits: `by_slopes`.
+        """
+        found = before - after
+        if abs(found) < ERROR * abs(before) or (promised < 100 * tolerance**2 and abs(found) < tolerance):
+            found = by_slopes
+        if not (math.isfinite(found) and found > ENOUGH * promised):
+            # after a step that failed, damping falls slowly: in a curved valley every other step would fail
+            self.damping, self.growth, self.fall, self.lengths = max(self.damping * self.growth, LEAST), 2 * self.growth, 2.0, ()
+            return False
+        ratio = found / max(promised, TINY)
+        # it rises where steps overshoot: where residuals stay large, undamped ones go to and fro along what shows least
+        change = 1 / self.fall if ratio > WELL else 3.0 if ratio < OVER else 1.0
+        self.damping = max(self.damping * change, LEAST)
+        self.growth, self.fall = 4.0, min(1.5 * self.fall, FASTEST)
+        return True
+
+
+@dataclass
+class Begun:
+    """The first steps of one member, taken elsewhere (`first_steps`)."""
+
+    theta: Float[np.ndarray, "1 unknowns"]  # after them
+    at: Linearised
+    pace: Pace
+    costs: list[float]  # F at first and after each step
+    converged: bool
+
+
 def minimise(
-    evaluate: Callable[[np.ndarray, np.ndarray], Linearised], theta: Float[np.ndarray, "members unknowns"], limits: Limits, control: Control, what: str = ""
+    evaluate: Callable[[np.ndarray, np.ndarray], Linearised],
+    theta: Float[np.ndarray, "members unknowns"],
+    limits: Limits,
+    control: Control,
+    what: str = "",
+    begun: "Begun | None" = None,
 ) -> Minimum:
-    """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers; `what`: says in the trace what is minimised."""
-    theta, going = theta.copy(), np.arange(len(theta))
-    at, count = evaluate(theta, going), len(theta)
-    converged, stuck, steps = np.zeros(count, bool), np.zeros(count, bool), np.zeros(count, int)
-    paces, costs = [_Pace() for _ in range(count)], [[cost] for cost in at.cost.tolist()]
-    going = going[np.isfinite(at.cost)]
-    for _ in range(control.most_steps):
+    """Minimise from `theta`. `evaluate(theta, members)`: value and slopes of the members with these numbers; `what`: says in the trace what is minimised.
+
+    `begun`: the first steps from there.
+    """
+    count = len(theta)
+    going, converged, stuck = np.arange(count), np.zeros(count, bool), np.zeros(count, bool)
+    if begun is None:
+        theta, at = theta.copy(), evaluate(theta, going)
+        paces, costs = [Pace() for _ in range(count)], [[cost] for cost in at.cost.tolist()]
+    else:
+        theta, at, paces, costs, converged[:] = begun.theta, begun.at, [begun.pace], [begun.costs], begun.converged
+    taken = len(costs[0]) - 1
+    steps, going = np.full(count, taken), going[np.isfinite(at.cost) & ~converged]
+
+    def left(going: np.ndarray) -> np.ndarray:
+        """Of these the ones that go on after a step."""
+        lost = np.array([paces[b].damping > MOST for b in going.tolist()], bool)
+        stuck[going[lost]], going = True, going[~lost]
+        if control.patience is None:
+            return going
+        before = -1 - control.patience
+        slow = [b for b in going.tolist() if len(costs[b]) >= -before and costs[b][-1] > max(control.near, SLOW * costs[b][before])]
+        return going[~np.isin(going, slow)] if slow else going
+
+    going = left(going) if taken else going
+    for _ in range(control.most_steps - taken):
         if not going.size:
             break
         arrow, x = (at.arrow, theta) if going.size == count else (at.arrow.at(going), theta[going])
@@ -166,7 +253,7 @@ def minimise(
         here = going.tolist()
         shrank = [paces[b].shrinkage(length) for b, length in zip(here, np.sqrt(change).tolist(), strict=True)]
         if min(shrank) < 1:
-            last = _is_small(change * np.square(shrank), size, d * np.array(shrank)[:, None], replace(control, tolerance=_SURELY * control.tolerance))
+            last = _is_small(change * np.square(shrank), size, d * np.array(shrank)[:, None], replace(control, tolerance=SURELY * control.tolerance))
             if last.any():
                 of = going[last]
                 at = at.replaced(of, (at if of.size == count else at.at(of)).moved(d[last], promised[last]), np.ones(of.size, bool))
@@ -185,60 +272,17 @@ def minimise(
         at = at.replaced(going, trial, chosen)
         for b in here:
             costs[b].append(float(at.cost[b]))
-        lost = [paces[b].damping > MOST for b in here]
-        if True in lost:
-            stuck[going[lost]], going = True, going[np.logical_not(lost)]
-        if control.patience is not None:
-            before = -1 - control.patience
-            slow = [b for b in going.tolist() if len(costs[b]) >= -before and costs[b][-1] > max(control.near, SLOW * costs[b][before])]
-            going = going[~np.isin(going, slow)] if slow else going
+        going = left(going)
     trace = np.empty(count, object)
     trace[:] = [((what, tuple(of_one)),) for of_one in costs]
     return Minimum(theta, at, converged, stuck, steps, np.zeros(count, bool), trace)
-
-
-@dataclass
-class _Pace:
-    """Damping of the next step of one member, and how it changes."""
-
-    damping: float = FIRST
-    growth: float = 4.0  # factor by which it grows after a step that failed
-    fall: float = FASTEST  # and falls after a good one
-    lengths: tuple[float, ...] = ()  # |J d| of the last steps, as long as they were taken
-
-    def shrinkage(self, length: float) -> float:
-        """By what factor this step is shorter than the last; one, unless steps have become short so fast that the problem is seen to be linear here."""
-        before, self.lengths = self.lengths, (*self.lengths[-1:], length)
-        if len(before) < 2 or length > _SHORT or before[1] > _FAST * before[0] or length > _FAST * before[1]:
-            return 1.0
-        return length / max(before[1], _TINY)
-
-    def tried(self, before: float, after: float, promised: float, by_slopes: float, tolerance: float) -> bool:
-        """Whether a step is taken from F of `before` to `after` (not finite: the motion failed) where the linear problem `promised` it to fall by so much.
-
-        Near the minimum the simulation's own error decides whether F falls: it jumps where a motion takes one step more. There the slopes of F at both ends
-        of the step tell it to more digits: `by_slopes`.
-        """
-        found = before - after
-        if abs(found) < _ERROR * abs(before) or (promised < 100 * tolerance**2 and abs(found) < tolerance):
-            found = by_slopes
-        if not (math.isfinite(found) and found > 1e-4 * promised):
-            # after a step that failed, damping falls slowly: in a curved valley every other step would fail
-            self.damping, self.growth, self.fall, self.lengths = max(self.damping * self.growth, LEAST), 2 * self.growth, 2.0, ()
-            return False
-        ratio = found / max(promised, _TINY)
-        # it rises where steps overshoot: where residuals stay large, undamped ones go to and fro along what shows least
-        change = 1 / self.fall if ratio > 0.9 else 3.0 if ratio < 0.6 else 1.0
-        self.damping = max(self.damping * change, LEAST)
-        self.growth, self.fall = 4.0, min(1.5 * self.fall, FASTEST)
-        return True
 
 
 def column_scaling(arrow: Arrow | JoinedArrow, size: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members unknowns"]:
     """D: lengths of the columns of J, and something positive for those that are zero."""
     norms = arrow.column_norms
     by_size = norms * size
-    least = 1e-8 * by_size.max(axis=1, keepdims=True)
+    least = LEAST_COLUMN * by_size.max(axis=1, keepdims=True)
     if (by_size > least).all():
         return norms
     D = np.maximum(norms, least / size)

@@ -44,6 +44,8 @@ class Shot:
 class PieceLanes:
     """Lanes of all pieces, which keep the states at their ends aside."""
 
+    alone = takes_steps = False
+
     def __init__(self, lanes: Lanes, pieces: int, states: int):
         self._lanes, self._pieces, self._states = lanes, pieces, states
         self.members, self.counted, self.whitened, self.channels = lanes.members, lanes.counted, lanes.whitened, lanes.channels
@@ -64,6 +66,8 @@ class PieceLanes:
 
 class Piecewise:
     """Lanes of whole runs that are worked out in pieces; what `Lanes` offers, and the same with nodes as unknowns."""
+
+    alone = takes_steps = False
 
     def __init__(
         self,

@@ -21,15 +21,16 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.correlated_noise import Chains, whitened
+from jourdain_jax.analysis.first_steps import Told, first_steps, read
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.nodes import begin, ended
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
 from jourdain_jax.build.reference import Reference
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import is_traced, real_type
 from jourdain_jax.motion.forward_mode import simulate_alongside
 from jourdain_jax.motion.inputs import Inputs, Sampled
-from jourdain_jax.motion.quick_compilation import quickly_compiled
+from jourdain_jax.motion.quick_compilation import quickly_compiled, sparingly_compiled
 from jourdain_jax.scene.scene import Scene
 
 TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
@@ -128,16 +129,19 @@ class Lanes:
 
     def __init__(self, scene: Scene, data: Sequence[Measurements], layout: Layout, simulation: dict, members: int | None):
         self.members, self._scene, self._layout = members, scene, layout
-        self._groups = [
-            _Group(scene, indices, [run_of(data[i], repeats=members is not None) for i in indices], layout, simulation, members) for indices in _alike(data)
-        ]
+        self.takes_steps = False  # whether a run that is `alone` is evaluated by the program that takes steps, so that no other is compiled
+        white = not any(run.unknown_sigma or run.correlation_time for run in data)
+        self.alone = white and members is None and len(data) == 1 and real_type() == np.float64  # of single precision, J'J would tell little
+        ready = lambda i: run_of(data[i], repeats=members is not None)  # noqa: E731
+        self._groups = [_Group(scene, indices, list(map(ready, indices)), layout, simulation, members) for indices in _alike(data)]
+        self.samples, self.first_steps = self._groups[0].samples, self._groups[0].first_steps  # of a run that is `alone`
         self.lengths = [run.ts.shape[0] for run in data]
         self._of_run = {run: group for group in self._groups for run in group.indices}
 
     def evaluate(self, shared: Float[np.ndarray, "members shared"], local: Float[np.ndarray, "members runs local"], members: np.ndarray):
         """Yields, some lanes at a time: numbers of members (among those given) and of runs, and [J r] (lanes, samples, unknowns + 1), own unknowns first."""
         for group in self._groups:
-            yield from group.evaluate(shared, local, members)
+            yield from group.evaluate(shared, local, members, self.takes_steps)
 
     def counted(self, names: Sequence[str], members: np.ndarray) -> Float[np.ndarray, "members names"]:
         """Samples of each of these channels that are not missing, in all runs."""
@@ -188,8 +192,8 @@ class _Group:
         leaves, treedef = jax.tree.flatten(((scene, simulation), filled[0]))
         # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
         repeated = {id(x) for part in (filled[0].values, filled[0].weights) for x in part.values()} if members is not None else set()
-        of_first = jax.tree.leaves(filled[0])
-        common = len(leaves) - len(of_first)
+        common = treedef.children()[0].num_leaves
+        of_first = leaves[common:]
         self._common = np.concatenate([_NONE, *(np.ravel(x) for x in leaves[:common] if _is_array(x))])
         alike = [k for k, x in enumerate(of_first) if _is_array(x) and id(x) not in repeated]
         by_member = [k for k, x in enumerate(of_first) if id(x) in repeated]
@@ -199,13 +203,14 @@ class _Group:
         self._own_rows = np.stack([np.concatenate([np.zeros((count, 0)), *(run[k].reshape(count, -1) for k in by_member)], axis=1) for run in of_runs])
         marks = [_Number(x.shape[int(id(x) in repeated) :], x.dtype, k >= common, id(x) in repeated) if _is_array(x) else x for k, x in enumerate(leaves)]
         reference = Reference.where_free(scene, layout.parameters)
-        self._run = _program(reference, treedef, tuple(marks), layout)
         self.weights = {name: np.array([run.weights[name] for run in filled]) for name in filled[0].weights}  # (runs, *members, times, *channel)
         self._t0, self._ts = np.array([run.t0 for run in filled]), np.array([run.ts for run in filled])
         self.channels, end = {}, 0
         for name, weight in sorted(filled[0].weights.items()):
             begin, end = end, end + math.prod(weight.shape[0 if members is None else 1 :])
             self.channels[name] = slice(begin, end)
+        self.samples = end
+        self._run, self._steps = _program(reference, treedef, tuple(marks), layout, end)
         taus = {name: np.stack([run.correlation_time[name] for run in filled]) for name in filled[0].correlation_time}
         self.chains = Chains.of(self.weights, self._ts, taus, self.channels, members is not None) if taus else None
         saved = times if filled[0].grid is None else filled[0].grid.shape[0]
@@ -213,7 +218,12 @@ class _Group:
         self._width = int(min(MOST_LANES, max(1, TOUCHED // states)))
         self._kept: dict[int, list] = {}
 
-    def evaluate(self, shared, local, members):
+    def evaluate(self, shared, local, members, takes_steps):
+        if takes_steps and len(members) == 1:
+            x = np.concatenate([local[0, 0], shared[0]])
+            only = np.zeros(1, int)
+            yield only, only, read(self.first_steps(x, np.zeros(Told.length(x.size, self.samples))), x.size)[-1][None]
+            return
         if len(members) not in self._kept:
             self._kept = {len(members): self._chunks(len(members))}
         first, *chunks = self._kept[len(members)]
@@ -237,6 +247,10 @@ class _Group:
         width = min(self._width, 1 << (count - 1).bit_length())
         lanes = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
         return [(min(width, count - k * width), *np.divmod(some, len(self.indices))) for k, some in enumerate(lanes)]
+
+    def first_steps(self, x: Float[np.ndarray, "unknowns"], told: Float[np.ndarray, "_"]) -> Float[np.ndarray, "_"]:
+        """Of the run, from unknowns with its own ones first; to be `read`."""
+        return np.asarray(self._steps(self._common, np.concatenate([self._rows[0], x, told])))
 
     def _begun(self, shared, local, members, b, j):
         own = members[b] if self._members is not None else 0
@@ -285,12 +299,12 @@ class _Number(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Callable:
-    """[J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns; compiled once.
+def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, samples: int) -> tuple[Callable, Callable]:
+    """[J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns; and `first_steps` of one.
 
-    `reference`: of the scene; `treedef`, `leaves`: of scene, options and run, with a `_Number` in place of each array.
+    Each is compiled once. `reference`: of the scene; `treedef`, `leaves`: of scene, options and run, with a `_Number` in place of each array.
     """
-    own = layout.sizes[1]
+    own, unknowns = layout.sizes[1], sum(layout.sizes)
 
     def lane(common: Float[Array, "shared"], row: Float[Array, "own"]) -> Float[Array, "samples width"]:
         begin, found = 0, dict.fromkeys(range(len(leaves)))
@@ -312,7 +326,13 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout) -> Ca
             J, r = jax.jacfwd(flat, has_aux=True)(row[begin:])
         return jnp.concatenate([J, r[:, None]], axis=1)
 
-    return quickly_compiled(jax.vmap(lane, (None, 0)), jax.jit)
+    lanes, told = jax.vmap(lane, (None, 0)), Told.length(unknowns, samples)
+
+    def steps(common: Float[Array, "shared"], row: Float[Array, "own"]) -> Float[Array, "_"]:
+        fixed, x, of_steps = row[: -told - unknowns], row[-told - unknowns : -told], row[-told:]
+        return first_steps(lambda x: lanes(common, jnp.concatenate([fixed, x])[None])[0], x, of_steps)
+
+    return quickly_compiled(lanes, jax.jit), sparingly_compiled(steps, loops=1)
 
 
 def _alike(data: Sequence[Measurements]) -> list[list[int]]:

@@ -10,11 +10,13 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from jourdain_jax.analysis.arrow import Arrow, arrow, triangle, with_prior
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
-from jourdain_jax.analysis.levenberg_marquardt import Linearised
-from jourdain_jax.analysis.losses import Loss
+from jourdain_jax.analysis.first_steps import ROOM, read
+from jourdain_jax.analysis.levenberg_marquardt import Begun, Control, Limits, Linearised, LinearisedLater, Minimum, minimise
+from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
@@ -33,6 +35,8 @@ class Problem:
         self.begun = np.zeros((0, 0))  # first guesses of the members, where spans grow
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
         self.tau = np.zeros((lanes.members or 1, len(self.with_memory)))  # s, of these: at first as if their noise were white
+        independent = not unknowns.with_prior.size or np.array_equal(unknowns.whitening, np.eye(len(unknowns.whitening)))
+        lanes.takes_steps = lanes.alone and loss is LEAST_SQUARES and independent  # by `first_steps`
         self._counted = lanes.counted(self.estimated, np.arange(lanes.members or 1))  # samples of channels whose sigma is estimated, of each member
 
     def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:
@@ -44,10 +48,41 @@ class Problem:
 
     def linearised(self, theta: np.ndarray, members: np.ndarray) -> Linearised:
         """What is minimised, with its arrow, of some members."""
-        return self._assembled(theta, members, self.lanes.evaluate(*self.unknowns.split(theta), members), self.taus(members))
+        evaluated = self.lanes.evaluate(*self.unknowns.split(theta), members)
+        return self._assembled(theta, members, evaluated, self.taus(members), self._share(members))
 
-    def _assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable, taus: dict[str, np.ndarray]) -> Linearised:
-        """What is minimised, from what was evaluated; `taus`: correlation times by channel, of these members."""
+    def _share(self, members: np.ndarray) -> np.ndarray | None:
+        """Of the span, of each of these members; None: all of it."""
+        return None if self.shares is None else self.shares[members]
+
+    def minimum(self, theta: np.ndarray, members: np.ndarray, limits: Limits, control: Control, what: str) -> Minimum:
+        """The minimum of some members, from theta; of a run that is alone, the first steps are taken in one program."""
+        begun = None
+        if self.lanes.takes_steps and len(theta) == 1 and not limits.fixed.any():
+            begun = self._first_steps(theta, members, limits, control)
+        return minimise(lambda x, here: self.linearised(x, members[here]), theta, limits, control, what, begun)
+
+    def _first_steps(self, theta: np.ndarray, members: np.ndarray, limits: Limits, control: Control) -> Begun:
+        p, m = self.unknowns.layout.sizes
+        order = [*range(p, p + m), *range(p)]  # of columns
+        shares = self._share(members)
+        (mean,), (spread,) = self._known_before(theta, members, shares)
+        known = np.isfinite(mean)
+        each = limits.low, limits.high, self.unknowns.least, np.where(known, mean, 0.0), np.where(known, 1 / spread, 0.0)
+        counts = np.ones(self.lanes.samples) if shares is None else self.lanes.within(np.zeros(1, int), shares)[0]
+        patience = np.inf if control.patience is None else control.patience
+        numbers = min(ROOM, control.most_steps), control.tolerance, control.cutoff, patience, control.near
+        told = np.concatenate([numbers, *(x[order] for x in each), counts])
+        pace, costs, converged, x, rows = read(self.lanes.first_steps(theta[0, order], told), p + m)
+        theta = np.empty_like(theta)
+        theta[0, order] = x
+        only, kept, there = np.zeros(1, int), np.empty((1, 1), object), theta.copy()
+        kept[0, 0] = rows[:, [*range(m, m + p), *range(m), m + p]]
+        arrow = lambda: self._assembled(there, members, [(only, only, rows[None])], {}, shares).arrow  # noqa: E731
+        return Begun(theta, LinearisedLater(np.array(costs[-1:]), arrow, kept, np.zeros((1, 0))), pace, costs, converged)
+
+    def _assembled(self, theta: np.ndarray, members: np.ndarray, evaluated: Iterable, taus: dict[str, np.ndarray], shares=None) -> Linearised:
+        """What is minimised, from what was evaluated; `taus`: correlation times by channel, and shares of the span that count, of these members."""
         (p, m), count, runs, kinds = self.unknowns.layout.sizes, len(theta), self.unknowns.runs, 1 + len(self.estimated)
         triangles = np.zeros((count, runs, kinds, m + p + 1, m + p + 1))
         costs, squares = np.zeros((count, runs)), np.zeros((count, runs, kinds))
@@ -57,8 +92,8 @@ class Problem:
                 if runs == 1:  # all unknowns are shared
                     plain = plain[..., [*range(m, m + p), *range(m), *range(m + p, plain.shape[-1])]]
                 whole = self.lanes.whitened(j, members[b], plain, {name: tau[b] for name, tau in taus.items()})
-                if self.shares is not None:
-                    whole = np.where(self.lanes.within(j, self.shares[members[b]])[..., None], whole, 0.0)
+                if shares is not None:
+                    whole = np.where(self.lanes.within(j, shares[b])[..., None], whole, 0.0)
                 for k, rows in enumerate(self._kinds(int(j[0]), whole)):
                     r = rows[..., -1]
                     triangles[b, j, k] = triangle(closed(self.loss.weighted(rows, r), m + p))
@@ -83,32 +118,34 @@ class Problem:
             scaled = triangles / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
             together = np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")
         whole = arrow(together, m if runs > 1 else 0)
-        if self.shares is not None or self.unknowns.with_prior.size:
-            mean, spread = self._known_before(theta, members)
+        if shares is not None or self.unknowns.with_prior.size:
+            mean, spread = self._known_before(theta, members, shares)
             r, M = np.where(np.isfinite(mean), (theta - mean) / spread, 0.0), self.unknowns.whitening
             cost = cost + 0.5 * (np.sum((r[:, :p] @ M.T) ** 2, axis=1) + np.sum(r[:, p:] ** 2, axis=1))
             whole = with_prior(whole, r, mean, spread, M)
         return Linearised(cost, whole, kept, sigma)
 
-    def is_followed(self, at: Linearised, share: float, most: float) -> np.ndarray:
-        """Of which members the squares of residuals over this share of the span are on average at most so many times those of noise."""
+    def is_followed(self, at: Linearised, shares: Float[np.ndarray, "shares"], most: float) -> Bool[np.ndarray, "members shares"]:
+        """Over which shares of the span the squares of residuals are on average at most so many times those of noise."""
         good = np.isfinite(at.cost)
-        squares, counted = np.zeros(good.sum()), np.zeros(good.sum())
+        squares, counted = np.zeros((2, good.sum(), len(shares)))
         for run in range(len(self.runs) if good.any() else 0):
-            r = np.where(self.lanes.within(np.array([run]), np.array([share])), np.stack([rows[:, -1] for rows in at.rows[good, run]]), 0.0)
+            within = self.lanes.within(np.full(len(shares), run), shares)
+            r = np.where(within, np.stack([rows[:, -1] for rows in at.rows[good, run]])[:, None], 0.0)
             for name, where in self.lanes.channels(run).items():
                 if name not in self.estimated:
-                    squares, counted = squares + np.sum(r[:, where] ** 2, axis=1), counted + np.count_nonzero(r[:, where], axis=1)
-        good[good] = squares <= most * counted
-        return good
+                    squares, counted = squares + np.sum(r[..., where] ** 2, axis=-1), counted + np.count_nonzero(r[..., where], axis=-1)
+        found = np.zeros((good.size, len(shares)), bool)
+        found[good] = squares <= most * counted
+        return found
 
-    def _known_before(self, theta: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _known_before(self, theta: np.ndarray, members: np.ndarray, shares: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Mean and standard deviation of priors, (members, unknowns); NaN where there is none.
 
         Over part of the span the first guess is a weak prior, known to its own size: what so few samples do not tell stays there.
         """
         mean, spread = (np.broadcast_to(x, theta.shape) for x in (self.unknowns.prior_mean, self.unknowns.prior_sigma))
-        if self.shares is None:
+        if shares is None:
             return mean, spread
         begun = self.begun[members]
         none = ~np.isfinite(mean) & ~self.unknowns.fixed

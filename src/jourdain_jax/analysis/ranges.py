@@ -39,7 +39,7 @@ class Range:
 
     def refusal(self, guess: np.ndarray) -> str:
         """Why a first guess cannot be taken; empty where it can."""
-        if ((guess > self.low) & (guess < self.high)).all():
+        if self.low < float(guess) < self.high if guess.ndim == 0 else ((guess > self.low) & (guess < self.high)).all():
             return ""
         if self.kind == "positive":
             return "expected a first guess above zero; or leave it free to change sign with `unbounded()`"

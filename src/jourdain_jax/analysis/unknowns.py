@@ -5,7 +5,7 @@ theta = (shared, own of run 0, own of run 1, ...), every run with a place for ea
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -90,6 +90,11 @@ class _Entry:
     fixed: bool = False
     prior: Any = None  # with mean and sigma
 
+    @property
+    def labels(self) -> list[str]:
+        """Of each number."""
+        return [self.label + "".join(f"[{i}]" for i in index) for index in np.ndindex(self.guess.shape)] if self.guess.ndim else [self.label]
+
 
 def unknowns_of(
     scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]"
@@ -101,7 +106,7 @@ def unknowns_of(
     Raises ValueError for unknown names, for guesses outside their bounds, for a parameter of each run, for an estimate that runs share but state differently,
     and where nothing is free.
     """
-    parameters = {name: field.metadata for name, field in scene.__dataclass_fields__.items() if field.metadata.get("parameter")}
+    parameters = _parameters(type(scene))
     entries: list[_Entry] = []
     shared, local, functions = _Places(), _Places(), {}
     bodies: list[BodyInertia] = []
@@ -152,12 +157,18 @@ def unknowns_of(
         guess=guess,
         fixed=each([entry.fixed for entry in entries]),
         ranges=tuple(entry.range for entry in entries for _ in range(entry.guess.size)),
-        labels=tuple(entry.label + "".join(f"[{i}]" for i in index) for entry in free_ones for index in np.ndindex(entry.guess.shape)),
-        units=tuple(entry.unit for entry in free_ones for _ in np.ndindex(entry.guess.shape)),
+        labels=tuple(label for entry in free_ones for label in entry.labels),
+        units=tuple(entry.unit for entry in free_ones for _ in range(entry.guess.size)),
         prior_mean=each([np.nan if entry.prior is None else float(entry.prior.mean) for entry in entries]),
         prior_sigma=each([np.nan if entry.prior is None else float(entry.prior.sigma) for entry in entries]),
         whitening=whitening([entry.prior for entry in entries for _ in range(entry.guess.size)][: layout.sizes[0]]),
     )
+
+
+@lru_cache(maxsize=256)
+def _parameters(kind: type[Scene]) -> dict[str, Mapping]:
+    """What is told of the parameters of a class, by name."""
+    return {name: field.metadata for name, field in kind.__dataclass_fields__.items() if field.metadata.get("parameter")}
 
 
 class _Places:
@@ -212,24 +223,24 @@ def _of_sensor(label: str, name: str, estimate: Estimate) -> _Entry:
 
 def _entry(label: str, unit: str, given, default: Range, value: np.ndarray) -> _Entry:
     """An unknown from what was given for it: an `Estimate`, a range, a prior or None; after a look at its first guess."""
+    guess, found, prior = value, default, None
     if isinstance(given, Estimate):
-        estimate = given
-    elif given is None or isinstance(given, Range):
-        estimate = Estimate(range=given)
+        guess = value if given.guess is None else np.asarray(given.guess, float)
+        found, prior = default if given.range is None else given.range, given.prior
+    elif isinstance(given, Range):
+        found = given
     elif hasattr(given, "mean") and hasattr(given, "sigma"):
-        estimate = Estimate(prior=given)
-    else:
+        prior = Estimate(prior=given).prior
+    elif given is not None:
         raise ValueError(
             f"`{label}` was given {given!r}; expected `bounds(low, high)`, `positive()`, `unbounded()`, `Normal(...)`, `Estimate(...)` or None; "
             "for a parameter that follows from others, a function of the scene"
         )
-    guess = value if estimate.guess is None else np.asarray(estimate.guess, float)
     if guess.shape != value.shape:
         raise ValueError(f"first guess of `{label}` has shape {guess.shape}, expected {value.shape}; leave it out for the value that is there")
-    found = default if estimate.range is None else estimate.range
     if refusal := found.refusal(guess):
         raise ValueError(f"first guess of `{label}` is {guess}; {refusal}")
-    if isinstance(estimate.prior, Correlated) and (value.shape or label.startswith("run ")):
+    if isinstance(prior, Correlated) and (value.shape or label.startswith("run ")):
         what = f"has {value.size} numbers" if value.shape else "belongs to one run"
         raise ValueError(f"`{label}` was given a prior of `joint_normal`, but it {what}; such a prior is for parameters of one number that all runs share")
-    return _Entry(label, unit, guess, found, prior=estimate.prior)
+    return _Entry(label, unit, guess, found, prior=prior)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jourdain_jax.build.row_lengths import usual_lengths_of
+from jourdain_jax.build.sparse_slopes import REGULAR, Pattern
 
 ITERATIONS = 25  # of Gauss-Newton, at most
 _DAMPED_ITERATIONS = 60
@@ -24,7 +25,8 @@ _AT_REST = 1e-7  # last correction of the coordinates, relative to their size: m
 _INSIDE = 1e-6  # of the width of the domain
 _ATTEMPTS = 4
 
-Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]  # coordinates of some states, and their numbers -> residuals, slopes
+# coordinates of some states, and their numbers -> residuals, and the entries of a pattern of slopes
+Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,12 @@ def without_rows(q: np.ndarray) -> Assembled:
     return Assembled(q, *np.zeros((3, len(q))))
 
 
-def assemble(look: Look, q: np.ndarray, low: np.ndarray, high: np.ndarray, generic: np.ndarray, far: int = 0) -> Assembled:
-    """Configurations near q on the rows: `look(q[k], k)` gives residuals and slopes of the rows at the states numbered k.
+def assemble(look: Look, pattern: Pattern, q: np.ndarray, low: np.ndarray, high: np.ndarray, generic: np.ndarray, far: int = 0) -> Assembled:
+    """Configurations near q on the rows: `look(q[k], k)` gives residuals and slopes of the rows at the states numbered k, these by the entries of a pattern.
 
     Of the `generic` ones those that find no place inside the domain begin anew elsewhere, until half of them have one. The last `far` ones need none.
     """
-    rows = _Rows(look, typical_lengths(_lengths(look(q, np.arange(len(q)))[1])[generic]), low, high)
+    rows = _Rows(look, pattern, typical_lengths(pattern.lengths(look(q, np.arange(len(q)))[1])[generic]), low, high)
     found = _judged(rows, *_newton(rows, q, np.arange(len(q))))
     generator = np.random.default_rng(2)
     for attempt in range(_ATTEMPTS):
@@ -75,6 +77,7 @@ class _Rows:
     """Rows with their typical lengths, where configurations lie anywhere in the domain: on the rows a row may be of no length at all."""
 
     look: Look
+    pattern: Pattern
     typical: np.ndarray  # (rows,)
     low: np.ndarray
     high: np.ndarray
@@ -94,15 +97,11 @@ def _judged(rows: _Rows, q: np.ndarray, shift: np.ndarray) -> Assembled:
     residual, G = rows.look(q, np.arange(len(q)))
     with np.errstate(invalid="ignore"):
         position_error = np.max(np.abs(residual), axis=1, initial=0.0)
-        size = np.maximum(_lengths(G), rows.typical) * (1 + np.max(np.abs(q), axis=1, initial=0.0, keepdims=True))
+        size = np.maximum(rows.pattern.lengths(G), rows.typical) * (1 + np.max(np.abs(q), axis=1, initial=0.0, keepdims=True))
         arrived = np.all(np.abs(residual) <= _ON_ROWS * np.finfo(float).eps * size, axis=1) & (shift <= _AT_REST)
         outside = np.max(np.maximum(np.maximum(rows.low - q, q - rows.high), 0.0) / rows.width, axis=1, initial=0.0)
     nowhere = lambda x, good: np.where(good & np.isfinite(x), x, np.inf)  # noqa: E731
     return Assembled(q, nowhere(position_error, True), nowhere(shift, arrived), nowhere(outside, True))
-
-
-def _lengths(G: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(G, axis=2)
 
 
 def typical_lengths(lengths: np.ndarray) -> np.ndarray:
@@ -116,7 +115,7 @@ def _newton(rows: _Rows, q: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, 
     q, last, moving = np.array(q, float), np.full(len(q), np.inf), which
     for _ in range(ITERATIONS):
         residual, G = rows.look(q[moving], moving)
-        shift = shortest(G, residual, rows.typical)
+        shift = _shortest(rows.pattern, G, residual, rows.typical)
         q[moving] -= shift
         last[moving] = np.max(np.abs(shift), axis=1, initial=0.0) / (1 + np.max(np.abs(q[moving]), axis=1, initial=0.0))
         moving = moving[~(last[moving] <= 4 * np.finfo(float).eps) & np.isfinite(last[moving])]
@@ -127,39 +126,57 @@ def _newton(rows: _Rows, q: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, 
 
 def _damped(rows: _Rows, q: np.ndarray, which: np.ndarray) -> np.ndarray:
     """Levenberg-Marquardt within the bounds at the states `which`, in coordinates and rows without units."""
-    look, low, high, width = rows.look, rows.low, rows.high, rows.width
+    look, pattern, low, high, width = rows.look, rows.pattern, rows.low, rows.high, rows.width
     q, best = np.array(q, float), q[which]
     residual, G = look(best, which)
-    d = 1 / typical_lengths(_lengths(G * width))
-    f, J = d * residual, d[:, None] * G * width
-    damping, moving = np.full(len(which), 1e-2), np.all(np.isfinite(f), axis=1) & np.all(np.isfinite(J), axis=(1, 2))
+    widths = width[pattern.columns]
+    d = 1 / typical_lengths(pattern.lengths(G * widths))
+    scales = d[pattern.rows]
+    f, J = d * residual, scales * G * widths
+    damping, moving = np.full(len(which), 1e-2), np.all(np.isfinite(f), axis=1) & np.all(np.isfinite(J), axis=1)
     for _ in range(_DAMPED_ITERATIONS):
         k = np.flatnonzero(moving)
         if not k.size:
             break
-        step = _damped_step(J[k], f[k], damping[k])
+        step = _damped_step(pattern, J[k], f[k], damping[k])
         held = ((best[k] <= low) & (step < 0)) | ((best[k] >= high) & (step > 0))
         if held.any():
-            step = _damped_step(np.where(held[:, None], 0.0, J[k]), f[k], damping[k])
+            step = _damped_step(pattern, np.where(held[:, pattern.columns], 0.0, J[k]), f[k], damping[k])
         step *= np.minimum(1.0, _FARTHEST / np.maximum(np.max(np.abs(step), axis=1, keepdims=True, initial=0.0), 1e-300))
         trial = np.clip(best[k] + width * step, low, high)
         residual, G = look(trial, which[k])
         f_trial = d * residual
         better = np.sum(f_trial**2, axis=1) < np.sum(f[k] ** 2, axis=1)  # never where it is not a number
-        better &= np.all(np.isfinite(G), axis=(1, 2))
+        better &= np.all(np.isfinite(G), axis=1)
         at = k[better]
-        best[at], f[at], J[at] = trial[better], f_trial[better], d[:, None] * G[better] * width
+        best[at], f[at], J[at] = trial[better], f_trial[better], scales * G[better] * widths
         damping[k] = np.clip(np.where(better, damping[k] / 6, damping[k] * 5), 1e-14, 1e8)
         moving[k] = (np.max(np.abs(f[k]), axis=1) > 1e-9) & (damping[k] < 1e7)
     q[which] = best
     return q
 
 
-def _damped_step(J: np.ndarray, f: np.ndarray, damping: np.ndarray) -> np.ndarray:
+def _damped_step(pattern: Pattern, J: np.ndarray, f: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """`-J' (J J' + damping)^-1 f` at every state."""
+    if pattern.band is not None:
+        return -pattern.transposed_times(J, pattern.band.solved(J, damping, f)[0])
+    J = pattern.dense(J)
     system, diagonal = J @ np.swapaxes(J, 1, 2), np.arange(J.shape[1])
     system[:, diagonal, diagonal] += damping[:, None]
     return -np.einsum("smn,sm->sn", J, np.linalg.solve(system, f[..., None])[..., 0])
+
+
+def _shortest(pattern: Pattern, G: np.ndarray, residual: np.ndarray, typical: np.ndarray) -> np.ndarray:
+    """As `shortest`: by elimination of `G G'` within its band, where that is narrow and rows are surely independent."""
+    if pattern.band is None:
+        return shortest(pattern.dense(G), residual, typical)
+    d = 1 / np.maximum(pattern.lengths(G), typical)
+    scaled = d[:, pattern.rows] * G
+    y, size = pattern.band.solved(scaled, np.zeros(len(G)), d * residual)
+    x = pattern.transposed_times(scaled, y)
+    for k in np.flatnonzero(~(size < REGULAR)):
+        x[k] = shortest(pattern.dense(G[k : k + 1]), residual[k : k + 1], typical)[0]
+    return x
 
 
 def shortest(G: np.ndarray, residual: np.ndarray, typical: np.ndarray) -> np.ndarray:

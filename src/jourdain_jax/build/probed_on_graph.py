@@ -18,6 +18,7 @@ from jourdain_jax.build.assembling import ITERATIONS, Assembled, assemble, short
 from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.probed import Probed, generic_inputs
 from jourdain_jax.build.row_lengths import speed_scales
+from jourdain_jax.build.sparse_slopes import Pattern
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.program.analyticity import CALLS, NONANALYTIC, decided_by, depend_on, passes
 from jourdain_jax.program.derivative import derivatives, jacobian
@@ -238,13 +239,15 @@ class _AtStates:
             q[:, first : first + 4] /= np.where(length == 0, 1.0, length)
         if not self.traced.at.closure.size:
             return without_rows(q)
-        rows, entries, columns = self.nodes.closures, self.nodes.of_closures, self.traced.q.tolist()
+        rows, entries, place = self.nodes.closures, self.nodes.of_closures, {n: k for k, n in enumerate(self.traced.q.tolist())}
+        pattern = Pattern.of([(i, place[n]) for i, row in enumerate(entries) for n in row], (len(rows), len(place)))
+        slopes = [node for row in entries for node in row.values()]
 
         def look(q, which):
             probes = self._probes(q, self.u[which], which)
-            return _values(probes, rows), self._matrices(probes, entries, columns)
+            return _values(probes, rows), _values(probes, slopes)
 
-        return assemble(look, q, *coordinate_bounds(self.scene), self.generic, self.far)
+        return assemble(look, pattern, q, *coordinate_bounds(self.scene), self.generic, self.far)
 
 
 def _flat(nodes) -> list[int]:

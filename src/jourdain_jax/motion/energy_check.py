@@ -11,8 +11,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.build.structure import structure_of
-from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.motion.integrators.solver_choice import takes_even_steps
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.vector_fields.field import Integrated
@@ -27,7 +25,7 @@ def conserves(setup: Setup) -> bool:
     Integrated work is no part of the check: it may be the small rest of large powers, whose errors nothing at the ends of steps bounds.
     """
     by_tolerance = setup.integrator.controller is None and not takes_even_steps(setup.integrator.solver)
-    return by_tolerance and not needs_work(setup.scene, structure_of(setup.scene))
+    return by_tolerance and setup.field.conserves
 
 
 def energies_near(setup: Setup, args, t: Float[Array, "times"], y: Integrated) -> Float[Array, "2 times 2"]:

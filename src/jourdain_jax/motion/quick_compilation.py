@@ -11,7 +11,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
-from jax.extend.core import get_opaque_trace_state
+from jax.extend.core import get_opaque_trace_state, jaxprs_in_params
 
 from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.reals import is_array_type
@@ -80,6 +80,25 @@ def quickly_compiled(f: Callable, compiler: Callable = compiled, options: dict |
         return (quick if jax.default_backend() == "cpu" and nothing_is_traced() else plain)(*arguments)
 
     return run
+
+
+def sparingly_compiled(f: Callable, loops: int) -> Callable:
+    """`f` of arrays of the same shapes in each call, compiled for a CPU with the least effort where it has no more loops than these: then none of them is one
+    of XLA's over the steps of a motion. Not inside another transformation."""
+    chosen: list[Callable] = []
+
+    def run(*arrays):
+        if not chosen:
+            plain = jax.jit(f)
+            few = jax.default_backend() == "cpu" and _loops(plain.trace(*arrays).jaxpr.jaxpr) <= loops
+            chosen.append(jax.jit(f, compiler_options=RUN_SELDOM) if few else quickly_compiled(f, jax.jit))
+        return chosen[0](*arrays)
+
+    return run
+
+
+def _loops(jaxpr) -> int:
+    return sum((eqn.primitive.name in ("while", "scan")) + sum(map(_loops, jaxprs_in_params(eqn.params))) for eqn in jaxpr.eqns)
 
 
 def nothing_is_traced() -> bool:

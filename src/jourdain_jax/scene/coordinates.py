@@ -5,6 +5,7 @@ angular velocity, `attitude_omega_x`, `..._y`, `..._z`, with `d attitude/dt = 1/
 """
 
 import keyword
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -134,12 +135,13 @@ def _split(names, what: str) -> list[str]:
 
 
 def _check_names(names: Sequence[str], kind: str) -> None:
+    counts = Counter(names)
     for name in names:
         if not name.isidentifier():
             raise ValueError(f"{kind} name `{name}` is not an identifier; use letters, digits and underscores")
         if keyword.iskeyword(name):
             raise ValueError(f"{kind} name `{name}` is a word of Python's own, so that `q.{name}` cannot be written; choose another")
-        if names.count(name) > 1:
+        if counts[name] > 1:
             raise ValueError(f"{kind} name `{name}` is used twice; every {kind} needs a name of its own")
         if name == "t" and kind != "input":
             raise ValueError(f'{kind} name `t` is taken by the time, so that `motion["t"]` would be two things; choose another')

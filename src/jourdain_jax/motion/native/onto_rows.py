@@ -9,21 +9,26 @@ the mass matrix. A lane that nothing changes any more stays as it is.
 import math
 import sys
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 from jourdain_jax.build.row_program import RowProgram
+from jourdain_jax.build.sparse_slopes import REGULAR, Pattern
 from jourdain_jax.calculus.fixed_point import QUIET, ROUND_OFF
 from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS
+from jourdain_jax.motion.native.rows_in_band import PLACES, sizes, write_eliminated, write_factors, write_solution
 from jourdain_jax.native.dense import write_cholesky, write_inverted, write_rotated, write_solved, write_triangular
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.scalar_program import as_real, unsupported
 from jourdain_jax.native.scalar_program import written as program_written
 from jourdain_jax.native.threads import write_rows
 
-LARGEST_PROGRAM = 10_000  # operations
-# Of a matrix. Measured, coordinates and speeds of trailers, in ms, here and by XLA: 6 trailers 0.2 and 0.2 alone, 0.06 and 0.18 each in a batch;
-# 12 (2,812 entries): 1.7 and 0.7, 0.48 and 0.76; 16: 4.4 and 1.0, 1.1 and 0.9; 32: 45 and 3.8, 8.6 and 4.7.
+LARGEST_PROGRAM = 60_000  # operations
+# Of a matrix. Measured: speeds of 6 trailers take 0.10 ms here and 0.08 by XLA alone, 0.05 and 0.06 each in a batch; of 12 (2,812 entries) 0.68 and 0.20,
+# 0.32 and 0.18; of 32 14.6 and 1.4, 3.6 and 1.2.
 MOST_ENTRIES = 3_000
+MOST_IN_BAND = 10_000_000  # of a matrix that is there only where rows in a band are nearly dependent
+CLEARLY = 1e-2  # the square of a cut-off over that of a singular value which surely counts
 _EPS = sys.float_info.epsilon
 
 Kind = Literal["positions", "speeds", "determined speeds"]
@@ -64,11 +69,18 @@ class Rows:
         parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
         return [*parameters, program.t, *program.q, *(() if self.kind == "positions" else (*program.u, *program.inputs))]
 
+    @cached_property
+    def in_band(self) -> Pattern | None:
+        """Where the slopes are, of rows whose products lie in a narrow band; None for others, and where speeds are to be nearest in a metric."""
+        pattern = Pattern.of(self.slopes, (len(self.residuals), len(self.moving)))
+        return pattern if self.metric is None and pattern.band is not None else None
+
     def reason_against(self) -> str:
         """Why this is not written as machine code, in words; empty where it can be."""
         if self.kind == "speeds" and self.program.M is None:
             return "the mass matrix is too large"
-        if max((len(self.residuals) + len(self.moving)) * len(self.residuals), len(self.moving) ** 2) > MOST_ENTRIES:
+        rows, columns = len(self.residuals), len(self.moving)
+        if max((rows + columns) * rows, columns**2) > (MOST_ENTRIES if self.in_band is None else MOST_IN_BAND):
             return "the rows are too many"
         nodes = [*self.residuals, *self.slopes.values(), *({} if self.metric is None else self.metric).values()]
         if self.program.graph.operations(nodes) > LARGEST_PROGRAM:
@@ -83,7 +95,6 @@ def written(of: Rows, lanes: int, fused: bool, threads: int, cutoff: float) -> s
     """
     w, rows, columns = Writer(lanes, fused), len(of.residuals), len(of.moving)
     _write_values(w, of, "residuals", dict(enumerate(of.residuals)))
-    _write_values(w, of, "slopes", {i * (rows + columns) + k: node for (i, k), node in of.slopes.items()})
     write_rotated(w, rows, columns)
     write_inverted(w, rows, columns, cutoff)
     write_solved(w, rows, columns)
@@ -92,8 +103,12 @@ def written(of: Rows, lanes: int, fused: bool, threads: int, cutoff: float) -> s
         write_cholesky(w, columns)
         write_triangular(w, columns)
         _write_metric(w, of)
-    _write_factored(w, of)
-    _write_moved(w, of)
+    if of.in_band is None:
+        _write_values(w, of, "slopes", {i * (rows + columns) + k: node for (i, k), node in of.slopes.items()})
+        _write_factored(w, of)
+        _write_moved(w, of)
+    else:
+        _write_in_band(w, of, of.in_band, min(REGULAR, CLEARLY / cutoff**2))
     _write_row(w, of)
     write_rows(w, len(of.given) + columns + rows, columns + rows, threads)
     return w.text
@@ -184,26 +199,55 @@ def _write_moved(w: Writer, of: Rows) -> None:
         w.give()
 
 
+def _write_in_band(w: Writer, of: Rows, pattern: Pattern, regular: float) -> None:
+    """`factored` and `moved` as above, of rows whose products lie in a narrow band, where the inverse of these is below `regular`."""
+    (rows, columns), first_free, first = pattern.shape, len(of.given), of.given.index(of.moving[0])
+    write_eliminated(w, pattern)
+    with w.function("factored", "void", dict.fromkeys(("state", *PLACES), "ptr"), attributes="noinline") as (state, *places):
+        known = {n: w.load(w.real, state, k) for k, n in enumerate(of.given)}
+        slopes = [as_real(w, x) for x in program_written(w, of.program.graph, of.slopes.values(), known)]
+        free = [w.load(w.real, state, first_free + k) for k in range(columns)]
+        write_factors(w, pattern, slopes, free, [w.load(w.real, state, first_free + columns + i) for i in range(rows)], places, regular)
+        w.give()
+    with w.function("moved", "void", dict.fromkeys(("state", *PLACES, "x"), "ptr"), attributes="noinline") as (state, *places, x):
+        left, d = w.room(w.real, rows), places[PLACES.index("d")]
+        w.call("residuals", "void", state, left)
+        with w.counted(0, rows) as i:
+            w.store(w.load(w.real, left, i) * w.load(w.real, d, i), left, i)
+        write_solution(w, pattern, places, left, x, regular)
+        with w.counted(0, columns) as k:
+            moves = w.load(w.real, state, k + first_free) > 0.0  # what is held does not move by round-off either
+            w.store(w.load(w.real, state, k + first) - w.where(moves, w.load(w.real, x, k), 0.0), x, k)
+        w.give()
+
+
 def _write_row(w: Writer, of: Rows) -> None:
     """`row(state, found)`: the lanes of a block, from what they are given to what they return."""
     rows, columns = len(of.residuals), len(of.moving)
     first = of.given.index(of.moving[0])
     with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
-        n = columns if of.metric is not None else 0
-        L, c, B, d, weights, x = (w.room(w.real, max(count, 1)) for count in (n * n, n, rows * (rows + columns), rows, rows, columns))
+        x, entries = w.room(w.real, columns), rows * (rows + columns)
+        if of.in_band is None:
+            n = columns if of.metric is not None else 0
+            factors = [w.room(w.real, max(count, 1)) for count in (n * n, n, entries, rows, rows)]
+        else:  # memory that nothing is written to costs next to nothing
+            dense = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), w.literal(-(entries * w.lanes * 8 // -64) * 64, "i64"))
+            factors = [dense if count is None else w.room(w.real, count) for count in sizes(of.in_band)]
         if of.metric is not None:
-            w.call("metric", "void", state, L, c)
+            w.call("metric", "void", state, *factors[:2])
         if of.affine:
-            w.call("factored", "void", state, L, c, B, d, weights)
+            w.call("factored", "void", state, *factors)
             for _ in range(2):
-                w.call("moved", "void", state, L, c, B, d, weights, x)
+                w.call("moved", "void", state, *factors, x)
                 with w.counted(0, columns) as k:
                     w.store(w.load(w.real, x, k), state, k + first)
         else:
-            _write_iteration(w, of, first, (state, L, c, B, d, weights, x))
+            _write_iteration(w, of, first, (state, *factors, x))
         with w.counted(0, columns) as k:
             w.store(w.load(w.real, state, k + first), found, k)
         w.call("residuals", "void", state, w.at(found, columns, w.real))
+        if of.in_band is not None:
+            w.external("free", "void", dense)
         w.give()
 
 

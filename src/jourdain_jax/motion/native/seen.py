@@ -26,7 +26,7 @@ from jourdain_jax.program.graph import Graph
 from jourdain_jax.scene.scene import Scene
 
 MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
-LARGEST_PROGRAM = 10_000  # operations
+LARGEST_PROGRAM = 60_000  # operations
 _TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is_finite"))
 
 

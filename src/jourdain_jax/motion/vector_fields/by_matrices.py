@@ -121,6 +121,7 @@ def full_without_projection(field: VectorField, scene: Scene, own_equations: str
         independent=None,
         reduction=field.reduction,
         with_work=field.with_work,
+        conserves=field.conserves,
         projects_positions=False,
         projects_speeds=False,
         of_inputs=field.of_inputs,

@@ -101,7 +101,8 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
     minimal = state == "minimal" or (state == "auto" and structure.has_minimal_state)
     independent = structure.independent if minimal else None
     inputs_in_rows = structure.rows_of_inputs and not constant
-    with_work = work and needs_work(scene, structure)
+    conserves = not needs_work(scene, structure)
+    with_work = work and not conserves
     dense = inputs_in_rows or (with_work and (structure.driven or structure.varying_inertia))
     program = _program(scene, minimal, backend, formulation, dense)
     cutoff = _cutoff(structure) if reduction is None and not minimal else None
@@ -110,6 +111,7 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
         "independent": independent,
         "reduction": reduction,
         "with_work": with_work,
+        "conserves": conserves,
         "projects_positions": formulation.projects and _is_closed(scene),
         "projects_speeds": formulation.projects and not minimal and bool(structure.row_names),
         "of_inputs": structure.potentials_of_inputs,

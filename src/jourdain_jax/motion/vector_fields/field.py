@@ -50,6 +50,7 @@ class VectorField(eqx.Module):
     independent: tuple[int, ...] | None = eqx.field(static=True)  # privileged speeds; None: the full state
     reduction: object
     with_work: bool = eqx.field(static=True)
+    conserves: bool = eqx.field(static=True)  # T + V is constant along every motion
     projects_positions: bool = eqx.field(static=True)
     projects_speeds: bool = eqx.field(static=True)
     of_inputs: tuple[int, ...] = eqx.field(static=True)  # numbers of the loads whose potential depends on inputs

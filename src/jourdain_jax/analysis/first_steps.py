@@ -1,0 +1,165 @@
+"""Levenberg-Marquardt of one run in the program that evaluates it: the steps of `levenberg_marquardt`, until one may be the last or would pass a bound.
+
+From one motion of a short run to the next, calls of compiled code and of NumPy take longer than the motion itself (a disc: four times as long). `minimise`
+goes on from where these end, by the same rules. The damped step is
+
+    d = - D^-1 V (S^2 + lambda)^-1 V' D^-1 g,      D^-1 J'J D^-1 = V S^2 V'        where S is not far from singular
+
+The noise is white, its sigmas are known, and squares of residuals count.
+"""
+
+from collections.abc import Callable
+from itertools import accumulate, pairwise
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jourdain_jax.analysis.levenberg_marquardt import (
+    ENOUGH,
+    ERROR,
+    FAST,
+    FASTEST,
+    LEAST,
+    LEAST_COLUMN,
+    MOST,
+    OVER,
+    SHORT,
+    SLOW,
+    SURELY,
+    TINY,
+    WELL,
+    Pace,
+)
+
+ROOM = 64  # for steps
+WEAK = 1e-4  # of the largest singular value: what J'J tells to eight digits
+
+
+class Told(NamedTuple):
+    """What steps go by, in one vector; unknowns in the order of the columns of J."""
+
+    most: Float[Array, ""]  # steps; zero: residuals are evaluated and nothing else
+    tolerance: Float[Array, ""]
+    cutoff: Float[Array, ""]
+    patience: Float[Array, ""]
+    near: Float[Array, ""]
+    low: Float[Array, "unknowns"]
+    high: Float[Array, "unknowns"]
+    least: Float[Array, "unknowns"]  # size of what is near zero
+    mean: Float[Array, "unknowns"]  # of priors
+    weight: Float[Array, "unknowns"]  # 1 / sigma of these; zero: there is none
+    counts: Float[Array, "samples"]  # which samples do
+
+    @staticmethod
+    def of(vector, unknowns: int) -> "Told":
+        """From such a vector."""
+        each = vector[5 : 5 + 5 * unknowns].reshape(5, unknowns)
+        return Told(*(vector[k] for k in range(5)), *(each[k] for k in range(5)), counts=vector[5 + 5 * unknowns :])
+
+    @staticmethod
+    def length(unknowns: int, samples: int) -> int:
+        """Of such a vector."""
+        return 5 + 5 * unknowns + samples
+
+
+class _At(NamedTuple):
+    """Where the steps are, and the next one; in one vector, since XLA copies and compiles each array of a loop by itself."""
+
+    pace: Float[Array, "5"]  # damping, growth, fall; lengths |J d| of the last two steps, NaN where none was taken
+    x: Float[Array, "unknowns"]
+    products: Float[Array, "width width"]  # [J r]'[J r] there, with priors
+    d: Float[Array, "unknowns"]
+    costs: Float[Array, "_"]  # F at first and after each step
+    steps: Float[Array, ""]  # tried; below zero: x itself is to be evaluated
+    promised: Float[Array, ""]
+    slope: Float[Array, ""]  # of F along the step
+    length: Float[Array, ""]  # |J d|
+    converged: Float[Array, ""]
+    foretold: Float[Array, ""]  # whether the step is the last, whose end is known without evaluation
+    goes: Float[Array, ""]  # whether it is tried
+
+    def vector(self) -> Float[Array, "_"]:
+        """All in one."""
+        return jnp.concatenate([jnp.ravel(x) for x in self])
+
+    @staticmethod
+    def of(vector, n: int) -> "_At":
+        """From such a vector, of NumPy or of JAX, of n unknowns."""
+        ends = [*accumulate((0, 5, n, (n + 1) ** 2, n, ROOM + 1))]
+        pace, x, products, d, costs = (vector[begin:end] for begin, end in pairwise(ends))
+        return _At(pace, x, products.reshape(n + 1, n + 1), d, costs, *(vector[ends[-1] + k] for k in range(7)))
+
+    @staticmethod
+    def room(n: int) -> int:
+        """Length of such a vector."""
+        return 13 + ROOM + 2 * n + (n + 1) ** 2
+
+
+def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], told: Float[Array, "_"]) -> Float[Array, "_"]:
+    """Where they end, in one vector (see `read`). `evaluate`: [J r] of unknowns, (samples, unknowns + 1)."""
+    n, places = x.shape[0], jnp.arange(ROOM + 1)
+    of = Told.of(told, n)
+
+    def tried(now: tuple[Array, Array]) -> tuple[Array, Array]:
+        old = _At.of(now[0], n)
+        x = old.x + old.d
+        rows = evaluate(x)
+        counted, prior = jnp.where(of.counts[:, None] > 0, rows, 0.0), jnp.append(of.weight * (x - of.mean), 0.0)
+        of_priors = jnp.diag(jnp.append(of.weight**2, prior @ prior)).at[:-1, -1].set(of.weight * prior[:-1])
+        products = counted.T @ counted + of_priors
+        cost, before = jnp.where(jnp.isfinite(jnp.sum(products)), 0.5 * products[-1, -1], jnp.inf), jnp.sum(jnp.where(places == old.steps, old.costs, 0.0))
+        found, by_slopes = before - cost, -0.5 * (old.slope + products[:-1, -1] @ old.d)
+        closely = (jnp.abs(found) < ERROR * jnp.abs(before)) | ((old.promised < 100 * of.tolerance**2) & (jnp.abs(found) < of.tolerance))
+        found = jnp.where(closely, by_slopes, found)
+        first, ratio = old.steps < 0, found / jnp.maximum(old.promised, TINY)
+        taken = first | (jnp.isfinite(found) & (found > ENOUGH * old.promised))
+        damping, growth, fall, _, before_last = old.pace
+        change = jnp.where(ratio > WELL, 1 / fall, jnp.where(ratio < OVER, 3.0, 1.0))
+        after = jnp.stack([jnp.maximum(damping * change, LEAST), 4.0, jnp.minimum(1.5 * fall, FASTEST), before_last, old.length])
+        failed = jnp.stack([jnp.maximum(damping * growth, LEAST), 2 * growth, 2.0, jnp.nan, jnp.nan])
+        pace, steps = jnp.where(first, old.pace, jnp.where(taken, after, failed)), old.steps + 1
+        costs = jnp.where(places == steps, jnp.where(taken, cost, before), old.costs)
+        at = jnp.where(taken, jnp.concatenate([x, products.ravel()]), jnp.concatenate([old.x, old.products.ravel()]))
+        x, products = at[:n], at[n:].reshape(n + 1, n + 1)
+        earlier = jnp.sum(jnp.where(places == steps - of.patience, costs, 0.0))
+        slow = (steps >= of.patience) & (jnp.where(taken, cost, before) > jnp.maximum(of.near, SLOW * earlier))
+
+        # the next step
+        A, gradient, size = products[:-1, :-1], products[:-1, -1], jnp.maximum(jnp.abs(x), of.least)
+        norms = jnp.sqrt(jnp.diag(A))
+        V, squares = jax.lax.linalg.eigh(A / (norms * norms[:, None]), symmetrize_input=False)
+        dampings = jnp.stack([pace[0], jnp.full_like(pace[0], LEAST)])
+        both = -((((gradient / norms) @ V) / (squares + dampings[:, None])) @ V.T) / norms  # the step, and the undamped one
+        lengths, moves = jnp.sqrt(jnp.sum((both @ A) * both, axis=1)), jnp.max(jnp.abs(both) / size, axis=1)
+        small = (lengths <= of.tolerance) & (moves <= of.tolerance)
+        inside = jnp.all((x + both >= of.low) & (x + both <= of.high) & (x > of.low) & (x < of.high), axis=1)
+        d, length, slope = both[0], lengths[0], gradient @ both[0]
+        shrinks = length / jnp.maximum(pace[4], TINY)
+        fast = (length <= SHORT) & (pace[4] <= FAST * pace[3]) & (length <= FAST * pace[4])
+        sure = fast & (length * shrinks <= SURELY * of.tolerance) & (moves[0] * shrinks <= SURELY * of.tolerance)
+        usual = (norms * size > LEAST_COLUMN * jnp.max(norms * size)) & (squares > jnp.maximum(WEAK, of.cutoff) ** 2 * squares[-1])
+        may = (steps < of.most) & ~slow & inside[0] & (pace[0] <= MOST) & jnp.isfinite(length) & jnp.all(usual)
+        done = small[0] & ((pace[0] <= LEAST) | (small[1] & inside[1]))
+        ends = may & jnp.stack([done | sure, ~done & sure, ~done & ~sure])
+        at = _At(pace, x, products, d, costs, steps, -slope - 0.5 * length**2, slope, length, *ends.astype(x.dtype))
+        return at.vector(), jnp.where(taken, rows, now[1])
+
+    zero, pace = jnp.zeros((), x.dtype), Pace()
+    begin = jnp.array([pace.damping, pace.growth, pace.fall, jnp.nan, jnp.nan]), x, jnp.zeros((n + 1, n + 1)), 0.0 * x, jnp.zeros(ROOM + 1)
+    at = _At(*begin, zero - 1, zero, zero, zero, zero, zero, zero + 1)
+    end, rows = jax.lax.while_loop(lambda now: now[0][-1] > 0, tried, (at.vector(), jnp.zeros((of.counts.shape[0], n + 1))))
+    at = _At.of(end, n)
+    steps, d, last = at.steps + at.foretold, jnp.where(at.foretold > 0, at.d, 0.0), jnp.sum(jnp.where(places == at.steps, at.costs, 0.0)) - at.promised
+    at = at._replace(steps=steps, x=at.x + d, costs=jnp.where((places == steps) & (at.foretold > 0), last, at.costs))
+    return jnp.concatenate([at.vector(), rows.at[:, -1].add(rows[:, :-1] @ d).ravel()])
+
+
+def read(found: Float[np.ndarray, "_"], unknowns: int) -> tuple[Pace, list[float], bool, np.ndarray, np.ndarray]:
+    """Damping and lengths of the last steps; F at first and after each step; whether a minimum was found; the unknowns, and [J r] there."""
+    at, rows = _At.of(found, unknowns), found[_At.room(unknowns) :].reshape(-1, unknowns + 1)
+    damping, growth, fall, *lengths = at.pace.tolist()
+    pace = Pace(damping, growth, fall, tuple(x for x in lengths if x == x))
+    return pace, at.costs[: int(at.steps) + 1].tolist(), bool(at.converged), at.x, rows

@@ -1,0 +1,132 @@
+"""Rows whose products lie in a narrow band, as those of a long chain, put to use as machine code; in a time that grows with the rows.
+
+    x = A' y,   (A A') y = r,   A A' = L D L'          A: scaled rows, zero in what is held
+
+Lanes in which rows are not surely independent take the way of the others (`native/dense.py`), by one-sided rotations; only then is there a dense matrix.
+Source of the estimate of how large the inverse is: as in `build/sparse_slopes.py`.
+"""
+
+from collections.abc import Sequence
+
+from jourdain_jax.build.sparse_slopes import Band, Pattern
+from jourdain_jax.native.ir import Value, Writer
+
+PLACES = ("S", "L", "d", "size", "B", "weights")  # entries, band, scales of rows, how large the inverse is, and what the dense way needs
+
+
+def sizes(pattern: Pattern) -> tuple[int | None, ...]:
+    """How many vectors are kept at each of the places; None for the dense matrix."""
+    return len(pattern.rows), _band(pattern).size, pattern.shape[0], 1, None, pattern.shape[0]
+
+
+def _band(pattern: Pattern) -> Band:
+    assert pattern.band is not None
+    return pattern.band
+
+
+def write_eliminated(w: Writer, pattern: Pattern) -> None:
+    """`eliminated(L, size)`: the factors of a band in its place, and about how large the inverse is; `substituted(L, y)`: the solution in place of y."""
+    band = _band(pattern)
+    n, width = len(band.order), band.width
+    column = lambda L, k: w.at(L, k * (width + 1), w.real)  # noqa: E731
+    with w.function("forward_in_band", "void", {"below": "ptr", "y": "ptr", "k": "i64"}) as (below, y, k):
+        own = w.load(w.real, y, k)
+        with w.counted(1, width + 1) as j:
+            w.store(w.load(w.real, y, k + j) - w.load(w.real, below, j) * own, y, k + j)
+        w.give()
+    with w.function("backward_in_band", "void", {"L": "ptr", "y": "ptr"}, attributes="noinline") as (L, y):
+        with w.counted(0, n) as k:
+            w.store(w.load(w.real, y, k) / w.load(w.real, column(L, k)), y, k)
+        with w.counted(0, n) as before:
+            k = w.literal(n - 1, "i64") - before
+            with w.counted(1, width + 1) as j:
+                w.store(w.load(w.real, y, k) - w.load(w.real, column(L, k), j) * w.load(w.real, y, k + j), y, k)
+        w.give()
+    with w.function("eliminated", "void", {"L": "ptr", "size": "ptr"}, attributes="noinline") as (L, size):
+        x = w.room(w.real, n + width)
+        with w.counted(0, n + width) as k:
+            w.store(w.number(0.0), x, k)
+        with w.counted(0, n) as k:
+            own = column(L, k)
+            pivot = w.load(w.real, own)
+            with w.counted(1, width + 1) as j:
+                share, other = w.load(w.real, own, j) / pivot, column(L, k + j)
+                with w.counted(0, w.literal(width + 1, "i64") - j) as i:
+                    w.store(w.load(w.real, other, i) - share * w.load(w.real, own, i + j), other, i)
+            with w.counted(1, width + 1) as j:
+                w.store(w.load(w.real, own, j) / pivot, own, j)
+            grown = w.load(w.real, x, k)
+            w.store(grown + w.intrinsic("copysign", w.number(1.0), grown), x, k)
+            w.call("forward_in_band", "void", own, x, k)
+        w.call("backward_in_band", "void", L, x)
+        w.store(w.number(0.0), size)
+        with w.counted(0, n) as k:
+            w.store(w.larger(w.load(w.real, size), w.magnitude(w.load(w.real, x, k))), size)
+        w.give()
+    with w.function("substituted", "void", {"L": "ptr", "y": "ptr"}, attributes="noinline") as (L, y):
+        with w.counted(0, n) as k:
+            w.call("forward_in_band", "void", column(L, k), y, k)
+        w.call("backward_in_band", "void", L, y)
+        w.give()
+
+
+def write_factors(
+    w: Writer, pattern: Pattern, slopes: Sequence[Value], free: Sequence[Value], typical: Sequence[Value], places: Sequence[Value], regular: float
+) -> None:
+    """Inside a function: from the entries of the rows to the factors of their band, and of the dense matrix for lanes whose inverse is not below `regular`."""
+    band, (rows, columns) = _band(pattern), pattern.shape
+    S, L, d, size, B, weights = places
+    held = [w.where(free[k] > 0.0, x, 0.0) for x, k in zip(slopes, pattern.columns, strict=True)]
+    square = [w.number(0.0)] * rows
+    for x, i in zip(held, pattern.rows, strict=True):
+        square[i] = w.fma(x, x, square[i])
+    scales = []
+    for i in range(rows):
+        length = w.larger(w.intrinsic("sqrt", square[i]), typical[i])
+        there = length > 0.0
+        scales.append(w.where(there, w.number(1.0) / w.where(there, length, 1.0), 1.0))
+        w.store(scales[i], d, i)
+    scaled = [x * scales[i] for x, i in zip(held, pattern.rows, strict=True)]
+    for e, x in enumerate(scaled):
+        w.store(x, S, e)
+    with w.counted(0, band.size) as k:
+        w.store(w.number(0.0), L, k)
+    sums: dict[int, Value] = {}
+    for place, a, b in zip(band.places.tolist(), *(x.tolist() for x in band.pairs), strict=True):
+        sums[place] = w.fma(scaled[a], scaled[b], sums[place]) if place in sums else scaled[a] * scaled[b]
+    for place, x in sums.items():
+        w.store(x, L, place)
+    w.call("eliminated", "void", L, size)
+    with w.when(w.any(~(w.load(w.real, size) < regular))):
+        with w.counted(0, rows * (rows + columns)) as k:
+            w.store(w.number(0.0), B, k)
+        for e, (i, k) in enumerate(zip(pattern.rows.tolist(), pattern.columns.tolist(), strict=True)):
+            w.store(w.load(w.real, S, e), B, i * (rows + columns) + k)
+        with w.counted(0, rows) as i:
+            w.store(w.number(1.0), B, i * (rows + columns) + i + columns)
+        w.call("rotated", "void", B)
+        w.call("inverted", "void", B, weights)
+
+
+def write_solution(w: Writer, pattern: Pattern, places: Sequence[Value], left: Value, x: Value, regular: float) -> None:
+    """Inside a function: into x the shortest one with `A x = left`, given the factors."""
+    band, (rows, columns) = _band(pattern), pattern.shape
+    S, L, _, size, B, weights = places
+    y = w.room(w.real, rows + band.width)
+    with w.counted(rows, rows + band.width) as k:
+        w.store(w.number(0.0), y, k)
+    for k, row in enumerate(band.order.tolist()):
+        w.store(w.load(w.real, left, row), y, k)
+    w.call("substituted", "void", L, y)
+    shares = dict(zip(band.order.tolist(), (w.load(w.real, y, k) for k in range(rows)), strict=True))
+    found = [w.number(0.0)] * columns
+    for e, (i, k) in enumerate(zip(pattern.rows.tolist(), pattern.columns.tolist(), strict=True)):
+        found[k] = w.fma(w.load(w.real, S, e), shares[i], found[k])
+    for k, value in enumerate(found):
+        w.store(value, x, k)
+    serves = w.load(w.real, size) < regular
+    with w.when(w.any(~serves)):
+        other = w.room(w.real, columns)
+        w.call("solved", "void", B, weights, left, other)
+        with w.counted(0, columns) as k:
+            w.store(w.where(serves, w.load(w.real, x, k), w.load(w.real, other, k)), x, k)

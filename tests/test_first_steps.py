@@ -1,0 +1,66 @@
+"""The steps that the program of a run takes by itself are those that `minimise` takes, evaluation by evaluation."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.analysis import problem
+
+
+class Oscillator(jj.Scene):
+    """`m x'' = - c x' - k x`: mass and stiffness show only in their ratio where nothing else is known."""
+
+    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
+    damping: jnp.ndarray = jj.parameter(0.3, non_negative=True)
+    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x),)
+
+
+def _run(damping=0.3) -> jj.Measurements:
+    ts, generator = np.linspace(0.0, 6.0, 61), np.random.default_rng(3)
+    x = np.asarray(jj.simulate(Oscillator(damping=damping), {"x": 0.5, "x_rate": 0.2}, ts=ts)["x"])
+    x = x + 0.01 * generator.normal(size=61)
+    x[7] = np.nan
+    return jj.Measurements(ts, {"x": x}, 0.01, start={"x": 0.45, "x_rate": 0.1}, unknown_start=("x", "x_rate"))
+
+
+CASES = {
+    "near": (Oscillator(stiffness=5.5), _run(), ("damping", "stiffness")),
+    "far, over growing spans": (Oscillator(stiffness=45.0, damping=2.0), _run(), ("damping", "stiffness")),
+    "at a bound": (Oscillator(stiffness=5.5), _run(), {"damping": jj.bounds(0.29, 0.5), "stiffness": jj.bounds(4.0, 5.8)}),
+    "past a bound": (Oscillator(damping=0.05), _run(damping=0.0), ("damping", "stiffness")),
+    "a prior": (Oscillator(stiffness=5.5), _run(), {"mass": jj.Normal(2.1, 0.05), "damping": None, "stiffness": None}),
+    "what does not show": (Oscillator(stiffness=5.5), _run(), ("mass", "damping", "stiffness")),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_program_of_a_run_takes_the_steps_of_minimise(case, monkeypatch):
+    scene, run, free = CASES[case]
+    found = jj.fit(scene, run, free)
+    taken = []
+    first_steps = problem.Problem._first_steps
+    monkeypatch.setattr(problem.Problem, "_first_steps", lambda *given: taken.append(given) or first_steps(*given))
+    jj.fit(scene, run, free)
+    assert taken
+    monkeypatch.setattr(problem.Problem, "_first_steps", lambda *_: None)
+    plain = jj.fit(scene, run, free)
+
+    assert plain.converged
+    assert found.converged
+    assert int(found.steps) == int(plain.steps)
+    assert bool(found.grown) == bool(plain.grown)
+    assert [(what, len(costs)) for what, costs in found.trace] == [(what, len(costs)) for what, costs in plain.trace]
+    for (_, ours), (_, theirs) in zip(found.trace, plain.trace, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+    np.testing.assert_allclose(found.values, plain.values, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(found.standard_errors, plain.standard_errors, rtol=1e-5)
+    np.testing.assert_allclose(found.residuals[0]["x"], plain.residuals[0]["x"], atol=1e-5)
+    assert found.not_identifiable == plain.not_identifiable

@@ -1,0 +1,134 @@
+"""Long chains of bodies take a time in proportion to their length: counted in operations, entries and lines of machine code, not in seconds.
+
+Elimination in a narrow band is compared with dense matrices.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.build import sparse_slopes, structure
+from jourdain_jax.build.assembling import assemble
+from jourdain_jax.build.row_program import row_program
+from jourdain_jax.build.sparse_slopes import Pattern
+from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
+from jourdain_jax.models import TrailerChain
+from jourdain_jax.motion import put_on_rows
+from jourdain_jax.motion.native.onto_rows import Rows, written
+from jourdain_jax.native import ffi
+
+native = pytest.mark.skipif(bool(ffi.reason_against()), reason="no machine code here")
+
+
+def links(count: int) -> tuple[Pattern, np.ndarray]:
+    """Rods in a row whose ends are points of a plane, and points on a zigzag: their rows in an order of no use."""
+    order = np.random.default_rng(0).permutation(count)
+    entries = [(int(order[i]), 2 * j + axis) for i in range(count) for j in (i, i + 1) for axis in range(2)]
+    points = np.stack([np.arange(count + 1.0), np.arange(count + 1) % 2 * 0.3], axis=1).ravel()
+    return Pattern.of(entries, (count, 2 * count + 2)), points
+
+
+def looking(pattern: Pattern, squares: np.ndarray):
+    """Of the squared lengths of those rods."""
+
+    def look(q, which):
+        G = np.zeros((len(q), *pattern.shape))
+        difference = [q[:, pattern.columns[4 * k + 2 : 4 * k + 4]] - q[:, pattern.columns[4 * k : 4 * k + 2]] for k in range(pattern.shape[0])]
+        for k, d in enumerate(difference):
+            row = pattern.rows[4 * k]
+            G[:, row, pattern.columns[4 * k : 4 * k + 4]] = np.concatenate([-2 * d, 2 * d], axis=1)
+        residual = np.zeros((len(q), pattern.shape[0]))
+        residual[:, pattern.rows[::4]] = np.stack([np.sum(d**2, axis=1) for d in difference], axis=1)
+        return residual - squares, G[:, pattern.rows, pattern.columns]
+
+    return look
+
+
+def test_rows_of_a_chain_lie_in_a_narrow_band_whatever_their_order():
+    short, long = (links(count)[0].band for count in (100, 200))
+    assert short.width == long.width == 1
+    assert len(long.places) < 2.05 * len(short.places)
+    assert links(30)[0].band is None  # few rows are dense
+    everywhere = Pattern.of([(i, k) for i in range(70) for k in range(80)], (70, 80))
+    assert everywhere.band is None
+
+
+def test_chains_are_assembled_in_a_band_as_by_dense_matrices(monkeypatch):
+    pattern, points = links(80)
+    q = points + 0.4 * np.random.default_rng(1).normal(size=(6, len(points)))
+    low, high, generic = np.full(len(points), -2.0), np.full(len(points), 82.0), np.ones(6, bool)
+    look = looking(pattern, np.full(80, 1.09))
+    found = assemble(look, pattern, q, low, high, generic)
+    monkeypatch.setattr(sparse_slopes, "FEWEST_ROWS", 1000)
+    dense = links(80)[0]
+    assert pattern.band is not None
+    assert dense.band is None
+    expected = assemble(look, dense, q, low, high, generic)
+    assert found.on_rows.all()
+    np.testing.assert_array_equal(found.on_rows, expected.on_rows)
+    np.testing.assert_allclose(found.q, expected.q, rtol=0, atol=1e-9)
+
+
+def test_a_band_knows_rows_that_depend_on_each_other():
+    pattern, _ = links(64)
+    values = np.random.default_rng(3).uniform(0.5, 1.0, (2, len(pattern.rows)))
+    values[1, pattern.rows == pattern.rows[40]] = 0.0  # no row at all
+    values /= np.where(pattern.lengths(values) > 0, pattern.lengths(values), 1.0)[:, pattern.rows]
+    f = np.ones((2, 64))
+    x, size = pattern.band.solved(values, np.zeros(2), f)
+    G = pattern.dense(values)[0]
+    np.testing.assert_allclose(x[0], np.linalg.solve(G @ G.T, f[0]), rtol=1e-10)
+    exact = np.linalg.norm(np.linalg.inv(G @ G.T), np.inf)
+    assert 0.1 * exact < size[0] < 1.001 * exact
+    assert not size[1] < sparse_slopes.REGULAR
+
+
+def test_nearly_dependent_rows_are_known_although_every_pivot_is_large():
+    n = 120  # pivots of 1/4, the inverse grows with 3^n
+    pattern = Pattern.of([(i, i) for i in range(n)] + [(i + 1, i) for i in range(n - 1)], (n, n))
+    values = np.concatenate([[1.0], np.full(n - 1, 0.5), np.full(n - 1, np.sqrt(0.75))])[None]
+    assert not pattern.band.solved(values, np.zeros(1), np.ones((1, n)))[1][0] < sparse_slopes.REGULAR
+
+
+@native
+@pytest.mark.parametrize("kind", ["positions", "determined speeds"])
+def test_machine_code_in_a_band_puts_lanes_onto_rows_as_by_rotations(kind, monkeypatch):
+    scene = TrailerChain(trailers=33)
+    program, generator, lanes = row_program(scene), np.random.default_rng(4), 4
+    in_band, dense = (Rows(program, kind, affine=kind != "positions") for _ in range(2))
+    assert in_band.in_band is not None
+    object.__setattr__(dense, "in_band", None)
+    q = np.array([list(scene.towing(np.linspace(0, 1, 34) * k).values())[2:] for k in (0.2, 0.5, 1.0, 1.5)])
+    t, free, typical = np.zeros((lanes, 1)), np.ones((lanes, len(in_band.moving))), np.full((lanes, len(in_band.residuals)), 1e-3)
+    free[1] = generator.uniform(size=free.shape[1]) > 0.05
+    free[2] = 0.0  # nothing moves: rows vanish, which no elimination serves
+    u = generator.normal(size=(lanes, len(program.u)))
+    state = [t, q + 1e-3 * generator.normal(size=q.shape)] + ([] if kind == "positions" else [u, np.zeros((lanes, 2))])
+    given = [jnp.asarray(x) for x in (*state, free, typical)]
+    by = lambda rows: jax.vmap(lambda *x: put_on_rows._put(rows, scene, list(x[:-2]), *x[-2:]))(*given)  # noqa: E731
+    found, expected = by(in_band), by(dense)
+    for x, y in zip(found, expected, strict=True):
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e-10)
+    assert np.max(np.abs(found[1][0])) < 1e-13
+    np.testing.assert_array_equal(found[0][2], state[1 if kind == "positions" else 2][2])
+
+
+@native
+def test_machine_code_of_a_chain_grows_with_its_length():
+    lines = []
+    for n in (22, 44):
+        rows = Rows(row_program(TrailerChain(trailers=n)), "determined speeds", affine=True)
+        assert not rows.reason_against()
+        lines.append(written(rows, 2, True, 1, rank_cutoff("float64")).count("\n"))
+    assert lines[1] < 2.05 * lines[0]
+
+
+def test_a_motion_finds_the_structure_of_its_scene_once(monkeypatch):
+    looked, probed = [], structure._probed_structure
+    monkeypatch.setattr(structure, "_probed_structure", lambda scene: looked.append(scene) or probed(scene))
+    monkeypatch.setenv("JOURDAIN_JAX_CACHE", "0")
+    motion = jj.simulate(TrailerChain(trailers=2, car_mass=1.2345), t1=0.1)
+    motion.raise_if_failed()
+    assert len(looked) == 1

@@ -1,0 +1,287 @@
+"""Deliberate errors of one line in what writes machine code: each must be caught by a check that passes without it.
+
+The checks know closed forms alone, of a bead on a spring that a growing force pushes, x'' = t - k x, and of beads at constant speed; and differences.
+"""
+
+from collections.abc import Callable
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_mutants import Mutant
+
+import jourdain_jax as jj
+from jourdain_jax.motion import integration, put_on_rows
+from jourdain_jax.motion.native import back, functions, kernel, loop, native_motion, onto_rows, search, step
+from jourdain_jax.motion.simulate import set_up
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.native import ffi
+
+pytestmark = pytest.mark.skipif(bool(ffi.reason_against()), reason="no machine code is made here")
+CLOSE = {"rtol": 0.0, "atol": 1e-8}
+
+
+class Pushed(jj.Scene):
+    """m x'' = t - k x; it stops at the level."""
+
+    k: float = jj.parameter(4.0)
+    level: float = jj.parameter(-0.1)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.t - self.k * motion.q.x),)
+
+    def events(self, motion):
+        return {"low": motion.q.x - self.level}
+
+
+class Round(jj.Scene):
+    """A bead on a circle of this radius, in coordinates of the plane."""
+
+    radius: float = jj.parameter(1.0)
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0 * q.x]))}
+
+    def geometric_constraints(self, pose):
+        return {"circle": pose.q.x**2 + pose.q.y**2 - self.radius**2}
+
+
+class Dips(jj.Scene):
+    """A bead at constant speed, and an event for a hundredth of a metre."""
+
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, 0 * q.x, 0 * q.x]))}
+
+    def events(self, motion):
+        return {"dip": (motion.q.x - 0.52) ** 2 - 1e-4}
+
+
+def pushed_position(t, x, v, k):
+    """x(t) where x(0) = x and x'(0) = v."""
+    w = jnp.sqrt(k)
+    return x * jnp.cos(w * t) + (v - 1 / k) / w * jnp.sin(w * t) + t / k
+
+
+TIMES = np.array([0.2, 0.5, 0.55, 1.3, 1.9])
+START = {"x": 0.7, "v": 0.4, "k": 4.0}
+
+
+def motion(scene: jj.Scene, values: dict, **options):
+    """What machine code returns of a motion, and its start as a state."""
+    setup = jax.tree.map(jnp.asarray, set_up(scene, values, work=False, **options))
+    assert not setup.reason_against_machine_code, setup.reason_against_machine_code
+    return setup.integrator.solved(setup.fitting(), integration._begin(setup))
+
+
+def pushed(x, v, k, level=-0.1, events=False, **options):
+    options = {"ts": TIMES, "rtol": 1e-10, "atol": 1e-10, "dt0": 1.0} | options
+    return motion(Pushed(k, level), {"x": x, "x_rate": v}, events=events, **options)
+
+
+def motions_follow_the_closed_form():
+    found = jax.jit(lambda: pushed(**START))()
+    np.testing.assert_allclose(found.ys.q[:, 0], pushed_position(TIMES, **START), **CLOSE, err_msg="closed form")
+    assert int(found.rejected) > 0, "no step was rejected, as this check needs it"
+    assert int(found.accepted + found.rejected) < 30, f"{found.accepted} and {found.rejected} steps: too many for the order"
+
+
+def lanes_of_a_batch_follow_their_own():
+    x = jnp.linspace(0.1, 1.0, 21)
+    spans = jnp.linspace(1.0, 0.5, 21)  # the first lanes end last
+    found = jax.jit(jax.vmap(lambda x, span: pushed(**START | {"x": x}, ts=TIMES * span)))(x, spans)
+    expected = jax.vmap(lambda x, span: pushed_position(TIMES * span, **START | {"x": x}))(x, spans)
+    np.testing.assert_allclose(found.ys.q[..., 0], expected, **CLOSE, err_msg="lanes")
+
+
+def an_event_is_found():
+    found = jax.jit(lambda: pushed(**START, events=True))()
+    assert int(found.code) == results.EVENT, "the event was passed over"
+    assert abs(pushed_position(found.t_end, **START) + 0.1) < 1e-9, "time of the event"
+    np.testing.assert_allclose(found.y_end.q[0], -0.1, **CLOSE, err_msg="state of the event")
+
+
+def an_event_within_a_step_is_found():
+    found = jax.jit(lambda: motion(Dips(), {"x": 0.0, "x_rate": 1.0}, ts=[2.0], dt0=1.0))()
+    assert int(found.code) == results.EVENT, "the event was passed over"
+    assert abs(found.t_end - 0.51) < 1e-9, "time of the event"
+
+
+def a_bead_stays_on_its_circle():
+    found = jax.jit(lambda: motion(Round(), {"x": 1.0, "y": 0.0, "y_rate": 2.0}, ts=TIMES, rtol=1e-4, atol=1e-4, dt0=0.1))()
+    np.testing.assert_allclose(jnp.sum(found.ys.q**2, axis=1), 1.0, atol=1e-13, err_msg="circle")
+    assert int(found.accepted) < 60, "too many steps"
+
+
+def a_start_is_put_onto_its_rows():
+    scene = Round()
+    usual = put_on_rows._worked_out(scene, False, True)
+    assert usual.program is not None
+    t, q, u = jnp.zeros(()), jnp.array([0.9, 0.7]), jnp.array([0.3, 1.1])
+    q_near, _ = jax.jit(lambda q: put_on_rows.put_positions(scene, t, q, jnp.ones(2, bool), usual))(q)
+    np.testing.assert_allclose(q_near, q / jnp.linalg.norm(q), rtol=0, atol=1e-14, err_msg="coordinates")
+    u_near, _ = jax.jit(lambda u: put_on_rows.put_speeds(scene, t, q_near, u, jnp.zeros(0), jnp.ones(2, bool), usual))(u)
+    np.testing.assert_allclose(u_near, u - q_near * (q_near @ u), rtol=0, atol=1e-14, err_msg="speeds")
+
+
+def _differentiated(mode: str, of: Callable, closed: Callable) -> None:
+    derivative = jax.jacrev if mode == "reverse" else jax.jacfwd
+    found = jax.jit(lambda x: derivative(of)(x))(START)
+    for name, expected in jax.jacfwd(closed)(START).items():
+        np.testing.assert_allclose(found[name], expected, rtol=0, atol=1e-7, err_msg=f"derivative with respect to {name}")
+
+
+def _at_saved_times(mode: str) -> None:
+    adjoint = None if mode == "reverse" else diffrax.ForwardMode()
+    weights = jnp.cos(1.0 + jnp.arange(5.0))
+    _differentiated(mode, lambda x: weights @ pushed(**x, adjoint=adjoint).ys.q[:, 0], lambda x: weights @ pushed_position(TIMES, **x))
+
+
+def _at_an_event(mode: str) -> None:
+    adjoint, t = None if mode == "reverse" else diffrax.ForwardMode(), jax.jit(lambda: pushed(**START, events=True))().t_end
+
+    def time_of_event(x):  # one Newton step has the derivative of the root
+        return t - (pushed_position(t, **x) + 0.1) / jax.lax.stop_gradient(jax.grad(pushed_position)(t, **x))
+
+    def speed_of_event(x):
+        return jax.grad(pushed_position)(time_of_event(x), **x)
+
+    def end(x):
+        found = pushed(**x, events=True, adjoint=adjoint)
+        return found.t_end + 0.3 * found.y_end.v[0]
+
+    _differentiated(mode, end, lambda x: time_of_event(x) + 0.3 * speed_of_event(x))
+
+
+def reverse_mode_through_saved_times():
+    _at_saved_times("reverse")
+
+
+def forward_mode_through_saved_times():
+    _at_saved_times("forward")
+
+
+def reverse_mode_to_an_event():
+    _at_an_event("reverse")
+
+
+def forward_mode_to_an_event():
+    _at_an_event("forward")
+
+
+def reverse_mode_with_respect_to_times():
+    weights = jnp.cos(1.0 + jnp.arange(5.0))
+    found = jax.jit(jax.grad(lambda ts: weights @ pushed(**START, ts=ts).ys.q[:, 0]))(jnp.asarray(TIMES))
+    rates = jax.vmap(jax.grad(lambda t: pushed_position(t, **START)))(jnp.asarray(TIMES))
+    np.testing.assert_allclose(found, weights * rates, rtol=0, atol=1e-7, err_msg="derivative with respect to times")
+
+
+def reverse_mode_back_over_projections():
+    """Of steps of whatever error, which projections move far; by central differences of fourth order."""
+
+    @jax.jit
+    def weighed(rate):
+        found = motion(Round(), {"x": 1.0, "y": 0.0, "y_rate": rate}, ts=[2.0, 4.0], rtol=1e3, atol=1e3, dt0=100.0)
+        return jnp.sum(found.ys.q @ jnp.array([0.4, 0.9])) + found.y_end.v[0], found.accepted
+
+    h = 1e-3
+    values = [weighed(1.3 + step * h)[0] for step in (-2, -1, 1, 2)]
+    expected = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * h)
+    found, steps = jax.jit(jax.grad(weighed, has_aux=True))(1.3)
+    assert steps == 2, "no long steps, as this check needs them"
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7, err_msg="derivative with respect to the rate")
+
+
+FORM, LANES, CIRCLE = motions_follow_the_closed_form, lanes_of_a_batch_follow_their_own, a_bead_stays_on_its_circle
+EVENT, DIP, ROWS = an_event_is_found, an_event_within_a_step_is_found, a_start_is_put_onto_its_rows
+BACK, ALONG, TIME = reverse_mode_through_saved_times, forward_mode_through_saved_times, reverse_mode_with_respect_to_times
+EVENT_BACK, EVENT_ALONG, PROJECTED_BACK = reverse_mode_to_an_event, forward_mode_to_an_event, reverse_mode_back_over_projections
+TRIED, WRONG = "_tried_by_stages", "derivative with respect to"
+MUTANTS = [
+    Mutant("a wrong weight", step, TRIED, "weighted(w, method.b, k", "weighted(w, method.b * (1 + 1e-6), k", FORM, "closed form"),
+    Mutant("the whole step for its error", step, TRIED, "weighted(w, method.b_error, k", "weighted(w, method.b, k", FORM, "too many|closed form"),
+    Mutant("every step accepted", step, TRIED, "(size_of_error <= 1.0)", "(size_of_error <= 1e30)", FORM, "closed form"),
+    Mutant("rows of the tableau too small", step, "_stages", "weighted(w, method.A[i], k", "weighted(w, 0.999 * method.A[i], k", FORM, "closed form|too many"),
+    Mutant("stages at the first time", step, "_stages", "w.fma(step, float(method.c[i]), t)", "t", FORM, "closed form|too many"),
+    Mutant("a rejected step takes time", step, "_take", '"t": w.where(accept, t1, t)', '"t": t1', FORM, "closed form"),
+    Mutant("a rejected step is taken", step, "_take", "w.where(accept, w.load(w.real, y1, i), w.load(w.real, y, i))", "w.load(w.real, y1, i)", FORM, "closed"),
+    Mutant("a goal that stays", loop, "_save", "number * times + last)", "number * times + saved)", FORM, "closed form"),
+    Mutant("starts of another lane", loop, "_write_begin", "number * given + row), lanes", "0 * given + row), lanes", LANES, "lanes"),
+    Mutant("goals of another lane", loop, "_write_begin", "number * w.load", "0 * w.load", LANES, "lanes"),
+    Mutant("states of another lane", loop, "_save", "(number * times + k)", "(0 * number + k)", LANES, "lanes"),
+    Mutant("no projection", step, "_project", 'w.call("project", "void", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
+    Mutant("no events", step, "_watched", "~search.no_event(w, c_1)", "~search.no_event(w, c_0)", EVENT, "event"),
+    Mutant("no dips", step, "_watched", "dips = accept & dips", "dips = accept & ~accept", DIP, "passed over"),
+    Mutant("a bracket with the wrong end", search, "advance", "w.where(same_side, t[1], t[0])", "t[0]", EVENT, "event"),
+    Mutant("rows by half", onto_rows, "_write_moved", "- w.where(moves, change, 0.0)", "- 0.5 * w.where(moves, change, 0.0)", ROWS, "coordinates|speeds"),
+    Mutant(
+        "rows that are not scaled",
+        onto_rows,
+        "_write_factored",
+        "w.load(w.real, row, k) * scale, row",
+        "w.load(w.real, row, k), row",
+        ROWS,
+        "coordinates|speeds",
+    ),
+    Mutant("weights of the first stage", back, "_write_step_back", "float(method.b[stage])", "float(method.b[0])", BACK, WRONG),
+    Mutant("no later stages", back, "_write_step_back", "float(method.A[j][stage])", "0.0", BACK, WRONG),
+    Mutant("cotangents not scaled by the step", back, "_write_step_back", "return h * total", "return total", BACK, WRONG),
+    Mutant(
+        "slopes of another stage",
+        back,
+        "_write_step_back",
+        "total = w.fma(w.load(w.real, G, j * count + i)",
+        "total = w.fma(w.load(w.real, G, i)",
+        BACK,
+        WRONG,
+    ),
+    Mutant("parameters of the last step", back, "_write_step_back", "w.load(w.real, by_known, i) + w.where(took", "w.where(took", BACK, WRONG),
+    Mutant("saved states forgotten", back, "_write_added", 'w.load("double", place) + more', "more", BACK, WRONG),
+    Mutant("no projection on the way back", back, "_write_step_back", "_project_back(w, form, state, t + h, at, g1, added)", "None", PROJECTED_BACK, WRONG),
+    Mutant("an event at a number for a time", back, "_write_event_back", "-total / rate", "total / rate", EVENT_BACK, WRONG),
+    Mutant("the level of an event forgotten", back, "_write_event_back", "w.where(usable, w.load(w.real, out, i), 0.0)", "w.number(0.0)", EVENT_BACK, WRONG),
+    Mutant("tangents of states alone", functions, "outputs_of", "| {others[i]: n for i, n in zip(form.moving, known, strict=True)}", "", ALONG, WRONG),
+    Mutant("the time of an event fixed", step, "_tangents_at_event", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
+    Mutant("the wrong way from an event", step, "_tangents_at_event", "w.fma(w.load(w.real, k, i), dt, before)", "before", EVENT_ALONG, WRONG),
+    Mutant(
+        "goals that do not move states",
+        native_motion,
+        "cotangents_of_times",
+        "goals = jnp.where(at.by_goal, by_states, 0.0)",
+        "goals = jnp.where(at.by_goal, 0 * by_states, 0.0)",
+        TIME,
+        WRONG,
+    ),
+]
+CHECKS = list(dict.fromkeys(mutant.check for mutant in MUTANTS))
+KEPT = (kernel.kernel, kernel.kernel_back, kernel.kernel_of_rates, put_on_rows._kernel, native_motion._reason_against_derivatives)
+
+
+@pytest.fixture(autouse=True)
+def _nothing_kept():
+    """Machine code is written in each test, and none of it is used afterwards."""
+    for kept in KEPT:
+        kept.cache_clear()
+    yield
+    for kept in KEPT:
+        kept.cache_clear()
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+def test_without_a_mutant(check):
+    check()
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.says)
+def test_a_mutant_is_caught(mutant, monkeypatch):
+    mutant.bring(monkeypatch)
+    with pytest.raises(AssertionError, match=mutant.shown_by):
+        mutant.check()
