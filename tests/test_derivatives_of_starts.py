@@ -1,5 +1,7 @@
 """Derivatives of what is put onto the rows, of a start off them by some finite amount, against differences of what is computed."""
 
+from itertools import pairwise
+
 import jax
 import jax.numpy as jnp
 import linkages
@@ -19,7 +21,7 @@ STEP = 2e-3
 def _slope(function, s: float = 0.0) -> np.ndarray:
     """The derivative by Richardson's extrapolation of central differences, of order 6."""
     D = [(np.asarray(function(s + h)) - np.asarray(function(s - h))) / (2 * h) for h in (STEP, STEP / 2, STEP / 4)]
-    D = [(4 * b - a) / 3 for a, b in zip(D, D[1:], strict=False)]
+    D = [(4 * b - a) / 3 for a, b in pairwise(D)]
     return (16 * D[1] - D[0]) / 15
 
 
