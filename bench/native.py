@@ -7,6 +7,7 @@ time, the least of some repeats, the two ways in turn; cold ones are wall time o
 """
 
 import argparse
+import itertools
 import json
 import os
 import subprocess
@@ -137,30 +138,36 @@ def heyoka(quick: bool) -> Iterator[Figure]:
 
 
 def records(quick: bool) -> Iterator[Figure]:
-    """2 s of a bicycle under a record of 201 samples of the steer torque, each lane its own; and its derivatives with respect to four parameters."""
+    """2 s of a bicycle whose steer torque is a record of 201 samples, or a function of time, each lane its own; and derivatives for four parameters."""
     scene, name, lanes, scale = jj.models.MODELS["whipple-bicycle"](), "whipple-bicycle", 2 if quick else 8, 1e-8
     start, times = jj.start(scene, rear_spin_rate=15.0, lean_rate=0.05), np.linspace(0.0, 2.0, 201)
     torques = jnp.asarray(0.1 * np.random.default_rng(0).normal(size=(lanes, 201)))
     parameters = jnp.stack([scene.mB, scene.IBxx, scene.zB, scene.mH])
 
-    def rates(backend, parameters, torque):
+    def wave(torque):
+        size, phase = torque[:2]
+        return lambda t: size * jnp.sin(5.0 * t + phase)
+
+    kinds = {"record": partial(jj.Sampled, times), "function of time": wave}
+
+    def rates(backend, kind, parameters, torque):
         own = scene.replace(**dict(zip(("mB", "IBxx", "zB", "mH"), parameters, strict=True)))
         options = {"ts": jnp.linspace(0.05, 2.0, 40), "rtol": scale, "atol": scale, "events": False, "adjoint": diffrax.ForwardMode(), "backend": backend}
-        return jj.simulate(own, start, inputs={"steer_torque": jj.Sampled(times, torque)}, **options).u
+        return jj.simulate(own, start, inputs={"steer_torque": kinds[kind](torque)}, **options).u
 
-    for what, function in (("motion", lambda f: f), ("its derivatives", jax.jacfwd)):
+    for kind, (what, function) in itertools.product(kinds, (("motion", lambda f: f), ("its derivatives", jax.jacfwd))):
         runs, found = {}, {}
         for way, backend in WAYS.items():
-            run = jax.jit(jax.vmap(function(partial(rates, backend)), (None, 0)))
+            run = jax.jit(jax.vmap(function(partial(rates, backend, kind)), (None, 0)))
             begin = time.process_time()
             found[way] = np.asarray(run(parameters, torques))
-            yield figure(f"record, {what}, {way}, trace, compile and run, s", name, time.process_time() - begin)
+            yield figure(f"{kind}, {what}, {way}, trace, compile and run, s", name, time.process_time() - begin)
             runs[way] = partial(lambda run: jax.block_until_ready(run(parameters, torques)), run)
         seconds = least_processor_time(runs, 3)
         for way in WAYS:
-            yield figure(f"record, {what}, {way}, ms per lane", name, 1e3 * seconds[way] / lanes)
-        yield figure(f"record, {what}, native / XLA", name, seconds["native"] / seconds["XLA"], 0.5)
-        yield figure(f"record, {what}, largest difference", name, float(np.max(np.abs(found["native"] - found["XLA"]))))
+            yield figure(f"{kind}, {what}, {way}, ms per lane", name, 1e3 * seconds[way] / lanes)
+        yield figure(f"{kind}, {what}, native / XLA", name, seconds["native"] / seconds["XLA"], 0.5)
+        yield figure(f"{kind}, {what}, largest difference", name, float(np.max(np.abs(found["native"] - found["XLA"]))))
 
 
 def times(quick: bool) -> Iterator[Figure]:

@@ -345,7 +345,9 @@ def test_it_is_said_why_machine_code_is_not_taken(monkeypatch):
     assert set_up(disc, backend="xla").reason_against_machine_code == "another backend was asked for"
     assert "diffrax" in set_up(disc, solver=diffrax.Heun()).reason_against_machine_code
     assert "scalar program" in set_up(disc, formulation=jj.Formulation(reduction="kkt")).reason_against_machine_code
-    assert "function of time" in set_up(board, inputs={"steer_torque": lambda t: jnp.sin(t)}).reason_against_machine_code
+    assert set_up(board, inputs={"steer_torque": lambda t: jnp.sin(t)}).reason_against_machine_code == ""
+    with_its_own_rule = set_up(board, inputs={"steer_torque": lambda t: jax.nn.softplus(t)})
+    assert "without scalar form" in with_its_own_rule.reason_against_machine_code
     monkeypatch.setattr(host, "reason_against", lambda: "llvmlite is not installed")
     assert set_up(disc).reason_against_machine_code == "llvmlite is not installed"
     monkeypatch.setattr(host, "reason_against", lambda: "")

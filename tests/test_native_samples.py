@@ -137,5 +137,10 @@ class Until(Pushed):
 
 def test_it_is_said_which_inputs_machine_code_does_not_take():
     assert set_up(Pushed(), {"x": 0.1}, inputs=inputs()).reason_against_machine_code == ""
-    assert "function of time" in set_up(Pushed(), {"x": 0.1}, inputs={"pull": jnp.sin}).reason_against_machine_code
+    table = jnp.linspace(0.0, 1.0, 300)
+    long_sum = set_up(Pushed(), {"x": 0.1}, inputs={"pull": lambda t: jnp.sum(table) * t})
+    assert "300 numbers, more than 200" in long_sum.reason_against_machine_code
+    few = table[:9]
+    looked_up = set_up(Pushed(), {"x": 0.1}, inputs={"pull": lambda t: jnp.interp(t, few, few)})
+    assert "function of time without scalar form" in looked_up.reason_against_machine_code
     assert "event" in set_up(Until(), {"x": 0.1}, inputs=inputs()).reason_against_machine_code

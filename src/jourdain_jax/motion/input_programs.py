@@ -44,13 +44,18 @@ class TimeProgram:
         outputs = lifted(jaxpr.outvars)
         arguments = [*(v for v, _ in taken), *jaxpr.constvars, *jaxpr.invars]
         self.numbers = np.array([number.val for _, number in taken], real)  # of this trace: they do not count in comparisons
-        self._closed = ClosedJaxpr(jaxpr.replace(constvars=[], invars=arguments, eqns=equations, outvars=outputs), [])
-        self._key = description(self._closed)
+        self.closed = ClosedJaxpr(jaxpr.replace(constvars=[], invars=arguments, eqns=equations, outvars=outputs), [])
+        self._key = description(self.closed)
         self._hash = hash(self._key)
+
+    @property
+    def shapes(self) -> list[tuple[int, ...]]:
+        """Of the arguments before the time: the plain numbers, and what the function closes over."""
+        return [x.shape for x in self.closed.in_avals[:-1]]
 
     def __call__(self, numbers, held, t):
         """The value at time t; `numbers`: the plain ones; `held`: what the function closes over."""
-        return jaxpr_as_fun(self._closed)(*numbers, *held, jnp.asarray(t, self._closed.in_avals[-1].dtype))[0]
+        return jaxpr_as_fun(self.closed)(*numbers, *held, jnp.asarray(t, self.closed.in_avals[-1].dtype))[0]
 
     def __hash__(self):
         return self._hash

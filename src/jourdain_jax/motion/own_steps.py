@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
-from jourdain_jax.motion.inputs import Constant, Sampled
+from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
 from jourdain_jax.motion.integrators.of_diffrax import alongside, diffrax
 from jourdain_jax.motion.integrators.tableaus import Method, method_of
@@ -177,14 +177,14 @@ def _pushed(setup: Setup, begun: Begun, along: Setup, d: Begun) -> tuple[Solved,
         like = setup.ts, setup.t0, setup.t1, setup.t0
         ts, t0, t1, origin = (jnp.zeros_like(x) if dx is None else dx for x, dx in zip(like, of_times, strict=True))
         times = native_motion.AlongTimes(_since(t0, ts, t1), origin)
-    return native_motion.tangents(motion, dy0, _known(d.args), times, _as_solved)
+    return native_motion.tangents(motion, dy0, native_motion.known_of(d.args), times, _as_solved)
 
 
 def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solved) -> tuple:
     """Cotangents of what varies, from those of the motion that was found."""
     motion = _motion(setup, begun)
     states = jax.tree.map(lambda g: jnp.concatenate([g, jnp.zeros((1, *g.shape[1:]))]), g.ys)  # nobody asks for the last one: it is that of the end
-    varies, asked = perturbed[0], [bool(varies) for varies in _known(perturbed[1].args)]
+    varies, asked = perturbed[0], [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
     by_start, by_known = native_motion.cotangents(motion, asked, states, g.y_end, g.t_end)
     none_else = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
     by_setup, (field, scene, inputs, fixed, origin) = none_else[0], none_else[1].args
@@ -198,18 +198,9 @@ def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solv
         by_setup = by_setup._replace(**{name: by for name, by in given.items() if getattr(varies, name)})
         origin = times.origin if perturbed[1].args[-1] else None
     y0 = jax.tree.map(lambda varies, by: by if varies else None, perturbed[1].y0, by_start)
-    constant = [i for i, channel in enumerate(inputs.channels) if isinstance(channel, Constant)]
-    if constant:
-        given = [by_known[len(fixed) + i] for i in constant]
-        inputs = eqx.tree_at(lambda x: [x.channels[i].value for i in constant], inputs, given, is_leaf=lambda x: x is None)
+    inputs = native_motion.with_known(inputs, by_known[len(fixed) :])
     args = field, scene, inputs, tuple(by_known[: len(fixed)]), origin
     return by_setup, eqx.tree_at(lambda b: (b.y0, b.args), none_else[1], (y0, args), is_leaf=lambda x: x is None)
-
-
-def _known(args: tuple) -> list:
-    """Of each number that the rates are given: what depends on parameters alone, and constant inputs; None of those that are given by samples."""
-    _, _, inputs, fixed, _ = args
-    return [*fixed, *(channel.value if isinstance(channel, Constant) else None for channel in inputs.channels)]
 
 
 def _goals(setup: Setup, ts) -> Float[Array, "times *lanes"]:

@@ -3,18 +3,22 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jourdain_jax.calculus.reals import real_type
+from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.motion.input_programs import FunctionOfTime
 from jourdain_jax.motion.inputs import Constant, Inputs, Sampled
 from jourdain_jax.motion.integrators.erk_loop import ended
 from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native.functions import Form, event_program, outputs_of
+from jourdain_jax.motion.native.functions_of_time import numbers_of, parts_from, with_functions
 from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel, kernel_back, kernel_of_rates
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.pulled import pulled_program, steps_of
@@ -65,8 +69,10 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
         return reason
     if any(isinstance(x, Sampled) for x in jax.tree.leaves(scene, is_leaf=lambda x: isinstance(x, Sampled))):
         return "the scene itself holds samples"
-    if not all(isinstance(channel, Constant | Sampled) for channel in inputs.channels):
-        return "an input is a function of time"
+    if not all(isinstance(channel, Constant | Sampled | FunctionOfTime) for channel in inputs.channels):
+        return "an input is a function of time that holds arrays of its own"
+    if isinstance(reason := _driven(field.program, inputs), str):
+        return reason
     if has_events and not field.lowers_events:
         return "a stop event is no part of the scalar program"
     return _reason_against_program(_form(field, inputs, has_events))
@@ -128,9 +134,18 @@ def _reason_against_derivatives(form: Form) -> str:
     return ""
 
 
+def _driven(program: Lowered, inputs: Inputs) -> Lowered | str:
+    """The program that takes numbers and samples alone, or why there is none."""
+    if not inputs.programs:
+        return program
+    return with_functions(program, tuple(channel.program if isinstance(channel, FunctionOfTime) else None for channel in inputs.channels))
+
+
 def _form(field: ByProgram, inputs: Inputs, has_events: bool, moving: tuple[int, ...] | None = None) -> Form:
-    sampled = tuple(i for i, channel in enumerate(inputs.channels) if isinstance(channel, Sampled))
-    return Form(field.program, field.with_work, field.projects, field.affine, has_events, field.has_pivots, moving, sampled)
+    sampled = tuple(i for i, channel in enumerate(_others(inputs)) if isinstance(channel, Sampled))
+    program = _driven(field.program, inputs)
+    assert not isinstance(program, str), program
+    return Form(program, field.with_work, field.projects, field.affine, has_events, field.has_pivots, moving, sampled)
 
 
 def _form_of(motion: Motion, moving: tuple[int, ...] | None = None) -> Form:
@@ -238,13 +253,39 @@ def _scaled(slope: Float[Array, "y"], by: Float[Array, "..."]) -> Float[Array, "
 
 def _rows(motion: Motion) -> tuple[Array, Array, Array]:
     """Progress, control and what is known, as a lane is given them."""
-    (_, _, inputs, fixed, origin), goals, control = motion.args, motion.goals, motion.control
+    origin, goals, control = motion.args[-1], motion.goals, motion.control
     zero, one = jnp.zeros(()), jnp.ones(())
     t, h, code, event = zero, jnp.abs(control.dt0), RUNNING * one, -one
     progress = [t, h, code, zero, zero, event, jnp.inf * one]
     limits = [jnp.sign(goals[-1]), goals[-1], control.rtol, control.atol, control.shortest, control.max_steps * one, origin]
-    known = [jnp.asarray(x, real_type()) for x in (*fixed, *inputs(origin))]
+    known = [zero if x is None else jnp.asarray(x, real_type()) for x in known_of(motion.args)]  # what samples say is looked up
     return jnp.stack(progress), jnp.stack(limits), jnp.stack(known) if known else jnp.zeros(0)
+
+
+def known_of(args: tuple) -> list:
+    """Of each number that the rates are given: what depends on parameters alone, the numbers of functions of time, and constant inputs; None of samples."""
+    _, _, inputs, fixed, _ = args
+    functions = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in numbers_of(channel)]
+    return [*fixed, *functions, *(channel.value if isinstance(channel, Constant) else None for channel in _others(inputs))]
+
+
+def with_known(inputs: Inputs, known: Sequence) -> Inputs:
+    """Inputs with what stands for their numbers, in the order of `known_of` and without what is fixed, in the place of these."""
+    each = iter(known)
+    new = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in parts_from(channel, each)]
+    new += [x for channel, x in zip(_others(inputs), each, strict=True) if isinstance(channel, Constant)]
+
+    def places(x: Inputs) -> list:
+        both: list[tuple[Any, Callable]] = list(zip(x.channels, inputs.channels, strict=True))
+        functions = [part for channel, own in both if isinstance(own, FunctionOfTime) for part in (channel.numbers, *(channel.held if own.held else ()))]
+        return [*functions, *(channel.value for channel, own in both if isinstance(own, Constant))]
+
+    return eqx.tree_at(places, inputs, new, is_leaf=lambda x: x is None) if new else inputs
+
+
+def _others(inputs: Inputs) -> list[Callable]:
+    """The channels that are no functions of time."""
+    return [channel for channel in inputs.channels if not isinstance(channel, FunctionOfTime)]
 
 
 def _samples(motion: Motion) -> tuple[Array, ...]:

@@ -1,0 +1,98 @@
+"""Inputs that are functions of time, as part of the scalar program: time and their numbers take the place of their values.
+
+u_i = f_i(t, c_i),   y' = F(t, y, u) = F(t, y, f(t, c))         c_i: the numbers in f_i and those that it closes over
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from functools import lru_cache
+from itertools import islice
+
+import jax.numpy as jnp
+import numpy as np
+
+from jourdain_jax.build.trace import Variables
+from jourdain_jax.lowering.lowered import Lowered
+from jourdain_jax.motion.input_programs import FunctionOfTime, TimeProgram
+from jourdain_jax.program.graph import ARRAYS, Graph, Unsupported
+from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
+
+MOST_NUMBERS = 200  # in a function of time; of a long table each is a row of a lane, and `jj.Sampled` looks up in it
+MOST_KEPT = 64
+
+
+@lru_cache(maxsize=MOST_KEPT)
+def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) -> Lowered | str:
+    """The program with these functions in the place of inputs, or why there is none, in words; their numbers come last among what is `fixed`."""
+    numbers = sum(math.prod(shape) for function in functions if function is not None for shape in function.shapes)
+    if numbers > MOST_NUMBERS:
+        return f"inputs are functions of time with {numbers} numbers, more than {MOST_NUMBERS}"
+    if any(program.graph.op[n] in ARRAYS for n in program.fixed):
+        return "the scene keeps parts as calls, and an input is a function of time"
+    graph = Graph(keeps_rules=True)
+    new = {n: graph.input(str(k), True) for k, n in enumerate(program.variables)}
+    t, known = new[program.traced.t], []
+    try:
+        for node, function in zip(program.traced.inputs.tolist(), functions, strict=True):
+            if function is not None:
+                given = [[graph.input(f"{node} {k} {i}", True) for i in range(math.prod(shape))] for k, shape in enumerate(function.shapes)]
+                known += [n for part in given for n in part]
+                arguments = [Nodes(np.reshape(part, shape)) for part, shape in zip(given, function.shapes, strict=True)]
+                new[node] = int(as_nodes(graph, interpret(graph, function.closed, [*arguments, Nodes(t)])[0]))
+    except (Unsupported, ValueError) as error:
+        return f"an input is a function of time without scalar form ({error})"
+    power = [] if program.power is None else [program.power]
+    outputs = [*program.qdot, *program.ydot, *power, *program.pivots, *program.guards, *program.events, *program.projected_q, *program.projected_u]
+    for node in program.graph.needed(outputs, new):
+        if program.graph.is_const(node):
+            new[node] = graph.const(program.graph.value[node])
+        else:
+            new[node] = graph.again(node, [new[a] for a in program.graph.args[node]], program.graph)
+
+    def on_it(nodes: Iterable[int]) -> tuple[int, ...]:
+        return tuple(new[n] for n in nodes)
+
+    stays = [i for i, function in enumerate(functions) if function is None]
+    u = [new.get(n, t) for n in program.traced.u.tolist()]  # dependent speeds are no variables
+    q, inputs = (np.array(on_it(nodes.tolist()), np.int64) for nodes in (program.traced.q, program.traced.inputs[stays]))
+    return replace(
+        program,
+        traced=Variables(graph, t, q, np.array(u, np.int64), inputs, []),
+        inputs=tuple(program.inputs[i] for i in stays),
+        fixed=(*on_it(program.fixed), *known),
+        sizes=on_it(program.sizes),
+        qdot=on_it(program.qdot),
+        ydot=on_it(program.ydot),
+        power=new[power[0]] if power else None,
+        pivots=on_it(program.pivots),
+        guards=on_it(program.guards),
+        events=on_it(program.events),
+        projected_q=on_it(program.projected_q),
+        projected_u=on_it(program.projected_u),
+        z=(),  # what is seen of a motion is evaluated with the values of inputs
+        energies=(),
+        usual={},
+        states={},
+    )
+
+
+def numbers_of(channel: FunctionOfTime) -> list:
+    """Each number of a function of time; of a tree of flags or of tangents in its place, what stands for each (None: nothing does)."""
+    return [x for part, shape in zip((channel.numbers, *channel.held), _shapes(channel), strict=True) for x in _each(part, shape)]
+
+
+def parts_from(channel: FunctionOfTime, numbers: Iterator) -> list:
+    """`channel.numbers`, and all that is `channel.held`, from the next of what stands for each number; None where nothing does."""
+    found = [(list(islice(numbers, math.prod(shape))), shape) for shape in _shapes(channel)]
+    return [None if any(x is None for x in each) else jnp.stack(each).reshape(shape) if each else jnp.zeros(shape) for each, shape in found]
+
+
+def _shapes(channel: FunctionOfTime) -> list[tuple[int, ...]]:
+    shapes = channel.program.shapes
+    count = len(shapes) - len(channel.held)
+    return [(count,), *shapes[count:]]
+
+
+def _each(part, shape: tuple[int, ...]) -> list:
+    return list(jnp.reshape(part, -1)) if hasattr(part, "shape") else [part] * math.prod(shape)

@@ -1,0 +1,125 @@
+"""Inputs that are functions of time, in machine code: motions and derivatives are those of closed forms and of XLA."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jourdain_jax as jj
+from jourdain_jax.motion.trajectories import results
+from jourdain_jax.native import ffi
+
+pytestmark = pytest.mark.skipif(bool(ffi.reason_against()), reason="no machine code is made here")
+TS = np.array([0.3, 1.0, 1.7, 2.5])
+TIGHT = {"rtol": 1e-11, "atol": 1e-11, "work": False}
+ADJOINTS = {"reverse": (None, jax.jacrev), "forward": (diffrax.ForwardMode(), jax.jacfwd)}
+
+
+class Pushed(jj.Scene):
+    """x'' = force - k x, and beside it y'' = aside; it stops where x has come to the wall, which the force moves."""
+
+    k: float = jj.parameter(4.0)
+    wall: float = jj.parameter(9.0)
+    coordinates, inputs = jj.coordinates("x y"), jj.inputs("force aside")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.force - self.k * motion.q.x, y_rate=motion.inputs.aside),)
+
+    def events(self, motion):
+        return {"wall": self.wall - motion.q.x - 0.1 * motion.inputs.force}
+
+
+def position(t, x, k, a, b):
+    """x(t) at rest at first, where the force is a sin(b t)."""
+    w, driven = jnp.sqrt(k), a / (k - b**2)
+    return x * jnp.cos(w * t) - driven * b / w * jnp.sin(w * t) + driven * jnp.sin(b * t)
+
+
+X = {"x": 0.3, "k": 4.0, "a": 0.8, "b": 1.3}
+
+
+def motion(x, k, a, b, aside=0.0, wall=9.0, **options):
+    inputs = {"force": lambda t: a * jnp.sin(b * t), "aside": aside}
+    return jj.simulate(Pushed(k, wall), {"x": x}, ts=TS, inputs=inputs, **TIGHT | options)
+
+
+@pytest.mark.parametrize("mode", ADJOINTS)
+def test_motions_and_derivatives_are_those_of_the_closed_form(mode):
+    adjoint, derivative = ADJOINTS[mode]
+    X0 = {name: jnp.asarray(value) for name, value in X.items()}
+    found = motion(**X0)
+    assert found.reduction.endswith("machine code")
+    np.testing.assert_allclose(found["x"], position(TS, **X0), rtol=0, atol=1e-9)
+    slopes = jax.jit(lambda x: derivative(lambda x: motion(**x, adjoint=adjoint)["x"])(x))(X0)
+    for name, expected in jax.jacfwd(lambda x: position(TS, **x))(X0).items():
+        np.testing.assert_allclose(slopes[name], expected, rtol=0, atol=1e-8, err_msg=name)
+
+
+def test_lanes_have_functions_of_their_own():
+    a = jnp.linspace(-1.0, 1.0, 11)
+    found = jax.jit(jax.vmap(lambda a: motion(**X | {"a": a})["x"]))(a)
+    np.testing.assert_allclose(found, jax.vmap(lambda a: position(TS, **X | {"a": a}))(a), rtol=0, atol=1e-9)
+    lanes = jj.rollout(Pushed(), {"x": jnp.linspace(0.1, 0.5, 5)}, ts=TS, inputs={"force": lambda t: 0.8 * jnp.sin(1.3 * t)}, **TIGHT).lanes
+    assert lanes.reduction.endswith("machine code")
+    expected = jax.vmap(lambda x: position(TS, **X | {"x": x}))(jnp.linspace(0.1, 0.5, 5))
+    np.testing.assert_allclose(lanes.q[..., 0], expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("mode", ADJOINTS)
+def test_functions_samples_and_numbers_stand_side_by_side(mode):
+    adjoint, derivative = ADJOINTS[mode]
+    record = jj.Sampled([0.0, 1.0, 3.0], [0.0, 0.6, 0.2])
+    for aside in (record, jnp.asarray(0.7)):
+        found = motion(**X, aside=aside)
+        assert found.reduction.endswith("machine code")
+        np.testing.assert_allclose(found["x"], position(TS, **X), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found["y"], 0.35 * TS**2, rtol=0, atol=1e-10)
+    slope = jax.jit(lambda f: derivative(lambda f: motion(**X, aside=f, adjoint=adjoint)["y"])(f))(0.7)
+    np.testing.assert_allclose(slope, TS**2 / 2, rtol=0, atol=1e-9)
+    of_record = jax.jit(lambda a: derivative(lambda a: motion(**X | {"a": a}, aside=record, adjoint=adjoint)["x"])(a))(0.8)
+    np.testing.assert_allclose(of_record, position(TS, **X | {"a": 1.0}) - position(TS, **X | {"a": 0.0}), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("mode", ADJOINTS)
+def test_an_event_may_depend_on_a_function_of_time(mode):
+    adjoint, derivative = ADJOINTS[mode]
+
+    def end(a):
+        return motion(-0.3, 4.0, a, 1.3, wall=0.2, adjoint=adjoint)
+
+    def gap(t, a):
+        return 0.2 - position(t, -0.3, 4.0, a, 1.3) - 0.1 * a * jnp.sin(1.3 * t)
+
+    found = end(0.8)
+    assert int(found.result) == results.EVENT
+    assert abs(gap(found.t_end, 0.8)) < 1e-9
+    by_t, by_a = jax.grad(gap, (0, 1))(found.t_end, 0.8)
+    slope = jax.jit(lambda a: derivative(lambda a: end(a).t_end)(a))(0.8)
+    np.testing.assert_allclose(slope, -by_a / by_t, rtol=0, atol=1e-7)
+
+
+def test_arrays_that_a_function_closes_over_have_derivatives_beside_one_that_closes_over_nothing():
+    def ends(amplitudes):
+        inputs = {"force": lambda t: amplitudes @ jnp.stack([jnp.sin(1.3 * t), jnp.sin(0.5 * t)]), "aside": lambda t: 2.0 * t}
+        return jj.simulate(Pushed(), {"x": 0.3}, ts=TS, inputs=inputs, **TIGHT)
+
+    found, amplitudes = ends(jnp.array([0.8, 0.1])), jnp.array([0.8, 0.1])
+    assert found.reduction.endswith("machine code")
+    np.testing.assert_allclose(found["y"], TS**3 / 3, rtol=0, atol=1e-9)
+    slopes = jax.jit(jax.jacrev(lambda a: ends(a)["x"]))(amplitudes)
+    for column, b in zip(slopes.T, (1.3, 0.5), strict=True):
+        np.testing.assert_allclose(column, position(TS, 0.0, 4.0, 1.0, b), rtol=0, atol=1e-8)
+
+
+def test_another_function_that_does_the_same_makes_no_other_machine_code():
+    def end(c):
+        return jj.simulate(Pushed(), {"x": 0.1}, ts=TS, inputs={"force": lambda t: c * t}, **TIGHT)["x"][-1]
+
+    ends, made = [end(1.0)], ffi.registered.cache_info().misses
+    ends += [end(2.0), end(3.0)]
+    assert ffi.registered.cache_info().misses == made
+    np.testing.assert_allclose(ends[2] - ends[1], ends[1] - ends[0], rtol=1e-9)  # the motion is linear in the force
