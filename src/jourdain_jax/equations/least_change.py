@@ -26,13 +26,23 @@ class Change(NamedTuple):
     K: Float[Array, "moving rows"]
 
 
-def least_change(A: Float[Array, "rows moving"], r: Float[Array, "rows"], M, free: Bool[Array, "moving"], typical=None, cutoff: float | None = None) -> Change:
+def least_change(
+    A: Float[Array, "rows moving"],
+    r: Float[Array, "rows"],
+    M: Float[Array, "moving moving"] | None,
+    free: Bool[Array, "moving"],
+    typical=None,
+    cutoff: float | None = None,
+    *,
+    determined: bool = False,
+) -> Change:
     """What moves least in the metric `M` (None: that of the coordinates as they are), of what is `free`; the identity where `M` is singular.
 
     `typical`: lengths of the rows, in the scaled speeds where there is a metric, by which one counts as vanishing (default: none does, unless it is zero).
     Rows count as dependent below `cutoff` (default: `rank_cutoff`). Differentiable in any mode where the rank does not change.
+    `determined`: rows determine what is free, and can be met, so that the first term of the derivative is all of it.
     """
-    x, K = _least_change((A, r, M), free=free, typical=jax.lax.stop_gradient(typical), cutoff=cutoff)
+    x, K = _least_change((A, r, M), free=free, typical=jax.lax.stop_gradient(typical), cutoff=cutoff, determined=determined)
     return Change(x, jax.lax.stop_gradient(K))
 
 
@@ -67,21 +77,23 @@ def _backward(L, y):
 
 
 @eqx.filter_custom_jvp
-def _least_change(of: tuple, *, free, typical, cutoff) -> Change:
+def _least_change(of: tuple, *, free, typical, cutoff, determined) -> Change:
     A, r, M = of
     return _solved(A, r, M, free, typical, cutoff).change
 
 
 @_least_change.def_jvp
-def _least_change_jvp(primals, tangents, *, free, typical, cutoff):
+def _least_change_jvp(primals, tangents, *, free, typical, cutoff, determined):
     ((A, r, M),), ((dA, dr, dM),) = primals, tangents
     (x, K), mu, d, c, L, definite = _solved(A, r, M, free, typical, cutoff)
     dx = jnp.zeros_like(x)
     if dr is not None:
         dx += K @ dr
     if dA is not None:
-        dx += K @ (K.T @ (dA.T @ (d**2 * (r - A @ x))) / d**2 - dA @ x)
-    if dA is not None or dM is not None:
+        dx -= K @ (dA @ x)
+    if dA is not None and not determined:
+        dx += K @ (K.T @ (dA.T @ (d**2 * (r - A @ x))) / d**2)
+    if (dA is not None or dM is not None) and not determined:
         pull = jnp.zeros_like(x)
         pull = pull if dA is None else pull + dA.T @ mu
         pull = c * (pull if dM is None else pull - jnp.where(definite, dM @ x, 0.0))

@@ -124,7 +124,7 @@ def project_speeds(
     def change(given, u):
         (parameters, t, q, inputs, M), (free, typical) = given
         phi, A = by.rows(parameters, t, q, u, inputs)
-        return least_change(A, phi, M, free, typical, cutoff)
+        return least_change(A, phi, M, free, typical, cutoff, determined=determined)
 
     given = (parameters, jnp.asarray(t), q, inputs, M), (free, typical)
     if not (affine or determined):
