@@ -170,3 +170,16 @@ def test_unknown_without_a_standard_error_cannot_be_whitened():
     data, free = runs(), ("mass", "damping", "stiffness")
     with pytest.raises(ValueError, match="`mass` has no standard error in the fit"):
         jj.log_density(Oscillator(), data, free).whitened(jj.fit(Oscillator(), data, free))
+
+
+def test_a_density_is_one_program_which_serves_other_numbers():
+    compiled = []
+    count = lambda name, *_, **__: compiled.append(name) if name.endswith("backend_compile_duration") else None  # noqa: E731
+    densities = [jj.log_density(Oscillator(mass=mass), runs()[0], FREE) for mass in (1.9, 1.8)]
+    z = jnp.array([0.3, -0.2, 0.25])
+    jax.monitoring.register_event_duration_secs_listener(count)
+    first = float(densities[0](z))
+    assert len(compiled) <= 2
+    compiled.clear()
+    assert float(densities[1](z)) != first
+    assert not compiled

@@ -42,6 +42,18 @@ def test_planned_covariance_is_that_of_a_fit():
     assert "mass" in str(found)
 
 
+def test_a_plan_is_one_program_which_serves_other_numbers():
+    compiled = []
+    count = lambda name, *_, **__: compiled.append(name) if name.endswith("backend_compile_duration") else None  # noqa: E731
+    jax.monitoring.register_event_duration_secs_listener(count)
+    told = lambda mass, x: float(jj.planned_information(Cart(mass=mass), plan(x), ("stiffness",)).log_det())  # noqa: E731
+    first = told(1.5, 0.2)
+    assert len(compiled) <= 8
+    compiled.clear()
+    assert told(1.5, 0.4) == pytest.approx(first + np.log(4.0), abs=1e-5)
+    assert not compiled
+
+
 def stated(x):
     """`sum (d x / d stiffness)^2 / sigma^2` of x0 cos(w t)."""
     w = jnp.sqrt(5.0 / 2.0)

@@ -28,8 +28,10 @@ from jourdain_jax.analysis.ranges import Range, bounds, positive
 from jourdain_jax.analysis.starts import check_starts
 from jourdain_jax.analysis.transforms import Transforms
 from jourdain_jax.analysis.unknowns import unknowns_of
+from jourdain_jax.build.reference import Reference
 from jourdain_jax.build.reference_parameters import reference_parameters
 from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import as_names, nearest
@@ -67,17 +69,20 @@ class LogDensity(eqx.Module):
 
     def __call__(self, z: Float[Array, "unknowns"]) -> Float[Array, ""]:
         """The logarithm of the density; -inf where the motion fails."""
-        x = self._spread(self._checked(z))
+        return _density(self, self._checked(z), Reference(self.scene))
+
+    def _at(self, z: Float[Array, "unknowns"], reference: Reference) -> Float[Array, ""]:
+        x = self._spread(z)
         inner = self.transforms.constrain(x)
         theta = self._told(inner)
-        known = jnp.where(np.isfinite(self.prior_sigma), (theta - self.prior_mean) / self.prior_sigma, 0.0)
+        known = jnp.where(jnp.isfinite(self.prior_sigma), (theta - self.prior_mean) / self.prior_sigma, 0.0)
         shared = len(self.whitening)
         known = jnp.concatenate([self.whitening @ known[:shared], known[shared:]])
         logs = self.transforms.log_slopes(x)
-        logs = logs - 0.5 * known**2 - jnp.where(np.isfinite(self.prior_sigma), jnp.log(self.prior_sigma * jnp.sqrt(2 * jnp.pi)), 0.0)
+        logs = logs - 0.5 * known**2 - jnp.where(jnp.isfinite(self.prior_sigma), jnp.log(self.prior_sigma * jnp.sqrt(2 * jnp.pi)), 0.0)
         # of a sigma: flat in its logarithm, which is x
         count, end = len(self.places), len(self.places) + len(self.sigmas)
-        logs = jnp.sum(logs[:count]) + jnp.sum(logs[end:]) + jnp.sum(jnp.log(jnp.diagonal(self.factor))) + np.linalg.slogdet(self.whitening)[1]
+        logs = jnp.sum(logs[:count]) + jnp.sum(logs[end:]) + jnp.sum(jnp.log(jnp.diagonal(self.factor))) + jnp.linalg.slogdet(self.whitening)[1]
         shared, local = self._split(theta)
         scene, sigma = self.layout.scene(self.scene, shared), dict(zip(self.sigmas, theta[count:end], strict=True))
         tau = dict(zip(self.with_memory, theta[end:], strict=True))
@@ -88,7 +93,7 @@ class LogDensity(eqx.Module):
             memory = here.correlation_time | {name: tau[name] for name in here.correlation_time if name in tau}
             return of_run(scene, here._replace(weights=weights, correlation_time=memory), simulation=self.simulation)
 
-        with reference_parameters(self.scene):
+        with reference.stands_in():
             return logs + sum(jnp.sum(mapped(one, group, local[np.array(runs)])) for group, runs in zip(self.groups, self.runs, strict=True))
 
     @property
@@ -175,6 +180,9 @@ class LogDensity(eqx.Module):
         shared, local = self.layout.sizes
         every = jnp.asarray(self.fixed).at[np.array(self.places, int)].set(theta[: len(self.places)])
         return every[:shared], every[shared:].reshape(-1, local) if local else jnp.zeros((sum(map(len, self.runs)), 0))
+
+
+_density = quickly_compiled(LogDensity._at)
 
 
 @shown_from_users_lines

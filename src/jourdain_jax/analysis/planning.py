@@ -16,15 +16,18 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood import as_runs
 from jourdain_jax.analysis.measurements import Measurements
-from jourdain_jax.analysis.predictions import run_of
+from jourdain_jax.analysis.predictions import Run, run_of
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
-from jourdain_jax.build.reference_parameters import reference_parameters, with_reference_parameters
+from jourdain_jax.build.reference import Reference
+from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.forward_mode import simulate_forward
+from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
 from jourdain_jax.scene.printing import Printed
@@ -43,8 +46,7 @@ class PlannedInformation(Printed, eqx.Module):
     @property
     def covariance(self) -> Float[Array, "unknowns unknowns"]:
         """F^-1. Entries grow beyond all bounds where a combination of unknowns does not show."""
-        scale = 1 / jnp.sqrt(jnp.where(jnp.diagonal(self.matrix) > 0, jnp.diagonal(self.matrix), 1.0))
-        return scale[:, None] * jnp.linalg.inv(scale[:, None] * self.matrix * scale) * scale
+        return _inverse(self.matrix)
 
     @property
     def standard_errors(self) -> dict[str, Float[Array, ""]]:
@@ -60,13 +62,25 @@ class PlannedInformation(Printed, eqx.Module):
         for name in asked:
             if name not in self.labels:
                 raise UnknownNameError(f"`{name}` is not among the unknowns; {nearest(name, self.labels)}")
-        places = np.array([self.labels.index(name) for name in asked], int)
-        return -jnp.linalg.slogdet(self.covariance[places[:, None], places])[1]
+        return -_log_det(self.matrix, tuple(self.labels.index(name) for name in asked))
 
     def _text(self) -> str:
         rows = [("unknown", "unit", "std. error")]
         rows += [(name, unit, f"{float(e):.3g}") for (name, e), unit in zip(self.standard_errors.items(), self.units, strict=True)]
         return "\n".join([f"Planned: {len(self.sensitivities)} runs, {len(self.labels)} unknowns", *table(rows)])
+
+
+@quickly_compiled
+def _inverse(F: Float[Array, "unknowns unknowns"]) -> Float[Array, "unknowns unknowns"]:
+    scale = 1 / jnp.sqrt(jnp.where(jnp.diagonal(F) > 0, jnp.diagonal(F), 1.0))
+    return scale[:, None] * jnp.linalg.inv(scale[:, None] * F * scale) * scale
+
+
+@quickly_compiled
+def _log_det(F: Float[Array, "unknowns unknowns"], places: tuple[int, ...]) -> Float[Array, ""]:
+    """Of this block of the inverse."""
+    some = np.array(places, int)
+    return jnp.linalg.slogdet(_inverse(F)[some[:, None], some])[1]
 
 
 @shown_from_users_lines
@@ -105,25 +119,32 @@ def planned_information(
             raise ValueError(f"the noise of channel `{name}` has a correlation time, of which a plan knows nothing; leave it out")
     numbers = [eqx.tree_at(lambda r: r.start, run, {n: np.zeros(x.shape) if is_traced(x) else x for n, x in run.start.items()}) for run in runs]
     unknowns = unknowns_of(with_reference_parameters(scene), numbers, free if isinstance(free, Mapping) else tuple(as_names(free)))
-    places, layout = unknowns.estimated, unknowns.layout
-    theta, count = _values(scene, runs, unknowns), layout.sizes[0]
-
-    def residuals(free_ones: Float[Array, "unknowns"]):
-        every = theta.at[places].set(free_ones)
-        moved, local = layout.scene(scene, every[:count]), every[count:].reshape(len(runs), -1)
-        return tuple(
-            run_of(run, jnp).at(layout, every[:count], own).residuals(moved, simulate_forward, simulation) for run, own in zip(runs, local, strict=True)
-        )
-
-    with reference_parameters(scene):
-        J = jax.jacfwd(residuals)(theta[places])
-    flat = jnp.concatenate([of.reshape(-1, len(places)) for run in J for of in run.values()])
+    places, count = unknowns.estimated, unknowns.layout.sizes[0]
+    ready = tuple(run_of(run, jnp if is_traced((run.values, run.sigma)) else np) for run in runs)
+    theta = _values(scene, runs, unknowns)
+    F, J = _sensitivities(scene, ready, theta, simulation, unknowns.layout, tuple(places.tolist()), Reference(scene))
     prior = np.diag(1 / np.where(np.isfinite(unknowns.prior_mean[places]), unknowns.prior_sigma[places], np.inf))
     prior[:count] = unknowns.whitening @ prior[:count]  # all that are shared are estimated
-    return PlannedInformation(flat.T @ flat + prior.T @ prior, J, unknowns.labels, unknowns.units)
+    return PlannedInformation(F + prior.T @ prior, J, unknowns.labels, unknowns.units)
 
 
-def _values(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> Float[Array, "places"]:
+@quickly_compiled
+def _sensitivities(scene: Scene, runs: tuple[Run, ...], theta: Float[Array, "places"], simulation: dict, layout: Layout, places: tuple, reference: Reference):
+    """F without priors, and the sensitivities, of unknowns in these places."""
+    some, count = np.array(places, int), layout.sizes[0]
+
+    def residuals(free_ones: Float[Array, "unknowns"]):
+        every = theta.at[some].set(free_ones)
+        moved, local = layout.scene(scene, every[:count]), every[count:].reshape(len(runs), -1)
+        return tuple(run.at(layout, every[:count], own).residuals(moved, simulate_forward, simulation) for run, own in zip(runs, local, strict=True))
+
+    with reference.stands_in():
+        J = jax.jacfwd(residuals)(theta[some])
+    flat = jnp.concatenate([of.reshape(-1, len(places)) for run in J for of in run.values()])
+    return flat.T @ flat, J
+
+
+def _values(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> Float[Array | np.ndarray, "places"]:
     """All unknowns at the values that the scene and the runs have; those of parameters and starts may be traced."""
     shared, local = unknowns.split(unknowns.guess)
     of_bodies = {label: x for body in unknowns.layout.bodies for label, x in zip(body.labels, body.numbers(scene), strict=True)}
@@ -132,7 +153,8 @@ def _values(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> F
         "sensor": lambda place: place.of(shared),
         "inertia": lambda place: of_bodies[place.name],
     }
-    rows = [jnp.ravel(of_kind[place.kind](place)) for place in unknowns.layout.shared]
+    rows = [of_kind[place.kind](place) for place in unknowns.layout.shared]
     for run, own in zip(runs, local, strict=True):
-        rows += [jnp.ravel(run.start.get(place.name, place.of(own))) for place in unknowns.layout.local]
-    return jnp.concatenate(rows)
+        rows += [run.start.get(place.name, place.of(own)) for place in unknowns.layout.local]
+    xp = jnp if is_traced(rows) else np
+    return xp.concatenate([xp.ravel(x) for x in rows])
