@@ -253,6 +253,9 @@ def cold_starts(quick: bool) -> Iterator[Figure]:
         yield figure("fresh process, lowered / dense", name, ratio, 1.5, 1)
 
 
+LONGEST = 200  # trailers of the chain that is to be built in a minute
+
+
 def growth(quick: bool) -> Iterator[Figure]:
     """Time per evaluation over n of chains of trailers and of pendulums, and their compile time."""
     few, many = (2, 4) if quick else (8, 64)
@@ -275,6 +278,10 @@ def growth(quick: bool) -> Iterator[Figure]:
         complete = len(laps) == 2
         yield figure(f"time per evaluation / n, n = {many} against n = {few}", name, laps[many] / laps[few] if complete else None, 3, 1.5)
         yield figure(f"compile time at n = {many}, s", name, compile_time if complete else None, 60, 15)
+    if not quick:
+        begin = time.perf_counter()
+        jj.simulate(TrailerChain(trailers=LONGEST), t1=1.0).raise_if_failed()
+        yield figure(f"n = {LONGEST}, built and its first motion, s", "trailer-chain", time.perf_counter() - begin, 60, 24)
 
 
 class TabulatedDisc(TiltingDisc):

@@ -129,3 +129,27 @@ def test_pendulum_readings_give_a_joint_prior():
 def test_what_is_no_joint_prior_is_refused(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def test_a_ride_and_the_pendulum_readings_of_a_bicycle_are_one_posterior_within_the_prior():
+    bicycle, ts, names = benchmark_from_measurements("Browser"), np.linspace(0.0, 2.0, 101), ("lean", "steer", "lean_rate", "steer_rate")
+    truth = bicycle.scene.replace(IBxx=1.02 * float(bicycle.scene.IBxx))
+    start = {"rear_spin_rate": 5.0 / float(truth.rR), "lean": 0.02, "lean_rate": 0.1, "steer": 0.0, "steer_rate": 0.0}
+    motion, generator = jj.simulate(truth, start, ts=ts, rtol=1e-8, atol=1e-8), np.random.default_rng(0)
+    values = {name: np.asarray(motion[name]) + 0.002 * generator.normal(size=101) for name in names}
+    ride = jj.Measurements(ts, values, 0.002, start=start, unknown_start=("lean", "lean_rate"))
+    joint = bicycle.joint_prior
+    found = jj.fit(bicycle.scene, ride, joint, rtol=1e-8, atol=1e-8)
+    assert found.converged
+    assert int(found.steps) < 15
+    assert 0.8 < found.reduced_chi_square < 1.3
+    sigma = np.array([prior.sigma for prior in joint.values()])
+    inverse = np.linalg.inv(whitening(list(joint.values())))
+    before = inverse @ inverse.T  # correlations
+    places = [found.labels.index(name) for name in joint]
+    after = found.covariance[np.ix_(places, places)] / np.outer(sigma, sigma)
+    eigenvalues = np.linalg.eigvalsh(before - after)
+    assert eigenvalues[0] > -1e-9  # no combination is told worse than before
+    assert eigenvalues[-1] > 0.5  # some are told far better
+    for name, prior in joint.items():
+        assert abs(float(found[name].value) - prior.mean) < 3 * prior.sigma, name

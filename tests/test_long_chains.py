@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.build import sparse_slopes, structure
+from jourdain_jax.build import structure
 from jourdain_jax.build.assembling import assemble
 from jourdain_jax.build.row_program import row_program
-from jourdain_jax.build.sparse_slopes import Pattern
+from jourdain_jax.calculus import sparse_slopes
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
+from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.models import TrailerChain
 from jourdain_jax.motion import put_on_rows
 from jourdain_jax.motion.native.onto_rows import Rows, written

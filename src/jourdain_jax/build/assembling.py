@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jourdain_jax.build.row_lengths import usual_lengths_of
-from jourdain_jax.build.sparse_slopes import REGULAR, Pattern
+from jourdain_jax.calculus.sparse_slopes import REGULAR, Pattern
 
 ITERATIONS = 25  # of Gauss-Newton, at most
 _DAMPED_ITERATIONS = 60

@@ -18,8 +18,8 @@ from jourdain_jax.build.assembling import ITERATIONS, Assembled, assemble, short
 from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.probed import Probed, generic_inputs
 from jourdain_jax.build.row_lengths import speed_scales
-from jourdain_jax.build.sparse_slopes import Pattern
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
+from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.program.analyticity import CALLS, NONANALYTIC, decided_by, depend_on, passes
 from jourdain_jax.program.derivative import derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes

@@ -24,6 +24,12 @@ def _product_of_rows(w: Writer, a: Value, b: Value, count) -> Value:
     return w.load(w.real, total)
 
 
+def cleared(w: Writer, place: Value, count: int) -> None:
+    """Zeros at so many places from one on."""
+    with w.counted(0, count) as k:
+        w.store(w.number(0.0), place, k)
+
+
 def write_rotated(w: Writer, rows: int, columns: int) -> None:
     """`rotated(B)`: the rows of B made orthogonal in their first `columns` entries; the `rows` entries behind them turn with them."""
     width = rows + columns

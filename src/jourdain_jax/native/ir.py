@@ -257,6 +257,12 @@ class Writer:
         self._declared[name] = f"@{name} = internal constant [{len(texts)} x double] [{', '.join(texts)}]"
         return Value(self, "ptr", f"@{name}")
 
+    def whole_numbers(self, name: str, numbers: Iterable[int]) -> Value:
+        """Whole numbers that stand in the module."""
+        texts = [f"i64 {int(x)}" for x in numbers]
+        self._declared[name] = f"@{name} = internal constant [{len(texts)} x i64] [{', '.join(texts)}]"
+        return Value(self, "ptr", f"@{name}")
+
     def room(self, type: str, count: int = 1) -> Value:
         """Memory for some values, one piece per call of the function."""
         self._count += 1

@@ -19,7 +19,8 @@ import numpy as np
 
 from jourdain_jax.calculus.round_off import EPS, halves, with_bound
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.program.derivative import columns
+from jourdain_jax.calculus.sparse_slopes import Pattern
+from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
 
@@ -165,24 +166,30 @@ def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinat
     moved = {name: n for name, n in coordinates.items() if n in needed}
     if not moved or any(graph.op[n] not in _KNOWN for n in needed):
         return probes
-    slopes = [n for column in columns(graph, rows, moved.values()) for n in column]
+    pattern, slopes = slopes_by_entries(graph, rows, list(moved.values()))
     q = np.stack([np.broadcast_to(near.inputs[name], probes.count) for name in moved])
     exact = dict.fromkeys(moved, np.zeros(()))
-    inverse, moving = np.zeros((probes.count, len(moved), len(rows))), np.arange(probes.count)
+    moving = np.arange(probes.count)
     for turn in range(STEPS + 1):
         here = probes.with_inputs(dict(zip(moved, q, strict=True)), exact)
         found = here(rows)
-        values, J = np.nan_to_num(np.asarray(found)), np.nan_to_num(np.asarray(here(slopes))).reshape(len(moved), len(rows), -1)
-        inverse[moving] = _pseudo_inverses(J[..., moving].transpose(2, 1, 0))
-        step = (inverse[moving] @ values.T[moving, :, None])[..., 0].T
+        values, J = np.nan_to_num(np.asarray(found)), np.nan_to_num(np.asarray(here(slopes))).T
+        step = pattern.shortest(J[moving], values.T[moving], _pseudo_inverses).T
         moves = np.any(np.abs(step) > EPS * np.max(np.abs(q[:, moving]), axis=0), axis=0)
         if turn == STEPS or not moves.any():
             break
         moving = moving[moves]
         q[:, moving] -= step[:, moves] / np.maximum(1.0, np.max(np.abs(step[:, moves]), axis=0))
-    errors = np.einsum("pqr,rp->qp", np.abs(inverse), np.abs(values) + found.error) + EPS * np.abs(q)
+    errors = np.einsum("pqr,rp->qp", np.abs(_pseudo_inverses(pattern.dense(J))), np.abs(values) + found.error) + EPS * np.abs(q)
     errors[:, ~np.all(np.abs(values) <= CLOSED * found.error, axis=0)] = np.inf
     return probes.with_inputs(dict(zip(moved, q, strict=True)), dict(zip(moved, errors, strict=True)))
+
+
+def slopes_by_entries(graph: Graph, rows: Sequence[int], variables: Sequence[int]) -> tuple[Pattern, list[int]]:
+    """Derivatives of rows with respect to variables: where they are not zero by structure, and their nodes."""
+    place = {n: k for k, n in enumerate(variables)}
+    entries = [(i, place[n], slope) for i, row in enumerate(jacobian(graph, rows, variables)) for n, slope in row.items() if slope != graph.zero]
+    return Pattern.of([(i, k) for i, k, _ in entries], (len(rows), len(place))), [slope for *_, slope in entries]
 
 
 def _pseudo_inverses(J: np.ndarray) -> np.ndarray:

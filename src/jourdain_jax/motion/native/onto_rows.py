@@ -13,11 +13,11 @@ from functools import cached_property
 from typing import Literal
 
 from jourdain_jax.build.row_program import RowProgram
-from jourdain_jax.build.sparse_slopes import REGULAR, Pattern
 from jourdain_jax.calculus.fixed_point import QUIET, ROUND_OFF
+from jourdain_jax.calculus.sparse_slopes import REGULAR, Pattern
 from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVES_OF_SPEEDS
 from jourdain_jax.motion.native.rows_in_band import PLACES, sizes, write_eliminated, write_factors, write_solution
-from jourdain_jax.native.dense import write_cholesky, write_inverted, write_rotated, write_solved, write_triangular
+from jourdain_jax.native.dense import cleared, write_cholesky, write_inverted, write_rotated, write_solved, write_triangular
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.scalar_program import as_real, unsupported
 from jourdain_jax.native.scalar_program import written as program_written
@@ -121,16 +121,11 @@ def _write_values(w: Writer, of: Rows, name: str, nodes: dict[int, int]) -> None
         w.give()
 
 
-def _cleared(w: Writer, place: Value, count: int) -> None:
-    with w.counted(0, count) as k:
-        w.store(w.number(0.0), place, k)
-
-
 def _write_metric(w: Writer, of: Rows) -> None:
     """`metric(state, L, c)`: scales of the speeds, and the Cholesky factor of the mass matrix in scaled speeds; the identity among speeds that are held."""
     n, first_free = len(of.moving), len(of.given)
     with w.function("metric", "void", {"state": "ptr", "L": "ptr", "c": "ptr"}, attributes="noinline") as (state, L, c):
-        _cleared(w, L, n * n)
+        cleared(w, L, n * n)
         w.call("masses", "void", state, L)
         with w.counted(0, n) as i:
             own = w.load(w.real, L, i * n + i)
@@ -150,7 +145,7 @@ def _write_factored(w: Writer, of: Rows) -> None:
     rows, columns, first_free = len(of.residuals), len(of.moving), len(of.given)
     width, first_typical = rows + columns, first_free + columns
     with w.function("factored", "void", dict.fromkeys(("state", "L", "c", "B", "d", "weights"), "ptr"), attributes="noinline") as (state, L, c, B, d, weights):
-        _cleared(w, B, rows * width)
+        cleared(w, B, rows * width)
         w.call("slopes", "void", state, B)
         with w.counted(0, rows) as i:
             row, square = w.at(B, i * width, w.real), w.room(w.real)
@@ -201,11 +196,11 @@ def _write_in_band(w: Writer, of: Rows, pattern: Pattern, regular: float) -> Non
     """`factored` and `moved` as above, of rows whose products lie in a narrow band, where the inverse of these is below `regular`."""
     (rows, columns), first_free, first = pattern.shape, len(of.given), of.given.index(of.moving[0])
     write_eliminated(w, pattern)
+    _write_values(w, of, "slopes", dict(enumerate(of.slopes.values())))
     with w.function("factored", "void", dict.fromkeys(("state", *PLACES), "ptr"), attributes="noinline") as (state, *places):
-        known = {n: w.load(w.real, state, k) for k, n in enumerate(of.given)}
-        slopes = [as_real(w, x) for x in program_written(w, of.program.graph, of.slopes.values(), known)]
-        free = [w.load(w.real, state, first_free + k) for k in range(columns)]
-        write_factors(w, pattern, slopes, free, [w.load(w.real, state, first_free + columns + i) for i in range(rows)], places, regular)
+        w.call("slopes", "void", state, places[PLACES.index("S")])
+        free, typical = (w.at(state, first_free + k, w.real) for k in (0, columns))
+        write_factors(w, pattern, free, typical, places, regular)
         w.give()
     with w.function("moved", "void", dict.fromkeys(("state", *PLACES, "x"), "ptr"), attributes="noinline") as (state, *places, x):
         left, d = w.room(w.real, rows), places[PLACES.index("d")]

@@ -3,12 +3,13 @@
     x = A' y,   (A A') y = r,   A A' = L D L'          A: scaled rows, zero in what is held
 
 Lanes in which rows are not surely independent take the way of the others (`native/dense.py`), by one-sided rotations; only then is there a dense matrix.
-Source of the estimate of how large the inverse is: as in `build/sparse_slopes.py`.
+Source of the estimate of how large the inverse is: as in `calculus/sparse_slopes.py`.
 """
 
 from collections.abc import Sequence
 
-from jourdain_jax.build.sparse_slopes import Band, Pattern
+from jourdain_jax.calculus.sparse_slopes import Band, Pattern
+from jourdain_jax.native.dense import cleared
 from jourdain_jax.native.ir import Value, Writer
 
 PLACES = ("S", "L", "d", "size", "B", "weights")  # entries, band, scales of rows, how large the inverse is, and what the dense way needs
@@ -44,8 +45,7 @@ def write_eliminated(w: Writer, pattern: Pattern) -> None:
         w.give()
     with w.function("eliminated", "void", {"L": "ptr", "size": "ptr"}, attributes="noinline") as (L, size):
         x = w.room(w.real, n + width)
-        with w.counted(0, n + width) as k:
-            w.store(w.number(0.0), x, k)
+        cleared(w, x, n + width)
         with w.counted(0, n) as k:
             own = column(L, k)
             pivot = w.load(w.real, own)
@@ -70,38 +70,45 @@ def write_eliminated(w: Writer, pattern: Pattern) -> None:
         w.give()
 
 
-def write_factors(
-    w: Writer, pattern: Pattern, slopes: Sequence[Value], free: Sequence[Value], typical: Sequence[Value], places: Sequence[Value], regular: float
-) -> None:
-    """Inside a function: from the entries of the rows to the factors of their band, and of the dense matrix for lanes whose inverse is not below `regular`."""
-    band, (rows, columns) = _band(pattern), pattern.shape
+class _Tables:
+    """Where entries and products are, as numbers in the module: loops over them are compiled in no time, whatever their length."""
+
+    def __init__(self, w: Writer, pattern: Pattern):
+        band = _band(pattern)
+        of = {"rows": pattern.rows, "columns": pattern.columns, "places": band.places, "order": band.order}
+        of |= dict(zip(("first", "second"), band.pairs, strict=True))
+        self._w, self._tables = w, {name: w.whole_numbers(f"{name}_of_band", numbers.tolist()) for name, numbers in of.items()}
+
+    def __call__(self, name: str, k: Value) -> Value:
+        return self._w.load("i64", self._tables[name], k)
+
+
+def write_factors(w: Writer, pattern: Pattern, free: Value, typical: Value, places: Sequence[Value], regular: float) -> None:
+    """Inside a function: from the entries of the rows, at their place, to the factors of their band, and of the dense matrix for lanes whose inverse is not
+    below `regular`.
+    """
+    band, (rows, columns), at = _band(pattern), pattern.shape, _Tables(w, pattern)
     S, L, d, size, B, weights = places
-    held = [w.where(free[k] > 0.0, x, 0.0) for x, k in zip(slopes, pattern.columns, strict=True)]
-    square = [w.number(0.0)] * rows
-    for x, i in zip(held, pattern.rows, strict=True):
-        square[i] = w.fma(x, x, square[i])
-    scales = []
-    for i in range(rows):
-        length = w.larger(w.intrinsic("sqrt", square[i]), typical[i])
+    cleared(w, d, rows)
+    with w.counted(0, len(pattern.rows)) as e:
+        i, held = at("rows", e), w.where(w.load(w.real, free, at("columns", e)) > 0.0, w.load(w.real, S, e), 0.0)
+        w.store(held, S, e)
+        w.store(w.fma(held, held, w.load(w.real, d, i)), d, i)
+    with w.counted(0, rows) as i:
+        length = w.larger(w.intrinsic("sqrt", w.load(w.real, d, i)), w.load(w.real, typical, i))
         there = length > 0.0
-        scales.append(w.where(there, w.number(1.0) / w.where(there, length, 1.0), 1.0))
-        w.store(scales[i], d, i)
-    scaled = [x * scales[i] for x, i in zip(held, pattern.rows, strict=True)]
-    for e, x in enumerate(scaled):
-        w.store(x, S, e)
-    with w.counted(0, band.size) as k:
-        w.store(w.number(0.0), L, k)
-    sums: dict[int, Value] = {}
-    for place, a, b in zip(band.places.tolist(), *(x.tolist() for x in band.pairs), strict=True):
-        sums[place] = w.fma(scaled[a], scaled[b], sums[place]) if place in sums else scaled[a] * scaled[b]
-    for place, x in sums.items():
-        w.store(x, L, place)
+        w.store(w.where(there, w.number(1.0) / w.where(there, length, 1.0), 1.0), d, i)
+    with w.counted(0, len(pattern.rows)) as e:
+        w.store(w.load(w.real, S, e) * w.load(w.real, d, at("rows", e)), S, e)
+    cleared(w, L, band.size)
+    with w.counted(0, len(band.places)) as k:
+        place = at("places", k)
+        w.store(w.fma(w.load(w.real, S, at("first", k)), w.load(w.real, S, at("second", k)), w.load(w.real, L, place)), L, place)
     w.call("eliminated", "void", L, size)
     with w.when(w.any(~(w.load(w.real, size) < regular))):
-        with w.counted(0, rows * (rows + columns)) as k:
-            w.store(w.number(0.0), B, k)
-        for e, (i, k) in enumerate(zip(pattern.rows.tolist(), pattern.columns.tolist(), strict=True)):
-            w.store(w.load(w.real, S, e), B, i * (rows + columns) + k)
+        cleared(w, B, rows * (rows + columns))
+        with w.counted(0, len(pattern.rows)) as e:
+            w.store(w.load(w.real, S, e), B, at("rows", e) * (rows + columns) + at("columns", e))
         with w.counted(0, rows) as i:
             w.store(w.number(1.0), B, i * (rows + columns) + i + columns)
         w.call("rotated", "void", B)
@@ -110,20 +117,19 @@ def write_factors(
 
 def write_solution(w: Writer, pattern: Pattern, places: Sequence[Value], left: Value, x: Value, regular: float) -> None:
     """Inside a function: into x the shortest one with `A x = left`, given the factors."""
-    band, (rows, columns) = _band(pattern), pattern.shape
+    band, (rows, columns), at = _band(pattern), pattern.shape, _Tables(w, pattern)
     S, L, _, size, B, weights = places
-    y = w.room(w.real, rows + band.width)
-    with w.counted(rows, rows + band.width) as k:
-        w.store(w.number(0.0), y, k)
-    for k, row in enumerate(band.order.tolist()):
-        w.store(w.load(w.real, left, row), y, k)
+    y, shares = w.room(w.real, rows + band.width), w.room(w.real, rows)
+    cleared(w, y, rows + band.width)
+    with w.counted(0, rows) as k:
+        w.store(w.load(w.real, left, at("order", k)), y, k)
     w.call("substituted", "void", L, y)
-    shares = dict(zip(band.order.tolist(), (w.load(w.real, y, k) for k in range(rows)), strict=True))
-    found = [w.number(0.0)] * columns
-    for e, (i, k) in enumerate(zip(pattern.rows.tolist(), pattern.columns.tolist(), strict=True)):
-        found[k] = w.fma(w.load(w.real, S, e), shares[i], found[k])
-    for k, value in enumerate(found):
-        w.store(value, x, k)
+    with w.counted(0, rows) as k:
+        w.store(w.load(w.real, y, k), shares, at("order", k))
+    cleared(w, x, columns)
+    with w.counted(0, len(pattern.rows)) as e:
+        k = at("columns", e)
+        w.store(w.fma(w.load(w.real, S, e), w.load(w.real, shares, at("rows", e)), w.load(w.real, x, k)), x, k)
     serves = w.load(w.real, size) < regular
     with w.when(w.any(~serves)):
         other = w.room(w.real, columns)
