@@ -6,7 +6,7 @@ Dense matrices take a time that grows with the cube of the rows, a band one that
 narrow band, matrices are dense. Source: E. Cuthill and J. McKee, Proc. 24th Nat. Conf. ACM (1969) 157, for the order.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -39,6 +39,18 @@ class Pattern:
     def lengths(self, values: np.ndarray) -> np.ndarray:
         """Of all rows, (states, rows)."""
         return np.linalg.norm(self.dense(values), axis=2) if self.band is None else np.sqrt(summed(self.rows, self.shape[0], values**2))
+
+    def shortest(self, values: np.ndarray, right: np.ndarray, inverses: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """The shortest x with `G x = right` at every state; within the band where rows are surely independent, or by the `inverses` of dense matrices."""
+        if self.band is None:
+            return (inverses(self.dense(values)) @ right[..., None])[..., 0]
+        lengths = self.lengths(values)
+        d = 1 / np.where(lengths > 0, lengths, 1.0)
+        scaled = d[:, self.rows] * values
+        y, size = self.band.solved(scaled, np.zeros(len(values)), d * right)
+        found, others = self.transposed_times(scaled, y), ~(size < REGULAR)
+        found[others] = (inverses(self.dense(values[others])) @ right[others, :, None])[..., 0]
+        return found
 
     @cached_property
     def band(self) -> "Band | None":

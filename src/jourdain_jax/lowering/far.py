@@ -3,7 +3,7 @@ rows, since dependent rows have a solution only there.
 """
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from jourdain_jax.build.trace import TracedScene
 from jourdain_jax.lowering.pivots import turns
 from jourdain_jax.program.derivative import columns
 from jourdain_jax.program.evaluate import Probes
+from jourdain_jax.program.identity_test import slopes_by_entries
 
 MANY, FEW = 96, 24  # probes; the latter where there are more coordinates than
 LARGE = 16
@@ -50,12 +51,12 @@ def _on_rows(probes: Probes, rows: list[int], coordinates: list[int]) -> Probes:
     moved = {f"q_{i}": n for i, n in enumerate(coordinates) if n in needed}
     if not moved:
         return probes
-    slopes = [n for column in columns(probes.graph, rows, moved.values()) for n in column]
+    pattern, slopes = slopes_by_entries(probes.graph, rows, list(moved.values()))
     q = np.stack([probes.inputs[name] for name in moved])
     for _ in range(STEPS):
         here = probes.with_inputs(dict(zip(moved, q, strict=True)))
-        values, J = np.nan_to_num(here(rows)), np.nan_to_num(here(slopes)).reshape(len(moved), len(rows), -1)
-        q = q - np.einsum("pqr,rp->qp", np.linalg.pinv(J.transpose(2, 1, 0), rcond=1e-9), values)
+        values, J = np.nan_to_num(here(rows)), np.nan_to_num(here(slopes))
+        q = q - pattern.shortest(J.T, values.T, partial(np.linalg.pinv, rcond=1e-9)).T
         if np.median(np.max(np.abs(values), axis=0)) < CLOSED:
             break
     left = np.max(np.abs(probes.with_inputs(dict(zip(moved, q, strict=True)))(rows)), axis=0)

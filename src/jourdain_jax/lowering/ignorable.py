@@ -48,7 +48,11 @@ def ignorable(scene: Scene, builder: AppellOnGraph, equations: Equations, expect
     groups = [*single, *attitudes]
     held = [i for group in groups if used.isdisjoint(q[list(group)].tolist()) for i in group]
     groups = [group for group in groups if group[0] not in held]
-    for group, counts in zip(groups, surely_changed(groups), strict=True):
-        if not counts and unchanged(group) and regular_at_reference(group):
+    left = [group for group, counts in zip(groups, surely_changed(groups), strict=True) if not counts]
+    together = [i for group in left for i in group]
+    if len(left) > FEW and unchanged(together) and regular_at_reference(together):  # what all of them together change nothing of, none does
+        return tuple(sorted([*held, *together]))
+    for group in left:
+        if unchanged(group) and regular_at_reference(group):
             held += group
     return tuple(sorted(held))

@@ -19,7 +19,7 @@ import numpy as np
 
 from jourdain_jax.calculus.round_off import EPS, halves, with_bound
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.calculus.sparse_slopes import REGULAR, Pattern
+from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.program.derivative import jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
@@ -166,9 +166,7 @@ def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinat
     moved = {name: n for name, n in coordinates.items() if n in needed}
     if not moved or any(graph.op[n] not in _KNOWN for n in needed):
         return probes
-    place = {n: k for k, n in enumerate(moved.values())}
-    entries = [(i, place[n], slope) for i, row in enumerate(jacobian(graph, rows, place)) for n, slope in row.items() if slope != graph.zero]
-    pattern, slopes = Pattern.of([(i, k) for i, k, _ in entries], (len(rows), len(moved))), [slope for _, _, slope in entries]
+    pattern, slopes = slopes_by_entries(graph, rows, list(moved.values()))
     q = np.stack([np.broadcast_to(near.inputs[name], probes.count) for name in moved])
     exact = dict.fromkeys(moved, np.zeros(()))
     moving = np.arange(probes.count)
@@ -176,7 +174,7 @@ def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinat
         here = probes.with_inputs(dict(zip(moved, q, strict=True)), exact)
         found = here(rows)
         values, J = np.nan_to_num(np.asarray(found)), np.nan_to_num(np.asarray(here(slopes))).T
-        step = _shortest(pattern, J[moving], values.T[moving]).T
+        step = pattern.shortest(J[moving], values.T[moving], _pseudo_inverses).T
         moves = np.any(np.abs(step) > EPS * np.max(np.abs(q[:, moving]), axis=0), axis=0)
         if turn == STEPS or not moves.any():
             break
@@ -187,17 +185,11 @@ def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinat
     return probes.with_inputs(dict(zip(moved, q, strict=True)), dict(zip(moved, errors, strict=True)))
 
 
-def _shortest(pattern: Pattern, J: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """`J+ values` at every probe, J by its entries; within the band of `J J'` where that is narrow and rows are surely independent."""
-    if pattern.band is None:
-        return (_pseudo_inverses(pattern.dense(J)) @ values[..., None])[..., 0]
-    lengths = pattern.lengths(J)
-    d = 1 / np.where(lengths > 0, lengths, 1.0)
-    scaled = d[:, pattern.rows] * J
-    y, size = pattern.band.solved(scaled, np.zeros(len(J)), d * values)
-    found, others = pattern.transposed_times(scaled, y), ~(size < REGULAR)
-    found[others] = (_pseudo_inverses(pattern.dense(J[others])) @ values[others, :, None])[..., 0]
-    return found
+def slopes_by_entries(graph: Graph, rows: Sequence[int], variables: Sequence[int]) -> tuple[Pattern, list[int]]:
+    """Derivatives of rows with respect to variables: where they are not zero by structure, and their nodes."""
+    place = {n: k for k, n in enumerate(variables)}
+    entries = [(i, place[n], slope) for i, row in enumerate(jacobian(graph, rows, variables)) for n, slope in row.items() if slope != graph.zero]
+    return Pattern.of([(i, k) for i, k, _ in entries], (len(rows), len(place))), [slope for *_, slope in entries]
 
 
 def _pseudo_inverses(J: np.ndarray) -> np.ndarray:
