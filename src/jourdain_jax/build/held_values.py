@@ -5,17 +5,20 @@
 Then the values cannot contradict each other, but for single configurations.
 """
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jourdain_jax.build.reference_parameters import with_reference_parameters
-from jourdain_jax.build.structure import Structure
+from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
 MOST_STATES = 4  # that are looked at
@@ -29,19 +32,28 @@ def may_contradict(scene: Scene, known: Structure, free_q: Bool[np.ndarray, "coo
         return False
     if of_speeds and not known.affine:
         return True
-    states = slice(0, min(known.random, MOST_STATES))
-    G, A = _slopes(with_reference_parameters(scene), known.times[states], known.coordinates[states])
-    return (of_coordinates and _loses_rank(G, free_q)) or (of_speeds and _loses_rank(A, free_u))
+    return (of_coordinates and _loses_rank(_slopes(scene, "closures"), free_q)) or (of_speeds and _loses_rank(_slopes(scene, "rows"), free_u))
 
 
 def _loses_rank(matrices, free) -> bool:
     return any(np.linalg.matrix_rank(one[:, free]) < np.linalg.matrix_rank(one) for one in matrices)
 
 
-@eval_numpy
-def _slopes(scene: Scene, times, coordinates):
-    def at(t, q):
-        u = jnp.zeros(len(scene.speed_names))
-        return jax.jacfwd(lambda q: closure_residual(scene, t, q))(q), jax.jacfwd(lambda u: velocity_residual(scene, t, q, u))(u)
+@once_per_class
+def _slopes(scene: Scene, of: Literal["closures", "rows"]) -> Float[np.ndarray, "states rows columns"]:
+    """G or A at some states of the domain."""
+    known = structure_of(scene)
+    states = slice(0, min(known.random, MOST_STATES))
+    every = _of_closures if of == "closures" else _of_rows
+    return every(with_reference_parameters(scene), known.times[states], known.coordinates[states])
 
-    return jax.vmap(at)(times, coordinates)
+
+@eval_numpy
+def _of_closures(scene: Scene, times, coordinates):
+    return jax.vmap(lambda t, q: jax.jacfwd(lambda q: closure_residual(scene, t, q))(q))(times, coordinates)
+
+
+@eval_numpy
+def _of_rows(scene: Scene, times, coordinates):
+    u = jnp.zeros(len(scene.speed_names))
+    return jax.vmap(lambda t, q: jax.jacfwd(lambda u: velocity_residual(scene, t, q, u))(u))(times, coordinates)

@@ -33,6 +33,16 @@ def differentiated_as(differentiable: Callable, quick: Callable, kind: Literal["
     return (_forward if kind == "forward" else _reverse)(differentiable, quick, rules)
 
 
+def derivatives_of(function: Callable) -> Rules:
+    """Rules by the function that is differentiated: what `quick` returns then stays the value, also where a derivative is taken."""
+
+    def push(arguments, tangents):
+        moving, fixed = eqx.partition(arguments, jax.tree.map(lambda d: d is not None, tangents, is_leaf=lambda d: d is None))
+        return jax.jvp(lambda moving: function(*eqx.combine(moving, fixed)), (moving,), (tangents,))
+
+    return Rules(lambda *_: True, push)
+
+
 def _forward(differentiable: Callable, quick: Callable, rules: Rules | None) -> Callable:
     def run(*arguments):
         arrays, rest = eqx.partition(arguments, eqx.is_array)

@@ -9,18 +9,15 @@ derivative with it. Rows affine in the speeds are met by one step. Unit norms of
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.fixed_point import fixed_point
-from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
+from jourdain_jax.equations.least_change import least_change
 from jourdain_jax.equations.listed import names_of_position_rows
-from jourdain_jax.equations.reductions import cholesky
 from jourdain_jax.equations.rows import position_residual, velocity_residual
-from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import mass_matrix_at
 from jourdain_jax.scene.scene import Scene
 
@@ -33,6 +30,11 @@ class RowFunctions(NamedTuple):
     closures: Callable  # (scene, t, q) -> g, G
     rows: Callable  # (scene, t, q, u, inputs) -> phi, A
     masses: Callable  # (scene, t, q) -> M
+    parameters: Callable | None = None  # scene -> what the first two may be given in its place
+
+    def given(self, scene: Scene):
+        """What the first two functions are given of a scene."""
+        return scene if self.parameters is None else self.parameters(scene)
 
 
 def closure_residual(scene: Scene, t, q) -> Float[Array, "closures"]:
@@ -73,13 +75,13 @@ def project_positions(
         return _normalised(scene, q)
     free = jnp.ones(q.shape, bool) if free is None else free
 
-    def step(q):
-        residual, G = by.closures(scene, t, q)
-        G = jnp.where(free, G, 0.0)
-        d = row_scale(G, typical)
-        return q - jnp.where(free, pseudo_inverse(d[:, None] * G) @ (d * residual), 0.0)  # what is held does not move by round-off either
+    def step(given, q):
+        at, (free, typical) = given
+        g, G = by.closures(*at, q)
+        return q - least_change(G, g, None, free, typical).x
 
-    return fixed_point(step, q, iterations)
+    prepare = None if by.parameters is None else lambda a: ((by.given(a[0][0]), a[0][1]), a[1])
+    return fixed_point(step, ((scene, jnp.asarray(t)), (free, typical)), q, iterations, prepare)
 
 
 def _normalised(scene: Scene, q: Float[Array, "coordinates"]) -> Float[Array, "coordinates"]:
@@ -115,57 +117,18 @@ def project_speeds(
     """
     if jax.eval_shape(lambda s, q, u: velocity_residual(s, 0.0, q, u), scene, q, u).shape[0] == 0:
         return u
-    if determined:
-        return _determined_speeds((scene, t, q, u, inputs), free=free, typical=typical, by=by)
-    free = jnp.ones(u.shape, bool) if free is None else free
-    M = by.masses(scene, t, q)
-    c = speed_scale(M)
-    M = jnp.where(free[:, None] & free, c[:, None] * M * c, jnp.eye(u.shape[0], dtype=u.dtype))
-    L, _ = cholesky(M)  # the identity where M is singular: then nearest in the scaled speeds
+    free = jnp.ones(u.shape, bool) if free is None else jnp.asarray(free)
+    parameters = by.given(scene)
+    M = None if determined else by.masses(scene, t, q)
 
-    def towards_rows(u):
-        """The residual of rows at u, and the linear function that takes a residual to the change of speeds which removes it."""
-        phi, A = by.rows(scene, t, q, u, inputs)
-        weighted = jax.scipy.linalg.solve_triangular(L, jnp.where(free, A * c, 0.0).T, lower=True).T  # A L'^-1
-        d = row_scale(weighted, typical)
-        P = pseudo_inverse(d[:, None] * weighted, cutoff)
-        return phi, lambda phi: -jnp.where(free, c * jax.scipy.linalg.solve_triangular(L.T, P @ (d * phi), lower=False), 0.0)
+    def change(given, u):
+        (parameters, t, q, inputs, M), (free, typical) = given
+        phi, A = by.rows(parameters, t, q, u, inputs)
+        return least_change(A, phi, M, free, typical, cutoff, determined=determined)
 
-    def step(u):
-        phi, change = towards_rows(u)
-        return u + change(phi)
-
-    if not affine:
-        return fixed_point(step, u, iterations)
-    phi, change = towards_rows(u)
-    u = u + change(phi)
-    return u + jax.lax.stop_gradient(change(by.rows(scene, t, q, u, inputs)[0]))  # round-off, of which no derivative is wanted
-
-
-@eqx.filter_custom_jvp
-def _determined_speeds(state: tuple, *, free, typical, by: RowFunctions) -> Float[Array, "speeds"]:
-    """Speeds on affine rows that determine those which are free; `state`: scene, time, coordinates, speeds, inputs."""
-    return _on_rows(state, free, typical, by)[0]
-
-
-@_determined_speeds.def_jvp
-def _determined_speeds_jvp(primals, tangents, *, free, typical, by):
-    """Of `phi = 0`, as of any root: `du = -A+ dphi`, with the derivative of the rows at speeds that are held."""
-    ((scene, t, q, u, inputs),), ((*along, du, dinputs),) = primals, tangents
-    u, P = _on_rows((scene, t, q, u, inputs), free, typical, by)
-    du = jnp.zeros_like(u) if du is None else jnp.where(free, 0.0, du)
-    tangents = (*along, du, dinputs)
-    moving, fixed = eqx.partition((scene, t, q, u, inputs), jax.tree.map(lambda d: d is not None, tangents, is_leaf=lambda d: d is None))
-    dphi = jax.jvp(lambda moving: by.rows(*eqx.combine(moving, fixed))[0], (moving,), (tangents,))[1]
-    return u, du - P @ dphi
-
-
-def _on_rows(state: tuple, free, typical, by: RowFunctions) -> tuple[Float[Array, "speeds"], Float[Array, "speeds rows"]]:
-    """Those speeds, and what takes a residual of rows to the change of speeds that makes it."""
-    scene, t, q, u, inputs = state
-    A = jnp.where(free, by.rows(scene, t, q, u, inputs)[1], 0.0)
-    d = row_scale(A, typical)
-    P = jnp.where(free[:, None], pseudo_inverse(d[:, None] * A) * d, 0.0)  # what is held does not move by round-off either
-    for _ in range(2):  # once more for round-off
-        u = u - P @ by.rows(scene, t, q, u, inputs)[0]
-    return u, P
+    given = (parameters, jnp.asarray(t), q, inputs, M), (free, typical)
+    if not (affine or determined):
+        return fixed_point(lambda given, u: u - change(given, u).x, given, u, iterations)
+    found = change(given, u)
+    u = u - found.x
+    return u - found.K @ by.rows(*jax.lax.stop_gradient((parameters, t, q, u, inputs)))[0]  # round-off, of which no derivative is wanted

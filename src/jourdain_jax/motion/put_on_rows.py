@@ -15,7 +15,7 @@ from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.structure import closure_lengths, plain_row_lengths, rows_are_affine, usual_rows
-from jourdain_jax.calculus.differentiated_as import differentiated_as
+from jourdain_jax.calculus.differentiated_as import derivatives_of, differentiated_as
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -62,19 +62,26 @@ def _as_arrays(scene: Scene, determined: bool, native: bool) -> Usual:
 usual_sizes = once_per_values(_as_arrays, of_traced=_worked_out)
 
 
-def put_positions(scene: Scene, t, q, free, usual: Usual) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
-    """The coordinates on the geometric rows nearest to q, and what is left of the rows."""
+def put_positions(scene: Scene, t, q, free, usual: Usual, known: tuple | None = None) -> tuple[Float[Array, "coordinates"], Float[Array, "closures"]]:
+    """The coordinates on the geometric rows nearest to q, and what is left of the rows; of what is `known`, both get their derivatives."""
     if usual.program is not None and not usual.program.g:
         return q, jnp.zeros(0, q.dtype)
 
     def by_xla(by: RowFunctions, scene, t, q, free, lengths):
         near_q = project_positions(scene, t, q, free=free, typical=lengths, by=by)
-        return near_q, by.closures(scene, t, near_q)[0]
+        return near_q, by.closures(by.given(scene), t, near_q)[0]
 
     def by_machine_code(rows: Rows):
         return lambda scene, t, q, free, lengths: _put(rows, scene, [t[None], q], free, lengths)
 
-    return _by_either(usual, "positions", False, by_xla, by_machine_code)(scene, jnp.asarray(t), q, free, usual.closures)
+    given = scene, jnp.asarray(t), q, free, usual.closures
+    if known is None:
+        return _by_either(usual, "positions", False, by_xla, by_machine_code)(*given)
+
+    def of_known(_, *given):
+        return by_xla(functions_of_rows(usual), *given)
+
+    return differentiated_as(of_known, lambda known, *_: known, "forward", derivatives_of(of_known))(known, *given)
 
 
 def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Float[Array, "speeds"], Float[Array, "rows"]]:
@@ -85,7 +92,7 @@ def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Float
 
     def by_xla(by: RowFunctions, scene, t, q, u, inputs, free, lengths):
         near_u = project_speeds(scene, t, q, u, inputs, free=free, typical=lengths, affine=affine, determined=determined, by=by)
-        return near_u, by.rows(scene, t, q, near_u, inputs)[0]
+        return near_u, by.rows(by.given(scene), t, q, near_u, inputs)[0]
 
     def by_machine_code(rows: Rows):
         return lambda scene, t, q, u, inputs, free, lengths: _put(rows, scene, [t[None], q, u, inputs], free, lengths)
@@ -94,17 +101,16 @@ def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Float
     return _by_either(usual, kind, affine or determined, by_xla, by_machine_code)(scene, jnp.asarray(t), q, u, inputs, free, usual.rows)
 
 
-def functions_of_positions(usual: Usual) -> RowFunctions:
-    """How geometric rows are evaluated where a derivative, or a search, needs them."""
-    served = usual.program is not None and usual.program.g and not _reason_against(Rows(usual.program, "positions"))
-    return row_functions(usual.program) if served else BY_AUTODIFF
+def functions_of_rows(usual: Usual) -> RowFunctions:
+    """How rows are evaluated where XLA puts something onto them, or a derivative or a search needs them."""
+    return BY_AUTODIFF if usual.program is None else row_functions(usual.program)
 
 
 def _by_either(usual: Usual, kind, affine: bool, by_xla, by_machine_code):
-    rows = None if usual.program is None else Rows(usual.program, kind, affine)
-    if rows is None or _reason_against(rows):
-        return partial(by_xla, BY_AUTODIFF)
-    return differentiated_as(partial(by_xla, row_functions(rows.program)), by_machine_code(rows), "forward")
+    of_rows = partial(by_xla, functions_of_rows(usual))
+    if usual.program is None or _reason_against(rows := Rows(usual.program, kind, affine)):
+        return of_rows
+    return differentiated_as(of_rows, by_machine_code(rows), "forward")
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -115,7 +121,7 @@ def _reason_against(rows: Rows) -> str:
 @lru_cache(maxsize=MOST_KERNELS)
 def _kernel(rows: Rows, given_in: np.dtype):
     count, cutoff = len(rows.moving) + len(rows.residuals), rank_cutoff(given_in)
-    return called(lambda lanes, threads: written(rows, lanes, host.fuses(), threads, cutoff), lambda *_: ((count,),), seldom=True)
+    return called(lambda lanes, threads: written(rows, lanes, host.fuses(), threads, cutoff), lambda *_: ((count,),), effort=1)
 
 
 def _put(rows: Rows, scene: Scene, state: list, free, lengths) -> tuple[Array, Array]:

@@ -8,19 +8,18 @@ Derivatives of higher order are those of the program as XLA runs it.
 
 from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
-from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.equations.projection import BY_AUTODIFF, RowFunctions
 from jourdain_jax.lowering.jacobian import on_its_own
+from jourdain_jax.motion.native import onto_rows
 from jourdain_jax.motion.native.called import nodes_called
-from jourdain_jax.motion.native.onto_rows import MOST_ENTRIES
 from jourdain_jax.motion.native.seen import entries
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.derivative import jacobian
@@ -29,50 +28,44 @@ from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.scene.scene import Scene
 
 MOST_KEPT = 64
-LARGEST_PROGRAM = 20_000  # operations of values and derivatives
+LARGEST_PROGRAM = 20_000  # operations of values and derivatives; machine code of so many takes 0.7 MB of the stack, and 0.15 s to make
 
 
 @lru_cache(maxsize=MOST_KEPT)
 def row_functions(program: RowProgram) -> RowFunctions:
-    """g and G, phi and A, and M, by the program; of large scenes by autodiff, since machine code has a Jacobian on the stack."""
-    closures, rows, coordinates, speeds = map(len, (program.g, program.phi, program.q, program.u))
-    known = sum(n >= 0 for leaf in program.parameters for n in leaf) + 1 + coordinates
+    """g and G, phi and A, and M, by the program; of what is no machine code, by autodiff."""
+    nodes = [*program.g, *program.G.values(), *program.phi, *program.A.values(), *(program.M or {}).values()]
+    if unsupported(program.graph, nodes) or program.graph.operations(nodes) > onto_rows.LARGEST_PROGRAM:
+        return BY_AUTODIFF
+    rows, speeds = len(program.phi), len(program.u)
+    closures, coordinates = len(program.g), len(program.q)
+    parameters = [n for leaf in program.parameters for n in leaf if n >= 0]
+    at = [*parameters, program.t, *program.q]
+    of_closures = _function(program.graph, _places(program.g, program.G, coordinates), closures * (1 + coordinates), at)
+    of_rows = _function(program.graph, _places(program.phi, program.A, speeds), rows * (1 + speeds), [*at, *program.u, *program.inputs])
+    M = {key: node for (i, k), node in (program.M or {}).items() for key in ((i, k), (k, i))}
+    of_masses = _function(program.graph, _places((), M, speeds), speeds**2, at)
 
-    def closures_at(scene: Scene, t, q):
-        found = _of_program(program, "closures")(_given(program, scene, t, q))
+    def parameters_of(scene: Scene):
+        found = entries(scene, program.parameters)
+        return jnp.concatenate(found) if found else jnp.zeros(0, real_type())
+
+    def together(given, t, *vectors):
+        first = parameters_of(given) if isinstance(given, Scene) else given
+        return jnp.concatenate([jnp.asarray(x, real_type()) for x in (first, jnp.asarray(t)[None], *vectors)])
+
+    def closures_at(given, t, q):
+        found = of_closures(together(given, t, q))
         return found[:closures], found[closures:].reshape(closures, coordinates)
 
-    def rows_at(scene: Scene, t, q, u, inputs):
-        found = _of_program(program, "rows")(_given(program, scene, t, q, u, inputs))
+    def rows_at(given, t, q, u, inputs):
+        found = of_rows(together(given, t, q, u, inputs))
         return found[:rows], found[rows:].reshape(rows, speeds)
 
-    def masses_at(scene: Scene, t, q):
-        return _of_program(program, "masses")(_given(program, scene, t, q)).reshape(speeds, speeds)
+    def masses_at(given, t, q):
+        return of_masses(together(given, t, q)).reshape(speeds, speeds)
 
-    return RowFunctions(
-        closures_at if closures * (1 + coordinates) * known <= MOST_ENTRIES else BY_AUTODIFF.closures,
-        rows_at if rows * (1 + speeds) * (known + speeds + len(program.inputs)) <= MOST_ENTRIES else BY_AUTODIFF.rows,
-        masses_at if program.M is not None and speeds**2 * known <= MOST_ENTRIES else BY_AUTODIFF.masses,
-    )
-
-
-def _given(program: RowProgram, scene: Scene, t, *vectors) -> Float[Array, "given"]:
-    parts = *entries(scene, program.parameters), jnp.asarray(t)[None], *vectors
-    return jnp.concatenate([jnp.asarray(x, real_type()) for x in parts])
-
-
-@lru_cache(maxsize=MOST_KEPT)
-def _of_program(program: RowProgram, what: Literal["closures", "rows", "masses"]) -> Callable[[Array], Array]:
-    """A vector and a matrix after it, or a matrix, of what is `_given`."""
-    at = [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q]
-    if what == "closures":
-        columns = len(program.q)
-        return _function(program.graph, _places(program.g, program.G, columns), len(program.g) * (1 + columns), at)
-    columns = len(program.u)
-    if what == "rows":
-        return _function(program.graph, _places(program.phi, program.A, columns), len(program.phi) * (1 + columns), [*at, *program.u, *program.inputs])
-    M = {key: node for (i, k), node in (program.M or {}).items() for key in ((i, k), (k, i))}
-    return _function(program.graph, _places((), M, columns), columns**2, at)
+    return RowFunctions(closures_at, rows_at, masses_at if program.M is not None else BY_AUTODIFF.masses, parameters_of)
 
 
 def _places(vector: Sequence[int], matrix: dict[tuple[int, int], int], columns: int) -> dict[int, int]:
@@ -81,42 +74,50 @@ def _places(vector: Sequence[int], matrix: dict[tuple[int, int], int], columns: 
 
 
 def _function(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
-    """Values of nodes, at their places among so many numbers, as a function of the values of the variables."""
+    """Values of nodes, at their places among so many numbers that are zero otherwise, as a function of the values of the variables."""
     graph, nodes, variables = on_its_own(graph, list(places.values()), variables)
     places = dict(zip(places, nodes, strict=True))
-    slopes = cache(lambda: _slopes(graph, places, size, variables))  # derived when the first derivative is asked for
-    by_xla, by_machine_code = _by_xla(graph, places, size, variables), nodes_called(graph, places, size, variables)
+    slopes = cache(lambda: _slopes(graph, places, variables))  # derived when the first derivative is asked for
 
     def push(arguments, along):
         (x,), (dx,) = arguments, along
-        return values(x), slopes()(x) @ dx
+        J, rows = slopes()
+        return values(x), jnp.zeros(size, dx.dtype).at[rows].set(J(x) @ dx, unique_indices=True, indices_are_sorted=True)
 
-    values = differentiated_as(by_xla, by_machine_code, "forward", Rules(lambda *_: slopes() is not None, push))
+    values = differentiated_as(*_ways(graph, places, size, variables), "forward", Rules(lambda *_: slopes() is not None, push))
     return values
 
 
-def _slopes(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array] | None:
-    """J as a function of the variables; None where it is too large, or no machine code."""
-    count, nodes = len(variables), list(places.values())
+def _slopes(graph: Graph, places: dict[int, int], variables: Sequence[int]) -> tuple[Callable[[Array], Array], np.ndarray] | None:
+    """Those rows of J that are not zero, as a function of the variables, and their places; None where it is too large, or no machine code."""
     try:
-        rows = jacobian(graph, nodes, variables)
+        slopes = dict(zip(places, jacobian(graph, places.values(), variables), strict=True))
     except Unsupported:
         return None
-    entries = {i * count + j: row[n] for i, row in zip(places, rows, strict=True) for j, n in enumerate(variables) if n in row}
+    rows = sorted(place for place, row in slopes.items() if row)
+    entries = {i * len(variables) + j: slopes[place][n] for i, place in enumerate(rows) for j, n in enumerate(variables) if n in slopes[place]}
     found = list(entries.values())
-    if unsupported(graph, found) or graph.operations([*nodes, *found]) > LARGEST_PROGRAM:
+    if unsupported(graph, found) or graph.operations([*places.values(), *found]) > LARGEST_PROGRAM:
         return None
-    of_all = graph, entries, size * count, variables
-    values = differentiated_as(_by_xla(*of_all), nodes_called(*of_all), "forward")
-    return lambda x: values(x).reshape(size, count)
+    values = differentiated_as(*_ways(graph, entries, len(rows) * len(variables), variables), "forward")
+    return lambda x: values(x).reshape(len(rows), len(variables)), np.array(rows, int)
 
 
-def _by_xla(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
-    where = np.array(list(places), int)
+def _ways(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> tuple[Callable, Callable]:
+    """Values of nodes at their places, as a function of the values of the variables: by XLA, and by machine code.
 
-    def of(x):
-        found = run(graph, places.values(), dict(zip(variables, x, strict=True)))
-        zeros = jnp.zeros(size, x.dtype)
-        return zeros.at[where].set(jnp.stack([jnp.asarray(value, x.dtype) for value in found]), unique_indices=True) if found else zeros
+    Machine code returns the numbers that are not zero: a whole matrix of 32 trailers lay beyond the end of its stack.
+    """
+    nodes = list(dict.fromkeys(places.values()))
+    number = {n: k for k, n in enumerate(nodes)}
+    which = np.full(size, len(nodes))
+    which[list(places)] = [number[n] for n in places.values()]
+    kernel = nodes_called(graph, nodes, variables, effort=0)
 
-    return of
+    def placed(found, x):
+        return jnp.concatenate([*found, jnp.zeros(1, x.dtype)])[which]
+
+    def by_xla(x):
+        return placed((jnp.asarray(value, x.dtype)[None] for value in run(graph, nodes, dict(zip(variables, x, strict=True)))), x)
+
+    return by_xla, lambda x: placed([kernel(x)], x)

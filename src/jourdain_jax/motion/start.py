@@ -28,7 +28,7 @@ from jourdain_jax.equations.projection import closure_residual, project_position
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs, inputs_at
-from jourdain_jax.motion.put_on_rows import Usual, functions_of_positions, put_positions, put_speeds, usual_sizes
+from jourdain_jax.motion.put_on_rows import Usual, functions_of_rows, put_positions, put_speeds, usual_sizes
 from jourdain_jax.motion.quick_compilation import RUN_SELDOM, nothing_is_traced, quickly_compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
@@ -185,18 +185,22 @@ def _can_search(scene: Scene) -> bool:
 def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: Usual, guesses) -> Found:
     """q and u on the constraints; no search where `guesses` is None."""
     q, u, free = jnp.asarray(q), jnp.asarray(u), jnp.asarray(free_q)
-    (near_q, g), guess = put_positions(scene, t, q, free, usual), jnp.zeros((), jnp.int32)
-    arrived = _arrived(q, near_q, g, usual)
+    given_q = q
+    here, at, begin = jax.lax.stop_gradient((scene, t, q))
+    near_q, g = put_positions(here, at, begin, free, usual)
+    arrived, found = _arrived(begin, near_q, g, usual), _Put(near_q, g, jnp.zeros((), jnp.int32), begin, jnp.array(True))
     if guesses is not None and _can_search(scene):
-        lost = jax.lax.stop_gradient(~arrived)
-        other_q, other = jax.lax.cond(eqxi.unvmap_any(lost), lambda: _searched(scene, t, q, free, usual, guesses), lambda: (near_q, guess))
-        other_g = functions_of_positions(usual).closures(scene, t, other_q)[0]
-        better = lost & (_left(other_g) <= _left(g))
-        near_q, g, guess = (jnp.where(better, *pair) for pair in ((other_q, near_q), (other_g, g), (other, guess)))
+        other = jax.lax.cond(eqxi.unvmap_any(~arrived), lambda: _searched(here, at, begin, free, usual, jax.lax.stop_gradient(guesses)), lambda: found)
+        better = ~arrived & (_left(other.g) <= _left(g))
+        found = jax.tree.map(lambda x, y: jnp.where(better, x, y), other, found)
+        q = jnp.where(better & free, found.begin, q)
+    # derivatives are those of Newton's method from where it began; where the rows cannot be met, they would run away
+    near_q, g = put_positions(scene, t, q, free, usual, (found.q, found.g))
+    near_q, guess = jnp.where(found.met, near_q, q), found.guess
     near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(free_u), usual)
     left = jnp.concatenate([g, phi])
     finite = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left])))
-    moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - q, near_u - u, left))
+    moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - given_q, near_u - u, left))
     names = scene.coordinate_names, scene.speed_names
     state = State(jnp.asarray(t), near_q, near_u, moved_q, moved_u, jnp.where(finite, residual, jnp.inf), names, guess.astype(q.dtype))
     return Found(state, arrived)
@@ -214,22 +218,32 @@ def _arrived(q, near_q, g, usual: Usual) -> Bool[Array, ""]:
     return jax.lax.stop_gradient(close & (_left(g) == 0))
 
 
-def _searched(scene: Scene, t, q, free, usual: Usual, guesses) -> tuple[Float[Array, "coordinates"], Int[Array, ""]]:
-    """Coordinates from the first guess that leads to the rows, q itself counting as the first; and its number."""
+class _Put(NamedTuple):
+    """Coordinates put onto the rows, without derivatives."""
+
+    q: Float[Array, "coordinates"]
+    g: Float[Array, "closures"]
+    guess: Int[Array, ""]
+    begin: Float[Array, "coordinates"]  # where Newton's method began
+    met: Bool[Array, ""]  # whether it was worth while
+
+
+def _searched(scene: Scene, t, q, free, usual: Usual, guesses) -> _Put:
+    """Coordinates from the first guess that leads to the rows, q itself counting as the first."""
     size = jnp.where(free, jnp.asarray(usual.width, q.dtype), 0.0)
-    here, still, at = jax.lax.stop_gradient((q, scene, t))
-    every = jnp.where(free, jnp.concatenate([here[None], guesses]), here)
-    by = functions_of_positions(usual)
-    G = jax.vmap(lambda q: by.closures(still, at, q)[1])(every)
-    every = jnp.where(jnp.any(G != 0, axis=(0, 1)), every, here)  # coordinates that no row depends on stay
+    every = jnp.where(free, jnp.concatenate([q[None], guesses]), q)
+    by = functions_of_rows(usual)
+    given = by.given(scene)
+    G = jax.vmap(lambda q: by.closures(given, t, q)[1])(every)
+    every = jnp.where(jnp.any(G != 0, axis=(0, 1)), every, q)  # coordinates that no row depends on stay
     d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
     tolerance = 16 * float(jnp.finfo(q.dtype).eps)
-    found = jax.vmap(lambda guess: damped_root(lambda q: d * by.closures(still, at, q)[0], guess, size, tolerance))(every)
+    found = jax.vmap(lambda guess: damped_root(lambda q: d * by.closures(given, t, q)[0], guess, size, tolerance))(every)
     good = found.left <= float(jnp.finfo(q.dtype).eps) ** 0.5
     guess = jnp.where(jnp.any(good), jnp.argmax(good), jnp.argmin(found.left)).astype(jnp.int32)
     begin = jnp.where(free, found.x[guess], q)
-    # derivatives come from the last steps of Newton's method; where the rows cannot be met, those would run away
-    return jnp.where(good[guess], project_positions(scene, t, begin, free=free, typical=usual.closures, by=by), begin), guess
+    near_q = jnp.where(good[guess], put_positions(scene, t, begin, free, usual)[0], begin)
+    return _Put(near_q, by.closures(given, t, near_q)[0], guess, begin, good[guess])
 
 
 def _tolerance(dtype) -> float:

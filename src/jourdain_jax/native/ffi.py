@@ -173,11 +173,11 @@ def _write_rounded(w: Writer) -> None:
 
 
 @functools.cache
-def registered(text: str, seldom: bool = False) -> str:
-    """The name under which JAX calls the handler of a module of LLVM IR; `seldom`: as in `host.object_code`."""
-    name = f"jourdain_jax_{hashlib.sha256(f'{host.description()} {seldom} {text}'.encode()).hexdigest()[:24]}"
+def registered(text: str, effort: int = 2) -> str:
+    """The name under which JAX calls the handler of a module of LLVM IR; `effort`: as of `host.object_code`."""
+    name = f"jourdain_jax_{hashlib.sha256(f'{host.description()} {effort} {text}'.encode()).hexdigest()[:24]}"
     capsule = ctypes.pythonapi.PyCapsule_New
     capsule.restype, capsule.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
-    code = disk.kept(name, lambda: host.object_code(text, seldom))
+    code = disk.kept(name, lambda: host.object_code(text, effort))
     jax.ffi.register_ffi_target(name, capsule(host.address(code, HANDLER), b"xla._CUSTOM_CALL_TARGET", None), platform="cpu")
     return name

@@ -16,7 +16,11 @@ except ImportError:  # an optional dependency
 llvm: Any = binding
 
 _LANES = (("avx512f", 8), ("avx", 4))  # doubles of a register; else 2, as every 64-bit machine has
-EFFORT = 2  # of LLVM, 0 to 3; no number depends on it: nothing here allows LLVM to round differently. 0 takes a fifth of the time to make, but runs slower
+# How much LLVM does, at most; no number depends on it: nothing here allows LLVM to round differently.
+# 2: all that it can, for what runs often.
+# 1: few passes; speeds of a bicycle put onto its rows take 0.51 s to compile in place of 0.84, and 2.4 us per lane in place of 1.6.
+# 0: registers are assigned without a search; 12,000 operations in a row take 0.07 s to compile in place of 0.72 (1) and 1.33 (2), and run at half the speed.
+EFFORT = 2
 _lock = threading.Lock()
 _engines: list = []  # what machine code lives in: as long as the process, which may call it
 
@@ -29,7 +33,7 @@ def reason_against() -> str:
     try:
         llvm.initialize_native_target()
         llvm.initialize_native_asmprinter()
-        _machine(EFFORT)
+        _machine(0)
         libm = ctypes.CDLL(ctypes.util.find_library("m"))
         for name in LIBM:
             llvm.add_symbol(PREFIX + name, ctypes.cast(getattr(libm, name), ctypes.c_void_p).value)
@@ -74,22 +78,21 @@ def description() -> str:
     return f"{EFFORT} {llvm.llvm_version_info} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
 
 
-def object_code(text: str, seldom: bool) -> bytes:
-    """Machine code of a module of LLVM IR; `seldom`: it runs so seldom that most of LLVM's optimisations cost more than they save.
-
-    Measured: speeds of a bicycle put onto its rows take 0.51 s to compile in place of 0.84, and 2.4 us per lane in place of 1.6.
-    """
+def object_code(text: str, effort: int) -> bytes:
+    """Machine code of a module of LLVM IR; `effort`: 0, 1, or 2, as of `EFFORT`."""
+    effort = min(effort, EFFORT)
     with _lock:
+        machine, seldom = _machine(effort), effort < 2
         module = llvm.parse_assembly(text)
         module.triple = llvm.get_process_triple()
-        options = llvm.create_pipeline_tuning_options(speed_level=0 if seldom else EFFORT)
+        options = llvm.create_pipeline_tuning_options(speed_level=0 if seldom else effort)
         options.loop_vectorization = options.slp_vectorization = False
-        builder = llvm.create_pass_builder(_machine(EFFORT), options)
+        builder = llvm.create_pass_builder(machine, options)
         passes = llvm.create_new_module_pass_manager() if seldom else builder.getModulePassManager()
         for add in ("add_sroa_pass", "add_simplify_cfg_pass") if seldom else ():
             getattr(passes, add, lambda: None)()  # older versions of llvmlite have not all of them
         passes.run(module, builder)
-        return _machine(EFFORT).emit_object(module)
+        return machine.emit_object(module)
 
 
 def address(code: bytes, name: str) -> int:

@@ -62,7 +62,7 @@ class IdentityProbes:
         return type(self)(self.graph, self.inputs | dict(changes), self._errors | dict(errors))
 
     def on_graph(self, graph: Graph, names: Mapping[str, str]) -> Self:
-        """The same probes of another graph; `names`: of its inputs, and of those that they stand for."""
+        """These probes, of another graph; `names`: of its inputs, and of those that they stand for."""
         errors = {name: self._errors.get(old, 0.0) for name, old in names.items()}
         return type(self)(graph, {name: self.inputs[old] for name, old in names.items()}, errors, self._radix)
 

@@ -4,7 +4,7 @@ Many lanes run side by side in the widest registers; one by itself runs in narro
 not depend on the width.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 
 import jax
@@ -20,15 +20,15 @@ from jourdain_jax.program.graph import Graph
 ALONE = 2  # places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
 
 
-def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 0, seldom: bool = False) -> Callable:
+def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 0, effort: int = 2) -> Callable:
     """A module of LLVM IR, written for so many lanes and threads, as a function of arrays without lanes; `shapes`: of its results, given the arguments.
 
-    The first arguments are samples, which lanes may share; `seldom`: as in `host.object_code`.
+    The first arguments are samples, which lanes may share; `effort`: as of `host.object_code`.
     """
 
     @cache
     def name(lanes: int) -> str:
-        return ffi.registered(text(lanes, 1 if lanes == ALONE else host.threads()), seldom)
+        return ffi.registered(text(lanes, 1 if lanes == ALONE else host.threads()), effort)
 
     def call(lanes: int, *arguments):
         results = tuple(jax.ShapeDtypeStruct((*arguments[-1].shape[:-1], *shape), arguments[-1].dtype) for shape in shapes(*arguments))
@@ -48,23 +48,20 @@ def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 
     return run
 
 
-def nodes_called(graph: Graph, places: Mapping[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array]:
-    """Values of nodes of a graph, at their places among so many numbers that are zero otherwise, as a function of the values of the variables."""
+def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1) -> Callable[[Array], Array]:
+    """Values of nodes of a graph as a function of the values of the variables."""
 
     def text(lanes: int, threads: int) -> str:
         w = Writer(lanes, host.fuses())
         with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
             known = {n: w.load(w.real, state, k) for k, n in enumerate(variables)}
-            if len(places) < size:
-                with w.counted(0, size) as k:
-                    w.store(w.number(0.0), found, k)
-            for k, value in zip(places, written(w, graph, places.values(), known), strict=True):
+            for k, value in enumerate(written(w, graph, nodes, known)):
                 w.store(as_real(w, value), found, k)
             w.give()
-        write_rows(w, len(variables), size, threads)
+        write_rows(w, len(variables), len(nodes), threads)
         return w.text
 
-    kernel = called(text, lambda *_: ((size,),), seldom=True)
+    kernel = called(text, lambda *_: ((len(nodes),),), effort=effort)
     return lambda x: kernel(x)[0]
 
 

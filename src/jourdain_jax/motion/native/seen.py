@@ -97,7 +97,7 @@ def is_right(program: RowProgram, scene: Scene, t, q) -> Bool[Array, ""]:
 @lru_cache(maxsize=MOST_KERNELS)
 def _kernel_of_right(program: RowProgram):
     given = [*(n for leaf in program.parameters for n in leaf if n >= 0), program.t, *program.q]
-    return nodes_called(program.graph, {0: program.right}, 1, given)
+    return nodes_called(program.graph, [program.right], given)
 
 
 def _seen(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "seen"]:
@@ -112,7 +112,7 @@ def _seen_nodes(program: Lowered) -> list[int]:
 @lru_cache(maxsize=MOST_KERNELS)
 def _kernel_of_seen(program: Lowered):
     count = len(program.independent) + len(program.dependent) + 3
-    return called(lambda lanes, threads: _text_of_seen(program, lanes, threads, count), lambda *_: ((count,),), seldom=True)
+    return called(lambda lanes, threads: _text_of_seen(program, lanes, threads, count), lambda *_: ((count,),), effort=1)
 
 
 def _text_of_seen(program: Lowered, lanes: int, threads: int, count: int) -> str:
@@ -146,7 +146,7 @@ def _needed(program: Lowered) -> tuple[tuple[int, ...], ...]:
 
 @lru_cache(maxsize=MOST_KERNELS)
 def _kernel_of_fixed(program: Lowered):
-    return called(lambda lanes, threads: _text_of_fixed(program, lanes, threads), lambda *_: ((len(program.fixed),),), seldom=True)
+    return called(lambda lanes, threads: _text_of_fixed(program, lanes, threads), lambda *_: ((len(program.fixed),),), effort=1)
 
 
 def _text_of_fixed(program: Lowered, lanes: int, threads: int) -> str:

@@ -1,0 +1,102 @@
+"""The least change that takes the residual of rows away, and its derivative in closed form.
+
+    x = K r:   |D (A x - r)| least, and among such x' M x least          K = C L'^-1 (D A C L'^-1)+ D,   C M C = L L'
+    dx = K (dr - dA x) + K D^-2 K' dA' D^2 (r - A x) + (1 - K A) M^-1 (dA' mu - dM x),   M x = A' mu
+
+C, D: diagonal scales of what moves, and of the rows, which are constants to differentiation; A, M, x: of what is free. The second term counts where rows
+contradict each other. Source: as of `calculus/pseudo_inverse.py`, in the metric M.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
+from jourdain_jax.equations.reductions import cholesky
+from jourdain_jax.equations.scaling import row_scale, speed_scale
+
+
+class Change(NamedTuple):
+    """The change, and the matrix that makes it of the residual, which has no derivative."""
+
+    x: Float[Array, "moving"]
+    K: Float[Array, "moving rows"]
+
+
+def least_change(
+    A: Float[Array, "rows moving"],
+    r: Float[Array, "rows"],
+    M: Float[Array, "moving moving"] | None,
+    free: Bool[Array, "moving"],
+    typical=None,
+    cutoff: float | None = None,
+    *,
+    determined: bool = False,
+) -> Change:
+    """What moves least in the metric `M` (None: that of the coordinates as they are), of what is `free`; the identity where `M` is singular.
+
+    `typical`: lengths of the rows, in the scaled speeds where there is a metric, by which one counts as vanishing (default: none does, unless it is zero).
+    Rows count as dependent below `cutoff` (default: `rank_cutoff`). Differentiable in any mode where the rank does not change.
+    `determined`: rows determine what is free, and can be met, so that the first term of the derivative is all of it.
+    """
+    x, K = _least_change((A, r, M), free=free, typical=jax.lax.stop_gradient(typical), cutoff=cutoff, determined=determined)
+    return Change(x, jax.lax.stop_gradient(K))
+
+
+class _Solved(NamedTuple):
+    change: Change
+    mu: Float[Array, "rows"]
+    d: Float[Array, "rows"]
+    c: Float[Array, "moving"]  # zero for what is held
+    L: Float[Array, "moving moving"] | None
+    definite: Bool[Array, ""] | None
+
+
+def _solved(A, r, M, free, typical, cutoff) -> _Solved:
+    A = jnp.where(free, A, 0.0)
+    if M is None:
+        c, L, definite = free.astype(A.dtype), None, None
+        W = A * c
+    else:
+        c = speed_scale(M)
+        L, definite = cholesky(jnp.where(free[:, None] & free, c[:, None] * M * c, jnp.eye(len(c), dtype=c.dtype)))
+        c = jnp.where(free, c, 0.0)
+        W = jax.scipy.linalg.solve_triangular(L, (A * c).T, lower=True).T
+    d = row_scale(W, typical)
+    P = pseudo_inverse(d[:, None] * W, cutoff)
+    y = P @ (d * r)
+    x, K = (c * y, c[:, None] * P * d) if L is None else (c * _backward(L, y), c[:, None] * _backward(L, P * d))
+    return _Solved(Change(x, K), d * (P.T @ y), d, c, L, definite)
+
+
+def _backward(L, y):
+    return jax.scipy.linalg.solve_triangular(L.T, y, lower=False)
+
+
+@eqx.filter_custom_jvp
+def _least_change(of: tuple, *, free, typical, cutoff, determined) -> Change:
+    A, r, M = of
+    return _solved(A, r, M, free, typical, cutoff).change
+
+
+@_least_change.def_jvp
+def _least_change_jvp(primals, tangents, *, free, typical, cutoff, determined):
+    ((A, r, M),), ((dA, dr, dM),) = primals, tangents
+    (x, K), mu, d, c, L, definite = _solved(A, r, M, free, typical, cutoff)
+    dx = jnp.zeros_like(x)
+    if dr is not None:
+        dx += K @ dr
+    if dA is not None:
+        dx -= K @ (dA @ x)
+    if dA is not None and not determined:
+        dx += K @ (K.T @ (dA.T @ (d**2 * (r - A @ x))) / d**2)
+    if (dA is not None or dM is not None) and not determined:
+        pull = jnp.zeros_like(x)
+        pull = pull if dA is None else pull + dA.T @ mu
+        pull = c * (pull if dM is None else pull - jnp.where(definite, dM @ x, 0.0))
+        moved = c * (pull if L is None else jax.scipy.linalg.cho_solve((L, True), pull))  # M^-1 (dA' mu - dM x)
+        dx += moved - K @ (A @ moved)
+    return Change(x, K), Change(dx, jnp.zeros_like(K))
