@@ -22,6 +22,8 @@ from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import invariants_of
 
+MOST_ENTRIES = 4_000_000  # of square matrices of the coordinates, at once: of 200 trailers at 201 times the derivatives of all poses took more than 23 GB
+
 
 @runtime_checkable
 class Record(Protocol):
@@ -69,7 +71,12 @@ def _mapped(f, record: Record, by_inputs: bool):
         values = f(record.scene, t, q, u, record.inputs.near(t) if by_inputs else record.inputs(t))
         return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan) if eqx.is_inexact_array(x) else x, values)
 
-    return jax.vmap(one)(record.ts, record.q, record.u)
+    count = len(record.ts)
+    at_once = max(1, MOST_ENTRIES // record.q.shape[-1] ** 2)
+    if count <= at_once:
+        return jax.vmap(one)(record.ts, record.q, record.u)
+    block = next(k for k in range(at_once, 0, -1) if count % k == 0)  # without a rest, which would be compiled by itself
+    return jax.lax.map(lambda state: one(*state), (record.ts, record.q, record.u), batch_size=block)
 
 
 _compiled = for_programs(_mapped, by_itself)
