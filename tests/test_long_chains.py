@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_mutants import rewritten
 
 import jourdain_jax as jj
 from jourdain_jax.build import structure
@@ -20,6 +21,7 @@ from jourdain_jax.calculus.sparse_slopes import Pattern
 from jourdain_jax.lowering import ignorable
 from jourdain_jax.models import TrailerChain
 from jourdain_jax.motion import put_on_rows
+from jourdain_jax.motion.native import onto_rows
 from jourdain_jax.motion.native.onto_rows import Rows, written
 from jourdain_jax.native import ffi
 from jourdain_jax.program.evaluate import Probes
@@ -120,6 +122,21 @@ def test_machine_code_in_a_band_puts_lanes_onto_rows_as_by_rotations(kind, monke
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-10)
     assert np.max(np.abs(found[1][0])) < 1e-13
     np.testing.assert_array_equal(found[0][2], state[1 if kind == "positions" else 2][2])
+
+
+@native
+def test_rows_in_a_band_are_no_numbers_where_memory_is_lost(monkeypatch):
+    scene = TrailerChain(trailers=33)
+    rows = Rows(row_program(scene), "positions")
+    monkeypatch.setattr(onto_rows, "_write_row", rewritten(onto_rows._write_row, "-(entries * w.lanes * 8 // -64) * 64", "1 << 60"))
+    put_on_rows._kernel.cache_clear()
+    q = scene.coordinates.reference()
+    given = [jnp.zeros(1), jnp.asarray(q), jnp.ones(len(q)), jnp.zeros(len(rows.residuals))]
+    found, left = put_on_rows._put(rows, scene, given[:2], *given[2:])
+    put_on_rows._kernel.cache_clear()
+    assert rows.in_band is not None
+    assert np.isnan(found).all()
+    assert np.isnan(left).any()
 
 
 @native

@@ -224,26 +224,34 @@ def _write_row(w: Writer, of: Rows) -> None:
         x, entries = w.room(w.real, columns), rows * (rows + columns)
         if of.in_band is None:
             n = columns if of.metric is not None else 0
-            factors = [w.room(w.real, max(count, 1)) for count in (n * n, n, entries, rows, rows)]
+            _write_putting(w, of, first, state, [w.room(w.real, max(count, 1)) for count in (n * n, n, entries, rows, rows)], x)
         else:  # memory that nothing is written to costs next to nothing
             dense = w.external("aligned_alloc", "ptr", w.literal(64, "i64"), w.literal(-(entries * w.lanes * 8 // -64) * 64, "i64"))
-            factors = [dense if count is None else w.room(w.real, count) for count in sizes(of.in_band)]
-        if of.metric is not None:
-            w.call("metric", "void", state, *factors[:2])
-        if of.affine:
-            w.call("factored", "void", state, *factors)
-            for _ in range(2):
-                w.call("moved", "void", state, *factors, x)
-                with w.counted(0, columns) as k:
-                    w.store(w.load(w.real, x, k), state, k + first)
-        else:
-            _write_iteration(w, of, first, (state, *factors, x))
+            there = w.converted("ptrtoint", dense, "i64").differs(0)
+            with w.when(there):
+                _write_putting(w, of, first, state, [dense if count is None else w.room(w.real, count) for count in sizes(of.in_band)], x)
+            with w.when(~there), w.counted(0, columns) as k:
+                w.store(w.number(math.nan), state, k + first)
         with w.counted(0, columns) as k:
             w.store(w.load(w.real, state, k + first), found, k)
         w.call("residuals", "void", state, w.at(found, columns, w.real))
         if of.in_band is not None:
             w.external("free", "void", dense)
         w.give()
+
+
+def _write_putting(w: Writer, of: Rows, first: int, state: Value, factors: list[Value], x: Value) -> None:
+    """What moves, put onto the rows in its place."""
+    if of.metric is not None:
+        w.call("metric", "void", state, *factors[:2])
+    if not of.affine:
+        _write_iteration(w, of, first, (state, *factors, x))
+        return
+    w.call("factored", "void", state, *factors)
+    for _ in range(2):
+        w.call("moved", "void", state, *factors, x)
+        with w.counted(0, len(of.moving)) as k:
+            w.store(w.load(w.real, x, k), state, k + first)
 
 
 def _write_iteration(w: Writer, of: Rows, first: int, places: tuple[Value, ...]) -> None:
