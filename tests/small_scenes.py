@@ -101,3 +101,18 @@ class AffineRows(jj.Scene):
         q, u = motion.q, motion.u
         # exp(t) (dx + x dt) is the differential of x exp(t); dy - strength z dx is none, whatever its factor
         return {"growing": u.x_rate + q.x, "sheet": u.y_rate - self.strength * q.z * u.x_rate}
+
+
+class Oscillator(jj.Scene):
+    """`m x'' = - c x' - k x`: mass and stiffness show only in their ratio where nothing else is known."""
+
+    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
+    damping: jnp.ndarray = jj.parameter(0.3, non_negative=True)
+    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
+    coordinates = jj.coordinates("x")
+
+    def bodies(self, t, q):
+        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x),)

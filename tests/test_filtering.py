@@ -5,24 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from small_scenes import Oscillator
 
 import jourdain_jax as jj
-
-
-class Oscillator(jj.Scene):
-    """`m x'' = - c x' - k x`."""
-
-    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
-    damping: jnp.ndarray = jj.parameter(0.3, non_negative=True)
-    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x),)
-
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-13}
 TS = np.array([0.0, 0.2, 0.45, 0.5, 0.9, 1.3, 1.7, 2.0])

@@ -1,26 +1,11 @@
 """The steps that the program of a run takes by itself are those that `minimise` takes, evaluation by evaluation."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import Oscillator
 
 import jourdain_jax as jj
 from jourdain_jax.analysis import problem
-
-
-class Oscillator(jj.Scene):
-    """`m x'' = - c x' - k x`: mass and stiffness show only in their ratio where nothing else is known."""
-
-    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
-    damping: jnp.ndarray = jj.parameter(0.3, non_negative=True)
-    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x),)
 
 
 def _run(damping=0.3) -> jj.Measurements:

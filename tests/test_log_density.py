@@ -4,26 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import Oscillator
 
 import jourdain_jax as jj
 from jourdain_jax.analysis.ranges import bounds, positive, unbounded
 from jourdain_jax.analysis.transforms import Transforms
-
-
-class Oscillator(jj.Scene):
-    """`m x'' = - c x' - k x`."""
-
-    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
-    damping: jnp.ndarray = jj.parameter(0.3, non_negative=True)
-    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x),)
-
 
 TS = np.linspace(0.0, 4.0, 21)
 FREE = {"damping": jj.bounds(0.0, 2.0), "stiffness": jj.Estimate(prior=jj.Normal(5.2, 0.4))}

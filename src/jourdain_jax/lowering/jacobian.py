@@ -65,9 +65,7 @@ def on_its_own(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -
     """The outputs on a new graph whose inputs are the variables: no simplification can look behind these."""
     own = Graph()
     inputs = [own.input(str(k), True) for k in range(len(variables))]
-    new = dict(zip(variables, inputs, strict=True))
-    for node in graph.needed(outputs, new):
-        new[node] = own.const(graph.value[node]) if graph.is_const(node) else own.again(node, [new[a] for a in graph.args[node]], graph)
+    new = own.copied(outputs, graph, dict(zip(variables, inputs, strict=True)))
     return own, [new[n] for n in outputs], inputs
 
 

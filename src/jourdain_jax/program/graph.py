@@ -275,6 +275,13 @@ class Graph:
             return self.array(args, *value)
         return self._node(op, args, value) if op in ARRAYS or op == "entry" else self.call(op, *args)
 
+    def copied(self, nodes: Iterable[int], of: "Graph", known: Mapping[int, int]) -> dict[int, int]:
+        """Nodes of another graph -> nodes of this one, where some are `known`."""
+        nodes, new = list(nodes), dict(known)
+        for node in of.needed(nodes, new):
+            new[node] = self.const(of.value[node]) if of.is_const(node) else self.again(node, [new[a] for a in of.args[node]], of)
+        return new
+
     def calls(self, nodes: Iterable[int]) -> list[int]:
         """The calls that the nodes need."""
         return [n for n in self.reachable(nodes) if self.op[n] == "kept"]

@@ -44,11 +44,7 @@ def with_functions(program: Lowered, functions: tuple[TimeProgram | None, ...]) 
         return f"an input is a function of time without scalar form ({error})"
     power = [] if program.power is None else [program.power]
     outputs = [*program.qdot, *program.ydot, *power, *program.pivots, *program.guards, *program.events, *program.projected_q, *program.projected_u]
-    for node in program.graph.needed(outputs, new):
-        if program.graph.is_const(node):
-            new[node] = graph.const(program.graph.value[node])
-        else:
-            new[node] = graph.again(node, [new[a] for a in program.graph.args[node]], program.graph)
+    new = graph.copied(outputs, program.graph, new)
 
     def on_it(nodes: Iterable[int]) -> tuple[int, ...]:
         return tuple(new[n] for n in nodes)
