@@ -23,19 +23,20 @@ from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Shot
 from jourdain_jax.analysis.profile import FAR_BEYOND
-from jourdain_jax.analysis.weak_directions import weak_combinations
+from jourdain_jax.analysis.weak_directions import CORRELATED, weak_combinations
 from jourdain_jax.build.plausibility import impossible_bodies
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
-CORRELATED = 0.98
+MOST_COINCIDING = 3  # different residuals, which two channels may share by chance
 MOST_COMPARED = 1000  # unknowns
 MOST_INFORMED = 24  # unknowns of which the report says what informs them
 
 
-class Estimated(eqx.Module):
+class Estimated(Printed, eqx.Module):
     """One unknown, in its unit; NaN for what the measurements cannot tell."""
 
     value: Float[np.ndarray, "*repeats"]
@@ -44,8 +45,17 @@ class Estimated(eqx.Module):
     high: Float[np.ndarray, "*repeats"]
     unit: str = eqx.field(static=True)
 
+    def _text(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        if self.value.ndim:
+            return f"{described(self.value)}{unit}: its fields `value`, `standard_error`, `low`, `high` have that shape"
+        if np.isnan(self.low + self.high):
+            return f"{self.value:.6g}{unit}, which the measurements do not tell"
+        error = f"standard error {self.standard_error:.2g}" if np.isfinite(self.standard_error) else "at its bound"
+        return f"{self.value:.6g}{unit}, {error}, 95 % interval [{self.low:.6g}, {self.high:.6g}]"
 
-class ChannelResiduals(eqx.Module):
+
+class ChannelResiduals(Printed, eqx.Module):
     """Residuals of one channel of one run, in units of sigma. Good fits have mean near 0 and rms near 1."""
 
     run: int
@@ -54,6 +64,10 @@ class ChannelResiduals(eqx.Module):
     mean: float
     rms: float
     largest: float  # in magnitude
+
+    def _text(self) -> str:
+        of = f"{self.samples} samples, mean {self.mean:.2g}, rms {self.rms:.3g}, largest {self.largest:.3g}"
+        return f"residuals of `{self.channel}` of run {self.run}, in sigmas: {of}"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,6 +100,9 @@ class Fit(Printed):
     def statistics(self) -> Statistics:
         """What follows from the minimum; each part of it is a property here."""
         return self.work_out()
+
+    def __getstate__(self) -> dict:
+        return vars(self) | {"statistics": self.statistics, "work_out": None}  # what was compiled stays in its process
 
     @property
     def scene(self) -> Scene:
@@ -246,6 +263,8 @@ class Fit(Printed):
             names = ", ".join(f"`{name}`" for name, far in zip(self.labels, self.beyond, strict=True) if far > FAR_BEYOND)
             found.append(f"{names} lies at a bound, which decides its value; all standard errors lose their meaning: widen the bounds")
         found += self.impossible
+        found += self.statistics.too_narrow
+        found += self._twice
         if self.guesses > 1 and self.converged and self.agreeing == 1:
             found.append(f"only one of {self.guesses} first guesses led to this minimum, so there may be a lower one; try more `guesses`, or narrower bounds")
         # chi-square has mean n and variance 2 n
@@ -262,6 +281,18 @@ class Fit(Printed):
                     'errors="runs" gives intervals that allow for it'
                 )
         return tuple(found)
+
+    @property
+    def _twice(self) -> list[str]:
+        """Channels whose residuals are those of another one, or of another run, one sentence each."""
+        found, first = [], {}
+        for run, of_run in enumerate(self.residuals):
+            for name, r in of_run.items():
+                counted = np.round(r[np.isfinite(r)], 6)
+                here, there = f"`{name}` of run {run}", first.setdefault(counted.tobytes(), f"`{name}` of run {run}")
+                if here != there and len(np.unique(counted)) > MOST_COINCIDING:
+                    found.append(f"{there} and {here} hold the same numbers: counted as two measurements, they make intervals too narrow; leave one out")
+        return found
 
     @property
     def autocorrelation(self) -> dict[str, tuple[float, float]]:
