@@ -30,7 +30,7 @@ RESULTS = {
     "Rollout": (lambda: jj.rollout(SLEIGH, {"heading_rate": np.array([0.5, 0.6])}, progress=False, **RUN), "Rollout of ChaplyginSleigh: 2 lanes"),
     "Fit": (fitted, "Fit of ChaplyginSleigh: converged"),
     "Estimated": (lambda: fitted()["offset"], f"{SLEIGH.offset:.3g} m, standard error"),
-    "Profile": (lambda: fitted().profiles(measured())["offset"], f"`offset` = {SLEIGH.offset:.3g} m, profile bounded: ["),
+    "Profile": (lambda: fitted().profiles(measured())["offset"], f"`offset` = {SLEIGH.offset:.3g} m, profile"),
     "Prediction": (lambda: fitted().predict(measured())[0]["x"], "5 samples from 0 to"),
     "ChannelResiduals": (lambda: fitted().residual_summary()[0], "residuals of `heading` of run 0, in sigmas: 5 samples"),
     "SteadyMotion": (lambda: jj.steady(SLEIGH, {"x_rate": 0.5}, held="x_rate"), "steady motion: residual"),

@@ -344,6 +344,8 @@ def test_a_prior_counts_as_a_measurement():
     assert known["mass"].standard_error == pytest.approx(weights.sum() ** -0.5, rel=1e-2)
     assert known["mass"].value == pytest.approx(weights @ [value, 2.005] / weights.sum(), abs=0.05 * error)
     assert known.samples == free.samples
+    assert not known.warnings
+    assert jj.fit(Cart(), data, {"mass": jj.Normal(2.1, 0.01)}).warning.startswith("`mass` lies 9.9 standard deviations from its prior")
 
 
 def test_a_prior_alone_is_an_estimate_with_it():
@@ -592,6 +594,10 @@ def with_input(push) -> jj.Fit:
         ),
         (lambda: jj.log_likelihood(Cart(), run(gain=GAIN)), "`gyro.gain` is to be estimated, but a likelihood needs its value"),
         (lambda: with_input(jj.Actuator(jj.Sampled([0.0, 1.0], [0.0, 1.0]), lag=0.1)), "command of input `push` of run 0 of `Cart` ends at 1 s, before"),
+        (
+            lambda: with_input(jj.Sampled([1.7e9, 1.7e9 + 4.0], [0.0, 1.0])),
+            "is sampled from 1700000000 to 1700000004 s, and the run is from 0 to 4 s, where it",
+        ),
         (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate(per_run=True)}), "`free` asks for a `mass` of each run, but all runs share the scene"),
         (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate((1.0, 2.0))}), r"first guess of `mass` has shape \(2,\), expected \(\)"),
         (

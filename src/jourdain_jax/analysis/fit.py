@@ -144,6 +144,7 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
             "`fit` was called inside jit, vmap or a derivative, but its steps are chosen outside of compiled code. Call it with known numbers; "
             "for many repeats use `fit_batch`, for derivatives of the fit's objective `log_likelihood`."
         )
+    _check_control(control)
     runs = as_runs(scene, data, repeats=repeats)
     _check_choices(runs, loss, errors)
     check_shooting(shooting, runs)
@@ -252,6 +253,15 @@ def _off_bounds(problem: Problem, found: Minimum, limits: Limits, control: Contr
         again = replace(again, steps=found.steps[members] + again.steps, trace=found.trace[members] + again.trace, grown=found.grown[members])
         found = _with_memory(problem, found.lowered(members, again), limits, control)
     return found, told
+
+
+def _check_control(control: Control) -> None:
+    if not 0 < control.cutoff < 1:
+        raise ValueError(f"`cutoff` is {control.cutoff!r}, expected a number between 0 and 1: the share of the largest singular value that counts as zero")
+    if not control.tolerance > 0:
+        raise ValueError(f"`tolerance` is {control.tolerance!r}, expected a number above zero: the step in sigmas that ends the fit")
+    if isinstance(control.most_steps, bool) or not isinstance(control.most_steps, int | np.integer) or control.most_steps < 0:
+        raise ValueError(f"`max_iterations` is {control.most_steps!r}, expected a whole number of steps")
 
 
 def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:

@@ -40,6 +40,7 @@ class Statistics:
     correlation_time: dict[str, Float[np.ndarray, "*repeats"]]
     chi_square: Float[np.ndarray, "*repeats"]
     samples: Int[np.ndarray, "*repeats"]
+    from_prior: Float[np.ndarray, "*repeats unknowns"]  # in standard deviations of the prior; NaN where there is none
     too_narrow: tuple[str, ...]  # which intervals are, near bounds, one sentence each; of one fit
 
 
@@ -94,6 +95,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
         correlation_time={name: one(problem.tau[:, k]) for k, name in enumerate(problem.with_memory)},
         chi_square=np.where(one(fails), np.nan, sum(_sum_of_squares(r, single) for run in white for r in run.values())),
         samples=np.asarray(samples),
+        from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
         too_narrow=tuple(too_narrow),
     )
 
