@@ -306,8 +306,8 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, sampl
     """
     own, unknowns = layout.sizes[1], sum(layout.sizes)
 
-    def lane(common: Float[Array, "shared"], row: Float[Array, "own"]) -> Float[Array, "samples width"]:
-        begin, found = 0, dict.fromkeys(range(len(leaves)))
+    def lane(common: Float[Array, "shared"], row: Float[Array, "own"], x: Float[Array, "unknowns"]) -> Float[Array, "samples width"]:
+        found = dict.fromkeys(range(len(leaves)))
         for vector, kinds in ((common, [(False, False)]), (row, [(True, False), (True, True)])):
             begin = 0
             for kind in kinds:
@@ -319,18 +319,20 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, sampl
 
         def flat(x):
             residuals = run.at(layout, x[own:], x[:own]).residuals(layout.scene(scene, x[own:]), simulate_alongside, simulation)
-            r = jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
-            return r, r
+            return jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
 
         with reference.stands_in():
-            J, r = jax.jacfwd(flat, has_aux=True)(row[begin:])
+            r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)), out_axes=(None, 1))(np.eye(unknowns, dtype=x.dtype))
         return jnp.concatenate([J, r[:, None]], axis=1)
 
-    lanes, told = jax.vmap(lane, (None, 0)), Told.length(unknowns, samples)
+    each, told = jax.vmap(lane, (None, 0, 0)), Told.length(unknowns, samples)
+
+    def lanes(common: Float[Array, "shared"], rows: Float[Array, "lanes own"]) -> Float[Array, "lanes samples width"]:
+        return each(common, *jnp.split(rows, [rows.shape[1] - unknowns], axis=1))
 
     def steps(common: Float[Array, "shared"], row: Float[Array, "own"]) -> Float[Array, "_"]:
-        fixed, x, of_steps = row[: -told - unknowns], row[-told - unknowns : -told], row[-told:]
-        return first_steps(lambda x: lanes(common, jnp.concatenate([fixed, x])[None])[0], x, of_steps)
+        fixed, x, of_steps = jnp.split(row, [row.shape[0] - told - unknowns, row.shape[0] - told])
+        return first_steps(lambda x, common, fixed: each(common, fixed[None], x[None])[0], x, (common, fixed), of_steps)
 
     return quickly_compiled(lanes, jax.jit), sparingly_compiled(steps, loops=1)
 
