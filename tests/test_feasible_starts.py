@@ -203,7 +203,8 @@ def test_guesses_that_are_tried_a_few_at_once_find_what_all_at_once_find(monkeyp
         monkeypatch.setattr(damped, "MOST_ENTRIES", most)
         found[most] = damped.first_root(_circle_and_line, guesses, size, 1e-14, 1e-8)
         nowhere = damped.first_root(lambda x: _circle_and_line(x, -1.0), guesses[3:], size, 1e-14, 1e-8)
-        assert int(nowhere[1]) == 0 and float(nowhere[0].left) > 0.1
+        assert int(nowhere[1]) == 0
+        assert float(nowhere[0].left) > 0.1
     for root, number in found.values():
         assert int(number) == 1  # at the first guess the slopes of the circle vanish
         np.testing.assert_allclose(root.x, -np.sqrt([0.5, 0.5]), rtol=1e-12)
