@@ -24,7 +24,7 @@ from jourdain_jax.analysis.correlated_noise import Chains, whitened
 from jourdain_jax.analysis.first_steps import Told, first_steps, read
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.measurements import Measurements
-from jourdain_jax.analysis.nodes import begin, ended
+from jourdain_jax.analysis.nodes import LAST, NODE, begin, ended
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.calculus.reals import is_traced, real_type
@@ -56,18 +56,23 @@ class Run(NamedTuple):
     correlation_time: dict[str, Float[Array | np.ndarray, ""]]  # s, of channels whose noise has a memory
 
     def residuals(self, scene: Scene, simulate: Callable, simulation: dict) -> dict[str, Float[Array | np.ndarray, "..."]]:
-        """`(reading - value) / sigma` by channel; of a piece of a run also the state at its end."""
+        """`(reading - value) / sigma` by channel; of a piece of a run also what it ends at."""
         inputs = self.inputs
         for drive in self.drives.values():
             inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
         ts = self.ts if self.grid is None else self.grid
         motion = simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, events=False, work=False, **simulation)
         states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
-        found = {}
+        found, filters, place = {}, [], len(scene.coordinate_names) + len(scene.speed_names)
         for name, weight in self.weights.items():
-            sensor = self.sensors.get(name, ideal(name))
-            found[name] = jnp.where(weight > 0, (sensor.shown(sensor.quantity(motion, states), self.grid, self.ts) - self.values[name]) * weight, 0.0)
-        return found | ended(motion, self.start)
+            sensor, at_first = self.sensors.get(name, ideal(name)), None
+            x = sensor.quantity(motion, states)
+            if sensor.has_filter and NODE in self.start:
+                place, at_first = place + x[0].size, self.start[NODE][place : place + x[0].size]
+            shown, y = sensor.shown(x, self.grid, self.ts, at_first)
+            filters += [y] if sensor.has_filter else []
+            found[name] = jnp.where(weight > 0, (shown - self.values[name]) * weight, 0.0)
+        return found | ended(motion, filters, self.start, ts)
 
     def at(self, layout: Layout, shared, local) -> "Run":
         """The run with these unknowns."""
@@ -85,28 +90,33 @@ def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
         sigma, known = data.sigma_of(name, repeats), xp.isfinite(xp.asarray(values))
         weights[name] = xp.where(known & xp.isfinite(sigma), 1.0 / sigma, 0.0)
     measured = {name: xp.where(weights[name] > 0, xp.asarray(values), 0.0) for name, values in data.values.items()}
-    grid = _grid(data.t0, data.ts) if any(sensor.is_late for sensor in data.readings.values()) else None
-    return Run(data.t0, data.ts, grid, measured, weights, data.start, data.inputs, data.readings, data.drives, data.correlation_time)
+    found = Run(data.t0, data.ts, None, measured, weights, data.start, data.inputs, data.readings, data.drives, data.correlation_time)
+    return _on_grid(found, _intervals(found)) if any(sensor.is_late for sensor in data.readings.values()) else found
 
 
-def _grid(t0, ts) -> Float[Array | np.ndarray, "grid"]:
-    """Times at equal intervals from the start to the last sample: the samples' own where these are equal, too; else none longer than their median.
+def _intervals(run: Run) -> int:
+    """How many equal intervals a grid has, from the start to the last sample: the samples' own where these are equal, too; else none longer than their median.
 
-    Of traced times only their number is known: there are two intervals for each of theirs, as if the first sample were at the start.
+    Of traced times only their number is known: there are two intervals for each of theirs, as if the first sample were at the start. A piece has as many up to
+    the next node, and more beyond.
     """
-    count = max(FEWEST_INTERVALS, 2 * (ts.shape[0] - 1))
-    if not is_traced((t0, ts)):
-        span, steps = float(ts[-1] - t0), np.diff(np.asarray(ts, float))
-        needed = span / np.median(steps) if steps.size else 1.0
-        count = round(needed) if abs(needed - round(needed)) < 1e-6 * needed else int(np.ceil(needed))
-        count *= -(-FEWEST_INTERVALS // count)
-    return _equal_intervals(t0, ts[-1], count)
+    t0, ts = run.t0, run.ts
+    if is_traced((t0, ts)):
+        return max(FEWEST_INTERVALS, 2 * (ts.shape[0] - 1))
+    steps, end = np.diff(np.asarray(ts, float)), run.start.get(LAST, ts[-1])
+    needed = float(end - t0) / np.median(steps) if steps.size else 1.0
+    count = round(needed) if abs(needed - round(needed)) < 1e-6 * needed else int(np.ceil(needed))
+    count *= -(-FEWEST_INTERVALS // count)
+    return int(np.ceil(count * float((ts[-1] - t0) / (end - t0)) - 1e-9))
 
 
-def _equal_intervals(t0, t1, count: int) -> Float[Array | np.ndarray, "grid"]:
-    xp = jnp if is_traced((t0, t1)) else np
-    found = xp.asarray(t0 + (t1 - t0) * xp.arange(count + 1) / count, jnp.result_type(float))
-    return xp.concatenate([found[:-1], xp.asarray(t1)[None]])  # the last one without round-off
+def _on_grid(run: Run, count: int) -> Run:
+    """The run with a grid of so many equal intervals up to the last sample; that of a piece goes on for at most one more, so that the next node is on it."""
+    t0, end, last = run.t0, run.start.get(LAST, run.ts[-1]), run.ts[-1]
+    xp = jnp if is_traced((t0, last)) else np
+    until = count if LAST not in run.start or end == last else int(count * float((end - t0) / (last - t0)) + 1e-9)
+    found = xp.asarray(t0 + (end - t0) * xp.arange(count + 1) / until, jnp.result_type(float))
+    return run._replace(grid=xp.where(xp.arange(count + 1) == until, end, found))  # this one without round-off
 
 
 def equal_runs(data: Sequence[Measurements]) -> list[tuple[tuple[int, ...], Run]]:
@@ -371,8 +381,8 @@ def _on_equal_grids(runs: Sequence[Run]) -> Sequence[Run]:
     """The runs with as many intervals in all grids as the longest has."""
     if runs[0].grid is None:
         return runs
-    count = max(run.grid.shape[0] for run in runs if run.grid is not None) - 1
-    return [run._replace(grid=_equal_intervals(run.t0, run.ts[-1], count)) for run in runs]
+    count = max(map(_intervals, runs))
+    return [_on_grid(run, count) for run in runs]
 
 
 def _filled(run: Run, times: int, knots: list[int], axis: int) -> Run:
