@@ -8,6 +8,7 @@ and none can be singular.
 from collections.abc import Sequence
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.motion.start import State
@@ -21,9 +22,8 @@ END = "~end of a piece"  # among its residuals, after all channels
 def begin(scene: Scene, start: dict, t0):
     """What `simulate` begins from: the start of a run; of a later piece its node, which `simulate` puts onto the constraints."""
     if NODE in start:
-        count, nothing = len(scene.coordinate_names), jnp.zeros(())
-        names = scene.coordinate_names, scene.speed_names
-        return State(jnp.asarray(t0), *jnp.split(start[NODE], [count, count + len(scene.speed_names)])[:2], nothing, nothing, nothing, names)
+        (q, u, _), nothing = jnp.split(start[NODE], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)])), jnp.zeros(())
+        return State(jnp.asarray(t0), q, u, nothing, nothing, nothing, (scene.coordinate_names, scene.speed_names))
     return {name: value for name, value in start.items() if name != LAST}
 
 

@@ -22,12 +22,13 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.correlated_noise import Chains, whitened
 from jourdain_jax.analysis.first_steps import Told, first_steps, read
+from jourdain_jax.analysis.grids import grid, intervals
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.nodes import LAST, NODE, begin, ended
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
 from jourdain_jax.build.reference import Reference
-from jourdain_jax.calculus.reals import is_traced, real_type
+from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.motion.forward_mode import simulate_alongside
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.quick_compilation import quickly_compiled, sparingly_compiled
@@ -36,7 +37,6 @@ from jourdain_jax.scene.scene import Scene
 TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
 MOST_LANES = 64
 AHEAD = 4  # groups of lanes that are begun before the first is read
-FEWEST_INTERVALS = 64  # of a motion that is read between its times
 _WHITE, _NONE = np.zeros((1, 1)), np.zeros(0)
 FILLED = 1e-6  # of a run's span: between the times that fill up a short one
 
@@ -91,32 +91,14 @@ def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
         weights[name] = xp.where(known & xp.isfinite(sigma), 1.0 / sigma, 0.0)
     measured = {name: xp.where(weights[name] > 0, xp.asarray(values), 0.0) for name, values in data.values.items()}
     found = Run(data.t0, data.ts, None, measured, weights, data.start, data.inputs, data.readings, data.drives, data.correlation_time)
-    return _on_grid(found, _intervals(found)) if any(sensor.is_late for sensor in data.readings.values()) else found
+    return _on_equal_grids([found])[0] if any(sensor.is_late for sensor in data.readings.values()) else found
 
 
-def _intervals(run: Run) -> int:
-    """How many equal intervals a grid has, from the start to the last sample: the samples' own where these are equal, too; else none longer than their median.
-
-    Of traced times only their number is known: there are two intervals for each of theirs, as if the first sample were at the start. A piece has as many up to
-    the next node, and more beyond.
-    """
-    t0, ts = run.t0, run.ts
-    if is_traced((t0, ts)):
-        return max(FEWEST_INTERVALS, 2 * (ts.shape[0] - 1))
-    steps, end = np.diff(np.asarray(ts, float)), run.start.get(LAST, ts[-1])
-    needed = float(end - t0) / np.median(steps) if steps.size else 1.0
-    count = round(needed) if abs(needed - round(needed)) < 1e-6 * needed else int(np.ceil(needed))
-    count *= -(-FEWEST_INTERVALS // count)
-    return int(np.ceil(count * float((ts[-1] - t0) / (end - t0)) - 1e-9))
-
-
-def _on_grid(run: Run, count: int) -> Run:
-    """The run with a grid of so many equal intervals up to the last sample; that of a piece goes on for at most one more, so that the next node is on it."""
-    t0, end, last = run.t0, run.start.get(LAST, run.ts[-1]), run.ts[-1]
-    xp = jnp if is_traced((t0, last)) else np
-    until = count if LAST not in run.start or end == last else int(count * float((end - t0) / (last - t0)) + 1e-9)
-    found = xp.asarray(t0 + (end - t0) * xp.arange(count + 1) / until, jnp.result_type(float))
-    return run._replace(grid=xp.where(xp.arange(count + 1) == until, end, found))  # this one without round-off
+def _on_equal_grids(runs: Sequence[Run]) -> list[Run]:
+    """The runs on grids of as many intervals as the longest needs."""
+    nodes = [run.start.get(LAST) for run in runs]
+    count = max(intervals(run.t0, run.ts, node) for run, node in zip(runs, nodes, strict=True))
+    return [run._replace(grid=grid(run.t0, run.ts, count, node)) for run, node in zip(runs, nodes, strict=True)]
 
 
 def equal_runs(data: Sequence[Measurements]) -> list[tuple[tuple[int, ...], Run]]:
@@ -198,7 +180,7 @@ class _Group:
     def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None):
         self.indices, self._members, self._runs = indices, members, np.array(indices)
         times, knots = max(run.ts.shape[0] for run in runs), _most_knots(runs)
-        filled = [_filled(run, times, knots, 0 if members is None else 1) for run in _on_equal_grids(runs)]
+        filled = [_filled(run, times, knots, 0 if members is None else 1) for run in (runs if runs[0].grid is None else _on_equal_grids(runs))]
         leaves, treedef = jax.tree.flatten(((scene, simulation), filled[0]))
         # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
         repeated = {id(x) for part in (filled[0].values, filled[0].weights) for x in part.values()} if members is not None else set()
@@ -375,14 +357,6 @@ def _without_knots(inputs):
 def _most_knots(runs: Sequence[Run]) -> list[int]:
     counts = [[x.ts.shape[0] for x in jax.tree.leaves((run.inputs, run.drives), is_leaf=_is_sampled) if _is_sampled(x)] for run in runs]
     return [max(column) for column in zip(*counts, strict=True)]
-
-
-def _on_equal_grids(runs: Sequence[Run]) -> Sequence[Run]:
-    """The runs with as many intervals in all grids as the longest has."""
-    if runs[0].grid is None:
-        return runs
-    count = max(map(_intervals, runs))
-    return [_on_grid(run, count) for run in runs]
 
 
 def _filled(run: Run, times: int, knots: list[int], axis: int) -> Run:

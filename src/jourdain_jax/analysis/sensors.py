@@ -42,9 +42,10 @@ class Sensor(eqx.Module):
 
     Each number may be an `Estimate`. By default an estimated lag is positive, gain and bias may be any number; a delay needs `range=jj.bounds(low, high)`.
 
-    With a delay or a lag, a motion (a piece of one, with `shooting`) is worked out at equal intervals, 64 or more and none longer than the median interval of the
-    samples, and read between them by polynomials of degree 5: with intervals h and an angular frequency w, to 0.02 (w h)^6 of the amplitude. Where the slope of the quantity jumps by J
-    (a speed under a force that steps), the error nearby is up to 0.26 J h; where its second derivative jumps by J, up to 0.08 J h^2.
+    With a delay or a lag, a motion (a piece of one, with `shooting`) is worked out at equal intervals, 64 or more and none longer than the median interval of
+    the samples, and read between them by polynomials of degree 5: with intervals h and an angular frequency w, to 0.02 (w h)^6 of the amplitude. Where the
+    slope of the quantity jumps by J (a speed under a force that steps), the error nearby is up to 0.26 J h; where its second derivative jumps by J, up to
+    0.08 J h^2.
 
     Inside `jit`, where times are not known, there are two intervals for each of the samples: take the first sample at or near `t0`.
 

@@ -17,9 +17,9 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Int
 
+from jourdain_jax.analysis.grids import FEWEST_INTERVALS
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.nodes import LAST, NODE
-from jourdain_jax.analysis.predictions import FEWEST_INTERVALS
 from jourdain_jax.analysis.sensors import latest
 from jourdain_jax.calculus.reals import Number, checked_real
 from jourdain_jax.motion.inputs import Inputs, Sampled
@@ -36,8 +36,8 @@ class MultipleShooting:
     - `duration`: about how long a piece is, s: a time over which neighbouring motions part by a factor of two to five.
     - `pieces`: how many pieces each run has; give one of the two.
 
-    Pieces begin at samples; where a sensor has a delay, they overlap by the largest that it may have. For motions that are unstable or chaotic over the whole run: steps are those of a problem that is almost linear. What is
-    minimised, and its minimum, are those of a fit without `shooting`.
+    Pieces begin at samples; where a sensor has a delay, they overlap by the largest that it may have. For motions that are unstable or chaotic over the whole
+    run: steps are those of a problem that is almost linear. What is minimised, and its minimum, are those of a fit without `shooting`.
 
     **Raises** ValueError unless one of the two is given, a finite duration above zero or two pieces or more; when used, for a run with too few samples.
     """
