@@ -274,6 +274,37 @@ def test_a_delay_that_is_not_there_is_at_its_bound():
     assert 0.0 < found["gyro.delay"].high < 0.02
 
 
+def late(seed, lag, delay=0.05, tau=0.05) -> jj.Measurements:
+    """Speed, 0.07 s late, through a low-pass with this lag; a sensor with an unknown delay, and a lag `tau` that is known or not."""
+    values = np.where(TS < SEEN, np.nan, shown(TS, delay=0.07, lag=lag) + 0.002 * np.random.default_rng(seed).normal(size=len(TS)))
+    sensor = jj.Sensor("x_rate", delay=jj.Estimate(delay, range=jj.bounds(0.0, SEEN)), lag=tau)
+    return jj.Measurements(TS, {"late": values}, 0.002, start={"x": 0.3}, sensors={"late": sensor})
+
+
+def test_a_lag_of_zero_is_left_where_a_delay_stands_in_for_it():
+    # at a lag of zero a longer delay does the same, to first order: a saddle on the bound
+    near, far = (jj.fit(Cart(), late(0, 0.1, *guess), ("mass",)) for guess in ((0.07, jj.Estimate(0.1)), (0.17, jj.Estimate(1e-4))))
+    assert far.converged
+    assert not far.warnings
+    assert float(far.chi_square) == pytest.approx(float(near.chi_square), rel=1e-6)
+    np.testing.assert_allclose(far.values, near.values, rtol=1e-3)
+    assert far["late.lag"].low < 0.1 < far["late.lag"].high
+
+
+def test_intervals_that_a_bound_makes_too_narrow_are_named():
+    data = late(0, 0.0, tau=jj.Estimate(0.05))
+    found = jj.fit(Cart(), data, ("mass",))
+    assert found["late.lag"].value == 0.0
+    held = jj.fit(Cart(), late(0, 0.0, tau=float(found["late.lag"].high)), ("mass",))
+    assert float(held.chi_square - found.chi_square) == pytest.approx(2.706, rel=0.05)
+    assert held["late.delay"].value < found["late.delay"].low
+    assert "`late.delay` moves beyond its own, which is too narrow" in found.warning
+    assert found.profiles(data, "late.delay")["late.delay"].low < held["late.delay"].value
+    near = jj.fit(Cart(), late(3, 0.0, tau=jj.Estimate(0.05)), ("mass",))
+    assert near["late.lag"].low > 0.0
+    assert near.warning.startswith("`late.lag` lies near a bound, where the squares rise less")
+
+
 @pytest.mark.skipif(bool(host.reason_against()), reason="needs llvmlite")
 def test_machine_code_serves_sensors_and_gives_what_xla_gives():
     data = run(4, gain=GAIN, delay=DELAY)
@@ -313,6 +344,8 @@ def test_a_prior_counts_as_a_measurement():
     assert known["mass"].standard_error == pytest.approx(weights.sum() ** -0.5, rel=1e-2)
     assert known["mass"].value == pytest.approx(weights @ [value, 2.005] / weights.sum(), abs=0.05 * error)
     assert known.samples == free.samples
+    assert not known.warnings
+    assert jj.fit(Cart(), data, {"mass": jj.Normal(2.1, 0.01)}).warning.startswith("`mass` lies 9.9 standard deviations from its prior")
 
 
 def test_a_prior_alone_is_an_estimate_with_it():
@@ -561,6 +594,10 @@ def with_input(push) -> jj.Fit:
         ),
         (lambda: jj.log_likelihood(Cart(), run(gain=GAIN)), "`gyro.gain` is to be estimated, but a likelihood needs its value"),
         (lambda: with_input(jj.Actuator(jj.Sampled([0.0, 1.0], [0.0, 1.0]), lag=0.1)), "command of input `push` of run 0 of `Cart` ends at 1 s, before"),
+        (
+            lambda: with_input(jj.Sampled([1.7e9, 1.7e9 + 4.0], [0.0, 1.0])),
+            "is sampled from 1700000000 to 1700000004 s, and the run is from 0 to 4 s, where it",
+        ),
         (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate(per_run=True)}), "`free` asks for a `mass` of each run, but all runs share the scene"),
         (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate((1.0, 2.0))}), r"first guess of `mass` has shape \(2,\), expected \(\)"),
         (
