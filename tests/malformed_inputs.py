@@ -573,7 +573,7 @@ MEASURED: dict[str, Case] = {
     "jj.unbounded('a')": ("ValueError", "`scale` of `unbounded` is the text 'a', expected real numbers"),
     "jj.fit(Bead, data, 'mass')": ("ValueError", "`scene` is the class `Bead`"),
     "jj.fit(b, 3, 'mass')": ("ValueError", "`data` is an int, expected a `Measurements` or a sequence of at least one"),
-    "jj.fit(b, [data, 3], 'mass')": ("ValueError", "`data` must be a `Measurements` or a sequence of at least one"),
+    "jj.fit(b, [data, 3], 'mass')": ("ValueError", "`data` holds an int, expected a `Measurements` or a sequence of at least one"),
     "jj.fit(b, data, ())": ("ValueError", "nothing is free; name parameters in `free` (`mass`, `stiffness`), or `unknown_start` values of a run"),
     "jj.fit(b, data, 'mas')": ("ValueError", "`free` names `mas`, which is no parameter of `Bead`; did you mean `mass`?"),
     "jj.fit(b, data, {'mass': 3})": (

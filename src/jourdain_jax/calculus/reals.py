@@ -97,7 +97,8 @@ def described(value) -> str:
     if isinstance(value, type):
         return f"the class `{value.__name__}`"
     if hasattr(value, "dtype") and hasattr(value, "shape"):
-        return f"an array of shape {tuple(value.shape)}"
+        numbers = getattr(value.dtype, "kind", "O") not in "OUSMm"
+        return f"an array of shape {tuple(value.shape)}" if numbers else f"an array of {value.dtype}, shape {tuple(value.shape)}"
     name = type(value).__name__
     return f"an {name}" if name[0] in "aeioAEIO" else f"a {name}"
 
