@@ -147,7 +147,7 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
     _check_control(control)
     runs = as_runs(scene, data, repeats=repeats)
     _check_choices(runs, loss, errors)
-    check_shooting(shooting, runs)
+    check_shooting(shooting)
     free = free if isinstance(free, Mapping) else tuple(as_names(free))
     unknowns = unknowns_of(scene, runs, free)
     check_starts(scene, runs, unknowns)
