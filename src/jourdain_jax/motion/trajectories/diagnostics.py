@@ -129,10 +129,15 @@ def _largest(values) -> Float[Array, ""]:
 def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     """What the diagnostics of a motion speak against, in words."""
     low, high = (int(rank) for rank in found.rank)
-    smallest = float(found.smallest_singular_value)
+    smallest, usual = float(found.smallest_singular_value), int(usual_rows(trajectory.scene).rank)
     warned = []
     if low != high:
         warned.append(f"rows change their rank along the motion, {low} to {high}: constraint forces and the motion beyond may not be unique")
+    elif high < usual:
+        warned.append(
+            f"rows have rank {high} all along, but {usual} at generic states: a singular configuration, or another way to assemble the scene; "
+            "state a `domain` around the motion to have it judged there"
+        )
     elif smallest < np.sqrt(jnp.finfo(trajectory.q.dtype).eps):
         warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
     for kind, residual, state in (("geometric", found.position_residual, trajectory.q), ("velocity", found.velocity_residual, trajectory.u)):
