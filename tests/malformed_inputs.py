@@ -150,6 +150,9 @@ PARAMETERS: dict[str, Case] = {
     "Bead(mass=0)": ("ValueError", "parameter `mass` of `Bead` is 0.0, expected a positive number in kg; give a value above zero"),
     "Bead(mass=inf)": ("ValueError", "parameter `mass` of `Bead` is inf, expected finite numbers; check where it was computed"),
     "Bead(mass='heavy')": ("ValueError", "parameter `mass` of `Bead` is the text 'heavy', expected a number in kg or an array of numbers"),
+    "Bead(mass=2 + 1j)": ("ValueError", "parameter `mass` of `Bead` is the complex number (2+1j), expected a number in kg"),
+    "Bead(mass=jnp.array(2 + 1j))": ("ValueError", "parameter `mass` of `Bead` is of type complex128, expected real numbers in kg"),
+    "b.replace(mass=True)": ("ValueError", "parameter `mass` of `Bead` is a bool, expected a number in kg"),
     "Bead(mass=None)": ("ValueError", "parameter `mass` of `Bead` is `None`, expected a number in kg"),
     "Bead(stiffness=-1.0)": ("ValueError", "parameter `stiffness` of `Bead` is -1.0, expected a number >= 0 in N/m; give a value that is not negative"),
     "Bead(mas=1.0)": ("ValueError", "scene `Bead` has no parameter `mas`; did you mean `mass`? Valid names: `mass`, `stiffness`."),
@@ -323,6 +326,10 @@ STATES: dict[str, Case] = {
 }
 
 MOTIONS: dict[str, Case] = {
+    "jj.simulate(b, {}, t1=1.0, inputs={'push': lambda t: jnp.exp(1j * t)})": (
+        "ValueError",
+        "input `push` of `Bead` returned a number of type complex128, expected a real number",
+    ),
     "jj.simulate(Bead, {}, t1=1.0)": ("ValueError", "`scene` is the class `Bead`, expected a scene of it; write `Bead()`"),
     "jj.simulate(3.0, {}, t1=1.0)": ("ValueError", "`scene` is a float, expected a scene: an instance of a subclass of `jj.Scene`"),
     "jj.simulate(b, 3.0, t1=1.0)": (
@@ -566,7 +573,7 @@ MEASURED: dict[str, Case] = {
     "jj.unbounded('a')": ("ValueError", "`scale` of `unbounded` is the text 'a', expected real numbers"),
     "jj.fit(Bead, data, 'mass')": ("ValueError", "`scene` is the class `Bead`"),
     "jj.fit(b, 3, 'mass')": ("ValueError", "`data` is an int, expected a `Measurements` or a sequence of at least one"),
-    "jj.fit(b, [data, 3], 'mass')": ("ValueError", "`data` must be a `Measurements` or a sequence of at least one"),
+    "jj.fit(b, [data, 3], 'mass')": ("ValueError", "`data` holds an int, expected a `Measurements` or a sequence of at least one"),
     "jj.fit(b, data, ())": ("ValueError", "nothing is free; name parameters in `free` (`mass`, `stiffness`), or `unknown_start` values of a run"),
     "jj.fit(b, data, 'mas')": ("ValueError", "`free` names `mas`, which is no parameter of `Bead`; did you mean `mass`?"),
     "jj.fit(b, data, {'mass': 3})": (

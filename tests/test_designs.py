@@ -92,6 +92,7 @@ def test_a_grid_crosses_its_levels_and_a_table_is_taken_as_it_is():
         (lambda: jj.Design({"a": [1.0]}, samples=3), "leave `samples` out"),
         (lambda: jj.Design(TWO), "`samples` is None"),
         (lambda: jj.Design(TWO, sampler="sobel", samples=8), "did you mean `sobol`"),
+        (lambda: jj.Design(TWO, sampler="grid", samples=8), "a grid takes `jj.Levels`, but `mass` varies as"),
         (lambda: jj.Design(TWO, samples=8, seed=-1), "`seed` is -1"),
         (lambda: jj.Design(TWO, sampler="saltelli", samples=9), "a multiple of 4"),
         (lambda: jj.Design(TWO, samples=8, correlation={("mass", "lenght"): 0.5}), "`lenght`, which does not vary"),

@@ -58,3 +58,22 @@ def test_lanes_are_those_of_vmap(f):
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert a.dtype == b.dtype
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+
+
+def test_what_all_lanes_share_has_no_axis_of_lanes():
+    random = np.random.default_rng(0)
+    x, A = random.normal(size=4), random.normal(size=(5, 3, 4))
+    found, expected = uncompiled_lanes(_products, shared=1)(x, A), jax.vmap(_products, in_axes=(None, 0))(x, A)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), found, expected)
+
+
+def test_what_no_result_needs_is_not_worked_out():
+    asked = []
+    seen = lambda x: asked.append(1) or x  # noqa: E731
+
+    @jax.jit
+    def both(x):
+        return jax.pure_callback(seen, x, x), 2 * x
+
+    assert uncompiled_lanes(lambda x: both(x)[1])(np.ones(3)).tolist() == [2.0, 2.0, 2.0]
+    assert not asked

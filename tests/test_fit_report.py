@@ -1,5 +1,6 @@
 """The HTML report of a fit: its numbers are those of the fit, its drawings those of data and simulation, and it loads nothing."""
 
+import pickle
 import re
 from pathlib import Path
 from xml.etree import ElementTree
@@ -28,6 +29,22 @@ def measured(seed: int, start=START, ts=TS) -> jj.Measurements:
 def fitted():
     data = measured(0)
     return jj.fit(TRUTH.replace(offset=0.3), data, free=("offset", "inertia")), data
+
+
+def test_a_fit_comes_back_from_a_pickle_with_all_that_it_tells(fitted):
+    fit, data = fitted
+    again = pickle.loads(pickle.dumps(fit))
+    assert str(again) == str(fit)
+    assert again.profiles(data, "offset")["offset"].high == fit.profiles(data, "offset")["offset"].high
+
+
+def test_measurements_that_count_twice_are_named(fitted):
+    _, data = fitted
+    assert not jj.fit(TRUTH, data, free=("offset",)).warnings
+    twice = jj.fit(TRUTH, [data, data], free=("offset",))
+    assert "`x` of run 0 and `x` of run 1 hold the same numbers" in str(twice.warnings)
+    both = jj.Measurements(data.ts, {"x": data.values["x"], "odometer": data.values["x"]}, 0.01, start=data.start, sensors={"odometer": "x"})
+    assert jj.fit(TRUTH, both, free=("offset",)).warning.startswith("`odometer` of run 0 and `x` of run 0 hold the same numbers")
 
 
 def page(path: Path) -> ElementTree.Element:

@@ -410,7 +410,11 @@ def test_one_sample_far_out_hardly_moves_a_robust_fit(loss, most):
     clean, spoilt = (fit(guess, noisy(5, ts=ts, outlier=far), THREE, loss=loss) for far in (0.0, 60.0))
     assert spoilt.converged
     assert np.max(np.abs(spoilt.values - clean.values) / clean.standard_errors) <= most
+    assert not spoilt.warnings
     plain = fit(guess, noisy(5, ts=ts, outlier=60.0), THREE)
+    assert "residuals are larger" in plain.warning
+    shaken = cart_run(values={name: x + 0.1 * np.sin(5.0 * ts) for name, x in noisy(5, ts=ts).values.items()}, ts=ts)
+    assert "residuals are larger" in fit(guess, shaken, THREE, loss=loss).warning
     assert np.max(np.abs(plain.values - clean.values) / clean.standard_errors) > 1.0
     assert np.all(np.abs(clean.standard_errors / fit(guess, noisy(5, ts=ts), THREE).standard_errors - 1) < 0.3)
 
@@ -566,6 +570,9 @@ def test_two_hidden_directions_and_a_parameter_that_does_nothing():
     ("call", "advice"),
     [
         (lambda: fit(CART, cart_run(), ("mas",)), "`mas`, which is no parameter of `Cart`; did you mean `mass`"),
+        (lambda: fit(CART, cart_run(), ("mass",), cutoff=1.0), "`cutoff` is 1.0, expected a number between 0 and 1"),
+        (lambda: fit(CART, cart_run(), ("mass",), tolerance=0.0), "`tolerance` is 0.0, expected a number above zero"),
+        (lambda: fit(CART, cart_run(), ("mass",), max_iterations=-1), "`max_iterations` is -1, expected a whole number"),
         (lambda: fit(CART, cart_run(), ()), "nothing is free; name parameters in `free`"),
         (lambda: fit(CART, cart_run(), {"mass": 3.0}), "`mass` was given 3.0; expected `bounds"),
         (
@@ -576,7 +583,7 @@ def test_two_hidden_directions_and_a_parameter_that_does_nothing():
             lambda: fit(Cart(damping=0.0), cart_run(), ("damping",)),
             "first guess of `damping` is 0.0; expected a first guess above",
         ),
-        (lambda: fit(CART, [], ("mass",)), "`data` must be a `Measurements` or a sequence"),
+        (lambda: fit(CART, [], ("mass",)), "`data` is empty, expected a `Measurements` or a sequence"),
         (
             lambda: fit(CART, cart_run(values={"x_rat": TS}, sigma=1.0), ("mass",)),
             "unknown channel `x_rat`; did you mean `x_rate`",

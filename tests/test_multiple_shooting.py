@@ -5,8 +5,11 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
+from jourdain_jax.analysis import grids
 from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.joined import JoinedArrow
+from jourdain_jax.analysis.lagged import read
+from jourdain_jax.analysis.levenberg_marquardt import Linearised
 
 FREE = ("mass2", "length1", "length2")
 TIGHT = {"rtol": 1e-8, "atol": 1e-8}
@@ -120,6 +123,19 @@ def test_a_step_of_joined_pieces_is_that_of_dense_least_squares():
         np.testing.assert_allclose(arrow.column_norms[b], np.linalg.norm(J, axis=0))
 
 
+def test_what_pieces_show_after_a_last_step_is_told_without_a_look_at_it():
+    g, (runs, m, p) = np.random.default_rng(1), (3, 2, 1)
+    pieces = Arrow(g.normal(size=(1, runs, m, m + p + 1)), g.normal(size=(1, 2, p + 1)), np.zeros((1, runs, p)))
+    rows, d = np.empty((1, runs), object), g.normal(size=(1, p + runs * m))
+    rows[0, :] = [g.normal(size=(4, m + p + 1)) for _ in range(runs)]
+    arrow = JoinedArrow(pieces, g.normal(size=(1, runs, 2, 2 * m + p + 1)), np.array([False, True, True]))
+    moved = Linearised(np.ones(1), arrow, rows, np.zeros((1, 0))).moved(d, np.array([0.25]))
+    assert moved.cost == 0.75
+    for i in range(runs):
+        own = np.concatenate([d[0, p + i * m : p + (i + 1) * m], d[0, :p]])
+        np.testing.assert_allclose(moved.rows[0, i][:, -1], rows[0, i][:, -1] + rows[0, i][:, :-1] @ own)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -141,9 +157,6 @@ def test_what_pieces_cannot_do_is_said():
         jj.fit(guess, run, FREE, shooting=jj.MultipleShooting(pieces=20))
     with pytest.raises(ValueError, match="one piece only"):
         jj.fit(guess, run, FREE, shooting=jj.MultipleShooting(duration=2.0))
-    late = jj.Measurements(run.ts, run.values, run.sigma, start=dict(run.start), sensors={"theta1": jj.Sensor("theta1", lag=0.01)})
-    with pytest.raises(ValueError, match="`theta1` of run 0 has a delay or a lag"):
-        jj.fit(guess, late, FREE, shooting=jj.MultipleShooting(pieces=2))
 
 
 SENSOR = {"bias": jj.Estimate(0.0, per_run=True), "gain": jj.Estimate(1.0, prior=jj.Normal(1.0, 0.05))}
@@ -161,6 +174,58 @@ CASES = {
 def test_pieces_change_no_estimate_and_no_interval(case):
     options, free, more = CASES[case]
     same(Oscillator(stiffness=15.0, damping=0.3), oscillations(**options), free, **more)
+
+
+def shown_late(scene, start, ts, t0, true, sensors, guess, sigma=0.005, **inputs):
+    """A run whose channels show coordinates or speeds late: name -> (what, delay, lag) in `true`. `guess`: of start values that are not known."""
+    generator, grid = np.random.default_rng(len(ts)), np.linspace(t0, ts[-1], 2001)
+    motion = jj.simulate(scene, start, t0=t0, ts=grid, rtol=1e-10, atol=1e-10, **inputs)
+    values = {name: np.asarray(read(np.asarray(motion[what]), grid, ts, delay, lag)[0]) for name, (what, delay, lag) in true.items()}
+    values = {name: x + sigma * generator.normal(size=len(ts)) for name, x in values.items()}
+    return jj.Measurements(ts, values, sigma, start=start | guess, unknown_start=tuple(guess), sensors=sensors, t0=t0, **inputs)
+
+
+def late_oscillations(true, sensors, counts):
+    """Runs of so many samples that begin half a second after their start."""
+    start, guess, force = {"x": 0.5, "x_rate": 0.3}, {"x": 0.45}, {"force": 1.0}
+    return [shown_late(Oscillator(), start, 0.05 * np.arange(n), -0.5, true, sensors, guess, inputs=force) for n in counts]
+
+
+DELAY, LONG = jj.Estimate(0.1, range=jj.bounds(0.0, 0.3)), jj.Estimate(0.4, range=jj.bounds(0.0, 0.5), per_run=True)
+GYRO = {"gyro": jj.Sensor("x_rate", delay=DELAY, lag=jj.Estimate(0.15))}
+LATE = {  # what channels show and how late, sensors, and numbers of samples
+    "a delay and a lag in one run of two": [
+        ({"x": ("x", 0.0, None)}, {}, (31,)),
+        ({"gyro": ("x_rate", 0.13, 0.2), "x": ("x", 0.0, None)}, GYRO, (61,)),
+    ],
+    "delays of each run, longer than a piece": [({"enc": ("x", 0.45, None)}, {"enc": jj.Sensor("x", delay=LONG)}, (41, 31))],
+    "a lag that is hardly one": [({"x": ("x", 0.0, 0.002)}, {"x": jj.Sensor(lag=jj.Estimate(0.01))}, (61,))],
+}
+
+
+@pytest.mark.parametrize("case", LATE)
+def test_sensors_are_late_in_pieces_as_in_whole_runs(case):
+    runs = [run for kind in LATE[case] for run in late_oscillations(*kind)]
+    same(Oscillator(stiffness=16.0, damping=0.2), runs, ("stiffness", "damping"))
+
+
+def test_a_chaotic_motion_is_found_from_afar_through_late_sensors(monkeypatch):
+    guess, truth, run = pendulum(5.0, seed=2)
+    sensors = {"theta1": jj.Sensor(delay=jj.Estimate(0.03, range=jj.bounds(0.0, 0.1))), "theta2": jj.Sensor(lag=jj.Estimate(0.03))}
+    true, start = {"theta1": ("theta1", 0.05, None), "theta2": ("theta2", 0.0, 0.06)}, {"theta1": 2.0, "theta2": 2.5}
+    run = shown_late(truth, start, np.asarray(run.ts)[2:], 0.0, true, sensors, run.start, sigma=0.05)
+    found = jj.fit(guess, run, FREE, shooting=jj.MultipleShooting(duration=0.5), **TIGHT)
+    assert found.converged
+    assert not found.warnings
+    monkeypatch.setattr(grids, "FEWEST_INTERVALS", 640)  # so that the whole run is read between times as close as those of ten pieces
+    begin = jj.Measurements(run.ts, run.values, run.sigma, start=found.starts[0], unknown_start=tuple(run.start), sensors=sensors, t0=0.0)
+    near = jj.fit(found.scene, begin, FREE, **TIGHT)
+    assert near.converged
+    assert not near.grown
+    assert np.max(np.abs(found.values - near.values) / near.standard_errors) < 1e-3
+    np.testing.assert_allclose(found.standard_errors, near.standard_errors, rtol=1e-3)
+    known = {name: float(getattr(truth, name)) for name in FREE} | {"theta1.delay": 0.05, "theta2.lag": 0.06}
+    assert all(abs(found[name].value - x) < 4 * found[name].standard_error for name, x in known.items())
 
 
 def test_an_actuator_is_estimated_in_pieces_too():

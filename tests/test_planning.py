@@ -42,6 +42,15 @@ def test_planned_covariance_is_that_of_a_fit():
     assert "mass" in str(found)
 
 
+def test_what_a_plan_will_not_tell_is_named():
+    found = jj.planned_information(Cart(), plan(), ("mass", "stiffness"))
+    (sentence,) = found.not_identifiable
+    assert "do not show separately" in sentence
+    assert sentence in str(found)
+    assert [row.split()[-1] for row in str(found).splitlines()[2:4]] == ["-", "-"]
+    assert not jj.planned_information(Cart(), plan(), "mass").not_identifiable
+
+
 def test_a_plan_is_one_program_which_serves_other_numbers():
     compiled = []
     count = lambda name, *_, **__: compiled.append(name) if name.endswith("backend_compile_duration") else None  # noqa: E731

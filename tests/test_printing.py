@@ -14,10 +14,13 @@ SLEIGH = ChaplyginSleigh()
 RUN = {"t1": 0.2, "ts": jnp.linspace(0.0, 0.2, 5)}
 
 
-def fitted():
+def measured():
     motion = jj.simulate(SLEIGH, {"x_rate": 0.6, "heading_rate": 0.9}, **RUN)
-    data = jj.Measurements(motion.ts, {"heading": motion["heading"], "x": motion["x"]}, 0.01, start={"x_rate": 0.6, "heading_rate": 0.9})
-    return jj.fit(SLEIGH, data, "offset")
+    return jj.Measurements(motion.ts, {"heading": motion["heading"], "x": motion["x"]}, 0.01, start={"x_rate": 0.6, "heading_rate": 0.9})
+
+
+def fitted():
+    return jj.fit(SLEIGH, measured(), "offset")
 
 
 RESULTS = {
@@ -26,6 +29,10 @@ RESULTS = {
     "Verification": (lambda: jj.verify(SLEIGH, {"heading_rate": 0.5}), "Verification of ChaplyginSleigh: passed"),
     "Rollout": (lambda: jj.rollout(SLEIGH, {"heading_rate": np.array([0.5, 0.6])}, progress=False, **RUN), "Rollout of ChaplyginSleigh: 2 lanes"),
     "Fit": (fitted, "Fit of ChaplyginSleigh: converged"),
+    "Estimated": (lambda: fitted()["offset"], f"{SLEIGH.offset:.3g} m, standard error"),
+    "Profile": (lambda: fitted().profiles(measured())["offset"], f"`offset` = {SLEIGH.offset:.3g} m, profile"),
+    "Prediction": (lambda: fitted().predict(measured())[0]["x"], "5 samples from 0 to"),
+    "ChannelResiduals": (lambda: fitted().residual_summary()[0], "residuals of `heading` of run 0, in sigmas: 5 samples"),
     "SteadyMotion": (lambda: jj.steady(SLEIGH, {"x_rate": 0.5}, held="x_rate"), "steady motion: residual"),
     "Linearization": (lambda: jj.linearize(SLEIGH, {"x_rate": 0.5}, ()), "Small motions: residual"),
 }

@@ -94,17 +94,17 @@ def test_a_reading_through_delay_and_lag_is_the_closed_form(lag):
     ts = np.linspace(0.3, 4.0, 173)
     for count in (81, 401):
         grid = np.linspace(0.0, 4.0, count)
-        error = np.abs(read(wave(grid), grid, ts, 0.123, lag) - lagged_wave(ts, 0.123, lag)).max()
+        error = np.abs(read(wave(grid), grid, ts, 0.123, lag)[0] - lagged_wave(ts, 0.123, lag)).max()
         assert error < 0.02 * (3.0 * grid[1]) ** 6 + 1e-12, (count, error)
     inside = ts[(ts > 0.6) & (ts < 3.5)]
     grid = np.linspace(0.0, 4.0, 81)
-    assert np.abs(read(wave(grid), grid, inside, 0.123) - wave(inside - 0.123)).max() < 0.005 * (3.0 * grid[1]) ** 6
+    assert np.abs(read(wave(grid), grid, inside, 0.123)[0] - wave(inside - 0.123)).max() < 0.005 * (3.0 * grid[1]) ** 6
 
 
 @pytest.mark.parametrize("lag", [0.0, 1e-5, 0.004, 0.0101, 0.3])
 def test_derivatives_of_a_reading_are_those_of_the_closed_form(lag):
     ts, grid = np.linspace(0.3, 4.0, 173), np.linspace(0.0, 4.0, 1601)
-    by_delay, by_lag = jax.jacfwd(lambda d, l: read(wave(grid), grid, ts, d, l), (0, 1))(0.123, lag)
+    by_delay, by_lag = jax.jacfwd(lambda d, l: read(wave(grid), grid, ts, d, l)[0], (0, 1))(0.123, lag)
     step = 1e-5
     expected = (lagged_wave(ts, 0.123 + step, lag) - lagged_wave(ts, 0.123 - step, lag)) / (2 * step)
     np.testing.assert_allclose(by_delay, expected, atol=1e-8)
@@ -117,7 +117,7 @@ def test_derivatives_of_a_reading_are_those_of_the_closed_form(lag):
 
 def test_the_low_pass_of_a_reading_starts_at_rest():
     grid = np.linspace(0.0, 1.0, 101)
-    ramp = read(2.0 + 3.0 * grid, grid, grid, 0.0, 0.2)
+    ramp, _ = read(2.0 + 3.0 * grid, grid, grid, 0.0, 0.2)
     np.testing.assert_allclose(ramp, 2.0 + 3.0 * (grid - 0.2 * (1 - np.exp(-grid / 0.2))), atol=1e-13)
 
 
@@ -125,7 +125,7 @@ def test_the_low_pass_of_a_reading_starts_at_rest():
 def test_near_a_jump_of_a_derivative_a_reading_has_the_stated_error(order, inside, at_the_ends):
     h = 0.1
     grid, ts = h * np.arange(41.0), h * np.linspace(0.0, 40.0, 2001)
-    reading = jax.jit(lambda values: read(values, grid, ts, 0.0))
+    reading = jax.jit(lambda values: read(values, grid, ts, 0.0)[0])
     # max(t - c, 0)^order / order!: the derivative of this order jumps by one at c
     errors = {
         c: np.abs(reading(np.maximum(grid - h * c, 0) ** order / order) - np.maximum(ts - h * c, 0) ** order / order).max() for c in np.arange(0, 20, 0.05)
@@ -137,10 +137,10 @@ def test_near_a_jump_of_a_derivative_a_reading_has_the_stated_error(order, insid
 def test_vectors_are_read_component_by_component_and_single_precision_stays():
     grid, ts = np.linspace(0.0, 4.0, 81), np.linspace(0.3, 4.0, 20)
     both = np.stack([wave(grid), 2.0 - wave(grid)], axis=1)
-    found = read(both, grid, ts, 0.1, 0.05)
+    found, _ = read(both, grid, ts, 0.1, 0.05)
     np.testing.assert_allclose(found[:, 1], 2.0 - found[:, 0], atol=1e-14)
     short = [jnp.asarray(x, jnp.float32) for x in (both, grid, ts, 0.1, 0.05)]
-    single = read(*short)
+    single, _ = read(*short)
     assert single.dtype == jnp.float32
     np.testing.assert_allclose(single, found, atol=5e-6)
 
@@ -274,6 +274,37 @@ def test_a_delay_that_is_not_there_is_at_its_bound():
     assert 0.0 < found["gyro.delay"].high < 0.02
 
 
+def late(seed, lag, delay=0.05, tau=0.05) -> jj.Measurements:
+    """Speed, 0.07 s late, through a low-pass with this lag; a sensor with an unknown delay, and a lag `tau` that is known or not."""
+    values = np.where(TS < SEEN, np.nan, shown(TS, delay=0.07, lag=lag) + 0.002 * np.random.default_rng(seed).normal(size=len(TS)))
+    sensor = jj.Sensor("x_rate", delay=jj.Estimate(delay, range=jj.bounds(0.0, SEEN)), lag=tau)
+    return jj.Measurements(TS, {"late": values}, 0.002, start={"x": 0.3}, sensors={"late": sensor})
+
+
+def test_a_lag_of_zero_is_left_where_a_delay_stands_in_for_it():
+    # at a lag of zero a longer delay does the same, to first order: a saddle on the bound
+    near, far = (jj.fit(Cart(), late(0, 0.1, *guess), ("mass",)) for guess in ((0.07, jj.Estimate(0.1)), (0.17, jj.Estimate(1e-4))))
+    assert far.converged
+    assert not far.warnings
+    assert float(far.chi_square) == pytest.approx(float(near.chi_square), rel=1e-6)
+    np.testing.assert_allclose(far.values, near.values, rtol=1e-3)
+    assert far["late.lag"].low < 0.1 < far["late.lag"].high
+
+
+def test_intervals_that_a_bound_makes_too_narrow_are_named():
+    data = late(0, 0.0, tau=jj.Estimate(0.05))
+    found = jj.fit(Cart(), data, ("mass",))
+    assert found["late.lag"].value == 0.0
+    held = jj.fit(Cart(), late(0, 0.0, tau=float(found["late.lag"].high)), ("mass",))
+    assert float(held.chi_square - found.chi_square) == pytest.approx(2.706, rel=0.05)
+    assert held["late.delay"].value < found["late.delay"].low
+    assert "`late.delay` moves beyond its own, which is too narrow" in found.warning
+    assert found.profiles(data, "late.delay")["late.delay"].low < held["late.delay"].value
+    near = jj.fit(Cart(), late(3, 0.0, tau=jj.Estimate(0.05)), ("mass",))
+    assert near["late.lag"].low > 0.0
+    assert near.warning.startswith("`late.lag` lies near a bound, where the squares rise less")
+
+
 @pytest.mark.skipif(bool(host.reason_against()), reason="needs llvmlite")
 def test_machine_code_serves_sensors_and_gives_what_xla_gives():
     data = run(4, gain=GAIN, delay=DELAY)
@@ -313,6 +344,8 @@ def test_a_prior_counts_as_a_measurement():
     assert known["mass"].standard_error == pytest.approx(weights.sum() ** -0.5, rel=1e-2)
     assert known["mass"].value == pytest.approx(weights @ [value, 2.005] / weights.sum(), abs=0.05 * error)
     assert known.samples == free.samples
+    assert not known.warnings
+    assert jj.fit(Cart(), data, {"mass": jj.Normal(2.1, 0.01)}).warning.startswith("`mass` lies 9.9 standard deviations from its prior")
 
 
 def test_a_prior_alone_is_an_estimate_with_it():
@@ -561,6 +594,10 @@ def with_input(push) -> jj.Fit:
         ),
         (lambda: jj.log_likelihood(Cart(), run(gain=GAIN)), "`gyro.gain` is to be estimated, but a likelihood needs its value"),
         (lambda: with_input(jj.Actuator(jj.Sampled([0.0, 1.0], [0.0, 1.0]), lag=0.1)), "command of input `push` of run 0 of `Cart` ends at 1 s, before"),
+        (
+            lambda: with_input(jj.Sampled([1.7e9, 1.7e9 + 4.0], [0.0, 1.0])),
+            "is sampled from 1700000000 to 1700000004 s, and the run is from 0 to 4 s, where it",
+        ),
         (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate(per_run=True)}), "`free` asks for a `mass` of each run, but all runs share the scene"),
         (lambda: jj.fit(Cart(), run(), {"mass": jj.Estimate((1.0, 2.0))}), r"first guess of `mass` has shape \(2,\), expected \(\)"),
         (

@@ -176,7 +176,7 @@ class _Filter:
             sensor = self.run.sensors.get(name, ideal(name))
             operation = sensor.operation
             x = operation(motion_at(self.scene, t, state.q, state.u, self.inputs(t))) if isinstance(operation, Channel) else state[sensor.name]
-            found.append(jnp.ravel(sensor.shown(x[None], None, None)))
+            found.append(jnp.ravel(sensor.shown(x[None], None, None)[0]))
         return jnp.concatenate(found)
 
 

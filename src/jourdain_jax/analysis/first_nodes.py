@@ -2,7 +2,7 @@
 
 A coordinate or speed that a channel shows is that of a parabola through the samples about the node; so is the rate of a coordinate,
 qdot = N(q) u + nu, met by the smallest change of the speeds. What no channel shows stays as it is at the start; coordinates that no geometric row depends on
-go on from piece to piece by as much as they change along each.
+go on from piece to piece by as much as they change along each. A sensor shows y as it was a delay ago, and the quantity is y + lag y'.
 """
 
 import jax
@@ -23,18 +23,24 @@ _SAMPLES = 5  # that a parabola goes through
 def first_nodes(
     scene: Scene, run: Measurements, ends: Int[np.ndarray, "ends"], q: Float[np.ndarray, "coordinates"], u: Float[np.ndarray, "speeds"], member: int | None
 ) -> Float[np.ndarray, "pieces states"]:
-    """States at the begin of all pieces of a run, the first one included; q, u: its start. `member`: which of the repeats."""
+    """Nodes at the begin of all pieces of a run, the first one included; q, u: its start. `member`: which of the repeats."""
     ts = np.asarray(run.ts, float)
     at = np.concatenate([[float(run.t0)], ts[ends[1:-1]]])
     qs, us, rates = np.tile(q, (len(at), 1)), np.tile(u, (len(at), 1)), np.full((len(at), len(q)), np.nan)
-    speeds = np.zeros(len(u), bool)
+    speeds, filters = np.zeros(len(u), bool), []
     for name, values in run.values.items():
         reading = run.readings.get(name, ideal(name))
-        gain, bias = (np.asarray(reading.numbers[number]) for number in ("gain", "bias"))
-        if reading.operation is not None or np.any(gain == 0):
+        gain, bias, delay, lag = (np.asarray(reading.numbers[number]) for number in ("gain", "bias", "delay", "lag"))
+        of_state = reading.operation is None and not np.any(gain == 0)
+        if not (of_state or reading.has_filter):
             continue
-        x = ((np.asarray(values if member is None else values[member], float) - bias) / gain).reshape(len(ts), -1)
-        found = np.array([[_parabola(ts, column, t) for column in x.T] for t in at])  # (nodes, entries, 2)
+        y = ((np.asarray(values if member is None else values[member], float) - bias) / np.where(gain == 0, 1.0, gain)).reshape(len(ts), -1)
+        found = np.array([[_parabola(ts - delay, column, t) for column in y.T] for t in at])  # (nodes, entries, 2)
+        if reading.has_filter:
+            filters.append(np.nan_to_num(found[..., 0]))
+        if not of_state:
+            continue
+        found[..., 0] += lag * found[..., 1]
         for names, state, of_speeds in ((scene.coordinate_names, qs, False), (scene.speed_names, us, True)):
             if reading.name in names:
                 where = _entries(names, reading.name)
@@ -48,7 +54,7 @@ def first_nodes(
         for k in range(len(at)):
             known = np.isfinite(rates[k])
             us[k, ~speeds] += np.linalg.lstsq(N[k][np.ix_(known, ~speeds)], (rates[k] - qdot[k])[known], rcond=1e-8)[0]
-    return np.concatenate([qs, us], axis=1)
+    return np.concatenate([qs, us, *filters], axis=1)
 
 
 def goes_on(scene: Scene, q: Float[np.ndarray, "coordinates"]) -> np.ndarray:

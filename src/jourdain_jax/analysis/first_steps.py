@@ -73,6 +73,7 @@ class _At(NamedTuple):
     products: Float[Array, "width width"]  # [J r]'[J r] there, with priors
     d: Float[Array, "unknowns"]
     costs: Float[Array, "_"]  # F at first and after each step
+    cost: Float[Array, ""]  # F there
     steps: Float[Array, ""]  # tried; below zero: x itself is to be evaluated
     promised: Float[Array, ""]
     slope: Float[Array, ""]  # of F along the step
@@ -90,27 +91,28 @@ class _At(NamedTuple):
         """From such a vector, of NumPy or of JAX, of n unknowns."""
         ends = [*accumulate((0, 5, n, (n + 1) ** 2, n, ROOM + 1))]
         pace, x, products, d, costs = (vector[begin:end] for begin, end in pairwise(ends))
-        return _At(pace, x, products.reshape(n + 1, n + 1), d, costs, *(vector[ends[-1] + k] for k in range(7)))
+        return _At(pace, x, products.reshape(n + 1, n + 1), d, costs, *(vector[ends[-1] + k] for k in range(8)))
 
     @staticmethod
     def room(n: int) -> int:
         """Length of such a vector."""
-        return 13 + ROOM + 2 * n + (n + 1) ** 2
+        return 14 + ROOM + 2 * n + (n + 1) ** 2
 
 
-def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], told: Float[Array, "_"]) -> Float[Array, "_"]:
-    """Where they end, in one vector (see `read`). `evaluate`: [J r] of unknowns, (samples, unknowns + 1)."""
-    n, places = x.shape[0], jnp.arange(ROOM + 1)
-    of = Told.of(told, n)
+def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], known: tuple[Array, ...], told: Float[Array, "_"]) -> Float[Array, "_"]:
+    """Where they end, in one vector (see `read`). `evaluate`: [J r] of unknowns and what is `known`, (samples, unknowns + 1)."""
+    n, places = x.shape[0], np.arange(ROOM + 1.0)
 
     def tried(now: tuple[Array, Array]) -> tuple[Array, Array]:
-        old = _At.of(now[0], n)
+        # XLA would take what depends on these alone out of the loop. Of many small operations that wait, it hands some to other threads, which costs more.
+        vector, numbers, others = jax.lax.optimization_barrier((now[0], told, known))
+        old, of = _At.of(vector, n), Told.of(numbers, n)
         x = old.x + old.d
-        rows = evaluate(x)
-        counted, prior = jnp.where(of.counts[:, None] > 0, rows, 0.0), jnp.append(of.weight * (x - of.mean), 0.0)
-        of_priors = jnp.diag(jnp.append(of.weight**2, prior @ prior)).at[:-1, -1].set(of.weight * prior[:-1])
-        products = counted.T @ counted + of_priors
-        cost, before = jnp.where(jnp.isfinite(jnp.sum(products)), 0.5 * products[-1, -1], jnp.inf), jnp.sum(jnp.where(places == old.steps, old.costs, 0.0))
+        rows = evaluate(x, *others)
+        of_priors = jnp.concatenate([of.weight[:, None] * np.eye(n), (of.weight * (x - of.mean))[:, None]], axis=1)
+        whole = jnp.concatenate([jnp.where(of.counts[:, None] > 0, rows, 0.0), of_priors])
+        products = whole.T @ whole
+        cost, before = jnp.where(jnp.isfinite(jnp.sum(products)), 0.5 * products[-1, -1], jnp.inf), old.cost
         found, by_slopes = before - cost, -0.5 * (old.slope + products[:-1, -1] @ old.d)
         closely = (jnp.abs(found) < ERROR * jnp.abs(before)) | ((old.promised < 100 * of.tolerance**2) & (jnp.abs(found) < of.tolerance))
         found = jnp.where(closely, by_slopes, found)
@@ -121,15 +123,16 @@ def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], told: Float[Arr
         after = jnp.stack([jnp.maximum(damping * change, LEAST), 4.0, jnp.minimum(1.5 * fall, FASTEST), before_last, old.length])
         failed = jnp.stack([jnp.maximum(damping * growth, LEAST), 2 * growth, 2.0, jnp.nan, jnp.nan])
         pace, steps = jnp.where(first, old.pace, jnp.where(taken, after, failed)), old.steps + 1
-        costs = jnp.where(places == steps, jnp.where(taken, cost, before), old.costs)
+        cost = jnp.where(taken, cost, before)
+        costs = jnp.where(places == steps, cost, old.costs)
         at = jnp.where(taken, jnp.concatenate([x, products.ravel()]), jnp.concatenate([old.x, old.products.ravel()]))
         x, products = at[:n], at[n:].reshape(n + 1, n + 1)
         earlier = jnp.sum(jnp.where(places == steps - of.patience, costs, 0.0))
-        slow = (steps >= of.patience) & (jnp.where(taken, cost, before) > jnp.maximum(of.near, SLOW * earlier))
+        slow = (steps >= of.patience) & (cost > jnp.maximum(of.near, SLOW * earlier))
 
         # the next step
         A, gradient, size = products[:-1, :-1], products[:-1, -1], jnp.maximum(jnp.abs(x), of.least)
-        norms = jnp.sqrt(jnp.diag(A))
+        norms = jnp.sqrt(jnp.sum(A * np.eye(n), axis=0))
         V, squares = jax.lax.linalg.eigh(A / (norms * norms[:, None]), symmetrize_input=False)
         dampings = jnp.stack([pace[0], jnp.full_like(pace[0], LEAST)])
         both = -((((gradient / norms) @ V) / (squares + dampings[:, None])) @ V.T) / norms  # the step, and the undamped one
@@ -144,17 +147,19 @@ def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], told: Float[Arr
         may = (steps < of.most) & ~slow & inside[0] & (pace[0] <= MOST) & jnp.isfinite(length) & jnp.all(usual)
         done = small[0] & ((pace[0] <= LEAST) | (small[1] & inside[1]))
         ends = may & jnp.stack([done | sure, ~done & sure, ~done & ~sure])
-        at = _At(pace, x, products, d, costs, steps, -slope - 0.5 * length**2, slope, length, *ends.astype(x.dtype))
+        at = _At(pace, x, products, d, costs, cost, steps, -slope - 0.5 * length**2, slope, length, *ends.astype(x.dtype))
         return at.vector(), jnp.where(taken, rows, now[1])
 
-    zero, pace = jnp.zeros((), x.dtype), Pace()
-    begin = jnp.array([pace.damping, pace.growth, pace.fall, jnp.nan, jnp.nan]), x, jnp.zeros((n + 1, n + 1)), 0.0 * x, jnp.zeros(ROOM + 1)
-    at = _At(*begin, zero - 1, zero, zero, zero, zero, zero, zero + 1)
-    end, rows = jax.lax.while_loop(lambda now: now[0][-1] > 0, tried, (at.vector(), jnp.zeros((of.counts.shape[0], n + 1))))
+    pace, none = Pace(), np.zeros(())
+    lengths = np.array([pace.damping, pace.growth, pace.fall, np.nan, np.nan])
+    begin = _At(lengths, np.zeros(n), np.zeros((n + 1, n + 1)), np.zeros(n), np.zeros(ROOM + 1), *[none] * 8)._replace(steps=none - 1, goes=none + 1)
+    first = jnp.asarray(np.concatenate([np.ravel(part) for part in begin])).at[5 : 5 + n].set(x)
+    end, rows = jax.lax.while_loop(lambda now: now[0][-1] > 0, tried, (first, jnp.zeros((told.shape[0] - Told.length(n, 0), n + 1))))
     at = _At.of(end, n)
-    steps, d, last = at.steps + at.foretold, jnp.where(at.foretold > 0, at.d, 0.0), jnp.sum(jnp.where(places == at.steps, at.costs, 0.0)) - at.promised
+    steps, d, last = at.steps + at.foretold, jnp.where(at.foretold > 0, at.d, 0.0), at.cost - at.promised
     at = at._replace(steps=steps, x=at.x + d, costs=jnp.where((places == steps) & (at.foretold > 0), last, at.costs))
-    return jnp.concatenate([at.vector(), rows.at[:, -1].add(rows[:, :-1] @ d).ravel()])
+    ended = jnp.concatenate([rows[:, :-1], rows[:, -1:] + rows[:, :-1] @ d[:, None]], axis=1)
+    return jnp.concatenate([at.vector(), ended.ravel()])
 
 
 def read(found: Float[np.ndarray, "_"], unknowns: int) -> tuple[Pace, list[float], bool, np.ndarray, np.ndarray]:

@@ -25,7 +25,7 @@ from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Piecewise, Shot
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
-from jourdain_jax.analysis.profile import limits_at_bounds
+from jourdain_jax.analysis.profile import AtBounds, limits_at_bounds
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.shooting import MultipleShooting, check_shooting
 from jourdain_jax.analysis.shooting_steps import cutoff_of, shot
@@ -47,6 +47,7 @@ _SOME = 12  # steps between two estimates of correlation times
 _SAME = 0.05  # of half the sum of squares, by which the same minimum is found lower from elsewhere
 _FEWEST_RUNS = 5  # that tell how much runs differ
 _WHOLE, _WITH_MEMORY = "whole runs", "whole runs, after a turn of correlation times"  # what is minimised
+_OFF_BOUND = "whole runs, off a bound"
 _TURNS, _SETTLED = 20, 1e-3  # of correlation times and unknowns at most; change of the correlation of neighbouring samples that ends them
 
 
@@ -143,9 +144,10 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
             "`fit` was called inside jit, vmap or a derivative, but its steps are chosen outside of compiled code. Call it with known numbers; "
             "for many repeats use `fit_batch`, for derivatives of the fit's objective `log_likelihood`."
         )
+    _check_control(control)
     runs = as_runs(scene, data, repeats=repeats)
     _check_choices(runs, loss, errors)
-    check_shooting(shooting, runs)
+    check_shooting(shooting)
     free = free if isinstance(free, Mapping) else tuple(as_names(free))
     unknowns = unknowns_of(scene, runs, free)
     check_starts(scene, runs, unknowns)
@@ -169,10 +171,10 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
             pieces.keep(int(np.argmin(found.at.cost)))
         control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.theta))))
         asked = replace(asked, control=control)
-    found = _with_memory(problem, found if members else found.lowest(), limits, control)
+    found, at_bounds = _off_bounds(problem, _with_memory(problem, found if members else found.lowest(), limits, control), limits, control)
     if pieces is not None:
         found.converged &= pieces.closed(np.arange(len(found.converged)))
-    return _result(problem, found, limits, asked, errors, guesses, same, None if pieces is None else pieces.told())
+    return _result(problem, found, limits, at_bounds, asked, errors, guesses, same, None if pieces is None else pieces.told())
 
 
 def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
@@ -240,6 +242,28 @@ def _with_memory(problem: Problem, found: Minimum, limits: Limits, control: Cont
     return found
 
 
+def _off_bounds(problem: Problem, found: Minimum, limits: Limits, control: Control) -> tuple[Minimum, AtBounds]:
+    """The minimum, gone on from where unknowns at a bound let it be lower away from it; and what is known of those that stay."""
+    for _ in range(_TURNS):
+        told = limits_at_bounds(problem.linearised, found, limits, control)
+        if not told.lower:
+            break
+        members = np.array(list(told.lower))
+        again = problem.minimum(np.stack(list(told.lower.values())), members, limits, control, _OFF_BOUND)
+        again = replace(again, steps=found.steps[members] + again.steps, trace=found.trace[members] + again.trace, grown=found.grown[members])
+        found = _with_memory(problem, found.lowered(members, again), limits, control)
+    return found, told
+
+
+def _check_control(control: Control) -> None:
+    if not 0 < control.cutoff < 1:
+        raise ValueError(f"`cutoff` is {control.cutoff!r}, expected a number between 0 and 1: the share of the largest singular value that counts as zero")
+    if not control.tolerance > 0:
+        raise ValueError(f"`tolerance` is {control.tolerance!r}, expected a number above zero: the step in sigmas that ends the fit")
+    if isinstance(control.most_steps, bool) or not isinstance(control.most_steps, int | np.integer) or control.most_steps < 0:
+        raise ValueError(f"`max_iterations` is {control.most_steps!r}, expected a whole number of steps")
+
+
 def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:
     if loss is not None and not isinstance(loss, Loss):
         raise ValueError(f"`loss` is {loss!r}, expected `huber()`, `student_t()`, or None for least squares")
@@ -273,14 +297,15 @@ def _check_enough(runs: Sequence[Measurements], unknowns: Unknowns, repeats: boo
         )
 
 
-def _result(problem: Problem, found: Minimum, limits: Limits, asked: Asked, errors: str, guesses: int, agreeing: np.ndarray, how: Shot | None) -> Fit:
+def _result(
+    problem: Problem, found: Minimum, limits: Limits, at_bounds: AtBounds, asked: Asked, errors: str, guesses: int, agreeing: np.ndarray, how: Shot | None
+) -> Fit:
     unknowns, single, control = problem.unknowns, problem.lanes.members is None, asked.control
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places = unknowns.estimated
-    limit, beyond = limits_at_bounds(problem.linearised, found, limits, control)
     told = Fit(
         values=one(found.theta[:, places]),
-        beyond=one(beyond[:, places]),
+        beyond=one(at_bounds.beyond[:, places]),
         converged=one(found.converged),
         stuck=one(found.stuck),
         steps=one(found.steps),
@@ -295,7 +320,7 @@ def _result(problem: Problem, found: Minimum, limits: Limits, asked: Asked, erro
         trace=found.trace[0] if single else (),
         asked=asked,
         layout=unknowns.layout,
-        work_out=partial(statistics, problem, found, limits, control, errors, limit),
+        work_out=partial(statistics, problem, found, limits, control, errors, at_bounds),
     )
     if problem.with_memory:  # its motions are needed, in the context that is here
         told.statistics  # noqa: B018

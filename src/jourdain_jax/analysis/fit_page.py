@@ -14,7 +14,7 @@ from jourdain_jax.analysis.fit_pictures import autocorrelation, data_and_predict
 from jourdain_jax.analysis.held_out import Prediction
 from jourdain_jax.analysis.informed import Informed
 from jourdain_jax.analysis.likelihood_profiles import Profile
-from jourdain_jax.analysis.weak_directions import WEAK
+from jourdain_jax.analysis.weak_directions import CORRELATED, WEAK
 
 _MOST_DRAWN, _MOST_SAMPLES = 1000, 24_000  # samples in one drawing, and in all: two megabytes
 _MOST_PANELS = 40  # components of channels of runs that are drawn, of the runs fitted and of those held out
@@ -127,7 +127,8 @@ def _untold(fit) -> list[str]:
         parts += [_note(f"and {len(sentences) - _MOST_SENTENCES} more")] if len(sentences) > _MOST_SENTENCES else []
     if len(parts) == 1:
         parts.append(
-            f"<p>Nothing was found: each combination of unknowns has a standard error below {100 * WEAK:g} %, and no two estimates correlate strongly.</p>"
+            f"<p>Nothing was found: each combination of unknowns has a standard error below {100 * WEAK:g} %, and no two estimates "
+            f"correlate by {CORRELATED:g} or more.</p>"
         )
     return parts
 

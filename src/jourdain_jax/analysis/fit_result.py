@@ -5,16 +5,17 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.asked import Asked, taken_up
 from jourdain_jax.analysis.derived import derived, standard_errors
+from jourdain_jax.analysis.estimated import ChannelResiduals, Estimated, summary
 from jourdain_jax.analysis.fit_page import fit_page
 from jourdain_jax.analysis.fit_pictures import interval_widths
 from jourdain_jax.analysis.fit_statistics import Statistics
 from jourdain_jax.analysis.fit_text import batch_text, text
+from jourdain_jax.analysis.fit_warnings import warnings_of
 from jourdain_jax.analysis.held_out import Prediction, of_fitted, of_held_out
 from jourdain_jax.analysis.information import Information, hidden_combinations
 from jourdain_jax.analysis.informed import informed
@@ -22,38 +23,15 @@ from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Shot
-from jourdain_jax.analysis.profile import FAR_BEYOND
-from jourdain_jax.analysis.weak_directions import weak_combinations
+from jourdain_jax.analysis.weak_directions import CORRELATED, weak_combinations
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
-CORRELATED = 0.98
 MOST_COMPARED = 1000  # unknowns
 MOST_INFORMED = 24  # unknowns of which the report says what informs them
-
-
-class Estimated(eqx.Module):
-    """One unknown, in its unit; NaN for what the measurements cannot tell."""
-
-    value: Float[np.ndarray, "*repeats"]
-    standard_error: Float[np.ndarray, "*repeats"]
-    low: Float[np.ndarray, "*repeats"]  # ends of the 95 % interval
-    high: Float[np.ndarray, "*repeats"]
-    unit: str = eqx.field(static=True)
-
-
-class ChannelResiduals(eqx.Module):
-    """Residuals of one channel of one run, in units of sigma. Good fits have mean near 0 and rms near 1."""
-
-    run: int
-    channel: str
-    samples: int
-    mean: float
-    rms: float
-    largest: float  # in magnitude
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,6 +64,9 @@ class Fit(Printed):
     def statistics(self) -> Statistics:
         """What follows from the minimum; each part of it is a property here."""
         return self.work_out()
+
+    def __getstate__(self) -> dict:
+        return vars(self) | {"statistics": self.statistics, "work_out": None}  # what was compiled stays in its process
 
     @property
     def scene(self) -> Scene:
@@ -228,40 +209,7 @@ class Fit(Printed):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Why estimates or intervals should not be relied on, the most serious reason first, one sentence each."""
-        if not np.isfinite(self.chi_square):
-            return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`",)
-        found = []
-        if self.stuck:
-            found.append(
-                "no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere"
-            )
-        elif self.shooting is not None and self.shooting.continuity > 1:
-            found.append(
-                f"pieces of runs do not join: states jump by up to {float(self.shooting.continuity):.2g} tolerances of the simulation; take shorter pieces, or "
-                "start nearer"
-            )
-        elif not self.converged:
-            found.append("no minimum was found; raise `max_iterations`, or start nearer to it")
-        if np.any(self.beyond > FAR_BEYOND):
-            names = ", ".join(f"`{name}`" for name, far in zip(self.labels, self.beyond, strict=True) if far > FAR_BEYOND)
-            found.append(f"{names} lies at a bound, which decides its value; all standard errors lose their meaning: widen the bounds")
-        found += self.impossible
-        if self.guesses > 1 and self.converged and self.agreeing == 1:
-            found.append(f"only one of {self.guesses} first guesses led to this minimum, so there may be a lower one; try more `guesses`, or narrower bounds")
-        # chi-square has mean n and variance 2 n
-        if self.reduced_chi_square > 1 + 5 * np.sqrt(2 / max(int(self.degrees_of_freedom), 1)):
-            found.append(
-                "the residuals are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, or sigmas that are too small"
-            )
-        if self.errors == "sigmas":
-            coloured = [f"`{name}` ({rho:.2f})" for name, (rho, limit) in self.autocorrelation.items() if abs(rho) > limit]
-            if coloured:
-                found.append(
-                    f"residuals of {', '.join(coloured)} are not white (in brackets: correlation of neighbouring ones), which makes intervals too narrow: the "
-                    "scene, a sensor or the noise is not right; `correlation_time=None` estimates a memory of the noise, and with five runs or more, "
-                    'errors="runs" gives intervals that allow for it'
-                )
-        return tuple(found)
+        return warnings_of(self)
 
     @property
     def autocorrelation(self) -> dict[str, tuple[float, float]]:
@@ -278,7 +226,7 @@ class Fit(Printed):
 
     def residual_summary(self) -> tuple[ChannelResiduals, ...]:
         """Count, mean, rms and largest residual per run and channel."""
-        return tuple(_summary(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
+        return tuple(summary(run, name, np.asarray(r)) for run, found in enumerate(self.residuals) for name, r in found.items())
 
     def derived(self, function: Callable[[Scene], Array], unit: str = "") -> Estimated:
         """A number, or an array of them, that follows from the parameters, with its standard error and 95 % interval.
@@ -387,9 +335,3 @@ class Fit(Printed):
 
     def _text(self) -> str:
         return batch_text(self) if self.values.ndim > 1 else text(self)
-
-
-def _summary(run: int, name: str, r: np.ndarray) -> ChannelResiduals:
-    r = r[~np.isnan(r)]
-    mean, rms, largest = (r.mean(), np.sqrt((r**2).mean()), np.abs(r).max()) if r.size else (np.nan,) * 3
-    return ChannelResiduals(run, name, r.size, float(mean), float(rms), float(largest))

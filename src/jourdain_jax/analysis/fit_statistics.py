@@ -14,6 +14,7 @@ from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.information import Information, information, students_t_95
 from jourdain_jax.analysis.levenberg_marquardt import LEAST, Control, Limits, Minimum
 from jourdain_jax.analysis.problem import Problem
+from jourdain_jax.analysis.profile import AtBounds, moved_from_bounds, too_narrow_near_bounds
 from jourdain_jax.scene.scene import Scene
 
 _NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
@@ -39,16 +40,18 @@ class Statistics:
     correlation_time: dict[str, Float[np.ndarray, "*repeats"]]
     chi_square: Float[np.ndarray, "*repeats"]
     samples: Int[np.ndarray, "*repeats"]
+    from_prior: Float[np.ndarray, "*repeats unknowns"]  # in standard deviations of the prior; NaN where there is none
+    too_narrow: tuple[str, ...]  # which intervals are, near bounds, one sentence each; of one fit
 
 
-def statistics(problem: Problem, found: Minimum, limits: Limits, control: Control, errors: str, limit: Float[np.ndarray, "members places"]) -> Statistics:
-    """Of the minimum of each member; without the axis of members where the problem has none. `limit`: ends of the intervals of unknowns at a bound."""
+def statistics(problem: Problem, found: Minimum, limits: Limits, control: Control, errors: str, at_bounds: AtBounds) -> Statistics:
+    """Of the minimum of each member; without the axis of members where the problem has none."""
     unknowns, theta, single = problem.unknowns, found.theta, problem.lanes.members is None
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     low, high = limits.low[places], limits.high[places]
     bound = (theta <= limits.low) | (theta >= limits.high)
-    limit = one(limit[:, places])
+    limit = one(at_bounds.limit[:, places])
     residuals = tuple(problem.by_channel(run, found.at, one) for run in range(len(problem.runs)))
     white = tuple(problem.by_channel(run, found.at, one, white=True) for run in range(len(problem.runs)))
     samples = sum(np.sum(np.isfinite(r), axis=tuple(range(0 if single else 1, r.ndim))) for run in residuals for r in run.values())
@@ -61,10 +64,16 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
 
     more, doubt = (one(x) for x in problem.doubt(theta, elsewhere))
     quantiles = _normal_or_t(doubt, (samples - known.rank)[..., None] if problem.all_estimated else np.inf) * np.sqrt(1 + more)
-    known = known.times(one(problem.inflation(residuals, samples, known.rank)))
+    inflation = one(problem.inflation(residuals, samples, known.rank))
+    known = known.times(inflation)
     if errors == "runs":
         known, quantiles = known.between_runs(one(found.at.arrow.scores)), students_t_95(len(problem.runs) - 1)
     reach = quantiles * known.standard_errors
+    too_narrow = []
+    if single and found.converged[0]:
+        too_narrow = moved_from_bounds(at_bounds, theta[0], reach, places, unknowns.labels)
+        if errors == "sigmas":
+            too_narrow += too_narrow_near_bounds(problem.linearised, found, limits, control, known.standard_errors, float(inflation), unknowns.labels)
     values = one(theta[:, places])
     shared, local = unknowns.split(theta)
     scene = unknowns.layout.scene(problem.scene, one(shared))
@@ -86,6 +95,8 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
         correlation_time={name: one(problem.tau[:, k]) for k, name in enumerate(problem.with_memory)},
         chi_square=np.where(one(fails), np.nan, sum(_sum_of_squares(r, single) for run in white for r in run.values())),
         samples=np.asarray(samples),
+        from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
+        too_narrow=tuple(too_narrow),
     )
 
 

@@ -15,9 +15,10 @@ from jourdain_jax.analysis.asked import for_runs
 from jourdain_jax.analysis.levenberg_marquardt import minimise
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.printing import Printed
 
 
-class Prediction(eqx.Module):
+class Prediction(Printed, eqx.Module):
     """A channel of a run as a fit predicts it, in the unit of the channel."""
 
     ts: Float[np.ndarray, "times"]  # s
@@ -41,6 +42,10 @@ class Prediction(eqx.Module):
         values = np.where(np.isfinite(self.error), self.values, np.nan)
         spread = np.nansum((values - np.nanmean(values, axis=0)) ** 2)
         return float(1 - np.nansum(self.error**2) / spread) if spread > 0 else np.nan
+
+    def _text(self) -> str:
+        told = f"rms of {self.rms:.3g}; R^2 {self.r_squared:.6g}"
+        return f"{np.isfinite(self.error).sum()} samples from {self.ts[0]:.6g} to {self.ts[-1]:.6g} s, predicted to an {told}"
 
 
 def of_fitted(fit, runs: Sequence[Measurements]) -> tuple[dict[str, Prediction], ...]:

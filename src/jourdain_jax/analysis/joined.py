@@ -33,6 +33,10 @@ class JoinedArrow:
         """That of some members."""
         return JoinedArrow(self.pieces.at(members), self.joins[members], self.follows)
 
+    def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Shared unknowns (members, shared), and those of the pieces (members, pieces, local)."""
+        return self.pieces.split(x)
+
     @property
     def _parts(self) -> tuple[np.ndarray, ...]:
         """A, B, C, c of the joins."""

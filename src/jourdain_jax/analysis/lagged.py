@@ -32,10 +32,11 @@ def read(
     ts: Float[Array | np.ndarray, "times"],
     delay,
     lag=None,
-) -> Float[Array, "times *channel"]:
-    """What is shown at `ts` of a quantity with these `values` at the times `grid` (s, at equal intervals, six or more); `lag` None: there is none.
+    begin: Float[Array, "entries"] | None = None,
+) -> tuple[Float[Array, "times *channel"], Float[Array | np.ndarray, "grid entries"]]:
+    """What is shown at `ts` of a quantity with these `values` at the times `grid` (s, at equal intervals, six or more), and y there; `lag` None: there is none.
 
-    Times before the first of the grid count as that. `delay`, `lag` in s.
+    Times before the first of the grid count as that. `delay`, `lag` in s. `begin`: what the filter gives at first; None: it starts at rest.
     """
     count, step = grid.shape[0], (grid[-1] - grid[0]) / (grid.shape[0] - 1)
     x = jnp.maximum((ts - delay - grid[0]) / step, 0.0)
@@ -47,7 +48,7 @@ def read(
     left = (np.arange(count - 1) - _first(np.arange(count - 1), count) - _MIDDLE).astype(flat.dtype)  # place of the interval's begin
     since = (x - interval)[:, None]
     if lag is None:
-        found = _value(polynomials[interval], jnp.asarray(left)[interval][:, None] + since)
+        found, y = _value(polynomials[interval], jnp.asarray(left)[interval][:, None] + since), flat
     else:
         rho = lag / step
 
@@ -55,9 +56,10 @@ def read(
             polynomial, begin = here
             return _relaxed(y, polynomial, begin, jnp.ones((), flat.dtype), rho), y
 
-        _, begins = jax.lax.scan(next_one, flat[0], (polynomials, jnp.asarray(left)))
+        end, begins = jax.lax.scan(next_one, flat[0] if begin is None else begin, (polynomials, jnp.asarray(left)))
         found = jax.vmap(_relaxed, (0, 0, 0, 0, None))(begins[interval], polynomials[interval], jnp.asarray(left)[interval], since[:, 0], rho)
-    return found.reshape(ts.shape[0], *values.shape[1:])
+        y = jnp.concatenate([begins, end[None]])
+    return found.reshape(ts.shape[0], *values.shape[1:]), y
 
 
 def _first(interval: np.ndarray, count: int) -> np.ndarray:

@@ -17,9 +17,10 @@ from jaxtyping import Float
 
 from jourdain_jax.analysis.asked import TakenUp
 from jourdain_jax.analysis.levenberg_marquardt import minimise
+from jourdain_jax.analysis.profile import RISE_95
 from jourdain_jax.scene.names import UnknownNameError, nearest
+from jourdain_jax.scene.printing import Printed
 
-RISE_95 = 3.841458820694124
 _CLOSE = 0.01  # of the rise at the end of an interval
 _POINTS, _REFINED = 16, 6  # at most, on one side: outwards, and between the last two
 _STEP = 0.6  # of sqrt(rise), from point to point
@@ -28,7 +29,7 @@ _LOWER = 0.02  # of the rise, by which a lower minimum is found
 _TOLERANCE = 1e-2  # standard errors
 
 
-class Profile(eqx.Module):
+class Profile(Printed, eqx.Module):
     """The rise of the sum of squares along one unknown, and the 95 % interval that follows from it."""
 
     name: str = eqx.field(static=True)
@@ -42,7 +43,7 @@ class Profile(eqx.Module):
     kind: str = eqx.field(static=True)  # "bounded", "one-sided" or "flat"
     notes: tuple[str, ...] = eqx.field(static=True)  # what else was seen
 
-    def __str__(self) -> str:
+    def _text(self) -> str:
         unit = f" {self.unit}" if self.unit else ""
         ends = "no data set an end to it" if self.kind == "flat" else f"[{self.low:.6g}, {self.high:.6g}]{unit}"
         return "; ".join((f"`{self.name}` = {self.estimate:.6g}{unit}, profile {self.kind}: {ends}", *self.notes))

@@ -16,7 +16,7 @@ from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.sensors import Actuator, Drive, Reading, Sensor, latest, numbers_of
 from jourdain_jax.calculus.reals import Number, checked_unless_traced, described, is_traced
-from jourdain_jax.motion.inputs import Inputs, as_inputs
+from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene, entries_named
 
@@ -201,6 +201,7 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
         if (values.shape[1:] if repeats else values.shape) != shape:
             expected = f"(repeats, {', '.join(map(str, shape))})" if repeats else f"{shape}"
             hint = "; many repeats go to `fit_batch`" if values.shape[1:] == shape and not repeats else ""
+            hint = "; take its only column, `[:, 0]`" if values.shape == (*shape, 1) else hint
             raise ValueError(f"channel `{name}` of {where} has shape {values.shape}, expected {expected} for {times} times{hint}")
         if run.sigma[name].shape not in ((), (times,), shape):
             raise ValueError(f"sigma of channel `{name}` of {where} has shape {run.sigma[name].shape}, expected (), {(times,)} or {shape}")
@@ -257,6 +258,8 @@ def _inputs(scene: Scene, run: Measurements, where: str, estimates: dict) -> tup
     if run.inputs is None and not len(scene.inputs):
         return _NO_INPUTS, {}
     given = run.inputs if isinstance(run.inputs, Mapping) else {}
+    for name, one in given.items():
+        _check_overlap(run, name, one.command if isinstance(one, Actuator) else one, where)
     actuators = {name: one for name, one in given.items() if isinstance(one, Actuator)}
     if not actuators:
         return as_inputs(scene, run.inputs), {}
@@ -278,6 +281,18 @@ def _inputs(scene: Scene, run: Measurements, where: str, estimates: dict) -> tup
         if unknown:
             drives[name] = drive
     return inputs, drives
+
+
+def _check_overlap(run: Measurements, name: str, signal, where: str) -> None:
+    """ValueError where all samples of an input that changes lie before the run, or after it."""
+    if not isinstance(signal, Sampled) or is_traced((signal, run.ts, run.t0)) or np.ptp(np.asarray(signal.values)) == 0:
+        return
+    if signal.ts[0] >= run.ts[-1] or signal.ts[-1] <= run.t0:
+        first, last, begin, end = (f"{float(t):.10g}" for t in (signal.ts[0], signal.ts[-1], run.t0, run.ts[-1]))
+        raise ValueError(
+            f"input `{name}` of {where} is sampled from {first} to {last} s, and the run is from {begin} to {end} s, where it would be constant; "
+            "take both from one clock, or give a number"
+        )
 
 
 def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> tuple[int, ...]:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jourdain_jax.analysis.joined import JoinedArrow
 from jourdain_jax.analysis.layout import Layout, Place
@@ -22,7 +22,7 @@ from jourdain_jax.analysis.nodes import NODE
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem, closed
 from jourdain_jax.analysis.ranges import Range, unbounded
-from jourdain_jax.analysis.shooting import MultipleShooting, ends_of_pieces, in_pieces
+from jourdain_jax.analysis.shooting import MultipleShooting, ends_of_pieces, in_pieces, numbers_of_filters, owned
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.motion.setup import TOLERANCE
 from jourdain_jax.scene.scene import Scene
@@ -37,31 +37,33 @@ class Shot:
 
     pieces: tuple[int, ...]  # of each run
     continuity: Float[np.ndarray, "*repeats"]  # the largest jump from one piece to the next, in tolerances of the simulation, atol + rtol |x|
-    sizes: Float[np.ndarray, "states"]  # of coordinates and speeds
-    nodes: tuple[Float[np.ndarray, "*repeats nodes states"], ...]  # states (q, u) at which the pieces of each run meet
+    sizes: Float[np.ndarray, "states"]  # of coordinates, speeds, and what low-passes of sensors give
+    nodes: tuple[Float[np.ndarray, "*repeats nodes states"], ...]  # states (q, u, y) at which the pieces of each run meet
 
 
 class PieceLanes:
-    """Lanes of all pieces, which keep the states at their ends aside."""
+    """Lanes of all pieces, which keep the states at their ends aside. `states`: how many numbers each piece ends at."""
 
     alone = takes_steps = False
 
-    def __init__(self, lanes: Lanes, pieces: int, states: int):
-        self._lanes, self._pieces, self._states = lanes, pieces, states
+    def __init__(self, lanes: Lanes, states: Int[np.ndarray, "pieces"]):
+        self._lanes, self._states, pieces = lanes, states, len(states)
         self.members, self.counted, self.whitened, self.channels = lanes.members, lanes.counted, lanes.whitened, lanes.channels
         self.within, self.log_widths, self.by_channel = lanes.within, lanes.log_widths, lanes.by_channel
         self.rows = np.empty((0, pieces), object)  # (members, pieces) of [J r]
-        self.ends = np.zeros((0, pieces, states, 0))  # [J x] of the states at the ends
+        self.ends = np.zeros((0, pieces, max(states), 0))  # [J x] of the states at the ends
 
     def evaluate(self, shared, local, members):
         """As of `Lanes`."""
-        self.rows = np.empty((len(members), self._pieces), object)
-        self.ends = np.full((len(members), self._pieces, self._states, local.shape[-1] + shared.shape[-1] + 1), np.nan)
+        self.rows = np.empty((len(members), len(self._states)), object)
+        self.ends = np.full((len(members), len(self._states), max(self._states), local.shape[-1] + shared.shape[-1] + 1), np.nan)
         for b, j, plain in self._lanes.evaluate(shared, local, members):
-            self.ends[b, j] = plain[:, -self._states :]
-            for place, one in zip(zip(b.tolist(), j.tolist(), strict=True), plain[:, : -self._states], strict=True):
+            rows, ends = np.split(plain, [-self._states[j[0]]], axis=1)
+            self.ends[b, j] = 0.0
+            self.ends[b, j, : ends.shape[1]] = ends
+            for place, one in zip(zip(b.tolist(), j.tolist(), strict=True), rows, strict=True):
                 self.rows[place] = one
-            yield b, j, plain[:, : -self._states]
+            yield b, j, rows
 
 
 class Piecewise:
@@ -80,7 +82,8 @@ class Piecewise:
         shooting: MultipleShooting,
     ):
         self.scene, self.runs, self.unknowns = scene, runs, unknowns
-        self.states = len(scene.coordinate_names) + len(scene.speed_names)
+        of_runs = [len(scene.coordinate_names) + len(scene.speed_names) + numbers_of_filters(run, members is not None) for run in runs]
+        self.states = max(of_runs)  # of a node; zero where a run has fewer low-passes than another
         self.ends_of = [ends_of_pieces(run, shooting, index) for index, run in enumerate(runs)]
         parts = [in_pieces(run, ends, self.states, members is not None) for run, ends in zip(runs, self.ends_of, strict=True)]
         self.parts = tuple(piece for of_run in parts for piece in of_run)
@@ -92,7 +95,7 @@ class Piecewise:
         self.own, self.shared = m, p
         self.layout = replace(layout, local=(*layout.local, Place(NODE, (self.states,), m)))
         self._carried = np.array([k for place in layout.local if place.of_sensor for k in range(place.begin, place.end)], int)  # the same in all pieces
-        self.lanes = PieceLanes(Lanes(scene, self.parts, self.layout, simulation, members), len(self.parts), self.states)
+        self.lanes = PieceLanes(Lanes(scene, self.parts, self.layout, simulation, members), np.array(of_runs)[self.run_of])
         self._whole = Lanes(scene, runs, layout, simulation, members)
         self.members, self.lengths = members, self._whole.lengths
         self.counted, self.whitened, self.channels = self._whole.counted, self._whole.whitened, self._whole.channels
@@ -304,12 +307,12 @@ class Piecewise:
         """Of the residuals of a piece those that belong to its run, and their places there."""
         run = int(self.run_of[piece])
         before = piece - int(np.flatnonzero(self.run_of == run)[0])
-        first, last = self.ends_of[run][before : before + 2]
-        times = last - first + (last == self.ends_of[run][-1])
+        first, firsts = self.ends_of[run][before], owned(self.runs[run], self.ends_of[run])
         of_piece, of_run = [], []
         for name, where in self.lanes.channels(piece).items():
-            shape = self.runs[run].values[name].shape[1 if self.members is None else 2 :]
-            count = int(np.prod(shape)) * times
-            of_piece.append(where.start + np.arange(count))
-            of_run.append(self.channels(run)[name].start + int(np.prod(shape)) * first + np.arange(count))
+            width = int(np.prod(self.runs[run].values[name].shape[1 if self.members is None else 2 :]))
+            begin, end = firsts[name][before : before + 2]
+            samples = np.arange(width * begin, width * end)
+            of_piece.append(where.start + samples - width * first)
+            of_run.append(self.channels(run)[name].start + samples)
         return np.concatenate(of_piece), np.concatenate(of_run)

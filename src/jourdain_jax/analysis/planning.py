@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.information import hidden_combinations
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood import as_runs
 from jourdain_jax.analysis.measurements import Measurements
@@ -34,11 +35,14 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
+_CUTOFF = 1e-6  # of the largest singular value of the scaled sensitivities: what is less does not show
+
 
 class PlannedInformation(Printed, eqx.Module):
     """What planned runs will tell of each unknown. `print` shows the standard errors that they lead to."""
 
     matrix: Float[Array, "unknowns unknowns"]  # F, in the units of the unknowns
+    values: Float[Array | np.ndarray, "unknowns"]  # at which it is taken
     sensitivities: tuple[dict[str, Float[Array, "*samples unknowns"]], ...]  # of each run and channel: (d y / d theta) / sigma, zero where there is no sample
     labels: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
@@ -64,10 +68,25 @@ class PlannedInformation(Printed, eqx.Module):
                 raise UnknownNameError(f"`{name}` is not among the unknowns; {nearest(name, self.labels)}")
         return -_log_det(self.matrix, tuple(self.labels.index(name) for name in asked))
 
+    @property
+    def not_identifiable(self) -> tuple[str, ...]:
+        """What the planned runs will not tell, one sentence for each combination of unknowns."""
+        return hidden_combinations(*self._hidden, np.asarray(self.values), self.labels)
+
+    @property
+    def _hidden(self) -> tuple[np.ndarray, np.ndarray]:
+        """Directions that do not show, in rows, and the sizes of the unknowns by which they are scaled."""
+        values = np.abs(np.asarray(self.values))
+        size = np.where(values > 0, values, 1.0)
+        squares, directions = np.linalg.eigh(np.asarray(self.matrix) * size * size[:, None])
+        return directions.T[squares <= _CUTOFF**2 * squares[-1]], size
+
     def _text(self) -> str:
-        rows = [("unknown", "unit", "std. error")]
-        rows += [(name, unit, f"{float(e):.3g}") for (name, e), unit in zip(self.standard_errors.items(), self.units, strict=True)]
-        return "\n".join([f"Planned: {len(self.sensitivities)} runs, {len(self.labels)} unknowns", *table(rows)])
+        shows = np.linalg.norm(self._hidden[0], axis=0) < np.sqrt(_CUTOFF)
+        errors = [f"{float(e):.3g}" if one else "-" for e, one in zip(self.standard_errors.values(), shows, strict=True)]
+        rows = [("unknown", "unit", "std. error"), *zip(self.labels, self.units, errors, strict=True)]
+        lines = [f"Planned: {len(self.sensitivities)} runs, {len(self.labels)} unknowns", *table(rows)]
+        return "\n".join(lines + [f"  {sentence}" for sentence in self.not_identifiable])
 
 
 @quickly_compiled
@@ -125,7 +144,7 @@ def planned_information(
     F, J = _sensitivities(scene, ready, theta, simulation, unknowns.layout, tuple(places.tolist()), Reference(scene))
     prior = np.diag(1 / np.where(np.isfinite(unknowns.prior_mean[places]), unknowns.prior_sigma[places], np.inf))
     prior[:count] = unknowns.whitening @ prior[:count]  # all that are shared are estimated
-    return PlannedInformation(F + prior.T @ prior, J, unknowns.labels, unknowns.units)
+    return PlannedInformation(F + prior.T @ prior, theta[places], J, unknowns.labels, unknowns.units)
 
 
 @quickly_compiled

@@ -22,12 +22,13 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.correlated_noise import Chains, whitened
 from jourdain_jax.analysis.first_steps import Told, first_steps, read
+from jourdain_jax.analysis.grids import grid, intervals
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.measurements import Measurements
-from jourdain_jax.analysis.nodes import begin, ended
+from jourdain_jax.analysis.nodes import LAST, NODE, begin, ended
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
 from jourdain_jax.build.reference import Reference
-from jourdain_jax.calculus.reals import is_traced, real_type
+from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.motion.forward_mode import simulate_alongside
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.quick_compilation import quickly_compiled, sparingly_compiled
@@ -36,7 +37,6 @@ from jourdain_jax.scene.scene import Scene
 TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
 MOST_LANES = 64
 AHEAD = 4  # groups of lanes that are begun before the first is read
-FEWEST_INTERVALS = 64  # of a motion that is read between its times
 _WHITE, _NONE = np.zeros((1, 1)), np.zeros(0)
 FILLED = 1e-6  # of a run's span: between the times that fill up a short one
 
@@ -56,18 +56,23 @@ class Run(NamedTuple):
     correlation_time: dict[str, Float[Array | np.ndarray, ""]]  # s, of channels whose noise has a memory
 
     def residuals(self, scene: Scene, simulate: Callable, simulation: dict) -> dict[str, Float[Array | np.ndarray, "..."]]:
-        """`(reading - value) / sigma` by channel; of a piece of a run also the state at its end."""
+        """`(reading - value) / sigma` by channel; of a piece of a run also what it ends at."""
         inputs = self.inputs
         for drive in self.drives.values():
             inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
         ts = self.ts if self.grid is None else self.grid
         motion = simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, events=False, work=False, **simulation)
         states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
-        found = {}
+        found, filters, place = {}, [], len(scene.coordinate_names) + len(scene.speed_names)
         for name, weight in self.weights.items():
-            sensor = self.sensors.get(name, ideal(name))
-            found[name] = jnp.where(weight > 0, (sensor.shown(sensor.quantity(motion, states), self.grid, self.ts) - self.values[name]) * weight, 0.0)
-        return found | ended(motion, self.start)
+            sensor, at_first = self.sensors.get(name, ideal(name)), None
+            x = sensor.quantity(motion, states)
+            if sensor.has_filter and NODE in self.start:
+                place, at_first = place + x[0].size, self.start[NODE][place : place + x[0].size]
+            shown, y = sensor.shown(x, self.grid, self.ts, at_first)
+            filters += [y] if sensor.has_filter else []
+            found[name] = jnp.where(weight > 0, (shown - self.values[name]) * weight, 0.0)
+        return found | ended(motion, filters, self.start, ts)
 
     def at(self, layout: Layout, shared, local) -> "Run":
         """The run with these unknowns."""
@@ -85,28 +90,15 @@ def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
         sigma, known = data.sigma_of(name, repeats), xp.isfinite(xp.asarray(values))
         weights[name] = xp.where(known & xp.isfinite(sigma), 1.0 / sigma, 0.0)
     measured = {name: xp.where(weights[name] > 0, xp.asarray(values), 0.0) for name, values in data.values.items()}
-    grid = _grid(data.t0, data.ts) if any(sensor.is_late for sensor in data.readings.values()) else None
-    return Run(data.t0, data.ts, grid, measured, weights, data.start, data.inputs, data.readings, data.drives, data.correlation_time)
+    found = Run(data.t0, data.ts, None, measured, weights, data.start, data.inputs, data.readings, data.drives, data.correlation_time)
+    return _on_equal_grids([found])[0] if any(sensor.is_late for sensor in data.readings.values()) else found
 
 
-def _grid(t0, ts) -> Float[Array | np.ndarray, "grid"]:
-    """Times at equal intervals from the start to the last sample: the samples' own where these are equal, too; else none longer than their median.
-
-    Of traced times only their number is known: there are two intervals for each of theirs, as if the first sample were at the start.
-    """
-    count = max(FEWEST_INTERVALS, 2 * (ts.shape[0] - 1))
-    if not is_traced((t0, ts)):
-        span, steps = float(ts[-1] - t0), np.diff(np.asarray(ts, float))
-        needed = span / np.median(steps) if steps.size else 1.0
-        count = round(needed) if abs(needed - round(needed)) < 1e-6 * needed else int(np.ceil(needed))
-        count *= -(-FEWEST_INTERVALS // count)
-    return _equal_intervals(t0, ts[-1], count)
-
-
-def _equal_intervals(t0, t1, count: int) -> Float[Array | np.ndarray, "grid"]:
-    xp = jnp if is_traced((t0, t1)) else np
-    found = xp.asarray(t0 + (t1 - t0) * xp.arange(count + 1) / count, jnp.result_type(float))
-    return xp.concatenate([found[:-1], xp.asarray(t1)[None]])  # the last one without round-off
+def _on_equal_grids(runs: Sequence[Run]) -> list[Run]:
+    """The runs on grids of as many intervals as the longest needs."""
+    nodes = [run.start.get(LAST) for run in runs]
+    count = max(intervals(run.t0, run.ts, node) for run, node in zip(runs, nodes, strict=True))
+    return [run._replace(grid=grid(run.t0, run.ts, count, node)) for run, node in zip(runs, nodes, strict=True)]
 
 
 def equal_runs(data: Sequence[Measurements]) -> list[tuple[tuple[int, ...], Run]]:
@@ -188,7 +180,7 @@ class _Group:
     def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None):
         self.indices, self._members, self._runs = indices, members, np.array(indices)
         times, knots = max(run.ts.shape[0] for run in runs), _most_knots(runs)
-        filled = [_filled(run, times, knots, 0 if members is None else 1) for run in _on_equal_grids(runs)]
+        filled = [_filled(run, times, knots, 0 if members is None else 1) for run in (runs if runs[0].grid is None else _on_equal_grids(runs))]
         leaves, treedef = jax.tree.flatten(((scene, simulation), filled[0]))
         # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
         repeated = {id(x) for part in (filled[0].values, filled[0].weights) for x in part.values()} if members is not None else set()
@@ -306,8 +298,8 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, sampl
     """
     own, unknowns = layout.sizes[1], sum(layout.sizes)
 
-    def lane(common: Float[Array, "shared"], row: Float[Array, "own"]) -> Float[Array, "samples width"]:
-        begin, found = 0, dict.fromkeys(range(len(leaves)))
+    def lane(common: Float[Array, "shared"], row: Float[Array, "own"], x: Float[Array, "unknowns"]) -> Float[Array, "samples width"]:
+        found = dict.fromkeys(range(len(leaves)))
         for vector, kinds in ((common, [(False, False)]), (row, [(True, False), (True, True)])):
             begin = 0
             for kind in kinds:
@@ -319,18 +311,20 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, sampl
 
         def flat(x):
             residuals = run.at(layout, x[own:], x[:own]).residuals(layout.scene(scene, x[own:]), simulate_alongside, simulation)
-            r = jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
-            return r, r
+            return jnp.concatenate([jnp.ravel(residuals[name]) for name in sorted(residuals)])
 
         with reference.stands_in():
-            J, r = jax.jacfwd(flat, has_aux=True)(row[begin:])
+            r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)), out_axes=(None, 1))(np.eye(unknowns, dtype=x.dtype))
         return jnp.concatenate([J, r[:, None]], axis=1)
 
-    lanes, told = jax.vmap(lane, (None, 0)), Told.length(unknowns, samples)
+    each, told = jax.vmap(lane, (None, 0, 0)), Told.length(unknowns, samples)
+
+    def lanes(common: Float[Array, "shared"], rows: Float[Array, "lanes own"]) -> Float[Array, "lanes samples width"]:
+        return each(common, *jnp.split(rows, [rows.shape[1] - unknowns], axis=1))
 
     def steps(common: Float[Array, "shared"], row: Float[Array, "own"]) -> Float[Array, "_"]:
-        fixed, x, of_steps = row[: -told - unknowns], row[-told - unknowns : -told], row[-told:]
-        return first_steps(lambda x: lanes(common, jnp.concatenate([fixed, x])[None])[0], x, of_steps)
+        fixed, x, of_steps = jnp.split(row, [row.shape[0] - told - unknowns, row.shape[0] - told])
+        return first_steps(lambda x, common, fixed: each(common, fixed[None], x[None])[0], x, (common, fixed), of_steps)
 
     return quickly_compiled(lanes, jax.jit), sparingly_compiled(steps, loops=1)
 
@@ -363,14 +357,6 @@ def _without_knots(inputs):
 def _most_knots(runs: Sequence[Run]) -> list[int]:
     counts = [[x.ts.shape[0] for x in jax.tree.leaves((run.inputs, run.drives), is_leaf=_is_sampled) if _is_sampled(x)] for run in runs]
     return [max(column) for column in zip(*counts, strict=True)]
-
-
-def _on_equal_grids(runs: Sequence[Run]) -> Sequence[Run]:
-    """The runs with as many intervals in all grids as the longest has."""
-    if runs[0].grid is None:
-        return runs
-    count = max(run.grid.shape[0] for run in runs if run.grid is not None) - 1
-    return [run._replace(grid=_equal_intervals(run.t0, run.ts[-1], count)) for run in runs]
 
 
 def _filled(run: Run, times: int, knots: list[int], axis: int) -> Run:

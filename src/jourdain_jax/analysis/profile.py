@@ -2,11 +2,12 @@
 
 p(delta) = min over all other unknowns of (F - F_min), theta = bound + delta;      the limit is where 2 p = 2.706, the square of the normal 95 % quantile
 p is close to g delta + h delta^2 / 2, g: slope of F there, 1 / h: variance of the unknown if it were free
+p < 0: the bound held a saddle. So it does where another unknown does the same at the bound (a delay, a lag of zero): F is level there, and falls further in
 Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -15,19 +16,30 @@ from jourdain_jax.analysis.information import information
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, minimise
 
 ONE_SIDED = 2.7055434540954146 / 2  # of F
+RISE_95 = 3.841458820694124  # of 2 F
 FAR_BEYOND = 3.0  # standard errors: an estimate that is held at its bound by more is no chance
-CLOSE, MOST = 0.02, 8  # relative error of p; evaluations of it
+CLOSE, MOST = 0.02, 16  # relative error of p, and by what share of `ONE_SIDED` a minimum is lower; evaluations of it
+FURTHER = 4.0  # factor of delta where p does not rise
+NARROW = 0.5  # of the rise that a standard error foretells at a bound nearby: with less, the interval is too narrow
 
 
-def limits_at_bounds(evaluate: Callable, found: Minimum, limits: Limits, control: Control) -> tuple[np.ndarray, np.ndarray]:
-    """For each unknown at a bound: the limit, and how many standard errors beyond the bound the data would put it; NaN elsewhere.
+@dataclass
+class AtBounds:
+    """Of each unknown at a bound, (members, unknowns); NaN elsewhere."""
 
-    The limit is infinite where the data give none; there is none of a fit that has not converged.
-    """
+    limit: np.ndarray  # infinite where the data give none; there is none of a fit that has not converged
+    beyond: np.ndarray  # by how many standard errors the data would put it beyond
+    lower: dict[int, np.ndarray] = field(default_factory=dict)  # by member: where F is lower, with such an unknown away from its bound
+    at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)  # by member and unknown: where all are with that one at its limit
+
+
+def limits_at_bounds(evaluate: Callable, found: Minimum, limits: Limits, control: Control) -> AtBounds:
+    """What is known of unknowns at a bound."""
     limit, beyond = np.full(found.theta.shape, np.nan), np.full(found.theta.shape, np.nan)
+    told, costs = AtBounds(limit, beyond), found.at.cost.copy()
     bound = ((found.theta <= limits.low) | (found.theta >= limits.high)) & ~limits.fixed
     if not bound.any():
-        return limit, beyond
+        return told
     for b, place in np.argwhere(bound & found.converged[:, None]).tolist():
         one = found.theta[b : b + 1]
         others = bound[b : b + 1].copy()
@@ -41,33 +53,71 @@ def limits_at_bounds(evaluate: Callable, found: Minimum, limits: Limits, control
         if beyond[b, place] > FAR_BEYOND:  # the bound decides: the slope alone gives the limit
             limit[b, place] = _root(slope, 1 / error**2) * inward + one[0, place]
             continue
-        limit[b, place] = _limit(lambda d, b=b, place=place, inward=inward: _profile(evaluate, found, b, place, inward * d, limits, control), slope, error)
-        limit[b, place] = np.clip(one[0, place] + inward * limit[b, place], limits.low[place], limits.high[place])
-    return limit, beyond
+        room = float(limits.high[place] - limits.low[place])
+        first = min(_root(slope, 1 / error**2) if np.isfinite(error) else float(size[0, place]), room)
+        delta, at = _limit(lambda d, b=b, place=place, inward=inward: _profile(evaluate, found, b, place, inward * d, limits, control), first, room)
+        if at is not None and np.isfinite(delta):
+            told.at_limit[b, place] = at.theta[0]
+        elif at is not None and at.at.cost[0] < costs[b]:
+            told.lower[b], costs[b] = at.theta[0], at.at.cost[0]
+        limit[b, place] = np.clip(one[0, place] + inward * delta, limits.low[place], limits.high[place])
+    return told
 
 
-def _limit(profile: Callable, slope: float, error: float) -> float:
-    """Where the profile reaches `ONE_SIDED`."""
-    if not np.isfinite(error):
-        return np.inf
-    curvature = 1 / error**2
-    delta = _root(slope, curvature)
+def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, places: np.ndarray, labels: tuple[str, ...]) -> list[str]:
+    """Of the first member: which unknowns move further than the `reach` of their interval while one at its bound moves to its limit, one sentence each."""
+    sentences = []
+    for (_, place), there in told.at_limit.items():
+        far = [f"`{name}`" for name, shift, most in zip(labels, np.abs(there - theta)[places], reach, strict=True) if shift > most]
+        if far:
+            bounded = labels[int(np.searchsorted(places, place))]
+            moves, tells = ("move beyond theirs, which are", "them") if len(far) > 1 else ("moves beyond its own, which is", "it")
+            away = f"with `{bounded}` away from its bound, though within its interval"
+            sentences.append(f"{away}, {', '.join(far)} {moves} too narrow; `profiles` tells {tells}")
+    return sentences
+
+
+def too_narrow_near_bounds(evaluate: Callable, found: Minimum, limits: Limits, control: Control, errors: np.ndarray, factor: float, labels) -> list[str]:
+    """Of the first member: which unknowns have a bound so near that their interval reaches it, where the squares rise less than `errors` foretell.
+
+    `errors`: standard errors of those that are not fixed; `factor`: by what their squares were multiplied.
+    """
+    narrow = []
+    for name, place, error in zip(labels, np.flatnonzero(~limits.fixed).tolist(), errors, strict=True):
+        for step in (limits.low[place] - found.theta[0, place], limits.high[place] - found.theta[0, place]):
+            square = (step / error) ** 2
+            if 1 < square < 2 * RISE_95 and 2 * _profile(evaluate, found, 0, place, step, limits, control)[0] < NARROW * factor * square:
+                narrow.append(f"`{name}`")
+    lie, theirs = ("lie near bounds", "their intervals") if len(narrow) > 1 else ("lies near a bound", "its interval")
+    return [
+        f"{', '.join(narrow)} {lie}, where the squares rise less than the standard error foretells: {theirs}, and those of unknowns that correlate, "
+        "are too narrow; `profiles` tells them"
+    ] * bool(narrow)
+
+
+def _limit(profile: Callable, delta: float, room: float) -> tuple[float, Minimum | None]:
+    """Where the profile reaches `ONE_SIDED`, looked for from `delta` on, and the minimum there; infinite where it does not, or is lower at the minimum."""
+    inner, outer = (0.0, 0.0), (np.inf, np.inf)  # delta and rise on either side
     for _ in range(MOST):
-        rise = profile(delta)
-        if not np.isfinite(rise):
-            delta /= 2
-            continue
-        if rise <= 0:  # the minimum that was found is not the lowest
-            delta *= 4
-            continue
+        rise, at = profile(delta)
+        if rise < -CLOSE * ONE_SIDED:
+            return np.inf, at
         if abs(rise / ONE_SIDED - 1) < CLOSE:
-            break
-        # the curvature that explains this rise; where even the slope is too much, a smaller slope
-        curvature = 2 * (rise - slope * delta) / delta**2
-        if curvature <= 0:
-            slope, curvature = rise / delta, 0.0
-        delta = _root(slope, curvature)
-    return float(delta)
+            return delta, at
+        if rise < ONE_SIDED:
+            inner = delta, max(rise, 0.0)
+        else:
+            outer = delta, rise
+        if inner[0] >= room:
+            return np.inf, None
+        if np.isfinite(outer[1]):  # the root of p is nearly straight
+            low, high = np.sqrt(inner[1]), np.sqrt(outer[1])
+            delta = inner[0] + (outer[0] - inner[0]) * (np.sqrt(ONE_SIDED) - low) / (high - low)
+        elif np.isfinite(outer[0]):  # the motion fails there
+            delta = (inner[0] + outer[0]) / 2
+        else:
+            delta = min(delta * min(np.sqrt(ONE_SIDED / inner[1]) * (1 + CLOSE) if inner[1] else FURTHER, FURTHER), room)
+    return (delta, at) if np.isfinite(outer[0]) else (np.inf, None)
 
 
 def _root(slope: float, curvature: float) -> float:
@@ -75,11 +125,12 @@ def _root(slope: float, curvature: float) -> float:
     return float(2 * ONE_SIDED / (slope + np.sqrt(slope**2 + 2 * curvature * ONE_SIDED)))
 
 
-def _profile(evaluate: Callable, found: Minimum, b: int, place: int, step, limits: Limits, control: Control) -> float:
+def _profile(evaluate: Callable, found: Minimum, b: int, place: int, step, limits: Limits, control: Control) -> tuple[float, Minimum]:
+    """The rise of F, and the minimum with the unknown held there; infinite where the motion fails."""
     theta: Float[np.ndarray, "1 unknowns"] = found.theta[b : b + 1].copy()
     theta[0, place] += step
     fixed = limits.fixed.copy()
     fixed[place] = True
     # to one per cent of a standard error is enough
     at = minimise(lambda x, _: evaluate(x, np.array([b])), theta, replace(limits, fixed=fixed), replace(control, tolerance=max(control.tolerance, 1e-2)))
-    return float(at.at.cost[0] - found.at.cost[b])
+    return float(at.at.cost[0] - found.at.cost[b]), at

@@ -55,7 +55,7 @@ class Report(Printed):
     worst_pivot: float  # smallest singular value of the scaled A_z over all probed states; zero: singular somewhere
     typical_pivot: float
     rank_losses: tuple[str, ...]  # probed configurations where the rows lose rank
-    rank_at_start: int | None  # at the given start; None where none was given
+    rank_at_start: int | None  # at the given start, or at the scene's example where that has another rank; None otherwise
     events: tuple[str, ...]  # names of the stop events
     domain: dict[str, tuple[float, float]]  # where states were probed, as the scene states it
     conventions: str
@@ -85,7 +85,7 @@ class Report(Printed):
             "lowered to": self.lowering,
             "their conditioning": self._conditioning(),
             "rank is lost at": "none of the probed configurations" if not self.rank_losses else "; ".join(self.rank_losses[:4]),
-            **({} if self.rank_at_start is None else {"at the given start": self._at_start()}),
+            **({} if self.rank_at_start is None else {"at the start": self._at_start()}),
             "stops at": _listed(self.events),
             "probed in": self._probed(),
             "conventions": self.conventions,
@@ -153,13 +153,15 @@ def report(scene: Scene | BuiltFor, *, depth: int = 4, start: State | dict | Non
     """Degrees of freedom, rows, rank, redundancy, integrability, growth vector, cyclic and ignorable coordinates of a scene.
 
     `depth` bounds the number of fields in a bracket for the growth vector. `start`: a state, or named values as for `jj.start`, at which the rank is
-    compared with that at generic states. `print(report(scene))` shows a table; `as_dict()` is
-    for machines. Found numerically at random states of the scene's `domain` and at symmetric configurations (zero and right
+    compared with that at generic states (default: the scene's example, where some configurations lose rank). `print(report(scene))` shows a table;
+    `as_dict()` is for machines. Found numerically at random states of the scene's `domain` and at symmetric configurations (zero and right
     angles): what holds at all of them is taken to hold everywhere.
     """
     built = build(scene)
     scene, structure = built.scene, structure_of(built.scene)
     by_row, growth = row_integrability(scene), growth_vector(scene, depth=depth)
+    asked = scene.example if start is None and structure.rank_losses and scene.example else start
+    rank_at_start = None if asked is None else _rank_at(scene, as_state(scene, asked))
     return Report(
         scene=type(scene).__name__,
         coordinates=scene.coordinate_names.entries,
@@ -186,7 +188,7 @@ def report(scene: Scene | BuiltFor, *, depth: int = 4, start: State | dict | Non
         worst_pivot=structure.worst_pivot,
         typical_pivot=structure.typical_pivot,
         rank_losses=structure.rank_losses,
-        rank_at_start=None if start is None else _rank_at(scene, as_state(scene, start)),
+        rank_at_start=None if start is None and rank_at_start == structure.rank else rank_at_start,
         events=built.events,
         domain={name: (float(low), float(high)) for name, (low, high) in scene.domain.items()},
         conventions=scene.conventions,

@@ -42,9 +42,10 @@ class Sensor(eqx.Module):
 
     Each number may be an `Estimate`. By default an estimated lag is positive, gain and bias may be any number; a delay needs `range=jj.bounds(low, high)`.
 
-    With a delay or a lag, the motion is worked out at equal intervals, 64 or more and none longer than the median interval of the samples, and read between
-    them by polynomials of degree 5: with intervals h and an angular frequency w, to 0.02 (w h)^6 of the amplitude. Where the slope of the quantity jumps by J
-    (a speed under a force that steps), the error nearby is up to 0.26 J h; where its second derivative jumps by J, up to 0.08 J h^2.
+    With a delay or a lag, a motion (a piece of one, with `shooting`) is worked out at equal intervals, 64 or more and none longer than the median interval of
+    the samples, and read between them by polynomials of degree 5: with intervals h and an angular frequency w, to 0.02 (w h)^6 of the amplitude. Where the
+    slope of the quantity jumps by J (a speed under a force that steps), the error nearby is up to 0.26 J h; where its second derivative jumps by J, up to
+    0.08 J h^2.
 
     Inside `jit`, where times are not known, there are two intervals for each of the samples: take the first sample at or near `t0`.
 
@@ -153,12 +154,18 @@ class Reading(eqx.Module):
             return motion[self.name]
         return self.operation.over_times(motion) if isinstance(self.operation, Accelerometer) else jax.vmap(self.operation)(states)
 
-    def shown(self, x, grid, ts) -> Float[Array, "times *channel"]:
-        """What it shows at `ts` of a quantity with values `x` at these times, or on a grid."""
+    @property
+    def has_filter(self) -> bool:
+        """Whether it has a low-pass."""
+        return "lag" in self.used
+
+    def shown(self, x, grid, ts, begin=None) -> tuple[Float[Array, "times *channel"], Float[Array | np.ndarray, "grid entries"] | None]:
+        """What it shows at `ts` of a quantity with values `x` at these times, or on a grid; and y on the grid, from what it is at first (None: at rest)."""
+        y = None
         if grid is not None:
-            x = read(x, grid, ts, self.numbers["delay"], self.numbers["lag"] if "lag" in self.used else None)
+            x, y = read(x, grid, ts, self.numbers["delay"], self.numbers["lag"] if self.has_filter else None, begin)
         x = self.numbers["gain"] * x if "gain" in self.used else x
-        return x + self.numbers["bias"] if "bias" in self.used else x
+        return x + self.numbers["bias"] if "bias" in self.used else x, y
 
 
 def ideal(name: str) -> Reading:

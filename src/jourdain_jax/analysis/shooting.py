@@ -3,21 +3,28 @@
     piece i of a run from t_i to t_i+1      state at its begin s_i,   motion x(t; s_i, theta),      s_0: the start of the run
     continuity                              x(t_i+1; s_i, theta) = s_i+1                            as an equation, not as something measured
 
+Where sensors are late, pieces overlap: a sample belongs to the piece that has begun at the earliest time it may show, and for it the piece goes on beyond
+t_i+1. What a sensor's low-pass gives is part of s.
+
 Over a short piece a motion depends on its unknowns almost linearly, however unstable or chaotic it is over the whole run.
 Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102; H. G. Bock, E. Kostina and J. P. Schlöder, GAMM-Mitteilungen 30 (2007) 376.
 """
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Int
 
+from jourdain_jax.analysis.grids import FEWEST_INTERVALS
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.nodes import LAST, NODE
+from jourdain_jax.analysis.sensors import latest
 from jourdain_jax.calculus.reals import Number, checked_real
 from jourdain_jax.motion.inputs import Inputs, Sampled
+
+_ROUND_OFF = 1e-9  # of a run's span
 
 
 @dataclass(frozen=True)
@@ -29,8 +36,8 @@ class MultipleShooting:
     - `duration`: about how long a piece is, s: a time over which neighbouring motions part by a factor of two to five.
     - `pieces`: how many pieces each run has; give one of the two.
 
-    Pieces begin at samples. For motions that are unstable or chaotic over the whole run: steps are those of a problem that is almost linear. What is
-    minimised, and its minimum, are those of a fit without `shooting`.
+    Pieces begin at samples; where a sensor has a delay, they overlap by the largest that it may have. For motions that are unstable or chaotic over the whole
+    run: steps are those of a problem that is almost linear. What is minimised, and its minimum, are those of a fit without `shooting`.
 
     **Raises** ValueError unless one of the two is given, a finite duration above zero or two pieces or more; when used, for a run with too few samples.
     """
@@ -64,27 +71,47 @@ def ends_of_pieces(run: Measurements, shooting: MultipleShooting, index: int) ->
     return np.unique([0, *nearest[(nearest > 0) & (nearest < count)], count])
 
 
+def numbers_of_filters(run: Measurements, repeats: bool) -> int:
+    """How many numbers the low-passes of the sensors of a run that was `checked` have."""
+    return sum(math.prod(x.shape[1 + repeats :]) for name, x in run.values.items() if name in run.readings and run.readings[name].has_filter)
+
+
+def owned(run: Measurements, ends: Int[np.ndarray, "ends"]) -> dict[str, Int[np.ndarray, "ends"]]:
+    """Of each channel the first sample that belongs to each piece, and one past the last of all.
+
+    A sample at which two pieces meet belongs to the later one; of a sensor with a delay, to the piece that has begun the largest delay before.
+    """
+    ts, found = np.asarray(run.ts, float), {}
+    for name in run.values:
+        late = latest(run.sensors[name].delay) if name in run.sensors else 0.0
+        inner = np.searchsorted(ts, ts[ends[1:-1]] + late - _ROUND_OFF * (ts[-1] - ts[0]))
+        found[name] = np.concatenate([[0], inner, [len(ts)]])
+    return found
+
+
 def in_pieces(run: Measurements, ends: Int[np.ndarray, "ends"], states: int, repeats: bool) -> list[Measurements]:
-    """The pieces of a run that was `checked`; all but the first begin at a node of so many numbers. A sample at which two meet belongs to the later one."""
-    found = []
-    for first, last in pairwise(ends):
+    """The pieces of a run that was `checked`; all but the first begin at a node of so many numbers. Each goes on to the last sample that belongs to it."""
+    found, firsts = [], owned(run, ends)
+    for k, (first, end) in enumerate(pairwise(ends)):
+        last = max(end, *(own[k + 1] - 1 for own in firsts.values()))
         here = slice(first, last + 1)
-        along = (slice(None), here) if repeats else here
-        values = {name: np.array(x[along], float) for name, x in run.values.items()}
-        for x in values.values():
-            if last != ends[-1]:
-                x[(slice(None), -1) if repeats else -1] = np.nan
+        values = {}
+        for name, x in run.values.items():
+            of_piece = np.arange(first, last + 1)
+            counts = (of_piece >= firsts[name][k]) & (of_piece < firsts[name][k + 1])
+            part = np.asarray(x[:, here] if repeats else x[here], float)
+            values[name] = np.where(counts.reshape(-1, *[1] * (part.ndim - 1 - repeats)), part, np.nan)
         begins = first == ends[0]
         piece = object.__new__(type(run))
-        t0, length = run.t0 if begins else np.asarray(run.ts[first]), np.array(float(last - first))
+        t0 = run.t0 if begins else np.asarray(run.ts[first])
         own = {
             "ts": run.ts[here],
             "t0": t0,
             "values": values,
             "sigma": {name: x if x.ndim == 0 else x[here] for name, x in run.sigma.items()},
-            "start": (run.start if begins else {NODE: np.zeros(states)}) | {LAST: length},
+            "start": (run.start if begins else {NODE: np.zeros(states)}) | {LAST: np.asarray(run.ts[end])},
             "unknown_start": run.unknown_start if begins else {},
-            "inputs": _cut(run, float(t0), float(run.ts[last])),
+            "inputs": _cut(run, float(t0), float(run.ts[last] + (run.ts[last] - t0) / FEWEST_INTERVALS)),  # a grid may end an interval later
         }
         vars(piece).update(vars(run) | own)
         found.append(piece)
@@ -107,16 +134,7 @@ def _between(sampled: Sampled, t0: float, t1: float) -> Sampled:
     return Sampled(ts[first : last + 1], np.asarray(sampled.values)[first : last + 1])
 
 
-def check_shooting(shooting, runs: Sequence[Measurements]) -> None:
-    """ValueError for what is no `MultipleShooting`, and for sensors that show what was before: a piece does not know it."""
-    if shooting is None:
-        return
-    if not isinstance(shooting, MultipleShooting):
+def check_shooting(shooting) -> None:
+    """ValueError for what is no `MultipleShooting`."""
+    if shooting is not None and not isinstance(shooting, MultipleShooting):
         raise ValueError(f"`shooting` is {shooting!r}, expected `jj.MultipleShooting(duration=...)`, `jj.MultipleShooting(pieces=...)`, or None")
-    for index, run in enumerate(runs):
-        for name, reading in run.readings.items():
-            if reading.is_late:
-                raise ValueError(
-                    f"sensor `{name}` of run {index} has a delay or a lag, which `shooting` does not know: at the begin of a piece it shows what was before; "
-                    "shift its times by the delay, or leave out `shooting`"
-                )

@@ -52,12 +52,15 @@ def shot(problem: Problem, lanes: Piecewise, theta: Float[np.ndarray, "members p
 def _begun(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> tuple[Problem, np.ndarray]:
     """The problem of pieces with all their starts as unknowns, and first guesses of these."""
     m, single, count, coordinates = lanes.own, lanes.members is None, len(theta), len(problem.scene.coordinate_names)
+    places = np.arange(lanes.states)
+    of_q, of_y = places < coordinates, places >= coordinates + len(problem.scene.speed_names)
     nodes, starts = np.zeros((count, len(lanes.parts), lanes.states)), np.zeros((len(lanes.parts), lanes.states))
     for run, data in enumerate(problem.runs):
         q, u = _start(problem, data, theta[0], run)
-        starts[lanes.run_of == run] = np.concatenate([q, u])
+        starts[lanes.run_of == run, : q.size + u.size] = np.concatenate([q, u])
         for b in range(1 if single else count):
-            nodes[slice(None) if single else b, lanes.run_of == run] = first_nodes(problem.scene, data, lanes.ends_of[run], q, u, None if single else b)
+            found = first_nodes(problem.scene, data, lanes.ends_of[run], q, u, None if single else b)
+            nodes[slice(None) if single else b, lanes.run_of == run, : found.shape[1]] = found
     guess = lanes.spread(theta)
     local = guess[:, lanes.shared :].reshape(count, len(lanes.parts), -1)  # a view
     local[:, lanes.follows, m:] = nodes[:, lanes.follows]
@@ -71,13 +74,12 @@ def _begun(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> tuple[Probl
         here = np.flatnonzero(lanes.run_of == run)
         still = (np.ptp(nodes[:, here, :coordinates], axis=(0, 1)) == 0) & goes_on(problem.scene, starts[here[0], :coordinates])
         nodes[:, here[1:, None], np.flatnonzero(still)] += np.cumsum(changes[:, here[:-1, None], np.flatnonzero(still)], axis=1)
-    nodes = np.where(failed[..., None], starts, nodes)  # a piece whose motion fails begins as its run does
+    nodes = np.where(failed[..., None] & ~of_y, starts, nodes)  # a piece whose motion fails begins as its run does
     local[:, lanes.follows, m:] = nodes[:, lanes.follows]
-    # sizes of coordinates and speeds: how they differ from node to node, and change over a piece
+    # sizes: how numbers differ from node to node, and change over a piece
     sizes = np.maximum(np.std(nodes, axis=(0, 1)), np.sqrt(np.mean(changes**2, axis=(0, 1))))
     sizes = np.maximum(sizes, _SMALL * np.max(np.abs(nodes), axis=(0, 1)))
-    of_q = np.arange(lanes.states) < coordinates
-    least = np.where(of_q, np.max(sizes[of_q], initial=0.0), np.max(sizes[~of_q], initial=0.0))
+    least = np.where(of_y, sizes, np.where(of_q, np.max(sizes[of_q], initial=0.0), np.max(sizes[~of_q & ~of_y], initial=0.0)))
     lanes.node_sizes = np.where(least > 0, np.maximum(sizes, _TINY * least), 1.0)
     return lanes.problem(problem.loss), guess
 
@@ -95,7 +97,7 @@ def _put_starts(problem: Problem, lanes: Piecewise, local: np.ndarray, nodes: np
     unknowns, scene = problem.unknowns, problem.scene
     (low, high), p, m = unknowns.ends, lanes.shared, lanes.own
     for run, first in enumerate(np.flatnonzero(~lanes.follows).tolist()):
-        q, u = np.split(nodes[:, first], [len(scene.coordinate_names)], axis=-1)
+        q, u, _ = np.split(nodes[:, first], np.cumsum([len(scene.coordinate_names), len(scene.speed_names)]), axis=-1)
         for place in unknowns.layout.local:
             if place.of_sensor:
                 continue

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 WEAK = 0.1  # relative standard error from which a direction is named
+CORRELATED = 0.98  # from which a pair is
 _PART = 0.1  # of the largest entry of a direction: what is less is left out
 _MOST = 400  # unknowns that are looked at
 

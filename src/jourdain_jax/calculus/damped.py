@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt from one guess: a root of rows that Newton's method runs away from, where there is one near enough.
+"""Levenberg-Marquardt from one guess, or from several: a root of rows that Newton's method runs away from, where there is one near enough.
 
     min |f(x)|^2:   x <- x - J' (J J' + damping)^-1 f,   J = df/dx
 
@@ -11,9 +11,11 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 MOST_STEPS = 80
+MOST_ENTRIES = 50_000  # of all slopes that are held at once, for each lane: of 96 trailers those of all guesses and 17 lanes took 57 GB
 _FARTHEST = 0.25  # of the size of the unknowns, in one step
 _GIVEN_UP = 1e7  # damping: no step makes the rows smaller
 
@@ -36,14 +38,15 @@ class _Search(eqx.Module):
 
 
 def damped_root(rows: Callable, guess: Float[Array, "unknowns"], size: Float[Array, "unknowns"], tolerance: float) -> Nearest:
-    """x near `guess` at which no entry of `rows(x)` exceeds the `tolerance`, or where they are smallest.
+    """x near `guess` at which no row exceeds the `tolerance`, or where they are smallest.
 
-    `size`: of each unknown, by which steps are measured; zero for one that is held. Rows should be of order one where unknowns change by their size.
+    `rows`: x -> f and J. `size`: of each unknown, by which steps are measured; zero for one that is held. Rows should be of order one where unknowns change
+    by their size.
     """
 
     def look(x):
-        f, slope = jax.linearize(rows, x)
-        return f, jax.vmap(slope, out_axes=1)(jnp.diag(size))  # per unit of size
+        f, J = rows(x)
+        return f, J * size  # per unit of size
 
     def once(search: _Search) -> _Search:
         f, J = look(search.trial)
@@ -61,3 +64,22 @@ def damped_root(rows: Callable, guess: Float[Array, "unknowns"], size: Float[Arr
     found = jax.lax.while_loop(lambda search: search.going, once, start)
     left = jnp.max(jnp.abs(found.f), initial=0.0)
     return Nearest(found.best, jnp.where(jnp.isfinite(left), left, jnp.inf))
+
+
+def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float) -> tuple[Nearest, Int[Array, ""]]:
+    """What the first of the `guesses` leads to that leaves less than `good`, and its number; where none does, what is nearest. Else as `damped_root`."""
+    count = guesses.shape[0]
+    at_once = max(1, min(count, MOST_ENTRIES // max(1, jax.eval_shape(rows, guesses[0])[1].size)))
+    blocks = -(-count // at_once)
+    places = np.minimum(np.arange(blocks * at_once), count - 1).reshape(blocks, at_once)  # the last one may stand there several times
+
+    def further(carried):
+        k, best, number = carried
+        found = jax.vmap(lambda guess: damped_root(rows, guess, size, tolerance))(guesses[jnp.asarray(places)[k]])
+        which = jnp.where(jnp.any(found.left <= good), jnp.argmax(found.left <= good), jnp.argmin(found.left)).astype(jnp.int32)
+        better = (k == 0) | (found.left[which] < best.left)
+        chosen = (Nearest(found.x[which], found.left[which]), jnp.asarray(places, jnp.int32)[k, which])
+        return k + 1, *jax.tree.map(lambda new, old: jnp.where(better, new, old), chosen, (best, number))
+
+    nothing = Nearest(guesses[0], jnp.full((), jnp.inf, guesses.dtype)), jnp.zeros((), jnp.int32)
+    return jax.lax.while_loop(lambda carried: (carried[0] < blocks) & ~(carried[1].left <= good), further, (jnp.zeros((), jnp.int32), *nothing))[1:]

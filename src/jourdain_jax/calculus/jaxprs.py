@@ -2,16 +2,12 @@
 
 from collections.abc import Sequence
 
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr
+from jax.interpreters.partial_eval import dce_jaxpr
 
 
 def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> ClosedJaxpr:
-    """`closed` with the operations alone that its `outputs` (numbers of them; default: all) depend on."""
+    """`closed` with the operations alone that its `outputs` (numbers of them, in order; default: all) depend on, also inside of what it calls."""
     jaxpr = closed.jaxpr
-    wanted = jaxpr.outvars if outputs is None else [jaxpr.outvars[i] for i in outputs]
-    needed, kept = {v for v in wanted if not isinstance(v, Literal)}, []
-    for equation in reversed(jaxpr.eqns):
-        if not needed.isdisjoint(equation.outvars):
-            kept.append(equation)
-            needed.update(v for v in equation.invars if not isinstance(v, Literal))
-    return ClosedJaxpr(jaxpr.replace(eqns=kept[::-1], outvars=wanted), closed.consts)
+    of_wanted = jaxpr if outputs is None else jaxpr.replace(outvars=[jaxpr.outvars[i] for i in outputs])
+    return ClosedJaxpr(dce_jaxpr(of_wanted, [True] * len(of_wanted.outvars), instantiate=True)[0], closed.consts)

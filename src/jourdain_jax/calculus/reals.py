@@ -21,10 +21,15 @@ def real_type() -> np.dtype:
 
 
 def as_real(x) -> Float[Array, "*shape"]:
-    """`x` as a floating-point array: integers become the default float, floats keep their type; never weakly typed, so that one trace serves all."""
+    """`x` as a floating-point array: integers become the default float, floats keep their type; never weakly typed, so that one trace serves all.
+
+    TypeError for complex numbers, whose imaginary parts are not dropped, and truth values.
+    """
     array = x if isinstance(x, jax.Array) else jnp.asarray(np.asarray(x, real_type()) if type(x) in (int, float) else x)
     if jnp.issubdtype(array.dtype, jnp.floating):
         return jnp.asarray(array, array.dtype) if array.weak_type else array
+    if not jnp.issubdtype(array.dtype, jnp.integer):
+        raise TypeError(f"real numbers are expected, but these are of type {array.dtype}")
     return jnp.asarray(array, real_type())
 
 
@@ -87,10 +92,13 @@ def described(value) -> str:
         return "`None`"
     if isinstance(value, str):
         return f"the text {value!r}"
+    if isinstance(value, complex):
+        return f"the complex number {value}"
     if isinstance(value, type):
         return f"the class `{value.__name__}`"
     if hasattr(value, "dtype") and hasattr(value, "shape"):
-        return f"an array of shape {tuple(value.shape)}"
+        numbers = getattr(value.dtype, "kind", "O") not in "OUSMm"
+        return f"an array of shape {tuple(value.shape)}" if numbers else f"an array of {value.dtype}, shape {tuple(value.shape)}"
     name = type(value).__name__
     return f"an {name}" if name[0] in "aeioAEIO" else f"a {name}"
 

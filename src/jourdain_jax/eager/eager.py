@@ -10,22 +10,27 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.eager.numpy_backend import uncompiled
 
 
 def eval_numpy(f: Callable) -> Callable:
-    """`f` run at once on concrete arguments, uncompiled: NumPy arrays out, also while something else is being traced."""
+    """`f` run at once on concrete arguments, uncompiled: NumPy arrays out, also while something else is being traced.
+
+    `lanes`: more arguments, with an axis of lanes first; `f` is that of one lane.
+    """
 
     @lru_cache(maxsize=32)
-    def program(treedef, rest, x64):
-        return uncompiled(lambda numbers: f(*eqx.combine(numbers, jax.tree.unflatten(treedef, rest))))
+    def program(treedef, rest, x64, of_lanes):
+        whole = lambda numbers, *lane: f(*eqx.combine(numbers, jax.tree.unflatten(treedef, rest)), *lane)  # noqa: E731
+        return uncompiled_lanes(whole, shared=1) if of_lanes else uncompiled(whole)
 
     @wraps(f)
-    def run(*arguments):
-        arguments = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array_like(x) else x, arguments)
+    def run(*arguments, lanes=()):
+        arguments = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array_like(x) and not isinstance(x, bool) else x, arguments)
         numbers, others = eqx.partition(arguments, eqx.is_array)
         rest, treedef = jax.tree.flatten(others, is_leaf=_is_none)
-        return program(treedef, tuple(rest), jax.config.jax_enable_x64)(numbers)
+        return program(treedef, tuple(rest), jax.config.jax_enable_x64, bool(lanes))(numbers, *lanes)
 
     return run
 

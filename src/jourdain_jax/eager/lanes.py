@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax.extend.core import Literal
 
-from jourdain_jax.eager.numpy_backend import ENTRYWISE, RULES, applied
+from jourdain_jax.eager.numpy_backend import ENTRYWISE, RULES, applied, traced_for_use
 
 
 class _Value(NamedTuple):
@@ -19,21 +19,22 @@ class _Value(NamedTuple):
     by_lane: bool  # whether it has an axis of lanes, the first one
 
 
-def uncompiled_lanes(f: Callable) -> Callable:
-    """`f`, of trees of arrays of one lane, run on NumPy for arrays with an axis of lanes first."""
+def uncompiled_lanes(f: Callable, shared: int = 0) -> Callable:
+    """`f`, of trees of arrays of one lane, run on NumPy for arrays with an axis of lanes first; the first `shared` arguments are those of all lanes."""
 
     @lru_cache(maxsize=64)
     def traced(treedef, shapes):
-        return jax.make_jaxpr(f, return_shape=True)(*jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(*s) for s in shapes]))
+        return traced_for_use(f, jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(*s) for s in shapes]))
 
     @wraps(f)
     def run(*arguments):
         leaves, treedef = jax.tree.flatten(arguments)
-        leaves = [np.asarray(x) for x in leaves]
-        count = len(leaves[0])
-        closed, shape = traced(treedef, tuple((x.shape[1:], x.dtype) for x in leaves))
+        without = len(jax.tree.leaves(arguments[:shared]))
+        values = [_Value(np.asarray(x), i >= without) for i, x in enumerate(leaves)]
+        count = len(values[without].array)
+        closed, shape = traced(treedef, tuple((x.array.shape[x.by_lane :], x.array.dtype) for x in values))
         with np.errstate(all="ignore"):
-            found = _run(closed, [_Value(x, True) for x in leaves], count)
+            found = _run(closed, values, count)
         return jax.tree.unflatten(jax.tree.structure(shape), [_of_all(x, count) for x in found])
 
     return run

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
+from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.scalar_operations import VALUES
 from jourdain_jax.eager.indexing import gathered, scattered
 
@@ -25,8 +26,7 @@ def uncompiled(f: Callable) -> Callable:
 
     @lru_cache(maxsize=64)
     def traced(treedef, shapes):
-        arguments = jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(*s) for s in shapes])
-        return jax.make_jaxpr(f, return_shape=True)(*arguments)
+        return traced_for_use(f, jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(*s) for s in shapes]))
 
     @wraps(f)
     def run(*arguments):
@@ -38,6 +38,12 @@ def uncompiled(f: Callable) -> Callable:
         return jax.tree.unflatten(jax.tree.structure(shape), out)
 
     return run
+
+
+def traced_for_use(f: Callable, arguments):
+    """`f` traced, without the operations that no result needs, and the shapes of its results."""
+    closed, shape = jax.make_jaxpr(f, return_shape=True)(*arguments)
+    return needed_only(closed), shape
 
 
 def _run(jaxpr, constants, arguments) -> list[np.ndarray]:

@@ -70,6 +70,9 @@ class Design(Printed):
         return "columns"
 
     def _check_sampler(self) -> None:
+        if self.sampler in (GRID, TABLE):
+            name, what = next(iter(self.variables.items()))
+            raise ValueError(f"a {self.sampler} takes {'`jj.Levels`' if self.sampler == GRID else 'columns of numbers'}, but `{name}` varies as {what!r}")
         if self.sampler not in SAMPLERS:
             raise ValueError(f"unknown sampler `{self.sampler}`; {nearest(str(self.sampler), SAMPLERS)} Grids take `jj.Levels`, tables columns.")
         if isinstance(self.samples, bool) or not isinstance(self.samples, int | np.integer) or self.samples < 1:

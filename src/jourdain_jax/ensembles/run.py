@@ -4,6 +4,7 @@ The first Ctrl-C lets the chunk under way end; a second one ends at once. Both l
 """
 
 import functools
+import json
 import signal
 import sys
 import threading
@@ -169,12 +170,23 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
     held, own = store.study["identity"], task.identity()
     other = [name for name in own if held.get(name) != own[name]]
     if other:
-        raise ValueError(f"`{store.path}` holds another study: its {' and '.join(other)} differ from this one's; give a new name, or ask for the same")
+        what = ", ".join(_difference(name, store.attributes, attributes(task)) for name in other)
+        raise ValueError(f"`{store.path}` holds another study; what differs: {what}; give a new name, or ask for the same")
     if chunk is not None and chunk != store.chunk:
         raise ValueError(f"`{store.path}` was begun with chunks of {store.chunk} lanes, and `chunk` is {chunk}; leave `chunk` out")
     changed = [f"{name} {held} (now {versions()[name]})" for name, held in store.study["versions"].items() if versions().get(name) != held]
     if changed:
         warnings.warn(f"`{store.path}` was begun with other versions: {', '.join(changed)}; what is computed now may differ in its last digits", stacklevel=3)
+
+
+def _difference(part: str, held: dict, own: dict) -> str:
+    """A part of a study that differs, and in what: options and parameters by name; the text of a design or start."""
+    kept = {"scene": "parameters", "options": "options", "start": "start"}.get(part, "")
+    if not kept:
+        return part
+    was, now = held.get(kept, {}), json.loads(json.dumps(own[kept]))
+    names = [f"`{name}`" for name in sorted({*was, *now}) if was.get(name) != now.get(name)]
+    return f"{part} ({', '.join(names)})" if names else f"{part} (its methods)" if part == "scene" else part
 
 
 @contextmanager

@@ -125,6 +125,11 @@ class Store:
             raise ValueError(f"`{self.path}` has format {found.get('format')}, this version of jourdain-jax reads {FORMAT}; use the version that wrote it")
         return found
 
+    @property
+    def attributes(self) -> dict:
+        """What it says of itself."""
+        return json.loads((self.path / "zarr.json").read_bytes())["attributes"]
+
     @staticmethod
     def is_taken(path: str | os.PathLike) -> bool:
         """Whether something is at `path`; an empty folder does not count."""

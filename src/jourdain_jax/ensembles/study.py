@@ -1,5 +1,6 @@
 """A study: what varies over many motions of one scene, and how they are run."""
 
+import inspect
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from jourdain_jax.ensembles.run import bounded, in_this_process, run
 from jourdain_jax.ensembles.task import AT_START, SAVES, Task
 from jourdain_jax.ensembles.workers import in_processes
 from jourdain_jax.motion.arguments import as_end, check_span, check_times, saved_times
+from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
@@ -27,6 +29,8 @@ from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
 TIMES = 201  # saved, where outputs look along the motion
+NO_OPTIONS = ("saveat", "adjoint", "progress", "parameters", "starts", "scene", "start")
+OPTIONS = tuple(name for name in inspect.signature(simulate).parameters if name not in NO_OPTIONS)
 
 
 @dataclass(frozen=True, repr=False)
@@ -104,9 +108,11 @@ class Study(Printed):
             raise ValueError(f"`save` is {save!r}; {nearest(str(save), SAVES)}")
         if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1 or (every > 1 and save != "trajectories"):
             raise ValueError(f"`every` is {every!r}, expected a whole number of at least 1; it says of which lanes save='trajectories' keeps the trajectory")
-        for name in ("saveat", "adjoint", "progress", "parameters", "starts"):
-            if name in options:
+        for name in options:
+            if name in NO_OPTIONS:
                 raise ValueError(f"`{name}` is no option of a study; times to save at are `ts`, and what is kept is said by `outputs` and `save`")
+            if name not in OPTIONS:
+                raise ValueError(f"`{name}` is no option of a study; {nearest(name, OPTIONS)}")
         known = as_outputs(self.scene, outputs)
         first = as_end("t0", 0.0 if t0 is None else t0)
         times = None if ts is None else saved_times(ts)

@@ -29,8 +29,8 @@ class Sampled(eqx.Module):
     values: Float[Array, "samples"] = eqx.field(converter=as_real)
 
     def __init__(self, ts, values):
-        self.ts = checked_real(ts, "`ts` of `Sampled`", advice="give times in s")
-        self.values = checked_real(values, "`values` of `Sampled`", advice="give one number per time")
+        self.ts = checked_real(ts, "`ts` of `Sampled`", advice="give times in s").astype(real_type())
+        self.values = checked_real(values, "`values` of `Sampled`", advice="give one number per time").astype(real_type())
         if self.ts.ndim != 1 or self.ts.shape[0] == 0 or self.values.shape != self.ts.shape:
             raise ValueError(
                 f"`Sampled` was given times of shape {self.ts.shape} and values of shape {self.values.shape}, expected two vectors of one length; "
@@ -116,10 +116,12 @@ def _as_channel(f: Callable, where: str) -> Callable:
         channel, found = traced(f, real_type())
     except TypeError as error:
         raise ValueError(f"{where} cannot be called with a time ({str(error).splitlines()[0]}); {advice}") from None
-    if not hasattr(found, "shape"):
+    if not (hasattr(found, "shape") and hasattr(found, "dtype")):
         raise ValueError(f"{where} returned {described(found)}, expected one number; {advice}")
     if found.shape != ():
         raise ValueError(f"{where} returned an array of shape {found.shape}, expected one number; {advice}")
+    if jnp.issubdtype(found.dtype, jnp.complexfloating):
+        raise ValueError(f"{where} returned a number of type {found.dtype}, expected a real number; {advice}")
     leaves = jax.tree.leaves(f)
     plain = len(leaves) == 1 and leaves[0] is f  # a module may hold arrays to be differentiated, and is kept as it is
     return channel if plain and channel is not None else f

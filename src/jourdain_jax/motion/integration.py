@@ -110,6 +110,8 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     all_states = jax.tree.map(lambda saved, first, last: jnp.concatenate([first[None], saved, last[None]]), (solved.ts, solved.ys, valid), *start_and_end)
     (q, u, work), pivots, states = jax.vmap(saved_state)(*all_states)
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
+    # without rows all are one, which XLA would go through while it compiles, for seconds, were it to know them
+    pivots = jax.lax.optimization_barrier(pivots)
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
     lost = energy_lost(energies_near(setup, args, *states), solved.accepted) if conserves(setup) else False

@@ -31,6 +31,7 @@ from jourdain_jax.motion.start import State, Unmoved, named_unmoved, put_on_rows
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.choice import Formulation, as_formulation, vector_field
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
+from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
@@ -132,7 +133,10 @@ def _integrated(setup: Setup) -> Trajectory | None:
 
 def set_up(scene: Scene | BuiltFor, start=None, **options) -> Setup:
     """What `simulate` integrates for these arguments, which are its own."""
-    bound = inspect.signature(simulate).bind(scene, start, **options)
+    signature = inspect.signature(simulate)
+    for name in options.keys() - signature.parameters.keys():
+        raise TypeError(f"simulate() got an unexpected keyword argument '{name}'; {nearest(name, signature.parameters)}")
+    bound = signature.bind(scene, start, **options)
     bound.apply_defaults()
     return _set_up(**bound.arguments)
 

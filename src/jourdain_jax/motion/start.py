@@ -20,7 +20,7 @@ from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.held_values import may_contradict
 from jourdain_jax.build.sampling import NoStateFoundError, seen_on_rows
 from jourdain_jax.build.structure import Structure, structure_of
-from jourdain_jax.calculus.damped import damped_root
+from jourdain_jax.calculus.damped import first_root
 from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, is_traced, real_type
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -238,12 +238,12 @@ def _searched(scene: Scene, t, q, free, usual: Usual, guesses) -> _Put:
     every = jnp.where(jnp.any(G != 0, axis=(0, 1)), every, q)  # coordinates that no row depends on stay
     d = row_scale(jnp.max(jnp.abs(G), axis=0) * size, usual.closures * jnp.mean(usual.width))
     tolerance = 16 * float(jnp.finfo(q.dtype).eps)
-    found = jax.vmap(lambda guess: damped_root(lambda q: d * by.closures(given, t, q)[0], guess, size, tolerance))(every)
-    good = found.left <= float(jnp.finfo(q.dtype).eps) ** 0.5
-    guess = jnp.where(jnp.any(good), jnp.argmax(good), jnp.argmin(found.left)).astype(jnp.int32)
-    begin = jnp.where(free, found.x[guess], q)
-    near_q = jnp.where(good[guess], put_positions(scene, t, begin, free, usual)[0], begin)
-    return _Put(near_q, by.closures(given, t, near_q)[0], guess, begin, good[guess])
+    scaled = lambda q: jax.tree.map(lambda x: (x.T * d).T, by.closures(given, t, q))  # noqa: E731
+    good = float(jnp.finfo(q.dtype).eps) ** 0.5
+    found, guess = first_root(scaled, every, size, tolerance, good)
+    begin, met = jnp.where(free, found.x, q), found.left <= good
+    near_q = jnp.where(met, put_positions(scene, t, begin, free, usual)[0], begin)
+    return _Put(near_q, by.closures(given, t, near_q)[0], guess, begin, met)
 
 
 def _tolerance(dtype) -> float:

@@ -58,7 +58,7 @@ def _as_vector(scene: Scene, what: str, x, names: Names) -> Array:
     if isinstance(x, Mapping):
         raise ValueError(f"`{what}` of `{type(scene).__name__}` is a dictionary, expected a vector of {listed}; `jj.start(scene, **values)` makes one by name")
     advice = f"one number for each of {listed}; use `jax.vmap` or `rollout` for many states"
-    return checked_real(x, f"`{what}` of `{type(scene).__name__}`", (len(names),), advice=advice)
+    return checked_real(x, f"`{what}` of `{type(scene).__name__}`", (len(names),), advice=advice).astype(real_type())
 
 
 class ChangingInputs(eqx.Module):

@@ -98,7 +98,7 @@ def _check_counts(scene) -> None:
     """A count that is no static field would be a number of the equations, and a loop or a branch over it could not be traced."""
     for field in fields(scene):
         value = getattr(scene, field.name)
-        if isinstance(value, int) and not field.metadata.get("static"):
+        if isinstance(value, int) and not field.metadata.get("static") and not field.metadata.get("parameter"):
             raise ValueError(
                 f"field `{field.name}` of `{type(scene).__name__}` is {value} and no parameter; for a count or switch write "
                 f"`{field.name}: {type(value).__name__} = eqx.field(static=True, default={value})`, for a number `{field.name} = jj.parameter({float(value)})`"

@@ -54,6 +54,8 @@ def check_parameters(scene) -> None:
         where = f"parameter `{name}` of `{type(scene).__name__}`"
         if not hasattr(value, "dtype"):
             raise ValueError(f"{where} is {described(value)}, expected a number{_in(metadata)} or an array of numbers")
+        if not jnp.issubdtype(value.dtype, jnp.floating):
+            raise ValueError(f"{where} is of type {value.dtype}, expected real numbers{_in(metadata)}; check where it was computed")
         if isinstance(value, jax.core.Tracer):
             continue
         numbers = np.asarray(value)

@@ -13,10 +13,9 @@ from jourdain_jax.calculus.pseudo_inverse import passing_cutoff
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.rows import UsualRows
 from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
-from jourdain_jax.motion.trajectories.over_times import Record, accelerations_over_times, contact_forces_over_times, energies, invariants, residuals
+from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record, energies, map_over_times, uncompiled_over_times
 from jourdain_jax.motion.trajectories.results import FALLBACKS
 
 
@@ -80,9 +79,10 @@ def diagnose(trajectory: Record) -> Diagnostics:
 
     Times that were not reached do not count.
     """
+    checks = Checks(jax.tree.map(jnp.asarray, usual_rows(trajectory.scene)))
     if trajectory.ts.shape[0] <= FEW_TIMES and not is_traced(trajectory):
-        return jax.tree.map(jnp.asarray, _uncompiled(trajectory, usual_rows(trajectory.scene)))
-    return _diagnosed(trajectory, usual_rows(trajectory.scene))
+        return jax.tree.map(jnp.asarray, _uncompiled(trajectory, uncompiled_over_times(checks, trajectory, by_inputs=True)))
+    return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True))
 
 
 FEW_TIMES = 1000
@@ -92,10 +92,9 @@ DRIFTED = 1e-2  # of the energy that moves
 _ROUND_OFF = 1e-6  # of the whole energy: where less than that moves, as at rest, nothing is said of its drift
 
 
-def _diagnosed(trajectory: Record, usual: UsualRows) -> Diagnostics:
-    energy = energies_of(trajectory, trajectory.work)
-    geometric, rows = residuals(trajectory)
-    motion = accelerations_over_times(trajectory, usual)
+def _diagnosed(trajectory: Record, found: Checked) -> Diagnostics:
+    energy = Energies(*found.energies, trajectory.work)
+    geometric, rows = found.residuals
     reached = jnp.all(jnp.isfinite(trajectory.q), axis=-1)
     return Diagnostics(
         energy_drift=_span(energy.balance),
@@ -103,10 +102,10 @@ def _diagnosed(trajectory: Record, usual: UsualRows) -> Diagnostics:
         energy_size=jnp.nanmax(energy.kinetic) + _span(energy.potential) + _ROUND_OFF * jnp.nanmax(jnp.abs(energy.balance)),
         position_residual=_largest(geometric),
         velocity_residual=_largest(rows),
-        smallest_singular_value=jnp.nanmin(jnp.where(reached, motion.smallest_singular_value, jnp.nan)),
-        rank=(jnp.min(motion.rank), jnp.max(motion.rank)),
-        invariant_drifts={name: _span(values) for name, values in invariants(trajectory).items()},
-        contacts={name: _extremes(force) for name, force in contact_forces_over_times(trajectory).items()},
+        smallest_singular_value=jnp.nanmin(jnp.where(reached, found.smallest_singular_value, jnp.nan)),
+        rank=(jnp.min(found.rank), jnp.max(found.rank)),
+        invariant_drifts={name: _span(values) for name, values in found.invariants.items()},
+        contacts={name: _extremes(force) for name, force in found.contacts.items()},
     )
 
 
@@ -130,10 +129,15 @@ def _largest(values) -> Float[Array, ""]:
 def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     """What the diagnostics of a motion speak against, in words."""
     low, high = (int(rank) for rank in found.rank)
-    smallest = float(found.smallest_singular_value)
+    smallest, usual = float(found.smallest_singular_value), int(usual_rows(trajectory.scene).rank)
     warned = []
     if low != high:
         warned.append(f"rows change their rank along the motion, {low} to {high}: constraint forces and the motion beyond may not be unique")
+    elif high < usual:
+        warned.append(
+            f"rows have rank {high} all along, but {usual} at generic states: a singular configuration, or another way to assemble the scene; "
+            "state a `domain` around the motion to have it judged there"
+        )
     elif smallest < np.sqrt(jnp.finfo(trajectory.q.dtype).eps):
         warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
     for kind, residual, state in (("geometric", found.position_residual, trajectory.q), ("velocity", found.velocity_residual, trajectory.u)):

@@ -1,16 +1,18 @@
 """Quantities along a recorded motion: a function of one state, mapped over all saved times."""
 
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.structure import structure_of, usual_rows
 from jourdain_jax.calculus.reals import checked_real, is_traced
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions, contact_forces, row_reactions
+from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import UsualRows, velocity_residual
@@ -66,13 +68,9 @@ def _mapped(f, record: Record, by_inputs: bool):
         return eqx.filter_vmap(lambda record: _mapped(f, record, by_inputs))(record)
 
     def one(t, q, u):
-        reached = jnp.all(jnp.isfinite(q))
-        t, q, u = (jnp.where(reached, a, b) for a, b in ((t, record.t_end), (q, record.q_end), (u, record.u_end)))
-        values = f(record.scene, t, q, u, record.inputs.near(t) if by_inputs else record.inputs(t))
-        return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan) if eqx.is_inexact_array(x) else x, values)
+        return _at_one_time(f, record, by_inputs, t, q, u)
 
-    count = len(record.ts)
-    at_once = max(1, MOST_ENTRIES // record.q.shape[-1] ** 2)
+    count, at_once = len(record.ts), _at_once(record)
     if count <= at_once:
         return jax.vmap(one)(record.ts, record.q, record.u)
     block = next(k for k in range(at_once, 0, -1) if count % k == 0)  # without a rest, which would be compiled by itself
@@ -80,6 +78,28 @@ def _mapped(f, record: Record, by_inputs: bool):
 
 
 _compiled = for_programs(_mapped, by_itself)
+
+
+def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
+    reached = jnp.all(jnp.isfinite(q))
+    t, q, u = (jnp.where(reached, a, b) for a, b in ((t, record.t_end), (q, record.q_end), (u, record.u_end)))
+    values = f(record.scene, t, q, u, record.inputs.near(t) if by_inputs else record.inputs(t))
+    return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan) if eqx.is_inexact_array(x) else x, values)
+
+
+def _at_once(record: Record) -> int:
+    """At how many times quantities are worked out together."""
+    return max(1, MOST_ENTRIES // record.q.shape[-1] ** 2)
+
+
+def uncompiled_over_times(f, record: Record, by_inputs: bool = False):
+    """As `map_over_times`, of one motion, uncompiled: for what is looked at once."""
+    by_time, size = (record.ts, record.q, record.u), _at_once(record)
+    blocks = [_uncompiled(f, record, by_inputs and _needs_rates(record), lanes=[x[k : k + size] for x in by_time]) for k in range(0, len(record.ts), size)]
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
+
+
+_uncompiled = eval_numpy(_at_one_time)
 
 
 def motions(record: Record) -> Motion:
@@ -168,3 +188,31 @@ def _residuals(scene, t, q, u, inputs):
 
 def _invariants(scene, t, q, u, inputs):
     return invariants_of(scene, motion_at(scene, t, q, u, inputs))
+
+
+class Checked(NamedTuple):
+    """What is looked at along a motion to trust it."""
+
+    energies: tuple[Array, Array]  # kinetic and potential
+    residuals: tuple[Array, Array]  # of the geometric rows and of the velocity rows
+    rank: Array
+    smallest_singular_value: Array
+    invariants: dict[str, Array]
+    contacts: dict[str, ContactForce]
+
+
+class Checks(eqx.Module):
+    """`Checked` at one state; `usual`: what the rows are at most states."""
+
+    usual: UsualRows
+
+    def __call__(self, scene, t, q, u, inputs) -> Checked:
+        found = accelerations(scene, t, q, u, inputs, reduction="svd", usual=self.usual)
+        return Checked(
+            _energies(scene, t, q, u, inputs),
+            _residuals(scene, t, q, u, inputs),
+            found.rank,
+            found.smallest_singular_value,
+            _invariants(scene, t, q, u, inputs),
+            contact_forces(scene, t, q, u, found, inputs),
+        )
