@@ -3,6 +3,7 @@
 Elimination in a narrow band is compared with dense matrices.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -64,14 +65,13 @@ def test_rows_of_a_chain_lie_in_a_narrow_band_whatever_their_order():
     assert everywhere.band is None
 
 
-def test_chains_are_assembled_in_a_band_as_by_dense_matrices(monkeypatch):
+def test_chains_are_assembled_in_a_band_as_by_dense_matrices():
     pattern, points = links(80)
     q = points + 0.4 * np.random.default_rng(1).normal(size=(6, len(points)))
     low, high, generic = np.full(len(points), -2.0), np.full(len(points), 82.0), np.ones(6, bool)
     look = looking(pattern, np.full(80, 1.09))
     found = assemble(look, pattern, q, low, high, generic)
-    monkeypatch.setattr(sparse_slopes, "FEWEST_ROWS", 1000)
-    dense = links(80)[0]
+    dense = replace(pattern, fewest=1000)
     assert pattern.band is not None
     assert dense.band is None
     expected = assemble(look, dense, q, low, high, generic)

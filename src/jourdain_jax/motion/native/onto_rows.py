@@ -19,12 +19,14 @@ from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVE
 from jourdain_jax.motion.native.rows_in_band import PLACES, sizes, write_eliminated, write_factors, write_solution
 from jourdain_jax.native.dense import cleared, write_cholesky, write_inverted, write_rotated, write_solved, write_triangular
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.scalar_program import as_real, unsupported
-from jourdain_jax.native.scalar_program import written as program_written
+from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn
 from jourdain_jax.native.threads import write_rows
 
 LARGEST_PROGRAM = 60_000  # operations
-# Of a matrix. Measured: speeds of 6 trailers take 0.10 ms here and 0.08 by XLA alone, 0.05 and 0.06 each in a batch; of 12 (2,812 entries) 0.68 and 0.20,
+# Of a band. Measured: speeds of 3, 5, 8 and 12 trailers (10 to 37 rows, width 4) take 0.010, 0.011, 0.012 and 0.013 ms in a band, by dense matrices 0.019,
+# 0.045, 0.14 and 0.45; in a batch 0.2 to 0.7 microseconds each, and 1.5, 5, 18 and 58.
+FEWEST_ROWS, NARROW = 8, 2
+# Of a dense matrix. Measured: speeds of 6 trailers take 0.10 ms here and 0.08 by XLA alone, 0.05 and 0.06 each in a batch; of 12 (2,812 entries) 0.68 and 0.20,
 # 0.32 and 0.18; of 32 14.6 and 1.4, 3.6 and 1.2.
 MOST_ENTRIES = 3_000
 MOST_IN_BAND = 10_000_000  # of a matrix that is there only where rows in a band are nearly dependent
@@ -72,7 +74,7 @@ class Rows:
     @cached_property
     def in_band(self) -> Pattern | None:
         """Where the slopes are, of rows whose products lie in a narrow band; None for others, and where the mass matrix is not diagonal."""
-        pattern = Pattern.of(self.slopes, (len(self.residuals), len(self.moving)))
+        pattern = Pattern.of(self.slopes, (len(self.residuals), len(self.moving)), fewest=FEWEST_ROWS, narrow=NARROW)
         return pattern if all(i == k for i, k in self.metric or ()) and pattern.band is not None else None
 
     def reason_against(self) -> str:
@@ -118,8 +120,9 @@ def _write_values(w: Writer, of: Rows, name: str, nodes: dict[int, int]) -> None
     """`name(state, found)`: values of nodes, each at its place in `found`."""
     with w.function(name, "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
         known = {n: w.load(w.real, state, k) for k, n in enumerate(of.given)}
-        for place, value in zip(nodes, program_written(w, of.program.graph, nodes.values(), known), strict=True):
-            w.store(as_real(w, value), found, place)
+        places = list(nodes)
+        for k, value in written_in_turn(w, of.program.graph, nodes.values(), known):
+            w.store(as_real(w, value), found, places[k])
         w.give()
 
 
