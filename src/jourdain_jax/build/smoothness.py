@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.trace import jaxpr_of_scene
 from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.kinematics import coordinate_rates, pose_at
 from jourdain_jax.equations.instant import constraint_rows
+from jourdain_jax.equations.kinematics import coordinate_rates, pose_at
 from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.program.roughness import may_bend
