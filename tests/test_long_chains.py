@@ -3,6 +3,7 @@
 Elimination in a narrow band is compared with dense matrices.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -64,14 +65,13 @@ def test_rows_of_a_chain_lie_in_a_narrow_band_whatever_their_order():
     assert everywhere.band is None
 
 
-def test_chains_are_assembled_in_a_band_as_by_dense_matrices(monkeypatch):
+def test_chains_are_assembled_in_a_band_as_by_dense_matrices():
     pattern, points = links(80)
     q = points + 0.4 * np.random.default_rng(1).normal(size=(6, len(points)))
     low, high, generic = np.full(len(points), -2.0), np.full(len(points), 82.0), np.ones(6, bool)
     look = looking(pattern, np.full(80, 1.09))
     found = assemble(look, pattern, q, low, high, generic)
-    monkeypatch.setattr(sparse_slopes, "FEWEST_ROWS", 1000)
-    dense = links(80)[0]
+    dense = replace(pattern, fewest=1000)
     assert pattern.band is not None
     assert dense.band is None
     expected = assemble(look, dense, q, low, high, generic)
@@ -102,10 +102,11 @@ def test_nearly_dependent_rows_are_known_although_every_pivot_is_large():
 
 
 @native
-@pytest.mark.parametrize("kind", ["positions", "determined speeds"])
-def test_machine_code_in_a_band_puts_lanes_onto_rows_as_by_rotations(kind, monkeypatch):
-    scene = TrailerChain(trailers=33)
-    program, generator, lanes = row_program(scene), np.random.default_rng(4), 4
+@pytest.mark.parametrize("kind", ["positions", "determined speeds", "speeds"])
+def test_machine_code_in_a_band_puts_lanes_onto_rows_as_by_rotations(kind):
+    generator, lanes = np.random.default_rng(4), 4
+    scene = TrailerChain(trailers=33, trailer_mass=generator.uniform(1.0, 9.0, 33))
+    program = row_program(scene)
     in_band, dense = (Rows(program, kind, affine=kind != "positions") for _ in range(2))
     assert in_band.in_band is not None
     object.__setattr__(dense, "in_band", None)
@@ -116,12 +117,19 @@ def test_machine_code_in_a_band_puts_lanes_onto_rows_as_by_rotations(kind, monke
     u = generator.normal(size=(lanes, len(program.u)))
     state = [t, q + 1e-3 * generator.normal(size=q.shape)] + ([] if kind == "positions" else [u, np.zeros((lanes, 2))])
     given = [jnp.asarray(x) for x in (*state, free, typical)]
-    by = lambda rows: jax.vmap(lambda *x: put_on_rows._put(rows, scene, list(x[:-2]), *x[-2:]))(*given)  # noqa: E731
+    by = lambda rows, scene=scene: jax.vmap(lambda *x: put_on_rows._put(rows, scene, list(x[:-2]), *x[-2:]))(*given)  # noqa: E731
     found, expected = by(in_band), by(dense)
     for x, y in zip(found, expected, strict=True):
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-10)
     assert np.max(np.abs(found[1][0])) < 1e-13
     np.testing.assert_array_equal(found[0][2], state[1 if kind == "positions" else 2][2])
+    if kind == "speeds":
+        heavy = jax.jit(lambda mass: by(in_band, scene.replace(trailer_mass=mass)))
+        assert np.isnan(heavy(jnp.full(33, jnp.nan))[0][0]).any()
+
+
+def test_mass_matrices_of_speeds_along_a_bodys_own_axes_are_diagonal():
+    assert all(i == k for i, k in row_program(TrailerChain(trailers=2)).M)
 
 
 @native

@@ -17,22 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.levenberg_marquardt import (
-    ENOUGH,
-    ERROR,
-    FAST,
-    FASTEST,
-    LEAST,
-    LEAST_COLUMN,
-    MOST,
-    OVER,
-    SHORT,
-    SLOW,
-    SURELY,
-    TINY,
-    WELL,
-    Pace,
-)
+from jourdain_jax.analysis.levenberg_marquardt import LEAST_COLUMN
+from jourdain_jax.analysis.pace import BEGIN, LEAST, MOST, SLOW, SURELY, after_trial, shrinkage
 
 ROOM = 64  # for steps
 WEAK = 1e-4  # of the largest singular value: what J'J tells to eight digits
@@ -113,16 +99,10 @@ def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], known: tuple[Ar
         whole = jnp.concatenate([jnp.where(of.counts[:, None] > 0, rows, 0.0), of_priors])
         products = whole.T @ whole
         cost, before = jnp.where(jnp.isfinite(jnp.sum(products)), 0.5 * products[-1, -1], jnp.inf), old.cost
-        found, by_slopes = before - cost, -0.5 * (old.slope + products[:-1, -1] @ old.d)
-        closely = (jnp.abs(found) < ERROR * jnp.abs(before)) | ((old.promised < 100 * of.tolerance**2) & (jnp.abs(found) < of.tolerance))
-        found = jnp.where(closely, by_slopes, found)
-        first, ratio = old.steps < 0, found / jnp.maximum(old.promised, TINY)
-        taken = first | (jnp.isfinite(found) & (found > ENOUGH * old.promised))
-        damping, growth, fall, _, before_last = old.pace
-        change = jnp.where(ratio > WELL, 1 / fall, jnp.where(ratio < OVER, 3.0, 1.0))
-        after = jnp.stack([jnp.maximum(damping * change, LEAST), 4.0, jnp.minimum(1.5 * fall, FASTEST), before_last, old.length])
-        failed = jnp.stack([jnp.maximum(damping * growth, LEAST), 2 * growth, 2.0, jnp.nan, jnp.nan])
-        pace, steps = jnp.where(first, old.pace, jnp.where(taken, after, failed)), old.steps + 1
+        by_slopes = -0.5 * (old.slope + products[:-1, -1] @ old.d)
+        taken, pace = after_trial(jnp, old.pace, old.length, before, cost, old.promised, by_slopes, of.tolerance)
+        first = old.steps < 0
+        taken, pace, steps = first | taken, jnp.where(first, old.pace, pace), old.steps + 1
         cost = jnp.where(taken, cost, before)
         costs = jnp.where(places == steps, cost, old.costs)
         at = jnp.where(taken, jnp.concatenate([x, products.ravel()]), jnp.concatenate([old.x, old.products.ravel()]))
@@ -140,9 +120,8 @@ def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], known: tuple[Ar
         small = (lengths <= of.tolerance) & (moves <= of.tolerance)
         inside = jnp.all((x + both >= of.low) & (x + both <= of.high) & (x > of.low) & (x < of.high), axis=1)
         d, length, slope = both[0], lengths[0], gradient @ both[0]
-        shrinks = length / jnp.maximum(pace[4], TINY)
-        fast = (length <= SHORT) & (pace[4] <= FAST * pace[3]) & (length <= FAST * pace[4])
-        sure = fast & (length * shrinks <= SURELY * of.tolerance) & (moves[0] * shrinks <= SURELY * of.tolerance)
+        shrinks = shrinkage(jnp, pace, length)
+        sure = (shrinks < 1) & (length * shrinks <= SURELY * of.tolerance) & (moves[0] * shrinks <= SURELY * of.tolerance)
         usual = (norms * size > LEAST_COLUMN * jnp.max(norms * size)) & (squares > jnp.maximum(WEAK, of.cutoff) ** 2 * squares[-1])
         may = (steps < of.most) & ~slow & inside[0] & (pace[0] <= MOST) & jnp.isfinite(length) & jnp.all(usual)
         done = small[0] & ((pace[0] <= LEAST) | (small[1] & inside[1]))
@@ -150,9 +129,8 @@ def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], known: tuple[Ar
         at = _At(pace, x, products, d, costs, cost, steps, -slope - 0.5 * length**2, slope, length, *ends.astype(x.dtype))
         return at.vector(), jnp.where(taken, rows, now[1])
 
-    pace, none = Pace(), np.zeros(())
-    lengths = np.array([pace.damping, pace.growth, pace.fall, np.nan, np.nan])
-    begin = _At(lengths, np.zeros(n), np.zeros((n + 1, n + 1)), np.zeros(n), np.zeros(ROOM + 1), *[none] * 8)._replace(steps=none - 1, goes=none + 1)
+    none = np.zeros(())
+    begin = _At(BEGIN, np.zeros(n), np.zeros((n + 1, n + 1)), np.zeros(n), np.zeros(ROOM + 1), *[none] * 8)._replace(steps=none - 1, goes=none + 1)
     first = jnp.asarray(np.concatenate([np.ravel(part) for part in begin])).at[5 : 5 + n].set(x)
     end, rows = jax.lax.while_loop(lambda now: now[0][-1] > 0, tried, (first, jnp.zeros((told.shape[0] - Told.length(n, 0), n + 1))))
     at = _At.of(end, n)
@@ -162,9 +140,7 @@ def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], known: tuple[Ar
     return jnp.concatenate([at.vector(), ended.ravel()])
 
 
-def read(found: Float[np.ndarray, "_"], unknowns: int) -> tuple[Pace, list[float], bool, np.ndarray, np.ndarray]:
-    """Damping and lengths of the last steps; F at first and after each step; whether a minimum was found; the unknowns, and [J r] there."""
+def read(found: Float[np.ndarray, "_"], unknowns: int) -> tuple[Float[np.ndarray, "5"], list[float], bool, np.ndarray, np.ndarray]:
+    """The pace of the next step; F at first and after each step; whether a minimum was found; the unknowns, and [J r] there."""
     at, rows = _At.of(found, unknowns), found[_At.room(unknowns) :].reshape(-1, unknowns + 1)
-    damping, growth, fall, *lengths = at.pace.tolist()
-    pace = Pace(damping, growth, fall, tuple(x for x in lengths if x == x))
-    return pace, at.costs[: int(at.steps) + 1].tolist(), bool(at.converged), at.x, rows
+    return at.pace.copy(), at.costs[: int(at.steps) + 1].tolist(), bool(at.converged), at.x, rows

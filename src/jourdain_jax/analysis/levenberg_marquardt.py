@@ -6,13 +6,10 @@ patience   where F is large, and has not become far smaller within so many steps
 converged  the undamped step is at most `tolerance` standard errors long, |J d|, and moves no unknown by more than that fraction of its size;
            or a step is at whose end it will be a tenth of that, as far as it shrank from the last one to this one: the end is then known without evaluation
 
-Several problems of one shape (`members`) go side by side; those that have ended cost nothing.
-Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105; near the minimum slopes in place of values:
-W. W. Hager and H. Zhang, SIAM J. Optim. 16 (2005) 170.
+Several problems of one shape (`members`) go side by side; those that have ended cost nothing. How damping changes: see `pace`.
+Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105.
 """
 
-import math
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,16 +20,9 @@ from jaxtyping import Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.joined import JoinedArrow
+from jourdain_jax.analysis.pace import BEGIN, LEAST, MOST, SLOW, SURELY, after_trial, shrinkage
 
-FIRST, LEAST, MOST = 1e-3, 1e-9, 1e9  # damping lambda: at first, at least, and where no step is found
-FASTEST = 10.0  # factor by which damping falls after a good step
-ENOUGH, WELL, OVER = 1e-4, 0.9, 0.6  # of what was promised: F falls by that much in a step that is taken, in a good one, and in one that overshoots
 LEAST_COLUMN = 1e-8  # of the longest column of J, both times the sizes of their unknowns: what counts as zero
-SURELY = 0.1  # times the tolerance: what the next step is to be below, where it is not looked at
-SHORT, FAST = 0.01, 0.1  # standard errors, of a step after which the next may be foretold; by what factor steps shrink then
-ERROR = 1e-6  # relative, of F: smaller changes may be errors of the simulation
-TINY = sys.float_info.min
-SLOW = 0.25  # of F: what it is to fall to
 RELEASES = 8  # times that unknowns which would pass a bound are put there and the others solved for again
 
 
@@ -150,49 +140,12 @@ class Minimum:
 
 
 @dataclass
-class Pace:
-    """Damping of the next step of one member, and how it changes."""
-
-    damping: float = FIRST
-    growth: float = 4.0  # factor by which it grows after a step that failed
-    fall: float = FASTEST  # and falls after a good one
-    lengths: tuple[float, ...] = ()  # |J d| of the last steps, as long as they were taken
-
-    def shrinkage(self, length: float) -> float:
-        """By what factor this step is shorter than the last; one, unless steps have become short so fast that the problem is seen to be linear here."""
-        before, self.lengths = self.lengths, (*self.lengths[-1:], length)
-        if len(before) < 2 or length > SHORT or before[1] > FAST * before[0] or length > FAST * before[1]:
-            return 1.0
-        return length / max(before[1], TINY)
-
-    def tried(self, before: float, after: float, promised: float, by_slopes: float, tolerance: float) -> bool:
-        """Whether a step is taken from F of `before` to `after` (not finite: the motion failed) where the linear problem `promised` it to fall by so much.
-
-        Near the minimum the simulation's own error decides whether F falls: it jumps where a motion takes one step more. There the slopes of F at both ends
-        of the step tell it to more digits: `by_slopes`.
-        """
-        found = before - after
-        if abs(found) < ERROR * abs(before) or (promised < 100 * tolerance**2 and abs(found) < tolerance):
-            found = by_slopes
-        if not (math.isfinite(found) and found > ENOUGH * promised):
-            # after a step that failed, damping falls slowly: in a curved valley every other step would fail
-            self.damping, self.growth, self.fall, self.lengths = max(self.damping * self.growth, LEAST), 2 * self.growth, 2.0, ()
-            return False
-        ratio = found / max(promised, TINY)
-        # it rises where steps overshoot: where residuals stay large, undamped ones go to and fro along what shows least
-        change = 1 / self.fall if ratio > WELL else 3.0 if ratio < OVER else 1.0
-        self.damping = max(self.damping * change, LEAST)
-        self.growth, self.fall = 4.0, min(1.5 * self.fall, FASTEST)
-        return True
-
-
-@dataclass
 class Begun:
     """The first steps of one member, taken elsewhere (`first_steps`)."""
 
     theta: Float[np.ndarray, "1 unknowns"]  # after them
     at: Linearised
-    pace: Pace
+    pace: Float[np.ndarray, "5"]
     costs: list[float]  # F at first and after each step
     converged: bool
 
@@ -213,15 +166,15 @@ def minimise(
     going, converged, stuck = np.arange(count), np.zeros(count, bool), np.zeros(count, bool)
     if begun is None:
         theta, at = theta.copy(), evaluate(theta, going)
-        paces, costs = [Pace() for _ in range(count)], [[cost] for cost in at.cost.tolist()]
+        pace, costs = np.repeat(BEGIN[:, None], count, axis=1), [[cost] for cost in at.cost.tolist()]
     else:
-        theta, at, paces, costs, converged[:] = begun.theta, begun.at, [begun.pace], [begun.costs], begun.converged
+        theta, at, pace, costs, converged[:] = begun.theta, begun.at, begun.pace[:, None], [begun.costs], begun.converged
     taken = len(costs[0]) - 1
     steps, going = np.full(count, taken), going[np.isfinite(at.cost) & ~converged]
 
     def left(going: np.ndarray) -> np.ndarray:
         """Of these the ones that go on after a step."""
-        lost = np.array([paces[b].damping > MOST for b in going.tolist()], bool)
+        lost = pace[0, going] > MOST
         stuck[going[lost]], going = True, going[~lost]
         if control.patience is None:
             return going
@@ -234,7 +187,7 @@ def minimise(
         if not going.size:
             break
         arrow, x = (at.arrow, theta) if going.size == count else (at.arrow.at(going), theta[going])
-        size, damping = limits.size(x), np.array([paces[b].damping for b in going.tolist()])
+        size, damping = limits.size(x), pace[0, going]
         scaling = column_scaling(arrow, size)
         d = damped_step(arrow, x, scaling, damping, limits, control.cutoff)
         change = arrow.change(d)
@@ -250,10 +203,10 @@ def minimise(
         steps[going] += 1
         fall = -np.einsum("bi,bi->b", arrow.gradient, d)  # of F along the step, at its begin
         promised = fall - 0.5 * change
-        here = going.tolist()
-        shrank = [paces[b].shrinkage(length) for b, length in zip(here, np.sqrt(change).tolist(), strict=True)]
-        if min(shrank) < 1:
-            last = _is_small(change * np.square(shrank), size, d * np.array(shrank)[:, None], replace(control, tolerance=SURELY * control.tolerance))
+        length = np.sqrt(change)
+        shrank = shrinkage(np, pace[:, going], length)
+        if (shrank < 1).any():
+            last = _is_small(change * shrank**2, size, d * shrank[:, None], replace(control, tolerance=SURELY * control.tolerance))
             if last.any():
                 of = going[last]
                 at = at.replaced(of, (at if of.size == count else at.at(of)).moved(d[last], promised[last]), np.ones(of.size, bool))
@@ -262,15 +215,14 @@ def minimise(
                     costs[b].append(float(at.cost[b]))
                 if not going.size:
                     break
-                d, x, fall, promised, here = d[~last], x[~last], fall[~last], promised[~last], going.tolist()
+                d, x, fall, promised, length = d[~last], x[~last], fall[~last], promised[~last], length[~last]
         trial = evaluate(x + d, going)
         slopes = 0.5 * (fall - np.einsum("bi,bi->b", trial.arrow.gradient, d))
-        of_each = zip(here, trial.cost.tolist(), promised.tolist(), slopes.tolist(), strict=True)
-        better = [paces[b].tried(costs[b][-1], cost, by, slope, control.tolerance) for b, cost, by, slope in of_each]
-        chosen = np.array(better)
+        with np.errstate(over="ignore", invalid="ignore"):
+            chosen, pace[:, going] = after_trial(np, pace[:, going], length, at.cost[going], trial.cost, promised, slopes, control.tolerance)
         theta[going[chosen]] = (x + d)[chosen]
         at = at.replaced(going, trial, chosen)
-        for b in here:
+        for b in going.tolist():
             costs[b].append(float(at.cost[b]))
         going = left(going)
     trace = np.empty(count, object)

@@ -94,11 +94,10 @@ def _mass_matrix(nodes: LookedAt, u: list[int]) -> dict[tuple[int, int], int] | 
 
     def add(row: dict[int, int], other: dict[int, int], weight: int) -> None:
         for n, x in row.items():
-            weighted = graph.mul(weight, x)
             for m, y in other.items():
                 if place[m] <= place[n]:
-                    key = place[n], place[m]
-                    found[key] = graph.add(found.get(key, graph.zero), graph.mul(weighted, y))
+                    key = place[n], place[m]  # x y first: so x y m - y x m is one node less itself, which is zero
+                    found[key] = graph.add(found.get(key, graph.zero), graph.mul(weight, graph.mul(x, y)))
 
     for b in range(bodies):
         beta, gamma = nodes.velocities[3 * b : 3 * b + 3], nodes.velocities[3 * (bodies + b) : 3 * (bodies + b) + 3]

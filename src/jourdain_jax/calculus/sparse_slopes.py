@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-FEWEST_ROWS, NARROW = 64, 8  # rows of a matrix whose band is looked for; as many times the width of a narrow band as there are rows
+FEWEST_ROWS, NARROW = 64, 8  # on NumPy: with fewer rows, and with so many times the width of the band or fewer, matrices are dense
 REGULAR = 1e8  # the largest inverse of G G', rows of length one, of which nothing is lost that a second step does not make good
 
 
@@ -23,12 +23,14 @@ class Pattern:
     rows: np.ndarray  # of each entry
     columns: np.ndarray
     shape: tuple[int, int]
+    fewest: int = FEWEST_ROWS  # rows of a matrix whose band is looked for
+    narrow: int = NARROW  # as many times the width of a narrow band there are rows
 
     @classmethod
-    def of(cls, entries: Iterable[tuple[int, int]], shape: tuple[int, int]) -> "Pattern":
+    def of(cls, entries: Iterable[tuple[int, int]], shape: tuple[int, int], **limits: int) -> "Pattern":
         """The pattern with entries at these places."""
         rows, columns = np.array(list(entries), int).reshape(-1, 2).T
-        return cls(rows, columns, shape)
+        return cls(rows, columns, shape, **limits)
 
     def dense(self, values: np.ndarray) -> np.ndarray:
         """The matrices."""
@@ -55,10 +57,10 @@ class Pattern:
     @cached_property
     def band(self) -> "Band | None":
         """Of the products of rows; None where that is not narrow."""
-        if self.shape[0] < FEWEST_ROWS:
+        if self.shape[0] < self.fewest:
             return None
         found = Band.of(self)
-        return found if NARROW * (found.width + 1) <= self.shape[0] else None
+        return found if self.narrow * (found.width + 1) <= self.shape[0] else None
 
     def transposed_times(self, values: np.ndarray, y: np.ndarray) -> np.ndarray:
         """`G' y` at every state."""

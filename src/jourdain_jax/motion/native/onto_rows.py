@@ -24,7 +24,10 @@ from jourdain_jax.native.scalar_program import written as program_written
 from jourdain_jax.native.threads import write_rows
 
 LARGEST_PROGRAM = 60_000  # operations
-# Of a matrix. Measured: speeds of 6 trailers take 0.10 ms here and 0.08 by XLA alone, 0.05 and 0.06 each in a batch; of 12 (2,812 entries) 0.68 and 0.20,
+# Of a band. Measured: speeds of 3, 5, 8 and 12 trailers (10 to 37 rows, width 4) take 0.010, 0.011, 0.012 and 0.013 ms in a band, by dense matrices 0.019,
+# 0.045, 0.14 and 0.45; in a batch 0.2 to 0.7 microseconds each, and 1.5, 5, 18 and 58.
+FEWEST_ROWS, NARROW = 8, 2
+# Of a dense matrix. Measured: speeds of 6 trailers take 0.10 ms here and 0.08 by XLA alone, 0.05 and 0.06 each in a batch; of 12 (2,812 entries) 0.68 and 0.20,
 # 0.32 and 0.18; of 32 14.6 and 1.4, 3.6 and 1.2.
 MOST_ENTRIES = 3_000
 MOST_IN_BAND = 10_000_000  # of a matrix that is there only where rows in a band are nearly dependent
@@ -71,9 +74,9 @@ class Rows:
 
     @cached_property
     def in_band(self) -> Pattern | None:
-        """Where the slopes are, of rows whose products lie in a narrow band; None for others, and where speeds are to be nearest in a metric."""
-        pattern = Pattern.of(self.slopes, (len(self.residuals), len(self.moving)))
-        return pattern if self.metric is None and pattern.band is not None else None
+        """Where the slopes are, of rows whose products lie in a narrow band; None for others, and where the mass matrix is not diagonal."""
+        pattern = Pattern.of(self.slopes, (len(self.residuals), len(self.moving)), fewest=FEWEST_ROWS, narrow=NARROW)
+        return pattern if all(i == k for i, k in self.metric or ()) and pattern.band is not None else None
 
     def reason_against(self) -> str:
         """Why this is not written as machine code, in words; empty where it can be."""
@@ -98,12 +101,12 @@ def written(of: Rows, lanes: int, fused: bool, threads: int, cutoff: float) -> s
     write_rotated(w, rows, columns)
     write_inverted(w, rows, columns, cutoff)
     write_solved(w, rows, columns)
-    if of.metric is not None:
-        _write_values(w, of, "masses", {i * columns + k: node for (i, k), node in of.metric.items()})
-        write_cholesky(w, columns)
-        write_triangular(w, columns)
-        _write_metric(w, of)
     if of.in_band is None:
+        if of.metric is not None:
+            _write_values(w, of, "masses", {i * columns + k: node for (i, k), node in of.metric.items()})
+            write_cholesky(w, columns)
+            write_triangular(w, columns)
+            _write_metric(w, of)
         _write_values(w, of, "slopes", {i * (rows + columns) + k: node for (i, k), node in of.slopes.items()})
         _write_factored(w, of)
         _write_moved(w, of)
@@ -130,9 +133,7 @@ def _write_metric(w: Writer, of: Rows) -> None:
         cleared(w, L, n * n)
         w.call("masses", "void", state, L)
         with w.counted(0, n) as i:
-            own = w.load(w.real, L, i * n + i)
-            heavy = own > 0.0
-            w.store(w.where(heavy, w.number(1.0) / w.intrinsic("sqrt", w.where(heavy, own, 1.0)), 1.0), c, i)
+            w.store(_scale_of_speed(w, w.load(w.real, L, i * n + i)), c, i)
         with w.counted(0, n) as i, w.counted(0, i + 1) as k:
             scaled = w.load(w.real, c, i) * w.load(w.real, L, i * n + k) * w.load(w.real, c, k)
             both = (w.load(w.real, state, i + first_free) > 0.0) & (w.load(w.real, state, k + first_free) > 0.0)
@@ -140,6 +141,12 @@ def _write_metric(w: Writer, of: Rows) -> None:
             w.store(w.where(both, scaled, alone), L, i * n + k)
         w.call("cholesky", "void", L)
         w.give()
+
+
+def _scale_of_speed(w: Writer, own: Value) -> Value:
+    """As `equations/scaling.speed_scale`, of an entry on the diagonal of the mass matrix."""
+    heavy = own > 0.0
+    return w.where(heavy, w.number(1.0) / w.intrinsic("sqrt", w.where(heavy, own, 1.0)), 1.0)
 
 
 def _write_factored(w: Writer, of: Rows) -> None:
@@ -199,8 +206,15 @@ def _write_in_band(w: Writer, of: Rows, pattern: Pattern, regular: float) -> Non
     (rows, columns), first_free, first = pattern.shape, len(of.given), of.given.index(of.moving[0])
     write_eliminated(w, pattern)
     _write_values(w, of, "slopes", dict(enumerate(of.slopes.values())))
+    _write_values(w, of, "masses", {k: node for (k, _), node in (of.metric or {}).items()})
     with w.function("factored", "void", dict.fromkeys(("state", *PLACES), "ptr"), attributes="noinline") as (state, *places):
-        w.call("slopes", "void", state, places[PLACES.index("S")])
+        S, c = (places[PLACES.index(name)] for name in ("S", "c"))
+        w.call("slopes", "void", state, S)
+        cleared(w, c, columns)
+        w.call("masses", "void", state, c)
+        with w.counted(0, columns) as k:
+            own = w.load(w.real, c, k)
+            w.store(_scale_of_speed(w, own) + (own - own), c, k)  # no number where the mass is none
         free, typical = (w.at(state, first_free + k, w.real) for k in (0, columns))
         write_factors(w, pattern, free, typical, places, regular)
         w.give()
@@ -242,7 +256,7 @@ def _write_row(w: Writer, of: Rows) -> None:
 
 def _write_putting(w: Writer, of: Rows, first: int, state: Value, factors: list[Value], x: Value) -> None:
     """What moves, put onto the rows in its place."""
-    if of.metric is not None:
+    if of.metric is not None and of.in_band is None:
         w.call("metric", "void", state, *factors[:2])
     if not of.affine:
         _write_iteration(w, of, first, (state, *factors, x))

@@ -1,6 +1,6 @@
 """Rows whose products lie in a narrow band, as those of a long chain, put to use as machine code; in a time that grows with the rows.
 
-    x = A' y,   (A A') y = r,   A A' = L D L'          A: scaled rows, zero in what is held
+    x = C A' y,   (A A') y = r,   A A' = L D L'        A: rows in what is scaled by C, themselves scaled; zero in what is held
 
 Lanes in which rows are not surely independent take the way of the others (`native/dense.py`), by one-sided rotations; only then is there a dense matrix.
 Source of the estimate of how large the inverse is: as in `calculus/sparse_slopes.py`.
@@ -12,12 +12,12 @@ from jourdain_jax.calculus.sparse_slopes import Band, Pattern
 from jourdain_jax.native.dense import cleared
 from jourdain_jax.native.ir import Value, Writer
 
-PLACES = ("S", "L", "d", "size", "B", "weights")  # entries, band, scales of rows, how large the inverse is, and what the dense way needs
+PLACES = ("S", "L", "d", "c", "size", "B", "weights")  # entries, band, scales of rows and of what moves, how large the inverse is; of the dense way
 
 
 def sizes(pattern: Pattern) -> tuple[int | None, ...]:
     """How many vectors are kept at each of the places; None for the dense matrix."""
-    return len(pattern.rows), _band(pattern).size, pattern.shape[0], 1, None, pattern.shape[0]
+    return len(pattern.rows), _band(pattern).size, *pattern.shape, 1, None, pattern.shape[0]
 
 
 def _band(pattern: Pattern) -> Band:
@@ -84,16 +84,17 @@ class _Tables:
 
 
 def write_factors(w: Writer, pattern: Pattern, free: Value, typical: Value, places: Sequence[Value], regular: float) -> None:
-    """Inside a function: from the entries of the rows, at their place, to the factors of their band, and of the dense matrix for lanes whose inverse is not
-    below `regular`.
+    """Inside a function: from the entries of the rows and the scales of what moves, at their places, to the factors of the band, and of the dense matrix for
+    lanes whose inverse is not below `regular`.
     """
     band, (rows, columns), at = _band(pattern), pattern.shape, _Tables(w, pattern)
-    S, L, d, size, B, weights = places
+    S, L, d, c, size, B, weights = places
     cleared(w, d, rows)
     with w.counted(0, len(pattern.rows)) as e:
-        i, held = at("rows", e), w.where(w.load(w.real, free, at("columns", e)) > 0.0, w.load(w.real, S, e), 0.0)
-        w.store(held, S, e)
-        w.store(w.fma(held, held, w.load(w.real, d, i)), d, i)
+        i, k = at("rows", e), at("columns", e)
+        slope = w.where(w.load(w.real, free, k) > 0.0, w.load(w.real, S, e) * w.load(w.real, c, k), 0.0)
+        w.store(slope, S, e)
+        w.store(w.fma(slope, slope, w.load(w.real, d, i)), d, i)
     with w.counted(0, rows) as i:
         length = w.larger(w.intrinsic("sqrt", w.load(w.real, d, i)), w.load(w.real, typical, i))
         there = length > 0.0
@@ -116,9 +117,9 @@ def write_factors(w: Writer, pattern: Pattern, free: Value, typical: Value, plac
 
 
 def write_solution(w: Writer, pattern: Pattern, places: Sequence[Value], left: Value, x: Value, regular: float) -> None:
-    """Inside a function: into x the shortest one with `A x = left`, given the factors."""
+    """Inside a function: into x what moves by the shortest scaled solution of `A x = left`, given the factors."""
     band, (rows, columns), at = _band(pattern), pattern.shape, _Tables(w, pattern)
-    S, L, _, size, B, weights = places
+    S, L, _, c, size, B, weights = places
     y, shares = w.room(w.real, rows + band.width), w.room(w.real, rows)
     cleared(w, y, rows + band.width)
     with w.counted(0, rows) as k:
@@ -136,3 +137,5 @@ def write_solution(w: Writer, pattern: Pattern, places: Sequence[Value], left: V
         w.call("solved", "void", B, weights, left, other)
         with w.counted(0, columns) as k:
             w.store(w.where(serves, w.load(w.real, x, k), w.load(w.real, other, k)), x, k)
+    with w.counted(0, columns) as k:
+        w.store(w.load(w.real, x, k) * w.load(w.real, c, k), x, k)
