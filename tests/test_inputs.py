@@ -234,6 +234,11 @@ def test_an_input_of_a_row_that_jumps_is_refused(way):
         jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": JUMPS[way]})
 
 
+def test_an_input_of_a_row_that_jumps_is_refused_for_lanes():
+    with pytest.raises(ValueError, match=r"input `speed` of `Towed` jumps at t = 1 s"):
+        jj.rollout(Towed(), {"x_rate": np.array([1.0, 2.0])}, t1=2.0, inputs={"speed": JUMPS["a branch"]}, progress=False)
+
+
 def test_an_input_of_a_row_may_bend():
     motion = jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": lambda t: jnp.clip(t, 0.5, 1.5) - 0.5})
     np.testing.assert_allclose(motion.u_end, [0.5, 1.5], atol=1e-6)  # x'' + y'' = 0

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.reals import is_traced, real_type
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.motion.inputs import Constant, Inputs, Sampled, inputs_at
@@ -13,14 +14,25 @@ from jourdain_jax.scene.scene import Scene
 EVENLY, HALVINGS = 256, 60
 
 
-def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1, q, u) -> None:
+def check_inputs_in_rows(scene: Scene, inputs: Inputs, t0, t1) -> None:
     """A ValueError that names an input on which rows depend and which jumps between the times t0 and t1, where all is known."""
-    rough = {k: channel for k, channel in enumerate(inputs.channels) if not isinstance(channel, Constant | Sampled) and _may_jump(channel)}
-    if not rough or is_traced(inputs, t0, t1, q, u):
+    known = structure_of(scene)
+    if not known.rows_of_inputs or is_traced(scene, inputs, t0, t1):
         return
-    in_rows = np.any(np.asarray(jax.jacfwd(lambda f: velocity_residual(scene, t0, q, u, f))(jnp.asarray(inputs_at(inputs, t0)))) != 0, axis=0)
+    rough = {k: channel for k, channel in enumerate(inputs.channels) if not isinstance(channel, Constant | Sampled) and _may_jump(channel)}
+    if not rough:
+        return
+    with jax.ensure_compile_time_eval():  # all is known, also inside a `jit`
+        _check_known(scene, inputs, rough, known.coordinates[0], float(t0), float(t1))
+
+
+def _check_known(scene: Scene, inputs: Inputs, rough: dict, q: np.ndarray, t0: float, t1: float) -> None:
+    """As `check_inputs_in_rows`, of inputs that are `rough`, at some coordinates."""
+    u = np.random.default_rng(5).standard_normal(len(scene.speed_names))
+    slopes = jax.jacfwd(lambda f: velocity_residual(scene, t0, q, u, f))(jnp.asarray(inputs_at(inputs, t0)))
+    in_rows = np.any(np.nan_to_num(np.asarray(slopes)) != 0, axis=0)
     for k, channel in rough.items():
-        if in_rows[k] and (t := _first_jump(channel, float(t0), float(t1))) is not None:
+        if in_rows[k] and (t := _first_jump(channel, t0, t1)) is not None:
             raise ValueError(
                 f"input `{scene.inputs.entries[k]}` of `{type(scene).__name__}` jumps at t = {t:.6g} s, and velocity rows depend on it: speeds would have to "
                 "jump there, by an impulse that no acceleration holds. Let it change within a short time, as by `jj.Sampled(ts, values)`, or end the motion "

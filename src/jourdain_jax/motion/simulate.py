@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import Number, as_array, is_traced
 from jourdain_jax.motion.arguments import as_state, check_options, named_values, span_and_times
@@ -160,8 +159,7 @@ def _set_up(
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     start = _start(scene, start, t0, inputs, native, formulation.projects, searches)
     field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
-    if structure_of(scene).rows_of_inputs:
-        check_inputs_in_rows(scene, inputs, t0, t1, start.q, start.u)
+    check_inputs_in_rows(scene, inputs, t0, t1)
     warn_float32(start.q.dtype, rtol)
     if solver is None:
         solver = default_solver(rtol) if order is None else DOPRI8
