@@ -159,7 +159,8 @@ def _set_up(
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     start = _start(scene, start, t0, inputs, native, formulation.projects, searches)
     field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
-    check_inputs_in_rows(scene, inputs, t0, t1)
+    if not inputs.constant:
+        check_inputs_in_rows(scene, inputs, t0, t1)
     warn_float32(start.q.dtype, rtol)
     if solver is None:
         solver = default_solver(rtol) if order is None else DOPRI8

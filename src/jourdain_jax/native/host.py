@@ -54,6 +54,12 @@ def lanes() -> int:
 
 
 @functools.cache
+def registers() -> int:
+    """How many values vector registers hold, with some left over for the working of an instruction."""
+    return 28 if features().get("avx512f") or features().get("neon") else 12
+
+
+@functools.cache
 def threads() -> int:
     """How many threads share a batch: one for every core that this process may use, or as many as `JOURDAIN_JAX_THREADS` says."""
     if not hasattr(ctypes.CDLL(None), "pthread_create"):

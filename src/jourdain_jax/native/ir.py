@@ -7,7 +7,7 @@ flags that let LLVM change results: every lane is rounded as it is written here,
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 _COMPARED = {"lt": ("olt", "slt"), "le": ("ole", "sle"), "gt": ("ogt", "sgt"), "ge": ("oge", "sge"), "eq": ("oeq", "eq"), "ne": ("une", "ne")}
 
@@ -19,6 +19,7 @@ class Value:
     writer: "Writer"
     type: str
     name: str
+    place: str = ""  # where in memory it comes from
 
     def __add__(self, other) -> "Value":
         return self.writer.binary("add", self, other)
@@ -275,12 +276,27 @@ class Writer:
 
     def load(self, type: str, pointer: Value, index=0) -> Value:
         """What is in memory."""
-        return self.instruction(type, f"load {type}, ptr {self.at(pointer, index, type).name}")
+        place = self.at(pointer, index, type).name
+        return replace(self.instruction(type, f"load {type}, ptr {place}"), place=place)
+
+    def again(self, value: Value) -> Value:
+        """A value that is in memory, from there, even where LLVM would rather keep it in a register."""
+        return self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}") if value.place else value
+
+    def opaque(self, pointer: Value, rows: Iterable[int]) -> list[Value]:
+        """Pointers to some rows of memory, each in a register of its own: LLVM does not know what they have in common."""
+        found, place = [], self.room("ptr")
+        for row in rows:
+            self.store(self.at(pointer, row, self.real), place)
+            found.append(self.instruction("ptr", f"load volatile ptr, ptr {place.name}"))
+        return found
 
     def counted_up(self, pointer: Value, index) -> Value:
         """A whole number in memory, which becomes one more, also where several threads ask."""
         return self.instruction("i64", f"atomicrmw add ptr {self.at(pointer, index, 'i64').name}, i64 1 monotonic")
 
-    def store(self, value: Value, pointer: Value, index=0) -> None:
-        """Puts a value into memory."""
-        self._lines.append(f"  store {value.type} {value.name}, ptr {self.at(pointer, index, value.type).name}")
+    def store(self, value: Value, pointer: Value, index=0) -> Value:
+        """Puts a value into memory; the value, as one that is there."""
+        place = self.at(pointer, index, value.type).name
+        self._lines.append(f"  store {value.type} {value.name}, ptr {place}")
+        return replace(value, place=place)

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from jourdain_jax.native import ffi, host
 from jourdain_jax.native.ir import Writer
-from jourdain_jax.native.scalar_program import as_real, written
+from jourdain_jax.native.scalar_program import as_real, written_in_turn
 from jourdain_jax.native.threads import write_rows
 from jourdain_jax.program.graph import Graph
 
@@ -55,7 +55,7 @@ def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], e
         w = Writer(lanes, host.fuses())
         with w.function("row", "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
             known = {n: w.load(w.real, state, k) for k, n in enumerate(variables)}
-            for k, value in enumerate(written(w, graph, nodes, known)):
+            for k, value in written_in_turn(w, graph, nodes, known):
                 w.store(as_real(w, value), found, k)
             w.give()
         write_rows(w, len(variables), len(nodes), threads)

@@ -19,8 +19,7 @@ from jourdain_jax.equations.projection import MOST_MOVES_OF_POSITIONS, MOST_MOVE
 from jourdain_jax.motion.native.rows_in_band import PLACES, sizes, write_eliminated, write_factors, write_solution
 from jourdain_jax.native.dense import cleared, write_cholesky, write_inverted, write_rotated, write_solved, write_triangular
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.scalar_program import as_real, unsupported
-from jourdain_jax.native.scalar_program import written as program_written
+from jourdain_jax.native.scalar_program import as_real, unsupported, written_in_turn
 from jourdain_jax.native.threads import write_rows
 
 LARGEST_PROGRAM = 60_000  # operations
@@ -121,8 +120,9 @@ def _write_values(w: Writer, of: Rows, name: str, nodes: dict[int, int]) -> None
     """`name(state, found)`: values of nodes, each at its place in `found`."""
     with w.function(name, "void", {"state": "ptr", "found": "ptr"}, attributes="noinline") as (state, found):
         known = {n: w.load(w.real, state, k) for k, n in enumerate(of.given)}
-        for place, value in zip(nodes, program_written(w, of.program.graph, nodes.values(), known), strict=True):
-            w.store(as_real(w, value), found, place)
+        places = list(nodes)
+        for k, value in written_in_turn(w, of.program.graph, nodes.values(), known):
+            w.store(as_real(w, value), found, places[k])
         w.give()
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from jourdain_jax.lowering.jacobian import on_its_own
 from jourdain_jax.motion.native.functions import Form, known_values
 from jourdain_jax.native.ir import Writer
-from jourdain_jax.native.scalar_program import as_real, written
+from jourdain_jax.native.scalar_program import as_real, written_in_turn
 from jourdain_jax.program.derivative import cotangents
 from jourdain_jax.program.graph import Graph
 
@@ -59,11 +59,11 @@ def _write(w: Writer, form: Form, name: str, nodes: Sequence[int], asked: Sequen
     with w.function(name, "void", dict.fromkeys(_ARGUMENTS, "ptr") | {"tau": w.real}, attributes="noinline") as (state, tau, y, g, to_y, to_known):
         given = dict(zip(variables, known_values(w, form, state, tau, y).values(), strict=True))
         given |= {n: w.load(w.real, g, i) for i, n in enumerate(weights)}
-        values = [as_real(w, x) for x in written(w, graph, found, given)]
+        for i, x in written_in_turn(w, graph, found, given):
+            if i < count:
+                w.store(as_real(w, x), to_y, i)
+            else:
+                w.store(w.load(w.real, to_known, i - count) + as_real(w, x), to_known, i - count)
         if work:
-            values.insert(count, w.load(w.real, g, count) if work_stays else w.number(0.0))
-        for i, x in enumerate(values[: form.layout.y]):
-            w.store(x, to_y, i)
-        for i, x in enumerate(values[form.layout.y :]):
-            w.store(w.load(w.real, to_known, i) + x, to_known, i)
+            w.store(w.load(w.real, g, count) if work_stays else w.number(0.0), to_y, count)
         w.give()

@@ -20,7 +20,7 @@ from jourdain_jax.motion.native.called import called, nodes_called, unless_batch
 from jourdain_jax.native import host
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import FUNCTIONS
-from jourdain_jax.native.scalar_program import as_real, unsupported, written
+from jourdain_jax.native.scalar_program import as_real, unsupported, written, written_in_turn
 from jourdain_jax.native.threads import write_rows
 from jourdain_jax.program.graph import Graph
 from jourdain_jax.scene.scene import Scene
@@ -161,7 +161,7 @@ def _text_of_fixed(program: Lowered, lanes: int, threads: int) -> str:
             sizes = w.room(w.real, len(usual))
             w.call("usual", "void", state, sizes)
             known |= {n: w.load(w.real, sizes, k) for k, n in enumerate(usual)}
-        for i, value in enumerate(written(w, program.graph, program.fixed, known)):
+        for i, value in written_in_turn(w, program.graph, program.fixed, known):
             w.store(as_real(w, value), found, i)
         w.give()
     write_rows(w, len(given), len(program.fixed), threads)

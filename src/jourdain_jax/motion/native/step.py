@@ -142,7 +142,7 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
         p[name] = w.where(moving, value, w.number(0.0) if name == "taken" else p[name])
 
 
-def for_rows(w: Writer, rows: range, body: Callable[[int | Value], None]) -> None:
+def for_rows(w: Writer, rows: range, body: Callable[[int | Value], object]) -> None:
     """`body` for the number of every row."""
     if len(rows) <= UNROLLED:
         for i in rows:
