@@ -2,7 +2,7 @@
 
 p(delta) = min over all other unknowns of (F - F_min), theta = bound + delta;      the limit is where 2 p = 2.706, the square of the normal 95 % quantile
 p is close to g delta + h delta^2 / 2, g: slope of F there, 1 / h: variance of the unknown if it were free
-p < 0: the bound held a saddle. So it does where another unknown does the same at the bound (a delay, a lag of zero): F is level there, and falls further in
+p < 0: there is a saddle at the bound. So it is where another unknown does the same there, as a delay does at a lag of zero: F is level, and falls further in
 Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87.
 """
 
