@@ -31,7 +31,7 @@ def say(text: str) -> None:
 
 def curves(names, quick: bool, ready: dict, methods=None) -> Iterator[dict]:
     """References and single trajectories; the disc's methods are kept ready for the figures."""
-    from work_precision_cases import measure, ours, peer_diffrax, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy
+    from work_precision_cases import measure, ours, peer_c, peer_diffrax, peer_exudyn, peer_heyoka, peer_mujoco, peer_sympy
     from work_precision_cases.figures import DISC
     from work_precision_cases.problems import PROBLEMS
 
@@ -40,7 +40,7 @@ def curves(names, quick: bool, ready: dict, methods=None) -> Iterator[dict]:
         reference = problem.judge.reference
         say(f"{name}: {reference.how}; {reference.uncertainty:.1e} from {reference.against}")
         yield {"reference": name, "how": reference.how, "against": reference.against, "uncertainty": reference.uncertainty}
-        peers = [*peer_sympy.curves(problem, quick), *peer_heyoka.curves(problem), *peer_diffrax.curves(problem, quick)]
+        peers = [*peer_sympy.curves(problem, quick), *peer_c.curves(problem), *peer_heyoka.curves(problem), *peer_diffrax.curves(problem, quick)]
         for curve in [*ours.curves(problem, quick), *peers, *peer_exudyn.curves(problem, quick), *peer_mujoco.curves(problem, quick)]:
             if methods and curve.method not in methods:
                 continue

@@ -16,6 +16,11 @@ def _run(damping=0.3) -> jj.Measurements:
     return jj.Measurements(ts, {"x": x}, 0.01, start={"x": 0.45, "x_rate": 0.1}, unknown_start=("x", "x_rate"))
 
 
+def _with_an_outlier() -> jj.Measurements:
+    run = _run()
+    return jj.Measurements(run.ts, {"x": np.where(np.arange(61) == 20, 1.0, run.values["x"])}, 0.01, start=run.start, unknown_start=("x", "x_rate"))
+
+
 CASES = {
     "near": (Oscillator(stiffness=5.5), _run(), ("damping", "stiffness")),
     "far, over growing spans": (Oscillator(stiffness=45.0, damping=2.0), _run(), ("damping", "stiffness")),
@@ -23,20 +28,22 @@ CASES = {
     "past a bound": (Oscillator(damping=0.05), _run(damping=0.0), ("damping", "stiffness")),
     "a prior": (Oscillator(stiffness=5.5), _run(), {"mass": jj.Normal(2.1, 0.05), "damping": None, "stiffness": None}),
     "what does not show": (Oscillator(stiffness=5.5), _run(), ("mass", "damping", "stiffness")),
+    "an outlier, Huber's loss": (Oscillator(stiffness=5.5), _with_an_outlier(), ("damping", "stiffness"), {"loss": jj.huber()}),
+    "an outlier, Student's noise": (Oscillator(stiffness=5.5), _with_an_outlier(), ("damping", "stiffness"), {"loss": jj.student_t()}),
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_program_of_a_run_takes_the_steps_of_minimise(case, monkeypatch):
-    scene, run, free = CASES[case]
-    found = jj.fit(scene, run, free)
+    scene, run, free, options = (*CASES[case], {})[:4]
+    found = jj.fit(scene, run, free, **options)
     taken = []
     first_steps = problem.Problem._first_steps
     monkeypatch.setattr(problem.Problem, "_first_steps", lambda *given: taken.append(given) or first_steps(*given))
-    jj.fit(scene, run, free)
+    jj.fit(scene, run, free, **options)
     assert taken
     monkeypatch.setattr(problem.Problem, "_first_steps", lambda *_: None)
-    plain = jj.fit(scene, run, free)
+    plain = jj.fit(scene, run, free, **options)
 
     assert plain.converged
     assert found.converged

@@ -133,6 +133,21 @@ def test_a_generalized_force_with_a_wrong_derivative_is_found_at_its_speed():
     refused(statements(*found), "derivatives", "its force on `yaw_rate`")
 
 
+def test_without_an_example_a_scene_is_checked_in_motion():
+    brake = with_slope(lambda u: -jnp.tanh(u), lambda u, du: -du)  # right at rest
+
+    class Slider(jj.Scene):
+        coordinates = jj.coordinates("x")
+
+        def bodies(self, t, q):
+            return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+        def loads(self, motion):
+            return (jj.generalized_force(motion, x_rate=brake(motion.u.x_rate)),)
+
+    refused(jj.verify(Slider()), "derivatives", "its force on `x_rate`")
+
+
 def test_a_velocity_row_with_a_wrong_drift_is_found_by_name():
     turned = with_slope(lambda x: jnp.stack([-jnp.sin(x), jnp.cos(x), 0 * x]), lambda x, dx: 0.5 * jnp.stack([-jnp.cos(x), -jnp.sin(x), 0 * x]) * dx)
     found = wrong(blade=lambda self, motion: motion["sledge"].velocity @ turned(motion.q.yaw))

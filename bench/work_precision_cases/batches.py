@@ -6,12 +6,14 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
-from baselines import heyoka_disc
+from baselines import heyoka_disc, heyoka_lowered
 
 import jourdain_jax as jj
 from jourdain_jax.equations.minimal import speeds_from_privileged
-from work_precision_cases import peer_diffrax
+from jourdain_jax.motion.integrators.taylor import order_for
+from work_precision_cases import peer_c, peer_diffrax, peer_heyoka
 from work_precision_cases import record as records
+from work_precision_cases.curve import NotApplicable
 from work_precision_cases.measure import fastest
 from work_precision_cases.ours import MAX_STEPS
 from work_precision_cases.problem import Problem
@@ -30,8 +32,8 @@ def starts(problem: Problem, lanes: int) -> np.ndarray:
     return problem.minimal_start * (1 + SCATTER * np.random.default_rng(SEED).normal(size=(max(lanes, JUDGED), len(problem.minimal_start))))[:lanes]
 
 
-def by_rollout(problem: Problem) -> Callable:
-    """`rollout` under `jit`; the consistent starts are given."""
+def by_rollout(problem: Problem, solver=None) -> Callable:
+    """`rollout` under `jit`, by Dopri8 unless said; the consistent starts are given."""
     scene, independent, n = problem.scene, problem.independent, len(problem.scene.coordinate_names.entries)
     known = problem.state
 
@@ -43,13 +45,38 @@ def by_rollout(problem: Problem) -> Callable:
 
     @jax.jit
     def compiled(tolerance, state):
-        options = {"ts": jnp.array([problem.end]), "rtol": tolerance, "atol": tolerance, "solver": diffrax.Dopri8(), "events": False, "max_steps": MAX_STEPS}
-        lanes = jj.rollout(scene, state, **options).lanes
+        options = {
+            "ts": jnp.array([problem.end]),
+            "rtol": tolerance,
+            "atol": tolerance,
+            "solver": solver or diffrax.Dopri8(),
+            "events": False,
+            "max_steps": MAX_STEPS,
+        }
+        lanes = jj.rollout(scene, state, solver=solver or diffrax.Dopri8(), **options).lanes
         return jnp.concatenate([lanes.q_end, lanes.u_end[:, jnp.array(independent)]], axis=1)
 
     def prepared(y):
         state = jax.block_until_ready(states(jnp.asarray(y)))
         return lambda tolerance: np.asarray(compiled(jnp.asarray(tolerance), state))
+
+    return prepared
+
+
+def by_series(problem: Problem) -> Callable:
+    """As `by_rollout`, by Taylor series of the order for each tolerance."""
+    made: dict = {}
+
+    def prepared(y):
+        def run(tolerance):
+            if tolerance not in made:
+                made[tolerance] = by_rollout(problem, jj.Taylor(order_for(tolerance)))
+            key = tolerance, len(y)
+            if key not in made:
+                made[key] = made[tolerance](y)
+            return made[key](tolerance)
+
+        return run
 
     return prepared
 
@@ -62,6 +89,20 @@ def by_vmap(problem: Problem) -> Callable:
     return lambda y: lambda tolerance: np.asarray(compiled(jnp.asarray(tolerance), jnp.asarray(y)))
 
 
+def in_blocks(problem: Problem) -> Callable:
+    """diffrax on the equations by hand, states as tuples of scalars, eight lanes side by side, one block of them after another."""
+    known = peer_diffrax.rates_by_hand(problem, stacked=False)
+    one = lambda tolerance, y: jnp.stack(peer_diffrax.final(known, problem.end, diffrax.Dopri8(), tolerance, tuple(y))[0])  # noqa: E731
+    compiled = jax.jit(lambda tolerance, y: jax.lax.map(lambda y: one(tolerance, y), y, batch_size=SIMD))
+    return lambda y: lambda tolerance: np.asarray(compiled(jnp.asarray(tolerance), jnp.asarray(y)))
+
+
+def by_c(problem: Problem) -> Callable:
+    """The equations by hand in C, eight lanes side by side, one at a time alone."""
+    alone, many = (peer_c.compiled(problem, width) for width in (1, SIMD))
+    return lambda y: lambda tolerance: (many if len(y) >= SIMD else alone)(tolerance, y)[0]
+
+
 def by_dense_vmap(problem: Problem) -> Callable:
     """diffrax under `vmap` on dense matrices; the disc."""
     from baselines import disc_run
@@ -70,33 +111,44 @@ def by_dense_vmap(problem: Problem) -> Callable:
     return lambda y: lambda tolerance: run(tolerance, y)
 
 
-def by_heyoka(problem: Problem) -> Callable:
-    """heyoka, eight trajectories in the lanes of SIMD registers, one at a time alone; the disc."""
-    made: dict = {}
+def by_heyoka(system: Callable[[Problem], list]) -> Callable[[Problem], Callable]:
+    """heyoka, eight trajectories in the lanes of SIMD registers, one at a time alone."""
 
-    def prepared(y):
-        width = SIMD if len(y) >= SIMD else 1
-        padded = np.concatenate([y, y[: -len(y) % width]]) if len(y) % width else y
+    def of(problem: Problem) -> Callable:
+        made: dict = {}
 
-        def run(tolerance):
-            if (tolerance, width) not in made:
-                made[tolerance, width] = heyoka_disc.final_states(tolerance, width)
-            return made[tolerance, width](padded)[: len(y)]
+        def prepared(y):
+            width = SIMD if len(y) >= SIMD else 1
+            padded = np.concatenate([y, y[: -len(y) % width]]) if len(y) % width else y
 
-        return run
+            def run(tolerance):
+                if (tolerance, width) not in made:
+                    made[tolerance, width] = heyoka_lowered.final_states(system(problem), problem.end, tolerance, width)
+                return made[tolerance, width](padded)[: len(y)]
 
-    return prepared
+            return run
+
+        return prepared
+
+    return of
 
 
 def methods(problem: Problem, quick: bool) -> list[tuple[str, str, Callable, tuple[str, ...]]]:
     """Name, kind, preparation, packages."""
     jax_packages = ("jax", "jaxlib", "diffrax")
-    found = [("rollout, Dopri8", records.OURS, by_rollout, jax_packages), ("JAX by hand, diffrax Dopri8", records.PEER, by_vmap, jax_packages)]
-    if problem.name == "tilting-disc":
-        if not quick:
-            found.append(("dense autodiff, diffrax Dopri8", records.PEER, by_dense_vmap, jax_packages))
-        if heyoka_disc.heyoka is not None:
-            found.append(("heyoka, equations by hand", records.PEER, by_heyoka, ("heyoka",)))
+    found = [
+        ("rollout, Dopri8", records.OURS, by_rollout, jax_packages),
+        ("rollout, Taylor", records.OURS, by_series, jax_packages),
+        ("JAX by hand, diffrax Dopri8", records.PEER, by_vmap, jax_packages),
+        ("JAX by hand in blocks of eight, diffrax Dopri8", records.PEER, in_blocks, jax_packages),
+        ("C by hand, Dopri8", records.PEER, by_c, ("sympy",)),
+    ]
+    if problem.name == "tilting-disc" and not quick:
+        found.append(("dense autodiff, diffrax Dopri8", records.PEER, by_dense_vmap, jax_packages))
+    if heyoka_lowered.heyoka is not None:
+        if problem.name == "tilting-disc":
+            found.append(("heyoka, equations by hand", records.PEER, by_heyoka(lambda problem: heyoka_disc.system()), ("heyoka",)))
+        found.append(("heyoka, the engine's equations", records.PEER, by_heyoka(peer_heyoka.system), ("heyoka",)))
     return found
 
 
@@ -105,7 +157,11 @@ def measured(problem: Problem, quick: bool, say: Callable[[str], None]) -> Itera
     sizes = SIZES[:2] if quick else SIZES
     expected = by_vmap(problem)(starts(problem, JUDGED))(1e-14)
     for method, kind, make, packages in methods(problem, quick):
-        prepare, each = make(problem), 0.0
+        try:
+            prepare, each = make(problem), 0.0
+        except (NotApplicable, ImportError) as reason:
+            say(f"  {method}: not measured: {reason}")
+            continue
         for size in sizes:
             if each * size > LONGEST:
                 say(f"  {method}: a batch of {size} is left out, it would take {each * size:.0f} s")

@@ -12,6 +12,7 @@ import matplotlib.pyplot as plt
 
 # Okabe and Ito's colours, which the colour-blind can tell apart; marks tell apart what shares a colour.
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PURPLE, GREY = "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7", "#8A8A8A"
+YELLOW_DARK = "#A89B00"  # yellow that shows on white
 TITLES = {
     "tilting-disc": "Tilting disc, 10 s",
     "chaplygin-sleigh": "Chaplygin sleigh, 12 s",
@@ -40,9 +41,11 @@ class Look:
 MAIN_LOOKS = {
     "Dopri8": Look("jourdain-jax, Dopri8", BLUE, "o", width=2.4),
     "Tsit5": Look("jourdain-jax, Tsit5", BLUE, "s", "--", 2.0),
-    "minimal state, not projected, Dopri8": Look("jourdain-jax, Dopri8, not projected", SKY, "o", "-", 1.8),
+    "Taylor": Look("jourdain-jax, Taylor series", SKY, "D", "-", 2.0),
+    "minimal state, not projected, Dopri8": Look("jourdain-jax, Dopri8, not projected", SKY, "o", ":", 1.8),
     "simulate, as it comes": Look("jourdain-jax, called from Python", GREY, "D", ":"),
     "heyoka, the engine's equations": Look("heyoka, our equations", GREEN, "^"),
+    "C by hand, Dopri8": Look("C by hand, Dopri8", YELLOW_DARK, "d"),
     "SymPy to C, SciPy ode DOP853": Look("SymPy to C, SciPy DOP853", ORANGE, "v"),
     "SymPy to C, SciPy ode LSODA": Look("SymPy to C, SciPy LSODA", ORANGE, "<", "--"),
     "JAX by hand, diffrax Dopri8": Look("JAX by hand, diffrax", PURPLE, "P", "--"),
@@ -77,8 +80,12 @@ GRADIENT_LOOKS = {
     "central differences": Look("central differences", RED, "^", "--"),
 }
 BATCH_LOOKS = {
-    "rollout, Dopri8": Look("jourdain-jax, rollout", BLUE, "o", width=2.4),
-    "heyoka, equations by hand": Look("heyoka, by hand", GREEN, "^"),
+    "rollout, Dopri8": Look("jourdain-jax, Dopri8", BLUE, "o", width=2.4),
+    "rollout, Taylor": Look("jourdain-jax, Taylor series", SKY, "D", width=2.0),
+    "heyoka, equations by hand": Look("heyoka, equations by hand", GREEN, "^"),
+    "heyoka, the engine's equations": Look("heyoka, our equations", GREEN, "v", "--"),
+    "C by hand, Dopri8": Look("C by hand, Dopri8", YELLOW_DARK, "d"),
+    "JAX by hand in blocks of eight, diffrax Dopri8": Look("JAX by hand in blocks of eight, diffrax", PURPLE, "s", ":"),
     "JAX by hand, diffrax Dopri8": Look("JAX by hand, diffrax", PURPLE, "P", "--"),
     "dense autodiff, diffrax Dopri8": Look("dense autodiff, diffrax", PURPLE, "p"),
 }

@@ -9,6 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
+from jourdain_jax.motion.integrators.taylor import order_for
+from jourdain_jax.motion.own_steps import reason_against_series
+from jourdain_jax.motion.simulate import set_up
 from work_precision_cases.curve import TOLERANCES, Curve, NotApplicable, Prepared, Solved
 from work_precision_cases.problem import Problem
 
@@ -62,6 +65,21 @@ def _by_simulate(solver, stepped: bool = False, **options) -> Callable[[Problem]
     return prepare
 
 
+def _by_series(problem: Problem) -> Prepared:
+    """As `_by_simulate`, by Taylor series of the order for each tolerance."""
+    prepared: dict[float, Prepared] = {}
+    order = order_for(COARSE[-1])
+    if against := reason_against_series(set_up(problem.scene, solver=jj.Taylor(order), events=False), order):
+        raise NotApplicable(against)
+
+    def run(tolerance: float):
+        if tolerance not in prepared:
+            prepared[tolerance] = _by_simulate(jj.Taylor(order_for(tolerance)))(problem)
+        return prepared[tolerance].run(tolerance)
+
+    return Prepared(run, _read(jj.Taylor()))
+
+
 def as_it_comes(problem: Problem) -> Prepared:
     """`simulate` called from Python with nothing chosen but the tolerance, one saved time; its Python is part of the time.
 
@@ -96,6 +114,7 @@ def curves(problem: Problem, quick: bool) -> list[Curve]:
         _tolerance("Tsit5", "solver", diffrax.Tsit5()),
         _tolerance("Dopri8", "solver", diffrax.Dopri8()),
     ]
+    found.append(Curve("Taylor", "ours", TOLERANCES, "tolerance", _by_series, group="solver"))
     if not problem.large:
         found.append(_step("implicit midpoint", problem, jj.ImplicitMidpoint()))
     given = _tolerance("minimal state, not projected, Dopri8", "state", diffrax.Dopri8(), formulation=jj.Formulation(stabilisation=None))

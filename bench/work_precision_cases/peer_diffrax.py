@@ -20,15 +20,15 @@ BY_HAND = {
 }
 
 
-def rates_by_hand(problem: Problem):
-    """`(t, y) -> dy/dt` of the minimal state, from `baselines/hand_derived.py`."""
+def rates_by_hand(problem: Problem, stacked: bool = True):
+    """`(t, y) -> dy/dt` of the minimal state, from `baselines/hand_derived.py`; `stacked`: in a flat array, otherwise in a tuple of scalars."""
     known, scene = HAND_DERIVED[BY_HAND[problem.name]], problem.scene
     parameters = {name: float(getattr(scene, name)) for name in known.parameters}
     n = len(known.coordinates)
 
     def rates(t, y):
         qdot, vdot = known.rates(parameters, t, tuple(y[:n]), tuple(y[n:]))
-        return jnp.stack([*qdot, *vdot])
+        return jnp.stack([*qdot, *vdot]) if stacked else (*qdot, *vdot)
 
     return rates
 
@@ -46,7 +46,7 @@ def final(rates, end: float, solver, tolerance, y0):
         saveat=diffrax.SaveAt(t1=True),
         max_steps=MAX_STEPS,
     )
-    return found.ys[0], found.stats["num_steps"]
+    return jax.tree.map(lambda y: y[0], found.ys), found.stats["num_steps"]
 
 
 def _run(problem: Problem, rates, start, read) -> Prepared:

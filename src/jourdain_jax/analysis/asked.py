@@ -88,7 +88,7 @@ def for_runs(fit, runs: Measurements | Sequence[Measurements], fitted: bool = Fa
     checked = as_runs(asked.scene, runs)
     unknowns = unknowns_of(asked.scene, checked, asked.free)
     of_runs = asked.scene, checked, unknowns.layout, asked.simulation, None
-    lanes = Piecewise(*of_runs, unknowns, asked.shooting) if fitted and asked.shooting is not None else Lanes(*of_runs)
+    lanes = Piecewise(*of_runs, unknowns, asked.shooting) if fitted and asked.shooting is not None else Lanes(*of_runs, asked.loss)
     problem = Problem(asked.scene, checked, unknowns, lanes, asked.loss)
     if problem.with_memory:
         problem.tau = np.array([[float(fit.correlation_time[name]) for name in problem.with_memory]])

@@ -5,7 +5,7 @@ goes on from where these end, by the same rules. The damped step is
 
     d = - D^-1 V (S^2 + lambda)^-1 V' D^-1 g,      D^-1 J'J D^-1 = V S^2 V'        where S is not far from singular
 
-The noise is white, its sigmas are known, and squares of residuals count.
+The noise is white, and its sigmas are known.
 """
 
 from collections.abc import Callable
@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.levenberg_marquardt import LEAST_COLUMN
+from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.pace import BEGIN, LEAST, MOST, SLOW, SURELY, after_trial, shrinkage
 
 ROOM = 64  # for steps
@@ -85,7 +86,7 @@ class _At(NamedTuple):
         return 14 + ROOM + 2 * n + (n + 1) ** 2
 
 
-def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], known: tuple[Array, ...], told: Float[Array, "_"]) -> Float[Array, "_"]:
+def first_steps(evaluate: Callable, loss: Loss, x: Float[Array, "unknowns"], known: tuple[Array, ...], told: Float[Array, "_"]) -> Float[Array, "_"]:
     """Where they end, in one vector (see `read`). `evaluate`: [J r] of unknowns and what is `known`, (samples, unknowns + 1)."""
     n, places = x.shape[0], np.arange(ROOM + 1.0)
 
@@ -96,9 +97,11 @@ def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], known: tuple[Ar
         x = old.x + old.d
         rows = evaluate(x, *others)
         of_priors = jnp.concatenate([of.weight[:, None] * np.eye(n), (of.weight * (x - of.mean))[:, None]], axis=1)
-        whole = jnp.concatenate([jnp.where(of.counts[:, None] > 0, rows, 0.0), of_priors])
+        counted = jnp.where(of.counts[:, None] > 0, rows, 0.0)
+        whole = jnp.concatenate([loss.weighted(counted, counted[:, -1], jnp), of_priors])
         products = whole.T @ whole
-        cost, before = jnp.where(jnp.isfinite(jnp.sum(products)), 0.5 * products[-1, -1], jnp.inf), old.cost
+        cost = loss.value(counted[:, -1], jnp) + LEAST_SQUARES.value(of_priors[:, -1], jnp)
+        cost, before = jnp.where(jnp.isfinite(jnp.sum(products)), cost, jnp.inf), old.cost
         by_slopes = -0.5 * (old.slope + products[:-1, -1] @ old.d)
         taken, pace = after_trial(jnp, old.pace, old.length, before, cost, old.promised, by_slopes, of.tolerance)
         first = old.steps < 0
@@ -130,7 +133,7 @@ def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], known: tuple[Ar
         return at.vector(), jnp.where(taken, rows, now[1])
 
     none = np.zeros(())
-    begin = _At(BEGIN, np.zeros(n), np.zeros((n + 1, n + 1)), np.zeros(n), np.zeros(ROOM + 1), *[none] * 8)._replace(steps=none - 1, goes=none + 1)
+    begin = _At(np.array(BEGIN), np.zeros(n), np.zeros((n + 1, n + 1)), np.zeros(n), np.zeros(ROOM + 1), *[none] * 8)._replace(steps=none - 1, goes=none + 1)
     first = jnp.asarray(np.concatenate([np.ravel(part) for part in begin])).at[5 : 5 + n].set(x)
     end, rows = jax.lax.while_loop(lambda now: now[0][-1] > 0, tried, (first, jnp.zeros((told.shape[0] - Told.length(n, 0), n + 1))))
     at = _At.of(end, n)
@@ -140,7 +143,7 @@ def first_steps(evaluate: Callable, x: Float[Array, "unknowns"], known: tuple[Ar
     return jnp.concatenate([at.vector(), ended.ravel()])
 
 
-def read(found: Float[np.ndarray, "_"], unknowns: int) -> tuple[Float[np.ndarray, "5"], list[float], bool, np.ndarray, np.ndarray]:
+def read(found: Float[np.ndarray, "_"], unknowns: int) -> tuple[tuple[float, ...], list[float], bool, np.ndarray, np.ndarray]:
     """The pace of the next step; F at first and after each step; whether a minimum was found; the unknowns, and [J r] there."""
     at, rows = _At.of(found, unknowns), found[_At.room(unknowns) :].reshape(-1, unknowns + 1)
-    return at.pace.copy(), at.costs[: int(at.steps) + 1].tolist(), bool(at.converged), at.x, rows
+    return tuple(at.pace.tolist()), at.costs[: int(at.steps) + 1].tolist(), bool(at.converged), at.x, rows

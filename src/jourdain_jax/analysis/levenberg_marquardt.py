@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.joined import JoinedArrow
-from jourdain_jax.analysis.pace import BEGIN, LEAST, MOST, SLOW, SURELY, after_trial, shrinkage
+from jourdain_jax.analysis.pace import BEGIN, LEAST, MOST, NUMBERS, SLOW, SURELY, Pace, after_trial, shrinkage
 
 LEAST_COLUMN = 1e-8  # of the longest column of J, both times the sizes of their unknowns: what counts as zero
 RELEASES = 8  # times that unknowns which would pass a bound are put there and the others solved for again
@@ -145,7 +145,7 @@ class Begun:
 
     theta: Float[np.ndarray, "1 unknowns"]  # after them
     at: Linearised
-    pace: Float[np.ndarray, "5"]
+    pace: Pace
     costs: list[float]  # F at first and after each step
     converged: bool
 
@@ -164,17 +164,18 @@ def minimise(
     """
     count = len(theta)
     going, converged, stuck = np.arange(count), np.zeros(count, bool), np.zeros(count, bool)
+    paces: list[Pace] = [BEGIN] * count
     if begun is None:
         theta, at = theta.copy(), evaluate(theta, going)
-        pace, costs = np.repeat(BEGIN[:, None], count, axis=1), [[cost] for cost in at.cost.tolist()]
+        costs = [[cost] for cost in at.cost.tolist()]
     else:
-        theta, at, pace, costs, converged[:] = begun.theta, begun.at, begun.pace[:, None], [begun.costs], begun.converged
+        theta, at, paces, costs, converged[:] = begun.theta, begun.at, [begun.pace], [begun.costs], begun.converged
     taken = len(costs[0]) - 1
     steps, going = np.full(count, taken), going[np.isfinite(at.cost) & ~converged]
 
     def left(going: np.ndarray) -> np.ndarray:
         """Of these the ones that go on after a step."""
-        lost = pace[0, going] > MOST
+        lost = np.array([paces[b][0] > MOST for b in going.tolist()], bool)
         stuck[going[lost]], going = True, going[~lost]
         if control.patience is None:
             return going
@@ -187,7 +188,7 @@ def minimise(
         if not going.size:
             break
         arrow, x = (at.arrow, theta) if going.size == count else (at.arrow.at(going), theta[going])
-        size, damping = limits.size(x), pace[0, going]
+        size, damping = limits.size(x), np.array([paces[b][0] for b in going.tolist()])
         scaling = column_scaling(arrow, size)
         d = damped_step(arrow, x, scaling, damping, limits, control.cutoff)
         change = arrow.change(d)
@@ -203,10 +204,10 @@ def minimise(
         steps[going] += 1
         fall = -np.einsum("bi,bi->b", arrow.gradient, d)  # of F along the step, at its begin
         promised = fall - 0.5 * change
-        length = np.sqrt(change)
-        shrank = shrinkage(np, pace[:, going], length)
-        if (shrank < 1).any():
-            last = _is_small(change * shrank**2, size, d * shrank[:, None], replace(control, tolerance=SURELY * control.tolerance))
+        length, here = np.sqrt(change), going.tolist()
+        shrank = [shrinkage(NUMBERS, paces[b], one) for b, one in zip(here, length.tolist(), strict=True)]
+        if min(shrank) < 1:
+            last = _is_small(change * np.square(shrank), size, d * np.array(shrank)[:, None], replace(control, tolerance=SURELY * control.tolerance))
             if last.any():
                 of = going[last]
                 at = at.replaced(of, (at if of.size == count else at.at(of)).moved(d[last], promised[last]), np.ones(of.size, bool))
@@ -215,14 +216,17 @@ def minimise(
                     costs[b].append(float(at.cost[b]))
                 if not going.size:
                     break
-                d, x, fall, promised, length = d[~last], x[~last], fall[~last], promised[~last], length[~last]
+                d, x, fall, promised, length, here = d[~last], x[~last], fall[~last], promised[~last], length[~last], going.tolist()
         trial = evaluate(x + d, going)
         slopes = 0.5 * (fall - np.einsum("bi,bi->b", trial.arrow.gradient, d))
-        with np.errstate(over="ignore", invalid="ignore"):
-            chosen, pace[:, going] = after_trial(np, pace[:, going], length, at.cost[going], trial.cost, promised, slopes, control.tolerance)
+        better, of_each = [], zip(here, length.tolist(), trial.cost.tolist(), promised.tolist(), slopes.tolist(), strict=True)
+        for b, one, cost, by, slope in of_each:
+            is_better, paces[b] = after_trial(NUMBERS, paces[b], one, costs[b][-1], cost, by, slope, control.tolerance)
+            better.append(is_better)
+        chosen = np.array(better)
         theta[going[chosen]] = (x + d)[chosen]
         at = at.replaced(going, trial, chosen)
-        for b in going.tolist():
+        for b in here:
             costs[b].append(float(at.cost[b]))
         going = left(going)
     trace = np.empty(count, object)

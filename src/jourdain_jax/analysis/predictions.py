@@ -10,7 +10,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -24,6 +24,7 @@ from jourdain_jax.analysis.correlated_noise import Chains, whitened
 from jourdain_jax.analysis.first_steps import Told, first_steps, read
 from jourdain_jax.analysis.grids import grid, intervals
 from jourdain_jax.analysis.layout import Layout
+from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.nodes import LAST, NODE, begin, ended
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
@@ -119,13 +120,13 @@ def equal_runs(data: Sequence[Measurements]) -> list[tuple[tuple[int, ...], Run]
 class Lanes:
     """All lanes of a problem; `evaluate` gives their weighted residuals with derivatives."""
 
-    def __init__(self, scene: Scene, data: Sequence[Measurements], layout: Layout, simulation: dict, members: int | None):
+    def __init__(self, scene: Scene, data: Sequence[Measurements], layout: Layout, simulation: dict, members: int | None, loss: Loss = LEAST_SQUARES):
         self.members, self._scene, self._layout = members, scene, layout
         self.takes_steps = False  # whether a run that is `alone` is evaluated by the program that takes steps, so that no other is compiled
         white = not any(run.unknown_sigma or run.correlation_time for run in data)
         self.alone = white and members is None and len(data) == 1 and real_type() == np.float64  # of single precision, J'J would tell little
         ready = lambda i: run_of(data[i], repeats=members is not None)  # noqa: E731
-        self._groups = [_Group(scene, indices, list(map(ready, indices)), layout, simulation, members) for indices in _alike(data)]
+        self._groups = [_Group(scene, indices, list(map(ready, indices)), layout, simulation, members, loss) for indices in _alike(data)]
         self.samples, self.first_steps = self._groups[0].samples, self._groups[0].first_steps  # of a run that is `alone`
         self.lengths = [run.ts.shape[0] for run in data]
         self._of_run = {run: group for group in self._groups for run in group.indices}
@@ -177,7 +178,7 @@ class Lanes:
 class _Group:
     """Runs of equal structure, filled up to one length."""
 
-    def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None):
+    def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None, loss: Loss):
         self.indices, self._members, self._runs = indices, members, np.array(indices)
         times, knots = max(run.ts.shape[0] for run in runs), _most_knots(runs)
         filled = [_filled(run, times, knots, 0 if members is None else 1) for run in (runs if runs[0].grid is None else _on_equal_grids(runs))]
@@ -202,7 +203,8 @@ class _Group:
             begin, end = end, end + math.prod(weight.shape[0 if members is None else 1 :])
             self.channels[name] = slice(begin, end)
         self.samples = end
-        self._run, self._steps = _program(reference, treedef, tuple(marks), layout, end)
+        self._run, steps = _program(reference, treedef, tuple(marks), layout, end)
+        self._steps = steps(loss)
         taus = {name: np.stack([run.correlation_time[name] for run in filled]) for name in filled[0].correlation_time}
         self.chains = Chains.of(self.weights, self._ts, taus, self.channels, members is not None) if taus else None
         saved = times if filled[0].grid is None else filled[0].grid.shape[0]
@@ -292,7 +294,7 @@ class _Number(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, samples: int) -> tuple[Callable, Callable]:
-    """[J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns; and `first_steps` of one.
+    """[J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns; `first_steps` by the loss.
 
     Each is compiled once. `reference`: of the scene; `treedef`, `leaves`: of scene, options and run, with a `_Number` in place of each array.
     """
@@ -322,11 +324,11 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, sampl
     def lanes(common: Float[Array, "shared"], rows: Float[Array, "lanes own"]) -> Float[Array, "lanes samples width"]:
         return each(common, *jnp.split(rows, [rows.shape[1] - unknowns], axis=1))
 
-    def steps(common: Float[Array, "shared"], row: Float[Array, "own"]) -> Float[Array, "_"]:
+    def steps(loss: Loss, common: Float[Array, "shared"], row: Float[Array, "own"]) -> Float[Array, "_"]:
         fixed, x, of_steps = jnp.split(row, [row.shape[0] - told - unknowns, row.shape[0] - told])
-        return first_steps(lambda x, common, fixed: each(common, fixed[None], x[None])[0], x, (common, fixed), of_steps)
+        return first_steps(lambda x, common, fixed: each(common, fixed[None], x[None])[0], loss, x, (common, fixed), of_steps)
 
-    return quickly_compiled(lanes, jax.jit), sparingly_compiled(steps, loops=1)
+    return quickly_compiled(lanes, jax.jit), lru_cache(maxsize=4)(lambda loss: sparingly_compiled(partial(steps, loss), loops=1))
 
 
 def _alike(data: Sequence[Measurements]) -> list[list[int]]:

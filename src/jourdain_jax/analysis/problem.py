@@ -16,7 +16,7 @@ from jourdain_jax.analysis.arrow import Arrow, arrow, triangle, with_prior
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
 from jourdain_jax.analysis.first_steps import ROOM, read
 from jourdain_jax.analysis.levenberg_marquardt import Begun, Control, Limits, Linearised, LinearisedLater, Minimum, minimise
-from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
+from jourdain_jax.analysis.losses import Loss
 from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
@@ -36,7 +36,7 @@ class Problem:
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
         self.tau = np.zeros((lanes.members or 1, len(self.with_memory)))  # s, of these: at first as if their noise were white
         independent = not unknowns.with_prior.size or np.array_equal(unknowns.whitening, np.eye(len(unknowns.whitening)))
-        lanes.takes_steps = lanes.alone and loss is LEAST_SQUARES and independent  # by `first_steps`
+        lanes.takes_steps = lanes.alone and independent  # by `first_steps`
         self._counted = lanes.counted(self.estimated, np.arange(lanes.members or 1))  # samples of channels whose sigma is estimated, of each member
 
     def taus(self, members: np.ndarray) -> dict[str, np.ndarray]:

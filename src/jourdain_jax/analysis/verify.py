@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.gradients import by_reduction, gradient_checks
 from jourdain_jax.analysis.statements import statement_checks
 from jourdain_jax.analysis.verification import Check, Verification, check
+from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import plain_row_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.null_space import null_space_svd
 from jourdain_jax.calculus.reals import Numbers
@@ -36,7 +37,7 @@ from jourdain_jax.equations.reductions import diagnosed
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import energies_at, equations_and_rows, newton_residual
 from jourdain_jax.motion.arguments import as_state
-from jourdain_jax.motion.start import State
+from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
@@ -54,12 +55,12 @@ def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: N
     the verification fails.
 
     **Arguments**
-    - `state`: on the constraints, from `start` or `consistent`, or named values as for `start` (default: the scene's example); generic, for a
-      symmetric one hides errors.
+    - `state`: on the constraints, from `start` or `consistent`, or named values as for `start` (default: the scene's example, or a random state of its
+      domain, where it has none); generic, for a symmetric one hides errors.
     - `inputs`: values of the scene's inputs, a vector or by name (default: zero).
-    - `seed`: of the random directions for derivatives. Those of accelerations are admissible in the coordinates, free in the speeds, relative in
-      the parameters; the Gibbs-Appell reduction is left out of them. Parameters that split rows which are dependent have no derivative there
-      and are left out, with a note (`derivative_exists`).
+    - `seed`: of that state, and of the random directions for derivatives. Those of accelerations are admissible in the coordinates, free in the
+      speeds, relative in the parameters; the Gibbs-Appell reduction is left out of them. Parameters that split rows which are dependent have no
+      derivative there and are left out, with a note (`derivative_exists`).
 
     **Returns** a `Verification`. Nothing is raised for a failed check; not under jit or vmap.
     """
@@ -67,6 +68,9 @@ def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: N
         raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
     scene = as_scene(scene)
     inputs = as_input_vector(scene, inputs)
+    if state is None and not scene.example:
+        (t,), (q,), (u,) = sample_states(scene, 1, seed)
+        state = consistent(scene, t, q, u, inputs)
     state = as_state(scene, state, what="state", inputs=inputs)
     t, q, u = state.t, state.q, state.u
     found = _evaluate(scene, t, q, u, inputs, usual_rows(scene), plain_row_lengths(scene))
