@@ -115,3 +115,21 @@ def test_verification_fails_where_no_acceleration_is_determined_and_says_so():
     assert not found.passed
     assert "no reduction applies" in str(found)
     assert set(found.not_applicable) == set(jj.reductions(OnSphere()))
+
+
+class BurningRocket(jj.Scene):
+    """Fuel leaves with the speed that the rocket has; a force pushes along x."""
+
+    coordinates = jj.coordinates("x angle")
+
+    def bodies(self, t, q):
+        left = 2.0 - 0.5 * t
+        return {"rocket": jj.RigidBody(left, left * jnp.ones(3), jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]), jj.rot_z(q.angle))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=3.0),)
+
+
+def test_mass_that_leaves_takes_its_momentum_with_it():
+    motion = jj.simulate(BurningRocket(), {"x_rate": 1.0, "angle_rate": 2.0}, t1=2.0, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(motion.u_end, [1.0 + 6.0 * np.log(2.0), 2.0], atol=1e-9)  # m x'' = F, I angle'' = 0

@@ -220,6 +220,30 @@ def test_rates_of_samples_in_rows_are_their_slopes():
     np.testing.assert_allclose(lanes.u_end, [[-1.0, 3.0], [0.0, 4.0]], atol=1e-7)
 
 
+JUMPS = {
+    "a branch": lambda t: jnp.where(t < 1.0, 0.0, 1.0),
+    "steps": lambda t: 0.1 * jnp.floor(3.0 * t),
+    "a pulse": lambda t: jnp.where(jnp.abs(t - 0.5) < 0.1, 1.0, 0.0),
+    "a comparison": lambda t: t >= 1.0,
+}
+
+
+@pytest.mark.parametrize("way", JUMPS)
+def test_an_input_of_a_row_that_jumps_is_refused(way):
+    with pytest.raises(ValueError, match=r"input `speed` of `Towed` jumps at t = .* s, and velocity rows depend on it"):
+        jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": JUMPS[way]})
+
+
+def test_an_input_of_a_row_that_jumps_is_refused_for_lanes():
+    with pytest.raises(ValueError, match=r"input `speed` of `Towed` jumps at t = 1 s"):
+        jj.rollout(Towed(), {"x_rate": np.array([1.0, 2.0])}, t1=2.0, inputs={"speed": JUMPS["a branch"]}, progress=False)
+
+
+def test_an_input_of_a_row_may_bend():
+    motion = jj.simulate(Towed(), {"x_rate": 1.0}, t1=2.0, inputs={"speed": lambda t: jnp.clip(t, 0.5, 1.5) - 0.5})
+    np.testing.assert_allclose(motion.u_end, [0.5, 1.5], atol=1e-6)  # x'' + y'' = 0
+
+
 def test_an_input_of_a_row_that_has_no_derivative_is_refused():
     def measured(t):
         return jax.pure_callback(lambda t: np.asarray(t) ** 2, jax.ShapeDtypeStruct((), t.dtype), t)

@@ -223,3 +223,44 @@ def test_a_spline_differentiates_with_respect_to_its_values():
 def test_malformed_splines_are_refused(given):
     with pytest.raises(ValueError, match="`Spline`"):
         jj.Spline(*given)
+
+
+class OnBelt(jj.Scene):
+    """A skate on a belt, and a wheel in it that no row holds: it turns back where the belt jerks the skate. `way`: how the belt runs."""
+
+    coordinates = jj.coordinates("x wheel")
+    way: object = None
+
+    def bodies(self, t, q):
+        weight = jnp.stack([q.x + q.wheel, 0.0 * q.x, 0.0 * q.x])
+        return {"weight": jj.Particle(1.0, weight), "skate": jj.Particle(1.0, jnp.stack([q.x, q.wheel, 0.0 * q.x]))}
+
+    def velocity_constraints(self, motion):
+        return {"grip": self.way(motion)}
+
+
+JERKS = {
+    "a branch": lambda motion: motion.u.x_rate - jnp.where(motion.t < 1.0, 1.0, 2.0),
+    "steps": lambda motion: motion.u.x_rate - 0.1 * jnp.floor(3.0 * motion.t),
+}
+WITHOUT_JERK = {
+    "a ramp": lambda motion: motion.u.x_rate - jnp.clip(motion.t, 1.0, 2.0),
+    "a row that sets in": lambda motion: jnp.where(motion.t < 1.0, 0.0, motion.u.x_rate - 1.0),
+    "a row that becomes another": lambda motion: jnp.where(motion.t < 1.0, motion.u.x_rate - 1.0, motion.u.wheel_rate),
+}
+
+
+@pytest.mark.parametrize("way", JERKS)
+def test_a_velocity_row_that_jumps_in_time_is_refused(way):
+    with pytest.raises(ValueError, match=r"row `grip` of `OnBelt` jumps at t = .* s: speeds would have to jump"):
+        jj.simulate(OnBelt(way=JERKS[way]), {"x_rate": 1.0}, t1=2.0)
+
+
+@pytest.mark.parametrize("way", WITHOUT_JERK)
+def test_a_velocity_row_that_bends_or_sets_in_is_not_refused(way):
+    jj.structure_of(OnBelt(way=WITHOUT_JERK[way]))
+
+
+def test_a_ramp_in_a_row_moves_what_no_row_holds():
+    motion = jj.simulate(OnBelt(way=WITHOUT_JERK["a ramp"]), {"x_rate": 1.0}, t1=3.0)
+    assert float(motion["wheel_rate"][-1]) == pytest.approx(-0.5, abs=1e-6)  # x'' + 2 wheel'' = 0

@@ -72,7 +72,7 @@ class Problem:
         counts = np.ones(self.lanes.samples) if shares is None else self.lanes.within(np.zeros(1, int), shares)[0]
         patience = np.inf if control.patience is None else control.patience
         numbers = min(ROOM, control.most_steps), control.tolerance, control.cutoff, patience, control.near
-        told = np.concatenate([numbers, *(x[order] for x in each), counts])
+        told = np.concatenate([numbers, np.array(each)[:, order].ravel(), counts])
         pace, costs, converged, x, rows = read(self.lanes.first_steps(theta[0, order], told), p + m)
         theta = np.empty_like(theta)
         theta[0, order] = x

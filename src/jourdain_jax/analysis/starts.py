@@ -22,11 +22,11 @@ def check_starts(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns)
     a fit. Where the motion fails at the first guess, ask `check_first_guess`.
     """
     guess = unknowns.guess
-    elsewhere = guess + 1e-3 * unknowns.sizes(guess) * np.where(unknowns.fixed, 0.0, np.sin(1.0 + np.arange(guess.size)))  # by unequal amounts
     leaves, treedef = jax.tree.flatten(scene)
     for index, run in enumerate(runs):
         if (key := _key(leaves, treedef, run, unknowns, index)) in _right:
             continue
+        elsewhere = guess + 1e-3 * unknowns.sizes(guess) * np.where(unknowns.fixed, 0.0, np.sin(1.0 + np.arange(guess.size)))  # by unequal amounts
         _check(scene, run, unknowns, guess, index, "is not admissible")
         _check(scene, run, unknowns, elsewhere, index, "no longer meets the constraints when the unknowns change: the values in `start` depend on each other")
         _right[key] = None

@@ -2,6 +2,7 @@
 
     r(t, q), R(t, q), g(t, q)      once continuously differentiable, or mass times a jump of velocity is lost in silence
     qdot(t, q, u)                  continuous, for the same reason
+    phi(t, q, 0)                   of velocity rows, continuous in time: where it jumps and A does not, speeds would have to jump
 
 A piecewise linear interpolation has a second derivative of zero wherever one looks. What is decided by a comparison or an index on the way from t and q to
 these quantities is therefore looked at along lines in t and q: intervals at whose ends the rate differs are halved until the difference has gone, or is a jump.
@@ -17,9 +18,10 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.trace import jaxpr_of_scene
 from jourdain_jax.eager.eager import eval_numpy
+from jourdain_jax.equations.instant import constraint_rows
 from jourdain_jax.equations.kinematics import coordinate_rates, pose_at
-from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows
-from jourdain_jax.equations.rows import position_residual
+from jourdain_jax.equations.listed import names_of_bodies, names_of_position_rows, names_of_rows
+from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.program.roughness import may_bend
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.once_per_class import once_per_class
@@ -38,12 +40,15 @@ class _Poses(eqx.Module):
     poses: Float[Array, "*points entries"]  # positions and orientations, body by body
     rows: Float[Array, "*points geometric_rows"]
     rates: Float[Array, "*points coordinates"]  # only continuous
+    drifts: Float[Array, "*points velocity_rows"]  # only continuous
 
 
 def _poses(scene: Scene, t, q, u) -> _Poses:
     bodies = [body.body for body in pose_at(scene, t, q).bodies.values()]
     parts = [jnp.concatenate([b.position, b.orientation.reshape(-1) if isinstance(b, RigidBody) else jnp.zeros(9, q.dtype)]) for b in bodies]
-    return _Poses(jnp.concatenate(parts), position_residual(scene, t, q), coordinate_rates(scene, t, q, u))
+    g = position_residual(scene, t, q)
+    drifts = velocity_residual(scene, t, q, jnp.zeros_like(u))[g.shape[0] :]
+    return _Poses(jnp.concatenate(parts), g, coordinate_rates(scene, t, q, u), drifts)
 
 
 def check_smoothness(scene: Scene, q: np.ndarray, u: np.ndarray) -> None:
@@ -52,8 +57,11 @@ def check_smoothness(scene: Scene, q: np.ndarray, u: np.ndarray) -> None:
         return
     search, names = _Search(scene, u[0]), _names(scene)
     for k, t in search.kinks(*_in_time(scene, q)):
-        raise ValueError(_said(scene, names[k], f"at t = {t:.6g} s"))
-    found = [names[k] for k, _ in search.kinks(*_across(q))]
+        if k < len(names):
+            raise ValueError(_said(scene, names[k], f"at t = {t:.6g} s"))
+        if not _sets_in(scene, t, q[0], u[0]):
+            raise ValueError(_said_of_speeds(scene, names_of_rows(scene)[len(names_of_position_rows(scene)) + k - len(names)], t))
+    found = [names[k] for k, _ in search.kinks(*_across(q)) if k < len(names)]
     for name in dict.fromkeys(found):
         if found.count(name) >= MANY:
             raise ValueError(_said(scene, name, "at several places on its way"))
@@ -66,7 +74,7 @@ def _may_bend(scene: Scene) -> bool:
     variables = (parameters, parameters + 1)
     closed, shape = jaxpr_of_scene(scene, ())
     at = shape[0]
-    wanted = jax.tree.leaves(jax.tree.map(lambda x: any(x is y for y in (at.position, at.orientation, at.closure, at.qdot)), shape))
+    wanted = jax.tree.leaves(jax.tree.map(lambda x: any(x is y for y in (at.position, at.orientation, at.closure, at.qdot, at.phi)), shape))
     if not any(bent and asked for bent, asked in zip(may_bend(closed, variables), wanted, strict=True)):
         return False
     leaves, treedef = jax.tree.flatten(scene)
@@ -119,8 +127,8 @@ class _Search:
         """Values, and rates of what must be differentiable; shape (points, 2, entries)."""
         values, rates = _along(self.scene, t, q, self.u, dt, dq)
         still = np.zeros_like(rates.rates)
-        first = np.concatenate([values.poses, values.rows, values.rates], axis=1)
-        return np.stack([first, np.concatenate([rates.poses, rates.rows, still], axis=1)], axis=1)
+        first = np.concatenate([values.poses, values.rows, values.rates, values.drifts], axis=1)
+        return np.stack([first, np.concatenate([rates.poses, rates.rows, still, np.zeros_like(rates.drifts)], axis=1)], axis=1)
 
 
 def _off(a: np.ndarray, b: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -161,6 +169,19 @@ def _names(scene: Scene) -> list[str]:
     """What each entry belongs to."""
     names = [f"the pose of body `{name}`" for name in names_of_bodies(scene) for _ in range(12)] + [f"row `{name}`" for name in names_of_position_rows(scene)]
     return names + [f"the rate of coordinate `{name}`" for name in scene.coordinate_names.entries]
+
+
+def _sets_in(scene: Scene, t: float, q: np.ndarray, u: np.ndarray) -> bool:
+    """Whether rows become others at this time: a state may meet both."""
+    before, after = (constraint_rows(scene, at, q, u).A for at in (np.nextafter(t, -np.inf), t))
+    return not np.allclose(before, after, rtol=1e-6, atol=1e-9)
+
+
+def _said_of_speeds(scene: Scene, row: str, t: float) -> str:
+    return (
+        f"row `{row}` of `{type(scene).__name__}` jumps at t = {t:.6g} s: speeds would have to jump there, by an impulse that no acceleration holds. Let it "
+        "change within a short time, as by a `jj.Sampled` input, or end the motion there and start another with the speeds after the jump"
+    )
 
 
 def _said(scene: Scene, what: str, where: str) -> str:

@@ -21,6 +21,7 @@ from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted, takes_even_steps
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method, as_solver
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
+from jourdain_jax.motion.jumps import check_inputs_in_rows
 from jourdain_jax.motion.marks import marked
 from jourdain_jax.motion.own_steps import own_steps, reason_against_series, takes
 from jourdain_jax.motion.quick_compilation import nothing_is_traced
@@ -158,6 +159,8 @@ def _set_up(
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     start = _start(scene, start, t0, inputs, native, formulation.projects, searches)
     field = fitted(solver, scene, vector_field(scene, formulation, work, backend, inputs), formulation.state)
+    if not inputs.constant:
+        check_inputs_in_rows(scene, inputs, t0, t1)
     warn_float32(start.q.dtype, rtol)
     if solver is None:
         solver = default_solver(rtol) if order is None else DOPRI8

@@ -17,6 +17,7 @@ class Particle(eqx.Module):
     """A point mass: `mass` in kg, `position` (3,) in m, inertial frame.
 
     ValueError for other shapes. Its velocity comes by differentiating the position.
+    Where the mass depends on time or coordinates, `m a` holds with what it is at each instant; the thrust of what leaves is a load.
     """
 
     mass: Float[Array, ""]  # kg
@@ -36,6 +37,8 @@ class RigidBody(eqx.Module):
     - `outline`: (points, 3) in m, a line in the body frame, relative to the mass centre; for drawing only (default: none).
 
     ValueError for other shapes. Velocities come by differentiating the pose.
+    Where mass or inertia depend on time or coordinates, they count as they are at each instant, `m a` and `I alpha + omega x I omega`: what leaves or
+    joins takes its momentum with it, and its thrust is a load. A skater who draws in the arms is several bodies.
     """
 
     mass: Float[Array, ""]  # kg

@@ -21,6 +21,7 @@ from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
+from jourdain_jax.motion.jumps import check_inputs_in_rows
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.retries import lost_codes, mark_retried, next_retry, retry_options
@@ -172,8 +173,8 @@ def rollout(
     parameters = {} if parameters is None else {name: checked_real(value, f"parameter `{name}`") for name, value in parameters.items()}
     fixed, varied, count = _lanes(scene, starts, parameters)
     chunk = _chunk(scene, count, chunk, options)
-    _check_times_of_lanes(scene, starts, options)
     options["inputs"] = as_inputs(scene, options.get("inputs"))
+    _check_times_of_lanes(scene, starts, options)
     if is_traced((scene, fixed, varied, parameters, options)):
         return Rollout(_together(scene, fixed, _with_arrays(options), varied, parameters))  # being differentiated or batched: one piece, no host loop
     pieces = []
@@ -200,7 +201,9 @@ def rollout(
 
 
 def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:
-    """Where all lanes have one span and it is known. Inside the lanes it is traced: a lane whose own time does not fit gets a result code."""
+    """Where all lanes have one span and it is known, with jumps of inputs in it. Inside the lanes it is traced: a lane whose own time does not fit
+    gets a result code.
+    """
     ts = None if options.get("ts") is None else saved_times(options["ts"])
     t0, t1 = (as_end(name, options.get(name)) for name in ("t0", "t1"))
     if t0 is None and isinstance(starts, State):
@@ -212,6 +215,7 @@ def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:
     check_span(t0, t1)
     if ts is not None:
         check_times(ts, t0, t1)
+    check_inputs_in_rows(scene, options["inputs"], t0, t1)
 
 
 def _next_retries(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int[np.ndarray, "lanes"]:

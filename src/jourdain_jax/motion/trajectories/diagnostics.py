@@ -146,7 +146,9 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
     drift, size = float(found.energy_drift), float(found.energy_size)
     if drift > DRIFTED * size:
         share = f"{drift:.1e} J, {drift / size:.0%} of the energy that moves"
-        warned.append(f"{found.energy_kind}, which is constant for a right motion, drifts by {share}: tighten `rtol`")
+        warned.append(
+            f"{found.energy_kind}, which is constant for a right motion, drifts by {share}: tighten `rtol`, or let `verify` look at potentials and rows"
+        )
     pivot, dense = float(trajectory.smallest_pivot), "lowered" not in trajectory.reduction
     # round-off over the square of the pivot is the error of an acceleration; other states than the full one end there
     if trajectory.state_form == "full" and dense and pivot < passing_cutoff(trajectory.q.dtype):

@@ -103,7 +103,9 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
     inputs_in_rows = structure.rows_of_inputs and not constant
     conserves = not needs_work(scene, structure)
     with_work = work and not conserves
-    dense = inputs_in_rows or (with_work and (structure.driven or structure.varying_inertia))
+    dense = "velocity rows with inputs that change with time need dense matrices" if inputs_in_rows else ""
+    if not dense and with_work and (structure.driven or structure.varying_inertia):
+        dense = "the work along poses that are driven, or of masses that change, needs dense matrices; `work=False` leaves it out"
     program = _program(scene, minimal, backend, formulation, dense)
     cutoff = _cutoff(structure) if reduction is None and not minimal else None
     reduction = as_reduction(scene, _default_reduction(structure, independent, program) if reduction is None else reduction)
@@ -133,13 +135,11 @@ def _without_parts(scene: Scene, state, stabilisation, work: bool, backend: str,
 _once = once_per_values(_without_parts, of_traced=_without_parts)
 
 
-def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation, dense: bool) -> Lowered | None:
+def _program(scene: Scene, minimal: bool, backend: str, formulation: Formulation, dense: str) -> Lowered | None:
     """The scalar program that is integrated; None: dense matrices are. ValueError where a backend asks for a program and there is none."""
-    reason = ""
+    reason = dense
     if formulation.reduction is not None or formulation.baumgarte is not None:
         reason = "a reduction or a stabilisation of its own needs dense matrices"
-    elif dense:
-        reason = "velocity rows with inputs that change with time, and work along driven poses, need dense matrices"
     if backend == "dense" or (backend == "auto" and reason):
         return None
     program = reason or lowered(scene, every_speed=not minimal)
