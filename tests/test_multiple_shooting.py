@@ -136,6 +136,18 @@ def test_what_pieces_show_after_a_last_step_is_told_without_a_look_at_it():
         np.testing.assert_allclose(moved.rows[0, i][:, -1], rows[0, i][:, -1] + rows[0, i][:, :-1] @ own)
 
 
+def test_pieces_lie_along_the_fit_though_an_unknown_at_its_bound_was_moved():
+    ts = np.linspace(0.0, 4.0, 41)
+    x = 0.5 * np.cos(3.0 * ts) * np.exp(-0.03 / 4 * ts) + 0.002 * np.random.default_rng(1).normal(size=41)  # a damping of 0.03
+    run = jj.Measurements(ts, {"x": x}, 0.005, start={"x": 0.5, "x_rate": 0.0}, unknown_start=("x",))
+    found = jj.fit(Oscillator(), run, {"damping": jj.bounds(0.035, 2.0)}, shooting=jj.MultipleShooting(pieces=4), **TIGHT)
+    assert found.at_bound[0]
+    assert float(found["damping"].high) > 0.04
+    begins = ts[[10, 20, 30]]
+    motion = jj.simulate(found.scene, found.starts[0], ts=begins, t0=0.0, t1=4.0, **TIGHT)
+    np.testing.assert_allclose(np.sort(found.shooting.nodes[0].ravel()), np.sort(np.stack([motion["x"], motion["x_rate"]]).ravel()), atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

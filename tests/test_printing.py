@@ -48,6 +48,14 @@ def test_a_result_shows_its_text_wherever_it_is_shown(name):
     assert result._repr_html_().startswith(f"<pre>{html.escape(str(result))}</pre>")
 
 
+def test_a_scene_shows_its_numbers_as_one_writes_them():
+    assert repr(ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)) == str(ChaplyginSleigh()) == "ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)"
+    assert str(TrailerChain(trailers=0)).startswith("TrailerChain(trailers=0, car_mass=1, ")
+    seen = []
+    jax.jit(lambda scene: seen.append(str(scene)))(SLEIGH)
+    assert seen == ["ChaplyginSleigh(mass=being traced, inertia=being traced, offset=being traced)"]
+
+
 def test_a_linearization_prints_its_matrices_by_name_and_its_eigenvalues():
     chain = jj.linearize(TrailerChain(trailers=0), {"forward0": 1.0}, ())
     text = str(chain)

@@ -76,6 +76,18 @@ def test_every_lane_is_the_motion_that_simulate_gives(whole):
     assert "stopped at an event" in str(whole.lane(int(fell[0])))
 
 
+def test_a_lane_shows_outputs_that_are_called_as_what_it_starts_with(tmp_path):
+    found = jj.Study(jj.models.TiltingDisc(), start={"lean": [0.1, 0.2]}).run(tmp_path / "d.zarr", t1=0.1, outputs={"lean": jj.End("lean")}, progress=False)
+    assert f"  lean = {float(found.to_xarray()['lean'][1]):.6g}" in str(found.lane(1)).splitlines()
+
+
+def test_the_bars_of_a_yes_and_a_no_are_equally_wide(whole):
+    counts, edges = whole.histogram("fell")
+    assert counts[0] + counts[-1] == counts.sum()
+    assert counts[-1] == np.sum(whole.to_xarray()["fell"].values == 1.0) > 0
+    np.testing.assert_allclose(np.diff(edges), edges[1] - edges[0])
+
+
 def test_a_failed_lane_is_named_and_left_out_of_statistics(whole):
     assert whole.failed.tolist() == [BAD]
     assert whole.counts["bad_parameter"] == 1

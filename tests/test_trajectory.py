@@ -31,6 +31,7 @@ def test_the_summary_prints_steps_drift_residuals_contact_and_result(rolling):
     html = rolling._repr_html_()
     assert html.startswith("<table>")
     assert html.count("<tr>") == text.count("\n")
+    assert "drift is not seen: one time was saved" in str(jj.simulate(rolling.scene, {"lean": 0.3}, ts=[0.1]))
 
 
 def test_the_contact_force_is_the_one_newton_asks_for(rolling):

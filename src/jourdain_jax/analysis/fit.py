@@ -8,6 +8,7 @@ Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 
@@ -171,7 +172,7 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
             pieces.keep(int(np.argmin(found.at.cost)))
         control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.theta))))
         asked = replace(asked, control=control)
-    found, at_bounds = _off_bounds(problem, _with_memory(problem, found if members else found.lowest(), limits, control), limits, control)
+    found, at_bounds = _off_bounds(problem, _with_memory(problem, found if members else found.lowest(), limits, control), limits, control, pieces)
     if pieces is not None:
         found.converged &= pieces.closed(np.arange(len(found.converged)))
     return _result(problem, found, limits, at_bounds, asked, errors, guesses, same, None if pieces is None else pieces.told())
@@ -242,10 +243,11 @@ def _with_memory(problem: Problem, found: Minimum, limits: Limits, control: Cont
     return found
 
 
-def _off_bounds(problem: Problem, found: Minimum, limits: Limits, control: Control) -> tuple[Minimum, AtBounds]:
+def _off_bounds(problem: Problem, found: Minimum, limits: Limits, control: Control, pieces: Piecewise | None) -> tuple[Minimum, AtBounds]:
     """The minimum, gone on from where unknowns at a bound let it be lower away from it; and what is known of those that stay."""
     for _ in range(_TURNS):
-        told = limits_at_bounds(problem.linearised, found, limits, control)
+        with nullcontext() if pieces is None else pieces.unmoved():
+            told = limits_at_bounds(problem.linearised, found, limits, control)
         if not told.lower:
             break
         members = np.array(list(told.lower))

@@ -7,7 +7,8 @@
 Once pieces join (c = 0), residuals and derivatives are those of the whole run. Source: H. G. Bock, in: Modelling of Chemical Reaction Systems (1981) 102.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -243,6 +244,14 @@ class Piecewise:
         slopes = self._slopes[members][:, :, self.own :] * sizes[:, :, None] / self.node_sizes[:, None]
         lengths = np.sqrt(np.sum(slopes**2, axis=(2, 3)))[:, self.follows]
         return np.maximum(np.max(lengths, axis=1) / np.maximum(np.min(lengths, axis=1), np.finfo(float).tiny), 1.0)
+
+    @contextmanager
+    def unmoved(self) -> Iterator[None]:
+        """Wherever unknowns are tried, the pieces are back where they are now afterwards."""
+        names = ("local", "theta", "jumps", "_slopes", "_gaps", "_rows")
+        kept = {name: getattr(self, name).copy() for name in names}
+        yield
+        vars(self).update(kept)
 
     def closed(self, members: np.ndarray) -> Bool[np.ndarray, "members"]:
         """Whether the pieces join, to the tolerance of the simulation."""

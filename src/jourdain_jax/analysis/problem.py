@@ -21,7 +21,7 @@ from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
 
-_LEAST_SIGMA = 1e-12  # of a channel that is met exactly
+_LEAST_SIGMA = 1e-10  # of the largest value of a channel: one that is met exactly
 _NODES = np.linspace(-3.2, 3.2, 9)  # of arcsin rho, in its standard deviations: 1 / sqrt(samples) without unknowns
 
 
@@ -31,6 +31,8 @@ class Problem:
     def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Any, loss: Loss):
         self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
+        largest = [max(float(np.nanmax(np.abs(run.values[name]))) for run in runs if name in run.values) for name in self.estimated]
+        self._least = _LEAST_SIGMA * np.array([x or 1.0 for x in largest])  # sigma of each of these
         self.shares: np.ndarray | None = None  # of each run's span, from its start, by member: samples beyond do not count
         self.begun = np.zeros((0, 0))  # first guesses of the members, where spans grow
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
@@ -113,7 +115,7 @@ class Problem:
         together = triangles[:, :, 0]
         if kinds > 1:
             samples = self._counted[members if self.lanes.members else np.zeros(count, int)]
-            sigma = np.sqrt(np.maximum(squares.sum(axis=1)[:, 1:] / samples, _LEAST_SIGMA**2))
+            sigma = np.sqrt(np.maximum(squares.sum(axis=1)[:, 1:] / samples, self._least**2))
             cost = cost + np.sum(samples * np.log(sigma), axis=1)
             scaled = triangles / np.concatenate([np.ones((count, 1)), sigma], axis=1)[:, None, :, None, None]
             together = np.linalg.qr(scaled.reshape(count, runs, -1, m + p + 1), mode="r")

@@ -42,7 +42,7 @@ class Lane(Printed):
         lines = [f"Lane {self.number}: " + ", ".join(f"{name} = {value}" for name, value in given.items())]
         if self.kept:
             lines.append(f"  {results.MESSAGES.get(int(self.kept['result']), 'not computed yet')}")
-            lines += [f"  {name} = {value:.6g}" for name, value in self.kept.items() if name not in ("result", *given)]
+            lines += [f"  {name} = {value:.6g}" for name, value in self.kept.items() if name != "result"]
         return "\n".join(lines)
 
 
@@ -158,8 +158,11 @@ class StudyResult(Printed):
         counts, edges = self.statistics.histogram(output)
         inside = np.flatnonzero(counts)
         first, last = (inside[0], inside[-1] + 1) if inside.size else (0, len(counts))
-        starts = np.arange(first, last, max(1, math.ceil((last - first) / cells)))
-        return np.add.reduceat(counts[:last], starts), np.append(edges[starts], edges[last])
+        step = max(1, math.ceil((last - first) / cells))
+        starts = np.arange(first, last, step)
+        # the last one is as wide as the others, unless it holds what lies beyond the grid
+        end = last if last == len(counts) else min(starts[-1] + step, len(counts) - 1)
+        return np.add.reduceat(counts[:last], starts), np.append(edges[starts], edges[end])
 
     def sensitivity(self, output: str, confidence: float = 0.95) -> SobolIndices:
         """First-order and total Sobol' indices of an `output`, with intervals that hold each with the given `confidence`; needs sampler="saltelli"."""

@@ -1,9 +1,11 @@
 """How results show themselves: their text in a console, the same in a notebook, and shapes while they are being traced."""
 
+import dataclasses
 import html
 from collections.abc import Callable
 
 import jax
+import numpy as np
 
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.scene.parameters import parameters_of
@@ -31,6 +33,17 @@ _pictures: list[Callable] = []  # of a scene: functions of layers above
 def show_scenes_with(picture: Callable) -> None:
     """Have notebooks show what `picture(scene)`, HTML, draws of a scene, too."""
     _pictures.append(picture)
+
+
+def scene_text(scene) -> str:
+    """A scene in a console, as one writes it: `ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)`; of large fields, what they are."""
+    shown = []
+    for field in dataclasses.fields(scene):
+        value = getattr(scene, field.name)
+        plain = value is None or isinstance(value, bool | int | float | str)
+        text = _value(value) if isinstance(value, jax.Array | np.ndarray) else repr(value) if plain else type(value).__name__
+        shown.append(f"{field.name}=[{text}]" if ", " in text and not plain else f"{field.name}={text}")
+    return f"{type(scene).__name__}({', '.join(shown)})"
 
 
 def scene_html(scene) -> str:

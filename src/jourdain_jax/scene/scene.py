@@ -21,7 +21,7 @@ from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
 from jourdain_jax.scene.parameters import check_parameters, parameters_of
-from jourdain_jax.scene.printing import scene_html
+from jourdain_jax.scene.printing import scene_html, scene_text
 from jourdain_jax.scene.visuals import Visual
 from jourdain_jax.scene.what_is_read import WhatIsRead, is_function, is_read_by
 
@@ -158,6 +158,9 @@ class Scene(eqx.Module, metaclass=_SceneClass):
     def speed_names(self) -> Names:
         """Names of the speeds u."""
         return self.coordinates.default_speeds if self.speeds is None else self.speeds
+
+    def __repr__(self) -> str:
+        return scene_text(self)
 
     def _repr_html_(self) -> str:
         """For notebooks: what it is, its parameters with values and units, its coordinates, speeds and inputs."""

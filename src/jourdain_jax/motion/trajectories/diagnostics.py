@@ -172,7 +172,8 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
     """The summary as pairs of heading and text."""
     found = diagnose(trajectory)
     ts = np.asarray(trajectory.ts)
-    saved = f"{int(np.sum(np.isfinite(np.asarray(trajectory.q)).all(axis=-1)))} of {len(ts)} times saved"
+    reached = int(np.sum(np.isfinite(np.asarray(trajectory.q)).all(axis=-1)))
+    saved, several = f"{reached} of {len(ts)} times saved", reached > 1
     pivot = "" if trajectory.state_form == "full" else f"; pivot of the privileged speeds at least {float(trajectory.smallest_pivot):.1e}"
     low, high = (int(r) for r in found.rank)
     rows = [
@@ -180,13 +181,13 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
         ("solver", f"{trajectory.solver}, {int(trajectory.accepted)} steps accepted, {int(trajectory.rejected)} rejected"),
         *([("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again ") + _left_domain(trajectory))] if int(trajectory.fallback) else []),
         ("state", f"{trajectory.state_form}, reduction: {trajectory.reduction}" + (", projected after each step" if trajectory.projected else "") + pivot),
-        ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}"),
+        ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}" if several else "drift is not seen: one time was saved"),
         ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
         ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),
         ("start", _start_text(trajectory)),
         *([("inputs", _inputs_text(trajectory))] if trajectory.scene.inputs else []),
     ]
-    rows += [(f"invariant {name}", f"drift {float(drift):.2e}") for name, drift in found.invariant_drifts.items()]
+    rows += [(f"invariant {name}", f"drift {float(drift):.2e}") for name, drift in found.invariant_drifts.items() if several]
     rows += [(f"contact {name}", _contact_text(contact)) for name, contact in found.contacts.items()]
     return rows + [("warning", text) for text in warnings_of(found, trajectory) if not text.startswith("contact")]
 
