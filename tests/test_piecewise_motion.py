@@ -246,6 +246,7 @@ JERKS = {
 WITHOUT_JERK = {
     "a ramp": lambda motion: motion.u.x_rate - jnp.clip(motion.t, 1.0, 2.0),
     "a row that sets in": lambda motion: jnp.where(motion.t < 1.0, 0.0, motion.u.x_rate - 1.0),
+    "a row that sets in early": lambda motion: jnp.where(motion.t < 0.003, 0.0, motion.u.x_rate - 1.0),
     "a row that becomes another": lambda motion: jnp.where(motion.t < 1.0, motion.u.x_rate - 1.0, motion.u.wheel_rate),
 }
 

@@ -16,12 +16,12 @@ from jourdain_jax.calculus.on_first_use import module_on_first_use
 from jourdain_jax.calculus.reals import Number, as_array, is_traced
 from jourdain_jax.motion.arguments import as_state, check_options, named_values, span_and_times
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
+from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
 from jourdain_jax.motion.integration import integrate
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted, takes_even_steps
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method, as_solver
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
-from jourdain_jax.motion.jumps import check_inputs_in_rows
 from jourdain_jax.motion.marks import marked
 from jourdain_jax.motion.own_steps import own_steps, reason_against_series, takes
 from jourdain_jax.motion.quick_compilation import nothing_is_traced

@@ -18,10 +18,10 @@ from jourdain_jax.calculus.reals import checked_real, described, is_traced
 from jourdain_jax.motion.arguments import as_end, check_options, check_span, check_times, saved_times
 from jourdain_jax.motion.input_programs import by_itself, for_programs
 from jourdain_jax.motion.inputs import as_inputs
+from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
 from jourdain_jax.motion.integration import integrate_lanes
 from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
-from jourdain_jax.motion.jumps import check_inputs_in_rows
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.quick_compilation import quickly_compiled
 from jourdain_jax.motion.retries import lost_codes, mark_retried, next_retry, retry_options

@@ -1,0 +1,41 @@
+"""Where functions along a line jump: intervals at whose ends the values differ are halved until the difference has gone, or is a jump."""
+
+from collections.abc import Callable, Iterator
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+SOME, ALL = 24, 48  # halvings after which a smooth function shows no jump that counts, and after which an interval has no width
+
+
+def jumps(
+    values: Callable[[np.ndarray], np.ndarray], a: Float[np.ndarray, "intervals variables"], b: Float[np.ndarray, "intervals variables"]
+) -> Iterator[tuple[int, Float[np.ndarray, "variables"], Float[np.ndarray, "variables"]]]:
+    """For every interval from `a` to `b` in which something jumps: which entry does most, and the points before and behind its jump.
+
+    `values`: of many points, (points, kinds, entries); an entry jumps if one of its kinds does.
+    """
+    least, floor = (1e-2, 1e-3) if jnp.result_type(float) == jnp.float32 else (1e-6, 1e-9)
+    at_a, at_b = values(a), values(b)
+    largest = np.nanmax(np.abs(np.concatenate([at_a, at_b])), axis=0, initial=0.0)
+    size = np.maximum(largest, floor * np.max(largest, axis=-1, keepdims=True)) + np.finfo(largest.dtype).tiny
+    for turn in range(ALL):
+        middle = (a + b) / 2
+        at_middle = values(middle)
+        left, right = _off(at_a, at_middle, size), _off(at_middle, at_b, size)
+        first = np.max(left, axis=1, initial=0.0) >= np.max(right, axis=1, initial=0.0)
+        off = np.where(first[:, None], left, right)
+        if turn >= SOME and not np.any(off > least):
+            return
+        a, b = np.where(first[:, None], a, middle), np.where(first[:, None], middle, b)
+        at_a, at_b = np.where(first[:, None, None], at_a, at_middle), np.where(first[:, None, None], at_middle, at_b)
+    for k in np.flatnonzero(np.max(off, axis=1, initial=0.0) > least):
+        yield int(np.argmax(off[k])), a[k], b[k]
+
+
+def _off(a: np.ndarray, b: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """By how much entries differ, in their sizes."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        difference = np.max(np.abs(b - a) / size, axis=1)
+    return np.where(np.isfinite(difference), difference, 0.0)
