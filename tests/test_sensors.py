@@ -298,11 +298,11 @@ def test_intervals_that_a_bound_makes_too_narrow_are_named():
     held = jj.fit(Cart(), late(0, 0.0, tau=float(found["late.lag"].high)), ("mass",))
     assert float(held.chi_square - found.chi_square) == pytest.approx(2.706, rel=0.05)
     assert held["late.delay"].value < found["late.delay"].low
-    assert "`late.delay` moves beyond its own, which is too narrow" in found.warning
+    assert found.warning.startswith("the interval of `late.delay` is too narrow: with `late.lag` away from its bound")
     assert found.profiles(data, "late.delay")["late.delay"].low < held["late.delay"].value
     near = jj.fit(Cart(), late(3, 0.0, tau=jj.Estimate(0.05)), ("mass",))
     assert near["late.lag"].low > 0.0
-    assert near.warning.startswith("`late.lag` lies near a bound, where the squares rise less")
+    assert near.warning.startswith("the interval of `late.lag` is too narrow, and so may be those of others: up to a bound nearby")
 
 
 @pytest.mark.skipif(bool(host.reason_against()), reason="needs llvmlite")

@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 
 from jourdain_jax.analysis.asked import Asked
+from jourdain_jax.analysis.at_bounds import AtBounds, limits_at_bounds
 from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
@@ -26,7 +27,6 @@ from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Piecewise, Shot
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
-from jourdain_jax.analysis.profile import AtBounds, limits_at_bounds
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.shooting import MultipleShooting, check_shooting
 from jourdain_jax.analysis.shooting_steps import cutoff_of, shot

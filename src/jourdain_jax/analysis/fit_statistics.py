@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow
+from jourdain_jax.analysis.at_bounds import AtBounds, moved_from_bounds, too_narrow_near_bounds
 from jourdain_jax.analysis.information import Information, information, students_t_95
 from jourdain_jax.analysis.levenberg_marquardt import LEAST, Control, Limits, Minimum
 from jourdain_jax.analysis.problem import Problem
-from jourdain_jax.analysis.profile import AtBounds, moved_from_bounds, too_narrow_near_bounds
 from jourdain_jax.scene.scene import Scene
 
 _NORMAL_95 = 1.959963984540054  # 97.5 % quantile of the standard normal distribution
@@ -41,7 +41,7 @@ class Statistics:
     chi_square: Float[np.ndarray, "*repeats"]
     samples: Int[np.ndarray, "*repeats"]
     from_prior: Float[np.ndarray, "*repeats unknowns"]  # in standard deviations of the prior; NaN where there is none
-    too_narrow: tuple[str, ...]  # which intervals are, near bounds, one sentence each; of one fit
+    too_narrow: tuple[str, ...]  # sentences about intervals that bounds make too narrow; none in a batch
 
 
 def statistics(problem: Problem, found: Minimum, limits: Limits, control: Control, errors: str, at_bounds: AtBounds) -> Statistics:
@@ -69,7 +69,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
     if errors == "runs":
         known, quantiles = known.between_runs(one(found.at.arrow.scores)), students_t_95(len(problem.runs) - 1)
     reach = quantiles * known.standard_errors
-    too_narrow = []
+    too_narrow = []  # looked for in one fit only, since it takes further motions
     if single and found.converged[0]:
         too_narrow = moved_from_bounds(at_bounds, theta[0], reach, places, unknowns.labels)
         if errors == "sigmas":

@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from jourdain_jax.analysis.at_bounds import FAR_BEYOND
 from jourdain_jax.analysis.losses import LEAST_SQUARES
-from jourdain_jax.analysis.profile import FAR_BEYOND
 
-_COINCIDING = 3  # different residuals, which two channels may share by chance
-_FROM_PRIOR = 4.0  # standard deviations, which an estimate does not lie from its prior by chance
+_COINCIDING = 3  # different residuals that two channels may share by chance
+_FROM_PRIOR = 4.0  # standard deviations: an estimate that lies further from its prior is no chance
 _SURE = 5.0  # standard deviations of chi-square
 
 

@@ -26,9 +26,9 @@ def as_runs(scene: Scene, data: Measurements | Sequence[Measurements], *, repeat
     if not isinstance(data, Measurements | Iterable):
         raise ValueError(f"`data` is {described(data)}, expected a `Measurements` or a sequence of at least one")
     runs = (data,) if isinstance(data, Measurements) else tuple(data)
-    other = next((f"`data` holds {described(run)}" for run in runs if not isinstance(run, Measurements)), "" if runs else "`data` is empty")
-    if other:
-        raise ValueError(f"{other}, expected a `Measurements` or a sequence of at least one")
+    wrong = [f"`data` holds {described(run)}" for run in runs if not isinstance(run, Measurements)] if runs else ["`data` is empty"]
+    if wrong:
+        raise ValueError(f"{wrong[0]}, expected a `Measurements` or a sequence of at least one")
     return tuple(checked(scene, run, index, repeats) for index, run in enumerate(runs))
 
 

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.analysis.asked import TakenUp
+from jourdain_jax.analysis.at_bounds import RISE_95
 from jourdain_jax.analysis.levenberg_marquardt import minimise
-from jourdain_jax.analysis.profile import RISE_95
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.printing import Printed
 

@@ -247,7 +247,7 @@ class Piecewise:
 
     @contextmanager
     def unmoved(self) -> Iterator[None]:
-        """Wherever unknowns are tried, the pieces are back where they are now afterwards."""
+        """A context in which unknowns may be tried anywhere: after it, the pieces are as they were before."""
         names = ("local", "theta", "jumps", "_slopes", "_gaps", "_rows")
         kept = {name: getattr(self, name).copy() for name in names}
         yield

@@ -17,7 +17,7 @@ from jourdain_jax.eager.numpy_backend import uncompiled
 def eval_numpy(f: Callable) -> Callable:
     """`f` run at once on concrete arguments, uncompiled: NumPy arrays out, also while something else is being traced.
 
-    `lanes`: more arguments, with an axis of lanes first; `f` is that of one lane.
+    The function takes `lanes`, too: further arguments with an axis of lanes first, of which `f` gets those of one lane.
     """
 
     @lru_cache(maxsize=32)
@@ -27,6 +27,7 @@ def eval_numpy(f: Callable) -> Callable:
 
     @wraps(f)
     def run(*arguments, lanes=()):
+        # a truth value is no number here: it decides what is traced
         arguments = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array_like(x) and not isinstance(x, bool) else x, arguments)
         numbers, others = eqx.partition(arguments, eqx.is_array)
         rest, treedef = jax.tree.flatten(others, is_leaf=_is_none)

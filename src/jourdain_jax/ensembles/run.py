@@ -170,7 +170,8 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
     held, own = store.study["identity"], task.identity()
     other = [name for name in own if held.get(name) != own[name]]
     if other:
-        what = ", ".join(_difference(name, store.attributes, attributes(task)) for name in other)
+        was, now = store.attributes, json.loads(json.dumps(attributes(task)))
+        what = ", ".join(_difference(name, was, now) for name in other)
         raise ValueError(f"`{store.path}` holds another study; what differs: {what}; give a new name, or ask for the same")
     if chunk is not None and chunk != store.chunk:
         raise ValueError(f"`{store.path}` was begun with chunks of {store.chunk} lanes, and `chunk` is {chunk}; leave `chunk` out")
@@ -179,14 +180,15 @@ def _check_same(store: Store, task: Task, chunk: int | None) -> None:
         warnings.warn(f"`{store.path}` was begun with other versions: {', '.join(changed)}; what is computed now may differ in its last digits", stacklevel=3)
 
 
-def _difference(part: str, held: dict, own: dict) -> str:
-    """A part of a study that differs, and in what: options and parameters by name; the text of a design or start."""
-    kept = {"scene": "parameters", "options": "options", "start": "start"}.get(part, "")
-    if not kept:
+def _difference(part: str, was: dict, now: dict) -> str:
+    """A part of a study that differs; of a scene, its options or its start with the names of what differs in it."""
+    kept = {"scene": "parameters", "options": "options", "start": "start"}.get(part)
+    if kept is None:
         return part
-    was, now = held.get(kept, {}), json.loads(json.dumps(own[kept]))
-    names = [f"`{name}`" for name in sorted({*was, *now}) if was.get(name) != now.get(name)]
-    return f"{part} ({', '.join(names)})" if names else f"{part} (its methods)" if part == "scene" else part
+    names = [f"`{name}`" for name in sorted({*was[kept], *now[kept]}) if was[kept].get(name) != now[kept].get(name)]
+    if part == "scene" and not names:
+        names = ["its methods"]
+    return f"{part} ({', '.join(names)})" if names else part
 
 
 @contextmanager

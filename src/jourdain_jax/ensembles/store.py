@@ -127,7 +127,7 @@ class Store:
 
     @property
     def attributes(self) -> dict:
-        """What it says of itself."""
+        """Attributes of the whole store, by name."""
         return json.loads((self.path / "zarr.json").read_bytes())["attributes"]
 
     @staticmethod

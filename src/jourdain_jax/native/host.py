@@ -55,7 +55,7 @@ def lanes() -> int:
 
 @functools.cache
 def registers() -> int:
-    """How many values vector registers hold, with some left over for the working of an instruction."""
+    """How many values may be kept in vector registers; four of these are left to the working of instructions."""
     return 28 if features().get("avx512f") or features().get("neon") else 12
 
 

@@ -280,11 +280,11 @@ class Writer:
         return replace(self.instruction(type, f"load {type}, ptr {place}"), place=place)
 
     def again(self, value: Value) -> Value:
-        """A value that is in memory, from there, even where LLVM would rather keep it in a register."""
+        """A value that was put into memory, read from there, even where LLVM would rather keep it in a register; others as they are."""
         return self.instruction(value.type, f"load volatile {value.type}, ptr {value.place}") if value.place else value
 
     def opaque(self, pointer: Value, rows: Iterable[int]) -> list[Value]:
-        """Pointers to some rows of memory, each in a register of its own: LLVM does not know what they have in common."""
+        """Pointers to some rows of memory, each in a register of its own, unknown to LLVM as related: rows nearby are reached by short offsets."""
         found, place = [], self.room("ptr")
         for row in rows:
             self.store(self.at(pointer, row, self.real), place)

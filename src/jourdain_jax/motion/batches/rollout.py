@@ -201,8 +201,9 @@ def rollout(
 
 
 def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:
-    """Where all lanes have one span and it is known, with jumps of inputs in it. Inside the lanes it is traced: a lane whose own time does not fit
-    gets a result code.
+    """Checks times, and inputs for jumps between them, where all lanes have one span and it is known.
+
+    Inside the lanes it is traced: a lane whose own time does not fit gets a result code.
     """
     ts = None if options.get("ts") is None else saved_times(options["ts"])
     t0, t1 = (as_end(name, options.get(name)) for name in ("t0", "t1"))

@@ -1,13 +1,14 @@
-"""How far from its bound an unknown may be that the measurements put there: a one-sided limit by profile likelihood.
+"""Unknowns at a bound: how far from it each may be, a one-sided limit by profile likelihood; and intervals that bounds make too narrow.
 
 p(delta) = min over all other unknowns of (F - F_min), theta = bound + delta;      the limit is where 2 p = 2.706, the square of the normal 95 % quantile
 p is close to g delta + h delta^2 / 2, g: slope of F there, 1 / h: variance of the unknown if it were free
-p < 0: there is a saddle at the bound. So it is where another unknown does the same there, as a delay does at a lag of zero: F is level, and falls further in
+p < 0: F is lower away from the bound. So it is where another unknown does the same at the bound, as a delay does at a lag of zero: F is level there, a saddle
 Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -18,23 +19,25 @@ from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, 
 ONE_SIDED = 2.7055434540954146 / 2  # of F
 RISE_95 = 3.841458820694124  # of 2 F
 FAR_BEYOND = 3.0  # standard errors: an estimate that is held at its bound by more is no chance
-CLOSE, MOST = 0.02, 16  # relative error of p, and by what share of `ONE_SIDED` a minimum is lower; evaluations of it
+CLOSE = 0.02  # of `ONE_SIDED`: error of p at the limit, and by how much F is to be lower elsewhere to count as lower
+MOST = 16  # evaluations of p
 FURTHER = 4.0  # factor of delta where p does not rise
 NARROW = 0.5  # of the rise that a standard error foretells at a bound nearby: with less, the interval is too narrow
+ADVICE = "`Fit.profiles` gives intervals that hold"
 
 
 @dataclass
 class AtBounds:
-    """Of each unknown at a bound, (members, unknowns); NaN elsewhere."""
+    """What is known of unknowns at a bound, of fits that have converged; NaN for all others."""
 
-    limit: np.ndarray  # infinite where the data give none; there is none of a fit that has not converged
-    beyond: np.ndarray  # by how many standard errors the data would put it beyond
-    lower: dict[int, np.ndarray] = field(default_factory=dict)  # by member: where F is lower, with such an unknown away from its bound
-    at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)  # by member and unknown: where all are with that one at its limit
+    limit: Float[np.ndarray, "members unknowns"]  # infinite where the data give none
+    beyond: Float[np.ndarray, "members unknowns"]  # by how many standard errors the data would put it beyond its bound
+    lower: dict[int, np.ndarray] = field(default_factory=dict)  # by member: all unknowns where F is lower, with one away from its bound
+    at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)  # by member and unknown at a bound: all unknowns with that one at its limit
 
 
 def limits_at_bounds(evaluate: Callable, found: Minimum, limits: Limits, control: Control) -> AtBounds:
-    """What is known of unknowns at a bound."""
+    """Each unknown at a bound is moved away from it, all others following."""
     limit, beyond = np.full(found.theta.shape, np.nan), np.full(found.theta.shape, np.nan)
     told, costs = AtBounds(limit, beyond), found.at.cost.copy()
     bound = ((found.theta <= limits.low) | (found.theta >= limits.high)) & ~limits.fixed
@@ -55,7 +58,8 @@ def limits_at_bounds(evaluate: Callable, found: Minimum, limits: Limits, control
             continue
         room = float(limits.high[place] - limits.low[place])
         first = min(_root(slope, 1 / error**2) if np.isfinite(error) else float(size[0, place]), room)
-        delta, at = _limit(lambda d, b=b, place=place, inward=inward: _profile(evaluate, found, b, place, inward * d, limits, control), first, room)
+        rise = partial(_rise, evaluate, found, limits, control, b, place)
+        delta, at = _limit(lambda d, rise=rise, inward=inward: rise(inward * d), first, room)
         if at is not None and np.isfinite(delta):
             told.at_limit[b, place] = at.theta[0]
         elif at is not None and at.at.cost[0] < costs[b]:
@@ -71,9 +75,7 @@ def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, plac
         far = [f"`{name}`" for name, shift, most in zip(labels, np.abs(there - theta)[places], reach, strict=True) if shift > most]
         if far:
             bounded = labels[int(np.searchsorted(places, place))]
-            moves, tells = ("move beyond theirs, which are", "them") if len(far) > 1 else ("moves beyond its own, which is", "it")
-            away = f"with `{bounded}` away from its bound, though within its interval"
-            sentences.append(f"{away}, {', '.join(far)} {moves} too narrow; `profiles` tells {tells}")
+            sentences.append(f"{_too_narrow(far)}: with `{bounded}` away from its bound, though within its interval, the best fit lies outside; {ADVICE}")
     return sentences
 
 
@@ -86,17 +88,22 @@ def too_narrow_near_bounds(evaluate: Callable, found: Minimum, limits: Limits, c
     for name, place, error in zip(labels, np.flatnonzero(~limits.fixed).tolist(), errors, strict=True):
         for step in (limits.low[place] - found.theta[0, place], limits.high[place] - found.theta[0, place]):
             square = (step / error) ** 2
-            if 1 < square < 2 * RISE_95 and 2 * _profile(evaluate, found, 0, place, step, limits, control)[0] < NARROW * factor * square:
+            if 1 < square < 2 * RISE_95 and 2 * _rise(evaluate, found, limits, control, 0, place, step)[0] < NARROW * factor * square:
                 narrow.append(f"`{name}`")
-    lie, theirs = ("lie near bounds", "their intervals") if len(narrow) > 1 else ("lies near a bound", "its interval")
-    return [
-        f"{', '.join(narrow)} {lie}, where the squares rise less than the standard error foretells: {theirs}, and those of unknowns that correlate, "
-        "are too narrow; `profiles` tells them"
-    ] * bool(narrow)
+    if not narrow:
+        return []
+    return [f"{_too_narrow(narrow)}, and so may be those of others: up to a bound nearby, the squares rise less than standard errors foretell; {ADVICE}"]
 
 
-def _limit(profile: Callable, delta: float, room: float) -> tuple[float, Minimum | None]:
-    """Where the profile reaches `ONE_SIDED`, looked for from `delta` on, and the minimum there; infinite where it does not, or is lower at the minimum."""
+def _too_narrow(names: list[str]) -> str:
+    return f"the {'intervals' if len(names) > 1 else 'interval'} of {', '.join(names)} {'are' if len(names) > 1 else 'is'} too narrow"
+
+
+def _limit(profile: Callable[[float], tuple[float, Minimum]], delta: float, room: float) -> tuple[float, Minimum | None]:
+    """Where the profile reaches `ONE_SIDED`, looked for from `delta` on, and the minimum there; infinite and None where it does not.
+
+    Infinite with a minimum: that one is lower than at the bound.
+    """
     inner, outer = (0.0, 0.0), (np.inf, np.inf)  # delta and rise on either side
     for _ in range(MOST):
         rise, at = profile(delta)
@@ -125,8 +132,8 @@ def _root(slope: float, curvature: float) -> float:
     return float(2 * ONE_SIDED / (slope + np.sqrt(slope**2 + 2 * curvature * ONE_SIDED)))
 
 
-def _profile(evaluate: Callable, found: Minimum, b: int, place: int, step, limits: Limits, control: Control) -> tuple[float, Minimum]:
-    """The rise of F, and the minimum with the unknown held there; infinite where the motion fails."""
+def _rise(evaluate: Callable, found: Minimum, limits: Limits, control: Control, b: int, place: int, step: float) -> tuple[float, Minimum]:
+    """By how much F of member `b` rises when one unknown is moved by a step and held there (infinite where the motion fails), and the minimum there."""
     theta: Float[np.ndarray, "1 unknowns"] = found.theta[b : b + 1].copy()
     theta[0, place] += step
     fixed = limits.fixed.copy()
