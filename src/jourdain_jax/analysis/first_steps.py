@@ -87,7 +87,7 @@ class _At(NamedTuple):
 
 
 def first_steps(evaluate: Callable, loss: Loss, x: Float[Array, "unknowns"], known: tuple[Array, ...], told: Float[Array, "_"]) -> Float[Array, "_"]:
-    """Where they end, in one vector (see `read`). `evaluate`: [J r] of unknowns and what is `known`, (samples, unknowns + 1)."""
+    """Takes the steps from x; where they end, in one vector (see `read`). `evaluate`: [J r] of unknowns and what is `known`, (samples, unknowns + 1)."""
     n, places = x.shape[0], np.arange(ROOM + 1.0)
 
     def tried(now: tuple[Array, Array]) -> tuple[Array, Array]:

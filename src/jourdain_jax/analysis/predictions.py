@@ -294,7 +294,8 @@ class _Number(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, samples: int) -> tuple[Callable, Callable]:
-    """[J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns; `first_steps` by the loss.
+    """Two programs: [J r] of lanes, shape (lanes, samples, local + shared + 1), from numbers that all share and rows of runs with their unknowns; and, of a
+    loss, the one that takes the `first_steps` of a run.
 
     Each is compiled once. `reference`: of the scene; `treedef`, `leaves`: of scene, options and run, with a `_Number` in place of each array.
     """

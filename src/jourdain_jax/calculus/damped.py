@@ -67,13 +67,16 @@ def damped_root(rows: Callable, guess: Float[Array, "unknowns"], size: Float[Arr
 
 
 def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, tolerance: float, good: float) -> tuple[Nearest, Int[Array, ""]]:
-    """What the first of the `guesses` leads to that leaves less than `good`, and its number; where none does, what is nearest. Else as `damped_root`."""
+    """The root that is found from the first of the `guesses` that leads to one, and its number; where none does, what comes nearest.
+
+    A root leaves at most `good`; all else is as for `damped_root`.
+    """
     count = guesses.shape[0]
     at_once = max(1, min(count, MOST_ENTRIES // max(1, jax.eval_shape(rows, guesses[0])[1].size)))
     blocks = -(-count // at_once)
     places = np.minimum(np.arange(blocks * at_once), count - 1).reshape(blocks, at_once)  # the last one may stand there several times
 
-    def further(carried):
+    def next_block(carried):
         k, best, number = carried
         found = jax.vmap(lambda guess: damped_root(rows, guess, size, tolerance))(guesses[jnp.asarray(places)[k]])
         which = jnp.where(jnp.any(found.left <= good), jnp.argmax(found.left <= good), jnp.argmin(found.left)).astype(jnp.int32)
@@ -82,4 +85,4 @@ def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, 
         return k + 1, *jax.tree.map(lambda new, old: jnp.where(better, new, old), chosen, (best, number))
 
     nothing = Nearest(guesses[0], jnp.full((), jnp.inf, guesses.dtype)), jnp.zeros((), jnp.int32)
-    return jax.lax.while_loop(lambda carried: (carried[0] < blocks) & ~(carried[1].left <= good), further, (jnp.zeros((), jnp.int32), *nothing))[1:]
+    return jax.lax.while_loop(lambda carried: (carried[0] < blocks) & ~(carried[1].left <= good), next_block, (jnp.zeros((), jnp.int32), *nothing))[1:]

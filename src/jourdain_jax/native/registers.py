@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Turn:
-    """Values that come from memory before a value is worked out, and those that go there after it."""
+    """Values that come from memory before a value is worked out, and those that go there after it, each with its place."""
 
-    loaded: list[int] = field(default_factory=list)
+    loaded: list[int]
     stored: list[tuple[int, int]] = field(default_factory=list)
 
 

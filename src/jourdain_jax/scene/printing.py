@@ -40,9 +40,12 @@ def scene_text(scene) -> str:
     shown = []
     for field in dataclasses.fields(scene):
         value = getattr(scene, field.name)
-        plain = value is None or isinstance(value, bool | int | float | str)
-        text = _value(value) if isinstance(value, jax.Array | np.ndarray) else repr(value) if plain else type(value).__name__
-        shown.append(f"{field.name}=[{text}]" if ", " in text and not plain else f"{field.name}={text}")
+        if isinstance(value, jax.Array | np.ndarray):
+            text = _value(value)
+            text = f"[{text}]" if ", " in text else text
+        else:
+            text = repr(value) if value is None or isinstance(value, bool | int | float | str) else type(value).__name__
+        shown.append(f"{field.name}={text}")
     return f"{type(scene).__name__}({', '.join(shown)})"
 
 

@@ -214,7 +214,7 @@ def _write_in_band(w: Writer, of: Rows, pattern: Pattern, regular: float) -> Non
         w.call("masses", "void", state, c)
         with w.counted(0, columns) as k:
             own = w.load(w.real, c, k)
-            w.store(_scale_of_speed(w, own) + (own - own), c, k)  # no number where the mass is none
+            w.store(_scale_of_speed(w, own) + (own - own), c, k)  # NaN where the mass is NaN
         free, typical = (w.at(state, first_free + k, w.real) for k in (0, columns))
         write_factors(w, pattern, free, typical, places, regular)
         w.give()

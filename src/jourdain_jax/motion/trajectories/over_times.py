@@ -1,5 +1,6 @@
 """Quantities along a recorded motion: a function of one state, mapped over all saved times."""
 
+from functools import partial
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -67,9 +68,7 @@ def _mapped(f, record: Record, by_inputs: bool):
     if record.q.ndim > 2:
         return eqx.filter_vmap(lambda record: _mapped(f, record, by_inputs))(record)
 
-    def one(t, q, u):
-        return _at_one_time(f, record, by_inputs, t, q, u)
-
+    one = partial(_at_one_time, f, record, by_inputs)
     count, at_once = len(record.ts), _at_once(record)
     if count <= at_once:
         return jax.vmap(one)(record.ts, record.q, record.u)
@@ -81,6 +80,7 @@ _compiled = for_programs(_mapped, by_itself)
 
 
 def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
+    """`f` at one state; NaN where that was not reached, in place of which f is run at the end of the motion."""
     reached = jnp.all(jnp.isfinite(q))
     t, q, u = (jnp.where(reached, a, b) for a, b in ((t, record.t_end), (q, record.q_end), (u, record.u_end)))
     values = f(record.scene, t, q, u, record.inputs.near(t) if by_inputs else record.inputs(t))
@@ -93,7 +93,7 @@ def _at_once(record: Record) -> int:
 
 
 def uncompiled_over_times(f, record: Record, by_inputs: bool = False):
-    """As `map_over_times`, of one motion, uncompiled: for what is looked at once."""
+    """As `map_over_times`, of one motion, on NumPy: compiling a function takes longer than running it once."""
     by_time, size = (record.ts, record.q, record.u), _at_once(record)
     blocks = [_uncompiled(f, record, by_inputs and _needs_rates(record), lanes=[x[k : k + size] for x in by_time]) for k in range(0, len(record.ts), size)]
     return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
@@ -118,11 +118,11 @@ def energies(record: Record) -> tuple[Float[Array, "*lanes times"], Float[Array,
     return map_over_times(_energies, record)
 
 
-def accelerations_over_times(record: Record, usual: UsualRows | None = None) -> Accelerations:
-    """Accelerations, multipliers, rank and smallest singular value; `usual`: from `usual_rows`, for a record whose parameters are traced."""
-    if usual is None and record.q.ndim > 2:  # every lane has parameters of its own
+def accelerations_over_times(record: Record) -> Accelerations:
+    """Accelerations, multipliers, rank and smallest singular value."""
+    if record.q.ndim > 2:  # every lane has parameters of its own
         return map_over_times(_accelerations, record, by_inputs=True)
-    return map_over_times(_Accelerations(jax.tree.map(jnp.asarray, usual_rows(record.scene) if usual is None else usual)), record, by_inputs=True)
+    return map_over_times(_Accelerations(jax.tree.map(jnp.asarray, usual_rows(record.scene))), record, by_inputs=True)
 
 
 def reactions_over_times(record: Record) -> RowReactions:
@@ -207,7 +207,7 @@ class Checks(eqx.Module):
     usual: UsualRows
 
     def __call__(self, scene, t, q, u, inputs) -> Checked:
-        found = accelerations(scene, t, q, u, inputs, reduction="svd", usual=self.usual)
+        found = _Accelerations(self.usual)(scene, t, q, u, inputs)
         return Checked(
             _energies(scene, t, q, u, inputs),
             _residuals(scene, t, q, u, inputs),
