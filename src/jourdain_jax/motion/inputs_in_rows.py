@@ -11,6 +11,7 @@ from jourdain_jax.build.smoothness import SPEEDS_WOULD_JUMP
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.jumps import jumps
 from jourdain_jax.calculus.reals import is_traced, real_type
+from jourdain_jax.eager.numpy_backend import uncompiled
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.motion.inputs import Constant, Inputs, Sampled, inputs_at
 from jourdain_jax.program.roughness import may_bend
@@ -47,6 +48,6 @@ def _in_rows(scene: Scene, inputs: Inputs, q: np.ndarray, t0) -> Bool[np.ndarray
 
 
 def _first_jump(channel: Callable, t0: float, t1: float) -> float | None:
-    values, ts = jax.jit(jax.vmap(channel)), np.linspace(t0, t1, EVENLY + 1)[:, None]
+    values, ts = uncompiled(jax.vmap(channel)), np.linspace(t0, t1, EVENLY + 1)[:, None]
     found = jumps(lambda t: np.asarray(values(t[:, 0]), float)[:, None, None], ts[:-1], ts[1:])
     return next((float(behind[0]) for _, _, behind in found), None)
