@@ -225,6 +225,7 @@ JUMPS = {
     "steps": lambda t: 0.1 * jnp.floor(3.0 * t),
     "a pulse": lambda t: jnp.where(jnp.abs(t - 0.5) < 0.1, 1.0, 0.0),
     "a comparison": lambda t: t >= 1.0,
+    "turns of a loop": lambda t: jax.lax.fori_loop(0, jnp.floor(3.0 * t).astype(int), lambda _, x: x + 0.1, 0.0),
 }
 
 

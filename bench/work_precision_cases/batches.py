@@ -45,14 +45,7 @@ def by_rollout(problem: Problem, solver=None) -> Callable:
 
     @jax.jit
     def compiled(tolerance, state):
-        options = {
-            "ts": jnp.array([problem.end]),
-            "rtol": tolerance,
-            "atol": tolerance,
-            "solver": solver or diffrax.Dopri8(),
-            "events": False,
-            "max_steps": MAX_STEPS,
-        }
+        options = {"ts": jnp.array([problem.end]), "rtol": tolerance, "atol": tolerance, "events": False, "max_steps": MAX_STEPS}
         lanes = jj.rollout(scene, state, solver=solver or diffrax.Dopri8(), **options).lanes
         return jnp.concatenate([lanes.q_end, lanes.u_end[:, jnp.array(independent)]], axis=1)
 

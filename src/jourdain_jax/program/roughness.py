@@ -44,7 +44,8 @@ def _results(equation, given: list[int], smooth: frozenset[str]) -> list[int]:
     if name == "while":
         conditions, constants = params["cond_nconsts"], params["body_nconsts"]
         found = _repeated(params["body_jaxpr"].jaxpr, given[conditions:], constants, len(given) - conditions - constants, smooth)
-        return [_MAY_BEND if mark else mark for mark in found]  # how often it turns may depend on them
+        turns = max(_marked(params["cond_jaxpr"].jaxpr, [*given[:conditions], *found], smooth))  # whether it depends on them how often it turns
+        return [_MAY_BEND if mark or turns else mark for mark in found]
     if name == "cond":
         branches = [_marked(branch.jaxpr, given[1:], smooth) for branch in params["branches"]]
         return [_MAY_BEND if given[0] else max(marks) for marks in zip(*branches, strict=True)]
