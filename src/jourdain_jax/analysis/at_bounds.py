@@ -58,8 +58,7 @@ def limits_at_bounds(evaluate: Callable, found: Minimum, limits: Limits, control
             continue
         room = float(limits.high[place] - limits.low[place])
         first = min(_root(slope, 1 / error**2) if np.isfinite(error) else float(size[0, place]), room)
-        rise = partial(_rise, evaluate, found, limits, control, b, place)
-        delta, at = _limit(lambda d, rise=rise, inward=inward: rise(inward * d), first, room)
+        delta, at = _limit(partial(_rise, evaluate, found, limits, control, b, place), inward, first, room)
         if at is not None and np.isfinite(delta):
             told.at_limit[b, place] = at.theta[0]
         elif at is not None and at.at.cost[0] < costs[b]:
@@ -99,14 +98,14 @@ def _too_narrow(names: list[str]) -> str:
     return f"the {'intervals' if len(names) > 1 else 'interval'} of {', '.join(names)} {'are' if len(names) > 1 else 'is'} too narrow"
 
 
-def _limit(profile: Callable[[float], tuple[float, Minimum]], delta: float, room: float) -> tuple[float, Minimum | None]:
-    """Where the profile reaches `ONE_SIDED`, looked for from `delta` on, and the minimum there; infinite and None where it does not.
+def _limit(profile: Callable[[float], tuple[float, Minimum]], inward: float, delta: float, room: float) -> tuple[float, Minimum | None]:
+    """How far `inward` (1 or -1) the profile reaches `ONE_SIDED`, looked for from `delta` on, and the minimum there; infinite and None where it does not.
 
     Infinite with a minimum: that one is lower than at the bound.
     """
     inner, outer = (0.0, 0.0), (np.inf, np.inf)  # delta and rise on either side
     for _ in range(MOST):
-        rise, at = profile(delta)
+        rise, at = profile(inward * delta)
         if rise < -CLOSE * ONE_SIDED:
             return np.inf, at
         if abs(rise / ONE_SIDED - 1) < CLOSE:
