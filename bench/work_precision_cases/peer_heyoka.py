@@ -5,12 +5,14 @@ Also the second computation behind most references, in extended precision. Sourc
 
 import functools
 
+import jax.numpy as jnp
 import numpy as np
 from baselines import dense, heyoka_lowered
 from baselines.hand_derived import tilting_disc
 from baselines.heyoka_lowered import MISSING, heyoka
 
 import jourdain_jax as jj
+from jourdain_jax.equations.minimal import speeds_from_privileged
 from work_precision_cases.curve import Curve, Prepared, Solved
 from work_precision_cases.problem import Problem
 
@@ -48,12 +50,16 @@ def operations(problem: Problem) -> int:
 
 
 def extended(problem: Problem) -> dict[str, float]:
-    """Coordinates and integrated speeds at the end, in long double with a tolerance of 1e-18."""
+    """Coordinates and speeds at the end, integrated in long double with a tolerance of 1e-18; the speeds that are not integrated follow from the rows."""
     names, start, _ = states(problem)
     start = start.astype(np.longdouble)
     solver = heyoka.taylor_adaptive(system(problem), start, tol=np.longdouble("1e-18"), fp_type=np.longdouble, compact_mode=True)
     solver.propagate_until(np.longdouble(problem.end))
-    return dict(zip(names, solver.state.astype(float), strict=True))
+    found = dict(zip(names, solver.state.astype(float), strict=True))
+    scene, independent = problem.scene, jj.lower(problem.scene).independent
+    q, v = (jnp.array([found[name] for name in which]) for which in (names[: len(names) - len(independent)], names[len(names) - len(independent) :]))
+    u = speeds_from_privileged(scene, tuple(independent), jnp.asarray(problem.end), q, v) if len(independent) < len(scene.speed_names) else v
+    return dict(zip(scene.speed_names.entries, np.asarray(u), strict=True)) | found
 
 
 def _prepared(problem: Problem, equations: list, start: np.ndarray, minimal: list[int], compact: bool) -> Prepared:
