@@ -171,7 +171,7 @@ def _finish(ax, title: str, xlabel: str, ylabel: str) -> None:
 
 def _legend(figure, looks: list[Look], title: str, path: Path, rows: int, columns: int) -> None:
     handles = [plt.Line2D([], [], color=x.colour, marker=x.mark, ls=x.line, lw=x.width, ms=5.5) for x in looks]
-    each = min(len(looks), 2 if columns == 1 else 3 if columns == 2 else 6)
+    each = min(len(looks), {1: 2, 2: 3, 3: 4}.get(columns, 6))
     lines = math.ceil(len(looks) / each)
     height = figure.get_figheight()
     figure.suptitle(title, fontsize=12)
