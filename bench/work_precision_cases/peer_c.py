@@ -5,6 +5,7 @@ Dopri8 without projection: the same tableau, norm and control, each lane with st
 """
 
 import ctypes
+import platform
 import re
 import shutil
 import subprocess
@@ -23,7 +24,8 @@ from work_precision_cases.peer_diffrax import BY_HAND
 from work_precision_cases.problem import Problem
 
 SIDE_BY_SIDE = 8
-FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp-simd", "-mprefer-vector-width=512", "-shared", "-fPIC")
+FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp-simd", "-shared", "-fPIC")
+WIDE = "-mprefer-vector-width=512"  # of processors that have such registers
 MISSING = "SymPy cannot be imported, which writes the equations by hand as C; `pip install sympy`"
 
 MACROS = """#define EACH_LANE _Pragma("omp simd") for (int l = 0; l < W; l++)
@@ -139,7 +141,10 @@ def compiled(problem: Problem, side_by_side: int) -> Callable[[float, np.ndarray
         raise NotApplicable("there is no C compiler (cc, gcc, clang)")
     text, folder = source(problem, side_by_side), Path(tempfile.mkdtemp())
     (folder / "motion.c").write_text(text)
-    subprocess.run([compiler, *FLAGS, "-o", str(folder / "motion.so"), str(folder / "motion.c"), "-lm"], check=True)
+    flags = (*FLAGS, WIDE) if platform.machine() in ("x86_64", "AMD64") else FLAGS
+    done = subprocess.run([compiler, *flags, "-o", str(folder / "motion.so"), str(folder / "motion.c"), "-lm"], capture_output=True, text=True)
+    if done.returncode != 0:
+        raise NotApplicable(f"{compiler} does not compile it: {done.stderr.strip().splitlines()[-1]}")
     solve = ctypes.CDLL(str(folder / "motion.so")).solve
     shutil.rmtree(folder)  # loaded already
     solve.argtypes, solve.restype = [ctypes.c_double, ctypes.c_double, ctypes.c_long, ctypes.c_void_p, ctypes.c_void_p], ctypes.c_long
