@@ -265,7 +265,7 @@ def _back_from_event(end: Progress, located, slope, g: _Cotangents, differentiab
 
 def _empty(start: Progress, max_steps: int) -> _Record:
     """A record with the start as its only state."""
-    state_bytes = sum(x.nbytes for x in jax.tree.leaves((start.t, start.y)))
+    state_bytes = sum(jnp.size(x) * jnp.result_type(x).itemsize for x in jax.tree.leaves((start.t, start.y)))
     length = max(_FEWEST[0], min(STEPS_TOGETHER if start.t.ndim else STEPS_ALONE, _MEMORY[0] // state_bytes, max_steps + MOST_STEPS + 2))
     windows = -(-(max_steps + MOST_STEPS) // (length - length // SPARE)) + 1
     windows = min(windows, max(_FEWEST[1], _MEMORY[1] // state_bytes))
