@@ -25,6 +25,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))  # small scenes that tests use, too
+from small_scenes import Oscillator
+
 import jourdain_jax as jj
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 
@@ -123,21 +126,6 @@ def outlier() -> list[Figure]:
         moved = float(np.max(np.abs(clean.values - spoilt.values) / clean.standard_errors))
         found.append(figure(f"an outlier of 60 sigmas moves estimates by, standard errors, {name}", "tilting-disc", moved, None if loss is None else 0.3))
     return found
-
-
-class Oscillator(jj.Scene):
-    """`m x'' = - c x' - k x`."""
-
-    mass: jnp.ndarray = jj.parameter(2.0, positive=True)
-    damping: jnp.ndarray = jj.parameter(0.3, non_negative=True)
-    stiffness: jnp.ndarray = jj.parameter(5.0, positive=True)
-    coordinates = jj.coordinates("x")
-
-    def bodies(self, t, q):
-        return {"cart": jj.Particle(self.mass, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
-
-    def loads(self, motion):
-        return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - self.stiffness * motion.q.x),)
 
 
 def bound() -> list[Figure]:

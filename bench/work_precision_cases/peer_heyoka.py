@@ -7,8 +7,7 @@ import functools
 
 import jax.numpy as jnp
 import numpy as np
-from baselines import dense, heyoka_lowered
-from baselines.hand_derived import tilting_disc
+from baselines import heyoka_disc, heyoka_lowered
 from baselines.heyoka_lowered import MISSING, heyoka
 
 import jourdain_jax as jj
@@ -85,10 +84,8 @@ def on_engines_equations(problem: Problem) -> Prepared:
 
 def on_disc_by_hand(problem: Problem) -> Prepared:
     """The disc's equations as an expert writes them."""
-    y = heyoka.make_vars(*problem.minimal_names)
-    qdot, vdot = tilting_disc(dense.DISC_PARAMETERS, heyoka.time, tuple(y[:5]), tuple(y[5:]), xp=heyoka)
     start = problem.minimal_start
-    return _prepared(problem, list(zip(y, (*qdot, *vdot), strict=True)), start, list(range(len(start))), compact=False)
+    return _prepared(problem, heyoka_disc.system(), start, list(range(len(start))), compact=False)
 
 
 def _missing(problem: Problem) -> Prepared:
