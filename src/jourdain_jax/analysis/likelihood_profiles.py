@@ -22,8 +22,8 @@ from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.printing import Printed
 
 _CLOSE = 0.01  # of the rise at the end of an interval
-_POINTS, _REFINED = 16, 6  # at most, on one side: outwards, and between the last two
-_SHARES = 0.05, 0.95  # of what is between them, in which the next one lies
+_POINTS, _REFINED = 16, 8  # at most, on one side: outwards, and between the last two
+_JUMP = 3.0  # times the rise at the end of an interval: with more between two points, it may jump
 _STEP = 0.6  # of sqrt(rise), from point to point
 _FAR = 1e3  # sizes of the unknown, beyond which nothing is looked for
 _LOWER = 0.02  # of the rise, by which a lower minimum is found
@@ -122,14 +122,13 @@ class _Side:
         return 2 * float(found.at.cost[0] - self._fitted.at.cost[0]) / self._inflation, found.theta
 
     def _crossing(self, theta: np.ndarray, origin: float, inner: tuple[float, float], outer: tuple[float, float]) -> float:
-        """Where the rise is that of the interval's end, between two points: by secants of its root, which is nearly straight where it does not jump.
+        """Where the rise is that of the interval's end, between two points: by halves where it jumps, else by secants of its root, which is nearly straight.
 
         `theta`: all unknowns at the inner point, from which the others follow; beyond the outer one they may have gone elsewhere.
         """
-        root = lambda rise: np.sqrt(max(rise, 0.0))  # noqa: E731
         for _ in range(_REFINED):
-            share = (np.sqrt(RISE_95) - root(inner[1])) / (root(outer[1]) - root(inner[1]))
-            middle = inner[0] + (outer[0] - inner[0]) * float(np.clip(share, *_SHARES))
+            low, end, high = np.sqrt(np.maximum([inner[1], RISE_95, outer[1]], 0.0))
+            middle = inner[0] + (outer[0] - inner[0]) * (0.5 if outer[1] > _JUMP * RISE_95 else float((end - low) / (high - low)))
             found, there = self._solved(theta, origin + self._way * middle)
             self.points.append((origin + self._way * middle, found))
             if abs(found / RISE_95 - 1) < _CLOSE:
@@ -138,6 +137,5 @@ class _Side:
                 inner, theta = (middle, found), there
             else:
                 outer = middle, found
-        if outer[1] > 2 * RISE_95:
-            self.note = f"the sum of squares jumps near {origin + self._way * outer[0]:.4g}: beyond it, other unknowns are elsewhere"
+        self.note = f"the sum of squares jumps near {origin + self._way * outer[0]:.4g}: beyond it, other unknowns are elsewhere"
         return outer[0]
