@@ -171,7 +171,7 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
     if pieces is not None:
         if not members:
             pieces.keep(int(np.argmin(found.at.cost)))
-        control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.theta))))
+        control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.at.theta))))
         asked = replace(asked, control=control)
     found, at_bounds = _off_bounds(problem, _with_memory(problem, found if members else found.lowest(), limits, control), limits, control, pieces)
     if pieces is not None:
