@@ -127,9 +127,8 @@ def test_rates_are_those_of_xla_and_of_dense_matrices_at_random_states(name):
     given = jnp.concatenate([*fixed, t[:, None], q, u[:, np.array(program.independent, int)], inputs], axis=1)
     outputs = [*program.qdot, *program.ydot]
     found = np.asarray(evaluated_natively.function(program.graph, outputs, program.variables)(given))
-    by_xla = emit.run(
-        program.graph, outputs, dict(zip(program.variables, given.T, strict=True))
-    )  # one operation after the other: nothing takes long to compile
+    # by XLA one operation after the other: nothing takes long to compile
+    by_xla = emit.run(program.graph, outputs, dict(zip(program.variables, given.T, strict=True)))
     parameters = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x, float), (1000, *np.shape(x))), scene)
     dense = dense_rates(scene, structure_of(scene), program.independent, parameters, *map(np.asarray, (t, q, u)), inputs)
     ways = {"XLA": np.stack([np.broadcast_to(np.asarray(x), 1000) for x in by_xla], axis=1), "dense": np.concatenate([dense.qdot, dense.ydot], axis=1)}
