@@ -110,10 +110,10 @@ def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, plac
     return sentences
 
 
-def too_narrow_near_bounds(around: Around, errors: Float[np.ndarray, "unknowns"], labels: tuple[str, ...]) -> list[str]:
+def too_narrow_near_bounds(around: Around, told: AtBounds, errors: Float[np.ndarray, "unknowns"], labels: tuple[str, ...]) -> list[str]:
     """Of the first member: which intervals are too narrow, since the squares rise less than `errors` foretell, those of all unknowns that are not fixed.
 
-    Looked at are bounds that an interval reaches, and where an unknown lies at its bound, the ends of the intervals of what runs share.
+    Looked at are bounds that an interval reaches, and where an unknown at its bound may leave it, the ends of the intervals of what runs share.
     """
     limits, theta, places = around.limits, around.found.theta[0], np.flatnonzero(~around.limits.fixed)
 
@@ -132,7 +132,7 @@ def too_narrow_near_bounds(around: Around, errors: Float[np.ndarray, "unknowns"]
     if names := named(range(len(labels)), to_bounds):
         why = "and so may be those of others: up to a bound nearby, the squares rise less than standard errors foretell"
         sentences.append(f"{_too_narrow(names)}, {why}; {ADVICE}")
-    bounded = ", ".join(f"`{labels[k]}`" for k in np.flatnonzero(around.at_bound[0, places]))
+    bounded = ", ".join(f"`{labels[k]}`" for k in np.flatnonzero(told.beyond[0, places] <= FAR_BEYOND))
     shared = [k for k, name in enumerate(labels) if bounded and np.isfinite(errors[k]) and not name.startswith("run ")]
     if names := named(shared[:MOST_LOOKED_AT], to_ends):
         sentences.append(f"{_too_narrow(names)}: {bounded} may leave its bound, and the squares rise less to the ends than standard errors foretell; {ADVICE}")

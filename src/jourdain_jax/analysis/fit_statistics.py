@@ -79,7 +79,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
     if looked_at:
         too_narrow = moved_from_bounds(at_bounds, theta[0], reach, places, unknowns.labels)
         if errors == "sigmas":
-            too_narrow += too_narrow_near_bounds(Around(problem.linearised, found, limits, control), plain, unknowns.labels)
+            too_narrow += too_narrow_near_bounds(Around(problem.linearised, found, limits, control), at_bounds, plain, unknowns.labels)
     values = one(theta[:, places])
     shared, local = unknowns.split(theta)
     scene = unknowns.layout.scene(problem.scene, one(shared))
