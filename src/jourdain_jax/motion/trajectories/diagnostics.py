@@ -80,11 +80,12 @@ def diagnose(trajectory: Record) -> Diagnostics:
     Times that were not reached do not count.
     """
     checks = Checks(jax.tree.map(jnp.asarray, usual_rows(trajectory.scene)))
-    if is_traced(trajectory):
-        return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True))
-    return jax.tree.map(jnp.asarray, _uncompiled(trajectory, uncompiled_over_times(checks, trajectory)))
+    if trajectory.ts.shape[0] <= FEW_TIMES and not is_traced(trajectory):
+        return jax.tree.map(jnp.asarray, _uncompiled(trajectory, uncompiled_over_times(checks, trajectory, by_inputs=True)))
+    return _diagnosed(trajectory, map_over_times(checks, trajectory, by_inputs=True))
 
 
+FEW_TIMES = 1000
 COARSE = 1e-3  # of a step: a clock that resolves less rounds times visibly
 VIOLATED = 1e-4  # residual of a row, relative to the state
 DRIFTED = 1e-2  # of the energy that moves

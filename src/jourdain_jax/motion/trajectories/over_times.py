@@ -92,10 +92,10 @@ def _at_once(record: Record) -> int:
     return max(1, MOST_ENTRIES // record.q.shape[-1] ** 2)
 
 
-def uncompiled_over_times(f, record: Record):
-    """As `map_over_times` by inputs, of one motion, on NumPy: compiling a function takes longer than running it once."""
-    by_time, size, by_inputs = (record.ts, record.q, record.u), _at_once(record), _needs_rates(record)
-    blocks = [_uncompiled(f, record, by_inputs, lanes=[x[k : k + size] for x in by_time]) for k in range(0, len(record.ts), size)]
+def uncompiled_over_times(f, record: Record, by_inputs: bool = False):
+    """As `map_over_times`, of one motion, on NumPy: compiling a function takes longer than running it once."""
+    by_time, size = (record.ts, record.q, record.u), _at_once(record)
+    blocks = [_uncompiled(f, record, by_inputs and _needs_rates(record), lanes=[x[k : k + size] for x in by_time]) for k in range(0, len(record.ts), size)]
     return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
 
 
