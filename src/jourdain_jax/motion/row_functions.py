@@ -84,7 +84,7 @@ def _function(graph: Graph, places: dict[int, int], size: int, variables: Sequen
         J, rows = slopes()
         return values(x), jnp.zeros(size, dx.dtype).at[rows].set(J(x) @ dx, unique_indices=True, indices_are_sorted=True)
 
-    values = differentiated_as(*_ways(graph, places, size, variables), "forward", Rules(lambda *_: slopes() is not None, push))
+    values = differentiated_as(*_ways(graph, places, size, variables), "forward", Rules(lambda order, *_: order == 1 and slopes() is not None, push))
     return values
 
 
