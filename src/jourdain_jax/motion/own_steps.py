@@ -1,4 +1,4 @@
-"""Our own explicit Runge-Kutta loop as an integrator: as machine code where that serves, first derivatives too, and as a loop of XLA where not.
+"""Our own explicit Runge-Kutta loop as an integrator: as machine code where that serves, its derivatives too, and as a loop of XLA where not.
 
 One motion, or lanes side by side: those of a scalar program in blocks of `lockstep.width`.
 """

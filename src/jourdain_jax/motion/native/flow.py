@@ -11,7 +11,7 @@ otherwise. Tolerances and the first step change nothing, and what samples say is
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -21,13 +21,16 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.kernel import MOST_KERNELS, Found, Start, kernel, kernel_of_rates
+from jourdain_jax.motion.native.kernel import Found, Start, kernel, kernel_of_rates
+from jourdain_jax.motion.native.taylor import products
 from jourdain_jax.motion.trajectories import results
 
+MOST_PRODUCTS = 36_000  # of coefficients in a step by Taylor series of second derivatives; where there are more, steps are those of the tableau
 
-@lru_cache(maxsize=MOST_KERNELS)
+
 def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Found]:
-    """The motion by a kernel."""
+    """The motion by a kernel; `order`: of Taylor series, in the place of the tableau."""
+    order = None if order is not None and len(form.moving) > 1 and products(form, order) > MOST_PRODUCTS else order
     own = jax.custom_jvp(kernel(form, method, order).motion)
 
     @partial(own.defjvp, symbolic_zeros=True)
@@ -89,7 +92,6 @@ def on_times(form: Form, start: Start, found: Stopped) -> OnTimes:
     return OnTimes(jax.vmap(slopes)(found.y, at), by_goal, found.event)
 
 
-@lru_cache(maxsize=MOST_KERNELS)
 def rates(form: Form) -> Callable[[Start, tuple], tuple]:
     """The rates of a state, and of its tangents, as a function of the state in the place of a start and of its time, which has tangents too."""
     n = form.layout.y

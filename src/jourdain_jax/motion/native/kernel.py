@@ -28,7 +28,7 @@ class Start(NamedTuple):
     """A motion as a kernel is given it; the state and what is known are followed by their tangents (`Layout`)."""
 
     of_samples: tuple[Array, ...]  # as `samples.py` has them
-    control: Float[Array, "5"]  # relative and absolute tolerance, shortest and first step, most steps
+    control: Float[Array, "5"]  # as `native_motion.Control`
     goals: Float[Array, "times"]  # since the start
     origin: Float[Array, ""]  # the time of the start
     y: tuple[Float[Array, "y"], ...]

@@ -33,8 +33,7 @@ from jourdain_jax.program.graph import Unsupported
 # Operations of all that is evaluated. Measured: they are compiled in a time that grows with them, 15,000 of a chain of 128 trailers in 2.8 s (XLA: 40 s),
 # 18,000 of a chain of 23 joint angles in 1.2 s.
 LARGEST_PROGRAM = 60_000
-HIGHEST_ORDER = 2  # of derivatives
-LARGEST_DERIVATIVE = {1: 10_000, 2: 40_000}  # operations of one of an order; what reverse mode keeps of the first lies on the stack
+LARGEST_DERIVATIVE = 10_000, 40_000  # operations of one of the first order, of which reverse mode keeps some on the stack, and of the second
 
 MOST_PRODUCTS = 12_000  # of coefficients in a step by Taylor series, which is written out
 
@@ -119,8 +118,8 @@ def _reason_against_series(form: Form, order: int) -> str:
 def reason_against_derivatives(field: VectorField, inputs: Inputs, has_events: bool, order: int) -> str:
     """Why machine code that integrates a scene cannot differentiate it so many times, in words; empty where it can."""
     assert isinstance(field, ByProgram)
-    if order > HIGHEST_ORDER:
-        return f"derivatives of order {order} are asked for, more than {HIGHEST_ORDER}"
+    if order > len(LARGEST_DERIVATIVE):
+        return f"machine code has no derivatives of order {order}"
     return _reason_against_derivatives(_form(field, inputs, has_events), order)
 
 
@@ -134,8 +133,8 @@ def _reason_against_derivatives(form: Form, order: int) -> str:
         for graph, of_it in found:
             if reason := unsupported(graph, of_it):
                 return reason
-            if (operations := graph.operations(of_it)) > LARGEST_DERIVATIVE[order]:
-                return f"a derivative of a part of it takes {operations} operations, more than {LARGEST_DERIVATIVE[order]}"
+            if (operations := graph.operations(of_it)) > (most := LARGEST_DERIVATIVE[order - 1]):
+                return f"a derivative of a part of it takes {operations} operations, more than {most}"
     return ""
 
 
@@ -161,8 +160,7 @@ def _form_of(motion: Motion) -> Form:
 def integrate(motion: Motion) -> tuple[Integrated, Bool[Array, "times"], Progress]:
     """As `erk_loop.integrate`, of one motion from time zero; JAX differentiates it in forward mode."""
     form = _form_of(motion)
-    found = flow(form, motion.method, motion.order)(_start(motion, motion.y0))
-    return _unpacked(form.layout, motion.goals, found)
+    return _unpacked(form.layout, motion.goals, flow(form, motion.method, motion.order)(_start(motion)))
 
 
 class AlongTimes(NamedTuple):
@@ -175,21 +173,19 @@ class AlongTimes(NamedTuple):
 def cotangents(motion: Motion, asked: Sequence[bool], ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> tuple[Integrated, list]:
     """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of the states and of the end."""
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
-    form, start = _form_of(motion), _start(motion, motion.y0)
+    form, start = _form_of(motion), _start(motion)
     ends = jnp.concatenate([_packed(y_end), t_end[None]])
     found = kernel_back(form, motion.method, which)(*start.of_samples, start.rows(jnp.zeros(()), ()), jax.vmap(_packed)(ys), ends, motion.goals)
     known = dict(zip(which, found[form.layout.y :], strict=True))
     return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
 
 
-def cotangents_of_times(
-    motion: Motion, found: tuple, by_start: Integrated, ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]
-) -> AlongTimes:
+def cotangents_of_times(motion: Motion, found: tuple, by_start: Integrated, ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> AlongTimes:
     """Cotangents of the times, from those of the start (as `cotangents` has it), of the states and of the end.
 
     `found`: the states, which goals were reached, the time of the end, and whether that was an event.
     """
-    form, start = _form_of(motion), _start(motion, motion.y0)
+    form, start = _form_of(motion), _start(motion)
     states, *rest = found
     at = on_times(form, start, Stopped((jax.vmap(_packed)(states),), *rest))
     (slopes,), (first,) = at.slopes, rates(form)(start, (jnp.zeros(()),))
@@ -201,12 +197,11 @@ def cotangents_of_times(
     return AlongTimes(goals, origin - jnp.sum(scaled(first, _packed(by_start))))
 
 
-def _start(motion: Motion, y: Integrated) -> Start:
+def _start(motion: Motion) -> Start:
     """What a kernel is given of a motion."""
-    rtol, atol, shortest, dt0, max_steps = motion.control
     known = tuple(jnp.zeros(()) if x is None else jnp.asarray(x, real_type()) for x in known_of(motion.args))  # what samples say is looked up
-    control = jnp.stack([jnp.asarray(x, real_type()) for x in (rtol, atol, shortest, dt0, max_steps)])
-    return Start(_samples(motion), control, motion.goals, jnp.asarray(motion.args[-1], real_type()), (_packed(y),), (known,))
+    control = jnp.stack([jnp.asarray(x, real_type()) for x in motion.control])
+    return Start(_samples(motion), control, motion.goals, jnp.asarray(motion.args[-1], real_type()), (_packed(motion.y0),), (known,))
 
 
 def known_of(args: tuple) -> list:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from jourdain_jax.motion.native.functions import Form, known_values, outputs_of
 from jourdain_jax.motion.native.layout import Lanes, Layout
+from jourdain_jax.native import series
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import power
 from jourdain_jax.native.scalar_program import as_real, written
@@ -68,9 +69,15 @@ def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> Jet:
     moved = [n for part in (states, *own.states) for n in with_work(part, None)]
     nodes = [n for part in (own.values[: len(rates)], *own.tangents) for n in with_work(part, own.graph.zero)]
     start = [w.load(w.real, y, i) for i in range(layout.integrated)]
-    series = Series(w, own.graph, given, moved, nodes, start, order, own.variables[first])
-    values = {n: w.number(0.0) if x[0] is None else x[0] for n, x in series.of.items()}
-    return Jet(series.state, _evaluated(w, form, own.graph, own.values[len(rates) :], values, known))
+    found = Series(w, own.graph, given, moved, nodes, start, order, own.variables[first])
+    values = {n: w.number(0.0) if x[0] is None else x[0] for n, x in found.of.items()}
+    return Jet(found.state, _evaluated(w, form, own.graph, own.values[len(rates) :], values, known))
+
+
+def products(form: Form, order: int) -> int:
+    """About how many multiplications a step takes, tangents and all."""
+    own = outputs_of(form, rates_of(form), len(rates_of(form)))
+    return series.products(own.graph, [*own.values, *(n for part in own.tangents for n in part)], order)
 
 
 def rates_of(form: Form) -> list[int]:
