@@ -1,10 +1,11 @@
 """Machine code that is kept on disk."""
 
 import multiprocessing
+from types import SimpleNamespace
 
 import pytest
 
-from jourdain_jax.native import disk
+from jourdain_jax.native import disk, ffi, host
 
 
 @pytest.fixture
@@ -44,6 +45,31 @@ def test_the_oldest_go_where_there_is_no_room(folder, monkeypatch):
         disk.kept(name, lambda: b"x" * 40)
     assert not (folder / "a.o").exists()
     assert (folder / "c.o").exists()
+
+
+@pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against())
+def test_code_for_another_program_effort_machine_or_compiler_has_another_name(monkeypatch):
+    class Asked(Exception):
+        """With the name of a file."""
+
+    def asked(name, make):
+        raise Asked(name)
+
+    def name(text="a program", effort=2) -> str:
+        with pytest.raises(Asked) as found:
+            ffi.registered.__wrapped__(text, effort)
+        return str(found.value)
+
+    monkeypatch.setattr(disk, "kept", asked)
+    usual = name()
+    assert name() == usual
+    names = [usual, name("another"), name(effort=1)]
+    flat = SimpleNamespace(flatten=lambda: "-avx")
+    for what, value in (("get_host_cpu_name", lambda: "another"), ("llvm_version_info", (1, 2, 3)), ("get_host_cpu_features", lambda: flat)):
+        with monkeypatch.context() as patch:
+            patch.setattr(host.llvm, what, value)
+            names.append(name())
+    assert len(set(names)) == 6
 
 
 def _write(name):

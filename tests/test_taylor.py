@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+from in_mpmath import in_mpmath
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.scalar_operations import TABLE
@@ -20,18 +21,6 @@ pytestmark = pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_
 
 ORDER = 9
 UNARY = [name for name, f in TABLE.items() if f.kind in ("analytic", "flat") and name not in ("add", "sub", "mul", "div", "pow", "atan2")]
-IN_MPMATH = {
-    "neg": lambda a: -a,
-    "exp2": lambda a: mpmath.power(2, a),
-    "log1p": lambda a: mpmath.log(1 + a),
-    "cbrt": lambda a: mpmath.sign(a) * mpmath.cbrt(abs(a)),
-    "logistic": lambda a: 1 / (1 + mpmath.exp(-a)),
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b,
-    "div": lambda a, b: a / b,
-    "pow": lambda a, b: a**b,
-}
 
 
 def coefficients(graph: Graph, s: int, outputs, at, known=None) -> np.ndarray:
@@ -59,10 +48,6 @@ def expected(f, at) -> np.ndarray:
     """Those by mpmath."""
     with mpmath.workdps(80):
         return np.array([float(c) for c in mpmath.taylor(f, mpmath.mpf(at), ORDER - 1)])
-
-
-def in_mpmath(op: str):
-    return IN_MPMATH.get(op) or getattr(mpmath, op)
 
 
 def test_recurrences_of_functions_give_their_taylor_series():

@@ -122,7 +122,7 @@ def power(w: Writer, x: Value, exponent: float) -> Value:
 
 
 def _sign(w: Writer, x: Value) -> Value:
-    return w.where(x > 0.0, 1.0, w.where(x < 0.0, -1.0, x))
+    return w.where(x > 0.0, 1.0, w.where(x < 0.0, -1.0, 0.0 * x))  # NaN stays; what compares as zero is zero
 
 
 FUNCTIONS: dict[str, Callable[..., Value]] = {
