@@ -43,7 +43,7 @@ def figure(name: str, model: str, value: float, required: float | None = None, a
     """One entry of the result."""
     met = required is None or (value >= required if at_least else value <= required)
     print(f"  {name}, {model}: {value:.4g}" + ("" if required is None else f" (required: {'>=' if at_least else '<='} {required:g})"), flush=True)
-    return {"figure": name, "model": model, "value": value, "required": required, "met": bool(met)}
+    return {"figure": name, "model": model, "value": float(value), "required": required, "met": bool(met)}
 
 
 def processor_times(runs: dict, repeats: int) -> dict[str, float]:

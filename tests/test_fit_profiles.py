@@ -54,6 +54,25 @@ def test_the_interval_ends_where_a_fit_with_the_unknown_held_is_that_much_worse(
     assert any(one.is_closed)
 
 
+def test_a_short_run_that_hardly_tells_an_inertia_ends_at_its_bound_with_intervals_that_are_named_as_too_narrow():
+    # along offset / (inertia + mass offset^2) nearly nothing shows; the best inertia is zero, which no scene can have
+    ts, noise = np.linspace(0.0, 0.5, 30), np.random.default_rng(1)
+    motion = jj.simulate(TRUTH, START, ts=ts)
+    values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=30) for name in ("x", "heading")}
+    data = jj.Measurements(ts, values, 0.01, start=START, unknown_start=("x_rate", "heading_rate"))
+    fit = jj.fit(TRUTH.replace(offset=0.4), data, ("offset", "inertia"))
+    assert fit.converged
+    assert fit.steps < 15
+    assert fit["inertia"].low == fit["inertia"].value == pytest.approx(4e-7)
+    assert fit["offset"].low > 0.25  # which is the truth
+    assert any("interval of `offset` is too narrow" in warning for warning in fit.warnings)
+    (one,) = fit.profiles(data, "offset").values()
+    held = jj.fit(fit.scene.replace(offset=0.25), data, ("inertia",))
+    assert held.chi_square - fit.chi_square < 1.0
+    assert one.low < 0.05
+    assert "jumps" in str(one)
+
+
 def test_a_damping_of_zero_has_a_one_sided_profile():
     class Oscillator(jj.Scene):
         damping: jnp.ndarray = jj.parameter(0.3, non_negative=True)

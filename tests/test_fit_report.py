@@ -231,7 +231,7 @@ def test_names_that_no_data_tell_stand_in_the_report(tmp_path):
     assert "the data do not tell" in text
     rows = tables(tmp_path / "fit.html")
     mass = next(row for row in rows["estimates"] if row[0] == "mass")
-    assert mass[6:] == ["flat", "0 (its bound)", "none"]
+    assert mass[6:] == ["flat", "1.3e-06 (its bound)", "none"]
     assert [row[0] for row in rows["informed"][1:]] == ["offset"]
 
 

@@ -313,6 +313,20 @@ def test_a_damping_of_zero_is_found_and_gets_a_one_sided_limit(damping):
         assert float(held.chi_square - found.chi_square) == pytest.approx(2.706, rel=0.05)
 
 
+def test_a_parameter_that_must_be_above_zero_ends_a_little_above_it():
+    class Damped(Cart):
+        damping: jnp.ndarray = jj.parameter(0.6, unit="N s/m", positive=True)  # with zero there is no motion
+
+    v = -0.3 * np.sqrt(5.0 / 2.0) * np.sin(np.sqrt(5.0 / 2.0) * TS)
+    run = cart_run(values={"x": 0.3 * np.cos(np.sqrt(5.0 / 2.0) * TS) * (1 + 0.002 * TS), "x_rate": v * (1 + 0.002 * TS)}, inputs=None)
+    found = fit(Damped(mass=2.2), run, ("mass", "damping"))
+    assert found.converged
+    assert found.steps < 15
+    assert found.at_bound.tolist() == [False, True]
+    assert found["damping"].value == pytest.approx(0.6e-6)
+    assert 0.0 < found["damping"].high < 0.1
+
+
 def test_a_motion_that_fails_gives_a_flag_and_no_numbers():
     found = fit(Cart(mass=1.7), cart_run(), ("mass",), max_steps=2)
     assert not found.converged
@@ -328,6 +342,27 @@ def test_too_few_iterations_and_wrong_sigmas_are_warned_of():
     data = cart_run()
     shaken = {name: values + 0.1 * np.sin(5.0 * TS) for name, values in data.values.items()}
     assert "residuals are larger than the sigmas allow" in fit(Cart(mass=1.7), cart_run(values=shaken), ("mass",)).warning
+
+
+def test_sigmas_that_are_too_large_are_warned_of_by_channel():
+    noise = np.random.default_rng(0)
+    noisy = {name: values + 0.01 * noise.normal(size=21) for name, values in cart_run().values.items()}
+    right = fit(Cart(mass=1.7), cart_run(values=noisy, sigma=0.01), ("mass",))
+    assert not right.warnings
+    (warning,) = fit(Cart(mass=1.7), cart_run(values=noisy, sigma={"x": 0.01, "x_rate": 0.07}), ("mass",)).warnings
+    assert "the residuals of `x_rate` are smaller than the sigmas foretell: these are too large by a factor of about 7" in warning
+    (warning,) = fit(Cart(mass=1.7), cart_run(values=noisy, sigma={"x": 0.1, "x_rate": 0.1}), ("mass",), loss=jj.huber()).warnings
+    assert "the residuals are smaller than the sigmas foretell" in warning
+
+
+def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():
+    ends, begins = ({"push": jj.Sampled(ts, [0.0, 1.0, 1.0])} for ts in ([-1.0, 0.0, 1.0], [1.5, 2.5, 10.0]))
+    with pytest.warns(UserWarning, match="`push` of run 1 is not sampled over all of the run and keeps its last value from 1 to 4 s") as seen:
+        found = fit(Cart(mass=1.7), [cart_run(), cart_run(inputs=ends)], ("mass",))
+    assert len(seen) == 1
+    assert sum("from 1 to 4 s" in warning for warning in found.warnings) == 1
+    with pytest.warns(UserWarning, match="`push` of run 0 .* keeps its first value until 1.5 s"):
+        log_likelihood(CART, cart_run(inputs=begins))
 
 
 def test_one_bad_repeat_harms_no_other():
@@ -550,22 +585,40 @@ def test_information_of_deficient_rank_keeps_the_unknowns_that_are_not_involved(
     pair = np.concatenate([shown, alone / 5.0], axis=1)
     assert found.covariance[1, 1] == pytest.approx(np.linalg.inv(pair.T @ pair)[1, 1], rel=1e-9)
     assert np.isnan(found.covariance[0]).all()
-    (sentence,) = hidden_combinations(found.hidden[0], size, np.array([2.0, 5.0, 3.0]), ("p", "q", "r"))
+    (sentence,) = hidden_combinations(found.hidden[0], found.least_part, size, np.array([2.0, 5.0, 3.0]), ("p", "q", "r"))
     assert "`p` and `r` do not show separately: no channel changes along d p/p : d r/r = -0.5 : 1" in sentence
     assert "what shows is r p^2" in sentence
+
+
+def test_an_unknown_that_a_hidden_direction_moves_beyond_its_error_has_no_interval():
+    # only theta_0 / theta_1 shows, at values that are small beside the size of theta_0: it hardly moves along what does not show, and yet by many of its errors
+    size, values = np.array([0.4, 0.004]), np.array([1e-5, 1e-4])
+    J = np.random.default_rng(2).normal(size=(30, 1)) @ np.array([[1 / values[0], -1 / values[1]]])
+    found = told(J, size)
+    assert np.linalg.norm(found.hidden[0], axis=0)[0] < 1e-3
+    assert not found.identifiable.any()
+    (sentence,) = hidden_combinations(found.hidden[0], found.least_part, size, values, ("p", "q"))
+    assert "`p` and `q` do not show separately" in sentence
+
+
+def test_a_sum_that_shows_is_told_as_one():
+    values = np.array([0.3, 0.7])
+    direction = np.array([[1.0, -1.0]]) / values  # a + b stays as it is
+    (sentence,) = hidden_combinations(direction / np.linalg.norm(direction), 1e-3, values, values, ("a", "b"))
+    assert sentence.endswith("what shows is their sum")
 
 
 def test_two_hidden_directions_and_a_parameter_that_does_nothing():
     # d theta_0/theta_0 = d theta_2/theta_2, with theta_1 = 0 counted in its own unit; theta_3 does nothing
     directions = np.linalg.qr(np.array([[1.0, 0.5, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]).T)[0].T
     turned = np.array([[0.6, 0.8], [-0.8, 0.6]]) @ directions
-    sentences = hidden_combinations(turned, np.ones(4), np.array([1.0, 0.0, 1.0, 1.0]), ("a", "b", "c", "d"))
+    sentences = hidden_combinations(turned, 1e-3, np.ones(4), np.array([1.0, 0.0, 1.0, 1.0]), ("a", "b", "c", "d"))
     assert any(s == "`d` does not show in any channel" for s in sentences)
     assert any("`a` and `b` and `c`" in s and "d a/a : d b : d c/c = 1 : 0.5 : 1" in s for s in sentences)
     assert len(sentences) == 2
     # where two directions share an unknown, no product of powers of two unknowns shows
     rows = np.linalg.qr(np.array([[1.0, 0.0, 0.4], [0.0, 1.0, 0.3]]).T)[0].T
-    for sentence in hidden_combinations(rows, np.ones(3), np.ones(3), ("a", "b", "c")):
+    for sentence in hidden_combinations(rows, 1e-3, np.ones(3), np.ones(3), ("a", "b", "c")):
         assert "`c` do not show separately" in sentence
         assert "what shows" not in sentence
 

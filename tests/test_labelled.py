@@ -1,7 +1,7 @@
 """Motions as labelled arrays and tables, and how scenes and motions show themselves in notebooks."""
 
-import builtins
 import re
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -64,14 +64,7 @@ def test_tables_have_one_row_for_each_time_of_each_lane(motion, lanes):
 
 @pytest.mark.parametrize(("package", "ask"), [("xarray", "to_xarray"), ("pandas", "to_pandas")])
 def test_a_missing_package_is_named_with_what_installs_it(motion, monkeypatch, package, ask):
-    found = builtins.__import__
-
-    def without(name, *args, **kwargs):
-        if name.partition(".")[0] == package:
-            raise ImportError(name)
-        return found(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ImportError, match=f"needs the package `{package}`, .* pip install {package}"):
         getattr(motion, ask)()
 

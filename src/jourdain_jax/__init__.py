@@ -11,6 +11,7 @@ import os as _os
 import typing as _typing
 
 from jourdain_jax.calculus.collecting import without_collecting as _without_collecting
+from jourdain_jax.calculus.on_first_use import module_on_first_use as _module_on_first_use
 from jourdain_jax.calculus.on_first_use import names_on_first_use as _names_on_first_use
 
 with _without_collecting():
@@ -71,6 +72,7 @@ with _without_collecting(all_stays=True):  # what a motion needs
     from jourdain_jax.scene.motion_state import fixed_point
     from jourdain_jax.scene.parameters import parameter
     from jourdain_jax.scene.possible_inertia import inertia_from_log_cholesky, log_cholesky
+    from jourdain_jax.scene.printing import show_scenes_with as _show_scenes_with
     from jourdain_jax.scene.scene import Scene
     from jourdain_jax.scene.spline import Spline
     from jourdain_jax.scene.visuals import Visual
@@ -169,6 +171,8 @@ _ON_FIRST_USE = {
     "plotting.quantities": "plot",
     "plotting.show": "View show",
 }
+_pictures = _module_on_first_use("jourdain_jax.plotting.scene_picture")
+_show_scenes_with(lambda scene: _pictures.scene_svg(scene))
 __getattr__, __dir__ = _names_on_first_use(globals(), {name: module for module, names in _ON_FIRST_USE.items() for name in names.split()})
 __version__ = _version_of("jourdain-jax")
 

@@ -6,12 +6,12 @@ p < 0: F is lower away from the bound. So it is where another unknown does the s
 Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jourdain_jax.analysis.information import information
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, minimise
@@ -22,7 +22,8 @@ FAR_BEYOND = 3.0  # standard errors: an estimate that is held at its bound by mo
 CLOSE = 0.02  # of `ONE_SIDED`: error of p at the limit, and by how much F is to be lower elsewhere to count as lower
 MOST = 16  # evaluations of p
 FURTHER = 4.0  # factor of delta where p does not rise
-NARROW = 0.5  # of the rise that a standard error foretells at a bound nearby: with less, the interval is too narrow
+NARROW = 0.5  # of the rise that a standard error foretells: with less, the interval is too narrow
+MOST_LOOKED_AT = 8  # unknowns whose intervals are compared with the rise at their ends
 ADVICE = "`Fit.profiles` gives intervals that hold"
 
 
@@ -32,39 +33,70 @@ class AtBounds:
 
     limit: Float[np.ndarray, "members unknowns"]  # infinite where the data give none
     beyond: Float[np.ndarray, "members unknowns"]  # by how many standard errors the data would put it beyond its bound
-    lower: dict[int, np.ndarray] = field(default_factory=dict)  # by member: all unknowns where F is lower, with one away from its bound
+    lower: dict[int, tuple[float, np.ndarray]] = field(default_factory=dict)  # by member: F and all unknowns where it is lower, one being off its bound
     at_limit: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)  # by member and unknown at a bound: all unknowns with that one at its limit
 
 
-def limits_at_bounds(evaluate: Callable, found: Minimum, limits: Limits, control: Control) -> AtBounds:
-    """Each unknown at a bound is moved away from it, all others following."""
-    limit, beyond = np.full(found.theta.shape, np.nan), np.full(found.theta.shape, np.nan)
-    told, costs = AtBounds(limit, beyond), found.at.cost.copy()
-    bound = ((found.theta <= limits.low) | (found.theta >= limits.high)) & ~limits.fixed
-    if not bound.any():
-        return told
-    for b, place in np.argwhere(bound & found.converged[:, None]).tolist():
-        one = found.theta[b : b + 1]
-        others = bound[b : b + 1].copy()
+@dataclass(frozen=True)
+class Around:
+    """A minimum, and how much worse the best fit is where one unknown is elsewhere."""
+
+    evaluate: Callable  # as `minimise` asks for
+    found: Minimum
+    limits: Limits
+    control: Control
+
+    @property
+    def at_bound(self) -> Bool[np.ndarray, "members unknowns"]:
+        """Which unknowns lie at a bound."""
+        theta, limits = self.found.theta, self.limits
+        return ((theta <= limits.low) | (theta >= limits.high)) & ~limits.fixed
+
+    def rise(self, b: int, place: int, step: float) -> tuple[float, Minimum]:
+        """By how much F of member `b` rises when one unknown is moved by a step and held there (infinite where the motion fails), and the minimum there."""
+        theta = self.found.theta[b : b + 1].copy()
+        theta[0, place] += step
+        fixed = self.limits.fixed.copy()
+        fixed[place] = True
+        roughly = replace(self.control, tolerance=max(self.control.tolerance, 1e-2))  # to one per cent of a standard error is enough
+        at = minimise(lambda x, _: self.evaluate(x, np.array([b])), theta, replace(self.limits, fixed=fixed), roughly)
+        return float(at.at.cost[0] - self.found.at.cost[b]), at
+
+    def if_free(self, b: int, place: int) -> tuple[float, float]:
+        """Of an unknown at its bound: the standard error that it had if it were free, infinite where it does not show, and the size of the slope of F."""
+        others, estimated, arrow = self.at_bound[b : b + 1], np.flatnonzero(~self.limits.fixed), self.found.at.arrow.at([b])
         others[0, place] = False
-        size, estimated = limits.size(one), np.flatnonzero(~limits.fixed)
-        known = information(found.at.arrow.at([b]), size, estimated, others, np.zeros(1, bool), control.cutoff, True)
+        known = information(arrow, self.limits.size(self.found.theta[b : b + 1]), estimated, others, np.zeros(1, bool), self.control.cutoff, True)
         error = float(known.standard_errors[np.searchsorted(estimated, place)])
-        slope = abs(float(found.at.arrow.at([b]).gradient[0, place]))
-        beyond[b, place] = slope * error
-        inward = 1.0 if one[0, place] <= limits.low[place] else -1.0
-        if beyond[b, place] > FAR_BEYOND:  # the bound decides: the slope alone gives the limit
-            limit[b, place] = _root(slope, 1 / error**2) * inward + one[0, place]
-            continue
-        room = float(limits.high[place] - limits.low[place])
-        first = min(_root(slope, 1 / error**2) if np.isfinite(error) else float(size[0, place]), room)
-        delta, at = _limit(partial(_rise, evaluate, found, limits, control, b, place), inward, first, room)
-        if at is not None and np.isfinite(delta):
-            told.at_limit[b, place] = at.theta[0]
-        elif at is not None and at.at.cost[0] < costs[b]:
-            told.lower[b], costs[b] = at.theta[0], at.at.cost[0]
-        limit[b, place] = np.clip(one[0, place] + inward * delta, limits.low[place], limits.high[place])
+        return error if np.isfinite(error) else np.inf, abs(float(arrow.gradient[0, place]))
+
+
+def limits_at_bounds(around: Around) -> AtBounds:
+    """Each unknown at a bound is moved away from it, all others following."""
+    theta = around.found.theta
+    told = AtBounds(np.full(theta.shape, np.nan), np.full(theta.shape, np.nan))
+    for b, place in np.argwhere(around.at_bound & around.found.converged[:, None]).tolist():
+        _look_inward(around, told, b, place)
     return told
+
+
+def _look_inward(around: Around, told: AtBounds, b: int, place: int) -> None:
+    """Tells what one unknown at its bound shows when it is moved away from it."""
+    bound, limits = around.found.theta[b, place], around.limits
+    inward = 1.0 if bound <= limits.low[place] else -1.0
+    error, slope = around.if_free(b, place)
+    told.beyond[b, place] = slope * error if np.isfinite(error) else np.nan
+    if told.beyond[b, place] > FAR_BEYOND:  # the bound decides: the slope alone gives the limit
+        told.limit[b, place] = bound + inward * _root(slope, 1 / error**2)
+        return
+    room = float(limits.high[place] - limits.low[place])
+    first = min(_root(slope, 1 / error**2) if np.isfinite(error) else float(limits.size(around.found.theta[b : b + 1])[0, place]), room)
+    delta, at = _limit(partial(around.rise, b, place), inward, first, room)
+    if at is not None and np.isfinite(delta):
+        told.at_limit[b, place] = at.theta[0]
+    elif at is not None and (b not in told.lower or at.at.cost[0] < told.lower[b][0]):
+        told.lower[b] = at.at.cost[0], at.theta[0]
+    told.limit[b, place] = np.clip(bound + inward * delta, limits.low[place], limits.high[place])
 
 
 def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, places: np.ndarray, labels: tuple[str, ...]) -> list[str]:
@@ -78,20 +110,33 @@ def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, plac
     return sentences
 
 
-def too_narrow_near_bounds(evaluate: Callable, found: Minimum, limits: Limits, control: Control, errors: np.ndarray, factor: float, labels) -> list[str]:
-    """Of the first member: which unknowns have a bound so near that their interval reaches it, where the squares rise less than `errors` foretell.
+def too_narrow_near_bounds(around: Around, errors: Float[np.ndarray, "unknowns"], labels: tuple[str, ...]) -> list[str]:
+    """Of the first member: which intervals are too narrow, since the squares rise less than `errors` foretell, those of all unknowns that are not fixed.
 
-    `errors`: standard errors of those that are not fixed; `factor`: by what their squares were multiplied.
+    Looked at are bounds that an interval reaches, and where an unknown lies at its bound, the ends of the intervals of what runs share.
     """
-    narrow = []
-    for name, place, error in zip(labels, np.flatnonzero(~limits.fixed).tolist(), errors, strict=True):
-        for step in (limits.low[place] - found.theta[0, place], limits.high[place] - found.theta[0, place]):
-            square = (step / error) ** 2
-            if 1 < square < 2 * RISE_95 and 2 * _rise(evaluate, found, limits, control, 0, place, step)[0] < NARROW * factor * square:
-                narrow.append(f"`{name}`")
-    if not narrow:
-        return []
-    return [f"{_too_narrow(narrow)}, and so may be those of others: up to a bound nearby, the squares rise less than standard errors foretell; {ADVICE}"]
+    limits, theta, places = around.limits, around.found.theta[0], np.flatnonzero(~around.limits.fixed)
+
+    def named(some: Iterable[int], steps: Callable[[int], list[float]]) -> list[str]:
+        rises_less = lambda k, step: 2 * around.rise(0, int(places[k]), step)[0] < NARROW * (step / errors[k]) ** 2  # noqa: E731
+        return [f"`{labels[k]}`" for k in some if any(rises_less(k, step) for step in steps(k))]
+
+    def to_bounds(k: int) -> list[float]:
+        return [step for end in (limits.low, limits.high) if 1 < ((step := float((end - theta)[places[k]])) / errors[k]) ** 2 < 2 * RISE_95]
+
+    def to_ends(k: int) -> list[float]:
+        at, reach = theta[places[k]], float(np.sqrt(RISE_95) * errors[k])
+        return [step for step in (-reach, reach) if limits.low[places[k]] < at + step < limits.high[places[k]]]
+
+    sentences = []
+    if names := named(range(len(labels)), to_bounds):
+        why = "and so may be those of others: up to a bound nearby, the squares rise less than standard errors foretell"
+        sentences.append(f"{_too_narrow(names)}, {why}; {ADVICE}")
+    bounded = ", ".join(f"`{labels[k]}`" for k in np.flatnonzero(around.at_bound[0, places]))
+    shared = [k for k, name in enumerate(labels) if bounded and np.isfinite(errors[k]) and not name.startswith("run ")]
+    if names := named(shared[:MOST_LOOKED_AT], to_ends):
+        sentences.append(f"{_too_narrow(names)}: {bounded} may leave its bound, and the squares rise less to the ends than standard errors foretell; {ADVICE}")
+    return sentences
 
 
 def _too_narrow(names: list[str]) -> str:
@@ -129,14 +174,3 @@ def _limit(profile: Callable[[float], tuple[float, Minimum]], inward: float, del
 def _root(slope: float, curvature: float) -> float:
     """delta > 0 with slope delta + curvature delta^2 / 2 = ONE_SIDED."""
     return float(2 * ONE_SIDED / (slope + np.sqrt(slope**2 + 2 * curvature * ONE_SIDED)))
-
-
-def _rise(evaluate: Callable, found: Minimum, limits: Limits, control: Control, b: int, place: int, step: float) -> tuple[float, Minimum]:
-    """By how much F of member `b` rises when one unknown is moved by a step and held there (infinite where the motion fails), and the minimum there."""
-    theta: Float[np.ndarray, "1 unknowns"] = found.theta[b : b + 1].copy()
-    theta[0, place] += step
-    fixed = limits.fixed.copy()
-    fixed[place] = True
-    # to one per cent of a standard error is enough
-    at = minimise(lambda x, _: evaluate(x, np.array([b])), theta, replace(limits, fixed=fixed), replace(control, tolerance=max(control.tolerance, 1e-2)))
-    return float(at.at.cost[0] - found.at.cost[b]), at

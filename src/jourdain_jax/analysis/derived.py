@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.analysis.information import Information
+from jourdain_jax.analysis.information import Information, least_move
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.scene import Scene
@@ -50,15 +50,17 @@ def standard_errors(
     NaN for those that depend on a direction that does not show, or on an unknown at a bound.
     """
     shared = slopes.shape[-1]
-    covariance = known.whole_covariance[..., :shared, :shared]
+    covariance, largest = known.whole_covariance[..., :shared, :shared], np.max(known.singular_values, axis=-1, initial=0.0)
 
-    def of_one(C, hidden, rank, slopes, sizes, at_bound):
+    def of_one(C, hidden, rank, largest, slopes, sizes, at_bound):
         error = np.sqrt(np.einsum("...i,ij,...j->...", slopes, C, slopes))
         scaled = slopes * sizes  # with respect to theta / size
         part = np.linalg.norm(scaled @ hidden[:, :shared].T, axis=-1)
-        told = (part <= np.sqrt(cutoff) * np.linalg.norm(scaled, axis=-1)) & ~np.any((slopes != 0) & (at_bound | (rank == 0)), axis=-1)
+        told = (part <= np.minimum(np.sqrt(cutoff) * np.linalg.norm(scaled, axis=-1), error * least_move(cutoff, largest))) & ~np.any(
+            (slopes != 0) & (at_bound | (rank == 0)), axis=-1
+        )
         return np.where(told, error, np.nan)
 
     if sizes.ndim == 1:
-        return of_one(covariance, known.hidden[0], known.rank, slopes, sizes, at_bound)
-    return np.stack([of_one(*one) for one in zip(covariance, known.hidden, known.rank, slopes, sizes, at_bound, strict=True)])
+        return of_one(covariance, known.hidden[0], known.rank, largest, slopes, sizes, at_bound)
+    return np.stack([of_one(*one) for one in zip(covariance, known.hidden, known.rank, largest, slopes, sizes, at_bound, strict=True)])

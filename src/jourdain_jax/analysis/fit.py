@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from jourdain_jax.analysis.asked import Asked
-from jourdain_jax.analysis.at_bounds import AtBounds, limits_at_bounds
+from jourdain_jax.analysis.at_bounds import Around, AtBounds, limits_at_bounds
 from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.fit_result import Fit
@@ -247,11 +247,11 @@ def _off_bounds(problem: Problem, found: Minimum, limits: Limits, control: Contr
     """The minimum, gone on from where unknowns at a bound let it be lower away from it; and what is known of those that stay."""
     for _ in range(_TURNS):
         with nullcontext() if pieces is None else pieces.unmoved():
-            told = limits_at_bounds(problem.linearised, found, limits, control)
+            told = limits_at_bounds(Around(problem.linearised, found, limits, control))
         if not told.lower:
             break
         members = np.array(list(told.lower))
-        again = problem.minimum(np.stack(list(told.lower.values())), members, limits, control, _OFF_BOUND)
+        again = problem.minimum(np.stack([theta for _, theta in told.lower.values()]), members, limits, control, _OFF_BOUND)
         again = replace(again, steps=found.steps[members] + again.steps, trace=found.trace[members] + again.trace, grown=found.grown[members])
         found = _with_memory(problem, found.lowered(members, again), limits, control)
     return found, told

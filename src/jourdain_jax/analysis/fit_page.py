@@ -232,7 +232,7 @@ def _way(fit) -> list[str]:
     parts = [f"<p>F went from {first:.6g} to {last:.6g}. "]
     parts.append("The first guess led elsewhere: the minimum was found over growing spans of the runs. " if fit.grown else "")
     if fit.guesses > 1:
-        parts.append(f"{int(fit.agreeing)} of {fit.guesses} first guesses led to this minimum. ")
+        parts.append(f"{int(fit.agreeing) or 'None'} of {fit.guesses} first guesses led to {'this' if fit.agreeing else 'a'} minimum. ")
     else:
         parts.append("One first guess was tried; <code>guesses=30</code> would tell how many lead here. ")
     rows = [(what, str(len(costs) - 1), f"{costs[0]:.6g}", f"{costs[-1]:.6g}") for what, costs in fit.trace]

@@ -131,7 +131,7 @@ def profile(one: Profile, error: float) -> str:
         parts.append(axes.line(x, np.where(parabola <= axes.y[1], parabola, np.nan), QUIET, "parabola", dashed=True))
     parts += [axes.upright(end, DATA, dashed=True) for end, closed in zip((one.low, one.high), one.is_closed, strict=True) if closed]
     parts += [axes.line(values, rise), axes.dots(values, rise, MODEL, size=4)]
-    return drawing(_WIDTH, 190, parts, str(one))
+    return drawing(_WIDTH, 190, parts, str(one).replace("`", ""))
 
 
 def way_to_the_minimum(trace: tuple[tuple[str, tuple[float, ...]], ...]) -> str:

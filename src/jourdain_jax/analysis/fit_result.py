@@ -176,7 +176,7 @@ class Fit(Printed):
         """What the measurements cannot tell, one sentence per combination of unknowns."""
         if not np.isfinite(self.chi_square):
             return ()
-        return hidden_combinations(self.information.hidden[0], self.sizes, self.values, self.labels)
+        return hidden_combinations(self.information.hidden[0], self.information.least_part, self.sizes, self.values, self.labels)
 
     @property
     def correlated(self) -> tuple[str, ...]:

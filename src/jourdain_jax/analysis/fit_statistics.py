@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow
-from jourdain_jax.analysis.at_bounds import AtBounds, moved_from_bounds, too_narrow_near_bounds
+from jourdain_jax.analysis.at_bounds import Around, AtBounds, moved_from_bounds, too_narrow_near_bounds
 from jourdain_jax.analysis.information import Information, information, students_t_95
 from jourdain_jax.analysis.levenberg_marquardt import LEAST, Control, Limits, Minimum
+from jourdain_jax.analysis.measurements import held_inputs
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.scene.scene import Scene
 
@@ -41,6 +42,7 @@ class Statistics:
     chi_square: Float[np.ndarray, "*repeats"]
     samples: Int[np.ndarray, "*repeats"]
     from_prior: Float[np.ndarray, "*repeats unknowns"]  # in standard deviations of the prior; NaN where there is none
+    held_inputs: tuple[str, ...]  # sentences about inputs that are not sampled over all of a run
     too_narrow: tuple[str, ...]  # sentences about intervals that bounds make too narrow; none in a batch
 
 
@@ -65,7 +67,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
     more, doubt = (one(x) for x in problem.doubt(theta, elsewhere))
     quantiles = _normal_or_t(doubt, (samples - known.rank)[..., None] if problem.all_estimated else np.inf) * np.sqrt(1 + more)
     inflation = one(problem.inflation(residuals, samples, known.rank))
-    known = known.times(inflation)
+    plain, known = known.standard_errors, known.times(inflation)
     if errors == "runs":
         known, quantiles = known.between_runs(one(found.at.arrow.scores)), students_t_95(len(problem.runs) - 1)
     reach = quantiles * known.standard_errors
@@ -73,7 +75,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
     if single and found.converged[0]:
         too_narrow = moved_from_bounds(at_bounds, theta[0], reach, places, unknowns.labels)
         if errors == "sigmas":
-            too_narrow += too_narrow_near_bounds(problem.linearised, found, limits, control, known.standard_errors, float(inflation), unknowns.labels)
+            too_narrow += too_narrow_near_bounds(Around(problem.linearised, found, limits, control), plain, unknowns.labels)
     values = one(theta[:, places])
     shared, local = unknowns.split(theta)
     scene = unknowns.layout.scene(problem.scene, one(shared))
@@ -96,6 +98,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, control: Contro
         chi_square=np.where(one(fails), np.nan, sum(_sum_of_squares(r, single) for run in white for r in run.values())),
         samples=np.asarray(samples),
         from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
+        held_inputs=held_inputs(problem.scene, problem.runs),
         too_narrow=tuple(too_narrow),
     )
 

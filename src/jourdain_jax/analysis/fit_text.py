@@ -4,7 +4,7 @@ import numpy as np
 
 from jourdain_jax.analysis.table import table
 
-MOST_NAMED = 8  # pairs of unknowns that correlate
+MOST_NAMED = 8  # combinations of unknowns that are told poorly, pairs that correlate
 
 
 def text(fit) -> str:
@@ -20,7 +20,7 @@ def text(fit) -> str:
         pieces = " + ".join(map(str, fit.shooting.pieces[:MOST_NAMED])) + (" + ..." if len(fit.shooting.pieces) > MOST_NAMED else "")
         lines.append(f"found by multiple shooting in {pieces} pieces, which join to {float(fit.shooting.continuity):.1g} of the simulation's tolerance")
     if fit.guesses > 1:
-        lines.append(f"{int(fit.agreeing)} of {fit.guesses} first guesses led to this minimum")
+        lines.append(f"{int(fit.agreeing) or 'none'} of {fit.guesses} first guesses led to {'this' if fit.agreeing else 'a'} minimum")
     if fit.errors == "runs":
         lines.append(f"standard errors from how much the {len(fit.residuals)} runs differ")
     lines += [f"sigma of `{name}`, estimated: {float(sigma):.4g}" for name, sigma in fit.sigma.items()]
@@ -32,8 +32,9 @@ def text(fit) -> str:
     if fit.not_identifiable:
         lines.append(f"singular values below {fit.cutoff:g} of the largest count as zero:")
         lines += [f"  {sentence}" for sentence in fit.not_identifiable]
-    lines += [f"  {sentence}" for sentence in fit.correlated[:MOST_NAMED]]
-    lines += [f"  and {len(fit.correlated) - MOST_NAMED} more pairs"] if len(fit.correlated) > MOST_NAMED else []
+    for sentences, what in ((fit.weak, "combinations"), (fit.correlated, "pairs")):
+        lines += [f"  {sentence}" for sentence in sentences[:MOST_NAMED]]
+        lines += [f"  and {len(sentences) - MOST_NAMED} more {what}"] if len(sentences) > MOST_NAMED else []
     rows = [("run", "channel", "samples", "mean", "rms", "largest residual (in sigmas)")]
     for s in fit.residual_summary():
         rows.append((str(s.run), s.channel, str(s.samples), f"{s.mean:.2g}", f"{s.rms:.3g}", f"{s.largest:.3g}"))

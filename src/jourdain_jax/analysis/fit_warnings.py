@@ -28,6 +28,7 @@ def warnings_of(fit) -> tuple[str, ...]:
         names = ", ".join(f"`{name}`" for name, far in zip(fit.labels, fit.beyond, strict=True) if far > FAR_BEYOND)
         found.append(f"{names} lies at a bound, which decides its value; all standard errors lose their meaning: widen the bounds")
     found += fit.impossible
+    found += fit.statistics.held_inputs
     found += fit.statistics.too_narrow
     found += _counted_twice(fit)
     if fit.guesses > 1 and fit.converged and fit.agreeing == 1:
@@ -37,8 +38,7 @@ def warnings_of(fit) -> tuple[str, ...]:
         for name, far in zip(fit.labels, fit.statistics.from_prior, strict=True)
         if abs(far) > _FROM_PRIOR
     ]
-    if _too_large(fit):
-        found.append("the residuals are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, or sigmas that are too small")
+    found += _sizes_of_residuals(fit)
     if fit.errors == "sigmas":
         coloured = [f"`{name}` ({rho:.2f})" for name, (rho, limit) in fit.autocorrelation.items() if abs(rho) > limit]
         if coloured:
@@ -50,14 +50,37 @@ def warnings_of(fit) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _too_large(fit) -> bool:
-    """Whether residuals are too large for their sigmas; under a robust loss most of them, since some are far out."""
-    degrees = max(int(fit.degrees_of_freedom), 1)
-    if fit.asked.loss is LEAST_SQUARES:
-        return bool(fit.reduced_chi_square > 1 + _SURE * np.sqrt(2 / degrees))  # chi-square has mean n and variance 2 n
-    # the median of w^2 is 0.4549 for a normal w; relative to it, that of n has the standard deviation 2.33 / sqrt(n)
-    squares = np.concatenate([np.ravel(r) for run in fit.whitened for r in run.values()]) ** 2
-    return bool(np.nanmedian(squares) / 0.4549 > 1 + _SURE * 2.33 / np.sqrt(degrees))
+def _sizes_of_residuals(fit) -> list[str]:
+    """Whether residuals, of all channels or of one, are too large for their sigmas, or too small; under a robust loss most of them, since some are far out."""
+    robust, determined = fit.asked.loss is not LEAST_SQUARES, int(fit.samples - fit.degrees_of_freedom)
+    names = [name for name in dict.fromkeys(name for run in fit.whitened for name in run) if name not in fit.sigma]
+    large, small = [], []
+    for channels in (names, *([name] for name in names)):
+        squares = np.concatenate([np.zeros(0), *(np.ravel(run[name]) for run in fit.whitened for name in channels if name in run)]) ** 2
+        squares = squares[np.isfinite(squares)]
+        degrees = max(squares.size - determined, 1)
+        if not squares.size:
+            continue
+        # chi-square has mean n and variance 2 n; the median of w^2 is 0.4549 for a normal w: relative to it, that of n has the deviation 2.33 / sqrt(n)
+        size, spread = (np.median(squares) / 0.4549, 2.33 / np.sqrt(degrees)) if robust else (squares.sum() / degrees, np.sqrt(2 / degrees))
+        named = f" of {', '.join(f'`{name}`' for name in channels)}" if len(channels) < len(names) else ""
+        if (size if robust or not named else squares.mean()) > 1 + _SURE * spread:
+            large.append(named)
+        # the cube root of chi-square is nearly normal (Wilson and Hilferty), also far below its mean
+        elif size < max(1 - spread**2 / 9 - _SURE * spread / 3, 0.0) ** 3:
+            small.append((named, size))
+    found = []
+    if large:
+        found.append(
+            f"the residuals{large[0]} are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, or sigmas that are too small"
+        )
+    if small:
+        named, size = small[0]
+        found.append(
+            f"the residuals{named} are smaller than the sigmas foretell: these are too large by a factor of about {1 / np.sqrt(size):.2g}, "
+            "so that intervals are too wide, or samples were smoothed; a sigma of `None` is estimated"
+        )
+    return found
 
 
 def _counted_twice(fit) -> list[str]:

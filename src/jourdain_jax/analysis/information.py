@@ -6,7 +6,8 @@
     covariance of s          size V_1 S_1^-2 V_1' size                    over the directions V_1 that show
                of x_i, x_j   delta_ij (T_i' T_i)^+ + G_i cov(s) G_j',     x_i = - G_i s where the run's own columns are fitted
 
-An unknown with a part in the remaining directions V_0 has no standard error and no interval.
+An unknown with a part in the remaining directions V_0 has no standard error and no interval: one that moves by sqrt(cutoff) of its size, or by a tenth of what
+would be its standard error, while all unknowns move along V_0 by about their sizes.
 Source: G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), sections 2.1 and 3.4; G. H. Golub and V. Pereyra, Inverse Problems 19 (2003) R1.
 """
 
@@ -19,7 +20,9 @@ from jaxtyping import Bool, Float, Int
 
 from jourdain_jax.analysis.arrow import Arrow
 
-_ARRAYS = ["singular_values", "hidden", "rank", "identifiable", "standard_errors", "shared", "own", "follow"]
+_ARRAYS = ["singular_values", "hidden", "least_part", "rank", "identifiable", "standard_errors", "shared", "own", "follow"]
+_WHOLE = 0.01  # how far from a multiple of one half an exponent may be, to be taken as that, and two changes from being equal
+_MOVES = 0.1  # standard errors: an unknown that moves so far along a direction that does not show has a part in it
 
 
 @partial(jax.tree_util.register_dataclass, meta_fields=["estimated"], data_fields=_ARRAYS)
@@ -29,6 +32,7 @@ class Information:
 
     singular_values: Float[np.ndarray, "*members shared"]  # of the shared unknowns, largest first
     hidden: tuple[Float[np.ndarray, "_ unknowns"], ...]  # of each member, orthonormal
+    least_part: Float[np.ndarray, "*members unknowns"]  # of theta / size along such a direction: with less, an unknown has no part in it
     rank: Int[np.ndarray, "*members"]  # directions that show
     identifiable: Bool[np.ndarray, "*members unknowns"]
     standard_errors: Float[np.ndarray, "*members unknowns"]  # NaN where not identifiable
@@ -87,8 +91,8 @@ def information(arrow: Arrow, size: Float[np.ndarray, "members places"], estimat
     """Information of an arrow in units of sigma.
 
     `size`: magnitude of each unknown, in its unit; `estimated`: places of unknowns; `bound`: (members, places), which lie at a bound, and are held there;
-    `fails`: (members,), of which nothing is known; `cutoff`: singular values below this fraction of the largest count as zero. Unknowns whose part in the
-    directions that do not show exceeds the square root of the cut-off are not identifiable. `single`: without the axis of members.
+    `fails`: (members,), of which nothing is known; `cutoff`: singular values below this fraction of the largest count as zero. `single`: without the axis of
+    members.
     """
     found = [_information(arrow.at([b]), size[b], estimated, bound[b], not fails[b], cutoff) for b in range(len(size))]
     if single:
@@ -117,13 +121,15 @@ def _information(arrow: Arrow, size: Float[np.ndarray, "places"], estimated: np.
     shows_s = cutoff * largest < S_s
     covariance = Vt_s.T @ (np.where(shows_s, 1 / np.where(shows_s, S_s, 1.0) ** 2, 0.0)[:, None] * Vt_s)
     hidden = _hidden_directions(Vt[~shows], np.nonzero(~shows)[0], Vt_s[~shows_s], follow, held)
-    part = np.linalg.norm(hidden, axis=0)
-    identifiable = (part < np.sqrt(cutoff))[estimated] & ~bound[estimated] & usable
     variance = np.concatenate([np.diagonal(covariance), (np.diagonal(own, axis1=1, axis2=2) + np.einsum("kij,jl,kil->ki", follow, covariance, follow)).ravel()])
+    least_part = np.minimum(np.sqrt(cutoff), np.sqrt(variance) * least_move(cutoff, largest))
+    has_part = np.linalg.norm(hidden, axis=0) > least_part
+    identifiable = ~has_part[estimated] & ~bound[estimated] & usable
     size_s, size_l = size[:p], size[p:].reshape(runs, m)
     return Information(
         singular_values=S_s,
         hidden=(hidden[:, estimated],),
+        least_part=least_part[estimated],
         rank=np.asarray(int(np.sum(~held)) - len(hidden) if usable else 0),
         identifiable=identifiable,
         standard_errors=np.where(identifiable, (np.sqrt(variance) * size)[estimated], np.nan),
@@ -132,6 +138,14 @@ def _information(arrow: Arrow, size: Float[np.ndarray, "places"], estimated: np.
         follow=follow * size_l[:, :, None] / size_s,
         estimated=tuple(estimated.tolist()),
     )
+
+
+def least_move(cutoff: float, largest):
+    """Standard errors by which something moves along a direction that does not show, to have a part in it.
+
+    An error of J by cutoff * largest (singular value) turns such a direction by as many.
+    """
+    return np.maximum(_MOVES, cutoff * largest)
 
 
 def _hidden_directions(own: np.ndarray, runs: np.ndarray, shared: np.ndarray, follow: np.ndarray, held: np.ndarray) -> np.ndarray:
@@ -150,41 +164,45 @@ def _hidden_directions(own: np.ndarray, runs: np.ndarray, shared: np.ndarray, fo
     return Vt[S > 1e-6]  # directions of held places alone are none
 
 
-def hidden_combinations(directions, size, values, labels: tuple[str, ...]) -> tuple[str, ...]:
-    """Each direction that does not show, in words. `directions`: rows, changes of theta / size, orthonormal.
+def hidden_combinations(directions, least_part, size, values, labels: tuple[str, ...]) -> tuple[str, ...]:
+    """Each direction that does not show, in words. `directions`: rows, changes of theta / size, orthonormal; parts below `least_part` are none.
 
-    A basis is chosen in which each direction has one unknown of its own (row-reduced form), in relative changes
+    A basis is chosen in which each direction has one unknown of its own (row-reduced form), told in relative changes
     `d theta / theta` where the unknown is not zero.
     """
     relative = np.abs(values) > 1e-3 * np.abs(size)
-    basis = _reduced(np.asarray(directions) * size / np.where(relative, values, 1.0))
+    basis = _reduced(np.asarray(directions), least_part) * size / np.where(relative, values, 1.0)
+    basis = basis / np.max(np.abs(basis), axis=1, keepdims=True, initial=np.finfo(float).tiny)
     shared = np.count_nonzero(basis, axis=0) > 1
-    return tuple(_in_words(row, relative, relative & ~shared, labels) for row in basis)
+    return tuple(_in_words(row, relative, relative & ~shared, values, labels) for row in basis)
 
 
-def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, labels: tuple[str, ...]) -> str:
-    """`power`: where a power of the unknown stays as it is along this direction and along all others."""
+def _in_words(row: np.ndarray, relative: np.ndarray, power: np.ndarray, values: np.ndarray, labels: tuple[str, ...]) -> str:
+    """`power`: where a power of the unknown may stay as it is along this direction and along all others."""
     involved = np.flatnonzero(row)
     if len(involved) == 1:
         return f"`{labels[involved[0]]}` does not show in any channel"
     names = " and ".join(f"`{labels[i]}`" for i in involved)
     changes = " : ".join(f"d {labels[i]}/{labels[i]}" if relative[i] else f"d {labels[i]}" for i in involved)
     text = f"{names} do not show separately: no channel changes along {changes} = {' : '.join(f'{row[i]:.3g}' for i in involved)}"
-    if not power[involved].all():
-        return text
     own, others = involved[0], involved[1:]
-    products = ", ".join(f"{labels[i]} {labels[own]}^{-row[i] / row[own]:.3g}" for i in others)
-    return f"{text}; what shows is {products}"
+    exponents = -row[others] / row[own]
+    if power[involved].all() and np.all(np.abs(exponents - np.round(2 * exponents) / 2) < _WHOLE):
+        of_own = ["" if abs(e - 1) < _WHOLE else f"^{e:.3g}" for e in exponents]
+        return f"{text}; what shows is {', '.join(f'{labels[i]} {labels[own]}{e}' for i, e in zip(others, of_own, strict=True))}"
+    moved = np.where(relative, row * values, row)[involved]
+    if len(involved) == 2 and abs(abs(moved[0]) - abs(moved[1])) < _WHOLE * abs(moved[0]):
+        return f"{text}; what shows is their {'difference' if moved[0] * moved[1] > 0 else 'sum'}"
+    return text
 
 
-def _reduced(rows: np.ndarray) -> np.ndarray:
-    """Reduced row-echelon form with the largest pivots; entries below 1e-3 of the largest of their row are noise, and go."""
-    rows = rows / np.max(np.abs(rows), axis=1, keepdims=True)
-    free = list(range(len(rows)))
+def _reduced(rows: np.ndarray, least_part) -> np.ndarray:
+    """Reduced row-echelon form with the largest pivots; parts below `least_part`, in rows of length one, are noise, and go."""
+    rows, free = rows.copy(), list(range(len(rows)))
     for _ in range(len(rows)):
         i, k = max(((i, k) for i in free for k in range(rows.shape[1])), key=lambda place: round(abs(rows[place]), 6))
         rows[i] /= rows[i, k]
         others = [j for j in range(len(rows)) if j != i]
         rows[others] -= np.outer(rows[others, k], rows[i])
         free.remove(i)
-    return np.where(np.abs(rows) > 1e-3 * np.max(np.abs(rows), axis=1, keepdims=True), rows, 0.0)
+    return np.where(np.abs(rows) > least_part * np.linalg.norm(rows, axis=1, keepdims=True), rows, 0.0)

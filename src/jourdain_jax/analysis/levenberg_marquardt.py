@@ -162,76 +162,125 @@ def minimise(
 
     `begun`: the first steps from there.
     """
-    count = len(theta)
-    going, converged, stuck = np.arange(count), np.zeros(count, bool), np.zeros(count, bool)
-    paces: list[Pace] = [BEGIN] * count
-    if begun is None:
-        theta, at = theta.copy(), evaluate(theta, going)
-        costs = [[cost] for cost in at.cost.tolist()]
-    else:
-        theta, at, paces, costs, converged[:] = begun.theta, begun.at, [begun.pace], [begun.costs], begun.converged
-    taken = len(costs[0]) - 1
-    steps, going = np.full(count, taken), going[np.isfinite(at.cost) & ~converged]
-
-    def left(going: np.ndarray) -> np.ndarray:
-        """Of these the ones that go on after a step."""
-        lost = np.array([paces[b][0] > MOST for b in going.tolist()], bool)
-        stuck[going[lost]], going = True, going[~lost]
-        if control.patience is None:
-            return going
-        before = -1 - control.patience
-        slow = [b for b in going.tolist() if len(costs[b]) >= -before and costs[b][-1] > max(control.near, SLOW * costs[b][before])]
-        return going[~np.isin(going, slow)] if slow else going
-
-    going = left(going) if taken else going
-    for _ in range(control.most_steps - taken):
-        if not going.size:
+    way = _Way(evaluate, limits, control, theta, begun)
+    for _ in range(control.most_steps - way.taken):
+        if not way.going.size:
             break
-        arrow, x = (at.arrow, theta) if going.size == count else (at.arrow.at(going), theta[going])
-        size, damping = limits.size(x), np.array([paces[b][0] for b in going.tolist()])
+        if (step := way.foretold(way.next_step())).members.size:
+            way.take(step)
+    return way.minimum(what)
+
+
+@dataclass
+class _Step:
+    """The next step of some members."""
+
+    members: Int[np.ndarray, "some"]
+    x: Float[np.ndarray, "some unknowns"]  # where it begins
+    d: Float[np.ndarray, "some unknowns"]
+    size: Float[np.ndarray, "some unknowns"]  # of the unknowns
+    change: Float[np.ndarray, "some"]  # |J d|^2
+    fall: Float[np.ndarray, "some"]  # of F along the step, by its slope at the begin
+
+    @property
+    def promised(self) -> Float[np.ndarray, "some"]:
+        """By how much F falls, to second order."""
+        return self.fall - 0.5 * self.change
+
+    def at(self, chosen: Bool[np.ndarray, "some"]) -> "_Step":
+        """That of the members that are chosen."""
+        return self if chosen.all() else _Step(*(part[chosen] for part in vars(self).values()))
+
+
+class _Way:
+    """Members on their way to a minimum: where each is, and which still go on."""
+
+    def __init__(self, evaluate: Callable, limits: Limits, control: Control, theta: np.ndarray, begun: Begun | None):
+        self._evaluate, self._limits, self._control, self._count = evaluate, limits, control, len(theta)
+        self.going, self._converged, self._stuck = np.arange(self._count), np.zeros(self._count, bool), np.zeros(self._count, bool)
+        self._paces: list[Pace] = [BEGIN] * self._count if begun is None else [begun.pace]
+        if begun is None:
+            self._theta, self._at = theta.copy(), evaluate(theta, self.going)
+            self._costs = [[cost] for cost in self._at.cost.tolist()]
+        else:
+            self._theta, self._at, self._costs = begun.theta, begun.at, [begun.costs]
+            self._converged[:] = begun.converged
+        self.taken = len(self._costs[0]) - 1  # steps
+        self._steps, self.going = np.full(self._count, self.taken), self.going[np.isfinite(self._at.cost) & ~self._converged]
+        if self.taken:
+            self._give_up()
+
+    def next_step(self) -> _Step:
+        """That of the members that go on; those have converged whose step is small, also without damping."""
+        here, limits, control = self.going, self._limits, self._control
+        arrow, x = (self._at.arrow, self._theta) if here.size == self._count else (self._at.arrow.at(here), self._theta[here])
+        size, damping = limits.size(x), np.array([self._paces[b][0] for b in here.tolist()])
         scaling = column_scaling(arrow, size)
         d = damped_step(arrow, x, scaling, damping, limits, control.cutoff)
         change = arrow.change(d)
         done = _is_small(change, size, d, control)
-        if True in done.tolist():
-            if (done & (damping > LEAST)).any():
-                undamped = damped_step(arrow, x, scaling, np.full(going.size, LEAST), limits, control.cutoff)
-                done &= _is_small(arrow.change(undamped), size, undamped, control)
-            converged[going[done]] = True
-            going, size, d, x, change, arrow = going[~done], size[~done], d[~done], x[~done], change[~done], arrow.at(~done)
-            if not going.size:
-                break
-        steps[going] += 1
-        fall = -np.einsum("bi,bi->b", arrow.gradient, d)  # of F along the step, at its begin
-        promised = fall - 0.5 * change
-        length, here = np.sqrt(change), going.tolist()
-        shrank = [shrinkage(NUMBERS, paces[b], one) for b, one in zip(here, length.tolist(), strict=True)]
-        if min(shrank) < 1:
-            last = _is_small(change * np.square(shrank), size, d * np.array(shrank)[:, None], replace(control, tolerance=SURELY * control.tolerance))
-            if last.any():
-                of = going[last]
-                at = at.replaced(of, (at if of.size == count else at.at(of)).moved(d[last], promised[last]), np.ones(of.size, bool))
-                theta[of], converged[of], going = x[last] + d[last], True, going[~last]
-                for b in of.tolist():
-                    costs[b].append(float(at.cost[b]))
-                if not going.size:
-                    break
-                d, x, fall, promised, length, here = d[~last], x[~last], fall[~last], promised[~last], length[~last], going.tolist()
-        trial = evaluate(x + d, going)
-        slopes = 0.5 * (fall - np.einsum("bi,bi->b", trial.arrow.gradient, d))
-        better, of_each = [], zip(here, length.tolist(), trial.cost.tolist(), promised.tolist(), slopes.tolist(), strict=True)
-        for b, one, cost, by, slope in of_each:
-            is_better, paces[b] = after_trial(NUMBERS, paces[b], one, costs[b][-1], cost, by, slope, control.tolerance)
+        if (done & (damping > LEAST)).any():
+            undamped = damped_step(arrow, x, scaling, np.full(here.size, LEAST), limits, control.cutoff)
+            done &= _is_small(arrow.change(undamped), size, undamped, control)
+        self._end(here[done])
+        return _Step(here, x, d, size, change, -np.einsum("bi,bi->b", arrow.gradient, d)).at(~done)
+
+    def foretold(self, step: _Step) -> _Step:
+        """The step but for members that need no look at its end, since the one after it will be small, as far as steps have shrunk: they are put there."""
+        here = step.members.tolist()
+        self._steps[step.members] += 1
+        shrank = np.array([shrinkage(NUMBERS, self._paces[b], one) for b, one in zip(here, np.sqrt(step.change).tolist(), strict=True)])
+        if not (last := shrank < 1).any():
+            return step
+        surely = replace(self._control, tolerance=SURELY * self._control.tolerance)
+        last &= _is_small(step.change * np.square(shrank), step.size, step.d * shrank[:, None], surely)
+        if not last.any():
+            return step
+        end = step.at(last)
+        whole = end.members.size == self._count
+        moved = (self._at if whole else self._at.at(end.members)).moved(end.d, end.promised)
+        self._put(end, moved, np.ones(end.members.size, bool))
+        self._end(end.members)
+        return step.at(~last)
+
+    def take(self, step: _Step) -> None:
+        """Evaluates at its end; members stay where they are if F does not fall."""
+        trial = self._evaluate(step.x + step.d, step.members)
+        slopes, better = 0.5 * (step.fall - np.einsum("bi,bi->b", trial.arrow.gradient, step.d)), []
+        numbers = (np.sqrt(step.change), trial.cost, step.promised, slopes)
+        for b, length, cost, promised, slope in zip(step.members.tolist(), *(x.tolist() for x in numbers), strict=True):
+            is_better, self._paces[b] = after_trial(NUMBERS, self._paces[b], length, self._costs[b][-1], cost, promised, slope, self._control.tolerance)
             better.append(is_better)
-        chosen = np.array(better)
-        theta[going[chosen]] = (x + d)[chosen]
-        at = at.replaced(going, trial, chosen)
-        for b in here:
-            costs[b].append(float(at.cost[b]))
-        going = left(going)
-    trace = np.empty(count, object)
-    trace[:] = [((what, tuple(of_one)),) for of_one in costs]
-    return Minimum(theta, at, converged, stuck, steps, np.zeros(count, bool), trace)
+        self._put(step, trial, np.array(better))
+        self._give_up()
+
+    def minimum(self, what: str) -> Minimum:
+        """Where all members ended."""
+        trace = np.empty(self._count, object)
+        trace[:] = [((what, tuple(of_one)),) for of_one in self._costs]
+        return Minimum(self._theta, self._at, self._converged, self._stuck, self._steps, np.zeros(self._count, bool), trace)
+
+    def _put(self, step: _Step, there: Linearised, chosen: Bool[np.ndarray, "some"]) -> None:
+        """Puts the chosen members at the end of the step, where all is as `there`."""
+        self._theta[step.members[chosen]] = (step.x + step.d)[chosen]
+        self._at = self._at.replaced(step.members, there, chosen)
+        for b in step.members.tolist():
+            self._costs[b].append(float(self._at.cost[b]))
+
+    def _end(self, members: Int[np.ndarray, "some"]) -> None:
+        if members.size:
+            self._converged[members] = True
+            self.going = self.going[~np.isin(self.going, members)]
+
+    def _give_up(self) -> None:
+        """Members for which no step is found are stuck; those that are far off and get nowhere go on no more."""
+        lost = np.array([self._paces[b][0] > MOST for b in self.going.tolist()], bool)
+        self._stuck[self.going[lost]], self.going = True, self.going[~lost]
+        if self._control.patience is None:
+            return
+        before, near = -1 - self._control.patience, self._control.near
+        slow = [len(self._costs[b]) >= -before and self._costs[b][-1] > max(near, SLOW * self._costs[b][before]) for b in self.going.tolist()]
+        self.going = self.going[~np.array(slow, bool)]
 
 
 def column_scaling(arrow: Arrow | JoinedArrow, size: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members unknowns"]:

@@ -3,6 +3,7 @@
 r = (reading - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi));      where noise has a memory, as in `correlated_noise`
 """
 
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.correlated_noise import log_density
-from jourdain_jax.analysis.measurements import Measurements, checked
+from jourdain_jax.analysis.measurements import Measurements, checked, held_inputs
 from jourdain_jax.analysis.predictions import Run, equal_runs
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.simulate import simulate
@@ -21,7 +22,7 @@ from jourdain_jax.scene.scene import Scene
 
 
 def as_runs(scene: Scene, data: Measurements | Sequence[Measurements], *, repeats: bool = False) -> tuple[Measurements, ...]:
-    """One run or several, checked against the scene; ValueError as in `checked`, and where there is no run."""
+    """One run or several, checked against the scene; ValueError as in `checked`, and where there is no run. Inputs that are held are warned of."""
     as_scene(scene)
     if not isinstance(data, Measurements | Iterable):
         raise ValueError(f"`data` is {described(data)}, expected a `Measurements` or a sequence of at least one")
@@ -29,7 +30,10 @@ def as_runs(scene: Scene, data: Measurements | Sequence[Measurements], *, repeat
     wrong = [f"`data` holds {described(run)}" for run in runs if not isinstance(run, Measurements)] if runs else ["`data` is empty"]
     if wrong:
         raise ValueError(f"{wrong[0]}, expected a `Measurements` or a sequence of at least one")
-    return tuple(checked(scene, run, index, repeats) for index, run in enumerate(runs))
+    found = tuple(checked(scene, run, index, repeats) for index, run in enumerate(runs))
+    for sentence in held_inputs(scene, found):
+        warnings.warn(sentence, stacklevel=5)
+    return found
 
 
 def in_all_or_none(runs: Sequence[Measurements], what: str, unknown: Callable[[Measurements], tuple[str, ...]]) -> tuple[str, ...]:

@@ -22,7 +22,8 @@ from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.printing import Printed
 
 _CLOSE = 0.01  # of the rise at the end of an interval
-_POINTS, _REFINED = 16, 6  # at most, on one side: outwards, and between the last two
+_POINTS, _REFINED = 16, 8  # at most, on one side: outwards, and between the last two
+_JUMP = 3.0  # times the rise at the end of an interval: with more between two points, it may jump
 _STEP = 0.6  # of sqrt(rise), from point to point
 _FAR = 1e3  # sizes of the unknown, beyond which nothing is looked for
 _LOWER = 0.02  # of the rise, by which a lower minimum is found
@@ -116,17 +117,25 @@ class _Side:
         begin[0, self._place] = value
         control = self._fitted.asked.control
         found = minimise(self._fitted.evaluate, begin, self._limits, replace(control, tolerance=max(control.tolerance, _TOLERANCE)))
+        if np.isfinite(found.at.cost[0]) and not found.converged[0]:
+            self.note = f"no minimum over the others was found near {value:.4g}, so that the interval may be too narrow"
         return 2 * float(found.at.cost[0] - self._fitted.at.cost[0]) / self._inflation, found.theta
 
     def _crossing(self, theta: np.ndarray, origin: float, inner: tuple[float, float], outer: tuple[float, float]) -> float:
-        """Where the rise is that of the interval's end: by secants of its root, which is nearly straight, between two points."""
-        root = lambda rise: np.sqrt(max(rise, 0.0))  # noqa: E731
-        middle = outer[0]
+        """Where the rise is that of the interval's end, between two points: by halves where it jumps, else by secants of its root, which is nearly straight.
+
+        `theta`: all unknowns at the inner point, from which the others follow; beyond the outer one they may have gone elsewhere.
+        """
         for _ in range(_REFINED):
-            middle = inner[0] + (outer[0] - inner[0]) * (np.sqrt(RISE_95) - root(inner[1])) / (root(outer[1]) - root(inner[1]))
-            found, theta = self._solved(theta, origin + self._way * middle)
+            low, end, high = np.sqrt(np.maximum([inner[1], RISE_95, outer[1]], 0.0))
+            middle = inner[0] + (outer[0] - inner[0]) * (0.5 if outer[1] > _JUMP * RISE_95 else float((end - low) / (high - low)))
+            found, there = self._solved(theta, origin + self._way * middle)
             self.points.append((origin + self._way * middle, found))
             if abs(found / RISE_95 - 1) < _CLOSE:
-                break
-            inner, outer = ((middle, found), outer) if found < RISE_95 else (inner, (middle, found))
-        return float(middle)
+                return middle
+            if found < RISE_95:
+                inner, theta = (middle, found), there
+            else:
+                outer = middle, found
+        self.note = f"the sum of squares jumps near {origin + self._way * outer[0]:.4g}: beyond it, other unknowns are elsewhere"
+        return outer[0]

@@ -3,7 +3,7 @@
 value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -293,6 +293,24 @@ def _check_overlap(run: Measurements, name: str, signal, where: str) -> None:
             f"input `{name}` of {where} is sampled from {first} to {last} s, and the run is from {begin} to {end} s, where it would be constant; "
             "take both from one clock, or give a number"
         )
+
+
+def held_inputs(scene: Scene, runs: Sequence[Measurements]) -> tuple[str, ...]:
+    """One sentence for each input whose samples begin or end more than an interval within a run, `checked`, while it changes: it is held there."""
+    found: list[str] = []
+    for index, run in enumerate(runs):
+        for name, signal in zip(scene.inputs.entries, run.inputs.channels if isinstance(run.inputs, Inputs) else (), strict=False):
+            if not isinstance(signal, Sampled) or is_traced((signal, run.ts, run.t0)) or np.ptp(np.asarray(signal.values)) == 0:
+                continue
+            ts, last = np.asarray(signal.ts), float(run.ts[-1])
+            spans = [f"its first value until {ts[0]:.6g} s"] if ts[0] > run.t0 + (ts[1] - ts[0]) else []
+            spans += [f"its last value from {ts[-1]:.6g} to {last:.6g} s"] if ts[-1] < last - (ts[-1] - ts[-2]) else []
+            if spans:
+                found.append(
+                    f"input `{name}` of run {index} is not sampled over all of the run and keeps {' and '.join(spans)}; if it did so, repeat that value in its "
+                    "samples, otherwise give more of them, or measurements of less"
+                )
+    return tuple(found)
 
 
 def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> tuple[int, ...]:

@@ -71,7 +71,8 @@ class PlannedInformation(Printed, eqx.Module):
     @property
     def not_identifiable(self) -> tuple[str, ...]:
         """What the planned runs will not tell, one sentence for each combination of unknowns."""
-        return hidden_combinations(*self._hidden, np.asarray(self.values), self.labels)
+        directions, size = self._hidden
+        return hidden_combinations(directions, np.sqrt(_CUTOFF), size, np.asarray(self.values), self.labels)
 
     @property
     def _hidden(self) -> tuple[np.ndarray, np.ndarray]:

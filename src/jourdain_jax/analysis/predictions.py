@@ -181,7 +181,8 @@ class _Group:
     def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None, loss: Loss):
         self.indices, self._members, self._runs = indices, members, np.array(indices)
         times, knots = max(run.ts.shape[0] for run in runs), _most_knots(runs)
-        filled = [_filled(run, times, knots, 0 if members is None else 1) for run in (runs if runs[0].grid is None else _on_equal_grids(runs))]
+        equal = runs if runs[0].grid is None or len(runs) == 1 else _on_equal_grids(runs)
+        filled = [_filled(run, times, knots, 0 if members is None else 1) for run in equal]
         leaves, treedef = jax.tree.flatten(((scene, simulation), filled[0]))
         # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
         repeated = {id(x) for part in (filled[0].values, filled[0].weights) for x in part.values()} if members is not None else set()

@@ -199,8 +199,11 @@ def numbers_of(owner: Sensor | Actuator) -> tuple[dict, tuple[str, ...], tuple[s
     """Its numbers (first guesses where they are estimated), names of those that are, and names of all that matter."""
     given = {name: getattr(owner, name) for name in NUMBERS}
     unknown = tuple(name for name, value in given.items() if isinstance(value, Estimate))
-    numbers = {name: jnp.asarray(value.guess if isinstance(value, Estimate) else value, jnp.result_type(float)) for name, value in given.items()}
-    used = tuple(n for n, x in numbers.items() if n in unknown or is_traced(x) or not np.all(np.asarray(x) == NUMBERS[n]))
+    numbers = {}
+    for name, value in given.items():
+        number = value.guess if isinstance(value, Estimate) else value
+        numbers[name] = (jnp if is_traced(number) else np).asarray(number, jnp.result_type(float))
+    used = tuple(n for n, x in numbers.items() if n in unknown or is_traced(x) or not np.all(x == NUMBERS[n]))
     return numbers, unknown, used
 
 

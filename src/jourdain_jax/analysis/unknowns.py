@@ -22,6 +22,8 @@ from jourdain_jax.analysis.ties import tied_by
 from jourdain_jax.scene.names import as_names, nearest
 from jourdain_jax.scene.scene import Scene
 
+_LEAST = 1e-6  # of the first guess: the bound of a parameter that is to be above zero
+
 
 @dataclass(frozen=True)
 class Unknowns:
@@ -127,7 +129,8 @@ def unknowns_of(
             continue
         about = parameters[name]
         default = positive() if about["positive"] or about["non_negative"] else unbounded()
-        entries.append(_entry(name, about["unit"], given, default, np.asarray(getattr(scene, name))))
+        entry = _entry(name, about["unit"], given, default, np.asarray(getattr(scene, name)))
+        entries.append(_above_zero(entry) if about["positive"] else entry)
         shared.add(name, entries[-1].guess.shape)
     for label, estimate in _of_all_runs(runs).items():
         if not estimate.per_run:
@@ -169,6 +172,11 @@ def unknowns_of(
 def _parameters(kind: type[Scene]) -> dict[str, Mapping]:
     """What is told of the parameters of a class, by name."""
     return {name: field.metadata for name, field in kind.__dataclass_fields__.items() if field.metadata.get("parameter")}
+
+
+def _above_zero(entry: "_Entry") -> "_Entry":
+    """With a bound a little above zero in place of one at zero, where the scene has no motion."""
+    return replace(entry, range=replace(entry.range, low=_LEAST * float(entry.guess.min()))) if entry.range.low == 0 else entry
 
 
 class _Places:

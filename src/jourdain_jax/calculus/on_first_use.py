@@ -32,6 +32,19 @@ def module_on_first_use(name: str) -> Any:
     return _OnFirstUse(name)
 
 
+def needed(module: str, purpose: str, extra: str = "") -> Any:
+    """An optional package, or a `module` of one; an ImportError where it is missing, which says for what it is needed and what to install.
+
+    `extra`: of this package, that brings it.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        package = module.partition(".")[0]
+        install = f"'jourdain-jax[{extra}]'" if extra else package
+        raise ImportError(f"{purpose} needs the package `{package}`, which is not installed; install it with: pip install {install}") from None
+
+
 def names_on_first_use(package: dict[str, Any], where: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """`__getattr__` and `__dir__` of a package, given its globals, for names that are defined in modules below it: name -> module, such as "analysis.fit".
 

@@ -11,8 +11,8 @@ from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 from jourdain_jax.calculus.reals import described
+from jourdain_jax.ensembles import optional
 from jourdain_jax.ensembles.deadly_lanes import without_deadly_lanes
-from jourdain_jax.ensembles.optional import cluster_by
 from jourdain_jax.ensembles.run import Runner
 from jourdain_jax.ensembles.store import Store
 from jourdain_jax.ensembles.task import Task
@@ -26,7 +26,7 @@ _one_at_a_time = threading.Lock()
 
 def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
     """What `run` takes as its workers; ValueError where `client` is no client of Dask, or the task cannot be sent to another process."""
-    distributed = cluster_by()
+    distributed = optional.distributed()
     if not isinstance(client, distributed.Client):
         raise ValueError(f"`client` is {described(client)}, expected a `dask.distributed.Client`")
     sent = sent_to_others(task)
@@ -99,7 +99,7 @@ def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None
     """
     with _one_at_a_time:
         if os.getpid() != asking and "JOURDAIN_JAX_THREADS" not in os.environ:  # a worker that is a process of its own keeps to its share of the cores
-            worker = cluster_by().get_worker()
+            worker = optional.distributed().get_worker()
             os.environ["JOURDAIN_JAX_THREADS"] = str(worker.state.nthreads)
             if places and worker.name in places:
                 keep_to_share(places[worker.name], len(places))

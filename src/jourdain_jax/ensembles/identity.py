@@ -5,7 +5,6 @@ classes of installed packages and of this one by their name alone, since their v
 """
 
 import hashlib
-import sys
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import partial
@@ -13,6 +12,8 @@ from types import CodeType, FunctionType, MethodType, ModuleType
 
 import jax
 import numpy as np
+
+from jourdain_jax.scene.what_is_read import is_installed
 
 DEEPEST = 8  # functions that call functions
 
@@ -63,11 +64,11 @@ def _content(x: object, depth: int, within: set[int]) -> object:
     if is_dataclass(x):
         return of(type(x)), tuple((field.name, of(getattr(x, field.name, None))) for field in fields(x))
     members = getattr(x, "__dict__", None)
-    return of(type(x)), of(members) if members and not _is_installed(type(x).__module__) else None
+    return of(type(x)), of(members) if members and not is_installed(type(x).__module__) else None
 
 
 def _function(f: FunctionType, of) -> object:
-    if _is_installed(f.__module__):
+    if is_installed(f.__module__):
         return "function", f.__module__, f.__qualname__
     cells = tuple(of(_within(cell)) for cell in f.__closure__ or ())
     named = tuple((name, of(f.__globals__[name])) for name in sorted(_names_in(f.__code__)) if name in f.__globals__)
@@ -86,18 +87,7 @@ def _names_in(code: CodeType) -> set[str]:
 
 
 def _class(kind: type, of) -> object:
-    if _is_installed(kind.__module__):
+    if is_installed(kind.__module__):
         return "class", kind.__module__, kind.__qualname__
     own = tuple((name, of(member)) for name, member in sorted(vars(kind).items()) if name == "__call__" or not name.startswith(("__", "_abc_")))
     return "class", kind.__qualname__, own, tuple(of(base) for base in kind.__bases__)
-
-
-def _is_installed(module: str | None) -> bool:
-    """Whether a module belongs to Python, to an installed package, or to this one."""
-    top = (module or "").partition(".")[0]
-    if top == "__main__":
-        return False
-    if top == __name__.partition(".")[0] or top in sys.builtin_module_names or top in sys.stdlib_module_names:
-        return True
-    file = getattr(sys.modules.get(module or ""), "__file__", None) or ""
-    return "site-packages" in file or "dist-packages" in file

@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
+from jourdain_jax.ensembles import optional
 from jourdain_jax.ensembles.histograms import CELLS as BARS
 from jourdain_jax.ensembles.histograms import Histogram, pictures
-from jourdain_jax.ensembles.optional import draws_with, labelled_by
 from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
 from jourdain_jax.ensembles.statistics import CELLS, Grid, Statistics, combined
 from jourdain_jax.ensembles.store import Store
@@ -182,7 +182,7 @@ class StudyResult(Printed):
 
     def to_xarray(self):
         """All arrays as an `xarray.Dataset` with names and units, read where they are used; lanes that are not done are NaN, their result is -1."""
-        return labelled_by().open_zarr(self.store.path, chunks=None, consolidated=True)
+        return optional.xarray().open_zarr(self.store.path, chunks=None, consolidated=True)
 
     def to_netcdf(self, path: str | os.PathLike) -> None:
         """Write all arrays to the NetCDF file `path`, by whichever engine of xarray is installed."""
@@ -197,7 +197,7 @@ class StudyResult(Printed):
 
     def plot(self, *outputs: str, path: str | os.PathLike | None = None):
         """Histograms of `outputs` (default: all) in one figure, which is returned, and written to `path` where that is given. Needs matplotlib."""
-        plt = draws_with()
+        plt = optional.pyplot()
         names = outputs or self.outputs
         figure, axes = plt.subplots(1, len(names), figsize=(3.6 * len(names), 3.0), squeeze=False, layout="constrained")
         for axis, name in zip(axes[0], names, strict=True):

@@ -23,8 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jourdain_jax.ensembles import optional
 from jourdain_jax.ensembles.files import locked, write_whole
-from jourdain_jax.ensembles.optional import stored_by
 
 FORMAT = 1
 _BEGIN = b"jourdain-jax chunk 1\n"
@@ -69,7 +69,7 @@ class Store:
     @staticmethod
     def make(path: str | os.PathLike, study: Mapping, columns: Mapping[str, Column], constants: Mapping[str, tuple], attributes: Mapping) -> "Store":
         """A new folder, whole or absent; an existing one is not touched. `constants`: name -> axis, values, attributes."""
-        zarr, _ = stored_by()
+        zarr = optional.zarr()
         path = Path(path)
         if path.is_file():
             raise ValueError(f"`{path}` is a file, expected a folder for the study; give another name")
@@ -164,7 +164,7 @@ class Store:
 
     def write(self, number: int, values: Mapping[str, np.ndarray], arrays: Mapping[str, np.ndarray]) -> None:
         """Keep a chunk: the values of all columns, then its receipt with `arrays`."""
-        _, crc32c = stored_by()
+        crc32c = optional.crc32c()
         checksums = {}
         try:
             for name, column in self.columns.items():
@@ -185,7 +185,7 @@ class Store:
     def receipt(self, number: int) -> Receipt | None:
         """The receipt of a chunk; None where there is none or it is torn."""
         try:
-            return _unpacked(self._receipt_file(number).read_bytes(), stored_by()[1])
+            return _unpacked(self._receipt_file(number).read_bytes(), optional.crc32c())
         except (FileNotFoundError, ValueError):
             return None
 
@@ -195,7 +195,7 @@ class Store:
 
     def is_whole(self, number: int) -> bool:
         """Whether a chunk has its receipt and all its arrays, and all of them are as they were written."""
-        _, crc32c = stored_by()
+        crc32c = optional.crc32c()
         receipt = self.receipt(number)
         if receipt is None or (receipt.first, receipt.last) != self.span(number) or set(receipt.checksums) != set(self.columns):
             return False

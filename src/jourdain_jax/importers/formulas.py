@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jourdain_jax.calculus.on_first_use import needed
+
 _FUNCTIONS = {
     **{name: name for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "sign", "floor", "sinc")},
     **{f"a{name}": f"arc{name}" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh")},
@@ -20,14 +22,10 @@ _RELATIONS |= {"StrictGreaterThan": "greater", "GreaterThan": "greater_equal", "
 _KNOWN = {*_FUNCTIONS, *_RELATIONS, "Add", "Mul", "Pow", "Min", "Max", "Heaviside", "Piecewise", "ExprCondPair", "erf", "BooleanTrue", "BooleanFalse"}
 
 
-def sympy_package(purpose: str) -> Any:
+def sympy_package() -> Any:
     """The package `sympy`; an ImportError that says how to get it where it is missing."""
-    try:
-        import sympy
-        import sympy.physics.mechanics
-    except ImportError:
-        raise ImportError(f"{purpose} needs the package `sympy`; install it with: pip install sympy") from None
-    return sympy
+    needed("sympy.physics.mechanics", "a scene from SymPy")
+    return needed("sympy", "a scene from SymPy")
 
 
 class Formulas:
@@ -35,7 +33,7 @@ class Formulas:
 
     def __init__(self, lists: Mapping[str, Sequence[Any]], leaves: Sequence[Any]):
         """The `lists` of expressions, by name, in what is called `leaves`. ValueError for a function that JAX does not have."""
-        sympy = sympy_package("a scene from SymPy")
+        sympy = sympy_package()
         self._lengths = {name: len(expressions) for name, expressions in lists.items()}
         flat = [sympy.sympify(e) for expressions in lists.values() for e in expressions]
         known = set(leaves)

@@ -29,7 +29,7 @@ def forces_of(system: MechanicalSystem, poses: Sequence[Pose]) -> Forces:
     A force on a point that is no mass centre, and a torque on a frame that is no body's, count by the power that they have by SymPy's velocity of that
     point or frame: Q_k = F . dv/du_k.
     """
-    sympy = sympy_package("a scene from SymPy")
+    sympy = sympy_package()
     found = Forces()
     for where, vector in system.loads:
         value = system.resolved(vector.to_matrix(system.frame))
@@ -49,7 +49,7 @@ def forces_of(system: MechanicalSystem, poses: Sequence[Pose]) -> Forces:
 
 def velocity_rows(system: MechanicalSystem, states: RandomStates) -> list[Any]:
     """The velocity rows that are not the rates of the geometric ones: SymPy wants both."""
-    sympy = sympy_package("a scene from SymPy")
+    sympy = sympy_package()
     rows = [system.resolved(sympy.sympify(row)) for row in system.velocity]
     if not rows or not system.configuration:
         return rows

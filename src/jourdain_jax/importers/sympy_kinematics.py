@@ -77,7 +77,7 @@ class AffineRows:
 
     def __init__(self, system: MechanicalSystem, rows: Iterable[Any]):
         """The `rows` as expressions."""
-        sympy = sympy_package("a scene from SymPy")
+        sympy = sympy_package()
         expressions = [system.resolved(sympy.sympify(row)) for row in rows]
         self.speeds, self.symbols = system.speeds, symbols_in(expressions) | set(system.speeds)
         self._formulas = Formulas({"rows": expressions}, list(self.symbols))
@@ -99,7 +99,7 @@ class AffineRows:
 
 def symbols_in(expressions: Iterable[Any]) -> set[Any]:
     """Functions of time, rates of these, and symbols in some expressions."""
-    sympy = sympy_package("a scene from SymPy")
+    sympy = sympy_package()
     time = sympy.physics.mechanics.dynamicsymbols._t
     found: set[Any] = set()
     for expression in map(sympy.sympify, expressions):
@@ -123,7 +123,7 @@ def _weighs(body) -> bool:
 
 def is_rigid(body) -> bool:
     """Whether SymPy's body is a rigid one; its `Body` may be a particle."""
-    mechanics = sympy_package("a scene from SymPy").physics.mechanics
+    mechanics = sympy_package().physics.mechanics
     return isinstance(body, mechanics.RigidBody) and getattr(body, "is_rigidbody", True)
 
 
@@ -134,7 +134,7 @@ def centre_of(body):
 
 def _oriented(system: MechanicalSystem, states: RandomStates) -> tuple[MechanicalSystem, list[Pose]]:
     """Poses with orientations, and positions as SymPy has them (zero where it has none)."""
-    sympy = sympy_package("a scene from SymPy")
+    sympy = sympy_package()
     poses: list[Pose] = []
     angles: dict[Any, tuple] = {}  # frame -> its orientation
     for body in filter(_weighs, system.bodies):
@@ -184,7 +184,7 @@ def _in_own_frame(body, angle: tuple | None):
 
 def _by_an_angle(system: MechanicalSystem, frame) -> tuple[MechanicalSystem, tuple]:
     """An angle for a frame without orientation: its orientation, the frame that it turns in, and its turn there."""
-    sympy = sympy_package("a scene from SymPy")
+    sympy = sympy_package()
     for parent, velocity in frame._ang_vel_dict.items():
         try:
             base = system.frame.dcm(parent)
@@ -205,7 +205,7 @@ def _by_an_angle(system: MechanicalSystem, frame) -> tuple[MechanicalSystem, tup
 
 def _constant(system: MechanicalSystem, states: RandomStates, matrix, what: str):
     """The matrix without coordinates, on which its value does not depend. ValueError where it does."""
-    sympy = sympy_package("a scene from SymPy")
+    sympy = sympy_package()
     matrix = system.resolved(matrix)
     if system.is_constant(matrix):
         return matrix
@@ -261,7 +261,7 @@ def _along_the_motion(system: MechanicalSystem, states: RandomStates, positions:
 
 def _moved(system: MechanicalSystem, states: RandomStates, poses: list[Pose]) -> tuple[MechanicalSystem, list[Pose]]:
     """Positions whose rates are the stated velocities, by further coordinates where they are not yet."""
-    sympy = sympy_package("a scene from SymPy")
+    sympy = sympy_package()
     stated = [system.resolved(pose.centre.vel(system.frame).to_matrix(system.frame)) for pose in poses]
     rates_of_rows = tuple(sympy.sympify(row).diff(system.time) for row in system.configuration)
     rows = AffineRows(system, (*system.velocity, *rates_of_rows))

@@ -212,7 +212,7 @@ def _name_of(function) -> str:
 
 def _check_known(system: MechanicalSystem, parts: dict[str, dict[str, list]], constants: list[Any], unknown: list[Any], given: dict[str, float]) -> None:
     """A ValueError for rates that nothing gives, inputs where there can be none, constants without a value, and values of nothing."""
-    sympy = sympy_package("a scene from SymPy")
+    sympy = sympy_package()
     for x in unknown:
         if isinstance(x, sympy.Derivative):
             speed = x.args[0] in system.speeds

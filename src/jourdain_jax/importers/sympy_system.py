@@ -36,17 +36,17 @@ class MechanicalSystem:
     @property
     def time(self):
         """The symbol of the time."""
-        return sympy_package("a scene from SymPy").physics.mechanics.dynamicsymbols._t
+        return sympy_package().physics.mechanics.dynamicsymbols._t
 
     def is_constant(self, expression) -> bool:
         """Whether it depends on constants only."""
-        sympy = sympy_package("a scene from SymPy")
+        sympy = sympy_package()
         return not expression.has(self.time) and not expression.atoms(sympy.core.function.AppliedUndef)
 
 
 def mechanical_system(system, origin) -> MechanicalSystem:
     """What a `KanesMethod`, a `JointsMethod` whose equations are formed, or a `System` of SymPy says. ValueError for anything else, and for what is missing."""
-    sympy = sympy_package("a scene from SymPy")
+    sympy = sympy_package()
     mechanics = sympy.physics.mechanics
     system = getattr(system, "method", None) or system  # of a JointsMethod
     if isinstance(system, mechanics.KanesMethod):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.calculus.reals import checked_real, described, is_traced
 from jourdain_jax.scene.bodies import _axis_index, _stack
 from jourdain_jax.scene.grounds import tangents_of
@@ -134,10 +135,7 @@ class Visual(eqx.Module):
         `at`, `turn`, `colour`, `opacity` as for all shapes. ImportError without `trimesh`; ValueError for a file that is missing, of an unknown format, or
         without faces.
         """
-        try:
-            import trimesh
-        except ImportError:
-            raise ImportError("reading a mesh from a file needs the package `trimesh`; install it with: pip install trimesh") from None
+        trimesh = needed("trimesh", "reading a mesh from a file")
         if not os.path.isfile(path):
             raise ValueError(f"cannot read a mesh from `{os.fspath(path)}`: there is no such file; relative paths begin at `{os.getcwd()}`")
         try:

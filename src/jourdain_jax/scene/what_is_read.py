@@ -145,7 +145,7 @@ class _Reader:
         if isinstance(x, FunctionType | type | SimpleNamespace):
             self._seen.add(id(x))
         if isinstance(x, FunctionType):
-            return self._identity(x) if _is_package(x.__module__) else self._function(x, depth)
+            return self._identity(x) if is_installed(x.__module__) else self._function(x, depth)
         if isinstance(x, type):
             return self._class(x, depth)
         return self._object(x, depth)
@@ -164,7 +164,7 @@ class _Reader:
         if type(x).__module__.startswith("equinox") and callable(inner := getattr(x, "method", None)):  # as Equinox holds methods
             return self.key(inner, depth)
         members = getattr(x, "__dict__", None)
-        if members is None or isinstance(x, ModuleType) or (_is_package(type(x).__module__) and not isinstance(x, SimpleNamespace)):
+        if members is None or isinstance(x, ModuleType) or (is_installed(type(x).__module__) and not isinstance(x, SimpleNamespace)):
             return self._identity(x)
         self._seen.add(id(x))
         self.by_identity.append(x)
@@ -197,7 +197,7 @@ class _Reader:
 
     def _attributes(self, module, attributes: Iterable[str], depth: int) -> list[Hashable]:
         """What is read of a module of the user's."""
-        if not isinstance(module, ModuleType) or _is_package(module.__name__):
+        if not isinstance(module, ModuleType) or is_installed(module.__name__):
             return []
         return [(name, self._named(vars(module), name, depth)) for name in attributes]
 
@@ -205,7 +205,7 @@ class _Reader:
         own: list[Hashable] = [self._identity(kind)]
         # of a scene all its classes count: someone may replace methods of this package's too, and a class made by `type(...)` bears another module's name
         for owner in kind.__mro__[: next((k for k, owner in enumerate(kind.__mro__) if owner.__module__ == _BASE), None)]:
-            if depth == 0 or not _is_package(owner.__module__):
+            if depth == 0 or not is_installed(owner.__module__):
                 self.members.append(vars(owner))
                 own += [(name, self.key(member, depth + 1)) for name, member in vars(owner).items() if not _is_bookkeeping(name)]
         return tuple(own)
@@ -278,7 +278,7 @@ def _is_only_changed(first, second) -> bool:
 
 
 @functools.lru_cache(maxsize=4096)
-def _is_package(name: str | None) -> bool:
+def is_installed(name: str | None) -> bool:
     """Whether a module belongs to Python, to an installed package, or to this one."""
     top = (name or "").partition(".")[0]
     if top == "__main__":

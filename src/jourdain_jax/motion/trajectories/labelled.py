@@ -5,10 +5,11 @@ A scene states the units of its parameters. Of its coordinates and speeds only t
 
 import math
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
+from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.trajectories.over_times import Record
 from jourdain_jax.scene.names import nearest
@@ -35,7 +36,7 @@ class WithEvents(Record, Protocol):
 
 def dataset(record: WithEvents, units: Mapping[str, str] | None = None):
     """The motion, or with a leading axis the lanes, as an `xarray.Dataset`; `units`: name of a coordinate or speed -> its unit."""
-    xarray = _package("xarray", "labelled arrays")
+    xarray = needed("xarray", "labelled arrays")
     lanes = _lanes(record)
     units = _units(record.scene, units)
     ts = np.asarray(record.ts)
@@ -61,7 +62,7 @@ def dataset(record: WithEvents, units: Mapping[str, str] | None = None):
 
 def frame(record: Record):
     """Coordinates and speeds as a `pandas.DataFrame`: one row for each time, or for each lane and time."""
-    pandas = _package("pandas", "a table of a motion")
+    pandas = needed("pandas", "a table of a motion")
     lanes, ts = _lanes(record), np.asarray(record.ts)
     if not lanes:
         return pandas.DataFrame(_columns(record), index=pandas.Index(ts, name="time"))
@@ -91,15 +92,3 @@ def _units(scene, given: Mapping[str, str] | None) -> dict[str, str]:
         if name not in valid:
             raise ValueError(f"`units` names `{name}`, which is no coordinate or speed of `{type(scene).__name__}`; {nearest(name, valid)}")
     return known | dict(given or {})
-
-
-def _package(name: str, purpose: str) -> Any:
-    """An optional package; an ImportError that says how to get it."""
-    try:
-        if name == "xarray":
-            import xarray as package
-        else:
-            import pandas as package
-    except ImportError:
-        raise ImportError(f"{purpose} needs the package `{name}`, which is not installed; install it with: pip install {name}") from None
-    return package
