@@ -28,7 +28,7 @@ class Start(NamedTuple):
     """A motion as a kernel is given it; the state and what is known are followed by their tangents (`Layout`)."""
 
     of_samples: tuple[Array, ...]  # as `samples.py` has them
-    control: Float[Array, "5"]  # as `native_motion.Control`
+    control: tuple[Float[Array, ""], ...]  # as `native_motion.Control`
     goals: Float[Array, "times"]  # since the start
     origin: Float[Array, ""]  # the time of the start
     y: tuple[Float[Array, "y"], ...]
@@ -40,8 +40,8 @@ class Start(NamedTuple):
         zero, one = jnp.zeros(()), jnp.ones(())
         progress = [t, jnp.abs(first), RUNNING * one, zero, zero, -one, jnp.inf * one, *dt]
         limits = [jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, most, self.origin]
-        known = [x for part in self.known for x in part]
-        return jnp.concatenate([*self.y, jnp.stack(progress), jnp.stack(limits), *([jnp.stack(known)] if known else [])])
+        known = [jnp.stack(part) for part in self.known if part]  # each tangent by itself: values may have no lanes where tangents have
+        return jnp.concatenate([*self.y, jnp.stack(progress), jnp.stack(limits), *known])
 
 
 class Found(NamedTuple):

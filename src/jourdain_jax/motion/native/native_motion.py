@@ -200,8 +200,8 @@ def cotangents_of_times(motion: Motion, found: tuple, by_start: Integrated, ys: 
 def _start(motion: Motion) -> Start:
     """What a kernel is given of a motion."""
     known = tuple(jnp.zeros(()) if x is None else jnp.asarray(x, real_type()) for x in known_of(motion.args))  # what samples say is looked up
-    control = jnp.stack([jnp.asarray(x, real_type()) for x in motion.control])
-    return Start(_samples(motion), control, motion.goals, jnp.asarray(motion.args[-1], real_type()), (_packed(motion.y0),), (known,))
+    control, origin = jax.tree.map(lambda x: jnp.asarray(x, real_type()), (tuple(motion.control), motion.args[-1]))
+    return Start(_samples(motion), control, motion.goals, origin, (_packed(motion.y0),), (known,))
 
 
 def known_of(args: tuple) -> list:
