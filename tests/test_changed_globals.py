@@ -246,3 +246,21 @@ def test_a_method_replaced_on_a_class_that_was_made_by_type_counts():
     before = acceleration()
     type(made).loads = lambda self, motion: jj.Load(generalized={"x_rate": -4.0 * motion.q.x})
     assert [before, acceleration()] == pytest.approx([-1.0, -4.0])
+
+
+@pytest.mark.parametrize("transformed", [jax.grad, jax.jit])
+def test_a_method_that_reads_what_jax_is_tracing_is_refused_with_its_name(transformed):
+    def end(stiffness):
+        class Sprung(jj.Scene):
+            coordinates = jj.coordinates("x")
+
+            def bodies(self, t, q):
+                return {"mass": jj.Particle(1.0, jnp.stack([q.x, 0.0, 0.0]))}
+
+            def potential(self, pose):
+                return 0.5 * stiffness * pose.q.x**2
+
+        return jj.simulate(Sprung(), {"x": 1.0}, t1=0.1).q_end[0]
+
+    with pytest.raises(ValueError, match="`Sprung` reads `stiffness` that JAX is tracing"):
+        transformed(end)(2.0)

@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_scenes import BeadOnTurningWire
 
+import jourdain_jax as jj
 from jourdain_jax.calculus.guards import DifferentiationModeError, forward_only, reverse_only
 
 
@@ -33,6 +35,7 @@ FORWARD_USES = {
     "jit of jacfwd of jit": jax.jit(jax.jacfwd(jax.jit(reverse))),
     "jvp": lambda x: jax.jvp(reverse, (x,), (x,)),
     "jvp of jit": lambda x: jax.jvp(jax.jit(reverse), (x,), (x,)),
+    "vmap of jvp along one direction": lambda x: jax.vmap(lambda x: jax.jvp(reverse, (x,), (1.0,)))(jnp.full(2, x)),
 }
 SECOND_USES = {
     "hessian": jax.hessian(reverse),
@@ -46,6 +49,16 @@ SECOND_USES = {
 def test_forward_mode_through_a_reverse_only_adjoint_names_the_adjoint_to_use(use):
     with pytest.raises(DifferentiationModeError, match="ForwardMode"):
         FORWARD_USES[use](1.0)
+
+
+def test_forward_mode_along_a_time_names_the_adjoint_to_use():
+    with pytest.raises(DifferentiationModeError, match="ForwardMode"):
+        jax.jvp(lambda t1: jj.simulate(BeadOnTurningWire(), {"r": 0.5}, ts=[0.1], t1=t1).q_end, (0.2,), (1.0,))
+
+
+def test_reverse_mode_of_the_time_of_an_event_names_the_adjoint_to_use():
+    with pytest.raises(DifferentiationModeError, match="RecursiveCheckpointAdjoint"):
+        jax.grad(lambda lean: jj.simulate(jj.models.TiltingDisc(), {"lean": lean}, ts=[0.1], adjoint=diffrax.ForwardMode()).t_end)(0.3)
 
 
 @pytest.mark.parametrize("use", SECOND_USES)

@@ -1,5 +1,8 @@
 """Inputs that are functions of time, in machine code: motions and derivatives are those of closed forms and of XLA."""
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -8,7 +11,8 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.motion.trajectories import results
-from jourdain_jax.native import ffi
+from jourdain_jax.native import disk, ffi, host
+from jourdain_jax.native.ir import Writer
 
 pytestmark = pytest.mark.skipif(bool(ffi.reason_against()), reason="no machine code is made here")
 TS = np.array([0.3, 1.0, 1.7, 2.5])
@@ -123,3 +127,14 @@ def test_another_function_that_does_the_same_makes_no_other_machine_code():
     ends += [end(2.0), end(3.0)]
     assert ffi.registered.cache_info().misses == made
     np.testing.assert_allclose(ends[2] - ends[1], ends[1] - ends[0], rtol=1e-9)  # the motion is linear in the force
+
+
+def test_threads_that_make_the_same_machine_code_at_once_all_get_it(monkeypatch):
+    writer, both = Writer(1, fused=False), threading.Barrier(2)
+    ffi.write_handler(writer, 1, 1, lambda given, found: None)
+    make = host.object_code
+    monkeypatch.setattr(disk, "kept", lambda name, find: find())
+    monkeypatch.setattr(host, "object_code", lambda text, effort: (both.wait(20), make(text, effort))[1])
+    with ThreadPoolExecutor(2) as threads:
+        names = set(threads.map(ffi.registered, [f"{writer.text}; of this test alone"] * 2))
+    assert len(names) == 1

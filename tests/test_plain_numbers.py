@@ -159,3 +159,25 @@ def test_a_state_in_single_precision_moves_in_double(backend):
     motion = jj.simulate(scene, jj.consistent(scene, 0.0, q, u), **options)
     assert motion.q.dtype == jnp.float64
     assert bool(jnp.all(motion.q_end == jj.simulate(scene, {"x_rate": 1.0, "angle_rate": 2.0}, **options).q_end))
+
+
+@pytest.mark.parametrize(("precision", "backend"), [(jnp.float32, "xla"), (jnp.bfloat16, "auto")])
+def test_parameters_of_less_precision_move_and_are_differentiated_as_the_same_numbers_in_double_precision(precision, backend):
+    def end(rate):
+        return jj.simulate(BeadOnTurningWire(rate=rate), {"r": 0.5}, ts=[0.7], rtol=1e-11, atol=1e-11, work=False, backend=backend).q_end[0]
+
+    given = precision(1.3)
+    value, slope = jax.value_and_grad(end)(given)
+    assert float(value) == pytest.approx(0.5 * np.cosh(0.7 * float(given)), rel=1e-10)  # r'' = rate^2 r
+    assert slope.dtype == precision
+    assert float(slope) == pytest.approx(0.35 * np.sinh(0.7 * float(given)), rel=float(jnp.finfo(precision).eps))
+
+
+@pytest.mark.parametrize("precision", [jnp.float32, jnp.bfloat16])
+def test_a_function_of_time_that_closes_over_a_number_of_less_precision_acts_as_with_the_same_number_in_double_precision(precision):
+    def end(rate):
+        return jj.simulate(Slider(), {"x": 0.0}, ts=[1.0], inputs={"push": lambda t: rate * t}).q_end[0]
+
+    given = precision(1.3)
+    assert float(end(given)) == pytest.approx(float(given) / 24, rel=1e-6)  # 4 kg, pushed by `rate t`: x = rate t^3 / 24
+    assert float(jax.grad(end)(given)) == pytest.approx(1 / 24, rel=float(jnp.finfo(precision).eps) + 1e-6)

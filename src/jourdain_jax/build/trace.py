@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, Num, PyTree
 
 from jourdain_jax.build.explicit_power import explicit_power
 from jourdain_jax.build.plausibility import PoseNumbers, numbers_of
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, velocities_of
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import energies_at, impressed, potential_energy, resultants
@@ -32,6 +33,7 @@ from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import events_of, loads_of
+from jourdain_jax.scene.what_is_read import names_of_what_is_traced
 
 Entries: TypeAlias = Array | np.ndarray
 
@@ -159,7 +161,7 @@ def traced_scene(scene: Scene, of_inputs: tuple[int, ...] = ()) -> TracedScene:
 def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
     """A jaxpr of the scene's quantities as functions of its parameters (one input per leaf), t, q, u and inputs, and their shapes.
 
-    `of_inputs`: numbers of the loads whose potential depends on inputs.
+    `of_inputs`: numbers of the loads whose potential depends on inputs. ValueError where a method reads what JAX is tracing elsewhere.
     """
     leaves, treedef = jax.tree.flatten(scene)
     real = jnp.result_type(float)
@@ -171,7 +173,15 @@ def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
         motion = motion_at(scene, t, q, u, inputs)
         return velocity_quantities(scene, motion, of_inputs), particulars_of(scene, motion)
 
-    return jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
+    closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
+    if is_traced(closed.consts):
+        name = next(iter(names_of_what_is_traced(scene)), "name")
+        what = "a number" if name == "name" else f"`{name}`"
+        raise ValueError(
+            f"a method of `{type(scene).__name__}` reads {what} that JAX is tracing (jit, grad, vmap) and that is no field of it; "
+            f"make it one, `{name}: float = jj.parameter(unit=...)`, and pass it to the scene"
+        )
+    return closed, shape
 
 
 def _on_graph(scene: Scene, closed, shape, interpreted: Callable) -> TracedScene:

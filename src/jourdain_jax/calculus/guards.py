@@ -62,21 +62,23 @@ _first_order_only_p = _identity("jourdain_first_order_only")
 _forward_only_p = _identity("jourdain_forward_only")
 
 # The tangent in reverse-only programs: it can be transposed, but neither evaluated nor compiled. It exists only after differentiation, so that
-# a batching rule meets it only in programs that were pushed forward (jacfwd).
+# a batching rule meets it only in programs that were pushed forward (jacfwd, vmap of jvp). It is given the value, too: where that alone has lanes, what
+# follows would be batched first, and answer in JAX's words.
 _tangent_p = Primitive("jourdain_reverse_only_tangent")
 _tangent_p.def_impl(_raise_forward)
-_tangent_p.def_abstract_eval(lambda x: x)
+_tangent_p.def_abstract_eval(lambda tangent, value: tangent)
 mlir.register_lowering(_tangent_p, _raise_forward)
 batching.primitive_batchers[_tangent_p] = _raise_forward
-ad.deflinear2(_tangent_p, lambda cotangent, x: [cotangent])
+ad.primitive_jvps[_tangent_p] = _raise_forward
+ad.primitive_transposes[_tangent_p] = lambda cotangent, tangent, value: [cotangent, None]
 
-ad.primitive_jvps[_reverse_only_p] = lambda primals, tangents: (_first_order_only_p.bind(*primals), _push(tangents[0]))
+ad.primitive_jvps[_reverse_only_p] = lambda primals, tangents: (_first_order_only_p.bind(*primals), _push(tangents[0], *primals))
 ad.primitive_jvps[_first_order_only_p] = _raise_second
 ad.deflinear2(_forward_only_p, _raise_reverse)
 
 
-def _push(tangent):
-    return tangent if type(tangent) is ad.Zero else _tangent_p.bind(tangent)
+def _push(tangent, value):
+    return tangent if type(tangent) is ad.Zero else _tangent_p.bind(tangent, value)
 
 
 def _on_floats(f, tree):

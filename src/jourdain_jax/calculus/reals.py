@@ -78,6 +78,11 @@ def as_array(x, dtype):
     return (jnp if is_traced_type(type(x)) else np).asarray(x, dtype)
 
 
+def in_default_precision(tree):
+    """The tree with its floating-point arrays in the default type."""
+    return jax.tree.map(lambda x: x.astype(real_type()) if is_array_type(type(x)) and jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
+
+
 def _check(array, what: str, shape: tuple[int, ...] | None, advice: str) -> None:
     if array.dtype.kind not in "iuf" and not jnp.issubdtype(array.dtype, jnp.integer) and not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(f"{what} is of type {array.dtype}, expected real numbers; {advice}")

@@ -55,7 +55,8 @@ class TimeProgram:
 
     def __call__(self, numbers, held, t):
         """The value at time t; `numbers`: the plain ones; `held`: what the function closes over."""
-        return jaxpr_as_fun(self.closed)(*numbers, *held, jnp.asarray(t, self.closed.in_avals[-1].dtype))[0]
+        given = zip((*numbers, *held, t), self.closed.in_avals, strict=True)
+        return jaxpr_as_fun(self.closed)(*(jnp.asarray(x, like.dtype) for x, like in given))[0]
 
     def __hash__(self):
         return self._hash

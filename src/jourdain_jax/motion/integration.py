@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool
 
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.build.row_program import row_program
+from jourdain_jax.calculus.reals import in_default_precision
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.arguments import times_fit
 from jourdain_jax.motion.energy_check import conserves, energies_near, energy_lost
@@ -41,7 +42,7 @@ def integrate(setup: Setup) -> Trajectory | None:
 
 def _one_motion(setup: Setup) -> tuple[Trajectory, Bool[Array, ""]]:
     """The motion, and whether its start came onto the rows."""
-    setup, arrived = _with_machine_code(setup), jnp.array(True)
+    setup, arrived = _with_machine_code(_prepared(setup)), jnp.array(True)
     if not isinstance(setup.start, State):
         found = moved_onto_rows(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0))
         setup, arrived = setup._replace(start=found.state), found.arrived
@@ -61,6 +62,12 @@ def _compiler_options(setup: Setup) -> dict | None:
 _compiled = for_programs(_one_motion, partial(quickly_compiled, options=_compiler_options))
 
 
+def _prepared(setup: Setup) -> Setup:
+    """The setup with all numbers in the default precision (derivatives keep the type of what is differentiated), marked by the mode of differentiation."""
+    numbers = in_default_precision({name: getattr(setup, name) for name in ("scene", "start", "inputs", "t0", "t1", "ts")})
+    return setup._replace(**marked_inputs(setup.integrator.mode, numbers))
+
+
 def _with_machine_code(setup: Setup) -> Setup:
     """The setup, where machine code integrates it also with machine code for what is seen of it, if that can be made."""
     field = setup.field
@@ -71,7 +78,7 @@ def _with_machine_code(setup: Setup) -> Setup:
 
 def integrate_lanes(setups: Setup) -> Trajectory:
     """The motions of all lanes: `lockstep.width` lanes at a time where the rates are a scalar program, otherwise under `vmap`."""
-    setups = _with_machine_code(setups)
+    setups = _with_machine_code(_prepared(setups))
     begun, fitting = eqx.filter_vmap(_begin)(setups), eqx.filter_vmap(Setup.fitting)(setups)
     solved = setups.integrator.lanes_solved(fitting, begun)
     return eqx.filter_vmap(_finish)(setups, fitting, begun, solved)
@@ -80,9 +87,8 @@ def integrate_lanes(setups: Setup) -> Trajectory:
 def _begin(setup: Setup) -> Begun:
     timely = times_fit(setup.ts, setup.t0, setup.t1)
     right, start = _without_faults(setup)
-    scene, start, inputs = marked_inputs(setup.integrator.mode, (setup.scene, start, setup.inputs))
-    field = setup.field
-    args = field, scene, inputs, field.fixed(scene), time_origin(setup.integrator.controller, setup.t0)
+    field, scene = setup.field, setup.scene
+    args = field, scene, setup.inputs, field.fixed(scene), time_origin(setup.integrator.controller, setup.t0)
     return Begun(right, timely, start, args, field.pack(start.q, start.u))
 
 
@@ -90,7 +96,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     t0, field, integrator = setup.t0, setup.field, setup.integrator
     start, args = begun.start, begun.args
     _, scene, inputs, fixed, origin = args
-    solved = eqx.tree_at(lambda s: (s.ys, s.y_end), solved, marked_outputs(integrator.mode, (solved.ys, solved.y_end)))
+    solved = eqx.tree_at(lambda s: (s.ys, s.y_end, s.t_end), solved, marked_outputs(integrator.mode, (solved.ys, solved.y_end, solved.t_end)))
     moving = field.projects
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
     direction = jnp.sign(setup.t1 - t0)

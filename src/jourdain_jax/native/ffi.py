@@ -11,6 +11,7 @@ import functools
 import hashlib
 import math
 import re
+import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -31,6 +32,9 @@ _TYPE, _DATA, _RANK, _DIMS = 2, 3, 4, 5  # of a buffer
 _SINGLE = 11  # the type of arrays in single precision
 _KIND, _METADATA = 1, 3  # of an extension
 _MAJOR = 3  # of metadata, with the minor version after it
+
+_REGISTERED: set[str] = set()  # names of handlers
+_REGISTERING = threading.Lock()
 
 
 @functools.cache
@@ -179,5 +183,8 @@ def registered(text: str, effort: int = 2) -> str:
     capsule = ctypes.pythonapi.PyCapsule_New
     capsule.restype, capsule.argtypes = ctypes.py_object, (ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
     code = disk.kept(name, lambda: host.object_code(text, effort))
-    jax.ffi.register_ffi_target(name, capsule(host.address(code, HANDLER), b"xla._CUSTOM_CALL_TARGET", None), platform="cpu")
+    with _REGISTERING:
+        if name not in _REGISTERED:  # by another thread meanwhile
+            jax.ffi.register_ffi_target(name, capsule(host.address(code, HANDLER), b"xla._CUSTOM_CALL_TARGET", None), platform="cpu")
+            _REGISTERED.add(name)
     return name

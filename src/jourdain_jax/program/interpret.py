@@ -254,16 +254,22 @@ def _same(graph, inputs, params, out):
 
 def _is_rounded(dtype: np.dtype) -> bool:
     """Whether numbers of a type have fewer digits than those of the program."""
-    return dtype.kind == "f" and dtype.itemsize < jnp.result_type(float).itemsize
+    return _kind(dtype) == "f" and dtype.itemsize < jnp.result_type(float).itemsize
+
+
+def _kind(dtype: np.dtype) -> str:
+    """As of NumPy, which does not know bfloat16 and its like for floating-point numbers."""
+    return "f" if jnp.issubdtype(dtype, jnp.floating) else dtype.kind
 
 
 def _converted(graph: Graph, ids: np.ndarray, old: np.dtype, new: np.dtype) -> Nodes:
     """Nodes of another type: what holds or not is 1 or 0 as a number, a number holds where it is not zero."""
-    if old.kind == "f" and old.itemsize > new.itemsize and _is_rounded(new):
+    kinds = _kind(old), _kind(new)
+    if kinds == ("f", "f") and jnp.finfo(new).eps > jnp.finfo(old).eps and _is_rounded(new):
         raise Unsupported(f"a number in {new}")
-    if old.kind == new.kind or (old.kind, new.kind) == ("i", "f"):
+    if kinds[0] == kinds[1] or kinds == ("i", "f"):
         return Nodes(ids)
-    if new.kind not in "fb":
+    if kinds[1] not in ("f", "b"):
         raise Unsupported("an integer that depends on the state")
     one = (lambda n: graph.call("select", n, graph.zero, graph.one)) if old.kind == "b" else (lambda n: graph.call("ne", n, graph.zero))
     return Nodes(np.array([one(n) for n in ids.ravel().tolist()], np.int64).reshape(ids.shape))

@@ -22,6 +22,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jourdain_jax.calculus.reals import is_traced
+
 DEEPEST = 6  # functions that call functions, objects within objects
 FEW = 2048  # entries of an array that are compared one by one; of a larger one as many, and the sum of all
 _PACKAGE = __name__.partition(".")[0]
@@ -55,6 +57,21 @@ def is_read_by(*roots) -> WhatIsRead:
 @functools.lru_cache(maxsize=1024)
 def _watch(roots: tuple) -> "_Watch":
     return _Watch(roots)
+
+
+def names_of_what_is_traced(tree) -> list[str]:
+    """Names by which the functions and classes of a tree read what JAX is tracing."""
+    found = _Reader()
+    for read in jax.tree.leaves(tree, is_leaf=lambda x: isinstance(x, WhatIsRead)):
+        for root in read.now()[0].roots if isinstance(read, WhatIsRead) else ():
+            found.key(root)
+    named = {(name, id(x)): x for f, *_ in found.functions for name, x in _named_in(f)}
+    return sorted({name for (name, _), x in named.items() if is_traced(x)})
+
+
+def _named_in(f: FunctionType) -> Iterable[tuple[str, Any]]:
+    yield from zip(f.__code__.co_freevars, map(_content_of, f.__closure__ or ()), strict=True)
+    yield from ((name, f.__globals__.get(name)) for name in _read_in(f.__code__).globals)
 
 
 def is_function(x) -> bool:
