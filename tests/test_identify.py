@@ -355,6 +355,22 @@ def test_sigmas_that_are_too_large_are_warned_of_by_channel():
     assert "the residuals are smaller than the sigmas foretell" in warning
 
 
+def test_an_event_before_the_last_sample_is_named():
+    class Stopped(Cart):
+        def events(self, motion):
+            return {"buffer": motion.q.x - 0.05}
+
+    x, _ = cart_motion(TS, 0.3, 0.0, 0.0)
+    run = cart_run(push=0.0, values={"x": x}, sigma=1e-3)
+    met = TS[np.argmax(x < 0.05)]  # s: the first sample after it
+    (warning,) = (w for w in fit(Stopped(mass=1.9), run, ("mass",)).warnings if "event" in w)
+    assert "the motion of run 0 meets its event `buffer` at" in warning
+    assert met - 0.2 < float(warning.partition(" at ")[2].partition(" s")[0]) < met
+    assert f"{np.sum(met <= TS)} samples come later" in warning
+    cut = cart_run(push=0.0, values={"x": np.where(met <= TS, np.nan, x)}, sigma=1e-3)
+    assert not any("event" in w for w in fit(Stopped(mass=1.9), cut, ("mass",)).warnings)
+
+
 def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():
     ends, begins = ({"push": jj.Sampled(ts, [0.0, 1.0, 1.0])} for ts in ([-1.0, 0.0, 1.0], [1.5, 2.5, 10.0]))
     with pytest.warns(UserWarning, match="`push` of run 1 is not sampled over all of the run and keeps its last value from 1 to 4 s") as seen:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
+from in_mpmath import in_mpmath
 
 import jourdain_jax as jj
 from jourdain_jax.build.structure import structure_of
@@ -99,19 +100,21 @@ def test_numbers_below_the_normal_ones_count_as_zero_or_as_what_they_are():
             assert (right[0] | right[1]).all(), (op, points[~(right[0] | right[1])], ours, of_zero, true)
 
 
-@pytest.mark.parametrize("op", ["sin", "cos", "exp", "log", "tan", "logistic"])
-def test_functions_of_our_own_are_right_to_a_unit_of_round_off(op):
-    graph = Graph()
-    x = graph.input("x", True)
-    random = np.random.default_rng(1)
-    values = {"exp": random.uniform(-700, 700, 300), "log": 10.0 ** random.uniform(-300, 300, 300), "logistic": random.uniform(-30, 30, 300)}
-    points = np.concatenate([values.get(op, random.normal(size=300) * 10.0 ** random.integers(-6, 20, size=300)), [1.0, 1 + 1e-9, 0.5]])
-    found = np.asarray(evaluated_natively.function(graph, [graph.call(op, x)], [x])(points[:, None]))[:, 0]
-    function = (lambda x: 1 / (1 + mpmath.exp(-x))) if op == "logistic" else getattr(mpmath, op)
+@pytest.mark.parametrize("op", ["sin", "cos", "exp", "log", "tan", "pow", "logistic"])
+def test_functions_of_our_own_are_right_to_the_last_digit(op):
+    graph, random = Graph(), np.random.default_rng(1)
+    x, y = graph.input("x", True), graph.input("y", True)
+    spread = random.normal(size=600) * 10.0 ** random.integers(-6, 20, size=600)
+    angles = np.concatenate([spread, random.uniform(-10, 10, 600), random.uniform(-5e5, 5e5, 600), np.arange(1, 200) * (np.pi / 2)])
+    values = {"exp": random.uniform(-700, 700, 600), "log": 10.0 ** random.uniform(-300, 300, 600), "logistic": random.uniform(-30, 30, 600)}
+    points = np.concatenate([values.get(op, np.abs(spread) if op == "pow" else angles), [1.0, 1 + 1e-9, 0.5]])
+    exponents = random.uniform(-10, 10, len(points))
+    node, more = (graph.call(op, x, y), [exponents]) if op == "pow" else (graph.call(op, x), [])
+    found = np.asarray(evaluated_natively.function(graph, [node], [x, y])(np.stack([points, exponents], axis=1)))[:, 0]
     with mpmath.workdps(60):
-        exact = [function(mpmath.mpf(float(x))) for x in points]
-        errors = [float(abs((mpmath.mpf(float(y)) - e) / (e or 1))) for e, y in zip(exact, found, strict=True)]
-    assert max(errors) < {"tan": 3, "logistic": 3}.get(op, 1.1) * 2.0**-52
+        exact = [in_mpmath(op)(*(mpmath.mpf(float(x)) for x in arguments)) for arguments in zip(points, *more, strict=True)]
+        errors = [float(abs(mpmath.mpf(float(y)) - e)) / np.spacing(abs(float(e))) for e, y in zip(exact, found, strict=True)]
+    assert max(errors) < (3 if op == "logistic" else 1)  # ulp
 
 
 @pytest.mark.parametrize("name", sorted(jj.models.MODELS))
@@ -124,9 +127,8 @@ def test_rates_are_those_of_xla_and_of_dense_matrices_at_random_states(name):
     given = jnp.concatenate([*fixed, t[:, None], q, u[:, np.array(program.independent, int)], inputs], axis=1)
     outputs = [*program.qdot, *program.ydot]
     found = np.asarray(evaluated_natively.function(program.graph, outputs, program.variables)(given))
-    by_xla = emit.run(
-        program.graph, outputs, dict(zip(program.variables, given.T, strict=True))
-    )  # one operation after the other: nothing takes long to compile
+    # by XLA one operation after the other: nothing takes long to compile
+    by_xla = emit.run(program.graph, outputs, dict(zip(program.variables, given.T, strict=True)))
     parameters = jax.tree.map(lambda x: np.broadcast_to(np.asarray(x, float), (1000, *np.shape(x))), scene)
     dense = dense_rates(scene, structure_of(scene), program.independent, parameters, *map(np.asarray, (t, q, u)), inputs)
     ways = {"XLA": np.stack([np.broadcast_to(np.asarray(x), 1000) for x in by_xla], axis=1), "dense": np.concatenate([dense.qdot, dense.ydot], axis=1)}

@@ -88,7 +88,8 @@ def fit(
       unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` says how many led to it.
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with
       starts of their own, and continuity between them is an equation. What is minimised stays the same.
-    - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events are ignored.
+    - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events are ignored, and `Fit.warnings` names
+      those that come before a sample.
 
     Where that finds no minimum, or one whose residuals are far beyond their sigmas, the fit is made once more over growing spans (unless `shooting` is
     given): the first 1/32 of each run, then more of it, as far as the motion that was found follows the data, with the first guess as a weak prior (known to
@@ -170,7 +171,7 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
     if pieces is not None:
         if not members:
             pieces.keep(int(np.argmin(found.at.cost)))
-        control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.theta))))
+        control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.at.theta))))
         asked = replace(asked, control=control)
     found, at_bounds = _off_bounds(problem, _with_memory(problem, found if members else found.lowest(), limits, control), limits, control, pieces)
     if pieces is not None:
@@ -322,7 +323,7 @@ def _result(
         trace=found.trace[0] if single else (),
         asked=asked,
         layout=unknowns.layout,
-        work_out=partial(statistics, problem, found, limits, control, errors, at_bounds),
+        work_out=partial(statistics, problem, found, limits, asked, errors, at_bounds),
     )
     if problem.with_memory:  # its motions are needed, in the context that is here
         told.statistics  # noqa: B018

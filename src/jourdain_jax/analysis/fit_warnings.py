@@ -28,6 +28,7 @@ def warnings_of(fit) -> tuple[str, ...]:
         names = ", ".join(f"`{name}`" for name, far in zip(fit.labels, fit.beyond, strict=True) if far > FAR_BEYOND)
         found.append(f"{names} lies at a bound, which decides its value; all standard errors lose their meaning: widen the bounds")
     found += fit.impossible
+    found += fit.statistics.events_met
     found += fit.statistics.held_inputs
     found += fit.statistics.too_narrow
     found += _counted_twice(fit)

@@ -23,6 +23,7 @@ from jourdain_jax.analysis.joined import JoinedArrow
 from jourdain_jax.analysis.pace import BEGIN, LEAST, MOST, NUMBERS, SLOW, SURELY, Pace, after_trial, shrinkage
 
 LEAST_COLUMN = 1e-8  # of the longest column of J, both times the sizes of their unknowns: what counts as zero
+SHRINKS = 0.1  # by what factor an unknown whose bound is above zero may shrink in one step: with far smaller masses and lengths, motions take long
 RELEASES = 8  # times that unknowns which would pass a bound are put there and the others solved for again
 
 
@@ -296,18 +297,18 @@ def column_scaling(arrow: Arrow | JoinedArrow, size: Float[np.ndarray, "members 
 
 def damped_step(arrow: Arrow | JoinedArrow, theta, D, damping, limits: Limits, cutoff: float) -> np.ndarray:
     """The damped step within the bounds."""
-    g = arrow.gradient
+    g, low = arrow.gradient, np.where(limits.low > 0, np.maximum(limits.low, SHRINKS * theta), limits.low)
     held = limits.fixed | ((theta <= limits.low) & (g >= 0)) | ((theta >= limits.high) & (g <= 0))
     moved = np.zeros(theta.shape)
     for _ in range(RELEASES):
         d = arrow.step(damping, D, held, moved, cutoff)
         ended = theta + d
-        within = np.minimum(np.maximum(ended, limits.low), limits.high)
+        within = np.minimum(np.maximum(ended, low), limits.high)
         over = (within != ended) & ~held
         if not over.any():
             return d
         held, moved = held | over, np.where(over, within - theta, moved)
-    return np.clip(theta + d, limits.low, limits.high) - theta
+    return np.clip(theta + d, low, limits.high) - theta
 
 
 def _is_small(change, size, d, control: Control) -> Bool[np.ndarray, "members"]:

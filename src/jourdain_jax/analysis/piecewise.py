@@ -67,6 +67,29 @@ class PieceLanes:
             yield b, j, rows
 
 
+@dataclass
+class _Standing:
+    """Where the pieces of all members are, and what was found there; all with an axis of members in front."""
+
+    local: Float[np.ndarray, "members pieces states_and_own"]  # unknowns of each piece, with its node
+    theta: Float[np.ndarray, "members places"]  # those of the whole runs
+    rows: np.ndarray  # (members, pieces) of [J r]
+    slopes: Float[np.ndarray, "members pieces states_and_own unknowns"]  # L
+    gaps: Float[np.ndarray, "members pieces states_and_own"]  # g
+    jumps: Float[np.ndarray, "members pieces states"]  # from the piece before
+
+    @staticmethod
+    def of(local: np.ndarray, theta: np.ndarray, unknowns: int, states: int) -> "_Standing":
+        """Before anything was found. `unknowns`: of a run and shared; `states`: of a node."""
+        members, pieces, width = local.shape
+        jumps = np.full((members, pieces, states), np.inf)
+        return _Standing(local, theta, np.empty((members, pieces), object), np.zeros((members, pieces, width, unknowns)), np.zeros(local.shape), jumps)
+
+    def only(self, members) -> "_Standing":
+        """A copy of that of some members."""
+        return _Standing(*(part[list(members)] for part in vars(self).values()))
+
+
 class Piecewise:
     """Lanes of whole runs that are worked out in pieces; what `Lanes` offers, and the same with nodes as unknowns."""
 
@@ -104,7 +127,7 @@ class Piecewise:
         self._places = [self._places_of(i) for i in range(len(self.parts))]
         self.node_sizes = np.ones(self.states)
         self.tolerance = float(simulation.get("rtol", TOLERANCE)), float(simulation.get("atol", TOLERANCE))
-        self.local, self.theta = np.zeros((0, len(self.parts), m + self.states)), np.zeros((0, p + len(runs) * m))  # where the pieces are, by member
+        self.at = _Standing.of(np.zeros((0, len(self.parts), m + self.states)), np.zeros((0, p + len(runs) * m)), m + p, self.states)
         self.closing, self.share = True, np.ones(0)  # whether pieces are joined at each evaluation; else what share of their gaps goes, by member
 
     # With nodes as unknowns. ----------------------------------------------------------------------------------------
@@ -174,13 +197,9 @@ class Piecewise:
     def put(self, theta: Float[np.ndarray, "members all_places"]) -> Float[np.ndarray, "members places"]:
         """Puts the pieces of all members where they are here; the unknowns of the whole runs."""
         shared, local = theta[:, : self.shared], theta[:, self.shared :].reshape(len(theta), len(self.parts), -1)
-        self.local = local.copy()
-        self.theta = np.concatenate([shared, local[:, ~self.follows, : self.own].reshape(len(theta), -1)], axis=1)
-        count, pieces, M = local.shape
-        self._rows = np.empty((count, pieces), object)
-        self._slopes, self._gaps = np.zeros((count, pieces, M, self.own + self.shared)), np.zeros((count, pieces, M))
-        self.jumps, self.share = np.full((count, pieces, self.states), np.inf), np.ones(count)
-        return self.theta.copy()
+        own = local[:, ~self.follows, : self.own].reshape(len(theta), -1)
+        self.at, self.share = _Standing.of(local.copy(), np.concatenate([shared, own], axis=1), self.own + self.shared, self.states), np.ones(len(theta))
+        return self.at.theta.copy()
 
     def put_nodes(self, theta: Float[np.ndarray, "members places"], found: Shot) -> None:
         """Puts the pieces where another fit of the same runs ended."""
@@ -192,9 +211,9 @@ class Piecewise:
 
     def told(self) -> Shot:
         """How the pieces join where they are."""
-        single, members = self.members is None, np.arange(len(self.local))
+        single, members = self.members is None, np.arange(len(self.at.local))
         one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
-        nodes = self.local[..., self.own :]
+        nodes = self.at.local[..., self.own :]
         return Shot(
             pieces=tuple(np.bincount(self.run_of).tolist()),
             continuity=one(self.continuity(members)),
@@ -204,8 +223,7 @@ class Piecewise:
 
     def keep(self, member: int) -> None:
         """Of all members, this one only."""
-        for name in ("local", "theta", "_rows", "_slopes", "_gaps", "jumps", "share"):
-            setattr(self, name, getattr(self, name)[[member]])
+        self.at, self.share = self.at.only([member]), self.share[[member]]
 
     def evaluate(self, shared, local, members):
         """As of `Lanes`; pieces move along with the unknowns, to first order. Unless `closing`, rows are [J g r]: r will have changed by g once pieces join."""
@@ -214,7 +232,7 @@ class Piecewise:
         for _ in range(_CLOSINGS if self.closing else 1):
             some = here[~failed]
             if self.closing:
-                some = some[~((theta[some] == self.theta[members[some]]).all(axis=1) & self.closed(members[some]))]
+                some = some[~((theta[some] == self.at.theta[members[some]]).all(axis=1) & self.closed(members[some]))]
             if not some.size:
                 break
             failed[some] = ~self._move(theta[some], members[some])
@@ -226,11 +244,11 @@ class Piecewise:
         """By how much a step with its gaps closed changes all residuals, |J ds_i + S dtheta|, in units of sigma."""
         d_shared, d_own = self.unknowns.split(d)
         whole = np.concatenate([d_own[:, self.run_of], np.broadcast_to(d_shared[:, None], (len(d), len(self.parts), self.shared))], axis=2)
-        ds = (self._slopes[members] @ whole[..., None])[..., 0] + self._gaps[members]
+        ds = (self.at.slopes[members] @ whole[..., None])[..., 0] + self.at.gaps[members]
         squares = np.zeros(len(d))
         for b, member in enumerate(members.tolist()):
             for i in range(len(self.parts)):
-                rows = self._rows[member, i]
+                rows = self.at.rows[member, i]
                 moved = rows[:, :-1] @ np.concatenate([ds[b, i], d_shared[b]])
                 for name, where in self.lanes.channels(i).items():
                     by = sigma[b, problem.estimated.index(name)] if name in problem.estimated else 1.0
@@ -239,19 +257,18 @@ class Piecewise:
 
     def growth(self, members: np.ndarray) -> Float[np.ndarray, "members"]:
         """By what factor small changes of the unknowns grow from the first node to where they are largest, in sizes of states and unknowns."""
-        shared, own = self.unknowns.split(self.unknowns.sizes(self.theta[members]))
+        shared, own = self.unknowns.split(self.unknowns.sizes(self.at.theta[members]))
         sizes = np.concatenate([own[:, self.run_of], np.broadcast_to(shared[:, None], (len(shared), len(self.parts), self.shared))], axis=2)
-        slopes = self._slopes[members][:, :, self.own :] * sizes[:, :, None] / self.node_sizes[:, None]
+        slopes = self.at.slopes[members][:, :, self.own :] * sizes[:, :, None] / self.node_sizes[:, None]
         lengths = np.sqrt(np.sum(slopes**2, axis=(2, 3)))[:, self.follows]
         return np.maximum(np.max(lengths, axis=1) / np.maximum(np.min(lengths, axis=1), np.finfo(float).tiny), 1.0)
 
     @contextmanager
     def unmoved(self) -> Iterator[None]:
         """A context in which unknowns may be tried anywhere: after it, the pieces are as they were before."""
-        names = ("local", "theta", "jumps", "_slopes", "_gaps", "_rows")
-        kept = {name: getattr(self, name).copy() for name in names}
+        kept = self.at.only(range(len(self.at.theta)))  # a copy
         yield
-        vars(self).update(kept)
+        self.at = kept
 
     def closed(self, members: np.ndarray) -> Bool[np.ndarray, "members"]:
         """Whether the pieces join, to the tolerance of the simulation."""
@@ -260,16 +277,16 @@ class Piecewise:
     def continuity(self, members: np.ndarray) -> Float[np.ndarray, "members"]:
         """The largest jump from one piece to the next, in tolerances of the simulation, `atol + rtol |x|`."""
         rtol, atol = self.tolerance
-        allowed = atol + rtol * np.maximum(np.abs(self.local[members][..., self.own :]), self.node_sizes)
-        return np.max(np.abs(self.jumps[members]) / allowed, axis=(1, 2), initial=0.0)
+        allowed = atol + rtol * np.maximum(np.abs(self.at.local[members][..., self.own :]), self.node_sizes)
+        return np.max(np.abs(self.at.jumps[members]) / allowed, axis=(1, 2), initial=0.0)
 
     def _move(self, theta: np.ndarray, members: np.ndarray) -> Bool[np.ndarray, "members"]:
         """Pieces of some members to other unknowns; which of them do not fail there. The others stay."""
         p, m, M = self.shared, self.own, self.own + self.states
         shared, own = self.unknowns.split(theta)
-        d_shared, d_own = self.unknowns.split(theta - self.theta[members])
+        d_shared, d_own = self.unknowns.split(theta - self.at.theta[members])
         d = np.concatenate([d_own[:, self.run_of], np.broadcast_to(d_shared[:, None], (len(theta), len(self.parts), p))], axis=2)
-        local = self.local[members] + (self._slopes[members] @ d[..., None])[..., 0] + self.share[members][:, None, None] * self._gaps[members]
+        local = self.at.local[members] + (self.at.slopes[members] @ d[..., None])[..., 0] + self.share[members][:, None, None] * self.at.gaps[members]
         local[:, ~self.follows, :m] = own
         for _ in self.lanes.evaluate(shared, local, members):
             pass
@@ -292,8 +309,8 @@ class Piecewise:
         for b in np.flatnonzero(good):
             good[b] = all(np.isfinite(rows.sum()) for rows in rows_of[b])
         here = members[good]
-        self.local[here], self.theta[here], self._slopes[here], self._gaps[here] = local[good], theta[good], slopes[good], gaps[good]
-        self.jumps[here], self._rows[here] = jumps[good], rows_of[good]
+        self.at.local[here], self.at.theta[here], self.at.slopes[here], self.at.gaps[here] = local[good], theta[good], slopes[good], gaps[good]
+        self.at.jumps[here], self.at.rows[here] = jumps[good], rows_of[good]
         return good
 
     def _condensed(self, run: int, members: np.ndarray, failed: np.ndarray) -> Float[np.ndarray, "members samples width"]:
@@ -306,10 +323,10 @@ class Piecewise:
                 if failed[b]:
                     found[b] = np.nan
                     continue
-                rows = self._rows[member, i][of_piece]
-                J = rows[:, :M] @ self._slopes[member, i]
+                rows = self.at.rows[member, i][of_piece]
+                J = rows[:, :M] @ self.at.slopes[member, i]
                 J[:, m:] += rows[:, M:-1]
-                found[b, of_run] = np.concatenate([J, (rows[:, :M] @ self._gaps[member, i])[:, None], rows[:, -1:]], axis=1)
+                found[b, of_run] = np.concatenate([J, (rows[:, :M] @ self.at.gaps[member, i])[:, None], rows[:, -1:]], axis=1)
         return found
 
     def _places_of(self, piece: int) -> tuple[np.ndarray, np.ndarray]:

@@ -33,6 +33,7 @@ from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.motion.forward_mode import simulate_alongside
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.quick_compilation import quickly_compiled, sparingly_compiled
+from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
 
 TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
@@ -56,13 +57,17 @@ class Run(NamedTuple):
     drives: dict[str, Drive]
     correlation_time: dict[str, Float[Array | np.ndarray, ""]]  # s, of channels whose noise has a memory
 
-    def residuals(self, scene: Scene, simulate: Callable, simulation: dict) -> dict[str, Float[Array | np.ndarray, "..."]]:
-        """`(reading - value) / sigma` by channel; of a piece of a run also what it ends at."""
+    def motion(self, scene: Scene, simulate: Callable, ts, **simulation) -> Trajectory:
+        """The motion at these times."""
         inputs = self.inputs
         for drive in self.drives.values():
             inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
+        return simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, work=False, **simulation)
+
+    def residuals(self, scene: Scene, simulate: Callable, simulation: dict) -> dict[str, Float[Array | np.ndarray, "..."]]:
+        """`(reading - value) / sigma` by channel; of a piece of a run also what it ends at."""
         ts = self.ts if self.grid is None else self.grid
-        motion = simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, events=False, work=False, **simulation)
+        motion = self.motion(scene, simulate, ts, events=False, **simulation)
         states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
         found, filters, place = {}, [], len(scene.coordinate_names) + len(scene.speed_names)
         for name, weight in self.weights.items():

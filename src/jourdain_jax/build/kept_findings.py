@@ -18,7 +18,7 @@ from jax.extend.core import Literal, Primitive
 from jourdain_jax.build.domain import coordinate_bounds, speed_bounds
 from jourdain_jax.build.sampling import seen_of
 from jourdain_jax.build.trace import jaxpr_of_scene
-from jourdain_jax.calculus.reals import real_type
+from jourdain_jax.calculus.reals import is_array, real_type
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.native import disk
 from jourdain_jax.program.interpret import inner_jaxpr, own_rule
@@ -30,7 +30,6 @@ _READ = ("calculus", "eager", "program", "scene", "equations", "build", "dynamic
 
 
 _SEVERAL = tuple, list  # kept as tuples: a union of types is made anew wherever it stands
-_ARRAYS = np.ndarray, np.generic, jax.Array
 _PLAIN = bool, int, float, str, bytes, np.dtype, enum.Enum, type(None)
 
 
@@ -100,7 +99,7 @@ def _parts(x) -> Iterable[bytes]:
         yield f"{len(x)} of {type(x).__name__}: ".encode()
         for y in x:
             yield from _parts(y)
-    elif isinstance(x, _ARRAYS):
+    elif is_array(x):
         x = np.asarray(x)
         if x.dtype.hasobject:
             raise _Nameless

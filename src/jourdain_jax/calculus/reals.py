@@ -20,6 +20,11 @@ def real_type() -> np.dtype:
     return dtypes.canonicalize_dtype(float)  # at a fortieth of the time of `jnp.result_type(float)`
 
 
+def is_array(x) -> bool:
+    """Whether x is an array, of a kind of its own too, as constants are in programs that jax 0.8 traces."""
+    return hasattr(x, "__array__") and not isinstance(x, type)
+
+
 def as_real(x) -> Float[Array, "*shape"]:
     """`x` as a floating-point array: integers become the default float, floats keep their type; never weakly typed, so that one trace serves all.
 

@@ -1,7 +1,8 @@
 """Functions of vectors of doubles: polynomials where these are short, otherwise libm for each lane.
 
-Sine and cosine are those of `program/emit.py` (pi/2 in three parts, minimax polynomials; error below 1 ulp while the multiple of pi/2 has 20 bits);
-lanes beyond go through libm. Exponential and logarithm are those of FreeBSD's libm, whose errors are below 1 ulp.
+Sine and cosine have the numbers of `program/emit.py` (pi/2 in three parts, minimax polynomials), and here the angle that is left a second part, by which
+it is short: errors are below 1 ulp while the multiple of pi/2 has 20 bits. Lanes beyond go through libm. Exponential and logarithm are those of FreeBSD's
+libm, whose errors are below 1 ulp.
 """
 
 import math
@@ -10,6 +11,7 @@ from collections.abc import Callable, Sequence
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.program.emit import COSINE, HALF_PI, SINE
 
+WHOLE = 1.5 * 2.0**52  # a number to which this is added is rounded to a whole one, whose last bits are the last of the sum
 LARGEST_ANGLE = 5e5  # rad; multiples of pi/2 below 2^20 times a part of 33 bits are exact
 _EXP = (4.13813679705723846039e-08, -1.65339022054652515390e-06, 6.61375632143793436117e-05, -2.77777777770155933842e-03, 1.66666666666666019037e-01)
 _LOG = (
@@ -42,17 +44,25 @@ def sine_and_cosine(w: Writer, x: Value) -> tuple[Value, Value]:
 
 
 def _quick_waves(w: Writer, x: Value) -> tuple[Value, Value]:
-    turns = w.intrinsic("roundeven", x * (2 / math.pi))
-    r = x
-    for part in HALF_PI:
-        r = w.fma(-turns, part, r)
+    shifted = w.fma(x, 2 / math.pi, WHOLE)
+    turns, quadrant = shifted - WHOLE, w.converted("bitcast", shifted, w.whole)
+    near = w.fma(-turns, HALF_PI[0], x)  # exact
+    r = w.fma(-turns, HALF_PI[1], near)
+    rest = w.fma(-turns, HALF_PI[2], w.fma(-turns, HALF_PI[1], near - r))  # by which r is short
     square = r * r
-    sine = w.fma(r, square * polynomial(w, SINE, square), r)
-    cosine = w.fma(square, w.fma(square, polynomial(w, COSINE, square), -0.5), 1.0)
-    quadrant = w.converted("fptosi", w.where(w.magnitude(turns) < 2.0**31, turns, 0.0), w.whole)
+    half = 0.5 * square
+    most = 1.0 - half
+    sine = r + w.fma(r, square * polynomial(w, SINE, square), rest * most)
+    cosine = most + (((1.0 - most) - half) + w.fma(square * square, polynomial(w, COSINE, square), -(sine * rest)))
     odd = (quadrant & 1).differs(0)
     s, c = w.where(odd, cosine, sine), w.where(odd, sine, cosine)
-    return w.where((quadrant & 2).differs(0), -s, s), w.where(((quadrant + 1) & 2).differs(0), -c, c)
+    return _turned(w, s, quadrant), _turned(w, c, quadrant + 1)
+
+
+def _turned(w: Writer, x: Value, quadrant: Value) -> Value:
+    """x, with the other sign in the third and fourth quadrant, which have the numbers 2 and 3."""
+    sign = w.bitwise("shl", quadrant & 2, 62)
+    return w.converted("bitcast", w.bitwise("xor", w.converted("bitcast", x, w.whole), sign), w.real)
 
 
 def _by_libm_where(w: Writer, far: Value, x: Value, quick: Sequence[Value], names: Sequence[str]) -> list[Value]:

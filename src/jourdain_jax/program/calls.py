@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal, jaxpr_as_fun
 
+from jourdain_jax.calculus.reals import is_array
 from jourdain_jax.eager.numpy_backend import uncompiled
 from jourdain_jax.program.graph import Unsupported
 
@@ -167,7 +168,7 @@ def description(x) -> Hashable:
         return tuple((key, description(value)) for key, value in sorted(x.items()))
     if isinstance(x, tuple | list):
         return tuple(map(description, x))
-    if isinstance(x, np.ndarray | np.generic | jax.Array | float):
+    if is_array(x) or isinstance(x, float):
         return str(np.asarray(x).dtype), np.shape(x), np.asarray(x).tobytes()
     try:
         hash(x)
