@@ -211,6 +211,28 @@ def gradients(quick: bool) -> Iterator[Figure]:
             yield figure(f"gradient by 8 numbers / one solve, {where}", name, best / timed["solve"], AT_MOST[name], 3)
 
 
+def second_derivatives(quick: bool) -> Iterator[Figure]:
+    """Second derivatives of a final-state loss by 8 numbers, forward over forward, relative to one solve at the same tolerance; what they take to compile."""
+    for name in ("tilting-disc",) if quick else BY_EIGHT:
+        losses, values = final_losses(name)
+        x = jnp.asarray(values)
+
+        def loss(x, losses=losses):
+            return losses(x[None], diffrax.ForwardMode())[0]
+
+        runs = {"solve": jax.jit(loss).lower(x).compile()}
+        begin = time.process_time()
+        runs["second"] = jax.jit(jax.jacfwd(jax.jacfwd(loss))).lower(x).compile()
+        seconds = time.process_time() - begin
+        found, slope, step = np.asarray(runs["second"](x)), jax.jit(jax.jacfwd(loss)), 1e-4 * np.diag(np.maximum(np.abs(values), 0.1))
+        differences = np.stack([(slope(x + h) - slope(x - h)) / (2 * np.sum(h)) for h in step])
+        np.testing.assert_allclose(found, differences, rtol=1e-4, atol=1e-4 * np.max(np.abs(found)))
+        timed = least_processor_time({way: lambda run=run, x=x: jax.block_until_ready(run(x)) for way, run in runs.items()}, 7)
+        print(f"  {name}: second derivatives by 8 numbers compiled in {seconds:.1f} s, {1e3 * timed['second']:.3f} ms", flush=True)
+        yield figure("trace and compile second derivatives by 8 numbers, s", name, seconds, 20, 10)
+        yield figure("second derivatives by 8 numbers / one solve", name, timed["second"] / timed["solve"], 64, 32)
+
+
 NAMED = {
     "tilting-disc": ({"lean": 0.3, "spin_rate": -3.0}, ("radius", "mass", "gravity"), "lean"),
     "whipple-bicycle": ({"lean": 0.05, "rear_spin_rate": 15.0, "lean_rate": 0.2}, ("IBxx", "mB", "c"), "lean"),
@@ -426,7 +448,10 @@ def limit(quick: bool) -> Iterator[Figure]:
                 yield figure(f"time per evaluation, lowered / dense{where}, n = {n}, {program.operations} operations", name, ratio, 1, 0.1)
 
 
-FIGURES = {f.__name__: f for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, named_starts, cold_starts, growth, kept_parts, limit)}
+FIGURES = {
+    f.__name__: f
+    for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, second_derivatives, named_starts, cold_starts, growth, kept_parts, limit)
+}
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jourdain_jax.eager.numpy_backend import uncompiled_lanes
+from jourdain_jax.eager.lanes import uncompiled_lanes
 
 CONSTANT = np.arange(12.0).reshape(3, 4)
 

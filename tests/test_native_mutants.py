@@ -145,20 +145,25 @@ def _at_saved_times(mode: str) -> None:
     _differentiated(mode, lambda x: weights @ pushed(**x, adjoint=adjoint).ys.q[:, 0], lambda x: weights @ pushed_position(TIMES, **x))
 
 
-def _at_an_event(mode: str) -> None:
+def _ends_at_an_event(mode: str) -> tuple[Callable, Callable]:
+    """A number made of the end of a motion, and its closed form, which has the first two derivatives."""
     adjoint, t = None if mode == "reverse" else diffrax.ForwardMode(), jax.jit(lambda: pushed(**START, events=True))().t_end
 
-    def time_of_event(x):  # one Newton step has the derivative of the root
-        return t - (pushed_position(t, **x) + 0.1) / jax.lax.stop_gradient(jax.grad(pushed_position)(t, **x))
+    def time_of_event(x):  # two steps of Newton's method have the first two derivatives of the root
+        def step(t):
+            return t - (pushed_position(t, **x) + 0.1) / jax.grad(pushed_position)(t, **x)
 
-    def speed_of_event(x):
-        return jax.grad(pushed_position)(time_of_event(x), **x)
+        return step(step(t))
 
     def end(x):
         found = pushed(**x, events=True, adjoint=adjoint)
         return found.t_end + 0.3 * found.y_end.v[0]
 
-    _differentiated(mode, end, lambda x: time_of_event(x) + 0.3 * speed_of_event(x))
+    return end, lambda x: time_of_event(x) + 0.3 * jax.grad(pushed_position)(time_of_event(x), **x)
+
+
+def _at_an_event(mode: str) -> None:
+    _differentiated(mode, *_ends_at_an_event(mode))
 
 
 def reverse_mode_through_saved_times():
@@ -175,6 +180,13 @@ def reverse_mode_to_an_event():
 
 def forward_mode_to_an_event():
     _at_an_event("forward")
+
+
+def forward_mode_to_an_event_twice():
+    found, expected = (jax.jit(jax.jacfwd(jax.jacfwd(end)))(START) for end in _ends_at_an_event("forward"))
+    for name, row in expected.items():
+        for other, value in row.items():
+            np.testing.assert_allclose(found[name][other], value, rtol=0, atol=1e-7, err_msg=f"derivative with respect to {name} and {other}")
 
 
 def reverse_mode_with_respect_to_times():
@@ -203,7 +215,8 @@ def reverse_mode_back_over_projections():
 FORM, LANES, CIRCLE = motions_follow_the_closed_form, lanes_of_a_batch_follow_their_own, a_bead_stays_on_its_circle
 EVENT, DIP, ROWS = an_event_is_found, an_event_within_a_step_is_found, a_start_is_put_onto_its_rows
 BACK, ALONG, TIME = reverse_mode_through_saved_times, forward_mode_through_saved_times, reverse_mode_with_respect_to_times
-EVENT_BACK, EVENT_ALONG, PROJECTED_BACK = reverse_mode_to_an_event, forward_mode_to_an_event, reverse_mode_back_over_projections
+EVENT_BACK, EVENT_ALONG, EVENT_TWICE = reverse_mode_to_an_event, forward_mode_to_an_event, forward_mode_to_an_event_twice
+PROJECTED_BACK = reverse_mode_back_over_projections
 TRIED, WRONG = "_tried_by_stages", "derivative with respect to"
 MUTANTS = [
     Mutant("a wrong weight", step, TRIED, "weighted(w, method.b, k", "weighted(w, method.b * (1 + 1e-6), k", FORM, "closed form"),
@@ -248,9 +261,10 @@ MUTANTS = [
     Mutant("no projection on the way back", back, "_write_step_back", "_project_back(w, form, state, t + h, at, g1, added)", "None", PROJECTED_BACK, WRONG),
     Mutant("an event at a number for a time", back, "_write_event_back", "-total / rate", "total / rate", EVENT_BACK, WRONG),
     Mutant("the level of an event forgotten", back, "_write_event_back", "w.where(usable, w.load(w.real, out, i), 0.0)", "w.number(0.0)", EVENT_BACK, WRONG),
-    Mutant("tangents of states alone", functions, "outputs_of", "| {others[i]: n for i, n in zip(form.moving, known, strict=True)}", "", ALONG, WRONG),
-    Mutant("the time of an event fixed", step, "_tangents_at_event", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
-    Mutant("the wrong way from an event", step, "_tangents_at_event", "w.fma(w.load(w.real, k, i), dt, before)", "before", EVENT_ALONG, WRONG),
+    Mutant("tangents of states alone", functions, "outputs_of", "| {len(y) + i: n for i, n in known[k].items()}", "", ALONG, WRONG),
+    Mutant("the time of an event fixed", step, "_put_tangents_at_event", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
+    Mutant("the wrong way from an event", step, "_move_rows", "w.fma(w.load(w.real, k, i + rates), dt, before)", "before", EVENT_ALONG, WRONG),
+    Mutant("tangents of an event by rates of before it moved", step, "_put_tangents_at_event", "if part > 1:", "if part > 9:", EVENT_TWICE, WRONG),
     Mutant(
         "goals that do not move states",
         native_motion,

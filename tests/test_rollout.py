@@ -124,3 +124,13 @@ def test_states_made_by_hand_are_starts_of_lanes():
     lanes = jj.rollout(sleigh, starts, **options)
     for k, state in enumerate(made):
         np.testing.assert_allclose(lanes.lanes.q_end[k], jj.simulate(sleigh, state, **options).q_end, rtol=1e-9, atol=1e-12)
+
+
+def test_lanes_that_are_given_to_devices_move_as_those_of_vmap():
+    def end(speed):
+        return jj.simulate(ChaplyginSleigh(), {"x_rate": speed, "heading_rate": 0.3}, ts=[0.2]).q_end
+
+    speeds, lanes = jnp.array([0.4, 0.6]), jax.sharding.PartitionSpec("lanes")
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("lanes",))
+    on_devices = jax.shard_map(jax.vmap(end), mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False)
+    np.testing.assert_allclose(jax.jit(on_devices)(speeds), [end(speed) for speed in speeds], rtol=1e-12, atol=1e-15)

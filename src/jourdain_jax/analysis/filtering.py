@@ -57,8 +57,8 @@ def filtered_log_likelihood(scene: Scene | BuiltFor, data: Measurements | Sequen
     The motion and its derivatives with respect to the state come from `simulate`, from each sample to the next. Linear scenes have their exact likelihood; of
     others, the spread of the state is carried along to first order. With no process noise and a known start it is `log_likelihood`.
 
-    Differentiable with respect to parameters, start values, sigmas and intensities in forward mode (`jax.jacfwd`: second derivatives of the motion, which XLA
-    compiles and runs), under `jit` and `vmap`. -inf where the motion fails. Make sensors outside of `jit`: inside, their delay is no number.
+    Differentiable with respect to parameters, start values, sigmas and intensities in forward mode (`jax.jacfwd`: second derivatives of the motion), under
+    `jit` and `vmap`. -inf where the motion fails. Make sensors outside of `jit`: inside, their delay is no number.
 
     **Raises** ValueError for names that are no independent speed, intensities below zero, quaternions, sensors with a delay or lag, accelerometers, noise with
     a correlation time, and numbers that are not known.

@@ -118,7 +118,7 @@ def planned_information(
     - `free`, `simulation`: as of `fit`. Start values in `unknown_start` and numbers of sensors that are estimated are unknowns, too, and priors count.
 
     **Returns** a `PlannedInformation`: `matrix`, `standard_errors`, `log_det`. It is differentiable with respect to parameters, start values and samples of
-    inputs in forward mode (`jax.jacfwd`; second derivatives of the motion, which XLA compiles and runs) and under `jit`: starts and inputs can be optimised.
+    inputs in forward mode (`jax.jacfwd`; second derivatives of the motion, by XLA for samples) and under `jit`: starts and inputs can be optimised.
 
     **Raises** ValueError for what does not fit the scene, and for sigmas or correlation times that are None or noise with a memory.
 

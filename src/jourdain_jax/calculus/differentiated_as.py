@@ -18,8 +18,8 @@ from jax.interpreters import ad, batching, mlir
 class Rules(NamedTuple):
     """Derivatives of the function that runs, by itself; trees of tangents and cotangents have None where there is none."""
 
-    serve: Callable[..., bool]  # (*perturbed): whether they serve, given for each array of the arguments whether it varies
-    push: Callable  # (arguments, tangents): the result and its tangents
+    serve: Callable[..., bool]  # (order, *perturbed): whether they serve derivatives of an order, given for each array of the arguments whether it varies
+    push: Callable  # (arguments, tangents): the result and its tangents; JAX can differentiate it where derivatives of a higher order are served
     pull: Callable | None = None  # (perturbed, arguments, result, cotangents): cotangents of those arguments that vary; of the reverse kind
     together: bool = False  # whether `push` gives the result as well where tangents are asked for, to the first order, by `jvp` and `jacfwd` alone
 
@@ -28,7 +28,7 @@ def differentiated_as(differentiable: Callable, quick: Callable, kind: Literal["
     """A function that runs `quick`, which JAX cannot differentiate. Its derivatives are by `rules` where these serve, otherwise those of `differentiable`.
 
     Both compute the same; they take trees of arrays and of anything else, and return trees of arrays. `kind`: the mode of differentiation of `differentiable`.
-    The rules are for first derivatives; those of higher order, of what the rules compute, are again those of `differentiable`.
+    Derivatives of an order that the rules do not serve, of what they compute, are again those of `differentiable`.
     """
     return (_forward if kind == "forward" else _reverse)(differentiable, quick, rules)
 
@@ -62,21 +62,29 @@ def _forward(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
 
                 return jax.jvp(of_moving, tuple(leaves[i] for i in moving), along)
 
+            def serve(order: int, varies: list, *_) -> bool:
+                varying = [i in moving or does for i, does in enumerate(varies)]
+                return rules is not None and rules.serve(order, *jax.tree.unflatten(treedef, varying))
+
             along = [tangents[i] for i in moving]
-            if rules is None or not rules.serve(*jax.tree.unflatten(treedef, [i in moving for i in range(len(leaves))])):
+            if not serve(1, [False] * len(leaves)):
                 found, rates = pushed(leaves, *along)
                 return lanes_first(found), lanes_first(rates)
 
             def pushed_by_rules(leaves, *along):
                 given = jax.tree.unflatten(treedef, [dict(zip(moving, along, strict=True)).get(i) for i in range(len(leaves))])
-                found, rates = rules.push(eqx.combine(jax.tree.unflatten(treedef, leaves), rest), given)
-                return (found, rates) if rules.together else _with_tangents(rates)
+                return rules.push(eqx.combine(jax.tree.unflatten(treedef, leaves), rest), given)
 
             if rules.together:
                 found, rates = pushed_by_rules(leaves, *along)
                 return lanes_first(found), _without_gaps(found, lanes_first(_with_tangents(rates)))
+
+            def rates_by_rules(*x):
+                return _with_tangents(pushed_by_rules(*x)[1])
+
+            again = Rules(lambda order, *varies: serve(order + 1, *varies), derivatives_of(rates_by_rules).push)
             found = own(*leaves)
-            rates = _forward(lambda *x: _with_tangents(pushed(*x)[1]), pushed_by_rules, None)(list(leaves), *along)
+            rates = _forward(lambda *x: _with_tangents(pushed(*x)[1]), rates_by_rules, again)(list(leaves), *along)
             return found, _without_gaps(found, rates)
 
         own.defjvp(rule, symbolic_zeros=True)
@@ -110,7 +118,7 @@ def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
     @own.def_bwd
     def back(found, cotangents, perturbed, arguments):
         g = jax.tree.map(_filled, found, cotangents, is_leaf=lambda x: x is None)
-        if rules is not None and rules.serve(*perturbed):
+        if rules is not None and rules.serve(1, *perturbed):
             return rules.pull(perturbed, arguments, found, g)
         moving, fixed = eqx.partition(arguments, perturbed)
         _, pull = eqx.filter_vjp(lambda moving: differentiable(*eqx.combine(moving, fixed)), moving)

@@ -39,10 +39,10 @@ def needed(module: str, purpose: str, extra: str = "") -> Any:
     """
     try:
         return import_module(module)
-    except ImportError:
+    except ImportError as error:
         package = module.partition(".")[0]
         install = f"'jourdain-jax[{extra}]'" if extra else package
-        raise ImportError(f"{purpose} needs the package `{package}`, which is not installed; install it with: pip install {install}") from None
+        raise ImportError(f"{purpose} needs the package `{package}`, which is not installed; install it with: pip install {install}") from error
 
 
 def names_on_first_use(package: dict[str, Any], where: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

@@ -93,23 +93,11 @@ def _groups(droppable: set[int], needs) -> list[list[int]]:
         droppable = droppable - needed_by_kept - in_circles
 
 
-def full_coordinates(scene: Scene, kept: Float[Array, "kept"], dropped=None) -> Float[Array, "coordinates"]:
-    """All coordinates from the kept ones; the dropped ones by name, at the reference where they are not given."""
-    reduced, q = reduced_coordinates(scene), jnp.asarray(scene.coordinates.reference())
-    q = q.at[_indices(scene, reduced.kept)].set(kept)
-    for name, value in (dropped or {}).items():
-        q = q.at[scene.coordinate_names.index(name, "coordinate")].set(value)
-    return q
-
-
-def _indices(scene: Scene, names: tuple[str, ...]):
-    return jnp.array([scene.coordinate_names.index(name, "coordinate") for name in names], jnp.int32)
-
-
 def reduced_accelerations(scene: Scene, t, kept: Float[Array, "kept"], y, inputs=None) -> Float[Array, "freedoms"]:
     """Privileged accelerations of the reduced equations (42) from time, kept coordinates and privileged speeds alone."""
     independent = structure_of(scene).independent
-    q = full_coordinates(scene, kept)
+    places = [scene.coordinate_names.index(name, "coordinate") for name in reduced_coordinates(scene).kept]
+    q = jnp.asarray(scene.coordinates.reference()).at[jnp.array(places, jnp.int32)].set(kept)  # the dropped ones at the reference
     rates = admissible_rates(scene, t, q, jnp.zeros(len(scene.speed_names)))
     found = bare_accelerations(scene, t, q, rates.C @ y + rates.c, inputs, reduction=Privileged(independent))
     return found.udot[jnp.array(independent, jnp.int32)]

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.reals import is_traced
-from jourdain_jax.eager.numpy_backend import uncompiled, uncompiled_lanes
+from jourdain_jax.eager.lanes import uncompiled_lanes
+from jourdain_jax.eager.numpy_backend import uncompiled
 
 
 def eval_numpy(f: Callable) -> Callable:

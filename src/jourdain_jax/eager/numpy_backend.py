@@ -11,8 +11,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal, jaxpr_as_fun
-from jax.tree_util import PyTreeDef
+from jax.extend.core import Literal
 
 from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.scalar_operations import VALUES
@@ -31,32 +30,12 @@ def uncompiled(f: Callable) -> Callable:
 
     @wraps(f)
     def run(*arguments):
-        leaves, treedef = _as_arrays(arguments)
-        return _run_on(*traced(treedef, tuple((x.shape, x.dtype) for x in leaves)), leaves)
-
-    return run
-
-
-def uncompiled_lanes(f: Callable, shared: int = 0) -> Callable:
-    """`f`, of trees of arrays of one lane, run on NumPy for arrays with an axis of lanes first; the first `shared` arguments are those of all lanes.
-
-    It is traced for one lane: of what no result needs, nothing is put to all lanes.
-    """
-
-    @lru_cache(maxsize=64)
-    def traced(treedef, shapes, of_all):
-        given = [jax.ShapeDtypeStruct(*s) for s in shapes]
-        of_one = [x if alone else jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x, alone in zip(given, of_all, strict=True)]
-        closed, shape = traced_for_use(f, jax.tree.unflatten(treedef, of_one))
-        count = next(x.shape[0] for x, alone in zip(given, of_all, strict=True) if not alone)
-        axes = [None if alone else 0 for alone in of_all]
-        return jax.make_jaxpr(jax.vmap(jaxpr_as_fun(closed), in_axes=axes, axis_size=count))(*given), shape
-
-    @wraps(f)
-    def run(*arguments):
-        leaves, treedef = _as_arrays(arguments)
-        without = len(jax.tree.leaves(arguments[:shared]))
-        return _run_on(*traced(treedef, tuple((x.shape, x.dtype) for x in leaves), tuple(i < without for i in range(len(leaves)))), leaves)
+        leaves, treedef = jax.tree.flatten(arguments)
+        leaves = [np.asarray(x) for x in leaves]
+        closed, shape = traced(treedef, tuple((x.shape, x.dtype) for x in leaves))
+        with np.errstate(all="ignore"):
+            out = _run(closed.jaxpr, closed.consts, leaves)
+        return jax.tree.unflatten(jax.tree.structure(shape), out)
 
     return run
 
@@ -65,17 +44,6 @@ def traced_for_use(f: Callable, arguments):
     """`f` traced, without the operations that no result needs, and the shapes of its results."""
     closed, shape = jax.make_jaxpr(f, return_shape=True)(*arguments)
     return needed_only(closed), shape
-
-
-def _as_arrays(arguments) -> tuple[list[np.ndarray], PyTreeDef]:
-    leaves, treedef = jax.tree.flatten(arguments)
-    return [np.asarray(x) for x in leaves], treedef
-
-
-def _run_on(closed, shape, leaves: list[np.ndarray]):
-    """Results of a traced function, as the tree of its `shape`."""
-    with np.errstate(all="ignore"):
-        return jax.tree.unflatten(jax.tree.structure(shape), _run(closed.jaxpr, closed.consts, leaves))
 
 
 def _run(jaxpr, constants, arguments) -> list[np.ndarray]:

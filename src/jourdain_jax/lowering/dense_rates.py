@@ -20,7 +20,7 @@ from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import VelocityQuantities, jaxpr_of_scene
 from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
-from jourdain_jax.eager.numpy_backend import uncompiled_lanes
+from jourdain_jax.eager.lanes import uncompiled_lanes
 from jourdain_jax.scene.scene import Scene
 
 LANES = 2048  # states times directions that are worked out at once

@@ -1,4 +1,4 @@
-"""Our own explicit Runge-Kutta loop as an integrator: as machine code where that serves, first derivatives too, and as a loop of XLA where not.
+"""Our own explicit Runge-Kutta loop as an integrator: as machine code where that serves, its derivatives too, and as a loop of XLA where not.
 
 One motion, or lanes side by side: those of a scalar program in blocks of `lockstep.width`.
 """
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jourdain_jax.calculus.differentiated_as import Rules, differentiated_as
+from jourdain_jax.calculus.differentiated_as import Rules, derivatives_of, differentiated_as
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
@@ -153,31 +153,15 @@ def _most_steps(setup: Setup, knots) -> int:
 def _rules(setup: Setup, mapped: Callable, alongside: bool) -> Rules:
     """Derivatives by machine code; `mapped`: of a function of one motion, that of all lanes."""
 
-    def serve(varies: Setup, begun: Begun) -> bool:
+    def serve(order: int, varies: Setup, begun: Begun) -> bool:
         of_samples = [channel for channel in (*varies.inputs.channels, *begun.args[2].channels) if isinstance(channel, Sampled)]
-        reason = native_motion.reason_against_derivatives(setup.field, setup.inputs, bool(setup.integrator.event_names))
+        reason = native_motion.reason_against_derivatives(setup.field, setup.inputs, bool(setup.integrator.event_names), order)
         return not any(jax.tree.leaves(of_samples)) and not reason
-
-    def push(arguments, along):
-        return mapped(_pushed)(*arguments, *along)
 
     def pull(perturbed, arguments, found, g):
         return mapped(partial(_pulled, perturbed))(*arguments, found, g)
 
-    return Rules(serve, push, pull, alongside)
-
-
-def _pushed(setup: Setup, begun: Begun, along: Setup, d: Begun) -> tuple[Solved, PyTree]:
-    """The motion and its tangents, along those of its start, of its times, and of what the rates are given; tolerances and the first step change nothing."""
-    motion = _motion(setup, begun)
-    dy0 = jax.tree.map(lambda x, dx: jnp.zeros_like(x) if dx is None else dx, begun.y0, d.y0)
-    of_times = along.ts, along.t0, along.t1, d.args[-1]
-    times = None
-    if any(x is not None for x in of_times):
-        like = setup.ts, setup.t0, setup.t1, setup.t0
-        ts, t0, t1, origin = (jnp.zeros_like(x) if dx is None else dx for x, dx in zip(like, of_times, strict=True))
-        times = native_motion.AlongTimes(_since(t0, ts, t1), origin)
-    return native_motion.tangents(motion, dy0, native_motion.known_of(d.args), times, _as_solved)
+    return Rules(serve, derivatives_of(mapped(_by_machine_code)).push, pull, alongside)
 
 
 def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solved) -> tuple:
@@ -191,8 +175,7 @@ def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solv
     if varies.ts or varies.t0 or varies.t1 or perturbed[1].args[-1]:
         ys, reached = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), (found.ys, found.reached), (found.y_end, found.t_end == motion.goals[-1]))
         event = (found.code == results.EVENT) & (found.accepted > 0)
-        of_motion = native_motion.Stopped(ys, reached, found.t_end, event)
-        times = native_motion.cotangents_of_times(motion, of_motion, by_start, states, g.y_end, g.t_end)
+        times = native_motion.cotangents_of_times(motion, (ys, reached, found.t_end, event), by_start, states, g.y_end, g.t_end)
         goals = times.goals.at[:-1].add(g.ts)
         given = {"ts": goals[:-1], "t0": -jnp.sum(goals), "t1": goals[-1]}
         by_setup = by_setup._replace(**{name: by for name, by in given.items() if getattr(varies, name)})

@@ -3,12 +3,13 @@
     g(t, q),   G = dg/dq;        phi(t, q, u),   A = dphi/du;        M(t, q)
     d o_i = sum_j J_ij d x_j     o: any of these numbers, x: parameters, time, coordinates, speeds, inputs;   J: derived on the graph
 
-Derivatives of higher order are those of the program as XLA runs it.
+The tangents of d o are derived on the graph too; derivatives of an order above the second are those of the program as XLA runs it.
 """
 
 from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -22,7 +23,7 @@ from jourdain_jax.motion.native import onto_rows
 from jourdain_jax.motion.native.called import nodes_called
 from jourdain_jax.motion.native.seen import entries
 from jourdain_jax.native.scalar_program import unsupported
-from jourdain_jax.program.derivative import jacobian
+from jourdain_jax.program.derivative import directional_derivative, jacobian
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.scene.scene import Scene
@@ -78,14 +79,37 @@ def _function(graph: Graph, places: dict[int, int], size: int, variables: Sequen
     graph, nodes, variables = on_its_own(graph, list(places.values()), variables)
     places = dict(zip(places, nodes, strict=True))
     slopes = cache(lambda: _slopes(graph, places, variables))  # derived when the first derivative is asked for
+    curved = cache(lambda: _tangents_of_tangents(graph, places, size, variables))  # and when the second is
 
-    def push(arguments, along):
-        (x,), (dx,) = arguments, along
+    @jax.custom_jvp
+    def along(x, dx):
         J, rows = slopes()
-        return values(x), jnp.zeros(size, dx.dtype).at[rows].set(J(x) @ dx, unique_indices=True, indices_are_sorted=True)
+        return jnp.zeros(size, dx.dtype).at[rows].set(J(x) @ dx, unique_indices=True, indices_are_sorted=True)
 
-    values = differentiated_as(*_ways(graph, places, size, variables), "forward", Rules(lambda *_: slopes() is not None, push))
+    @along.defjvp
+    def rule(at, tangents):
+        return along(*at), curved()(jnp.concatenate([*at, *tangents]))
+
+    def serve(order: int, *_) -> bool:
+        return order <= 2 and slopes() is not None and (order == 1 or curved() is not None)
+
+    def push(arguments, tangents):
+        return values(*arguments), along(*arguments, *tangents)
+
+    values = differentiated_as(*_ways(graph, places, size, variables), "forward", Rules(serve, push))
     return values
+
+
+def _tangents_of_tangents(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array] | None:
+    """The tangents of d o as a function of x and dx and of their tangents, in a row; None where they are too large, or no machine code."""
+    count, nodes = len(variables), list(places.values())
+    given = [*variables, *(graph.input(f"tangent {k} of variable {i}", True) for k in range(3) for i in range(count))]
+    for pairs in (zip(variables, given[count : 2 * count], strict=True), zip(given[: 2 * count], given[2 * count :], strict=True)):
+        nodes = [rate.get(0, graph.zero) for rate in directional_derivative(graph, nodes, {0: dict(pairs)})]
+    found = {place: node for place, node in zip(places, nodes, strict=True) if node != graph.zero}
+    if unsupported(graph, found.values()) or graph.operations(found.values()) > LARGEST_PROGRAM:
+        return None
+    return _ways(graph, found, size, given)[1]
 
 
 def _slopes(graph: Graph, places: dict[int, int], variables: Sequence[int]) -> tuple[Callable[[Array], Array], np.ndarray] | None:

@@ -82,7 +82,7 @@ def simulate(
       for forward mode of any order; `diffrax.DirectAdjoint()` for all.
     - `formulation`: which equations are integrated, a `jj.Formulation(state, reduction, stabilisation)` (default: what serves the scene).
     - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code made for it, on CPUs, where llvmlite is installed and the solver is a
-      default one; "xla", that program compiled by XLA, as `jax.export` needs, and as derivatives of higher order and with respect to samples are in any case;
+      default one; "xla", that program compiled by XLA, as `jax.export` needs, and as third derivatives and those with respect to samples are in any case;
       "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
     - `inputs`: name -> number, function of time, or `Sampled`.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.

@@ -29,11 +29,12 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.rotations import quaternion_product, quaternion_rate
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.motion.integrators.implicit_midpoint import ImplicitMidpoint
+from jourdain_jax.motion.integrators.wrapping_solver import WrappingSolver
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
 
-class MuntheKaas(diffrax.AbstractWrappedSolver):
+class MuntheKaas(WrappingSolver):
     """A Runge-Kutta `solver` with attitudes (quaternion coordinates) advanced by the exponential map: `simulate(..., solver=MuntheKaas())`.
 
     Within a step the attitude is `p_0 exp(sigma)`, a turn by the rotation vector sigma (rad), and the method integrates
@@ -57,24 +58,6 @@ class MuntheKaas(diffrax.AbstractWrappedSolver):
                 f"`solver` of `MuntheKaas` is {type(self.solver).__name__}, expected a Runge-Kutta method; give diffrax.Tsit5(), diffrax.Dopri8() "
                 "or jj.ImplicitMidpoint()"
             )
-
-    @property
-    def term_structure(self):
-        """As the wrapped solver."""
-        return self.solver.term_structure
-
-    @property
-    def scan_kind(self):
-        """As the wrapped solver: see `wrapping_solver.for_adjoint`."""
-        return self.solver.scan_kind
-
-    def order(self, terms):
-        """As the wrapped solver. `terms` as in diffrax."""
-        return self.solver.order(terms)
-
-    def error_order(self, terms):
-        """As the wrapped solver. `terms` as in diffrax."""
-        return self.solver.error_order(terms)
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
         """The given `field` of the state, without a projection where there would be only norms to keep; whatever was `asked` for.
@@ -111,10 +94,6 @@ class MuntheKaas(diffrax.AbstractWrappedSolver):
         y1 = Integrated(chart.coordinates(local1.q), local1.v, local1.work)
         error = None if error is None else Integrated(_Chart(y1.q, chart.firsts).pushed(error.q), error.v, error.work)
         return y1, error, {"y0": y0, "y1": y1}, None, result
-
-    def func(self, terms, t0, y0, args):
-        """The rates at a state. `terms`, `t0`, `y0`, `args`: as in diffrax."""
-        return terms.vf(t0, y0, args)
 
 
 class _Chart(eqx.Module):

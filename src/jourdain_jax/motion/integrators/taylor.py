@@ -19,7 +19,7 @@ class Taylor(eqx.Module):
 
     **Arguments:** `order`, from 4 to 30; None: from the tolerance `rtol`.
     **Raises** from `simulate`: ValueError where no machine code serves, an input is given by samples, the equations branch, or they are too long.
-    Derivatives: forward mode by series too; reverse mode goes over the motion once more by Dopri8, and those of higher order are XLA's.
+    Derivatives: forward mode by series too, and by Dopri8 where those of second derivatives were too long; reverse mode goes over the motion once more by it.
     Source: A. Jorba and M. Zou, Experimental Mathematics 14 (2005) 99.
     """
 

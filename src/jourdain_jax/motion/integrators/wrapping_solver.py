@@ -40,19 +40,19 @@ class WrappingSolver(diffrax.AbstractWrappedSolver):
         return self.solver.root_find_max_steps
 
     def order(self, terms):
-        """As the wrapped solver."""
+        """As the wrapped solver. `terms` as in diffrax."""
         return self.solver.order(terms)
 
     def strong_order(self, terms):
-        """As the wrapped solver."""
+        """As the wrapped solver. `terms` as in diffrax."""
         return self.solver.strong_order(terms)
 
     def error_order(self, terms):
-        """As the wrapped solver."""
+        """As the wrapped solver. `terms` as in diffrax."""
         return self.solver.error_order(terms)
 
     def func(self, terms, t0, y0, args):
-        """As the wrapped solver."""
+        """As the wrapped solver. `terms`, `t0`, `y0`, `args`: as in diffrax."""
         return self.solver.func(terms, t0, y0, args)
 
 

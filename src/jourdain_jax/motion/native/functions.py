@@ -3,6 +3,8 @@
 Where a tangent is pushed along, it follows its state in memory, and each function also gives the tangents of what it gives:
 
     d f(t, y, p) = df/dy dy + df/dp dp          p: numbers that the rates are given, of which those in `Form.moving` have tangents
+
+and, of derivatives of higher order, the tangents of these along the next direction.
 """
 
 from collections.abc import Sequence
@@ -31,8 +33,9 @@ class Form:
     affine: bool
     has_events: bool
     has_pivots: bool
-    moving: tuple[int, ...] | None = None  # which of the numbers known have a tangent; None: nothing has one
+    moving: tuple[tuple[int, ...], ...] = ()  # of every tangent (`Layout`), which of the numbers known have it
     sampled: tuple[int, ...] = ()  # which of the inputs are given by samples
+    time_moves: bool = False  # whether time has tangents
 
     @property
     def layout(self) -> Layout:
@@ -45,7 +48,7 @@ class Form:
             self.with_work,
             known,
             len(program.events) if self.has_events else 0,
-            None if self.moving is None else len(self.moving),
+            tuple(map(len, self.moving)),
             len(self.sampled),
         )
 
@@ -74,35 +77,52 @@ class Outputs(NamedTuple):
 
     graph: Graph
     values: list[int]
-    tangents: list[int]  # none where nothing has one
+    tangents: list[list[int]]  # one after the other
     variables: list[int]  # for those of the scene's program
-    states: list[int]  # inputs for the tangents of the state
-    known: list[int]  # and of those numbers known that have one
+    states: list[list[int]]  # inputs for the tangents of the state
+    known: list[int]  # for those of the numbers known that have some, all of the first tangent first
+    times: list[int]  # for those of time
+    slopes: list[int]  # and for how fast inputs given by samples change with it
 
 
 def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
     """The first `pushed` of the nodes with their tangents."""
-    program, layout = form.program, form.layout
-    if form.moving is None:
-        return Outputs(program.graph, list(nodes), [], program.variables, [], [])
+    program, layout, count = form.program, form.layout, len(form.moving)
+    if not count:
+        return Outputs(program.graph, list(nodes), [], program.variables, [], [], [], [])
     graph, values, variables = on_its_own(program.graph, nodes, program.variables)
-    count, first = layout.coordinates + layout.speeds, len(program.fixed) + 1  # time, then the state
-    others = [*variables[: first - 1], *variables[first + count :]]
-    states = [graph.input(f"tangent of state {i}", True) for i in range(count)]
-    known = [graph.input(f"tangent of number {i}", True) for i in form.moving]
-    direction = dict(zip(variables[first : first + count], states, strict=True)) | {others[i]: n for i, n in zip(form.moving, known, strict=True)}
-    rates = [rate.get(0, graph.zero) for rate in directional_derivative(graph, values[:pushed], {0: direction})]
-    return Outputs(graph, values, rates, variables, states, known)
+    first = len(program.fixed)  # time, then the state
+    y = variables[first + 1 : first + 1 + layout.coordinates + layout.speeds]
+    others = [*variables[:first], *variables[first + 1 + len(y) :]]
+    states = [[graph.input(f"tangent {k} of state {i}", True) for i in range(len(y))] for k in range(count)]
+    known = [{i: graph.input(f"tangent {k} of number {i}", True) for i in moving} for k, moving in enumerate(form.moving)]
+    times = [graph.input(f"tangent {k} of time", True) for k in range(count if form.time_moves else 0)]
+    slopes = [graph.input(f"slope of input {i}", True) for i in (form.sampled if form.time_moves else ())]
+    inputs = {len(variables) - 1 - len(program.inputs) + i: n for i, n in zip(form.sampled, slopes, strict=False)}
+    # all that varies, and its tangents, in the order of these
+    given = [dict(enumerate([*y, *others, variables[first]]))]
+    for k in range(count):
+        of_time = {len(variables) - 1: times[k]} | {i: graph.mul(n, times[k]) for i, n in inputs.items()} if times else {}
+        given.append(dict(enumerate(states[k])) | {len(y) + i: n for i, n in known[k].items()} | of_time)
+    found = [values[:pushed]]
+    while len(found) <= count:
+        direction = {given[k][i]: n for k in range(len(found)) for i, n in given[k + len(found)].items()}
+        rates = [rate.get(0, graph.zero) for rate in directional_derivative(graph, [n for part in found for n in part], {0: direction})]
+        found += [rates[k * pushed : (k + 1) * pushed] for k in range(len(found))]
+    return Outputs(graph, values, found[1:], variables, states, [n for part in known for n in part.values()], times, slopes)
 
 
-def _found(w: Writer, form: Form, own: Outputs, known: dict[int, Value], state: Value, y: Value) -> tuple[list[Value], list[Value]]:
+def _found(w: Writer, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> tuple[list[Value], list[list[Value]]]:
     """The values of outputs, and their tangents; `known`: as from `known_values`."""
-    given = dict(zip(own.variables, known.values(), strict=True))
-    given |= {n: w.load(w.real, y, form.layout.y + i) for i, n in enumerate(own.states)}
-    if own.known:
-        given |= dict(zip(own.known, Lanes(w, form.layout, state).every("dknown"), strict=True))
-    found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *own.tangents], given)]
-    return found[: len(own.values)], found[len(own.values) :]
+    given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form.layout, state)
+    for k, states in enumerate(own.states):
+        given |= {n: w.load(w.real, y, (k + 1) * form.layout.y + i) for i, n in enumerate(states)}
+    given |= dict(zip(own.known, lanes.every("dknown"), strict=True)) if own.known else {}
+    given |= dict(zip(own.times, lanes.every("dt"), strict=True)) if own.times else {}
+    given |= dict(zip(own.slopes, looked_up(w, form.layout, state, tau, True)[form.layout.sampled :], strict=True)) if own.slopes else {}
+    found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *(n for part in own.tangents for n in part)], given)]
+    tangents = iter(found[len(own.values) :])
+    return found[: len(own.values)], [[next(tangents) for _ in part] for part in own.tangents]
 
 
 def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> dict[int, Value]:
@@ -110,7 +130,7 @@ def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> d
     program, layout, lanes = form.program, form.layout, Lanes(w, form.layout, state)
     states = [w.load(w.real, y, k) for k in range(layout.coordinates + layout.speeds)]
     known, fixed, t = lanes.every("known"), len(program.fixed), lanes["origin"] + tau
-    found = dict(zip(form.sampled, looked_up(w, layout, state, tau), strict=True))
+    found = dict(zip(form.sampled, looked_up(w, layout, state, tau, form.time_moves), strict=False))
     inputs = [found.get(i, x) for i, x in enumerate(known[fixed:])]
     return dict(zip(program.variables, [*known[:fixed], t, *states, *inputs], strict=True))
 
@@ -124,13 +144,13 @@ def write_rates(w: Writer, form: Form) -> None:
         power = [program.power] if form.with_work and program.power is not None else []
         rates = [*program.qdot, *program.ydot, *power]
         known = known_values(w, form, state, tau, y)
-        found, tangents = _found(w, form, outputs_of(form, [*rates, *program.guards, *program.pivots[: form.pivots]], len(rates)), known, state, y)
+        found, tangents = _found(w, form, outputs_of(form, [*rates, *program.guards, *program.pivots[: form.pivots]], len(rates)), known, state, tau, y)
         if form.with_work and not power:
             found.insert(layout.coordinates + layout.speeds, w.number(0.0))
-            tangents += [w.number(0.0)] if tangents else []
+            tangents = [[*part, w.number(0.0)] for part in tangents]
         for guard in found[layout.y : layout.y + len(program.guards)]:
             found[0] = w.where(guard > 0.0, found[0], float("nan"))
-        for i, x in enumerate([*found[: layout.y], *tangents]):
+        for i, x in enumerate([*found[: layout.y], *(x for part in tangents for x in part)]):
             w.store(x, k, i)
         for i in range(form.pivots):
             w.store(found[layout.y + len(program.guards) + i] / known[program.sizes[i]], pivots, i)
@@ -144,11 +164,10 @@ def write_projection(w: Writer, form: Form) -> None:
         known = known_values(w, form, state, tau, y)
         for condition, nodes, first in ((q_moves, program.projected_q, 0), (~q_moves, program.projected_u, layout.coordinates)):
             with w.when(condition):
-                found, tangents = _found(w, form, outputs_of(form, nodes, len(nodes)), known, state, y)
-                for i, x in enumerate(found):
-                    w.store(x, y, first + i)
-                for i, x in enumerate(tangents):
-                    w.store(x, y, layout.y + first + i)
+                found, tangents = _found(w, form, outputs_of(form, nodes, len(nodes)), known, state, tau, y)
+                for k, part in enumerate([found, *tangents]):
+                    for i, x in enumerate(part):
+                        w.store(x, y, k * layout.y + first + i)
         w.give()
     with w.function("project", "void", {"state": "ptr", "tau": w.real, "y": "ptr"}) as (state, tau, y):
         for q_moves in form.moves:
@@ -189,9 +208,9 @@ def write_events(w: Writer, form: Form) -> None:
             w.store(found[i], c, i)
             w.store(found[count + i], rate, i)
         w.give()
-    if form.moving is not None:
+    if form.moving:
         with w.function("event_tangents", "void", {"state": "ptr", "tau": w.real, "y": "ptr", "dc": "ptr"}, attributes="noinline") as (state, tau, y, dc):
-            _, tangents = _found(w, form, outputs_of(form, program.events, count), known_values(w, form, state, tau, y), state, y)
-            for i, x in enumerate(tangents):
+            _, tangents = _found(w, form, outputs_of(form, program.events, count), known_values(w, form, state, tau, y), state, tau, y)
+            for i, x in enumerate(x for part in tangents for x in part):
                 w.store(x, dc, i)
             w.give()

@@ -4,7 +4,7 @@ Many motions run side by side in the widest registers; one by itself runs in nar
 not depend on the width.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -12,23 +12,53 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jourdain_jax.motion.integrators.erk_step import RUNNING
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native import back, loop, samples, slopes
 from jourdain_jax.motion.native.called import called
 from jourdain_jax.motion.native.functions import Form
-from jourdain_jax.motion.native.layout import PROGRESS, Layout
+from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.taylor import TaylorSteps
 from jourdain_jax.native import host
 
 MOST_KERNELS = 64  # whose names are kept; machine code lives as long as the process
 
 
+class Start(NamedTuple):
+    """A motion as a kernel is given it; the state and what is known are followed by their tangents (`Layout`)."""
+
+    of_samples: tuple[Array, ...]  # as `samples.py` has them
+    control: tuple[Float[Array, ""], ...]  # as `native_motion.Control`
+    goals: Float[Array, "times"]  # since the start
+    origin: Float[Array, ""]  # the time of the start
+    y: tuple[Float[Array, "y"], ...]
+    known: tuple[tuple[Float[Array, ""], ...], ...]
+
+    def rows(self, t, dt: Sequence) -> Float[Array, "given"]:
+        """The rows of a lane at the time t since the start, which has tangents."""
+        rtol, atol, shortest, first, most = self.control
+        zero, one = jnp.zeros(()), jnp.ones(())
+        progress = [t, jnp.abs(first), RUNNING * one, zero, zero, -one, jnp.inf * one, *dt]
+        limits = [jnp.sign(self.goals[-1]), self.goals[-1], rtol, atol, shortest, most, self.origin]
+        known = [jnp.stack(part) for part in self.known if part]  # each tangent by itself: values may have no lanes where tangents have
+        return jnp.concatenate([*self.y, jnp.stack(progress), jnp.stack(limits), *known])
+
+
+class Found(NamedTuple):
+    """A motion as a kernel returns it; each with its tangents."""
+
+    y: tuple[Float[Array, "times y"], ...]  # at the goals
+    end: tuple[Float[Array, "y"], ...]
+    t: tuple[Float[Array, ""], ...]  # of the end, since the start
+    rest: Float[Array, "rest"]  # rows of the progress after its time, and the number of goals that were reached one after the other
+
+
 class Kernel(NamedTuple):
-    """`run(*samples, starts, goals)` returns states (and their tangents, where the form has some) at the goals, and the rows of the end."""
+    """The loop over steps of a form."""
 
     form: Form
-    run: Callable
-    along: Callable  # (*samples, starts, goals, tangents): states and the end, their tangents and that of the time of the end, all in one run
+    run: Callable  # (*samples, rows of starts, goals): states at the goals, and rows of the end
+    motion: Callable[[Start], Found]
 
     @property
     def layout(self) -> Layout:
@@ -48,29 +78,36 @@ def kernel(form: Form, method: Method, order: int | None = None) -> Kernel:
         return tuple(run_rows(*arguments))
 
     run_rows = called(lambda lanes, threads: loop.written(form, steps, lanes, host.fuses(), threads), shapes, samples.arguments(layout))
-    return Kernel(form, run, _along(layout, run))
+    return Kernel(form, run, _motion(layout, run))
 
 
-def _along(layout: Layout, run: Callable) -> Callable:
-    """`run` of a form with tangents, given rows of starts as without, and tangents of the state and of what is known; values have lanes where starts do."""
+def _motion(layout: Layout, run: Callable) -> Callable[[Start], Found]:
+    """`run` in words; a tangent has lanes where anything has that it depends on: all directions share the values of one motion."""
+    n, parts = layout.y, 1 + len(layout.moving)
 
     @jax.custom_batching.custom_vmap
-    def along(*arguments):
-        *of_samples, starts, goals, tangents = arguments
-        n, rest = layout.y, layout.y + len(PROGRESS)
-        rows = [starts[:n], tangents[:n], starts[n:rest], jnp.zeros(1), starts[rest:], tangents[n:]]
-        states, end = run(*of_samples, jnp.concatenate(rows), goals)
-        plain = jnp.concatenate([end[:n], end[2 * n : -2], end[-1:]])
-        return states[:, :n], plain, states[:, n:], end[n : 2 * n], end[-2]
+    def motion(start: Start) -> Found:
+        states, end = run(*start.of_samples, start.rows(jnp.zeros(()), [jnp.zeros(())] * (parts - 1)), start.goals)
+        progress, dt, count = end[n * parts : -parts], end[-parts:-1], end[-1:]
+        every = [slice(k * n, (k + 1) * n) for k in range(parts)]
+        return Found(
+            tuple(states[:, part] for part in every),
+            tuple(end[part] for part in every),
+            (progress[0], *dt),
+            jnp.concatenate([progress[1:], count]),
+        )
 
-    @along.def_vmap
-    def along_many(count: int, batched: list[bool], *arguments):
-        found = jax.vmap(along.fun, [0 if has_axis else None for has_axis in batched], axis_size=count)(*arguments)
-        if any(batched[:-1]):
-            return found, (True,) * len(found)
-        return (*(x[0] for x in found[:2]), *found[2:]), (False, False, True, True, True)  # all directions have the values of one motion
+    @motion.def_vmap
+    def motions(count: int, batched: Sequence, start: Start):
+        (given,) = batched
+        found = jax.vmap(motion.fun, [jax.tree.map(lambda has_axis: 0 if has_axis else None, given)], axis_size=count)(start)
+        base = any(jax.tree.leaves(given._replace(y=(), known=())))
+        own = [any(jax.tree.leaves((given.y[k], given.known[k]))) for k in range(parts)]
+        lanes = tuple(base or any(own[other] for other in range(k + 1) if other & k == other) for k in range(parts))
+        lanes = Found(lanes, lanes, lanes, lanes[0])
+        return jax.tree.map(lambda x, has_lanes: x if has_lanes else x[0], found, lanes), lanes
 
-    return along
+    return motion
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -87,7 +124,7 @@ def kernel_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable:
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel_of_rates(form: Form) -> Callable:
-    """A function of samples, rows as those of a start, and their times as an array of one: the rates of the states in these rows."""
-    count, of_samples = form.layout.y, samples.arguments(form.layout)
+    """A function of samples, rows as those of a start, and their times as an array of one: the rates of the states in these rows, and of their tangents."""
+    count, of_samples = form.layout.integrated, samples.arguments(form.layout)
     run_rows = called(lambda lanes, threads: slopes.written(form, lanes, host.fuses(), threads), lambda *_: ((count,),), of_samples)
     return lambda *arguments: run_rows(*arguments)[0]

@@ -1,7 +1,9 @@
 """Where the numbers of a lane are: a lane is a column of rows, one row per number, and a row is one vector for all lanes side by side.
 
-A lane is handed over with all rows of `Layout.given`, its progress at the start among them, and handed back with those of its progress. Where a tangent is
-pushed along, the state is followed by its own, and so are the numbers that the rates are given; `dt` is that of the time of an event. Where inputs are
+A lane is handed over with all rows of `Layout.given`, its progress at the start among them, and handed back with those of its progress. Where tangents are
+pushed along, the state is followed by its own, and so are the numbers that the rates are given; `dt` are those of time, which only an event's has. Of
+derivatives of order n in directions e_1 to e_n the tangents are 2^n - 1, in the order of the binary numbers that say which e_i are taken together: of the
+second order those along e_1, e_2, and both. Where inputs are
 given by samples, rows of pointers and whole numbers say where the samples of a lane are (`table`), how many each input has (`samples`), and where the next
 knot is at which a step must end (`knot`). `taken` is by how far the last step has gone; of a step by Taylor series, `before` is the time at which it began, and
 `bound` how long the next one may be after one that was rejected.
@@ -27,7 +29,7 @@ class Layout:
     with_work: bool
     known: int  # numbers that the rates are given: what depends on parameters alone, then the inputs
     events: int
-    moving: int | None = None  # of those known, how many have a tangent; None: nothing has one
+    moving: tuple[int, ...] = ()  # of every tangent, how many of those known have it
     sampled: int = 0  # how many of the inputs are given by samples
 
     @property
@@ -37,8 +39,8 @@ class Layout:
 
     @property
     def integrated(self) -> int:
-        """Numbers of the state and of its tangent."""
-        return self.y if self.moving is None else 2 * self.y
+        """Numbers of the state and of its tangents."""
+        return self.y * (1 + len(self.moving))
 
     @property
     def parts(self) -> list[range]:
@@ -50,8 +52,8 @@ class Layout:
     def rows(self) -> dict[str, range]:
         """Name -> rows."""
         search = {"search_t": 3, "search_c": 3 * self.events, "search_step": 1, "search_left": 1, "search_shift": 1, "search_slope": self.events}
-        tangents = {"dt": 0 if self.moving is None else 1}, {"dknown": self.moving or 0}
-        counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), **tangents[0], **dict.fromkeys(CONTROL, 1), "known": self.known, **tangents[1]}
+        counts = {"y": self.integrated, **dict.fromkeys(PROGRESS, 1), "dt": len(self.moving), **dict.fromkeys(CONTROL, 1)}
+        counts |= {"known": self.known, "dknown": sum(self.moving)}
         counts |= {"goal": 1, "taken": 1, "before": 1, "bound": 1, **(search if self.events else {}), **dict.fromkeys(SAMPLES if self.sampled else (), 1)}
         found, first = {}, 0
         for name, count in counts.items():

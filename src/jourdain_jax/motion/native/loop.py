@@ -39,7 +39,7 @@ def written(form: Form, method: Method | TaylorSteps, lanes: int, fused: bool, t
 def write_functions(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
     """`step`, and what it calls."""
     if form.sampled:
-        samples.write_inputs(w, form.layout)
+        samples.write_inputs(w, form.layout, form.time_moves)
     write_rates(w, form)
     if form.projects:
         write_projection(w, form)

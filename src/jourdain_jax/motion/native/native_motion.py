@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,15 +15,15 @@ from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.input_programs import FunctionOfTime
 from jourdain_jax.motion.inputs import Constant, Inputs, Sampled
 from jourdain_jax.motion.integrators.erk_loop import ended
-from jourdain_jax.motion.integrators.erk_step import RUNNING, Progress
+from jourdain_jax.motion.integrators.erk_step import Progress
 from jourdain_jax.motion.integrators.tableaus import Method
+from jourdain_jax.motion.native.flow import Stopped, flow, on_times, rates, scaled
 from jourdain_jax.motion.native.functions import Form, event_program, outputs_of
 from jourdain_jax.motion.native.functions_of_time import numbers_of, parts_from, with_functions
-from jourdain_jax.motion.native.kernel import MOST_KERNELS, kernel, kernel_back, kernel_of_rates
+from jourdain_jax.motion.native.kernel import MOST_KERNELS, Found, Start, kernel_back
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.pulled import pulled_program, steps_of
 from jourdain_jax.motion.native.taylor import rates_of
-from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.vector_fields.by_program import ByProgram
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.native import ffi, series
@@ -33,7 +33,7 @@ from jourdain_jax.program.graph import Unsupported
 # Operations of all that is evaluated. Measured: they are compiled in a time that grows with them, 15,000 of a chain of 128 trailers in 2.8 s (XLA: 40 s),
 # 18,000 of a chain of 23 joint angles in 1.2 s.
 LARGEST_PROGRAM = 60_000
-LARGEST_DERIVATIVE = 10_000  # operations of one; what reverse mode keeps of them lies on the stack
+LARGEST_DERIVATIVE = 10_000, 40_000  # operations of one of the first order, of which reverse mode keeps some on the stack, and of the second
 
 MOST_PRODUCTS = 12_000  # of coefficients in a step by Taylor series, which is written out
 
@@ -115,22 +115,26 @@ def _reason_against_series(form: Form, order: int) -> str:
     return f"its series take {count} products, more than {MOST_PRODUCTS}" if count > MOST_PRODUCTS else ""
 
 
-def reason_against_derivatives(field: VectorField, inputs: Inputs, has_events: bool) -> str:
-    """Why machine code that integrates a scene cannot differentiate it, in words; empty where it can."""
+def reason_against_derivatives(field: VectorField, inputs: Inputs, has_events: bool, order: int) -> str:
+    """Why machine code that integrates a scene cannot differentiate it so many times, in words; empty where it can."""
     assert isinstance(field, ByProgram)
-    return _reason_against_derivatives(_form(field, inputs, has_events))
+    if order > len(LARGEST_DERIVATIVE):
+        return f"machine code has no derivatives of order {order}"
+    return _reason_against_derivatives(_form(field, inputs, has_events), order)
 
 
 @lru_cache(maxsize=MOST_KERNELS)
-def _reason_against_derivatives(form: Form) -> str:
+def _reason_against_derivatives(form: Form, order: int) -> str:
     for nodes in steps_of(form).values():
-        along = outputs_of(replace(form, moving=()), nodes, len(nodes))
-        graph, back, *_ = pulled_program(form, nodes, ())
-        if reason := unsupported(along.graph, along.tangents) or unsupported(graph, back):
-            return reason
-        operations = max(along.graph.operations([*along.values, *along.tangents]), graph.operations(back))
-        if operations > LARGEST_DERIVATIVE:
-            return f"a derivative of a part of it takes {operations} operations, more than {LARGEST_DERIVATIVE}"
+        along = outputs_of(replace(form, moving=((),) * (2**order - 1)), nodes, len(nodes))
+        found = [(along.graph, [*along.values, *(n for part in along.tangents for n in part)])]
+        if order == 1:
+            found.append(pulled_program(form, nodes, ())[:2])
+        for graph, of_it in found:
+            if reason := unsupported(graph, of_it):
+                return reason
+            if (operations := graph.operations(of_it)) > (most := LARGEST_DERIVATIVE[order - 1]):
+                return f"a derivative of a part of it takes {operations} operations, more than {most}"
     return ""
 
 
@@ -141,125 +145,63 @@ def _driven(program: Lowered, inputs: Inputs) -> Lowered | str:
     return with_functions(program, tuple(channel.program if isinstance(channel, FunctionOfTime) else None for channel in inputs.channels))
 
 
-def _form(field: ByProgram, inputs: Inputs, has_events: bool, moving: tuple[int, ...] | None = None) -> Form:
+def _form(field: ByProgram, inputs: Inputs, has_events: bool) -> Form:
     sampled = tuple(i for i, channel in enumerate(_others(inputs)) if isinstance(channel, Sampled))
     program = _driven(field.program, inputs)
     assert not isinstance(program, str), program
-    return Form(program, field.with_work, field.projects, field.affine, has_events, field.has_pivots, moving, sampled)
+    return Form(program, field.with_work, field.projects, field.affine, has_events, field.has_pivots, sampled=sampled)
 
 
-def _form_of(motion: Motion, moving: tuple[int, ...] | None = None) -> Form:
+def _form_of(motion: Motion) -> Form:
     field, _, inputs, *_ = motion.args
-    return _form(field, inputs, motion.has_events, moving)
+    return _form(field, inputs, motion.has_events)
 
 
 def integrate(motion: Motion) -> tuple[Integrated, Bool[Array, "times"], Progress]:
-    """As `erk_loop.integrate`, of one motion from time zero."""
-    own = kernel(_form_of(motion), motion.method, motion.order)
-    return _unpacked(own.layout, motion.goals, *own.run(*_samples(motion), jnp.concatenate([_packed(motion.y0), *_rows(motion)]), motion.goals))
-
-
-class Stopped(NamedTuple):
-    """A motion as its derivatives with respect to times see it."""
-
-    ys: Integrated  # at the goals, the last of which is the end
-    reached: Bool[Array, "times"]
-    t: Float[Array, ""]  # of the end
-    event: Bool[Array, ""]  # whether a stop event ended it on its way
+    """As `erk_loop.integrate`, of one motion from time zero; JAX differentiates it in forward mode."""
+    form = _form_of(motion)
+    return _unpacked(form.layout, motion.goals, flow(form, motion.method, motion.order)(_start(motion)))
 
 
 class AlongTimes(NamedTuple):
-    """Of what the times of a motion depend on: tangents or cotangents."""
+    """Cotangents of what the times of a motion depend on."""
 
     goals: Float[Array, "times"]  # times since the start
     origin: Float[Array, ""]  # the start
 
 
-def tangents(motion: Motion, dy0: Integrated, dknown: Sequence, times: AlongTimes | None, of: Callable) -> tuple[PyTree, PyTree]:
-    """`of` the goals and what `integrate` returns, and its tangents; one run gives both.
-
-    `dy0`, `dknown`: of the state, and of each of the numbers that the rates are given, None: zero; `times`: of the times, None where none varies.
-    """
-    moving = tuple(i for i, d in enumerate(dknown) if d is not None)
-    own, d_start = kernel(_form_of(motion, moving), motion.method, motion.order), _packed(dy0)
-    if times is not None:
-        d_start = d_start - _scaled(_rates(motion, motion.y0, jnp.zeros(())), times.origin)
-    layout, (progress, limits, known) = own.layout, _rows(motion)
-    more = [jnp.asarray(dknown[i], real_type())[None] for i in moving]
-    plain = replace(layout, moving=None)
-    starts = jnp.concatenate([_packed(motion.y0), progress, limits, known])
-    states, end, d_states, d_y, d_t = own.along(*_samples(motion), starts, motion.goals, jnp.concatenate([d_start, *more]))
-    primals, d_goals = (motion.goals, states, end), jnp.zeros_like(motion.goals)
-    if times is not None:
-        d_goals = times.goals
-        ys, reached, last = _unpacked(plain, *primals)
-        at = _on_times(motion, Stopped(ys, reached, last.t, (last.code == results.EVENT) & (last.accepted > 0)))
-        absolute = jnp.where(at.by_goal, times.goals + times.origin, jnp.where(at.event, 0.0, times.origin))
-        d_states = d_states + jax.vmap(_scaled)(at.slopes, absolute)
-        d_y = d_y + _scaled(at.slopes[-1], absolute[-1])
-        d_t = jnp.where(at.event, d_t - times.origin, jnp.where(at.by_goal[-1], times.goals[-1], 0.0))
-    along = jnp.zeros_like(end).at[: layout.y].set(d_y).at[plain.rows["t"].start].set(d_t)
-    return jax.jvp(lambda goals, *found: of(goals, *_unpacked(plain, goals, *found)), primals, (d_goals, d_states, along))
-
-
 def cotangents(motion: Motion, asked: Sequence[bool], ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> tuple[Integrated, list]:
     """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of the states and of the end."""
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
-    form = _form_of(motion)
-    starts, ends = jnp.concatenate([_packed(motion.y0), *_rows(motion)]), jnp.concatenate([_packed(y_end), t_end[None]])
-    found = kernel_back(form, motion.method, which)(*_samples(motion), starts, jax.vmap(_packed)(ys), ends, motion.goals)
+    form, start = _form_of(motion), _start(motion)
+    ends = jnp.concatenate([_packed(y_end), t_end[None]])
+    found = kernel_back(form, motion.method, which)(*start.of_samples, start.rows(jnp.zeros(()), ()), jax.vmap(_packed)(ys), ends, motion.goals)
     known = dict(zip(which, found[form.layout.y :], strict=True))
     return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
 
 
-def cotangents_of_times(motion: Motion, found: Stopped, by_start: Integrated, ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> AlongTimes:
-    """Cotangents of the times, from those of the start (as `cotangents` has it), of the states and of the end; `found`: the motion."""
-    at = _on_times(motion, found)
-    by_states = jnp.sum(jax.vmap(_scaled)(at.slopes, jax.vmap(_packed)(ys)), axis=1)
-    by_end = jnp.sum(_scaled(at.slopes[-1], _packed(y_end)))
+def cotangents_of_times(motion: Motion, found: tuple, by_start: Integrated, ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> AlongTimes:
+    """Cotangents of the times, from those of the start (as `cotangents` has it), of the states and of the end.
+
+    `found`: the states, which goals were reached, the time of the end, and whether that was an event.
+    """
+    form, start = _form_of(motion), _start(motion)
+    states, *rest = found
+    at = on_times(form, start, Stopped((jax.vmap(_packed)(states),), *rest))
+    (slopes,), (first,) = at.slopes, rates(form)(start, (jnp.zeros(()),))
+    by_states = jnp.sum(jax.vmap(scaled)(slopes, jax.vmap(_packed)(ys)), axis=1)
+    by_end = jnp.sum(scaled(slopes[-1], _packed(y_end)))
     goals = jnp.where(at.by_goal, by_states, 0.0).at[-1].add(jnp.where(at.by_goal[-1], by_end + t_end, 0.0))
     of_event = jnp.sum(jnp.where(at.by_goal, by_states, 0.0)) - t_end
     origin = jnp.where(at.event, of_event, jnp.sum(by_states) + by_end)
-    return AlongTimes(goals, origin - jnp.sum(_scaled(_rates(motion, motion.y0, jnp.zeros(())), _packed(by_start))))
+    return AlongTimes(goals, origin - jnp.sum(scaled(first, _packed(by_start))))
 
 
-class _OnTimes(NamedTuple):
-    """How the states at the goals, the last of which is the end, depend on times.
-
-    In absolute time, with f the rates and Phi the derivative of the flow, a state changes by `Phi (dy_0 - f_0 dt_0) + f dt`. Its time t is the goal where
-    that was reached, is found by the loop itself where a stop event ended the motion before, and lies at a number after the start otherwise.
-    """
-
-    slopes: Float[Array, "times y"]
-    by_goal: Bool[Array, "times"]  # whether the time is the goal
-    event: Bool[Array, ""]
-
-
-def _on_times(motion: Motion, found: Stopped) -> _OnTimes:
-    by_goal = found.reached & ~(found.event & (motion.goals == found.t))
-    at = jnp.where(by_goal, motion.goals, found.t)
-    return _OnTimes(jax.vmap(partial(_rates, motion))(found.ys, at), by_goal, found.event)
-
-
-def _rates(motion: Motion, y: Integrated, t: Float[Array, ""]) -> Float[Array, "y"]:
-    progress, limits, known = _rows(motion)
-    return kernel_of_rates(_form_of(motion))(*_samples(motion), jnp.concatenate([_packed(y), progress.at[0].set(t), limits, known]), t[None])
-
-
-def _scaled(slope: Float[Array, "y"], by: Float[Array, "..."]) -> Float[Array, "y"]:
-    """Their product; zero, whatever the slope, where it is multiplied by zero."""
-    return jnp.where(by == 0.0, 0.0, slope * by)
-
-
-def _rows(motion: Motion) -> tuple[Array, Array, Array]:
-    """Progress, control and what is known, as a lane is given them."""
-    origin, goals, control = motion.args[-1], motion.goals, motion.control
-    zero, one = jnp.zeros(()), jnp.ones(())
-    t, h, code, event = zero, jnp.abs(control.dt0), RUNNING * one, -one
-    progress = [t, h, code, zero, zero, event, jnp.inf * one]
-    limits = [jnp.sign(goals[-1]), goals[-1], control.rtol, control.atol, control.shortest, control.max_steps * one, origin]
-    known = [zero if x is None else jnp.asarray(x, real_type()) for x in known_of(motion.args)]  # what samples say is looked up
-    return jnp.stack(progress), jnp.stack(limits), jnp.stack(known) if known else jnp.zeros(0)
+def _start(motion: Motion) -> Start:
+    """What a kernel is given of a motion."""
+    known = tuple(jnp.zeros(()) if x is None else jnp.asarray(x, real_type()) for x in known_of(motion.args))  # what samples say is looked up
+    control, origin = jax.tree.map(lambda x: jnp.asarray(x, real_type()), (tuple(motion.control), motion.args[-1]))
+    return Start(_samples(motion), control, motion.goals, origin, (_packed(motion.y0),), (known,))
 
 
 def known_of(args: tuple) -> list:
@@ -291,6 +233,7 @@ def _others(inputs: Inputs) -> list[Callable]:
 def _samples(motion: Motion) -> tuple[Array, ...]:
     """Tables of the inputs that are given by samples, and the knots, as the kernel takes them; nothing where there are none."""
     _, _, inputs, _, origin = motion.args
+    origin = jax.lax.stop_gradient(origin)  # what samples say at a time since the start is that of a number
     channels = [channel for channel in inputs.channels if isinstance(channel, Sampled)]
     if not channels:
         return ()
@@ -308,12 +251,13 @@ def _packed(y: Integrated) -> Float[Array, "y"]:
     return jnp.concatenate([y.q, y.v, *([] if y.work is None else [y.work[None]])])
 
 
-def _unpacked(layout: Layout, goals, states: Float[Array, "times y"], end: Float[Array, "ends"]) -> tuple[Integrated, Bool[Array, "times"], Progress]:
-    t, h, code, accepted, rejected, event, pivot, count = end[layout.y :]
+def _unpacked(layout: Layout, goals, found: Found) -> tuple[Integrated, Bool[Array, "times"], Progress]:
+    h, code, accepted, rejected, event, pivot, count = found.rest
+    (states,), (end,), (t,) = found[:3]
     reached = (jnp.arange(len(goals)) < count) | (goals == t)
     numbers = [x.astype(jnp.int32) for x in (code, accepted, rejected, event)]
     code, accepted, rejected, event = numbers
-    last = Progress(t, _state(layout, end[: layout.y]), h, code, jnp.zeros((), jnp.int32), accepted, rejected, event, None, pivot, None)
+    last = Progress(t, _state(layout, end), h, code, jnp.zeros((), jnp.int32), accepted, rejected, event, None, pivot, None)
     return jax.vmap(lambda y: _state(layout, y))(states), reached, ended(last, 0.0)
 
 

@@ -1,6 +1,7 @@
 """Inputs that are given by samples, in machine code: straight lines between them, looked up in tables, and knots at which steps end.
 
     f(t) = f_k + (t - t_k)/(t_{k+1} - t_k) (f_{k+1} - f_k),   t_k <= t < t_{k+1};   constant before the first sample and after the last
+    df/dt = (f_{k+1} - f_k)/(t_{k+1} - t_k)
 
 Tables have the shape (tables, inputs, 2, samples): times since the start, then values, of every input that is given by samples, padded with infinite
 times. Knots (`integrators/knots.py`) have the shape (rows, knots). Lanes that share them have one of each: of T tables, lane i of N has number i T / N.
@@ -57,8 +58,8 @@ def pass_knot(w: Writer, lanes: Lanes, lane: Value) -> None:
     lanes.set("knot", lane, w.at(lanes.of("knot", lane, "ptr"), 1, "double"))
 
 
-def write_inputs(w: Writer, layout: Layout) -> None:
-    """`sampled_inputs(state, t, values)`: the values of all inputs that are given by samples, at the time t since the start, of each lane."""
+def write_inputs(w: Writer, layout: Layout, with_slopes: bool) -> None:
+    """`sampled_inputs(state, t, values)`: the values of all inputs that are given by samples, at the time t since the start, of each lane; then df/dt."""
     with w.function("sampled_inputs", "void", {"state": "ptr", "t": w.real, "values": "ptr"}, attributes="noinline") as (state, t, values):
         lanes, times, low, high = Lanes(w, layout, state), w.room(w.real), w.room("i64"), w.room("i64")
         w.store(t, times)
@@ -78,16 +79,20 @@ def write_inputs(w: Writer, layout: Layout) -> None:
                     w.store(w.where(after, b, middle), high)
                 k = w.load("i64", low)
                 t_k, f_k = w.load("double", ts, k), w.load("double", fs, k)
-                share = (now - t_k) / (w.load("double", ts, k + 1) - t_k)
-                share = w.smaller(w.larger(share, 0.0), 1.0)
-                w.store(f_k + share * (w.load("double", fs, k + 1) - f_k), w.at(values, i * w.lanes + lane, "double"))
+                span, rise = w.load("double", ts, k + 1) - t_k, w.load("double", fs, k + 1) - f_k
+                there = (now - t_k) / span
+                share = w.smaller(w.larger(there, 0.0), 1.0)
+                w.store(f_k + share * rise, w.at(values, i * w.lanes + lane, "double"))
+                if with_slopes:
+                    w.store(w.where(there.equals(share), rise / span, 0.0), w.at(values, (layout.sampled + i) * w.lanes + lane, "double"))
         w.give()
 
 
-def looked_up(w: Writer, layout: Layout, state: Value, t: Value) -> list[Value]:
-    """The values at the time t since the start of all inputs that are given by samples."""
+def looked_up(w: Writer, layout: Layout, state: Value, t: Value, with_slopes: bool) -> list[Value]:
+    """The values at the time t since the start of all inputs that are given by samples, then their slopes."""
     if not layout.sampled:
         return []
-    values = w.room(w.real, layout.sampled)
+    count = layout.sampled * (1 + with_slopes)
+    values = w.room(w.real, count)
     w.call("sampled_inputs", "void", state, t, values)
-    return [w.load(w.real, values, i) for i in range(layout.sampled)]
+    return [w.load(w.real, values, i) for i in range(count)]

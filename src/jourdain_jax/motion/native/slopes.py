@@ -17,7 +17,7 @@ def written(form: Form, lanes: int, fused: bool, threads: int) -> str:
     """The module of LLVM IR."""
     w = Writer(lanes, fused)
     if form.sampled:
-        samples.write_inputs(w, form.layout)
+        samples.write_inputs(w, form.layout, form.time_moves)
     write_rates(w, form)
     with w.function("loop", "ptr", {"job": "ptr"}, attributes="noinline") as (job,):
         _write_rows(w, form, job)
@@ -28,7 +28,7 @@ def written(form: Form, lanes: int, fused: bool, threads: int) -> str:
 
 def _write_rows(w: Writer, form: Form, job: Value) -> None:
     """Rows side by side, until none is left."""
-    layout, count = form.layout, form.layout.y
+    layout, count = form.layout, form.layout.integrated
     state, who = w.room(w.real, layout.all), w.room("i64", w.lanes)
     found, pivots = w.room(w.real, count), w.room(w.real, max(form.pivots, 1))
     lanes = Lanes(w, layout, state)

@@ -268,9 +268,8 @@ def _watched(
         return w.where(stays, w.load(w.real, y, i), w.where(found, w.fma(shift, w.load(w.real, k, i), after), after))
 
     each_row(w, rows, y1, state)
-    along = {}
-    if form.moving is not None:
-        along = {"dt": _tangents_at_event(w, form, p, k, found, new["t"], rate_0, y1)}
+    if form.moving:
+        _put_tangents_at_event(w, form, p, k, found, new["t"], rate_0, y1)
     tried = _count(w, dips)
     now = w.where(found, float(results.EVENT), w.where(locating, float(LOCATING), new["code"]))
     new = {
@@ -281,32 +280,44 @@ def _watched(
         "accepted": new["accepted"] - tried,
         "rejected": new["rejected"] + tried,
         "event": w.where(happened | (locating & was_trying), w.load(w.real, first), p["event"]),
-        **along,
     }
     begun = {"h": p["h"], "code": w.number(float(results.EVENT)), "accepted": p["accepted"], "rejected": p["rejected"], "event": which}
     return new | {name: w.where(over, value, new[name]) for name, value in begun.items()}
 
 
-def _tangents_at_event(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Value, rate: list[Value], y1: Value) -> Value:
-    """The tangent of the time of an event, zero where none is found; adds to those of the state `y1` there.
+def _put_tangents_at_event(w: Writer, form: Form, p: Lanes, k: Value, found: Value, t: Value, rate: list[Value], y1: Value) -> None:
+    """Where an event is found at the time t in the state `y1`, the tangents of that time, and those of the state there; `k`: the rates.
 
-    dt = -(dc/dy dy + dc/dp dp)/cdot,   dy <- dy + f dt;   NaN where c has no slope there
+    Each tangent of time is found in turn, the state being moved by it, with e the directions taken together in it,
+
+        dt = -(dc/dt dt + dc/dy dy + dc/dp dp)/cdot,   y <- y + e dt f(t, y),   t <- t + e dt,   e^2 = 0
+
+    where values, tangents and rates are those before; dt is NaN where c has no slope there.
     """
-    layout, place = form.layout, w.room(w.real)
-    w.store(p["dt"], place)
+    layout, count, times = form.layout, form.layout.events, form.layout.rows["dt"]
     with w.when(w.any(found)):
-        values = w.room(w.real, layout.events)
-        w.call("event_tangents", "void", p.pointer, t, y1, values)
-        dc = search.chosen(w, p["event"], [w.load(w.real, values, i) for i in range(layout.events)])
+        values, pivots = w.room(w.real, count * len(times)), w.room(w.real, max(form.pivots, 1))
         slope = search.chosen(w, p["event"], rate)
         usable = found & slope.differs(0.0) & (w.magnitude(slope) < math.inf)
         flat = found & search.is_flat(w, p, slope)
-        dt = w.where(flat, math.nan, w.where(usable, -dc / slope, 0.0))
-        w.store(w.where(found, dt, p["dt"]), place)
+        for part, row in enumerate(times, 1):
+            if part > 1:  # what is known of the rates is of the state as it was
+                k = w.room(w.real, layout.integrated)
+                w.call("rates", "void", p.pointer, t, y1, k, pivots)
+            w.call("event_tangents", "void", p.pointer, t, y1, values)
+            dc = search.chosen(w, p["event"], [w.load(w.real, values, (part - 1) * count + i) for i in range(count)])
+            dt = w.where(flat, math.nan, w.where(usable, -dc / slope, 0.0))
+            w.store(w.where(found, dt, w.load(w.real, p.pointer, row)), p.pointer, row)
+            for other in range(len(times) + 1):
+                if not other & part:
+                    _move_rows(w, layout, y1, k, (other | part) * layout.y, other * layout.y, dt, usable | flat)
 
-        def moved(i: int | Value) -> Value:
-            before = w.load(w.real, y1, i + layout.y)
-            return w.where(usable | flat, w.fma(w.load(w.real, k, i), dt, before), before)
 
-        for_rows(w, range(layout.y), lambda i: w.store(moved(i), y1, i + layout.y))
-    return w.load(w.real, place)
+def _move_rows(w: Writer, layout: Layout, y: Value, k: Value, rows: int, rates: int, dt: Value, moves: Value) -> None:
+    """Adds the rates that begin with row `rates` of `k`, times `dt`, to those that begin with row `rows` of `y`."""
+
+    def moved(i: int | Value) -> Value:
+        before = w.load(w.real, y, i + rows)
+        return w.where(moves, w.fma(w.load(w.real, k, i + rates), dt, before), before)
+
+    for_rows(w, range(layout.y), lambda i: w.store(moved(i), y, i + rows))

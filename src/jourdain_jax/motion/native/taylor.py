@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from jourdain_jax.motion.native.functions import Form, known_values, outputs_of
 from jourdain_jax.motion.native.layout import Lanes, Layout
+from jourdain_jax.native import series
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.math_functions import power
 from jourdain_jax.native.scalar_program import as_real, written
@@ -54,24 +55,29 @@ class Jet(NamedTuple):
 def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> Jet:
     """The Taylor series of the lanes' states, and of their tangents, at the time t."""
     program, layout, y = form.program, form.layout, p.pointer
-    work, moving = layout.y - layout.coordinates - layout.speeds, form.moving is not None
     rates = rates_of(form)
     own = outputs_of(form, [*rates, *_watched(form)], len(rates))
     first = len(program.fixed)  # time, then the state
     known = dict(zip(own.variables, known_values(w, form, y, t, y).values(), strict=True))
     states = own.variables[first + 1 : first + 1 + layout.coordinates + layout.speeds]
-    given = {n: x for n, x in known.items() if n not in states} | dict(zip(own.known, p.every("dknown") if moving else [], strict=True))
+    given = {n: x for n, x in known.items() if n not in states} | dict(zip(own.known, p.every("dknown"), strict=True))
+    given |= dict(zip(own.times, p.every("dt"), strict=True)) if own.times else {}
 
     def with_work(nodes: list[int], other: int | None) -> list:
         return [*nodes, *[other] * (layout.y - len(nodes))]
 
-    moved = [*with_work(states, None), *(with_work(own.states, None) if moving else [])]
-    nodes = [*with_work(own.values[: len(rates)], own.graph.zero), *(with_work(own.tangents, own.graph.zero) if moving else [])]
-    assert work in (0, 1)
+    moved = [n for part in (states, *own.states) for n in with_work(part, None)]
+    nodes = [n for part in (own.values[: len(rates)], *own.tangents) for n in with_work(part, own.graph.zero)]
     start = [w.load(w.real, y, i) for i in range(layout.integrated)]
-    series = Series(w, own.graph, given, moved, nodes, start, order, own.variables[first])
-    values = {n: w.number(0.0) if x[0] is None else x[0] for n, x in series.of.items()}
-    return Jet(series.state, _evaluated(w, form, own.graph, own.values[len(rates) :], values, known))
+    found = Series(w, own.graph, given, moved, nodes, start, order, own.variables[first])
+    values = {n: w.number(0.0) if x[0] is None else x[0] for n, x in found.of.items()}
+    return Jet(found.state, _evaluated(w, form, own.graph, own.values[len(rates) :], values, known))
+
+
+def products(form: Form, order: int) -> int:
+    """About how many multiplications a step takes, tangents and all."""
+    own = outputs_of(form, rates_of(form), len(rates_of(form)))
+    return series.products(own.graph, [*own.values, *(n for part in own.tangents for n in part)], order)
 
 
 def rates_of(form: Form) -> list[int]:
