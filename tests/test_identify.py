@@ -3,6 +3,8 @@
 Measurements come from closed forms or hand-written equations (tests/oracles), not from the engine.
 """
 
+import warnings
+
 import diffrax
 import equinox as eqx
 import jax
@@ -350,9 +352,27 @@ def test_sigmas_that_are_too_large_are_warned_of_by_channel():
     right = fit(Cart(mass=1.7), cart_run(values=noisy, sigma=0.01), ("mass",))
     assert not right.warnings
     (warning,) = fit(Cart(mass=1.7), cart_run(values=noisy, sigma={"x": 0.01, "x_rate": 0.07}), ("mass",)).warnings
-    assert "the residuals of `x_rate` are smaller than the sigmas foretell: these are too large by a factor of about 7" in warning
+    assert "the residuals of `x_rate` are smaller than the sigmas foretell by a factor of about 7.9: sigmas are too large" in warning
     (warning,) = fit(Cart(mass=1.7), cart_run(values=noisy, sigma={"x": 0.1, "x_rate": 0.1}), ("mass",), loss=jj.huber()).warnings
     assert "the residuals are smaller than the sigmas foretell" in warning
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("guess", [1.7, 2.0], ids=["nearly", "exactly"])
+def test_measurements_without_noise_are_told_in_one_sentence(guess):
+    motion = jj.simulate(CART, {"x": 0.3}, ts=TS)  # CART has the mass of 2 kg
+    run = Measurements(TS, {name: motion[name] for name in ("x", "x_rate")}, 0.01, start={"x": 0.3})
+    (warning,) = fit(Cart(mass=guess), run, ("mass",)).warnings
+    assert "samples were smoothed or have no noise" in warning
+
+
+def test_sigmas_are_not_called_too_large_where_residuals_have_a_memory():
+    noise = np.random.default_rng(5).normal(size=(2, TS.size))
+    for k in range(1, TS.size):
+        noise[:, k] = 0.9 * noise[:, k - 1] + np.sqrt(1 - 0.9**2) * noise[:, k]
+    shaken = {name: values + 0.004 * e for (name, values), e in zip(cart_run().values.items(), noise, strict=True)}
+    (warning,) = fit(Cart(mass=1.7), cart_run(values=shaken, sigma=0.01), ("mass",)).warnings
+    assert "are not white" in warning
 
 
 def test_an_event_before_the_last_sample_is_named():
@@ -366,19 +386,28 @@ def test_an_event_before_the_last_sample_is_named():
     (warning,) = (w for w in fit(Stopped(mass=1.9), run, ("mass",)).warnings if "event" in w)
     assert "the motion of run 0 meets its event `buffer` at" in warning
     assert met - 0.2 < float(warning.partition(" at ")[2].partition(" s")[0]) < met
-    assert f"{np.sum(met <= TS)} samples come later" in warning
+    assert f"before {np.sum(met <= TS)} of its samples" in warning
     cut = cart_run(push=0.0, values={"x": np.where(met <= TS, np.nan, x)}, sigma=1e-3)
     assert not any("event" in w for w in fit(Stopped(mass=1.9), cut, ("mass",)).warnings)
 
 
 def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():
-    ends, begins = ({"push": jj.Sampled(ts, [0.0, 1.0, 1.0])} for ts in ([-1.0, 0.0, 1.0], [1.5, 2.5, 10.0]))
+    ends, begins = ({"push": jj.Sampled(ts, [0.0, 1.0, 1.0])} for ts in ([-1.0, 0.0, 1.0], [1.6, 2.6, 10.0]))
     with pytest.warns(UserWarning, match="`push` of run 1 is not sampled over all of the run and keeps its last value from 1 to 4 s") as seen:
         found = fit(Cart(mass=1.7), [cart_run(), cart_run(inputs=ends)], ("mass",))
     assert len(seen) == 1
     assert sum("from 1 to 4 s" in warning for warning in found.warnings) == 1
-    with pytest.warns(UserWarning, match="`push` of run 0 .* keeps its first value until 1.5 s"):
+    with pytest.warns(UserWarning, match="`push` of run 0 .* keeps its first value until 1.6 s"):
         log_likelihood(CART, cart_run(inputs=begins))
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        log_likelihood(CART, cart_run(inputs=ends))
+        assert [one.filename for one in seen] == [__file__]
+        seen.clear()
+        for ts in (np.arange(20) / 5.0, 0.1 + np.arange(39) / 10.0):  # until an interval before the end, and from one after the start
+            for hold in (False, True):
+                log_likelihood(CART, cart_run(inputs={"push": jj.Actuator(jj.Sampled(ts, np.sin(ts)), hold=hold)}))
+        assert not seen
 
 
 def test_one_bad_repeat_harms_no_other():

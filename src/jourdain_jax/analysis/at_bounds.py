@@ -118,11 +118,11 @@ def too_narrow_near_bounds(around: Around, told: AtBounds, errors: Float[np.ndar
     limits, theta, places = around.limits, around.found.theta[0], np.flatnonzero(~around.limits.fixed)
 
     def named(some: Iterable[int], steps: Callable[[int], list[float]]) -> list[str]:
-        rises_less = lambda k, step: 2 * around.rise(0, int(places[k]), step)[0] < NARROW * (step / errors[k]) ** 2  # noqa: E731
-        return [f"`{labels[k]}`" for k in some if any(rises_less(k, step) for step in steps(k))]
+        return [f"`{labels[k]}`" for k in some if any(2 * around.rise(0, int(places[k]), step)[0] < NARROW * (step / errors[k]) ** 2 for step in steps(k))]
 
     def to_bounds(k: int) -> list[float]:
-        return [step for end in (limits.low, limits.high) if 1 < ((step := float((end - theta)[places[k]])) / errors[k]) ** 2 < 2 * RISE_95]
+        steps = [float((end - theta)[places[k]]) for end in (limits.low, limits.high)]
+        return [step for step in steps if 1 < (step / errors[k]) ** 2 < 2 * RISE_95]
 
     def to_ends(k: int) -> list[float]:
         at, reach = theta[places[k]], float(np.sqrt(RISE_95) * errors[k])

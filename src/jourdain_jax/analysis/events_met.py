@@ -23,6 +23,6 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"], simulation:
         if motion.event >= 0 and samples:
             event = f"its event `{motion.event_names[int(motion.event)]}` at {float(motion.t_end):.4g} s"
             found.append(
-                f"the motion of run {index} meets {event}, but {samples} samples come later: it is fitted as if it went on; leave them out, or give NaN"
+                f"the motion of run {index} meets {event}, before {samples} of its samples: it is fitted as if it went on; leave these out, or give NaN"
             )
     return tuple(found)

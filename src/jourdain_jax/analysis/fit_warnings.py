@@ -1,5 +1,8 @@
 """Why estimates of a fit, or their intervals, should not be relied on, in words."""
 
+from collections.abc import Mapping
+from typing import NamedTuple
+
 import numpy as np
 
 from jourdain_jax.analysis.at_bounds import FAR_BEYOND
@@ -39,49 +42,67 @@ def warnings_of(fit) -> tuple[str, ...]:
         for name, far in zip(fit.labels, fit.statistics.from_prior, strict=True)
         if abs(far) > _FROM_PRIOR
     ]
-    found += _sizes_of_residuals(fit)
-    if fit.errors == "sigmas":
-        coloured = [f"`{name}` ({rho:.2f})" for name, (rho, limit) in fit.autocorrelation.items() if abs(rho) > limit]
-        if coloured:
-            found.append(
-                f"residuals of {', '.join(coloured)} are not white (in brackets: correlation of neighbouring ones), which makes intervals too narrow: the "
-                "scene, a sensor or the noise is not right; `correlation_time=None` estimates a memory of the noise, and with five runs or more, "
-                'errors="runs" gives intervals that allow for it'
-            )
+    coloured, sizes = {name: rho for name, (rho, limit) in fit.autocorrelation.items() if abs(rho) > limit}, _sizes_of_residuals(fit)
+    if large := [size for size in sizes if size.least > 1 + _SURE * size.narrow]:
+        found.append(
+            f"the residuals{large[0].named} are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, or sigmas that are "
+            "too small"
+        )
+    if small := [size for size in sizes if size.is_small(coloured)]:
+        times = f" by a factor of about {1 / np.sqrt(small[0].most):.2g}" if small[0].most > 0 else ""
+        found.append(
+            f"the residuals{small[0].named} are smaller than the sigmas foretell{times}: sigmas are too large, so that intervals are too wide, or samples were "
+            "smoothed or have no noise; a sigma of `None` is estimated"
+        )
+    wide = {name for size in small for name in size.channels}
+    named = ", ".join(f"`{name}` ({rho:.2f})" for name, rho in coloured.items() if name not in wide)
+    if named and fit.errors == "sigmas":
+        found.append(
+            f"residuals of {named} are not white (in brackets: correlation of neighbouring ones), which makes intervals too narrow: the scene, a sensor or the "
+            'noise is not right; `correlation_time=None` estimates a memory of the noise, and with five runs or more, errors="runs" gives intervals that '
+            "allow for it"
+        )
     return tuple(found)
 
 
-def _sizes_of_residuals(fit) -> list[str]:
-    """Whether residuals, of all channels or of one, are too large for their sigmas, or too small; under a robust loss most of them, since some are far out."""
+class _Size(NamedTuple):
+    """The mean square of the residuals of some channels, in sigmas."""
+
+    channels: list[str]
+    named: str  # as a sentence goes on; empty where these are all channels
+    least: float  # where they determined no unknown that others may have determined
+    narrow: float  # standard deviation of that, of normal residuals
+    most: float  # where they determined all of them
+    wide: float
+
+    def is_small(self, coloured: Mapping[str, float]) -> bool:
+        """Whether it is too small to be chance; `coloured`: correlations rho of neighbours, with which residuals tell (1 + rho)/(1 - rho) times less."""
+        larger = max((1 + rho) / max(1 - rho, 1e-9) for rho in (0.0, *(coloured.get(name, 0.0) for name in self.channels)))
+        # the cube root of chi-square is nearly normal (Wilson and Hilferty), also far below its mean
+        return bool(self.most * larger < max(1 - self.wide**2 / 9 - _SURE * self.wide / 3, 0.0) ** 3)
+
+
+def _sizes_of_residuals(fit) -> list[_Size]:
+    """Of all channels whose sigmas are known together, then one by one; under a robust loss that of most residuals, since some are far out."""
     robust, determined = fit.asked.loss is not LEAST_SQUARES, int(fit.samples - fit.degrees_of_freedom)
     names = [name for name in dict.fromkeys(name for run in fit.whitened for name in run) if name not in fit.sigma]
-    large, small = [], []
+    found = []
     for channels in (names, *([name] for name in names)):
         squares = np.concatenate([np.zeros(0), *(np.ravel(run[name]) for run in fit.whitened for name in channels if name in run)]) ** 2
         squares = squares[np.isfinite(squares)]
-        degrees = max(squares.size - determined, 1)
-        if not squares.size:
-            continue
-        # chi-square has mean n and variance 2 n; the median of w^2 is 0.4549 for a normal w: relative to it, that of n has the deviation 2.33 / sqrt(n)
-        size, spread = (np.median(squares) / 0.4549, 2.33 / np.sqrt(degrees)) if robust else (squares.sum() / degrees, np.sqrt(2 / degrees))
-        named = f" of {', '.join(f'`{name}`' for name in channels)}" if len(channels) < len(names) else ""
-        if (size if robust or not named else squares.mean()) > 1 + _SURE * spread:
-            large.append(named)
-        # the cube root of chi-square is nearly normal (Wilson and Hilferty), also far below its mean
-        elif size < max(1 - spread**2 / 9 - _SURE * spread / 3, 0.0) ** 3:
-            small.append((named, size))
-    found = []
-    if large:
-        found.append(
-            f"the residuals{large[0]} are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, or sigmas that are too small"
-        )
-    if small:
-        named, size = small[0]
-        found.append(
-            f"the residuals{named} are smaller than the sigmas foretell: these are too large by a factor of about {1 / np.sqrt(size):.2g}, "
-            "so that intervals are too wide, or samples were smoothed; a sigma of `None` is estimated"
-        )
+        if squares.size:
+            some = len(channels) < len(names)
+            named = f" of {', '.join(f'`{name}`' for name in channels)}" if some else ""
+            found.append(_Size(channels, named, *_mean_square(squares, 0 if some else determined, robust), *_mean_square(squares, determined, robust)))
     return found
+
+
+def _mean_square(squares: np.ndarray, determined: int, robust: bool) -> tuple[float, float]:
+    """The mean square of residuals that determined so many unknowns, and its standard deviation where they are normal; `robust`: from their median."""
+    degrees = max(squares.size - determined, 1)
+    if robust:  # the median of w^2 is 0.4549 for a normal w; relative to it, that of n has the standard deviation 2.33 / sqrt(n)
+        return float(np.median(squares)) / 0.4549, 2.33 / degrees**0.5
+    return float(np.sum(squares)) / degrees, (2 / degrees) ** 0.5  # chi-square has mean n and variance 2 n
 
 
 def _counted_twice(fit) -> list[str]:

@@ -19,6 +19,7 @@ from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.scene import Scene
+from jourdain_jax.scene.tracebacks import users_level
 
 
 def as_runs(scene: Scene, data: Measurements | Sequence[Measurements], *, repeats: bool = False) -> tuple[Measurements, ...]:
@@ -32,7 +33,7 @@ def as_runs(scene: Scene, data: Measurements | Sequence[Measurements], *, repeat
         raise ValueError(f"{wrong[0]}, expected a `Measurements` or a sequence of at least one")
     found = tuple(checked(scene, run, index, repeats) for index, run in enumerate(runs))
     for sentence in held_inputs(scene, found):
-        warnings.warn(sentence, stacklevel=5)
+        warnings.warn(sentence, stacklevel=users_level())
     return found
 
 

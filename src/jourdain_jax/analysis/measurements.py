@@ -296,15 +296,19 @@ def _check_overlap(run: Measurements, name: str, signal, where: str) -> None:
 
 
 def held_inputs(scene: Scene, runs: Sequence[Measurements]) -> tuple[str, ...]:
-    """One sentence for each input whose samples begin or end more than an interval within a run, `checked`, while it changes: it is held there."""
+    """One sentence for each input that changes and whose samples leave more than 1.5 of their intervals of a run, `checked`, at an end: it is held there.
+
+    The last interval may be a jump, such as those of commands that are held; then the one before it counts.
+    """
     found: list[str] = []
     for index, run in enumerate(runs):
         for name, signal in zip(scene.inputs.entries, run.inputs.channels if isinstance(run.inputs, Inputs) else (), strict=False):
             if not isinstance(signal, Sampled) or is_traced((signal, run.ts, run.t0)) or np.ptp(np.asarray(signal.values)) == 0:
                 continue
             ts, last = np.asarray(signal.ts), float(run.ts[-1])
-            spans = [f"its first value until {ts[0]:.6g} s"] if ts[0] > run.t0 + (ts[1] - ts[0]) else []
-            spans += [f"its last value from {ts[-1]:.6g} to {last:.6g} s"] if ts[-1] < last - (ts[-1] - ts[-2]) else []
+            intervals = np.diff(ts)
+            spans = [f"its first value until {ts[0]:.6g} s"] if ts[0] - run.t0 > 1.5 * intervals[0] else []
+            spans += [f"its last value from {ts[-1]:.6g} to {last:.6g} s"] if last - ts[-1] > 1.5 * max(intervals[-2:]) else []
             if spans:
                 found.append(
                     f"input `{name}` of run {index} is not sampled over all of the run and keeps {' and '.join(spans)}; if it did so, repeat that value in its "
