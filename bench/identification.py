@@ -438,7 +438,8 @@ def report_windows() -> None:
     again, warm = fit_windows(57)
     print("\n".join(line for line in str(found).split("\n") if "run " not in line and not line.strip()[:2].isdigit()))
     step = {count: time_of_a_step(count) for count in (8, 32)}
-    print(json.dumps({"cold": cold, "warm": warm, "memory": memory, "steps": int(found.steps), "converged": bool(again.converged), "ratio": step[32] / step[8]}))
+    told = {"cold": cold, "warm": warm, "memory": memory, "steps": int(found.steps), "converged": bool(again.converged), "ratio": step[32] / step[8]}
+    print(json.dumps(told))
 
 
 def time_of_a_step(count: int) -> float:
