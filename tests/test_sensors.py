@@ -267,6 +267,33 @@ def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_grav
         jj.fit(Swing(), bad, ("stiffness",))
 
 
+def test_a_load_cell_shows_what_the_ground_bears_and_tells_a_mass():
+    disc, start, cell = jj.models.TiltingDisc(mass=1.3), {"lean": 0.4, "spin_rate": -4.0, "yaw_rate": 0.5}, jj.LoadCell("rim")
+    motion = jj.simulate(disc, start, ts=TS, rtol=1e-10, atol=1e-10)
+    force, felt = cell.over_times(motion), jj.Accelerometer("disc").over_times(motion)
+    np.testing.assert_allclose(force, 1.3 * jnp.einsum("tij,tj->ti", motion.motions()["disc"].orientation, felt), atol=1e-9)  # F = m (a - g)
+    data = jj.Measurements(TS, {"plate": force}, 0.1, start=start, sensors={"plate": cell})
+    found = jj.fit(disc.replace(mass=1.0), data, ("mass", "radius"))
+    assert found["mass"].value == pytest.approx(1.3, rel=1e-6)
+    assert found["radius"].value == pytest.approx(float(disc.radius), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("scene", "name", "message"),
+    [
+        (jj.models.TiltingDisc(), "rin", "the load cell `plate` of run 0 of `TiltingDisc` is under contact `rin`, which is not there; did you mean `rim`"),
+        (jj.models.TwoWheelAxleRedundant(), "wheel1", "is under contact `wheel1`, whose force is not determined"),
+    ],
+    ids=["no such contact", "a force that two wheels share"],
+)
+def test_a_load_cell_that_shows_nothing_is_refused(scene, name, message):
+    data = jj.Measurements(TS, {"plate": np.ones((TS.size, 3))}, 1.0, start={}, sensors={"plate": jj.LoadCell(name)})
+    with pytest.raises(ValueError, match=message):
+        jj.fit(scene, data, ("mass",))
+    with pytest.raises(ValueError, match="`contact` of `LoadCell` is an int"):
+        jj.LoadCell(3)
+
+
 def test_a_delay_that_is_not_there_is_at_its_bound():
     found = jj.fit(Cart(mass=1.9), run(3, truth=IDEAL, delay=DELAY), ("mass",))
     assert found.converged

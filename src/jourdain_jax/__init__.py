@@ -78,7 +78,6 @@ with _without_collecting(all_stays=True):  # what a motion needs
     from jourdain_jax.scene.visuals import Visual
 
 if _typing.TYPE_CHECKING:  # what else there is, for static tools
-    from jourdain_jax.analysis.accelerometer import Accelerometer
     from jourdain_jax.analysis.body_inertia import possible_inertia
     from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
     from jourdain_jax.analysis.estimate import Estimate
@@ -86,6 +85,7 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.analysis.fit import fit, fit_batch
     from jourdain_jax.analysis.fit_result import Fit
     from jourdain_jax.analysis.gradients import derivative_exists
+    from jourdain_jax.analysis.instruments import Accelerometer, LoadCell
     from jourdain_jax.analysis.joint_prior import joint_normal
     from jourdain_jax.analysis.likelihood import log_likelihood
     from jourdain_jax.analysis.linearize import Linearization, linearize
@@ -125,7 +125,6 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.plotting.show import View, show
 
 _ON_FIRST_USE = {
-    "analysis.accelerometer": "Accelerometer",
     "analysis.body_inertia": "possible_inertia",
     "analysis.energy": "Energy EnergyBalance energy energy_balance",
     "analysis.estimate": "Estimate",
@@ -133,6 +132,7 @@ _ON_FIRST_USE = {
     "analysis.fit": "fit fit_batch",
     "analysis.fit_result": "Fit",
     "analysis.gradients": "derivative_exists",
+    "analysis.instruments": "Accelerometer LoadCell",
     "analysis.joint_prior": "joint_normal",
     "analysis.likelihood": "log_likelihood",
     "analysis.linearize": "Linearization linearize",
@@ -206,6 +206,7 @@ __all__ = [
     "Levels",
     "Linearization",
     "Load",
+    "LoadCell",
     "LogDensity",
     "LogNormal",
     "LogUniform",

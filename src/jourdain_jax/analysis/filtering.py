@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.accelerometer import Accelerometer
 from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.instruments import Instrument
 from jourdain_jax.analysis.joint_prior import Correlated
 from jourdain_jax.analysis.likelihood import as_runs, mapped
 from jourdain_jax.analysis.measurements import Measurements
@@ -202,8 +202,8 @@ def _check_supported(scene: Scene, runs: Sequence[Measurements]) -> None:
 def _check_reading(name: str, reading: Reading, index: int) -> None:
     if reading.is_late:
         raise ValueError(f"sensor `{name}` of run {index} has a delay or a lag, which a filter does not know; shift its times by the delay, or use `fit`")
-    if isinstance(reading.operation, Accelerometer):
-        raise ValueError(f"sensor `{name}` of run {index} is an accelerometer, which shows the white disturbance itself; leave it out, or use `fit`")
+    if isinstance(reading.operation, Instrument):
+        raise ValueError(f"sensor `{name}` of run {index} shows accelerations, and so the white disturbance itself; leave it out, or use `fit`")
 
 
 def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Float[Array, "speeds"]:

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.accelerometer import Accelerometer
-from jourdain_jax.analysis.channels import channel, motion_shape
+from jourdain_jax.analysis.channels import channel
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.instruments import Instrument
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.sensors import Actuator, Drive, Reading, Sensor, latest, numbers_of
 from jourdain_jax.calculus.reals import Number, checked_unless_traced, described, is_traced
@@ -40,8 +40,8 @@ class Measurements(eqx.Module):
     - `unknown_start`: names in `start` whose values are first guesses, to be estimated; or name -> `bounds(...)`, `positive()`,
       `unbounded()` (None: unbounded), or an `Estimate` with a prior.
     - `inputs`: as in `simulate`: name -> number, function of time, or `Sampled`; or an `Actuator`.
-    - `sensors`: channel -> `Sensor`; or what an ideal one shows: a coordinate, a speed, an `Accelerometer`, or a function of a `Motion` (one instant), such as
-      `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`.
+    - `sensors`: channel -> `Sensor`; or what an ideal one shows: a coordinate, a speed, an `Accelerometer`, a `LoadCell`, or a function of a `Motion`
+      (one instant), such as `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`.
     - `t0`: time of the start in s; default: the first of `ts`.
 
     **Raises** ValueError for times that do not increase, values that are infinite, channels without any value, sigmas that are not positive, names
@@ -72,7 +72,7 @@ class Measurements(eqx.Module):
         start: Mapping,
         unknown_start: Mapping | Iterable[str] = (),
         inputs: "dict | Inputs | None" = None,
-        sensors: "Mapping[str, Sensor | str | Callable | Accelerometer] | None" = None,
+        sensors: "Mapping[str, Sensor | str | Callable | Instrument] | None" = None,
         t0: Number | None = None,
         correlation_time: "Mapping | Number | None" = 0.0,
     ):
@@ -213,12 +213,10 @@ def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measu
     return found
 
 
-def _quantity(scene: Scene, given: str | Callable | Accelerometer | None, channel_name: str, where: str):
-    """What a sensor measures: a function made ready, an accelerometer, or a name; and its shape."""
-    if isinstance(given, Accelerometer):
-        bodies = motion_shape(scene).bodies
-        if given.body not in bodies:
-            raise ValueError(f"the accelerometer `{channel_name}` of {where} sits on body `{given.body}`, which is not there; {nearest(given.body, bodies)}")
+def _quantity(scene: Scene, given: str | Callable | Instrument | None, channel_name: str, where: str):
+    """What a sensor measures: a function made ready, an instrument, or a name; and its shape."""
+    if isinstance(given, Instrument):
+        given.check(scene, channel_name, where)
         return given, (3,)
     if callable(given):
         operation = channel(given, scene)

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.accelerometer import Accelerometer
 from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.instruments import Instrument
 from jourdain_jax.analysis.lagged import filtered, filtered_held, held, read
 from jourdain_jax.analysis.ranges import positive, unbounded
 from jourdain_jax.calculus.reals import checked_real, described, is_traced
@@ -34,7 +34,7 @@ class Sensor(eqx.Module):
 
         jj.Sensor("lean_rate", gain=jj.Estimate(1.0), bias=jj.Estimate(0.0, per_run=True), delay=jj.Estimate(0.02, range=jj.bounds(0.0, 0.1)), lag=0.01)
 
-    - `quantity`: a coordinate, a speed, an `Accelerometer`, or a function of a `Motion` (one instant) such as
+    - `quantity`: a coordinate, a speed, an `Accelerometer`, a `LoadCell`, or a function of a `Motion` (one instant) such as
       `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`; default: what the channel is called.
     - `gain`, `bias` (in the unit of the channel): one number, or one for each component of a channel that is a vector.
     - `delay` in s. No sample that counts may show a time before the start of the run: its time less the largest delay is at or after `t0`.
@@ -52,14 +52,14 @@ class Sensor(eqx.Module):
     **Raises** ValueError for numbers that are not finite, and delays or lags below zero.
     """
 
-    quantity: str | Callable | Accelerometer | None
+    quantity: str | Callable | Instrument | None
     gain: Float[Array, "..."] | Estimate
     bias: Float[Array, "..."] | Estimate
     delay: Float[Array, ""] | Estimate  # s
     lag: Float[Array, ""] | Estimate  # s
 
     def __init__(self, quantity=None, *, gain=1.0, bias=0.0, delay=0.0, lag=0.0):
-        if not (quantity is None or isinstance(quantity, str | Accelerometer) or callable(quantity)):
+        if not (quantity is None or isinstance(quantity, str | Instrument) or callable(quantity)):
             raise ValueError(f"`quantity` of `Sensor` is {described(quantity)}, expected a coordinate, a speed, or a function of a motion")
         self.quantity = quantity
         self.gain, self.bias, self.delay, self.lag = _checked("Sensor", gain=gain, bias=bias, delay=delay, lag=lag)
@@ -137,7 +137,7 @@ def default_range(name: str):
 class Reading(eqx.Module):
     """A sensor of one run made ready: its quantity looked up, numbers in place of what is to be estimated."""
 
-    operation: Channel | Accelerometer | None  # None: a coordinate or speed by name
+    operation: Channel | Instrument | None  # None: a coordinate or speed by name
     name: str = eqx.field(static=True)  # of that
     numbers: dict[str, Float[Array | np.ndarray, "..."] | float]
     unknown: tuple[str, ...] = eqx.field(static=True)  # names of numbers that are estimated
@@ -152,7 +152,7 @@ class Reading(eqx.Module):
         """What it measures, along a motion; `states`: the same as bodies, where a channel is a function of them."""
         if self.operation is None:
             return motion[self.name]
-        return self.operation.over_times(motion) if isinstance(self.operation, Accelerometer) else jax.vmap(self.operation)(states)
+        return self.operation.over_times(motion) if isinstance(self.operation, Instrument) else jax.vmap(self.operation)(states)
 
     @property
     def has_filter(self) -> bool:
