@@ -4,6 +4,7 @@ import inspect
 import itertools
 import math
 import subprocess
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -365,3 +366,22 @@ def test_an_operation_has_one_value_one_derivative_and_a_bound_of_its_round_off(
         near, bound = np.split(operation.bounded(*single), 2)
         assert np.all(np.abs(near - operation.value(*points)) <= bound)
         assert np.all(bound <= 1e-4 * (1.0 + np.abs(near)))
+
+
+def test_two_threads_that_want_a_new_node_at_once_get_the_same():
+    both_looked, graph, found = threading.Barrier(2, timeout=10), Graph(), []
+
+    class Known(dict):
+        def get(self, key):
+            node = super().get(key)
+            both_looked.wait()
+            return node
+
+    x = graph.input("x", True)
+    graph._known = Known(graph._known)
+    threads = [threading.Thread(target=lambda: found.append(graph.call("sinh", x))) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == [len(graph.op) - 1] * 2

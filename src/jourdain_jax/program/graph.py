@@ -6,6 +6,7 @@ Arguments of sums and products are ordered, so that a b and b a are one node.
 
 import heapq
 import math
+import threading
 from collections import Counter
 from collections.abc import Iterable, Mapping
 
@@ -17,6 +18,7 @@ MOST_NODES = 500_000  # of one graph: some seconds of building
 MOST_FACTORS = 8  # of a product that is looked at for squares of sines
 MOST_MULTIPLICATIONS = 512  # of one product of matrices taken apart; measured: at 16 x 16 scalars are faster in batches, from 24 x 24 on a call is
 ARRAYS = {"array", "kept", "output"}  # what is no scalar (`calls.py`)
+_GROWING = threading.Lock()  # threads may derive on one graph
 OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
 
 
@@ -50,14 +52,20 @@ class Graph:
     def _node(self, op: str, args: tuple[int, ...] = (), value=None, varies: bool | None = None) -> int:
         key = (op, args, value)
         node = self._known.get(key)
-        if node is None:
-            if len(self.op) >= MOST_NODES:
+        if node is not None:
+            return node
+        with _GROWING:
+            count = len(self.op)
+            if count >= MOST_NODES:
                 raise Unsupported(f"a computation of more than {MOST_NODES} scalars")
-            node = self._known[key] = len(self.op)
             self.op.append(op)
             self.args.append(args)
             self.value.append(value)
             self.varies.append(any(map(self.varies.__getitem__, args)) if varies is None else varies)
+            node = self._known.setdefault(key, count)
+            if node != count:  # another thread has made it meanwhile
+                for of_nodes in (self.op, self.args, self.value, self.varies):
+                    of_nodes.pop()
         return node
 
     # leaves

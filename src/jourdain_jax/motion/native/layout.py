@@ -3,10 +3,9 @@
 A lane is handed over with all rows of `Layout.given`, its progress at the start among them, and handed back with those of its progress. Where tangents are
 pushed along, the state is followed by its own, and so are the numbers that the rates are given; `dt` are those of time, which only an event's has. Of
 derivatives of order n in directions e_1 to e_n the tangents are 2^n - 1, in the order of the binary numbers that say which e_i are taken together: of the
-second order those along e_1, e_2, and both. Where inputs are
-given by samples, rows of pointers and whole numbers say where the samples of a lane are (`table`), how many each input has (`samples`), and where the next
-knot is at which a step must end (`knot`). `taken` is by how far the last step has gone; of a step by Taylor series, `before` is the time at which it began, and
-`bound` how long the next one may be after one that was rejected.
+second order those along e_1, e_2, and both. Where inputs are given by samples, rows of pointers and whole numbers say where the samples of a lane are
+(`table`), how many each input has (`samples`), and where the next knot is at which a step must end (`knot`). `taken` is by how far the last step has gone; of
+a step by Taylor series, `before` is the time at which it began, and `bound` how long the next one may be after one that was rejected.
 """
 
 from dataclasses import dataclass
