@@ -51,12 +51,10 @@ class Graph:
 
     def _node(self, op: str, args: tuple[int, ...] = (), value=None, varies: bool | None = None) -> int:
         key = (op, args, value)
-        node = self._known.get(key)
-        if node is not None:
+        if (node := self._known.get(key)) is not None:
             return node
         with _GROWING:
-            count = len(self.op)
-            if count >= MOST_NODES:
+            if (count := len(self.op)) >= MOST_NODES:
                 raise Unsupported(f"a computation of more than {MOST_NODES} scalars")
             self.op.append(op)
             self.args.append(args)
