@@ -135,7 +135,7 @@ def too_narrow_near_bounds(around: Around, told: AtBounds, errors: Float[np.ndar
     bounded = ", ".join(f"`{labels[k]}`" for k in np.flatnonzero(told.beyond[0, places] <= FAR_BEYOND))
     shared = [k for k, name in enumerate(labels) if bounded and np.isfinite(errors[k]) and not name.startswith("run ")]
     if names := named(shared[:MOST_LOOKED_AT], to_ends):
-        sentences.append(f"{_too_narrow(names)}: {bounded} may leave its bound, and the squares rise less to the ends than standard errors foretell; {ADVICE}")
+        sentences.append(f"{_too_narrow(names)}: where {bounded} may leave a bound, the squares rise less to the ends than standard errors foretell; {ADVICE}")
     return sentences
 
 

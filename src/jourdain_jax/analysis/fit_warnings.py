@@ -10,7 +10,7 @@ from jourdain_jax.analysis.losses import LEAST_SQUARES
 
 _COINCIDING = 3  # different residuals that two channels may share by chance
 _FROM_PRIOR = 4.0  # standard deviations: an estimate that lies further from its prior is no chance
-_SURE = 5.0  # standard deviations of chi-square
+_SURE = 5.0  # standard deviations: a mean square that is further from 1 is no chance
 
 
 def warnings_of(fit) -> tuple[str, ...]:
@@ -43,7 +43,7 @@ def warnings_of(fit) -> tuple[str, ...]:
         if abs(far) > _FROM_PRIOR
     ]
     coloured, sizes = {name: rho for name, (rho, limit) in fit.autocorrelation.items() if abs(rho) > limit}, _sizes_of_residuals(fit)
-    if large := [size for size in sizes if size.least > 1 + _SURE * size.narrow]:
+    if large := [size for size in sizes if size.least > _by_chance(size.narrow, _SURE)]:
         found.append(
             f"the residuals{large[0].named} are larger than the sigmas allow: a local minimum (start nearer), a scene that is not right, or sigmas that are "
             "too small"
@@ -78,8 +78,12 @@ class _Size(NamedTuple):
     def is_small(self, coloured: Mapping[str, float]) -> bool:
         """Whether it is too small to be chance; `coloured`: correlations rho of neighbours, with which residuals tell (1 + rho)/(1 - rho) times less."""
         larger = max((1 + rho) / max(1 - rho, 1e-9) for rho in (0.0, *(coloured.get(name, 0.0) for name in self.channels)))
-        # the cube root of chi-square is nearly normal (Wilson and Hilferty), also far below its mean
-        return bool(self.most * larger < max(1 - self.wide**2 / 9 - _SURE * self.wide / 3, 0.0) ** 3)
+        return self.most * larger < _by_chance(self.wide, -_SURE)
+
+
+def _by_chance(spread: float, deviations: float) -> float:
+    """A mean square so many standard deviations from 1: its cube root is nearly normal, also far out (Wilson and Hilferty). `spread`: one of it, near 1."""
+    return max(1 - spread**2 / 9 + deviations * spread / 3, 0.0) ** 3
 
 
 def _sizes_of_residuals(fit) -> list[_Size]:
