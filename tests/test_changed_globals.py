@@ -262,5 +262,5 @@ def test_a_method_that_reads_what_jax_is_tracing_is_refused_with_its_name(transf
 
         return jj.simulate(Sprung(), {"x": 1.0}, t1=0.1).q_end[0]
 
-    with pytest.raises(ValueError, match="`Sprung` reads `stiffness` that JAX is tracing"):
+    with pytest.raises(ValueError, match="`Sprung` reads `stiffness`, which JAX is tracing"):
         transformed(end)(2.0)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from jourdain_jax.analysis.fit_pictures import autocorrelation, data_and_prediction, information_over_time, interval_widths, profile, way_to_the_minimum
+from jourdain_jax.analysis.fit_text import agreement
 from jourdain_jax.analysis.held_out import Prediction
 from jourdain_jax.analysis.informed import Informed
 from jourdain_jax.analysis.likelihood_profiles import Profile
@@ -232,7 +233,7 @@ def _way(fit) -> list[str]:
     parts = [f"<p>F went from {first:.6g} to {last:.6g}. "]
     parts.append("The first guess led elsewhere: the minimum was found over growing spans of the runs. " if fit.grown else "")
     if fit.guesses > 1:
-        parts.append(f"{int(fit.agreeing) or 'None'} of {fit.guesses} first guesses led to {'this' if fit.agreeing else 'a'} minimum. ")
+        parts.append(f"{agreement(fit).capitalize()}. ")
     else:
         parts.append("One first guess was tried; <code>guesses=30</code> would tell how many lead here. ")
     rows = [(what, str(len(costs) - 1), f"{costs[0]:.6g}", f"{costs[-1]:.6g}") for what, costs in fit.trace]

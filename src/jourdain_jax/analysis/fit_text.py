@@ -20,7 +20,7 @@ def text(fit) -> str:
         pieces = " + ".join(map(str, fit.shooting.pieces[:MOST_NAMED])) + (" + ..." if len(fit.shooting.pieces) > MOST_NAMED else "")
         lines.append(f"found by multiple shooting in {pieces} pieces, which join to {float(fit.shooting.continuity):.1g} of the simulation's tolerance")
     if fit.guesses > 1:
-        lines.append(f"{int(fit.agreeing) or 'none'} of {fit.guesses} first guesses led to {'this' if fit.agreeing else 'a'} minimum")
+        lines.append(agreement(fit))
     if fit.errors == "runs":
         lines.append(f"standard errors from how much the {len(fit.residuals)} runs differ")
     lines += [f"sigma of `{name}`, estimated: {float(sigma):.4g}" for name, sigma in fit.sigma.items()]
@@ -58,3 +58,8 @@ def batch_text(fit) -> str:
         numbers = (f"{values.mean():.6g}", f"{values.std(ddof=1):.2g}", error) if some else ("-", "-", "-")
         rows.append((name, e.unit, *numbers))
     return "\n".join([f"{good.size} fits of {type(fit.scene).__name__}: {good.sum()} converged", *table(rows)])
+
+
+def agreement(fit) -> str:
+    """How many first guesses led to the minimum."""
+    return f"{int(fit.agreeing) or 'none'} of {fit.guesses} first guesses led to {'this' if fit.agreeing else 'a'} minimum"

@@ -175,11 +175,11 @@ def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
 
     closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
     if is_traced(closed.consts):
-        name = next(iter(names_of_what_is_traced(scene)), "name")
-        what = "a number" if name == "name" else f"`{name}`"
+        name = next(iter(names_of_what_is_traced(scene)), "")
+        what = f"`{name}`" if name else "a number"
         raise ValueError(
-            f"a method of `{type(scene).__name__}` reads {what} that JAX is tracing (jit, grad, vmap) and that is no field of it; "
-            f"make it one, `{name}: float = jj.parameter(unit=...)`, and pass it to the scene"
+            f"a method of `{type(scene).__name__}` reads {what}, which JAX is tracing (jit, grad, vmap) and which is no field of it; "
+            f"make it one, `{name or 'name'}: float = jj.parameter(unit=...)`, and pass it to the scene"
         )
     return closed, shape
 

@@ -36,7 +36,7 @@ class WithEvents(Record, Protocol):
 
 def dataset(record: WithEvents, units: Mapping[str, str] | None = None):
     """The motion, or with a leading axis the lanes, as an `xarray.Dataset`; `units`: name of a coordinate or speed -> its unit."""
-    xarray = needed("xarray", "labelled arrays")
+    xarray = needed("xarray", "a motion as labelled arrays")
     lanes = _lanes(record)
     units = _units(record.scene, units)
     ts = np.asarray(record.ts)
