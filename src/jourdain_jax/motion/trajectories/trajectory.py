@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.build.plausibility import body_faults
+from jourdain_jax.calculus.nan_where import nan_where
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
@@ -195,10 +196,11 @@ class Trajectory(eqx.Module):
 
             loss = lambda radius: jj.simulate(disc.replace(radius=radius), start, t1=2.0).nan_if_failed().q_end[0]
 
-        Lanes that are left out of a loss by `jnp.where(motion.succeeded, ..., 0.0)` do not disturb its derivatives with respect to what all lanes share.
+        Their derivatives are NaN, too. Lanes that are left out of a loss by `jnp.where(motion.succeeded, ..., 0.0)` do not disturb its derivatives with respect
+        to what all lanes share.
         """
         parts = [x for x in (self.q, self.u, self.q_end, self.u_end, self.work) if x is not None]
-        marked = [jnp.where(jnp.expand_dims(self.succeeded, tuple(range(jnp.ndim(self.result), x.ndim))), x, jnp.nan) for x in parts]
+        marked = [nan_where(jnp.broadcast_to(jnp.expand_dims(~self.succeeded, tuple(range(jnp.ndim(self.result), x.ndim))), x.shape), x) for x in parts]
         return eqx.tree_at(lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None], self, marked)
 
     def raise_if_failed(self) -> "Trajectory":
