@@ -1,7 +1,7 @@
 """NaN in place of numbers, also of their derivatives.
 
-`jnp.where(failed, nan, x)` has derivatives of zero where it is NaN, which pass for those of a minimum. Those here are NaN, but where nothing depends on the
-number, or it on nothing: zeros stay.
+`jnp.where(failed, nan, x)` has derivatives of zero where it is NaN, which pass for those of a minimum. Those here are NaN, except where the number depends on
+nothing, or nothing on it: there they stay zero.
 """
 
 import jax
