@@ -28,8 +28,9 @@ def warnings_of(fit) -> tuple[str, ...]:
     elif not fit.converged:
         found.append("no minimum was found; raise `max_iterations`, or start nearer to it")
     if np.any(fit.beyond > FAR_BEYOND):
-        names = ", ".join(f"`{name}`" for name, far in zip(fit.labels, fit.beyond, strict=True) if far > FAR_BEYOND)
-        found.append(f"{names} lies at a bound, which decides its value; all standard errors lose their meaning: widen the bounds")
+        names = [f"`{name}`" for name, far in zip(fit.labels, fit.beyond, strict=True) if far > FAR_BEYOND]
+        verb = "lies at a bound, which decides its value" if len(names) == 1 else "lie at bounds, which decide their values"
+        found.append(f"{', '.join(names)} {verb}; all standard errors lose their meaning: widen the bounds")
     found += fit.impossible
     found += fit.statistics.events_met
     found += fit.statistics.held_inputs

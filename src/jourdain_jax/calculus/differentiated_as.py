@@ -143,10 +143,14 @@ def lanes_first(tree):
     return jax.tree.unflatten(treedef, leaves)
 
 
-def _batched(values, axes):
+def with_lanes_first(values, axes) -> list:
+    """Arrays of which each has its lanes along an axis, or none (None), as a batching rule is given them: all have the first axis of lanes."""
     count = next(x.shape[axis] for x, axis in zip(values, axes, strict=True) if axis is not None)
-    first = [jnp.broadcast_to(x, (count, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(values, axes, strict=True)]
-    return lanes_first_p.bind(*first), [0] * len(first)
+    return [jnp.broadcast_to(x, (count, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(values, axes, strict=True)]
+
+
+def _batched(values, axes):
+    return lanes_first_p.bind(*with_lanes_first(values, axes)), [0] * len(values)
 
 
 lanes_first_p = Primitive("jourdain_lanes_first")

@@ -10,6 +10,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.calculus.differentiated_as import with_lanes_first
+
 
 @jax.custom_jvp
 def nan_where(failed: Bool[Array, "..."], x: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -26,18 +28,12 @@ def _rates(failed, rates):
     return jnp.where(failed & (rates != 0), jnp.nan, rates)
 
 
-def _batched(values, axes):
-    count = next(x.shape[axis] for x, axis in zip(values, axes, strict=True) if axis is not None)
-    first = [jnp.broadcast_to(x, (count, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(values, axes, strict=True)]
-    return _rates_p.bind(*first), 0
-
-
 # of tangents and cotangents, of which it counts as a linear function
 _rates_p = Primitive("jourdain_nan_where_rates")
 _rates_p.def_impl(_rates)
 _rates_p.def_abstract_eval(lambda failed, rates: rates)
 mlir.register_lowering(_rates_p, mlir.lower_fun(_rates, multiple_results=False))
-batching.primitive_batchers[_rates_p] = _batched
+batching.primitive_batchers[_rates_p] = lambda values, axes: (_rates_p.bind(*with_lanes_first(values, axes)), 0)
 ad.primitive_jvps[_rates_p] = lambda primals, tangents: (_rates_p.bind(*primals), _of(primals[0], tangents[1]))
 ad.primitive_transposes[_rates_p] = lambda cotangent, failed, rates: [None, _of(failed, cotangent)]
 
