@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from ends_of_models import end_of_model
 
 import jourdain_jax as jj
 from jourdain_jax.eager.eager import eval_numpy
@@ -197,17 +198,7 @@ CASES = {
 def _slope(name: str, backend: str, adjoint) -> np.ndarray:
     """Of a number made of saved states and the end of a motion, with respect to parameters and two directions of the start."""
     start, options, parameters = CASES[name]
-    scene = jj.models.MODELS[name.split(",")[0]]()
-    begun = jj.start(scene, **(scene.example if start is None else start))
-    x = jnp.array([float(getattr(scene, p)) for p in parameters] + [0.0, 0.0])
-    q, u = (jnp.asarray(np.random.default_rng(0).normal(size=(2, len(part)))) for part in (begun.q, begun.u))
-
-    def end(x):
-        own = scene.replace(**{p: x[i] for i, p in enumerate(parameters)}) if parameters else scene
-        state = jj.State(begun.t, begun.q + x[-2] * q[0], begun.u + x[-1] * u[0], begun.moved_q, begun.moved_u, begun.residual, begun.names, begun.guess)
-        motion = jj.simulate(own, state, rtol=1e-10, atol=1e-10, backend=backend, adjoint=adjoint, **options)
-        return q[1] @ motion.q_end + u[1] @ motion.u_end + motion.t_end + jnp.nansum(motion.q[:3] ** 2)
-
+    end, x = end_of_model(name.split(",")[0], start, parameters, backend=backend, adjoint=adjoint, **options)
     return np.asarray(jax.jit((jax.grad if adjoint is None else jax.jacfwd)(end))(x))
 
 

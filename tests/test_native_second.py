@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from ends_of_models import end_of_model
 
 import jourdain_jax as jj
 from jourdain_jax.motion.integrators import erk_loop
@@ -87,22 +88,6 @@ def test_what_machine_code_does_not_serve_is_left_to_xla(which, monkeypatch):
     np.testing.assert_allclose(found, (lower(1.0 + h) - lower(1.0 - h)) / (2 * h), rtol=1e-6)
 
 
-def _of_a_model(name: str, start, parameters, backend, options):
-    """A number made of saved states and the end of a motion, as a function of parameters and two directions of the start; and where to look."""
-    scene = jj.models.MODELS[name]()
-    begun = jj.start(scene, **(scene.example if start is None else start))
-    x = jnp.array([float(getattr(scene, p)) for p in parameters] + [0.0, 0.0])
-    q, u = (jnp.asarray(np.random.default_rng(0).normal(size=(2, len(part)))) for part in (begun.q, begun.u))
-
-    def end(x):
-        own = scene.replace(**{p: x[i] for i, p in enumerate(parameters)}) if parameters else scene
-        state = jj.State(begun.t, begun.q + x[-2] * q[0], begun.u + x[-1] * u[0], begun.moved_q, begun.moved_u, begun.residual, begun.names, begun.guess)
-        motion = jj.simulate(own, state, rtol=1e-10, atol=1e-10, backend=backend, adjoint=FORWARD, **options)
-        return q[1] @ motion.q_end + u[1] @ motion.u_end + motion.t_end + jnp.nansum(motion.u[:3] ** 2)
-
-    return end, x
-
-
 @pytest.mark.parametrize(
     ("name", "start", "parameters", "options"),
     [
@@ -116,14 +101,15 @@ def _of_a_model(name: str, start, parameters, backend, options):
     ids=["sleigh", "falling disc", "disc at rest", "rattleback", "rods", "quaternion"],
 )
 def test_second_derivatives_of_a_model_are_those_of_xla(name, start, parameters, options):
-    found, expected = (np.asarray(twice(end)(x)) for end, x in (_of_a_model(name, start, parameters, backend, options) for backend in ("native", "xla")))
+    ends = (end_of_model(name, start, parameters, backend=backend, adjoint=FORWARD, **options) for backend in ("native", "xla"))
+    found, expected = (np.asarray(twice(end)(x)) for end, x in ends)
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * np.max(np.abs(expected)))
     assert np.any(expected != 0)
 
 
 @pytest.mark.parametrize("formulation", [jj.Formulation(), jj.Formulation(stabilisation=None)], ids=["projected", "not projected"])
 def test_second_derivatives_of_a_bicycle_are_differences_of_first_ones(formulation):
-    end, x = _of_a_model("whipple-bicycle", None, ["w", "g", "mB"], "auto", {"t1": 0.5, "formulation": formulation})
+    end, x = end_of_model("whipple-bicycle", None, ["w", "g", "mB"], t1=0.5, formulation=formulation, adjoint=FORWARD)
     first, h = jax.jit(jax.jacfwd(end)), 1e-4
     differences = [(8 * (first(x + h * e) - first(x - h * e)) - first(x + 2 * h * e) + first(x - 2 * h * e)) / (12 * h) for e in np.eye(5)]
     np.testing.assert_allclose(twice(end)(x), differences, rtol=1e-5, atol=1e-6 * np.max(np.abs(differences)))

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.kernel import Found, Start, kernel, kernel_of_rates
@@ -37,7 +38,7 @@ def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Fou
     def rule(primals, tangents):
         (start,), (along,) = primals, tangents
         if not all(map(_is_zero, along.of_samples[:1])):
-            raise NotImplementedError("machine code does not differentiate with respect to samples")
+            raise DifferentiationModeError('machine code does not differentiate with respect to samples; `backend="xla"` does')
         raised, more = with_tangents(form, start, along)
         times = None if _is_zero(along.goals) and _is_zero(along.origin) else (_filled(along.goals), _filled(along.origin))
         if times is not None:
