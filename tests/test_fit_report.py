@@ -162,9 +162,7 @@ def test_runs_held_out_are_predicted_in_table_and_drawing(fitted, tmp_path):
 def test_profiles_and_a_bootstrap_stand_beside_the_intervals(fitted, tmp_path):
     fit, data = fitted
     along = fit.profiles(data, "offset")
-    noise, motion = np.random.default_rng(5), jj.simulate(fit.scene, START, ts=TS)
-    values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=(40, 41)) for name in ("x", "heading")}
-    again = jj.fit_batch(fit.scene, jj.Measurements(TS, values, {"x": 0.01, "heading": None}, start=START), ("offset", "inertia"))
+    again = fit.bootstrap(data, 40)
     fit.report(tmp_path / "fit.html", profiles=along, bootstrap=again)
     rows = tables(tmp_path / "fit.html")["estimates"]
     offset, inertia = (dict(zip(rows[0], row, strict=True)) for row in rows[1:])
@@ -172,8 +170,11 @@ def test_profiles_and_a_bootstrap_stand_beside_the_intervals(fitted, tmp_path):
     assert float(offset["low (profile)"]) == pytest.approx(along["offset"].low, rel=1e-5)
     assert inertia["profile"] == "-"
     assert float(inertia["high (bootstrap)"]) == pytest.approx(np.quantile(again.values[:, 1], 0.975), rel=1e-5)
-    with pytest.raises(ValueError, match="`bootstrap` is a fit of offset"):
+    assert "quantiles of 40 fits of repeats; 0 did not converge" in (tmp_path / "fit.html").read_text(encoding="utf-8")
+    with pytest.raises(ValueError, match="`bootstrap` is Fit of ChaplyginSleigh"):
         fit.report(tmp_path / "fit.html", bootstrap=fit)
+    with pytest.raises(ValueError, match="profiles and a bootstrap are computed from the runs"):
+        fit.report(tmp_path / "fit.html", bootstrap=True)
 
 
 def test_report_tells_the_way_to_the_minimum(tmp_path):
