@@ -12,7 +12,7 @@ OSCILLATOR = Oscillator(damping=0.0)
 W = float(np.sqrt(OSCILLATOR.stiffness / OSCILLATOR.mass))
 
 
-def run(seed: int, ts=TS, sigma=SIGMA, tau=0.0, start=None, stated=SIGMA) -> jj.Measurements:
+def run(seed: int, ts=TS, sigma=SIGMA, tau=0.0, start=None, stated=SIGMA) -> jj.Experiment:
     """x = x0 cos(w t) + (v0 / w) sin(w t), read with a bias of 0.1 m; every fifth sample is missing."""
     e = sigma * np.random.default_rng(seed).normal(size=len(ts))
     rho = np.exp(-np.diff(ts) / tau) if tau else np.zeros(len(ts) - 1)
@@ -22,7 +22,7 @@ def run(seed: int, ts=TS, sigma=SIGMA, tau=0.0, start=None, stated=SIGMA) -> jj.
     x[::5] = np.nan
     unknown = ("x", "x_rate") if start is None else start
     sensor = jj.Sensor("x", bias=jj.Estimate(0.05))
-    return jj.Measurements(ts, {"gauge": x}, stated, start={"x": 0.25, "x_rate": 0.1}, unknown_start=unknown, sensors={"gauge": sensor}, correlation_time=tau)
+    return jj.Experiment(ts, {"gauge": x}, stated, start={"x": 0.25, "x_rate": 0.1}, unknown_start=unknown, sensors={"gauge": sensor}, correlation_time=tau)
 
 
 def rows(ts) -> np.ndarray:
@@ -104,7 +104,7 @@ def test_what_the_data_do_not_tell_has_no_interval_and_a_bound_is_named():
     ratio = found.derived(lambda scene: scene.stiffness / scene.mass, "1/s^2")
     assert ratio.standard_error == pytest.approx(fit.derived(lambda scene: scene.stiffness / scene.mass).standard_error, rel=0.5)
     x = 0.3 * np.cos(W * TS) + 0.01 * np.random.default_rng(1).normal(size=41)
-    undamped = jj.Measurements(TS, {"x": x}, 0.01, start={"x": 0.3})
+    undamped = jj.Experiment(TS, {"x": x}, 0.01, start={"x": 0.3})
     kept = jj.fit(Oscillator(), undamped, ("damping", "stiffness")).bootstrap(undamped, 40)
     assert "`damping` is at a bound in" in str(kept.warnings)
     assert 0 < kept.at_bound[:, 0].mean() < 1

@@ -18,11 +18,11 @@ TS = jnp.linspace(0.0, 4.0, 41)
 TRUTH = jj.models.ChaplyginSleigh(offset=0.25)
 
 
-def measured(seed: int, start=START, ts=TS) -> jj.Measurements:
+def measured(seed: int, start=START, ts=TS) -> jj.Experiment:
     motion, noise = jj.simulate(TRUTH, start, ts=ts), np.random.default_rng(seed)
     values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=len(ts)) for name in ("x", "heading")}
     values["x"][3] = np.nan
-    return jj.Measurements(ts, values, {"x": 0.01, "heading": None}, start=start)
+    return jj.Experiment(ts, values, {"x": 0.01, "heading": None}, start=start)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def test_measurements_that_count_twice_are_named(fitted):
     assert not jj.fit(TRUTH, data, free=("offset",)).warnings
     twice = jj.fit(TRUTH, [data, data], free=("offset",))
     assert "`x` of run 0 and `x` of run 1 hold the same numbers" in str(twice.warnings)
-    both = jj.Measurements(data.ts, {"x": data.values["x"], "odometer": data.values["x"]}, 0.01, start=data.start, sensors={"odometer": "x"})
+    both = jj.Experiment(data.ts, {"x": data.values["x"], "odometer": data.values["x"]}, 0.01, start=data.start, sensors={"odometer": "x"})
     assert jj.fit(TRUTH, both, free=("offset",)).warning.startswith("`odometer` of run 0 and `x` of run 0 hold the same numbers")
 
 
@@ -178,7 +178,7 @@ def test_profiles_and_a_bootstrap_stand_beside_the_intervals(fitted, tmp_path):
 
 
 def test_report_tells_the_way_to_the_minimum(tmp_path):
-    data = jj.Measurements(TS, measured(0).values, 0.01, start=START)
+    data = jj.Experiment(TS, measured(0).values, 0.01, start=START)
     guess = TRUTH.replace(offset=0.3)
     fit = jj.fit(guess, data, free={"offset": jj.bounds(0.05, 1.0)}, guesses=4)
     (what, costs), logs = fit.trace[0], np.log(0.01 * np.sqrt(2 * np.pi)) * 81
@@ -199,7 +199,7 @@ def test_residuals_that_are_not_white_are_told_with_what_that_means(tmp_path):
     e = 0.01 * noise.normal(size=41)
     for k in range(1, 41):
         e[k] = 0.9 * e[k - 1] + np.sqrt(1 - 0.9**2) * e[k]
-    data = jj.Measurements(TS, {"heading": np.asarray(motion["heading"]) + e}, 0.01, start=START)
+    data = jj.Experiment(TS, {"heading": np.asarray(motion["heading"]) + e}, 0.01, start=START)
     fit = jj.fit(TRUTH, data, free=("offset",))
     fit.report(tmp_path / "fit.html", data)
     (row,) = tables(tmp_path / "fit.html")["whiteness"][1:]

@@ -21,10 +21,10 @@ from jourdain_jax.analysis.asked import TakenUp, taken_up
 from jourdain_jax.analysis.correlated_noise import memory
 from jourdain_jax.analysis.derived import derived
 from jourdain_jax.analysis.estimated import Estimated
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.held_out import Prediction, of_fitted
 from jourdain_jax.analysis.levenberg_marquardt import Minimum
 from jourdain_jax.analysis.losses import LEAST_SQUARES
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.search import off_bounds, with_memory
@@ -108,7 +108,7 @@ class Bootstrap(Printed):
         return "\n".join([*lines, *table(rows)])
 
 
-def bootstrap(fit, data: Measurements | Sequence[Measurements], repeats: int, seed: int, noise: str) -> Bootstrap:
+def bootstrap(fit, data: Experiment | Sequence[Experiment], repeats: int, seed: int, noise: str) -> Bootstrap:
     """Of a `Fit` of one experiment; see `Fit.bootstrap`."""
     if isinstance(repeats, bool) or not isinstance(repeats, int | np.integer) or repeats < _FEWEST:
         raise ValueError(f"`repeats` is {repeats!r}, expected a whole number of {_FEWEST} or more; 1000 tell an end to a tenth of a standard error")
@@ -142,7 +142,7 @@ def _fitted(fit, again: TakenUp, generator: np.random.Generator, count: int, noi
     return off_bounds(of_repeats, with_memory(of_repeats, found, limits, asked.control), limits, asked.control, None)[0]
 
 
-def _drawn(fit, problem: Problem, generator: np.random.Generator, count: int, noise: str) -> tuple[Measurements, ...]:
+def _drawn(fit, problem: Problem, generator: np.random.Generator, count: int, noise: str) -> tuple[Experiment, ...]:
     """The runs with so many repeats of their values; what is missing is so in each."""
     runs, from_residuals = [], noise == "residuals"
     larger = math.sqrt(fit.samples / max(int(fit.degrees_of_freedom), 1)) if from_residuals or problem.all_estimated else 1.0

@@ -17,12 +17,12 @@ from jourdain_jax.analysis.asked import Asked
 from jourdain_jax.analysis.at_bounds import AtBounds
 from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.fit_statistics import statistics
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum
 from jourdain_jax.analysis.likelihood import as_runs, in_all_or_none
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Piecewise, Shot
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
@@ -46,7 +46,7 @@ _FEWEST_RUNS = 5  # that tell how much runs differ
 @shown_from_users_lines
 def fit(
     scene: Scene | BuiltFor,
-    data: Measurements | Sequence[Measurements],
+    data: Experiment | Sequence[Experiment],
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     *,
     cutoff: float = 1e-6,
@@ -99,7 +99,7 @@ def fit(
 
         truth, start, ts = jj.models.ChaplyginSleigh(offset=0.25), {"x_rate": 0.6, "heading_rate": 0.9}, jnp.linspace(0.0, 2.0, 21)
         motion = jj.simulate(truth, start, ts=ts)
-        data = jj.Measurements(ts, {"x": motion["x"], "heading": motion["heading"]}, 0.01, start=start)       # sigma: 0.01 m, 0.01 rad
+        data = jj.Experiment(ts, {"x": motion["x"], "heading": motion["heading"]}, 0.01, start=start)       # sigma: 0.01 m, 0.01 rad
         found = jj.fit(jj.models.ChaplyginSleigh(), data, free={"offset": jj.bounds(0.05, 1.0)})
         print(found)                                              # estimates with 95 % intervals, and what the data cannot tell
         found["offset"].value, found.scene.offset                 # near 0.25 m
@@ -111,7 +111,7 @@ def fit(
 
 def fit_batch(
     scene: Scene | BuiltFor,
-    data: Measurements | Sequence[Measurements],
+    data: Experiment | Sequence[Experiment],
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     *,
     cutoff: float = 1e-6,
@@ -179,7 +179,7 @@ def _check_control(control: Control) -> None:
         raise ValueError(f"`max_iterations` is {control.most_steps!r}, expected a whole number of steps")
 
 
-def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:
+def _check_choices(runs: Sequence[Experiment], loss, errors) -> None:
     if loss is not None and not isinstance(loss, Loss):
         raise ValueError(f"`loss` is {loss!r}, expected `huber()`, `student_t()`, or None for least squares")
     if errors not in ("sigmas", "runs"):
@@ -197,14 +197,14 @@ def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:
     in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
 
 
-def _repeats(runs: Sequence[Measurements]) -> int:
+def _repeats(runs: Sequence[Experiment]) -> int:
     counts = {values.shape[0] for run in runs for values in run.values.values()}
     if len(counts) != 1 or 0 in counts:
         raise ValueError(f"the channels hold {sorted(counts)} repeats; give every channel of every run the same leading axis, of one or more")
     return counts.pop()
 
 
-def _check_enough(runs: Sequence[Measurements], unknowns: Unknowns, repeats: bool) -> None:
+def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> None:
     samples = sum(math.prod(values.shape[int(repeats) :]) for run in runs for values in run.values.values()) + len(unknowns.with_prior)
     if samples < len(unknowns.labels):
         raise ValueError(

@@ -12,6 +12,7 @@ from jourdain_jax.analysis.asked import Asked, taken_up
 from jourdain_jax.analysis.bootstrap import Bootstrap, bootstrap
 from jourdain_jax.analysis.derived import derived, standard_errors
 from jourdain_jax.analysis.estimated import ChannelResiduals, Estimated, summary
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.fit_page import fit_page
 from jourdain_jax.analysis.fit_pictures import interval_widths
 from jourdain_jax.analysis.fit_statistics import Statistics
@@ -22,7 +23,6 @@ from jourdain_jax.analysis.information import Information, hidden_combinations
 from jourdain_jax.analysis.informed import informed
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Shot
 from jourdain_jax.analysis.weak_directions import CORRELATED, weak_combinations
 from jourdain_jax.build.plausibility import impossible_bodies
@@ -257,7 +257,7 @@ class Fit(Printed):
         units = {name: about["unit"] for name, _, about in parameters_of(self.asked.scene)}
         return {name: self.derived(lambda scene, name=name: getattr(scene, name), units[name]) for name in self.layout.following}
 
-    def profiles(self, data: Measurements | Sequence[Measurements], names: str | Iterable[str] = ()) -> dict[str, Profile]:
+    def profiles(self, data: Experiment | Sequence[Experiment], names: str | Iterable[str] = ()) -> dict[str, Profile]:
         """The profile likelihood of the unknowns in `names` (default: all that are not of one run alone), by name: how far each may be moved, all others
         being fitted anew, before 2 (F - F_min) reaches 3.84, and whether that is "bounded", "one-sided" or "flat". `data`: the runs fitted.
 
@@ -270,7 +270,7 @@ class Fit(Printed):
         inflation = float(fitted.problem.inflation(self.residuals, self.samples, self.information.rank)[0])
         return profiles(fitted, as_names(names) or of_all, dict(zip(self.labels, self.standard_errors.tolist(), strict=True)), inflation)
 
-    def bootstrap(self, data: Measurements | Sequence[Measurements], repeats: int = 1000, *, seed: int = 0, noise: str = "sigmas") -> Bootstrap:
+    def bootstrap(self, data: Experiment | Sequence[Experiment], repeats: int = 1000, *, seed: int = 0, noise: str = "sigmas") -> Bootstrap:
         """The parametric bootstrap: measurements of so many repeats of the experiment, drawn about what the fit predicts, and fitted side by side.
 
         `data`: the runs fitted. Noise is drawn as the fit takes it: of the sigmas, given or estimated; with its correlation times; of Student's t under that
@@ -286,7 +286,7 @@ class Fit(Printed):
         self._check_one()
         return bootstrap(self, data, repeats, seed, noise)
 
-    def predict(self, runs: Measurements | Sequence[Measurements]) -> tuple[dict[str, Prediction], ...]:
+    def predict(self, runs: Experiment | Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
         """What the fit predicts for `runs` that had no part in it, by channel: `prediction`, `error`, `rms` (in the unit of the channel) and `r_squared`.
 
         What all runs share is held at its estimate; start values that are unknown, and numbers of sensors of each run, are fitted to the run itself.
@@ -298,9 +298,9 @@ class Fit(Printed):
     def report(
         self,
         path: str | os.PathLike,
-        data: Measurements | Sequence[Measurements] = (),
+        data: Experiment | Sequence[Experiment] = (),
         *,
-        held_out: Measurements | Sequence[Measurements] = (),
+        held_out: Experiment | Sequence[Experiment] = (),
         profiles: "bool | str | Iterable[str] | Mapping[str, Profile]" = False,
         bootstrap: "bool | Bootstrap" = False,
         units: Mapping[str, str] | None = None,
@@ -317,7 +317,7 @@ class Fit(Printed):
 
         ValueError for a path that is no .html file, a fit of a batch or one that failed, other data than the fit's, and the bootstrap of another fit.
         """
-        runs, others = ((x,) if isinstance(x, Measurements) else tuple(x) for x in (data, held_out))
+        runs, others = ((x,) if isinstance(x, Experiment) else tuple(x) for x in (data, held_out))
         if not str(path).lower().endswith((".html", ".htm")):
             raise ValueError(f"cannot write `{os.fspath(path)}`: the report of a fit is a .html file")
         self._check_one()

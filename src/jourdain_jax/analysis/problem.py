@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float
 
 from jourdain_jax.analysis.arrow import Arrow, arrow, triangle, with_prior
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.first_steps import ROOM, read
 from jourdain_jax.analysis.levenberg_marquardt import Begun, Control, Limits, Linearised, LinearisedLater, Minimum, minimise
 from jourdain_jax.analysis.losses import Loss
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
 
@@ -28,7 +28,7 @@ _NODES = np.linspace(-3.2, 3.2, 9)  # of arcsin rho, in its standard deviations:
 class Problem:
     """Residuals with their derivatives, of any members at any numbers. `lanes`: `Lanes`, or what predicts runs as they do (`Piecewise`)."""
 
-    def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Any, loss: Loss):
+    def __init__(self, scene: Scene, runs: tuple[Experiment, ...], unknowns: Unknowns, lanes: Any, loss: Loss):
         self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
         largest = [max(float(np.nanmax(np.abs(run.values[name]))) for run in runs if name in run.values) for name in self.estimated]
