@@ -389,6 +389,19 @@ def test_an_event_before_the_last_sample_is_named():
     assert f"before {np.sum(met <= TS)} of its samples" in warning
     cut = cart_run(push=0.0, values={"x": np.where(met <= TS, np.nan, x)}, sigma=1e-3)
     assert not any("event" in w for w in fit(Stopped(mass=1.9), cut, ("mass",)).warnings)
+    unfinished = fit(Stopped(mass=1.9), run, ("mass",), max_iterations=1)
+    assert not unfinished.converged
+    assert any("meets its event `buffer`" in w for w in unfinished.warnings)
+
+
+def test_the_time_of_a_light_gate_is_a_measurement():
+    # x = x0 cos(w t) is at the gate, x = 0, at t = pi / (2 w) with w^2 = k / m: dt / dk = - t / (2 k)
+    at, error = np.pi / 2 * np.sqrt(2.0 / 5.0), 0.002  # s
+    speed = 0.3 * np.sqrt(5.0 / 2.0)
+    run = Experiment([0.0, at], {"gate": [np.nan, 0.0]}, error * speed, start={"x": 0.3}, sensors={"gate": "x"}, inputs={"push": 0.0})
+    found = fit(Cart(damping=0.0, stiffness=5.3), run, ("stiffness",), rtol=1e-9, atol=1e-9)
+    assert float(found["stiffness"].value) == pytest.approx(5.0, rel=1e-6)
+    assert float(found["stiffness"].standard_error) == pytest.approx(2 * 5.0 / at * error, rel=1e-5)
 
 
 def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():

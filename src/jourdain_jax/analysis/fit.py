@@ -79,8 +79,9 @@ def fit(
       unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` says how many led to it.
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with
       starts of their own, and continuity between them is an equation. What is minimised stays the same.
-    - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events are ignored, and `Fit.warnings` names
-      those that come before a sample.
+    - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events cut no run: what is given counts, and `Fit.warnings`
+      names those that the fitted motion meets before a sample. Give samples up to where the real motion met one; were runs cut where the fitted one does,
+      estimates whose motion ends early would have fewer residuals.
 
     Where that finds no minimum, or one whose residuals are far beyond their sigmas, the fit is made once more over growing spans (unless `shooting` is
     given): the first 1/32 of each run, then more of it, as far as the motion that was found follows the data, with the first guess as a weak prior (known to

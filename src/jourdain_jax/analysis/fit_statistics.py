@@ -51,8 +51,7 @@ class Statistics:
 
 def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, errors: str, at_bounds: AtBounds) -> Statistics:
     """Of the minimum of each member; without the axis of members where the problem has none."""
-    control, looked_at = asked.control, problem.lanes.members is None and bool(found.converged[0])  # what takes further motions
-    unknowns, theta, single = problem.unknowns, found.theta, problem.lanes.members is None
+    control, unknowns, theta, single = asked.control, problem.unknowns, found.theta, problem.lanes.members is None
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     low, high = limits.low[places], limits.high[places]
@@ -76,7 +75,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
         known, quantiles = known.between_runs(one(found.at.arrow.scores)), students_t_95(len(problem.runs) - 1)
     reach = quantiles * known.standard_errors
     too_narrow = []
-    if looked_at:
+    if single and found.converged[0]:
         too_narrow = moved_from_bounds(at_bounds, theta[0], reach, places, unknowns.labels)
         if errors == "sigmas":
             too_narrow += too_narrow_near_bounds(Around(problem.linearised, found, limits, control), at_bounds, plain, unknowns.labels)
@@ -103,7 +102,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
         samples=np.asarray(samples),
         from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
         held_inputs=held_inputs(problem.scene, problem.runs),
-        events_met=events_met(problem, theta[0], asked.simulation) if looked_at and asked.shooting is None else (),
+        events_met=events_met(problem, theta[0], asked.simulation) if single and not fails[0] and asked.shooting is None else (),
         too_narrow=tuple(too_narrow),
     )
 
