@@ -6,8 +6,7 @@ by Levenberg-Marquardt. Jacobians come by forward mode through the simulation, r
 Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), chapter 3.
 """
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -132,14 +131,14 @@ def fit_batch(
 
 
 def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | None, errors: str, repeats: bool, guesses: int = 1, shooting=None) -> Fit:
-    scene = as_scene(scene)
+    scene, data = as_scene(scene), tuple(data) if isinstance(data, Iterator) else data
     if is_traced((scene, data, control.tolerance, control.cutoff, simulation)):
         raise DifferentiationModeError(
             "`fit` was called inside jit, vmap or a derivative, but its steps are chosen outside of compiled code. Call it with known numbers; "
             "for many repeats use `fit_batch`, for derivatives of the fit's objective `log_likelihood`."
         )
     _check_control(control)
-    runs = as_runs(scene, data, repeats=repeats)
+    runs = as_runs(scene, data, simulation, repeats=repeats)
     _check_choices(runs, loss, errors)
     check_shooting(shooting)
     free = free if isinstance(free, Mapping) else tuple(as_names(free))
@@ -206,10 +205,13 @@ def _repeats(runs: Sequence[Experiment]) -> int:
 
 
 def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> None:
-    samples = sum(math.prod(values.shape[int(repeats) :]) for run in runs for values in run.values.values()) + len(unknowns.with_prior)
-    if samples < len(unknowns.labels):
+    counts = [np.isfinite(values).reshape(*values.shape[: int(repeats)], -1).sum(axis=-1) for run in runs for values in run.values.values()]
+    samples, sigmas = int(np.max(sum(counts))) + len(unknowns.with_prior), len({name for run in runs for name in run.unknown_sigma})
+    if samples < len(unknowns.labels) + sigmas:
+        and_sigmas = f" and {sigmas} sigmas" if sigmas else ""
         raise ValueError(
-            f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns; measure more, or free fewer of {', '.join(unknowns.labels)}"
+            f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns{and_sigmas}; measure more, or free fewer of "
+            f"{', '.join(unknowns.labels)}"
         )
 
 
