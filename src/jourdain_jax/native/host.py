@@ -35,7 +35,7 @@ def reason_against() -> str:
         llvm.initialize_native_asmprinter()
         _machine(0)
         libm = ctypes.CDLL(ctypes.util.find_library("m"))
-        for name in LIBM:
+        for name in LIBM.values():
             llvm.add_symbol(PREFIX + name, ctypes.cast(getattr(libm, name), ctypes.c_void_p).value)
     except (OSError, RuntimeError, AttributeError) as error:
         return f"LLVM does not know this machine ({str(error).splitlines()[0]})"
