@@ -122,9 +122,10 @@ def own_rule(name: str, params) -> str:
     """
     if name == "stop_gradient":
         return "`stop_gradient`, whose derivative is zero by decree,"
-    if name not in ("custom_jvp_call", "custom_vjp_call"):
+    function = called(name, params)
+    if function is None or not name.startswith("custom_"):
         return ""
-    info = getattr(called(name, params).jaxpr.debug_info, "func_src_info", None) or "a function"
+    info = getattr(function.jaxpr.debug_info, "func_src_info", None) or "a function"
     return "" if _HOME in info else f"`{info.split(' at ')[0]}`, which has a derivative of its own,"
 
 
