@@ -335,7 +335,7 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, sampl
         fixed, x, of_steps = jnp.split(row, [row.shape[0] - told - unknowns, row.shape[0] - told])
         return first_steps(lambda x, common, fixed: each(common, fixed[None], x[None])[0], loss, x, (common, fixed), of_steps)
 
-    return quickly_compiled(lanes, jax.jit), lru_cache(maxsize=4)(lambda loss: sparingly_compiled(partial(steps, loss), loops=1))
+    return quickly_compiled(lanes, jax.jit), lru_cache(maxsize=4)(lambda loss: sparingly_compiled(partial(steps, loss), most_loops=1))
 
 
 def _alike(data: Sequence[Experiment]) -> list[list[int]]:
