@@ -1,6 +1,6 @@
 """What is odd about measurements though nothing forbids it: inputs that are not sampled where a run needs them, and angles that jump by a turn."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -23,10 +23,10 @@ def oddities(scene: Scene, runs: Sequence[Experiment], repeats: bool) -> tuple[s
             if isinstance(signal, Sampled) and not is_traced((signal, run.ts, run.t0)) and np.ptp(np.asarray(signal.values)) > 0:
                 found += _of_input(f"input `{name}` of run {index}", np.asarray(signal.ts), float(run.t0), float(run.ts[-1]))
         for name, values in run.values.items():
-            quantity = run.sensors[name].quantity if name in run.sensors else name
-            is_angle = quantity in scene.coordinate_names.entries if isinstance(quantity, str) else isinstance(quantity, Callable)
-            if is_angle and not is_traced(values):
-                found += _of_angle(f"channel `{name}` of run {index}", values[0] if repeats else values, run.ts)
+            quantity, shown = run.sensors[name].quantity if name in run.sensors else name, values[0] if repeats else values
+            is_angle = quantity in scene.coordinate_names.entries if isinstance(quantity, str) else callable(quantity)
+            if is_angle and shown.ndim == 1 and not is_traced((shown, run.ts)):
+                found += _of_angle(f"channel `{name}` of run {index}", shown, run.ts)
     return tuple(found)
 
 
@@ -57,8 +57,8 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
 def _of_angle(what: str, values: Float[np.ndarray, "times"], ts: Float[np.ndarray, "times"]) -> Iterator[str]:
     """Where values lie in [-pi, pi] or [0, 2 pi], and neighbours are nearly one turn apart, but near each other without it."""
     known = np.isfinite(values)
-    x, t = values[known], np.asarray(ts)[known] if values.ndim == 1 else ts
-    if values.ndim > 1 or x.size < 2 or not any(low <= x.min() and x.max() <= low + _TURN for low in (-np.pi, 0.0)):
+    x, t = values[known], ts[known]
+    if x.size < 2 or not any(low <= x.min() and x.max() <= low + _TURN for low in (-np.pi, 0.0)):
         return
     steps = np.diff(x)
     (jumps,) = np.nonzero(np.abs(steps) > 0.75 * _TURN)
