@@ -50,7 +50,7 @@ class Statistics:
 
 
 def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, errors: str, at_bounds: AtBounds) -> Statistics:
-    """Of the minimum of each member; without the axis of members where the problem has none."""
+    """Statistics of the minimum of each member; without the axis of members where the problem has none."""
     control, looked_at = asked.control, problem.lanes.members is None and bool(found.converged[0])  # what takes further motions
     unknowns, theta, single = problem.unknowns, found.theta, problem.lanes.members is None
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)

@@ -99,7 +99,7 @@ def _aligned(equation, inputs: list[_Value]) -> list[np.ndarray]:
 
 
 def _gather(equation, x, indices):
-    """By the places of what is taken, where those are the same in all lanes and lie in the array."""
+    """What is gathered, by its places where those are the same in all lanes and lie in the array."""
     if np.any(indices != indices[:1]):
         return None
     places = np.asarray(gathered(equation, np.arange(x[0].size).reshape(x.shape[1:]), indices[0]))

@@ -24,7 +24,7 @@ def decided_by(graph: Graph, outputs: Iterable[int], variables: Iterable[int], k
 
 
 def depend_on(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[bool]:
-    """Of each output, whether it needs one of the variables."""
+    """Whether each output needs one of the variables."""
     variables = set(variables)
     return _with(graph, outputs, lambda n: n in variables)
 

@@ -1,4 +1,4 @@
-"""What is kept of a traced function as it is: a call of JAX in a graph of scalars.
+"""Calls of JAX in a graph of scalars: the parts of a traced function that have no scalar form.
 
     array   entries put together             kept    the results of a `Call` of arrays
     output  one of these results             entry   one entry of it, a scalar again
@@ -36,7 +36,7 @@ class Call:
 
     @property
     def reason(self) -> str:
-        """In words, without a verb."""
+        """Why it is a call, in words without a verb."""
         return " and ".join(self.reasons)
 
     @property
@@ -46,7 +46,7 @@ class Call:
 
     @functools.cache  # noqa: B019  (calls are few, and live as long as their graph)
     def slopes(self, moves: tuple[tuple[bool, ...], ...]) -> "Call":
-        """Of each result, its derivatives with respect to those entries of the operands that move, with a leading axis of these.
+        """The derivatives of each result with respect to those entries of the operands that move, with a leading axis of these.
 
         `Unsupported` where JAX has no forward derivative.
         """
