@@ -55,7 +55,7 @@ class Arrow:
         return Arrow(*(x[members] for x in self.arrays))
 
     def scaled(self, size: Float[np.ndarray, "members unknowns"]) -> "Arrow":
-        """The same least squares in unknowns divided by `size`."""
+        """This arrow in unknowns divided by `size`."""
         shared, local = self.split(size)
         whole = np.concatenate([local, np.broadcast_to(shared[:, None], (*local.shape[:2], shared.shape[1])), np.ones((*local.shape[:2], 1))], axis=-1)
         return Arrow(

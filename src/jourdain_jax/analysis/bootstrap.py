@@ -112,6 +112,8 @@ def bootstrap(fit, data: Experiment | Sequence[Experiment], repeats: int, seed: 
     """The bootstrap of a `Fit` of one experiment; see `Fit.bootstrap`."""
     if isinstance(repeats, bool) or not isinstance(repeats, int | np.integer) or repeats < _FEWEST:
         raise ValueError(f"`repeats` is {repeats!r}, expected a whole number of {_FEWEST} or more; 1000 tell an end to a tenth of a standard error")
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"`seed` is {seed!r}, expected a whole number of zero or more")
     if noise not in ("sigmas", "residuals"):
         raise ValueError(f'`noise` is {noise!r}, expected "sigmas" or "residuals": from what noise is drawn')
     if not fit.converged:

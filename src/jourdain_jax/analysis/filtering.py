@@ -68,7 +68,7 @@ def filtered_log_likelihood(scene: Scene | BuiltFor, data: Experiment | Sequence
         jj.filtered_log_likelihood(sleigh, run, process_noise={"heading_rate": 0.01})      # (rad/s)^2 / s
     """
     scene = as_scene(scene)
-    runs = as_runs(scene, data)
+    runs = as_runs(scene, data, simulation)
     _check_supported(scene, runs)
     speeds = privileged_speeds(scene)
     intensities = _intensities(scene, speeds, process_noise)

@@ -168,8 +168,8 @@ class Fit(Printed):
 
     @property
     def reduced_chi_square(self) -> Float[np.ndarray, "*repeats"]:
-        """Sum of squared residuals per degree of freedom: near 1 where scene and sigmas are right."""
-        return np.asarray(self.chi_square / self.degrees_of_freedom)
+        """Sum of squared residuals per degree of freedom, near 1 where scene and sigmas are right; NaN where there are as many unknowns as samples."""
+        return np.asarray(self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan))
 
     # Of one fit, not of a batch. -----------------------------------------------------------------------------------
 

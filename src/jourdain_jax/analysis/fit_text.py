@@ -7,6 +7,7 @@ from jourdain_jax.analysis.table import table
 MOST_NAMED = 8  # combinations of unknowns that are told poorly, pairs that correlate
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def text(fit) -> str:
     """The text of a fit of one experiment: estimates with their intervals, warnings, what the data do not tell, residuals by channel."""
     lines = [

@@ -33,7 +33,7 @@ def warnings_of(fit) -> tuple[str, ...]:
         found.append(f"{', '.join(names)} {verb}; all standard errors lose their meaning: widen the bounds")
     found += fit.impossible
     found += fit.statistics.events_met
-    found += fit.statistics.held_inputs
+    found += fit.statistics.oddities
     found += fit.statistics.too_narrow
     found += _counted_twice(fit)
     if fit.guesses > 1 and fit.converged and fit.agreeing == 1:

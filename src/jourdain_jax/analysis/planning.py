@@ -131,7 +131,7 @@ def planned_information(
         slope = jax.jacfwd(told)(-3.0)
     """
     scene = as_scene(scene)
-    runs = as_runs(scene, plan)
+    runs = as_runs(scene, plan, simulation)
     for run in runs:
         for name in run.unknown_sigma:
             raise ValueError(f"sigma of channel `{name}` is None, but a plan needs the standard deviation of its noise; give a number")
