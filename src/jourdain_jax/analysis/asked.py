@@ -53,7 +53,7 @@ class TakenUp:
         return self.problem.linearised(theta, members)
 
     def residuals(self, run: int) -> dict[str, np.ndarray]:
-        """Of a run by channel, in units of sigma, at theta; NaN where a sample is missing."""
+        """Residuals of a run by channel, in units of sigma, at theta; NaN where a sample is missing."""
         return self.problem.by_channel(run, self.at, lambda x: x[0])
 
     def information(self) -> Information:

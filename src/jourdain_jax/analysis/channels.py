@@ -1,4 +1,4 @@
-"""Channels that are functions of a `Motion`: looked at anew in every fit, and compared by what they compute.
+"""Channels that are functions of a `Motion`: every fit traces them anew, and two are equal that compute the same.
 
 A function is traced where it is handed over. What it closes over becomes arguments, what is left, the operations, is compared by value: a new lambda that
 does the same in every run is one channel, batched and compiled once; a function whose globals have changed is another one.

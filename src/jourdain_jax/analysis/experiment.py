@@ -151,7 +151,7 @@ def _reals(what: str, given: Mapping, advice: str = "check how it is put togethe
 
 
 def _unmasked(value):
-    """With NaN where samples are masked."""
+    """The values, with NaN where samples are masked."""
     return np.ma.filled(value.astype(float), np.nan) if isinstance(value, np.ma.MaskedArray) and value.dtype.kind in "iuf" else value
 
 

@@ -98,7 +98,7 @@ class _Filter:
         self.held = (*(scene.coordinate_names.entries[i] for i in self.coordinates), *(scene.speed_names.entries[i] for i in speeds))
 
     def log_likelihood(self, unknown: tuple[str, ...], sigma: Float[Array, "unknown"]) -> Float[Array, ""]:
-        """Of all samples; `sigma`: standard deviations of start values."""
+        """The log-likelihood of all samples; `sigma`: standard deviations of start values."""
         run, begin = self.run, self.begin
         x = self._independent(begin.q, begin.u)
         P = jnp.zeros((x.size, x.size))

@@ -51,7 +51,7 @@ class Statistics:
 
 @np.errstate(over="ignore", invalid="ignore")  # of unknowns that no bound kept from growing beyond all measure
 def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, errors: str, at_bounds: AtBounds) -> Statistics:
-    """Of the minimum of each member; without the axis of members where the problem has none."""
+    """Statistics of the minimum of each member; without the axis of members where the problem has none."""
     control, unknowns, theta, single = asked.control, problem.unknowns, found.theta, problem.lanes.members is None
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)

@@ -98,7 +98,7 @@ def _inverse(F: Float[Array, "unknowns unknowns"]) -> Float[Array, "unknowns unk
 
 @quickly_compiled
 def _log_det(F: Float[Array, "unknowns unknowns"], places: tuple[int, ...]) -> Float[Array, ""]:
-    """Of this block of the inverse."""
+    """The logarithm of the determinant of this block of the inverse."""
     some = np.array(places, int)
     return jnp.linalg.slogdet(_inverse(F)[some[:, None], some])[1]
 
