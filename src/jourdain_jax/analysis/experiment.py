@@ -175,7 +175,8 @@ def _check_times(ts) -> None:
         raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
     if is_traced(ts):
         return
-    good = np.isfinite(ts) & (np.diff(ts, prepend=-np.inf) > 0)
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(ts) & (np.diff(ts, prepend=-np.inf) > 0)
     if not good.all():
         k = int(np.argmin(good))
         after = f" after {ts[k - 1]:.10g} s" if k else ""
