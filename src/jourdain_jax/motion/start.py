@@ -285,19 +285,18 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bo
 
 
 def _moved_if_near(scene: Scene, start: State, inputs, native: bool | None) -> State:
-    """The start moved onto the rows as a whole, where it is off them by more than round-off, and by less than what counts as a contradiction."""
-    near = is_off(start) & (start.residual < _tolerance(start.q.dtype))
+    """The start moved onto the rows as a whole, where it is off them by less than what counts as a contradiction.
 
-    def moved_again(start: State) -> State:
-        state = put_on_rows(scene, start.t, start.q, start.u, inputs, native=native)
-        moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
-        state = eqx.tree_at(lambda s: (s.moved_q, s.moved_u, s.guess), state, (*moved, start.guess))
-        return jax.tree.map(lambda x, y: jnp.where(near, x, y), state, start)
-
-    if is_traced(near):
-        # worked out once more on the way back of a derivative: what would be kept for it, of a branch that is rarely taken, costs as much as the start itself
-        return jax.lax.cond(eqxi.unvmap_any(near), jax.checkpoint(moved_again), lambda start: start, start)
-    return moved_again(start) if near else start
+    Where it is off by round-off alone, its numbers stay as they are, but what is traced gets the derivatives of a start that is moved: values that agree at
+    these parameters contradict each other at others.
+    """
+    near = start.residual < _tolerance(start.q.dtype)
+    if not is_traced(near) and not (near and is_off(start)):
+        return start
+    state = put_on_rows(scene, start.t, start.q, start.u, inputs, native=native)
+    moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
+    state = eqx.tree_at(lambda s: (s.moved_q, s.moved_u, s.guess), state, (*moved, start.guess))
+    return jax.tree.map(lambda x, y: jnp.where(near, x, y), state, start)
 
 
 class _Named(NamedTuple):
