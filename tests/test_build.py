@@ -59,7 +59,7 @@ def test_what_was_built_stands_wherever_its_scene_does():
     np.testing.assert_array_equal(jj.linearize(built, state).A, jj.linearize(sleigh, state).A)
     assert str(jj.report(built)) == str(jj.report(sleigh))
     assert jj.lower(built) is jj.lower(sleigh)
-    data = jj.Measurements(ts, {"heading": jnp.array([0.1, 0.2])}, 0.01, start=start)
+    data = jj.Experiment(ts, {"heading": jnp.array([0.1, 0.2])}, 0.01, start=start)
     fits = [jj.fit(scene, data, free=["offset"]) for scene in (built, sleigh)]
     assert fits[0].estimates == fits[1].estimates
 
@@ -133,7 +133,7 @@ def batch(scene, ts, start) -> list:
 
 
 def fitted(scene, ts, start) -> list:
-    data = jj.Measurements(ts, {"x": 0.1 + ts, "z": 0.02 * ts}, 0.01, start=start)
+    data = jj.Experiment(ts, {"x": 0.1 + ts, "z": 0.02 * ts}, 0.01, start=start)
     return np.asarray(jj.fit(scene, data, free={"arm": None}, max_iterations=2).values).tolist()
 
 

@@ -7,11 +7,11 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.information import Information, information
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised
 from jourdain_jax.analysis.likelihood import as_runs
 from jourdain_jax.analysis.losses import Loss
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
@@ -64,7 +64,7 @@ class TakenUp:
         return information(self.at.arrow, size, unknowns.estimated, bound, fails, self.asked.control.cutoff, True)
 
 
-def taken_up(fit, data: Measurements | Sequence[Measurements]) -> TakenUp:
+def taken_up(fit, data: Experiment | Sequence[Experiment]) -> TakenUp:
     """A `Fit` of one experiment where it ended, with residuals and derivatives computed anew. ValueError where `data` are not what it was fitted to."""
     again = for_runs(fit, data, fitted=True)
     unknowns = again.problem.unknowns
@@ -79,7 +79,7 @@ def taken_up(fit, data: Measurements | Sequence[Measurements]) -> TakenUp:
     return again
 
 
-def for_runs(fit, runs: Measurements | Sequence[Measurements], fitted: bool = False) -> TakenUp:
+def for_runs(fit, runs: Experiment | Sequence[Experiment], fitted: bool = False) -> TakenUp:
     """The problem of a `Fit` for these runs, at the first guesses; ValueError where they do not fit the scene.
 
     `fitted`: they are those of the fit, in pieces where it was found so.

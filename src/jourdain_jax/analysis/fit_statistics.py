@@ -14,9 +14,9 @@ from jourdain_jax.analysis.arrow import Arrow
 from jourdain_jax.analysis.asked import Asked
 from jourdain_jax.analysis.at_bounds import Around, AtBounds, moved_from_bounds, too_narrow_near_bounds
 from jourdain_jax.analysis.events_met import events_met
+from jourdain_jax.analysis.experiment import held_inputs
 from jourdain_jax.analysis.information import Information, information, students_t_95
 from jourdain_jax.analysis.levenberg_marquardt import LEAST, Limits, Minimum
-from jourdain_jax.analysis.measurements import held_inputs
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.scene.scene import Scene
 

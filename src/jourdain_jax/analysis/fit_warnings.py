@@ -89,7 +89,7 @@ def _by_chance(spread: float, deviations: float) -> float:
 
 def _sizes_of_residuals(fit) -> list[_Size]:
     """Of all channels whose sigmas are known together, then one by one; under a robust loss that of most residuals, since some are far out."""
-    robust, determined = fit.asked.loss is not LEAST_SQUARES, int(fit.samples - fit.degrees_of_freedom)
+    robust, determined = fit.asked.loss != LEAST_SQUARES, int(fit.samples - fit.degrees_of_freedom)
     names = [name for name in dict.fromkeys(name for run in fit.whitened for name in run) if name not in fit.sigma]
     found = []
     for channels in (names, *([name] for name in names)):

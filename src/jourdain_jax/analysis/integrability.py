@@ -105,8 +105,8 @@ def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 def _derivative_of_inverse(N: np.ndarray, inverse: np.ndarray, dN: np.ndarray) -> np.ndarray:
     """Of the pseudo-inverse: `-N+ dN N+ + N+ N+' dN' (1 - N N+) + (1 - N+ N) dN' N+' N+` (Golub and Pereyra)."""
     down, across = np.swapaxes(dN, 1, 2), np.swapaxes(inverse, 1, 2)
-    outside, unseen = np.eye(N.shape[1]) - N @ inverse, np.eye(N.shape[2]) - inverse @ N
-    return -inverse @ dN @ inverse + inverse @ across @ down @ outside + unseen @ down @ across @ inverse
+    off_range, of_null_space = np.eye(N.shape[1]) - N @ inverse, np.eye(N.shape[2]) - inverse @ N
+    return -inverse @ dN @ inverse + inverse @ across @ down @ off_range + of_null_space @ down @ across @ inverse
 
 
 def growth_vector(scene: Scene, *, depth: int = 4, points: int = 2, seed: int = 0) -> Growth:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.correlated_noise import log_density
-from jourdain_jax.analysis.measurements import Measurements, checked, held_inputs
+from jourdain_jax.analysis.experiment import Experiment, checked, held_inputs
 from jourdain_jax.analysis.predictions import Run, equal_runs
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.simulate import simulate
@@ -22,22 +22,22 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import users_level
 
 
-def as_runs(scene: Scene, data: Measurements | Sequence[Measurements], *, repeats: bool = False) -> tuple[Measurements, ...]:
+def as_runs(scene: Scene, data: Experiment | Sequence[Experiment], *, repeats: bool = False) -> tuple[Experiment, ...]:
     """One run or several, checked against the scene; ValueError as in `checked`, and where there is no run. Inputs that are held are warned of."""
     as_scene(scene)
-    if not isinstance(data, Measurements | Iterable):
-        raise ValueError(f"`data` is {described(data)}, expected a `Measurements` or a sequence of at least one")
-    runs = (data,) if isinstance(data, Measurements) else tuple(data)
-    wrong = [f"`data` holds {described(run)}" for run in runs if not isinstance(run, Measurements)] if runs else ["`data` is empty"]
+    if not isinstance(data, Experiment | Iterable):
+        raise ValueError(f"`data` is {described(data)}, expected an `Experiment` or a sequence of at least one")
+    runs = (data,) if isinstance(data, Experiment) else tuple(data)
+    wrong = [f"`data` holds {described(run)}" for run in runs if not isinstance(run, Experiment)] if runs else ["`data` is empty"]
     if wrong:
-        raise ValueError(f"{wrong[0]}, expected a `Measurements` or a sequence of at least one")
+        raise ValueError(f"{wrong[0]}, expected an `Experiment` or a sequence of at least one")
     found = tuple(checked(scene, run, index, repeats) for index, run in enumerate(runs))
     for sentence in held_inputs(scene, found):
         warnings.warn(sentence, stacklevel=users_level())
     return found
 
 
-def in_all_or_none(runs: Sequence[Measurements], what: str, unknown: Callable[[Measurements], tuple[str, ...]]) -> tuple[str, ...]:
+def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Experiment], tuple[str, ...]]) -> tuple[str, ...]:
     """Channels of which something is not known; ValueError where it is None in one run and given in another."""
     names = tuple(sorted({name for run in runs for name in unknown(run)}))
     for name in names:
@@ -46,7 +46,7 @@ def in_all_or_none(runs: Sequence[Measurements], what: str, unknown: Callable[[M
     return names
 
 
-def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **simulation) -> Float[Array, ""]:
+def log_likelihood(scene: Scene, data: Experiment | Sequence[Experiment], **simulation) -> Float[Array, ""]:
     """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
     Differentiable in scene, start values, measured values, sigmas and numbers of sensors and actuators (reverse mode, unless `adjoint` says

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.joined import JoinedArrow
 from jourdain_jax.analysis.layout import Layout, Place
 from jourdain_jax.analysis.levenberg_marquardt import Linearised
 from jourdain_jax.analysis.losses import Loss
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.nodes import NODE
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem, closed
@@ -98,7 +98,7 @@ class Piecewise:
     def __init__(
         self,
         scene: Scene,
-        runs: tuple[Measurements, ...],
+        runs: tuple[Experiment, ...],
         layout: Layout,
         simulation: dict,
         members: int | None,

@@ -16,10 +16,10 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.information import hidden_combinations
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood import as_runs
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.predictions import Run, run_of
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.table import table
@@ -106,7 +106,7 @@ def _log_det(F: Float[Array, "unknowns unknowns"], places: tuple[int, ...]) -> F
 @shown_from_users_lines
 def planned_information(
     scene: Scene | BuiltFor,
-    plan: Measurements | Sequence[Measurements],
+    plan: Experiment | Sequence[Experiment],
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     **simulation,
 ) -> PlannedInformation:
@@ -125,7 +125,7 @@ def planned_information(
     **Example**
 
         def told(spin):
-            plan = jj.Measurements(ts, {"lean": ts}, 0.005, start={"lean": 0.3, "spin_rate": spin})
+            plan = jj.Experiment(ts, {"lean": ts}, 0.005, start={"lean": 0.3, "spin_rate": spin})
             return jj.planned_information(disc, plan, free=("radius", "gravity")).log_det()
 
         slope = jax.jacfwd(told)(-3.0)
@@ -164,7 +164,7 @@ def _sensitivities(scene: Scene, runs: tuple[Run, ...], theta: Float[Array, "pla
     return flat.T @ flat, J
 
 
-def _values(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> Float[Array | np.ndarray, "places"]:
+def _values(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> Float[Array | np.ndarray, "places"]:
     """All unknowns at the values that the scene and the runs have; those of parameters and starts may be traced."""
     shared, local = unknowns.split(unknowns.guess)
     of_bodies = {label: x for body in unknowns.layout.bodies for label, x in zip(body.labels, body.numbers(scene), strict=True)}

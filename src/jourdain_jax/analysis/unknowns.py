@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float
 
 from jourdain_jax.analysis.body_inertia import BodyInertia, PossibleInertia, inertia_of_body
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.joint_prior import Correlated, whitening
 from jourdain_jax.analysis.layout import Kind, Layout, Place
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.ranges import Range, positive, unbounded
 from jourdain_jax.analysis.sensors import UNITS, default_range
 from jourdain_jax.analysis.ties import tied_by
@@ -99,7 +99,7 @@ class _Entry:
 
 
 def unknowns_of(
-    scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]"
+    scene: Scene, runs: Sequence[Experiment], free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]"
 ) -> Unknowns:
     """The unknowns that `free`, the runs' `unknown_start` and their sensors and actuators name.
 
@@ -199,7 +199,7 @@ def _check_told_once(layout: Layout, functions: Mapping) -> None:
         told |= {entry.name: f"the possible inertia of `{body.body}`" for entry in body.entries}
 
 
-def _of_all_runs(runs: Sequence[Measurements]) -> dict[str, Estimate]:
+def _of_all_runs(runs: Sequence[Experiment]) -> dict[str, Estimate]:
     """Estimates of sensors and actuators by name; ValueError where runs state one differently."""
     found: dict[str, tuple[int, Estimate]] = {}
     for index, run in enumerate(runs):
@@ -213,7 +213,7 @@ def _of_all_runs(runs: Sequence[Measurements]) -> dict[str, Estimate]:
     return {label: estimate for label, (_, estimate) in found.items()}
 
 
-def _of_run(label: str, place: Place, run: Measurements) -> _Entry:
+def _of_run(label: str, place: Place, run: Experiment) -> _Entry:
     """An unknown of one run; where it is known there, or does not exist, it is held."""
     if place.of_sensor:
         estimate = run.estimates.get(place.name)

@@ -129,7 +129,7 @@ def _parameters(y: Values, hangings: dict[str, tuple[int, ...]], by_table: bool)
         found |= {f"miss {part}{k}": miss for k, miss in zip(numbers, misses, strict=True)}
         lengths[part] = jnp.sqrt(r @ r)
     found |= _moments_about_y(y, lengths) | _moments_in_plane(y, hangings, tilts)
-    return found if "G" not in hangings else found | _together(found)
+    return found if "G" not in hangings else found | _of_whole_bicycle(found)
 
 
 def _column(what: str, part: str, numbers: tuple[int, ...], y: Values) -> Float[Array, "hangings"]:
@@ -212,7 +212,7 @@ def _moments_in_plane(y: Values, hangings: dict[str, tuple[int, ...]], tilts: di
     return dict(zip(names, newton_root(condition, guess, jnp.ones(len(names))).x, strict=True))
 
 
-def _together(found: Values) -> Values:
+def _of_whole_bicycle(found: Values) -> Values:
     """Handlebar G and fork S as one body H."""
     mass = found["mG"] + found["mS"]
     x, z = ((found["mG"] * found[f"{axis}G"] + found["mS"] * found[f"{axis}S"]) / mass for axis in "xz")

@@ -217,8 +217,8 @@ def _probed_structure(scene: Scene) -> Structure:
     generator = np.random.default_rng(0)
     drawn = random_states(scene, RANDOM_PROBES, generator)
     t, u, generic, found = _at_probes(scene, *drawn)
-    serves = np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2))
-    near = None if serves[generic].any() else states_near_what_was_seen(scene, RANDOM_PROBES, generator)
+    finite = np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2))
+    near = None if finite[generic].any() else states_near_what_was_seen(scene, RANDOM_PROBES, generator)
     if near is not None:
         drawn = near
         t, u, generic, found = _at_probes(scene, *near)

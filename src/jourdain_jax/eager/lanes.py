@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jax.extend.core import Literal
 
+from jourdain_jax.calculus.jaxprs import called
 from jourdain_jax.eager.numpy_backend import ENTRYWISE, RULES, applied, traced_for_use
 
 
@@ -43,8 +44,8 @@ def uncompiled_lanes(f: Callable, shared: int = 0) -> Callable:
 
 
 def _run(closed, arguments: list[_Value], count: int) -> list[_Value]:
-    jaxpr, constants = (closed.jaxpr, closed.consts) if hasattr(closed, "consts") else (closed, [])
-    values = {v: _Value(np.asarray(x), False) for v, x in zip(jaxpr.constvars, constants, strict=True)} | dict(zip(jaxpr.invars, arguments, strict=True))
+    jaxpr = closed.jaxpr
+    values = {v: _Value(np.asarray(x), False) for v, x in zip(jaxpr.constvars, closed.consts, strict=True)} | dict(zip(jaxpr.invars, arguments, strict=True))
     for equation in jaxpr.eqns:
         inputs = [_Value(np.asarray(x.val, x.aval.dtype), False) if isinstance(x, Literal) else values[x] for x in equation.invars]
         if any(x.by_lane for x in inputs):
@@ -58,8 +59,9 @@ def _run(closed, arguments: list[_Value], count: int) -> list[_Value]:
 def _applied(equation, inputs: list[_Value], count: int) -> list[_Value]:
     """Results of an equation of which some inputs differ from lane to lane."""
     name, params = equation.primitive.name, equation.params
-    if name in _CALLS:
-        return _run(params[_CALLS[name]], inputs, count)
+    inner = called(name, params)
+    if inner is not None:
+        return _run(inner, inputs, count)
     if name == "cond" and not inputs[0].by_lane:
         return _run(params["branches"][int(inputs[0].array)], inputs[1:], count)
     if name == "custom_linear_solve":
@@ -146,7 +148,6 @@ def _reduced(function: Callable, of_nothing=None) -> Callable:
     return reduced
 
 
-_CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
 _LANES: dict[str, Callable] = {
     **dict.fromkeys(("reshape", "squeeze", "expand_dims"), _reshaped),
     **{name: RULES[name] for name in ("integer_pow", "lu", "cholesky", "svd")},

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
-from jourdain_jax.calculus.jaxprs import needed_only
+from jourdain_jax.calculus.jaxprs import called, needed_only
 from jourdain_jax.calculus.scalar_operations import VALUES
 from jourdain_jax.eager.indexing import gathered, scattered
 
@@ -34,7 +34,7 @@ def uncompiled(f: Callable) -> Callable:
         leaves = [np.asarray(x) for x in leaves]
         closed, shape = traced(treedef, tuple((x.shape, x.dtype) for x in leaves))
         with np.errstate(all="ignore"):
-            out = _run(closed.jaxpr, closed.consts, leaves)
+            out = _run(closed, leaves)
         return jax.tree.unflatten(jax.tree.structure(shape), out)
 
     return run
@@ -46,8 +46,9 @@ def traced_for_use(f: Callable, arguments):
     return needed_only(closed), shape
 
 
-def _run(jaxpr, constants, arguments) -> list[np.ndarray]:
-    values = dict(zip(jaxpr.constvars, map(np.asarray, constants), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
+def _run(closed, arguments) -> list[np.ndarray]:
+    jaxpr = closed.jaxpr
+    values = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
 
     def read(atom):
         return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
@@ -60,13 +61,12 @@ def _run(jaxpr, constants, arguments) -> list[np.ndarray]:
     return [read(x) for x in jaxpr.outvars]
 
 
-def _closed(inner, inputs):
-    return _run(inner.jaxpr, inner.consts, inputs) if hasattr(inner, "consts") else _run(inner, [], inputs)
-
-
 def applied(equation, inputs) -> list[np.ndarray]:
     """Results of one equation of a traced function."""
     name, params = equation.primitive.name, equation.params
+    inner = called(name, params)
+    if inner is not None:
+        return _run(inner, inputs)
     if name == "while":
         return _while(equation, inputs)
     if name in _CONTROL:
@@ -93,7 +93,7 @@ def _scan(params, inputs) -> list[np.ndarray]:
     order = range(params["length"])
     before: list[np.ndarray] = []  # what was carried one turn ago
     for done, i in enumerate(reversed(order) if params["reverse"] else order, 1):
-        result = _closed(params["jaxpr"], [*constants, *carry, *(x[i] for x in xs)])
+        result = _run(params["jaxpr"], [*constants, *carry, *(x[i] for x in xs)])
         before_last, before, carry = before, carry, result[:carried]
         if not xs and not outs and (_equal(carry, before) or (_equal(carry, before_last) and (params["length"] - done) % 2 == 0)):
             return carry  # an iteration that has converged, or goes to and fro: the rest changes nothing
@@ -113,10 +113,10 @@ def _while(equation, inputs) -> list[np.ndarray]:
     a, b = params["cond_nconsts"], params["body_nconsts"]
     of_condition, of_body, carry = inputs[:a], inputs[a : a + b], inputs[a + b :]
     for _ in range(MOST_TURNS):
-        going = np.asarray(_closed(params["cond_jaxpr"], [*of_condition, *carry])[0])
+        going = np.asarray(_run(params["cond_jaxpr"], [*of_condition, *carry])[0])
         if not np.any(going):
             return carry
-        new = _closed(params["body_jaxpr"], [*of_body, *carry])
+        new = _run(params["body_jaxpr"], [*of_body, *carry])
         carry = new if going.ndim == 0 else [np.where(going.reshape(going.shape + (1,) * (n.ndim - going.ndim)), n, o) for n, o in zip(new, carry, strict=True)]
     if np.all(going):
         raise ValueError(
@@ -137,28 +137,19 @@ def _where(equation) -> str:
 
 
 def _cond(params, inputs) -> list[np.ndarray]:
-    return _closed(params["branches"][int(inputs[0])], inputs[1:])
+    return _run(params["branches"][int(inputs[0])], inputs[1:])
 
 
 def _linear_solve(params, inputs) -> list[np.ndarray]:
     lengths = params["const_lengths"]
     constants, right = np.split(np.arange(len(inputs)), [sum(lengths)])
     of_solve = constants[lengths.matvec + lengths.vecmat :][: lengths.solve]
-    return _closed(params["jaxprs"].solve, [inputs[i] for i in (*of_solve, *right)])
-
-
-def _call(key: str) -> Callable:
-    return lambda params, inputs: _closed(params[key], inputs)
+    return _run(params["jaxprs"].solve, [inputs[i] for i in (*of_solve, *right)])
 
 
 _CONTROL: dict[str, Callable] = {
     "scan": _scan,
     "cond": _cond,
-    "jit": _call("jaxpr"),
-    "pjit": _call("jaxpr"),
-    "closed_call": _call("call_jaxpr"),
-    "custom_jvp_call": _call("call_jaxpr"),
-    "custom_vjp_call": _call("call_jaxpr"),
     "custom_lin": lambda params, inputs: inputs,
     "custom_linear_solve": _linear_solve,
 }

@@ -57,7 +57,7 @@ def eliminate(graph: Graph, A: list[list[int]], right: list[list[int]], probes: 
         ]
         found = [products(graph, b, pivot.inverse) for b in zip(*rest, strict=True)]
         solution |= dict(zip(pivot.columns, map(list, zip(*found, strict=True)), strict=True)) if found else {c: [] for c in pivot.columns}
-    return Eliminated([solution[c] for c in range(count)], [pivot.watched for pivot in order if graph.op[pivot.watched] != "const"])
+    return Eliminated([solution[c] for c in range(count)], [pivot.monitored for pivot in order if graph.op[pivot.monitored] != "const"])
 
 
 def quotient(graph: Graph, a: int, b: int) -> int:

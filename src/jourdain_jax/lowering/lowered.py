@@ -166,7 +166,7 @@ class Lowered:
 
     def _rates_and(self, more: list[int]) -> Callable[..., tuple]:
         outputs = [*self.qdot, *self.ydot, *more, *self.guards]
-        return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, watched=self.pivots)
+        return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, monitored=self.pivots)
 
     @property
     def variables(self) -> list[int]:

@@ -38,7 +38,7 @@ class Pivot:
     rows: tuple[int, ...]
     columns: tuple[int, ...]
     inverse: tuple[tuple[int, ...], ...]  # of A[rows][columns]
-    watched: int  # must not vanish
+    monitored: int  # must not vanish
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Pivots:
         if pair is not None:
             return pair
         good.sort(key=cost)
-        serving = next(((r, c) for r, c, entry in good if entry.fixed or self._serves_everywhere((r, c))), None)
+        serving = next(((r, c) for r, c, entry in good if entry.fixed or self._regular_everywhere((r, c))), None)
         if serving is not None:
             return self._single(*serving)
         r, c, _ = good[0] if good else max(judged, key=lambda place: place[2].worst)
@@ -141,13 +141,13 @@ class Pivots:
         graph = self.graph
         return not graph.varies[node] and (graph.is_const(node) or not any(turns(graph, n) for n in graph.reachable([node])))
 
-    def _single(self, row: int, column: int, watched: int | None = None) -> Pivot:
+    def _single(self, row: int, column: int, monitored: int | None = None) -> Pivot:
         entry = self.A[row][column]
-        return Pivot((row,), (column,), ((self.graph.div(self.graph.one, entry),),), entry if watched is None else watched)
+        return Pivot((row,), (column,), ((self.graph.div(self.graph.one, entry),),), entry if monitored is None else monitored)
 
     # judgement: at the probes of the domain, and at full turns of all angles where the system itself is regular
 
-    def _serves_everywhere(self, place: tuple[int, int]) -> bool:
+    def _regular_everywhere(self, place: tuple[int, int]) -> bool:
         """Whether an entry stays away from zero also outside of the domain, wherever the system is regular."""
         ratio = self._beside_row(place)
         ratio = ratio[self._regular & np.isfinite(ratio)]
@@ -226,8 +226,8 @@ class Pivots:
         graph, probes = self.graph, self.probes
         both = graph.mul(a, b), graph.mul(c, d)
         determinant = self.forms.simplified(graph.sub(*both))
-        serves = not graph.varies[determinant] and np.all(np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(both)), axis=0))
-        return determinant if serves else None
+        regular = not graph.varies[determinant] and np.all(np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(both)), axis=0))
+        return determinant if regular else None
 
     # rows combined
 
@@ -335,7 +335,7 @@ class Pivots:
             return pivot
         others = self.graph.one
         for other in self._combined[:-1]:
-            others = self.graph.mul(others, other.watched)
+            others = self.graph.mul(others, other.monitored)
         return Pivot(pivot.rows, pivot.columns, pivot.inverse, self.graph.div(self._determinant, others))
 
 

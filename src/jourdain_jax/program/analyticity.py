@@ -19,8 +19,8 @@ def passes(graph: Graph, outputs: Iterable[int], kinds: Collection[str]) -> list
 def decided_by(graph: Graph, outputs: Iterable[int], variables: Iterable[int], kinds: Collection[str]) -> bool:
     """Whether an operation of these kinds on the way to the outputs depends on one of the variables."""
     outputs, variables = list(outputs), set(variables)
-    hiding = [n for n in graph.reachable(outputs) if graph.op[n] in kinds]
-    return any(depend_on(graph, hiding, variables))
+    decisions = [n for n in graph.reachable(outputs) if graph.op[n] in kinds]
+    return any(depend_on(graph, decisions, variables))
 
 
 def depend_on(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[bool]:

@@ -93,8 +93,8 @@ def motion(forward: Callable, problem: Problem, method: Method, y0: PyTree, t0, 
 
 def _problem(moving, control) -> Problem:
     (rates, project, args), events, knots, *_ = moving
-    norm, rtol, atol, shortest, max_steps, *watched = control[0]
-    return Problem(rates, args, project, events, norm, rtol, atol, shortest, max_steps, knots, *watched)
+    norm, rtol, atol, shortest, max_steps, *monitored = control[0]
+    return Problem(rates, args, project, events, norm, rtol, atol, shortest, max_steps, knots, *monitored)
 
 
 @eqx.filter_custom_vjp

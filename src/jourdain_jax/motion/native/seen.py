@@ -31,7 +31,7 @@ _TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is
 
 
 @lru_cache(maxsize=MOST_KERNELS)
-def serves(program: Lowered) -> bool:
+def is_supported(program: Lowered) -> bool:
     """Whether all this can be machine code."""
     graph, nodes = program.graph, [*_seen_nodes(program), *program.fixed, *program.usual.values()]
     truths = any(_is_truth(graph, n) for n in program.fixed)  # which XLA hands on as such

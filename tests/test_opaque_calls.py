@@ -384,7 +384,7 @@ def test_a_stop_event_without_a_scalar_form_is_a_call_and_leaves_the_program_as_
 SINGLE = """
 import json, sys
 sys.path[:0] = {path!r}
-import jax, numpy as np, test_kept_parts as here
+import jax, numpy as np, test_opaque_calls as here
 assert not jax.config.jax_enable_x64
 found = {{}}
 for name in ("network",):

@@ -1,4 +1,4 @@
-"""Measurements of one run of a scene: times, named channels with a sigma and a sensor each, the start, sampled inputs.
+"""An experiment, what was measured in one run of a scene: times, named channels with a sigma and a sensor each, the start, sampled inputs.
 
 value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 """
@@ -23,10 +23,10 @@ from jourdain_jax.scene.scene import Scene, entries_named
 _NO_INPUTS = Inputs(())
 
 
-class Measurements(eqx.Module):
-    """One run.
+class Experiment(eqx.Module):
+    """What was measured in one run of a scene; several runs are a list of these.
 
-        Measurements(ts, {"x": x, "gyro": w}, {"x": 0.01, "gyro": 0.02}, start={"x_rate": 0.6}, sensors={"gyro": jj.Sensor("heading_rate", lag=0.01)})
+        Experiment(ts, {"x": x, "gyro": w}, {"x": 0.01, "gyro": 0.02}, start={"x_rate": 0.6}, sensors={"gyro": jj.Sensor("heading_rate", lag=0.01)})
 
     **Arguments**
     - `ts`: times in s, strictly increasing.
@@ -80,7 +80,7 @@ class Measurements(eqx.Module):
         _check_times(self.ts)
         for what, part in (("values", values), ("start", start), ("sensors", {} if sensors is None else sensors)):
             if not isinstance(part, Mapping):
-                raise ValueError(f'`{what}` of `Measurements` is {described(part)}, expected a dictionary by name, such as {{"x": ...}}')
+                raise ValueError(f'`{what}` of `Experiment` is {described(part)}, expected a dictionary by name, such as {{"x": ...}}')
         self.values = _reals("values of channel", values)
         given = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.values, sigma)
         self.unknown_sigma = tuple(sorted(name for name, value in given.items() if value is None))
@@ -181,7 +181,7 @@ def _check_same_names(what: str, names, expected) -> None:
             raise ValueError(f"channel `{name}` has no {what}; give `{what}` a number for it, or one number for all channels")
 
 
-def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measurements:
+def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experiment:
     """The run with its inputs and sensors made ready, after its channels and shapes were compared with the scene.
 
     `repeats`: values have a leading axis. Raises ValueError for an unknown channel, start value or input, for wrong shapes, and for samples that may show
@@ -235,7 +235,7 @@ def _reading(sensor: Sensor, name: str, where: str, quantity, shape: tuple[int, 
     return Reading(None if named else quantity, quantity if named else "", numbers, unknown, used)
 
 
-def _check_begin(run: Measurements, name: str, where: str, repeats: bool) -> None:
+def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
     """ValueError where a sample that counts may show a time before the start."""
     delay, values = run.sensors[name].delay, run.values[name]
     if is_traced((delay, run.ts, run.t0, values, run.sigma[name])) or latest(delay) == 0:
@@ -251,7 +251,7 @@ def _check_begin(run: Measurements, name: str, where: str, repeats: bool) -> Non
         )
 
 
-def _inputs(scene: Scene, run: Measurements, where: str, estimates: dict) -> tuple[Inputs, dict[str, Drive]]:
+def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple[Inputs, dict[str, Drive]]:
     """All inputs, at the first guess of what is to be estimated; and the actuators that have such numbers."""
     if run.inputs is None and not len(scene.inputs):
         return _NO_INPUTS, {}
@@ -281,7 +281,7 @@ def _inputs(scene: Scene, run: Measurements, where: str, estimates: dict) -> tup
     return inputs, drives
 
 
-def _check_overlap(run: Measurements, name: str, signal, where: str) -> None:
+def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
     """ValueError where all samples of an input that changes lie before the run, or after it."""
     if not isinstance(signal, Sampled) or is_traced((signal, run.ts, run.t0)) or np.ptp(np.asarray(signal.values)) == 0:
         return
@@ -293,7 +293,7 @@ def _check_overlap(run: Measurements, name: str, signal, where: str) -> None:
         )
 
 
-def held_inputs(scene: Scene, runs: Sequence[Measurements]) -> tuple[str, ...]:
+def held_inputs(scene: Scene, runs: Sequence[Experiment]) -> tuple[str, ...]:
     """One sentence for each input that changes and whose samples leave more than 1.5 of their intervals of a run, `checked`, at an end: it is held there.
 
     The last interval may be a jump, such as those of commands that are held; then the one before it counts.
