@@ -39,6 +39,7 @@ from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 FAR = 10.0  # widths of the domain: a coordinate that Newton's method moves by more has run away
 GUESSES = 8  # of each kind
+_TYPED = 1.5e-5  # of numbers that were typed with a few digits
 _OFF = 1e4  # units of round-off: a residual that is more
 NEAR = 0.1  # of the domain: how far the first guesses are from what was given
 
@@ -247,7 +248,8 @@ def _searched(scene: Scene, t, q, free, usual: Usual, guesses) -> _Put:
 
 
 def _tolerance(dtype) -> float:
-    return 1e3 * float(np.finfo(dtype).eps) ** 0.5
+    """The residual (m, rad) from which on given values contradict each other: that of numbers typed with a few digits, or of round-off."""
+    return max(_TYPED, _OFF * float(np.finfo(dtype).eps))
 
 
 _compiled_projection = quickly_compiled(_put_onto_constraints, options=RUN_SELDOM)  # one program for every choice of what is held
