@@ -548,7 +548,10 @@ ANALYSIS: dict[str, Case] = {
 }
 
 MEASURED: dict[str, Case] = {
-    "jj.Experiment([0.0, 0.0], {'x': [0.0, 0.0]}, 0.01, start={})": ("ValueError", "`ts` must be finite and strictly increasing; sort the samples by time"),
+    "jj.Experiment([0.0, 0.0], {'x': [0.0, 0.0]}, 0.01, start={})": (
+        "ValueError",
+        "strictly increasing, but sample 1 is at 0 s after 0 s; sort the samples",
+    ),
     "jj.Experiment('ts', {'x': [0.0]}, 0.01, start={})": ("ValueError", "`ts` is the text 'ts', expected real numbers; give times in s"),
     "jj.Experiment([0.0, 0.1], [0.0, 0.0], 0.01, start={})": ("ValueError", "`values` of `Experiment` is a list, expected a dictionary by name"),
     "jj.Experiment([0.0, 0.1], {}, 0.01, start={})": ("ValueError", "`values` is empty; give at least one channel: name -> measured values"),

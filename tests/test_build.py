@@ -75,8 +75,9 @@ def test_a_start_and_a_diagnosis_are_bit_equal_however_often_they_are_asked_for(
     assert np.array_equal(found, jj.accelerations(scene, starts[-1].t, starts[-1].q, starts[-1].u).udot)
 
 
-@pytest.mark.parametrize("scene", [ChaplyginSleigh(), DoublePendulumRods()], ids=["minimal", "full"])
-def test_a_motion_and_its_diagnosis_are_bit_equal_however_often_they_are_asked_for(scene):
+@pytest.mark.parametrize("name", MODELS)
+def test_a_motion_and_its_diagnosis_are_bit_equal_however_often_they_are_asked_for(name):
+    scene = MODELS[name]()
     ts = jnp.linspace(0.0, 0.5, 4)
     motions = [jj.simulate(scene, scene.example, ts=ts) for _ in range(OFTEN)]
     inside = jax.jit(lambda start: jj.simulate(scene, start, ts=ts))

@@ -389,6 +389,66 @@ def test_an_event_before_the_last_sample_is_named():
     assert f"before {np.sum(met <= TS)} of its samples" in warning
     cut = cart_run(push=0.0, values={"x": np.where(met <= TS, np.nan, x)}, sigma=1e-3)
     assert not any("event" in w for w in fit(Stopped(mass=1.9), cut, ("mass",)).warnings)
+    unfinished = fit(Stopped(mass=1.9), run, ("mass",), max_iterations=1)
+    assert not unfinished.converged
+    assert any("meets its event `buffer`" in w for w in unfinished.warnings)
+
+
+def test_the_time_of_a_light_gate_is_a_measurement():
+    # x = x0 cos(w t) is at the gate, x = 0, at t = pi / (2 w) with w^2 = k / m: dt / dk = - t / (2 k)
+    at, error = np.pi / 2 * np.sqrt(2.0 / 5.0), 0.002  # s
+    speed = 0.3 * np.sqrt(5.0 / 2.0)
+    run = Experiment([0.0, at], {"gate": [np.nan, 0.0]}, error * speed, start={"x": 0.3}, sensors={"gate": "x"}, inputs={"push": 0.0})
+    found = fit(Cart(damping=0.0, stiffness=5.3), run, ("stiffness",), rtol=1e-9, atol=1e-9)
+    assert float(found["stiffness"].value) == pytest.approx(5.0, rel=1e-6)
+    assert float(found["stiffness"].standard_error) == pytest.approx(2 * 5.0 / at * error, rel=1e-5)
+
+
+def test_samples_that_are_masked_are_missing():
+    run = cart_run()
+    masked = cart_run(values={"x": np.ma.masked_where(TS > 2.0, np.where(TS > 2.0, 99.0, run.values["x"]))}, sigma=0.01)
+    found = fit(Cart(mass=1.7), masked, ("mass",))
+    assert int(found.samples) == np.sum(TS <= 2.0)
+    assert float(found["mass"].value) == pytest.approx(2.0, rel=1e-4)
+
+
+def test_an_angle_that_was_wrapped_is_named_and_one_that_swings_is_not():
+    class Wheel(jj.Scene):
+        inertia: jnp.ndarray = jj.parameter(0.1, unit="kg m^2", positive=True)
+        drag: jnp.ndarray = jj.parameter(0.05, unit="N m s/rad", positive=True)
+        coordinates = jj.coordinates("angle")
+
+        def bodies(self, t, q):
+            return {"wheel": jj.RigidBody(1.0, jnp.diag(jnp.stack([self.inertia] * 3)), jnp.zeros(3), jj.rot_z(q.angle))}
+
+        def loads(self, motion):
+            return (jj.generalized_force(motion, angle_rate=-self.drag * motion.u.angle_rate),)
+
+    ts = np.linspace(0.0, 3.0, 61)
+    angle = 9.0 * 2.0 * (1 - np.exp(-0.5 * ts))
+    turned = lambda x, missing=0: np.where(np.arange(61) % 7 < missing, np.nan, x)  # noqa: E731
+    for x in (np.mod(angle + np.pi, 2 * np.pi) - np.pi, turned(np.mod(angle, 2 * np.pi), 1)):
+        run = Experiment(ts, {"encoder": x}, 0.01, start={"angle_rate": 9.0}, sensors={"encoder": "angle"})
+        with pytest.warns(UserWarning, match=r"channel `encoder` of run 0 jumps by -[56]\.\d+ at .* s and stays within one turn"):
+            log_likelihood(Wheel(), run)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for x in (angle, 3.1 * np.sin(9 * ts), np.random.default_rng(0).uniform(-3.1, 3.1, 61)):
+            log_likelihood(Wheel(), Experiment(ts, {"angle": x}, 0.01, start={"angle_rate": 9.0}))
+
+
+def test_a_gap_in_a_logged_input_is_named():
+    ts = np.linspace(0.0, 4.0, 81)
+    gap = (ts > 1.0) & (ts < 1.9)
+    log = lambda some: {"push": jj.Sampled(ts[some], np.sin(ts[some]))}  # noqa: E731
+    with pytest.warns(UserWarning, match=r"`push` of run 0 is sampled every 0.05 s, but not from 1 to 1.9 s, where it is a straight line"):
+        found = fit(Cart(mass=1.7), cart_run(inputs=log(~gap)), ("mass",))
+    assert "not from 1 to 1.9 s" in found.warning
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        steps = {"push": jj.Sampled([0.0, 1.0, 1.001, 4.0], [0.0, 0.0, 1.0, 1.0])}
+        for inputs in (log(ts >= 0), steps):
+            log_likelihood(CART, cart_run(inputs=inputs))
 
 
 def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():
@@ -725,6 +785,14 @@ def test_two_hidden_directions_and_a_parameter_that_does_nothing():
         (lambda: jj.student_t(np.inf), r"student_t\(inf\): expected a positive finite number"),
         (lambda: cart_run(values={}, sigma=1.0), "`values` is empty"),
         (lambda: cart_run(ts=TS[::-1]), "`ts` must be finite and strictly increasing"),
+        (lambda: cart_run(ts=np.where(TS[4] == TS, TS[3], TS)), "but sample 4 is at 0.6 s after 0.6 s; sort the samples by time and merge repeated"),
+        (lambda: cart_run(ts=np.ma.masked_greater(TS, 3.0)), "`ts` is an array of shape .* some are masked"),
+        (lambda: fit(CART, cart_run(), ("mass",), rtoll=1e-6), "`rtoll` is no option of `simulate`; did you mean `rtol`"),
+        (lambda: fit(CART, cart_run(), ("mass",), ts=TS), "`ts` is no option here: each `Experiment` states start, times and inputs"),
+        (lambda: fit(CART, cart_run(), ("mass",), adjoint=diffrax.ForwardMode()), "`adjoint` is no option here: derivatives come by forward mode"),
+        (lambda: fit(CART, cart_run(values={"x": np.where(TS[4] == TS, 0.1, np.nan)}, sigma=None), ("mass",)), "1 measured values .* 1 unknowns and 1 sigmas"),
+        (lambda: fit(CART, cart_run(values={"a": TS}, sigma=1.0, sensors={"a": lambda motion: np.sin(motion.q.x)}), ("mass",)), "write it with `jax.numpy`"),
+        (lambda: fit(CART, cart_run(values={"a": TS}, sigma=1.0, sensors={"a": lambda m: abs(m.q.x) if m.q.x > 0 else 0.0}), ("mass",)), "without `if`"),
         (lambda: cart_run(ts=np.where(TS[4] == TS, np.nan, TS)), "`ts` must be finite and strictly increasing"),
         (lambda: Experiment(TS[:0], {"x": TS}, 1.0, start={}), "expected a vector of at least one time"),
         (lambda: cart_run(t0=1.0), "the start at t0 = 1.0 s comes after the first sample"),

@@ -53,7 +53,7 @@ class TakenUp:
         return self.problem.linearised(theta, members)
 
     def residuals(self, run: int) -> dict[str, np.ndarray]:
-        """Of a run by channel, in units of sigma, at theta; NaN where a sample is missing."""
+        """Residuals of a run by channel, in units of sigma, at theta; NaN where a sample is missing."""
         return self.problem.by_channel(run, self.at, lambda x: x[0])
 
     def information(self) -> Information:
@@ -85,7 +85,7 @@ def for_runs(fit, runs: Experiment | Sequence[Experiment], fitted: bool = False)
     `fitted`: they are those of the fit, in pieces where it was found so.
     """
     asked = fit.asked
-    checked = as_runs(asked.scene, runs)
+    checked = as_runs(asked.scene, runs, asked.simulation)
     unknowns = unknowns_of(asked.scene, checked, asked.free)
     of_runs = asked.scene, checked, unknowns.layout, asked.simulation, None
     lanes = Piecewise(*of_runs, unknowns, asked.shooting) if fitted and asked.shooting is not None else Lanes(*of_runs, asked.loss)

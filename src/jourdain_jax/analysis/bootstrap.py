@@ -57,7 +57,7 @@ class Bootstrap(Printed):
 
     @property
     def bias(self) -> dict[str, float]:
-        """By how much estimates of repeats are on average above what these were drawn from."""
+        """How much estimates of repeats are on average above what these were drawn from."""
         found = np.mean(self.values[self.converged], axis=0) - self.fit.values if self.converged.any() else np.full(len(self.fit.labels), np.nan)
         return dict(zip(self.fit.labels, found.tolist(), strict=True))
 
@@ -109,9 +109,11 @@ class Bootstrap(Printed):
 
 
 def bootstrap(fit, data: Experiment | Sequence[Experiment], repeats: int, seed: int, noise: str) -> Bootstrap:
-    """Of a `Fit` of one experiment; see `Fit.bootstrap`."""
+    """The bootstrap of a `Fit` of one experiment; see `Fit.bootstrap`."""
     if isinstance(repeats, bool) or not isinstance(repeats, int | np.integer) or repeats < _FEWEST:
         raise ValueError(f"`repeats` is {repeats!r}, expected a whole number of {_FEWEST} or more; 1000 tell an end to a tenth of a standard error")
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ValueError(f"`seed` is {seed!r}, expected a whole number of zero or more")
     if noise not in ("sigmas", "residuals"):
         raise ValueError(f'`noise` is {noise!r}, expected "sigmas" or "residuals": from what noise is drawn')
     if not fit.converged:

@@ -68,7 +68,7 @@ def filtered_log_likelihood(scene: Scene | BuiltFor, data: Experiment | Sequence
         jj.filtered_log_likelihood(sleigh, run, process_noise={"heading_rate": 0.01})      # (rad/s)^2 / s
     """
     scene = as_scene(scene)
-    runs = as_runs(scene, data)
+    runs = as_runs(scene, data, simulation)
     _check_supported(scene, runs)
     speeds = privileged_speeds(scene)
     intensities = _intensities(scene, speeds, process_noise)
@@ -98,7 +98,7 @@ class _Filter:
         self.held = (*(scene.coordinate_names.entries[i] for i in self.coordinates), *(scene.speed_names.entries[i] for i in speeds))
 
     def log_likelihood(self, unknown: tuple[str, ...], sigma: Float[Array, "unknown"]) -> Float[Array, ""]:
-        """Of all samples; `sigma`: standard deviations of start values."""
+        """The log-likelihood of all samples; `sigma`: standard deviations of start values."""
         run, begin = self.run, self.begin
         x = self._independent(begin.q, begin.u)
         P = jnp.zeros((x.size, x.size))

@@ -6,8 +6,7 @@ by Levenberg-Marquardt. Jacobians come by forward mode through the simulation, r
 Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), chapter 3.
 """
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -79,8 +78,9 @@ def fit(
       unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` says how many led to it.
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with
       starts of their own, and continuity between them is an equation. What is minimised stays the same.
-    - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events are ignored, and `Fit.warnings` names
-      those that come before a sample.
+    - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events cut no run: what is given counts, and `Fit.warnings`
+      names those that the fitted motion meets before a sample. Give samples up to where the real motion met one; were runs cut where the fitted one does,
+      estimates whose motion ends early would have fewer residuals.
 
     Where that finds no minimum, or one whose residuals are far beyond their sigmas, the fit is made once more over growing spans (unless `shooting` is
     given): the first 1/32 of each run, then more of it, as far as the motion that was found follows the data, with the first guess as a weak prior (known to
@@ -131,14 +131,14 @@ def fit_batch(
 
 
 def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | None, errors: str, repeats: bool, guesses: int = 1, shooting=None) -> Fit:
-    scene = as_scene(scene)
+    scene, data = as_scene(scene), tuple(data) if isinstance(data, Iterator) else data
     if is_traced((scene, data, control.tolerance, control.cutoff, simulation)):
         raise DifferentiationModeError(
             "`fit` was called inside jit, vmap or a derivative, but its steps are chosen outside of compiled code. Call it with known numbers; "
             "for many repeats use `fit_batch`, for derivatives of the fit's objective `log_likelihood`."
         )
     _check_control(control)
-    runs = as_runs(scene, data, repeats=repeats)
+    runs = as_runs(scene, data, simulation, repeats=repeats)
     _check_choices(runs, loss, errors)
     check_shooting(shooting)
     free = free if isinstance(free, Mapping) else tuple(as_names(free))
@@ -205,10 +205,13 @@ def _repeats(runs: Sequence[Experiment]) -> int:
 
 
 def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> None:
-    samples = sum(math.prod(values.shape[int(repeats) :]) for run in runs for values in run.values.values()) + len(unknowns.with_prior)
-    if samples < len(unknowns.labels):
+    counts = [np.isfinite(values).reshape(*values.shape[: int(repeats)], -1).sum(axis=-1) for run in runs for values in run.values.values()]
+    samples, sigmas = int(np.max(sum(counts))) + len(unknowns.with_prior), len({name for run in runs for name in run.unknown_sigma})
+    if samples < len(unknowns.labels) + sigmas:
+        and_sigmas = f" and {sigmas} sigmas" if sigmas else ""
         raise ValueError(
-            f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns; measure more, or free fewer of {', '.join(unknowns.labels)}"
+            f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns{and_sigmas}; measure more, or free fewer of "
+            f"{', '.join(unknowns.labels)}"
         )
 
 

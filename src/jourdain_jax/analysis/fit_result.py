@@ -112,7 +112,7 @@ class Fit(Printed):
 
     @property
     def residuals(self) -> tuple[dict[str, Float[np.ndarray, "..."]], ...]:
-        """Of each run by channel, (times, *channel): (prediction - value) / sigma; NaN where missing."""
+        """Residuals of each run by channel, (times, *channel): (prediction - value) / sigma; NaN where missing."""
         return self.statistics.residuals
 
     @property
@@ -168,8 +168,8 @@ class Fit(Printed):
 
     @property
     def reduced_chi_square(self) -> Float[np.ndarray, "*repeats"]:
-        """Sum of squared residuals per degree of freedom: near 1 where scene and sigmas are right."""
-        return np.asarray(self.chi_square / self.degrees_of_freedom)
+        """Sum of squared residuals per degree of freedom, near 1 where scene and sigmas are right; NaN where there are as many unknowns as samples."""
+        return np.asarray(self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan))
 
     # Of one fit, not of a batch. -----------------------------------------------------------------------------------
 
@@ -215,7 +215,7 @@ class Fit(Printed):
 
     @property
     def autocorrelation(self) -> dict[str, tuple[float, float]]:
-        """Of each channel, the correlation of neighbouring whitened residuals over all runs, and what white ones hardly exceed (3.5 / sqrt(pairs))."""
+        """For each channel, the correlation of neighbouring whitened residuals over all runs, and what white ones hardly exceed (3.5 / sqrt(pairs))."""
         found = {}
         for name in dict.fromkeys(name for run in self.whitened for name in run):
             runs = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in self.whitened if name in run]

@@ -49,12 +49,12 @@ class Prediction(Printed, eqx.Module):
 
 
 def of_fitted(fit, runs: Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
-    """Of the runs that a `Fit` was fitted to."""
+    """Predictions of the runs that a `Fit` was fitted to."""
     return tuple(_by_channel(fit, run, residuals) for run, residuals in zip(runs, fit.residuals, strict=True))
 
 
 def of_held_out(fit, runs: Experiment | Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
-    """Of other runs; ValueError where they do not fit the scene, or share unknowns that the fit did not estimate."""
+    """Predictions of other runs; ValueError where they do not fit the scene, or share unknowns that the fit did not estimate."""
     runs = (runs,) if isinstance(runs, Experiment) else tuple(runs)
     other = for_runs(fit, runs)
     unknowns, shared = other.problem.unknowns, other.problem.unknowns.layout.sizes[0]

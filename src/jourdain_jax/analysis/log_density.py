@@ -213,7 +213,7 @@ def log_density(
         draws = density.named(positions)["radius"]                               # m, of the positions (draws, unknowns) that were sampled
     """
     scene = as_scene(scene)
-    runs = as_runs(scene, data)
+    runs = as_runs(scene, data, simulation, forward=False)
     sigmas = in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
     with_memory = in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
     limits = [correlation_limits([np.asarray(run.ts) for run in runs if name in run.values]) for name in with_memory]

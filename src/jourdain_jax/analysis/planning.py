@@ -98,7 +98,7 @@ def _inverse(F: Float[Array, "unknowns unknowns"]) -> Float[Array, "unknowns unk
 
 @quickly_compiled
 def _log_det(F: Float[Array, "unknowns unknowns"], places: tuple[int, ...]) -> Float[Array, ""]:
-    """Of this block of the inverse."""
+    """The logarithm of the determinant of this block of the inverse."""
     some = np.array(places, int)
     return jnp.linalg.slogdet(_inverse(F)[some[:, None], some])[1]
 
@@ -131,7 +131,7 @@ def planned_information(
         slope = jax.jacfwd(told)(-3.0)
     """
     scene = as_scene(scene)
-    runs = as_runs(scene, plan)
+    runs = as_runs(scene, plan, simulation)
     for run in runs:
         for name in run.unknown_sigma:
             raise ValueError(f"sigma of channel `{name}` is None, but a plan needs the standard deviation of its noise; give a number")

@@ -249,7 +249,7 @@ class _Group:
         return [(min(width, count - k * width), *np.divmod(some, len(self.indices))) for k, some in enumerate(lanes)]
 
     def first_steps(self, x: Float[np.ndarray, "unknowns"], told: Float[np.ndarray, "_"]) -> Float[np.ndarray, "_"]:
-        """Of the run, from unknowns with its own ones first; to be `read`."""
+        """The first steps of the run, from unknowns with its own ones first; to be `read`."""
         return np.asarray(self._steps(self._common, np.concatenate([self._rows[0], x, told])))
 
     def _begun(self, shared, local, members, b, j):
@@ -260,7 +260,7 @@ class _Group:
         return b[:kept], self._runs[j[:kept]], np.asarray(found)[:kept]
 
     def chained(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> tuple[np.ndarray | None, np.ndarray]:
-        """Of each sample of lanes, the place of the one before it (None: all noise is white) and their correlation."""
+        """For each sample of lanes, the place of the one before it (None: all noise is white) and their correlation."""
         if self.chains is None:
             return None, _WHITE
         places = [self.indices.index(run) for run in runs.tolist()]

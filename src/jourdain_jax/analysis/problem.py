@@ -55,7 +55,7 @@ class Problem:
         return self._assembled(theta, members, evaluated, self.taus(members), self._share(members))
 
     def _share(self, members: np.ndarray) -> np.ndarray | None:
-        """Of the span, of each of these members; None: all of it."""
+        """The share of the span that each of these members takes; None: all of it."""
         return None if self.shares is None else self.shares[members]
 
     def minimum(self, theta: np.ndarray, members: np.ndarray, limits: Limits, control: Control, what: str) -> Minimum:
@@ -232,7 +232,7 @@ class Problem:
         return parts
 
     def inflation(self, residuals, samples, rank) -> np.ndarray:
-        """By what the covariance of each member is to be multiplied: for the loss, and for sigmas that are estimated."""
+        """The factor by which the covariance of each member is to be multiplied: for the loss, and for sigmas that are estimated."""
         members = self.lanes.members or 1
         by_member = [np.concatenate([r.reshape(members, -1)[b] for run in residuals for r in run.values()]) for b in range(members)]
         of_loss = np.array([self.loss.inflation(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in by_member])

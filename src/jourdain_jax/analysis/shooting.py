@@ -77,7 +77,7 @@ def numbers_of_filters(run: Experiment, repeats: bool) -> int:
 
 
 def owned(run: Experiment, ends: Int[np.ndarray, "ends"]) -> dict[str, Int[np.ndarray, "ends"]]:
-    """Of each channel the first sample that belongs to each piece, and one past the last of all.
+    """For each channel, the first sample that belongs to each piece, and one past the last of all.
 
     A sample at which two pieces meet belongs to the later one; of a sensor with a delay, to the piece that has begun the largest delay before.
     """

@@ -110,7 +110,7 @@ def _put_starts(problem: Problem, lanes: Piecewise, local: np.ndarray, nodes: np
 
 
 def _closed(problem: Problem, lanes: Piecewise, theta: np.ndarray, limits: Limits, control: Control) -> Minimum:
-    """By sequential quadratic programming, from where the pieces are."""
+    """The minimum with all gaps closed, by sequential quadratic programming from where the pieces are."""
     lanes.closing = False
     count = len(theta)
     at = problem.linearised(theta, np.arange(count))

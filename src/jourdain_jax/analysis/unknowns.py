@@ -94,7 +94,7 @@ class _Entry:
 
     @property
     def labels(self) -> list[str]:
-        """Of each number."""
+        """The name of each number."""
         return [self.label + "".join(f"[{i}]" for i in index) for index in np.ndindex(self.guess.shape)] if self.guess.ndim else [self.label]
 
 
@@ -175,7 +175,7 @@ def _parameters(kind: type[Scene]) -> dict[str, Mapping]:
 
 
 def _above_zero(entry: "_Entry") -> "_Entry":
-    """With a bound a little above zero in place of one at zero, where the scene has no motion."""
+    """The range with a bound a little above zero in place of one at zero, where the scene has no motion."""
     return replace(entry, range=replace(entry.range, low=_LEAST * float(entry.guess.min()))) if entry.range.low == 0 else entry
 
 

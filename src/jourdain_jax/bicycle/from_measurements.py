@@ -157,7 +157,7 @@ def _geometry(y: Values, known: Values, by_table: bool) -> Values:
 
 
 def _handlebar_to_axle(y: Values, lam: Scalar) -> Float[Array, "2"]:
-    """From where the handlebar hung to the front axle, (x, z), m; both lay on a table, with the steer axis level."""
+    """The vector from where the handlebar hung to the front axle, (x, z), m; both lay on a table, with the steer axis level."""
     across = y["h7"] - y["h6"] + (y["d5"] - y["d6"]) / 2
     along = jnp.sqrt((y["l"] - (y["d5"] + y["d6"]) / 2) ** 2 - across**2)
     return jnp.stack([along * jnp.sin(lam) - across * jnp.cos(lam), along * jnp.cos(lam) + across * jnp.sin(lam)])

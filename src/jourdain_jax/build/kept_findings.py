@@ -65,7 +65,7 @@ def name_of(kind: str, scene: Scene, of_inputs: tuple[int, ...], more: tuple) ->
 
 @once_per_class
 def _digest_of_trace(scene: Scene, of_inputs: tuple[int, ...]) -> bytes | None:
-    """Of what was traced of a scene; None where something in it has no name of its own."""
+    """The digest of what was traced of a scene; None where something in it has no name of its own."""
     closed, shape = jaxpr_of_scene(scene, of_inputs)
     labels = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(shape)]
     try:

@@ -131,7 +131,7 @@ def _look(scene: Scene, *states_and_generic) -> Probed:
 
 
 def _looked_at_from_afar(scene: Scene, t, q, u, u_other, generic) -> Probed:
-    """At a few states far off as well: no graph says what calls do where the probes do not show it."""
+    """What was looked at, at a few states far off as well: no graph says what calls do where the probes do not show it."""
     generator = np.random.default_rng(1)
     far_q = q[:FAR_PROBES] * FAR ** generator.uniform(size=(FAR_PROBES, 1))
     for first, _ in scene.coordinates.quaternions:

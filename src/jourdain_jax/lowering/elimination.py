@@ -22,7 +22,7 @@ class Eliminated:
 
 
 def pivots_ok(pivots: list[int], probes: Probes | IdentityProbes) -> Bool[np.ndarray, "probes"]:
-    """At which probes what was divided by these pivots is more than round-off: none of them is small beside its usual size."""
+    """The probes at which what was divided by these pivots is more than round-off: none of them is small beside its usual size."""
     sizes = np.abs(probes(pivots))
     return np.all(sizes > SMALLEST_PIVOT * usual(sizes)[:, None], axis=0)
 

@@ -233,7 +233,7 @@ class Lowered:
 
     @functools.cached_property
     def _fixed_shapes(self) -> dict[int, tuple[int, ...]]:
-        """Of the arrays among what is fixed: without lanes."""
+        """The shapes of the arrays among what is fixed, without lanes."""
         return {n: self.graph.value[n][-2] for n in self.fixed if self.graph.op[n] in ARRAYS}
 
     @functools.cached_property

@@ -164,7 +164,7 @@ class Pivots:
 
     @property
     def _regular(self) -> np.ndarray:
-        """At which probes the given system is: its rows and columns scaled, at the probes of the domain and the far ones."""
+        """The probes at which the given system is regular: its rows and columns scaled, at the probes of the domain and the far ones."""
         if self._kept_regular is None:
             count = len(self._given[0])
             A = np.moveaxis(self._at([n for row in self._given for n in row]).reshape(len(self._given), count, -1), -1, 0)
@@ -184,7 +184,7 @@ class Pivots:
         return near if self._far is None else np.concatenate([near, self._far()(nodes)], axis=1)
 
     def _size(self, row: int) -> np.ndarray:
-        """Of what a row was made of, at all probes."""
+        """The size of what a row was made of, at all probes."""
         if row not in self._sizes:
             self._sizes[row] = np.max(np.abs(self._at(self.A[row])), axis=0)
         return self._sizes[row]
@@ -267,7 +267,7 @@ class Pivots:
         return len(self.rows) > len(self.columns)
 
     def _weights(self, rows: list[int]) -> list[float]:
-        """Of rows in a combination: one where their sizes are alike."""
+        """The weights of rows in a combination: one where their sizes are alike."""
         sizes = [float(np.nanmedian(self._size(r))) for r in rows]
         largest = max(sizes)
         if min(sizes) * LIKE > largest:
@@ -315,7 +315,7 @@ class Pivots:
         return self._single(new, c, graph.call("sqrt", squares))
 
     def _determinant_left(self) -> int:
-        """Of the rows and columns that are left, by minors."""
+        """The determinant of the rows and columns that are left, by minors."""
         graph, rows, columns = self.graph, sorted(self.rows), sorted(self.columns)
         minors: dict[tuple[int, ...], int] = {(): graph.one}
         for size, r in enumerate(rows, 1):

@@ -1,4 +1,4 @@
-"""The machine that runs this process: whether machine code can be made for it, how many lanes it takes at once, and the making."""
+"""The machine that runs this process: whether machine code can be made for it, how many lanes it takes at once; and how code is made."""
 
 import ctypes
 import ctypes.util

@@ -30,7 +30,7 @@ PREFIX = "jourdain_libm_"  # of libm's functions in a module
 
 
 def polynomial(w: Writer, coefficients: Sequence[float], x: Value) -> Value:
-    """By Horner's rule, highest power first."""
+    """A polynomial by Horner's rule, highest power first."""
     total = w.number(coefficients[0])
     for c in coefficients[1:]:
         total = w.fma(total, x, c)

@@ -169,7 +169,7 @@ def _aligned(graph: Graph, nodes: np.ndarray) -> list[list[tuple[int, ...]]]:
 
 
 def _origins(nodes: np.ndarray, arguments) -> np.ndarray:
-    """Of each iteration, where its arguments are found: k in the same iteration, length + k in the one before, -1 before the loop, -2 elsewhere in it."""
+    """Where the arguments of each iteration are found: k in the same iteration, length + k in the one before, -1 before the loop, -2 elsewhere in it."""
     iterations, length = nodes.shape
     place = {n: divmod(k, length) for k, n in enumerate(nodes.ravel().tolist())}
 

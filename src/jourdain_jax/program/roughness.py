@@ -16,7 +16,7 @@ _SMOOTH, _MOVES, _MAY_BEND = 0, 1, 2  # does not depend on the inputs; depends s
 
 
 def may_bend(closed, variables: Collection[int], smooth: Collection[str] = ()) -> list[bool]:
-    """Of each output of a closed jaxpr, whether it may have kinks or jumps as a function of those inputs; functions named in `smooth` have none."""
+    """Whether each output of a closed jaxpr may have kinks or jumps as a function of those inputs; functions named in `smooth` have none."""
     marks = [_MOVES if k in variables else _SMOOTH for k in range(len(closed.jaxpr.invars))]
     return [mark == _MAY_BEND for mark in _marked(closed.jaxpr, marks, frozenset(smooth))]
 
@@ -60,7 +60,7 @@ def _results(equation, given: list[int], smooth: frozenset[str]) -> list[int]:
 
 
 def _repeated(jaxpr, given: list[int], constants: int, carried: int, smooth: frozenset[str]) -> list[int]:
-    """Of a loop: until nothing that is carried changes any more."""
+    """The marks of a loop, gone round until nothing that is carried changes any more."""
     given = list(given)
     while True:
         found = _marked(jaxpr, given, smooth)

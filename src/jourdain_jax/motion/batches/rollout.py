@@ -220,7 +220,7 @@ def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:
 
 
 def _next_retries(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int[np.ndarray, "lanes"]:
-    """In which ways each lane is run again, those it was run in already included; AS_ASKED: it is not."""
+    """How each lane is run again, all earlier changes of its run included; AS_ASKED: it is not."""
     own_times = isinstance(starts, State) and options.get("t0") is None
     first = 0.0 if options.get("t0") is None else options["t0"]
     begun = np.broadcast_to(np.asarray(starts.t if own_times else first), lanes.result.shape)

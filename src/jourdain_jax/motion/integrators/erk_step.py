@@ -91,7 +91,7 @@ def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0, directi
 
 
 def standing(problem: Problem, y: PyTree, t: Float[Array, "*lanes"], h: Float[Array, "*lanes"], direction) -> Progress:
-    """On the way, with no step behind and no event to search for."""
+    """Progress at a start: no step is behind, and no event is searched for."""
     zero = jnp.zeros(jnp.shape(t), jnp.int32)
     rest = jax.lax.stop_gradient(jax.tree.map(jnp.zeros_like, y)) if _rounding_adds_up(problem, y) else None
     return Progress(t, y, h, zero + RUNNING, problem.knots_passed(t, direction), zero, zero, zero - 1, None, no_pivot(t), rest)
@@ -246,7 +246,7 @@ def weighted(weights, slopes: Float[Array, "stages *shape"]) -> Float[Array, "*s
 
 
 def as_in(x, like) -> Array:
-    """In the precision of the state: time keeps its own."""
+    """A number in the precision of the state: time keeps its own."""
     return jnp.asarray(x, like.dtype)
 
 

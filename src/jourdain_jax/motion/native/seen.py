@@ -1,4 +1,4 @@
-"""What is seen of a motion beside its steps, as machine code: numbers that depend on parameters alone, and all speeds, pivots and energies at saved states.
+"""Numbers beside the steps of a motion, as machine code: those that depend on parameters alone, and all speeds, pivots and energies at saved states.
 
 Each is a function of JAX on one state or scene; under `vmap` all lanes go to one call. In batches of motions XLA sees the states: machine code, for which
 rows of numbers are put together, takes twice as long there. Derivatives are those of the same by XLA (`lowering/lowered.py`).

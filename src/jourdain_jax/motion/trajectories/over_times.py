@@ -88,7 +88,7 @@ def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
 
 
 def _largest_block(record: Record) -> int:
-    """At how many times quantities are worked out together."""
+    """The number of times at which quantities are worked out together."""
     return max(1, MOST_ENTRIES // record.q.shape[-1] ** 2)
 
 
