@@ -75,7 +75,7 @@ def test_special_values_are_those_of_c_also_the_signs_of_zeros():
     points = np.array([(x, y) for x in values for y in values])
     found = np.asarray(evaluated_natively.function(graph, [*outputs, *roots], inputs)(points))
     with np.errstate(all="ignore"):
-        expected = [TABLE[op].value(*points[:, : 1 if op in ONE else 2].T) for op in ops] + [np.power(points[:, 0], y) for y in (0.5, 1.5)]
+        expected = [TABLE[op].value(*points[:, : 1 if op in ONE else 2].T) for op in ops] + [np.power(points[:, 0], np.full(len(points), y)) for y in (0.5, 1.5)]
         for op, ours, true in zip([*ops, "x^0.5", "x^1.5"], found.T, expected, strict=True):
             right = (ours == true) | (np.abs(ours - true) <= 1e-15 * np.abs(true) + 2.0**-1022)
             right = (np.isnan(ours) & np.isnan(true)) | (right & (np.signbit(ours) == np.signbit(true)))
@@ -94,7 +94,7 @@ def test_numbers_in_single_precision_give_what_they_give_by_xla():
 
 
 GROWING = ("exp", "exp2", "expm1", "sinh", "cosh", "logistic")
-OWN = sorted({"sin", "cos", "pow", *BY_POLYNOMIALS})
+OWN = ["sin", "cos", *BY_POLYNOMIALS]
 
 
 @functools.cache

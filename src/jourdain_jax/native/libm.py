@@ -5,11 +5,10 @@ from collections.abc import Sequence
 
 from jourdain_jax.native.ir import Value, Writer
 
-LIBM = ("sin", "cos", "tan", "atan2", "asinh", "acosh", "atanh", "cbrt", "fmod")
 PREFIX = "jourdain_libm_"  # of libm's functions in a module
 
 
-def by_libm(w: Writer, name: str, *args: Value) -> Value:
+def by_libm(name: str, w: Writer, *args: Value) -> Value:
     """A function of libm, lane by lane."""
     result = w.number(math.nan)
     for lane in range(w.lanes):
@@ -26,5 +25,5 @@ def by_libm_where(w: Writer, far: Value, args: Sequence[Value], quick: Sequence[
         w.store(value, place)
     with w.when(w.any(far)):
         for value, place, name in zip(quick, found, names, strict=True):
-            w.store(w.where(far, by_libm(w, name, *args), value), place)
+            w.store(w.where(far, by_libm(name, w, *args), value), place)
     return [w.load(w.real, place) for place in found]

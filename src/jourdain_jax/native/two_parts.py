@@ -9,7 +9,7 @@ from jourdain_jax.native.ir import Value, Writer
 
 
 def polynomial(w: Writer, coefficients: Sequence[float], x: Value) -> Value:
-    """By Horner's rule, highest power first; of a long one, even and odd powers side by side."""
+    """A polynomial by Horner's rule, highest power first; of a long one, even and odd powers side by side."""
     if len(coefficients) > 7:
         square, odd = x * x, 1 - len(coefficients) % 2
         return w.fma(polynomial(w, coefficients[1 - odd :: 2], square), x, polynomial(w, coefficients[odd::2], square))

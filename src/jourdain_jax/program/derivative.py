@@ -23,12 +23,12 @@ def derivatives(graph: Graph, outputs: Iterable[int], direction: dict[int, int])
 
 
 def jacobian(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[dict[int, int]]:
-    """Of each output, its derivatives with respect to the variables (nodes that are not looked into) on which it depends."""
+    """The derivatives of each output with respect to the variables (nodes that are not looked into) on which it depends."""
     return directional_derivative(graph, outputs, {n: {n: graph.one} for n in variables})
 
 
 def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Mapping[int, Mapping[int, int]]) -> list[dict[int, int]]:
-    """Of each output, its derivatives along those named directions in which it changes, in one sweep; `directions[k][n]` is dn/ds in direction k.
+    """The derivatives of each output along those named directions in which it changes, in one sweep; `directions[k][n]` is dn/ds in direction k.
 
     Nodes in any direction are not looked into in any other.
     """

@@ -39,7 +39,7 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
             run_loop(part, values, {n for n in part.nodes.ravel().tolist() if last_use.get(n, -1) > k}, _operation)
         else:
             _run_in_a_row(graph, part, values)
-            values |= _together([n for n in part if last_use.get(n, -1) > k and graph.op[n] not in ARRAYS], values)
+            values |= _fused_by_shape([n for n in part if last_use.get(n, -1) > k and graph.op[n] not in ARRAYS], values)
     return [values[n] for n in outputs]
 
 
@@ -81,7 +81,7 @@ def _depth(graph: Graph, nodes: list[int]) -> int:
     return max(depth.values(), default=0)
 
 
-def _together(nodes: list[int], values: Mapping[int, jax.Array]) -> dict[int, jax.Array]:
+def _fused_by_shape(nodes: list[int], values: Mapping[int, jax.Array]) -> dict[int, jax.Array]:
     """The values of the nodes, those of one shape and type computed together."""
     alike: dict[tuple, list[int]] = {}
     for n in nodes:
@@ -145,7 +145,7 @@ def _polynomial(coefficients, x):
     return total
 
 
-UNROLLED = 2  # rounds that follow one another without a jump; measured: one is slower, four compile to more functions
+UNROLLED = 2  # iterations that follow one another without a jump; measured: one is slower, four compile to more functions
 
 
 class Values(dict):

@@ -356,7 +356,7 @@ class Graph:
         new: dict[int, int] = {}
         for node in self.reachable(outputs):
             args = self.args[node]
-            divided = [(a, self.args[b][1]) for a, b in (args, args[::-1]) if self._serves_once(b, uses, outputs)] if self._is_product(node) else []
+            divided = [(a, self.args[b][1]) for a, b in (args, args[::-1]) if self._divides_once(b, uses, outputs)] if self._is_product(node) else []
             if divided:
                 new[node] = self._node("div", (new[divided[0][0]], new[divided[0][1]]))
             else:
@@ -366,7 +366,7 @@ class Graph:
     def _is_product(self, node: int) -> bool:
         return self.op[node] == "mul" and self.varies[node]
 
-    def _serves_once(self, node: int, uses: dict[int, int], outputs: list[int]) -> bool:
+    def _divides_once(self, node: int, uses: dict[int, int], outputs: list[int]) -> bool:
         """Whether a node is a varying reciprocal with one use."""
         reciprocal = self.op[node] == "div" and self.args[node][0] == self.one and self.varies[node]
         return reciprocal and uses[node] == 1 and node not in outputs

@@ -96,7 +96,7 @@ class IdentityProbes:
 
 
 def equal(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
-    """Of each pair of rows, values of expressions at generic probes, whether they are equal but for round-off, at those that are `regular`."""
+    """Whether the rows of each pair, values of expressions at generic probes, are equal but for round-off, at those that are `regular`."""
     finite = np.isfinite(SURE * (a.error + b.error)) & regular & np.isfinite(np.asarray(b))
     return np.all(alike(a, b, regular), axis=1) & (np.count_nonzero(finite, axis=1) >= FEWEST)
 

@@ -15,9 +15,10 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
+from jourdain_jax.calculus.jaxprs import called
 from jourdain_jax.program.calls import Call
 from jourdain_jax.program.graph import Graph, Unsupported
-from jourdain_jax.program.interpret import Nodes, Value, apply, inner_jaxpr, refuse
+from jourdain_jax.program.interpret import Nodes, Value, apply, refuse
 
 LARGE = 16  # entries of an array that is not taken apart beside a call
 LARGEST = 4096  # entries of an array of scalars
@@ -75,7 +76,7 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
     """Outputs of a closed jaxpr at the given arguments, as `interpret`, with calls for the parts that have no scalar form."""
     inputs: list[_Variable] = [_Variable(v.aval) for v in closed.jaxpr.invars]
     steps: list[_Step] = []
-    outputs = _flat(closed.jaxpr, closed.consts, inputs, steps)
+    outputs = _flat(closed, inputs, steps)
     steps = _needed(steps, outputs)
     numbers = _judged(Graph(graph.most_multiplications, graph.keeps_rules), steps, inputs)
     steps = [step for step in steps if any(v not in numbers for v in step.outputs)]
@@ -94,9 +95,10 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
     return [values[x] if isinstance(x, _Variable) else x for x in outputs]
 
 
-def _flat(jaxpr, constants, arguments, steps: list[_Step]) -> list:
+def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
     """Appends all equations, those of inner jaxprs in their place; functions with derivatives of their own stay whole."""
-    environment = dict(zip(jaxpr.constvars, map(np.asarray, constants), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
+    jaxpr = closed.jaxpr
+    environment = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
 
     def read(atom):
         return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else environment[atom]
@@ -104,12 +106,12 @@ def _flat(jaxpr, constants, arguments, steps: list[_Step]) -> list:
     for equation in jaxpr.eqns:
         name, inputs = equation.primitive.name, [read(x) for x in equation.invars]
         refuse(name, equation)
-        inner = None if name.startswith("custom_") else inner_jaxpr(name, equation.params)
+        inner = None if name.startswith("custom_") else called(name, equation.params)
         if inner is None:
             results = [_Variable(v.aval) for v in equation.outvars]
             steps.append(_Step(equation, jaxpr, inputs, results))
         else:
-            results = _flat(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), inputs, steps)
+            results = _flat(inner, inputs, steps)
         environment |= dict(zip(equation.outvars, results, strict=True))
     return [read(x) for x in jaxpr.outvars]
 
