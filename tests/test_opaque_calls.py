@@ -460,4 +460,4 @@ def test_a_computation_of_too_many_scalars_is_refused_in_parts_too(monkeypatch):
 
 def test_chains_and_the_bicycle_have_no_calls():
     for scene in (jj.models.TrailerChain(trailers=16), jj.models.PendulumChain(links=16), jj.models.MODELS["whipple-bicycle"]()):
-        assert "kept" not in traced_scene(scene).graph.op
+        assert "opaque" not in traced_scene(scene).graph.op

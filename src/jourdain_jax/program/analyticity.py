@@ -8,7 +8,7 @@ from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.graph import Graph
 
 NONANALYTIC = frozenset(name for name, operation in TABLE.items() if operation.kind != "analytic")
-CALLS = frozenset({"kept"})
+CALLS = frozenset({"opaque"})
 
 
 def passes(graph: Graph, outputs: Iterable[int], kinds: Collection[str]) -> list[bool]:

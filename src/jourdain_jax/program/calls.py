@@ -1,6 +1,6 @@
 """Calls of JAX in a graph of scalars: the parts of a traced function that have no scalar form.
 
-    array   entries put together             kept    the results of a `Call` of arrays
+    array   entries put together             opaque  the results of a `Call` of arrays
     output  one of these results             entry   one entry of it, a scalar again
 
 The values of an array may have axes of lanes, which come last, as a scalar's do.
@@ -123,7 +123,7 @@ def _entry(index, x):
     return jax.lax.index_in_dim(x.reshape(-1, *x.shape[dimensions:]), number, keepdims=False)
 
 
-EMITTED: dict[str, Callable] = {"array": _array, "kept": lambda call, *operands: call.results(*operands), "output": _output, "entry": _entry}
+EMITTED: dict[str, Callable] = {"array": _array, "opaque": lambda call, *operands: call.results(*operands), "output": _output, "entry": _entry}
 
 
 def _array_at_probes(shape_and_type, *entries):
@@ -133,7 +133,7 @@ def _array_at_probes(shape_and_type, *entries):
 
 AT_PROBES: dict[str, Callable] = {
     "array": _array_at_probes,
-    "kept": lambda call, *operands: call.at_probes(*operands),
+    "opaque": lambda call, *operands: call.at_probes(*operands),
     "output": _output,
     "entry": lambda index, x: x.reshape(len(x), -1)[:, index[0]],
 }

@@ -106,7 +106,7 @@ def _derivative(graph: Graph, node: int, dots: list):
     if op in TABLE:
         rule = TABLE[op].derivative
         return graph.zero if rule is None else rule(graph, node, *args, *dots)
-    if op == "kept":
+    if op == "opaque":
         return _of_call(graph, node, dots)
     value = graph.value[node]
     if op == "array":
@@ -126,7 +126,7 @@ def _of_call(graph: Graph, node: int, dots: list) -> tuple:
     )
     moving = [dx for pair in zip(rates, moves, strict=True) for dx, does in zip(*pair, strict=True) if does]
     found: list = []
-    slopes = graph.kept(call.slopes(moves), operands)
+    slopes = graph.opaque(call.slopes(moves), operands)
     for k, aval in enumerate(call.closed.out_avals):
         if not np.issubdtype(aval.dtype, np.floating):
             found.append(graph.zero)

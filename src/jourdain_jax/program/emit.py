@@ -153,20 +153,20 @@ class Values(dict):
 
     def __init__(self, known) -> None:
         super().__init__(known)
-        self._kept: dict[int, tuple[jax.Array, int]] = {}
+        self._in_arrays: dict[int, tuple[jax.Array, int]] = {}
 
     def __missing__(self, node: int) -> jax.Array:
-        array, k = self._kept[node]
+        array, k = self._in_arrays[node]
         self[node] = value = array[k]
         return value
 
     def keep(self, nodes: Sequence[int], array: jax.Array) -> None:
         """The values of the nodes, along the first axis of an array."""
-        self._kept |= {node: (array, k) for k, node in enumerate(nodes)}
+        self._in_arrays |= {node: (array, k) for k, node in enumerate(nodes)}
 
     def stacked(self, nodes: Sequence[int], shape: tuple[int, ...], real) -> jax.Array:
         """The values of the nodes along a new first axis: part of an array that is kept, where they follow one another in it."""
-        places = [self._kept[n] for n in nodes if n in self._kept]
+        places = [self._in_arrays[n] for n in nodes if n in self._in_arrays]
         steps = {b[1] - a[1] for a, b in pairwise(places)}
         if len(places) == len(nodes) and steps in ({1}, {-1}) and all(array is places[0][0] for array, _ in places):
             low, high = sorted((places[0][1], places[-1][1]))

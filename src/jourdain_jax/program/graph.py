@@ -17,7 +17,7 @@ from jourdain_jax.calculus.scalar_operations import BRANCHES, TABLE
 MOST_NODES = 500_000  # of one graph: some seconds of building
 MOST_FACTORS = 8  # of a product that is looked at for squares of sines
 MOST_MULTIPLICATIONS = 512  # of one product of matrices taken apart; measured: at 16 x 16 scalars are faster in batches, from 24 x 24 on a call is
-ARRAYS = {"array", "kept", "output"}  # what is no scalar (`calls.py`)
+ARRAYS = {"array", "opaque", "output"}  # what is no scalar (`calls.py`)
 _GROWING = threading.Lock()  # threads may derive on one graph
 OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
 
@@ -256,9 +256,9 @@ class Graph:
             return whole
         return self._node("array", entries, (shape, dtype))
 
-    def kept(self, call, operands: Iterable[int]) -> int:
+    def opaque(self, call, operands: Iterable[int]) -> int:
         """A call of arrays."""
-        return self._node("kept", tuple(operands), call)
+        return self._node("opaque", tuple(operands), call)
 
     def results(self, call: int, shapes: Mapping[int, tuple[tuple[int, ...], str]]) -> list[int]:
         """Results of a call, by number, given their shapes and types."""
@@ -290,7 +290,7 @@ class Graph:
 
     def calls(self, nodes: Iterable[int]) -> list[int]:
         """The calls that the nodes need."""
-        return [n for n in self.reachable(nodes) if self.op[n] == "kept"]
+        return [n for n in self.reachable(nodes) if self.op[n] == "opaque"]
 
     def total(self, terms: Iterable[int]) -> int:
         """The sum of nodes."""
