@@ -786,6 +786,8 @@ def test_two_hidden_directions_and_a_parameter_that_does_nothing():
         (lambda: cart_run(values={}, sigma=1.0), "`values` is empty"),
         (lambda: cart_run(ts=TS[::-1]), "`ts` must be finite and strictly increasing"),
         (lambda: cart_run(ts=np.where(TS[4] == TS, TS[3], TS)), "but sample 4 is at 0.6 s after 0.6 s; sort the samples by time and merge repeated"),
+        (lambda: Experiment([0.0, 1.0, np.inf, np.inf], {"x": np.zeros(4)}, 1.0, start={}), "but sample 2 is at inf s after 1 s"),
+        (lambda: Experiment([np.nan], {"x": [0.0]}, 1.0, start={}), "but sample 0 is at nan s; sort"),
         (lambda: cart_run(ts=np.ma.masked_greater(TS, 3.0)), "`ts` is an array of shape .* some are masked"),
         (lambda: fit(CART, cart_run(), ("mass",), rtoll=1e-6), "`rtoll` is no option of `simulate`; did you mean `rtol`"),
         (lambda: fit(CART, cart_run(), ("mass",), ts=TS), "`ts` is no option here: each `Experiment` states start, times and inputs"),

@@ -33,7 +33,7 @@ class Experiment(eqx.Module):
     - `values`: channel -> measured values, shape (times, *channel). A channel is a coordinate, a speed, or a name in `sensors`.
     - `sigma`: standard deviation of the noise, in the unit of the channel: channel -> number, (times,) or the shape of its
       values; or one number for all channels. None: not known; one sigma for all samples of the channel in all runs is estimated.
-      NaN in `values`, or an infinite sigma, marks a sample that is missing.
+      NaN in `values`, the mask of a masked array, or an infinite sigma marks a sample that is missing.
     - `correlation_time`: s, of noise with a memory, whose correlation falls as exp(-|t - t'| / correlation time): channel -> number, or one number for all;
       channels that are not named have white noise, as with zero. None: not known; one for all components of the channel in all runs is estimated.
     - `start`: coordinate or speed -> value at `t0`. These are held; what is not given is solved for, as by `jj.start`.
@@ -173,11 +173,15 @@ def _correlation_times(given: Mapping) -> dict[str, Array | np.ndarray]:
 def _check_times(ts) -> None:
     if ts.ndim != 1 or ts.size == 0:
         raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
-    if not (_holds(np.isfinite, ts) and _holds(lambda t: np.diff(t) > 0, ts)):
-        k = int(np.argmin(np.diff(ts) > 0))  # also where either is NaN
+    if is_traced(ts):
+        return
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(ts) & (np.diff(ts, prepend=-np.inf) > 0)
+    if not good.all():
+        k = int(np.argmin(good))
+        after = f" after {ts[k - 1]:.10g} s" if k else ""
         raise ValueError(
-            f"`ts` must be finite and strictly increasing, but sample {k + 1} is at {ts[k + 1]:.10g} s after {ts[k]:.10g} s; sort the samples by time and "
-            "merge repeated ones"
+            f"`ts` must be finite and strictly increasing, but sample {k} is at {ts[k]:.10g} s{after}; sort the samples by time and merge repeated ones"
         )
 
 

@@ -205,7 +205,8 @@ def _repeats(runs: Sequence[Experiment]) -> int:
 
 
 def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> None:
-    counts = [np.isfinite(values).reshape(*values.shape[: int(repeats)], -1).sum(axis=-1) for run in runs for values in run.values.values()]
+    known = [np.isfinite(values) & np.isfinite(run.sigma_of(name, repeats)) for run in runs for name, values in run.values.items()]
+    counts = [one.reshape(*one.shape[: int(repeats)], -1).sum(axis=-1) for one in known]
     samples, sigmas = int(np.max(sum(counts))) + len(unknowns.with_prior), len({name for run in runs for name in run.unknown_sigma})
     if samples < len(unknowns.labels) + sigmas:
         and_sigmas = f" and {sigmas} sigmas" if sigmas else ""

@@ -345,7 +345,7 @@ class Fit(Printed):
 
     def _check_one(self) -> None:
         if self.values.ndim > 1 or not np.isfinite(self.chi_square):
-            raise ValueError("there is a report of one fit whose motion does not fail; of a batch, and of a failed fit, see `print`")
+            raise ValueError("this is told of one fit whose motion does not fail; of a batch, and of a failed fit, see `print`")
 
     def _repr_html_(self) -> str:
         one = self.values.ndim == 1 and np.isfinite(self.chi_square)

@@ -47,7 +47,7 @@ def _of_input(what: str, ts: Float[np.ndarray, "samples"], begin: float, end: fl
     (gaps,) = np.nonzero((intervals > _GAP * usual) & (ts[:-1] < end) & (ts[1:] > begin))
     if gaps.size and np.mean(np.abs(intervals / usual - 1) < 0.1) > _REGULAR:
         k = int(gaps[0])
-        more = f" and {gaps.size - 1} more such gaps" if gaps.size > 1 else ""
+        more = f" (the first of {gaps.size} gaps)" if gaps.size > 1 else ""
         yield (
             f"{what} is sampled every {usual:.3g} s, but not from {ts[k]:.6g} to {ts[k + 1]:.6g} s{more}, where it is a straight line; if that is not what it "
             "did, give the samples, or measurements of less"

@@ -305,7 +305,8 @@ def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
     if not moved:
         return
     share = np.median([x / x.max() for x in moved], axis=0)
-    names = ", ".join(f"`{name}`" for name, part in zip(scene.speed_names.entries, share, strict=True) if part > 1e-3)
+    moving = [f"`{name}`" for name, part in zip(scene.speed_names.entries, share, strict=True) if part > 1e-3]
+    names = ", ".join(moving) + (" together" if len(moving) > 1 else "")
     raise ValueError(
         f"nothing in `{type(scene).__name__}` has inertia along {names}: no mass moves with it and no row holds it, so that its acceleration is not "
         "determined; give a body that moves with it a mass (or inertia), hold it by a row, or leave the coordinate out"
