@@ -159,6 +159,7 @@ _CONTROL: dict[str, Callable] = {
     "closed_call": _call("call_jaxpr"),
     "custom_jvp_call": _call("call_jaxpr"),
     "custom_vjp_call": _call("call_jaxpr"),
+    "jourdain_or_elsewhere": lambda params, inputs: _run(params["here"], inputs[: len(params["here"].constvars)], inputs[len(params["here"].constvars) :]),
     "custom_lin": lambda params, inputs: inputs,
     "custom_linear_solve": _linear_solve,
 }
