@@ -62,7 +62,7 @@ class OwnSteps(Integrator):
         return self._by_either(partial(in_blocks, _lanes_by_xla, width(program)), eqx.filter_vmap, setups, begun)
 
     def _by_either(self, by_xla: Callable, mapped: Callable, setup: Setup, begun: Begun) -> Solved:
-        """By machine code where that serves; `mapped`: of a function of one motion, that of all lanes."""
+        """A motion by machine code where that serves; `mapped`: of a function of one motion, that of all lanes."""
         if setup.reason_against_machine_code:
             return by_xla(setup, begun)
         quick = or_elsewhere(mapped(_by_machine_code), by_xla)

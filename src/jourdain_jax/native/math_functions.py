@@ -7,7 +7,9 @@ libm, whose errors are below 1 ulp.
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
+from jourdain_jax.calculus.scalar_operations import COMPARISONS, TABLE
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.program.emit import COSINE, HALF_PI, SINE
 
@@ -24,13 +26,11 @@ _LOG = (
     6.666666666666735130e-01,
 )
 _LN2 = (6.93147180369123816490e-01, 1.90821492927058770002e-10)  # the first has 32 bits
-LIBM = ("sin", "cos", "tan", "tanh", "sinh", "cosh", "asin", "acos", "atan", "asinh", "acosh", "atanh", "exp2", "expm1", "log1p", "cbrt")
-LIBM += ("atan2", "pow", "fmod")
 PREFIX = "jourdain_libm_"  # of libm's functions in a module
 
 
 def polynomial(w: Writer, coefficients: Sequence[float], x: Value) -> Value:
-    """By Horner's rule, highest power first."""
+    """A polynomial by Horner's rule, highest power first."""
     total = w.number(coefficients[0])
     for c in coefficients[1:]:
         total = w.fma(total, x, c)
@@ -72,11 +72,11 @@ def _by_libm_where(w: Writer, far: Value, x: Value, quick: Sequence[Value], name
         w.store(value, place)
     with w.when(w.any(far)):
         for value, place, name in zip(quick, found, names, strict=True):
-            w.store(w.where(far, by_libm(w, name, x), value), place)
+            w.store(w.where(far, by_libm(name, w, x), value), place)
     return [w.load(w.real, place) for place in found]
 
 
-def by_libm(w: Writer, name: str, *args: Value) -> Value:
+def by_libm(name: str, w: Writer, *args: Value) -> Value:
     """A function of libm, lane by lane."""
     result = w.number(math.nan)
     for lane in range(w.lanes):
@@ -135,7 +135,7 @@ def _sign(w: Writer, x: Value) -> Value:
     return w.where(x > 0.0, 1.0, w.where(x < 0.0, -1.0, 0.0 * x))  # NaN stays; what compares as zero is zero
 
 
-FUNCTIONS: dict[str, Callable[..., Value]] = {
+_OF_VECTORS: dict[str, Callable[..., Value]] = {
     "add": lambda w, a, b: a + b,
     "sub": lambda w, a, b: a - b,
     "mul": lambda w, a, b: a * b,
@@ -149,11 +149,12 @@ FUNCTIONS: dict[str, Callable[..., Value]] = {
     "floor": lambda w, a: w.intrinsic("floor", a),
     "ceil": lambda w, a: w.intrinsic("ceil", a),
     "round": lambda w, a: w.intrinsic("roundeven", a),
-    "rem": lambda w, a, b: by_libm(w, "fmod", a, b),
     "exp": exponential,
     "log": logarithm,
     "logistic": lambda w, a: 1.0 / (1.0 + exponential(w, -a)),
     "is_finite": lambda w, a: w.magnitude(a) < math.inf,
-    **{name: lambda w, a, b, name=name: w.compared(name, a, b) for name in ("lt", "le", "gt", "ge", "eq", "ne")},
-    **{name: lambda w, *args, name=name: by_libm(w, name, *args) for name in LIBM if name not in ("sin", "cos", "fmod")},
+    **{name: lambda w, a, b, name=name: w.compared(name, a, b) for name in COMPARISONS},
 }
+# All others are those of C's library, by the names that they have there; sine and cosine too, beyond `LARGEST_ANGLE`.
+LIBM = {name: operation.c or name for name, operation in TABLE.items() if operation.is_number and name not in _OF_VECTORS and "{" not in operation.c}
+FUNCTIONS = _OF_VECTORS | {name: partial(by_libm, in_c) for name, in_c in LIBM.items()}

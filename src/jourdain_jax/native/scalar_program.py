@@ -23,7 +23,7 @@ _TRUTHS = {"and": "and", "or": "or"}
 
 def unsupported(graph: Graph, nodes: Iterable[int]) -> str:
     """Why the nodes cannot be written as machine code; empty where they can."""
-    known = {*FUNCTIONS, *_TRUTHS, *ARRAYS, "not", "select", "sin", "cos", "const", "input"}
+    known = {*FUNCTIONS, *_TRUTHS, *ARRAYS, "not", "select", "const", "input"}
     for node in graph.reachable(nodes):
         if graph.op[node] in ARRAYS or graph.op[node] == "entry":
             return "a part of it is kept as a call of JAX"

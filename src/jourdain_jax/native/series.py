@@ -164,7 +164,7 @@ class Series:
 
 
 def _newest_last(js: Sequence[int], k: int) -> list[int]:
-    """In the order in which both factors of a_j b_{k-j} are known."""
+    """The numbers j in the order in which both factors of a_j b_{k-j} are known."""
     return sorted(js, key=lambda j: max(j, k - j))
 
 

@@ -39,7 +39,7 @@ def steps_of(form: Form) -> dict[str, list[int]]:
 
 
 def pulled_program(form: Form, nodes: Sequence[int], asked: Sequence[int]) -> tuple[Graph, list[int], list[int], list[int]]:
-    """On a graph of its own: the cotangents of the state and of what is asked for, the variables, and inputs for the cotangents of the nodes."""
+    """A program on a graph of its own: the cotangents of the state and of what is asked for, the variables, and inputs for the cotangents of the nodes."""
     program, first = form.program, len(form.program.fixed) + 1
     graph, values, variables = on_its_own(program.graph, nodes, program.variables)
     weights = [graph.input(f"cotangent {i}", True) for i in range(len(nodes))]
