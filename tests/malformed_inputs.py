@@ -424,6 +424,10 @@ BATCHES: dict[str, Case] = {
     "jj.rollout(b, 3.0, t1=0.1)": ("ValueError", "`starts` is a float, expected a dictionary by name"),
     "jj.rollout(b, {'x': 1.0}, t1=0.1)": ("ValueError", "no lanes: give at least one start value or parameter as an array with one entry per lane"),
     "jj.rollout(b, {'x': []}, t1=0.1)": ("ValueError", "no lanes: give at least one start value or parameter"),
+    "jj.rollout(b, {'x': [1.0, 2.0]}, parameters={'mass': object()}, t1=0.1)": (
+        "ValueError",
+        "parameter `mass` is an object, expected real numbers; give an array with one entry per lane; a field that is a module varies by",
+    ),
     "jj.rollout(b, {'x': ['a', 'b']}, t1=0.1)": ("ValueError", "start `x` is a list, expected real numbers"),
     "jj.rollout(b, {'x': [1.0, 2.0], 'y': [1.0]}, t1=0.1)": (
         "ValueError",

@@ -7,7 +7,8 @@ import os
 import threading
 from typing import Any
 
-from jourdain_jax.native.math_functions import LIBM, PREFIX
+from jourdain_jax.native.libm import PREFIX
+from jourdain_jax.native.math_functions import LIBM
 
 try:
     from llvmlite import binding

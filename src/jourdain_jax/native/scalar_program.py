@@ -8,8 +8,9 @@ from operator import itemgetter
 from typing import Any
 
 from jourdain_jax.native import host
+from jourdain_jax.native.angles import sine_and_cosine
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.math_functions import FUNCTIONS, sine_and_cosine
+from jourdain_jax.native.math_functions import FUNCTIONS
 from jourdain_jax.native.registers import Turn, turns
 from jourdain_jax.program.graph import ARRAYS, Graph
 

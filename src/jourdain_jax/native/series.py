@@ -13,8 +13,9 @@ Sums add the newest coefficients last: all others are known long before. Source:
 from collections.abc import Mapping, Sequence
 
 from jourdain_jax.calculus.scalar_operations import TABLE
+from jourdain_jax.native.angles import sine_and_cosine
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.math_functions import FUNCTIONS, sine_and_cosine
+from jourdain_jax.native.math_functions import FUNCTIONS
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.graph import Graph
 

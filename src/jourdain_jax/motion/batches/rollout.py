@@ -170,7 +170,8 @@ def rollout(
     for what, given in (("starts", starts), ("parameters", parameters)):
         if given is not None and not isinstance(given, Mapping) and not (what == "starts" and isinstance(given, State)):
             raise ValueError(f'`{what}` is {described(given)}, expected a dictionary by name, such as {{"x": jnp.linspace(0.0, 1.0, 8)}}')
-    parameters = {} if parameters is None else {name: checked_real(value, f"parameter `{name}`") for name, value in parameters.items()}
+    advice = "give an array with one entry per lane; a field that is a module varies by `equinox.filter_vmap` of `simulate`"
+    parameters = {name: checked_real(value, f"parameter `{name}`", advice=advice) for name, value in (parameters or {}).items()}
     fixed, varied, count = _lanes(scene, starts, parameters)
     chunk = _chunk(scene, count, chunk, options)
     options["inputs"] = as_inputs(scene, options.get("inputs"))

@@ -13,8 +13,8 @@ from typing import NamedTuple
 from jourdain_jax.motion.native.functions import Form, known_values, outputs_of
 from jourdain_jax.motion.native.layout import Lanes, Layout
 from jourdain_jax.native import series
+from jourdain_jax.native.exponentials import power
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.math_functions import power
 from jourdain_jax.native.scalar_program import as_real, written
 from jourdain_jax.native.series import Coefficients, Series
 
