@@ -14,6 +14,8 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jourdain_jax.calculus.elsewhere import or_elsewhere
+
 
 class Rules(NamedTuple):
     """Derivatives of the function that runs, by itself; trees of tangents and cotangents have None where there is none."""
@@ -118,11 +120,14 @@ def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
     @own.def_bwd
     def back(found, cotangents, perturbed, arguments):
         g = jax.tree.map(_filled, found, cotangents, is_leaf=lambda x: x is None)
-        if rules is not None and rules.serve(1, *perturbed):
-            return rules.pull(perturbed, arguments, found, g)
-        moving, fixed = eqx.partition(arguments, perturbed)
-        _, pull = eqx.filter_vjp(lambda moving: differentiable(*eqx.combine(moving, fixed)), moving)
-        return pull(g)[0]
+
+        def by_autodiff(perturbed, arguments, found, g):
+            moving, fixed = eqx.partition(arguments, perturbed)
+            _, pull = eqx.filter_vjp(lambda moving: differentiable(*eqx.combine(moving, fixed)), moving)
+            return pull(g)[0]
+
+        serve = rules is not None and rules.serve(1, *perturbed)
+        return (or_elsewhere(rules.pull, by_autodiff) if serve else by_autodiff)(perturbed, arguments, found, g)
 
     return lambda *arguments: own(arguments)
 

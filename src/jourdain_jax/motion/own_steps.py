@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.differentiated_as import Rules, derivatives_of, differentiated_as
+from jourdain_jax.calculus.elsewhere import or_elsewhere
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
@@ -64,25 +65,20 @@ class OwnSteps(Integrator):
         """A motion by machine code where that serves; `mapped`: of a function of one motion, that of all lanes."""
         if setup.reason_against_machine_code:
             return by_xla(setup, begun)
-        return differentiated_as(by_xla, mapped(_by_machine_code), self.mode, _rules(setup, mapped, self.alongside))(setup, begun)
+        quick = or_elsewhere(mapped(_by_machine_code), by_xla)
+        return differentiated_as(by_xla, quick, self.mode, _rules(setup, quick, mapped, self.alongside))(setup, begun)
 
 
 _once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
 
 
-def takes(solver, stepsize_controller, adjoint, saveat) -> bool:
-    """Whether our own loop has such a solver and such an adjoint (None: the default ones), and nothing else is stated."""
-    if stepsize_controller is not None or saveat is not None or not (solver is None or isinstance(solver, Method) or method_of(solver) is not None):
-        return False
-    return adjoint is None or _kind(adjoint) is not None
-
-
 def own_steps(solver, stepsize_controller, adjoint, saveat, **static) -> OwnSteps | None:
-    """Our own loop, where it takes these options."""
-    if not takes(solver, stepsize_controller, adjoint, saveat):
-        return None
+    """Our own loop, where it has such a solver and such an adjoint (None: the default one), and nothing else is stated."""
     method = solver if isinstance(solver, Method) else method_of(solver)
-    return _once(method, "reverse" if adjoint is None else _kind(adjoint), adjoint is not None and type(adjoint) is alongside.Alongside, **static)
+    kind = "reverse" if adjoint is None else _kind(adjoint)
+    if stepsize_controller is not None or saveat is not None or method is None or kind is None:
+        return None
+    return _once(method, kind, adjoint is not None and type(adjoint) is alongside.Alongside, **static)
 
 
 def _kind(adjoint) -> Literal["forward", "reverse"] | None:
@@ -150,8 +146,8 @@ def _most_steps(setup: Setup, knots) -> int:
     return setup.integrator.max_steps + (0 if knots is None else len(knots))
 
 
-def _rules(setup: Setup, mapped: Callable, alongside: bool) -> Rules:
-    """Derivatives by machine code; `mapped`: of a function of one motion, that of all lanes."""
+def _rules(setup: Setup, quick: Callable, mapped: Callable, alongside: bool) -> Rules:
+    """Derivatives of `quick` by machine code; `mapped`: of a function of one motion, that of all lanes."""
 
     def serve(order: int, varies: Setup, begun: Begun) -> bool:
         of_samples = [channel for channel in (*varies.inputs.channels, *begun.args[2].channels) if isinstance(channel, Sampled)]
@@ -161,7 +157,7 @@ def _rules(setup: Setup, mapped: Callable, alongside: bool) -> Rules:
     def pull(perturbed, arguments, found, g):
         return mapped(partial(_pulled, perturbed))(*arguments, found, g)
 
-    return Rules(serve, derivatives_of(mapped(_by_machine_code)).push, pull, alongside)
+    return Rules(serve, derivatives_of(quick).push, pull, alongside)
 
 
 def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solved) -> tuple:
