@@ -15,6 +15,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jourdain_jax.calculus.elsewhere import or_elsewhere
+from jourdain_jax.calculus.promotion import with_usual_promotion
 
 
 class Rules(NamedTuple):
@@ -55,6 +56,7 @@ def _forward(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
 
         own = jax.custom_jvp(lambda *leaves: lanes_first(of(quick, leaves)))
 
+        @with_usual_promotion
         def rule(leaves, tangents):
             moving = [i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero)]
 
@@ -113,11 +115,13 @@ def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
 
     # What is kept for the way back is the same whatever varies: under `jit`, JAX keeps one structure of it for all calls that share a trace.
     @own.def_fwd
+    @with_usual_promotion
     def forth(perturbed, arguments):
         found = own(arguments)
         return found, found
 
     @own.def_bwd
+    @with_usual_promotion
     def back(found, cotangents, perturbed, arguments):
         g = jax.tree.map(_filled, found, cotangents, is_leaf=lambda x: x is None)
 

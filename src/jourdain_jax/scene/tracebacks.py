@@ -13,6 +13,8 @@ from typing import TypeVar
 
 import jax
 
+from jourdain_jax.calculus.promotion import usual_promotion
+
 F = TypeVar("F", bound=Callable)
 _OURS = str(Path(__file__).parents[1])
 _INSTALLED = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
@@ -26,7 +28,8 @@ def shown_from_users_lines(function: F) -> F:
     def called(*args, **kwargs):
         __tracebackhide__ = True  # for IPython and pytest
         try:
-            return function(*args, **kwargs)
+            with usual_promotion():
+                return function(*args, **kwargs)
         except Exception as error:
             if not _is_shortened(error):
                 raise
