@@ -3,11 +3,11 @@
     python bench/identification.py [--quick] [--only NAME ...] [--json FILE]
 
 Parts: disc (one fit against SciPy), outlier, bound, starts (30 first guesses within a factor of 5), unstable (100 first guesses of a bicycle below its weave
-speed), chaotic (100 of a double pendulum, by growing spans and by multiple shooting), coverage, three (coverage of three models, unknown starts and sigmas,
-white noise and AR(1) noise), nuts (sampling by BlackJAX), disturbed (a motion with process noise), design (a start that tells more), windows (57 runs of the
-steer-by-wire bicycle with an unknown start each; the data are in `notebooks/data`), logs (what halves of these runs say of each other: numbers of the notebook
-on them). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs, with fewer repeats. Times are processor time,
-the least of some repeats, in turn; those of the windows are wall time of a fresh process.
+speed), chaotic (100 of a double pendulum, by growing spans and by multiple shooting), coverage, bootstrap (its coverage), three (coverage of three models,
+unknown starts and sigmas, white noise and AR(1) noise), nuts (sampling by BlackJAX), disturbed (a motion with process noise), design (a start that tells more),
+windows (57 runs of the steer-by-wire bicycle with an unknown start each; the data are in `notebooks/data`), logs (what halves of these runs say of each other:
+numbers of the notebook on them). Writes a list of {"figure", "model", "value", "required", "met"}. `--quick` leaves out windows and logs, with fewer repeats.
+Times are processor time, the least of some repeats, in turn; those of the windows are wall time of a fresh process.
 """
 
 import argparse
@@ -62,7 +62,7 @@ def processor_times(runs: dict, repeats: int) -> dict[str, float]:
 # The disc: radius and gravity, and two unknown initial values. ------------------------------------------------------------
 
 
-def disc_data(seed: int, ts=None, outlier: float = 0.0, repeats: tuple[int, ...] = (), delay: float = 0.0) -> jj.Measurements:
+def disc_data(seed: int, ts=None, outlier: float = 0.0, repeats: tuple[int, ...] = (), delay: float = 0.0) -> jj.Experiment:
     """Lean and place of a rolling disc at 61 times over 2 s; the lean is seen with this delay, which is to be estimated where it is not zero."""
     ts = jnp.linspace(0.1 if delay else 0.0, 2.0, 61) if ts is None else ts
     motion, noise = jj.simulate(jj.models.TiltingDisc(), START, t0=0.0, ts=ts), np.random.default_rng(seed)
@@ -74,7 +74,7 @@ def disc_data(seed: int, ts=None, outlier: float = 0.0, repeats: tuple[int, ...]
     values = {name: exact[name] + s * noise.normal(size=(*repeats, len(ts))) for name, s in SIGMA.items()}
     values["lean"][..., 17] += outlier * SIGMA["lean"]
     start = {"lean": 0.31, "spin_rate": -2.9}
-    return jj.Measurements(ts, values, SIGMA, start=start, unknown_start=("lean", "spin_rate"), sensors=sensors, t0=0.0)
+    return jj.Experiment(ts, values, SIGMA, start=start, unknown_start=("lean", "spin_rate"), sensors=sensors, t0=0.0)
 
 
 def disc(repeats: int) -> list[Figure]:
@@ -133,7 +133,7 @@ def bound() -> list[Figure]:
     ts, steps, converged = np.linspace(0.0, 10.0, 101), [], []
     for seed in range(10):
         x = 0.3 * np.cos(np.sqrt(2.5) * ts) + 0.01 * np.random.default_rng(seed).normal(size=101)
-        found = jj.fit(Oscillator(), jj.Measurements(ts, {"x": x}, 0.01, start={"x": 0.3}), ("damping", "stiffness"))
+        found = jj.fit(Oscillator(), jj.Experiment(ts, {"x": x}, 0.01, start={"x": 0.3}), ("damping", "stiffness"))
         steps.append(int(found.steps))
         converged.append(bool(found.converged) and np.isfinite(found["damping"].high))
     return [
@@ -150,7 +150,7 @@ def starts() -> list[Figure]:
     false, spent = 0, 0.0
     for factors in np.exp(generator.uniform(-np.log(5), np.log(5), (30, 4))):
         begin = {"lean": jnp.asarray(0.3 * min(factors[2], 1.4 / 0.3)), "spin_rate": jnp.asarray(-3.0 * factors[3])}
-        run = jj.Measurements(data.ts, data.values, SIGMA, start=begin, unknown_start=("lean", "spin_rate"))
+        run = jj.Experiment(data.ts, data.values, SIGMA, start=begin, unknown_start=("lean", "spin_rate"))
         clock = time.process_time()
         found = jj.fit(jj.models.TiltingDisc(radius=0.5 * factors[0], gravity=9.81 * factors[1]), run, ("radius", "gravity"))
         spent += (time.process_time() - clock) / 30
@@ -158,7 +158,7 @@ def starts() -> list[Figure]:
         best.append(same)
         false += not same and not found.warning
     begin = {"lean": 0.5, "spin_rate": -5.0}
-    run = jj.Measurements(data.ts, data.values, SIGMA, start=begin, unknown_start={"lean": jj.bounds(0.06, 1.4), "spin_rate": jj.bounds(-15.0, -0.6)})
+    run = jj.Experiment(data.ts, data.values, SIGMA, start=begin, unknown_start={"lean": jj.bounds(0.06, 1.4), "spin_rate": jj.bounds(-15.0, -0.6)})
     ranges, found = {"radius": jj.bounds(0.1, 2.5), "gravity": jj.bounds(2.0, 49.0)}, {}
 
     def batch():
@@ -181,13 +181,32 @@ def coverage(repeats: int) -> list[Figure]:
     truth = {"radius": 0.5, "gravity": 9.81, "run 0: lean": 0.3, "run 0: spin_rate": -3.0, "lean.delay": DISC_DELAY}
     for name, sigma, delay in (("sigmas known", SIGMA, 0.0), ("sigmas estimated", None, 0.0), ("delay of a sensor", SIGMA, DISC_DELAY)):
         data = disc_data(1, repeats=(repeats,), delay=delay)
-        data = jj.Measurements(data.ts, data.values, sigma, start=data.start, unknown_start=("lean", "spin_rate"), sensors=data.sensors, t0=data.t0)
+        data = jj.Experiment(data.ts, data.values, sigma, start=data.start, unknown_start=("lean", "spin_rate"), sensors=data.sensors, t0=data.t0)
         fits = jj.fit_batch(jj.models.TiltingDisc(radius=0.51, gravity=10.0), data, ("radius", "gravity"))
         for label in fits.labels:
             share = 100 * float(np.mean((fits[label].low < truth[label]) & (truth[label] < fits[label].high)))
             entry = figure(f"intervals that hold the truth, %, {label}, {name}", "tilting-disc", share)
             found.append(entry | {"required": [93, 97], "met": 93 <= share <= 97})
     return found
+
+
+def bootstrap(experiments: int) -> list[Figure]:
+    """How often the 95 % interval of a bootstrap of 400 repeats holds the truth, and its standard errors over those of Gauss-Newton: a disc."""
+    truth = {"radius": 0.5, "gravity": 9.81, "run 0: lean": 0.3, "run 0: spin_rate": -3.0}
+    guess, inside, ratios, failed = jj.models.TiltingDisc(radius=0.51, gravity=10.0), [], [], 0
+    for seed in range(experiments):
+        data = disc_data(100 + seed)
+        fit = jj.fit(guess, data, ("radius", "gravity"))
+        found = fit.bootstrap(data, 400, seed=seed)
+        inside.append([found[label].low < x < found[label].high for label, x in truth.items()])
+        ratios.append([found[label].standard_error / fit[label].standard_error for label in truth])
+        failed += np.count_nonzero(~found.converged)
+    figures = [figure("fits of repeats that did not converge, of all", "tilting-disc", failed / (400 * experiments))]
+    for label, share, ratio in zip(truth, 100 * np.mean(inside, axis=0), np.mean(ratios, axis=0), strict=True):
+        entry = figure(f"intervals of a bootstrap that hold the truth, %, {label}", "tilting-disc", share)
+        figures.append(entry | {"required": [93, 97], "met": bool(93 <= share <= 97)})
+        figures.append(figure(f"standard error of a bootstrap over that of Gauss-Newton, mean, {label}", "tilting-disc", ratio))
+    return figures
 
 
 CORRELATION = 0.8  # of neighbouring samples, where noise has a memory
@@ -236,7 +255,7 @@ def three(repeats: int) -> list[Figure]:
                 motion = jj.simulate(scene, start, ts=ts)
                 values = {name: np.asarray(motion[name]) + s * noisy(generator, (repeats, len(ts)), rho) for name, s in sigma.items()}
                 begin = {name: x + 0.01 for name, x in start.items()}
-                runs.append(jj.Measurements(ts, values, None, start=begin, unknown_start=tuple(start), correlation_time=None if rho else 0.0))
+                runs.append(jj.Experiment(ts, values, None, start=begin, unknown_start=tuple(start), correlation_time=None if rho else 0.0))
                 truth |= {f"run {i}: {name}": x for name, x in start.items()}
             clock = time.process_time()
             fits = jj.fit_batch(scene.replace(**guesses), runs, tuple(guesses))
@@ -320,12 +339,12 @@ def disturbed(repeats: int) -> list[Figure]:
     q = np.asarray(jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(3), repeats)))
     draw = np.random.default_rng(11)
     values = {n: q[..., truth.coordinate_names.entries.index(n)] + s * draw.normal(size=q.shape[:2]) for n, s in sigma.items()}
-    plain = jj.fit_batch(truth.replace(offset=0.26), jj.Measurements(ts, values, sigma, start=start), ("offset",))
+    plain = jj.fit_batch(truth.replace(offset=0.26), jj.Experiment(ts, values, sigma, start=start), ("offset",))
     share = 100 * float(np.mean((plain["offset"].low < 0.25) & (plain["offset"].high > 0.25)))
     grid = np.linspace(0.19, 0.31, 13)
 
     def along(offset, values):
-        run = jj.Measurements(ts, values, sigma, start=start)
+        run = jj.Experiment(ts, values, sigma, start=start)
         return jj.filtered_log_likelihood(truth.replace(offset=offset), run, process_noise=noise, rtol=1e-7, atol=1e-7)
 
     logs = np.asarray(jax.jit(lambda v: jax.lax.map(lambda one: jax.vmap(lambda x: along(x, one))(jnp.asarray(grid)), v))(values))
@@ -354,7 +373,7 @@ def design(repeats: int) -> list[Figure]:
     free, unknown = ("radius", "gravity"), ("lean", "spin_rate")
 
     def planned(z):
-        plan = jj.Measurements(ts, dict.fromkeys(SIGMA, ts), SIGMA, start={"lean": z[0], "spin_rate": z[1]}, unknown_start=unknown)
+        plan = jj.Experiment(ts, dict.fromkeys(SIGMA, ts), SIGMA, start={"lean": z[0], "spin_rate": z[1]}, unknown_start=unknown)
         return jj.planned_information(disc, plan, free)
 
     slope, first = jax.jit(jax.jacfwd(lambda z: planned(z).log_det(free))), jnp.array([0.3, -3.0])
@@ -368,7 +387,7 @@ def design(repeats: int) -> list[Figure]:
     start = {"lean": float(z[0]), "spin_rate": float(z[1])}
     motion, noise = jj.simulate(disc, start, ts=ts), np.random.default_rng(12)
     values = {name: np.asarray(motion[name]) + s * noise.normal(size=(repeats, len(ts))) for name, s in SIGMA.items()}
-    fits = jj.fit_batch(disc, jj.Measurements(ts, values, SIGMA, start=start, unknown_start=unknown), free)
+    fits = jj.fit_batch(disc, jj.Experiment(ts, values, SIGMA, start=start, unknown_start=unknown), free)
     for name in free:
         spread = float(np.std(np.asarray(fits[name].value)[np.asarray(fits.converged)], ddof=1))
         found.append(figure(f"planned standard error of {name} at the best start over that at the first", model, float(after[name] / before[name])))
@@ -406,7 +425,7 @@ FREE = dict.fromkeys(("gain", "steer_damping", "lean_damping", "IBxz", "zB", "c"
 }
 
 
-def windows() -> list[jj.Measurements]:
+def windows() -> list[jj.Experiment]:
     """The 57 windows: lean rate and steer rate, the command as input, and an unknown start each."""
     with gzip.open(WINDOWS, "rt") as file:
         rows = list(csv.DictReader(file))
@@ -418,7 +437,7 @@ def windows() -> list[jj.Measurements]:
         values = {"lean_rate": column["lean_rate"], "steer_rate": column["fork_rate"]}
         unknown = {name: jj.unbounded(s) for name, s in scale.items()}
         torque = jj.Sampled(ts, column["command_fork"])
-        runs.append(jj.Measurements(ts, values, {"lean_rate": 0.03, "steer_rate": 0.1}, start=start, unknown_start=unknown, inputs={"steer_torque": torque}))
+        runs.append(jj.Experiment(ts, values, {"lean_rate": 0.03, "steer_rate": 0.1}, start=start, unknown_start=unknown, inputs={"steer_torque": torque}))
     return runs
 
 
@@ -504,7 +523,7 @@ def logs() -> list[Figure]:
 # A bicycle below its weave speed. --------------------------------------------------------------------------------------
 
 
-def unstable_run(seed: int) -> tuple[WhippleBicycle, jj.Measurements]:
+def unstable_run(seed: int) -> tuple[WhippleBicycle, jj.Experiment]:
     """Ten seconds of a bicycle at 3.6 m/s, whose weave grows from 0.1 to 20 degrees; a first guess, each number of which is off by up to half."""
     bicycle, ts, sigma = WhippleBicycle(), jnp.linspace(0.0, 10.0, 101), 0.002
     start = {"rear_spin_rate": 3.6 / bicycle.rR, "lean": 0.002, "lean_rate": 0.0, "steer": 0.004, "steer_rate": 0.0}
@@ -514,7 +533,7 @@ def unstable_run(seed: int) -> tuple[WhippleBicycle, jj.Measurements]:
     begin = {"rear_spin_rate": start["rear_spin_rate"], "lean": 0.002 * (1 + off[0]), "steer": 0.004 * (1 + off[1])}
     begin |= {"lean_rate": 0.006 * off[2], "steer_rate": 0.006 * off[3]}
     guess = bicycle.replace(**{name: getattr(bicycle, name) * (1 + by) for name, by in zip(("IBxx", "c", "mB"), off[4:], strict=True)})
-    return guess, jj.Measurements(ts, values, sigma, start=begin, unknown_start=("lean", "lean_rate", "steer", "steer_rate"))
+    return guess, jj.Experiment(ts, values, sigma, start=begin, unknown_start=("lean", "lean_rate", "steer", "steer_rate"))
 
 
 def timed(*arguments, **options) -> tuple[jj.Fit, float]:
@@ -565,7 +584,7 @@ def _warm(fits: list[tuple[jj.Fit, float]]) -> float:
 # A chaotic double pendulum. --------------------------------------------------------------------------------------------
 
 
-def chaotic_run(seed: int, span: float) -> tuple[jj.models.DoublePendulumAngles, dict, jj.Measurements]:
+def chaotic_run(seed: int, span: float) -> tuple[jj.models.DoublePendulumAngles, dict, jj.Experiment]:
     """A double pendulum that turns over, 20 samples a second with 1 % noise; mass, lengths and start are first guesses, each off by up to half."""
     truth, ts, generator = jj.models.DoublePendulumAngles(), np.linspace(0.0, span, round(20 * span) + 1), np.random.default_rng(seed)
     start = {"theta1": 2.0, "theta2": 2.5, "theta1_rate": 0.0, "theta2_rate": 0.0}
@@ -576,7 +595,7 @@ def chaotic_run(seed: int, span: float) -> tuple[jj.models.DoublePendulumAngles,
     true = {name: float(getattr(truth, name)) for name in ("mass2", "length1", "length2")}
     guess = truth.replace(**{name: x * (1 + generator.uniform(-0.5, 0.5)) for name, x in true.items()})
     begin = {name: x * (1 + generator.uniform(-0.5, 0.5)) if x else 3 * generator.uniform(-0.5, 0.5) for name, x in start.items()}
-    return guess, true, jj.Measurements(ts, values, sigma, start=begin, unknown_start=tuple(begin))
+    return guess, true, jj.Experiment(ts, values, sigma, start=begin, unknown_start=tuple(begin))
 
 
 def chaotic(count: int) -> list[Figure]:
@@ -631,6 +650,7 @@ def main() -> None:
         "unstable": lambda: unstable(20 if options.quick else 100),
         "chaotic": lambda: chaotic(10 if options.quick else 100),
         "coverage": lambda: coverage(50 if options.quick else 500),
+        "bootstrap": lambda: bootstrap(40 if options.quick else 500),
         "three": lambda: three(50 if options.quick else 1000),
         "nuts": lambda: nuts(500 if options.quick else 2000),
         "disturbed": lambda: disturbed(50 if options.quick else 200),

@@ -1,6 +1,6 @@
 """Motions by machine code of our own against the same motions by XLA, in one run on one core: batches, alone, cold starts.
 
-    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|heyoka|records|times|watching|calls|single|compilation ...]
+    taskset -c 0 python bench/native.py [--quick] [--json FILE] [--only batches|heyoka|records|times|watching|calls|single|laws|compilation ...]
 
 Writes a list of {"figure", "model", "value", "required", "met"}; `required` is None where a figure is only told. Times of warm motions are processor
 time, the least of some repeats, the two ways in turn; cold ones are wall time of fresh processes.
@@ -22,6 +22,7 @@ import against_heyoka
 import diffrax
 import jax
 import jax.numpy as jnp
+import laws_of_force
 import numpy as np
 from baselines import disc_run, heyoka_lowered
 from baselines.timing import least_processor_time
@@ -271,6 +272,32 @@ def single(quick: bool) -> Iterator[Figure]:
             yield figure(f"single precision, {what}, native / XLA", name, seconds["native"] / seconds["xla"], 1.0)
 
 
+def laws(quick: bool) -> Iterator[Figure]:
+    """Batches of scenes whose forces are functions beyond sine and cosine, and their derivatives with respect to the start."""
+    lanes = 128 if quick else LANES
+    for name, (scene, starts, span) in list(laws_of_force.cases(lanes).items())[: 1 if quick else None]:
+        values = {key: jnp.asarray(x) for key, x in starts.items()}
+        for what, count, adjoint, of in (
+            ("motion", lanes, None, lambda f: f),
+            ("forward mode", 8, diffrax.ForwardMode(), jax.jacfwd),
+            ("reverse mode", 8, None, jax.jacrev),
+        ):
+            runs = {}
+            for way, backend in WAYS.items():
+
+                def end(start, scene=scene, span=span, adjoint=adjoint, backend=backend):
+                    return jj.simulate(scene, start, ts=jnp.array([span]), rtol=1e-8, atol=1e-8, adjoint=adjoint, backend=backend).q_end
+
+                run, given, begin = jax.jit(jax.vmap(of(end))), {key: x[:count] for key, x in values.items()}, time.process_time()
+                jax.block_until_ready(run(given))
+                yield figure(f"{what}, {way}, trace, compile and run, s", name, time.process_time() - begin)
+                runs[way] = partial(lambda run, given: jax.block_until_ready(run(given)), run, given)
+            seconds = least_processor_time(runs, 3 if quick else 7)
+            for way in WAYS:
+                yield figure(f"{what}, {way}, us per trajectory", name, 1e6 * seconds[way] / count)
+            yield figure(f"{what}, native / XLA", name, seconds["native"] / seconds["XLA"], 1.0)
+
+
 def compilation(quick: bool) -> Iterator[Figure]:
     """The motion alone, lowered and compiled in this process, once the scene is built; fresh processes to the end of a first motion."""
     for name in ("tilting-disc", "whipple-bicycle"):
@@ -298,7 +325,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="few lanes, the disc alone")
     parser.add_argument("--json", help="write the figures to this file")
-    parts = {part.__name__: part for part in (batches, heyoka, records, times, watching, calls, single, compilation)}
+    parts = {part.__name__: part for part in (batches, heyoka, records, times, watching, calls, single, laws, compilation)}
     parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), help="these figures")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)

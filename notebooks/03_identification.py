@@ -38,7 +38,7 @@ motion = jj.simulate(truth, push, ts=ts)
 noise = np.random.default_rng(3)
 sigma = {"x": 0.005, "y": 0.005, "heading": 0.01}
 values = {name: np.asarray(motion[name]) + noise.normal(0.0, s, len(ts)) for name, s in sigma.items()}
-data = jj.Measurements(ts, values, sigma, start=push)
+data = jj.Experiment(ts, values, sigma, start=push)
 
 # %% [markdown]
 # ## Estimate inertia and offset, the mass being known

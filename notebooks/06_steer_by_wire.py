@@ -129,7 +129,7 @@ def run_of(window, sensors):
     values = {"lean_rate": np.where(ts < 0.0499, np.nan, window["lean_rate"]), "steer_rate": np.where(ts < 0.0499, np.nan, window["fork_rate"])}
     start["rear_spin_rate"] = window["speed"].mean() / 0.3498
     torque = jj.Actuator(jj.Sampled(ts, window["command_fork"]), hold=True)  # the controller holds a command for 0.01 s
-    return jj.Measurements(ts, values, SIGMA, start=start, unknown_start=unknown, inputs={"steer_torque": torque}, sensors=sensors)
+    return jj.Experiment(ts, values, SIGMA, start=start, unknown_start=unknown, inputs={"steer_torque": torque}, sensors=sensors)
 
 
 # %% [markdown]

@@ -26,7 +26,7 @@ LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", 
 LONGEST = """
 every_model identify native sensors mutants linearize native_derivatives call_costs feasible_starts simulate what_probes_do_not_show studies readme from_sympy
 stiff lowering malformed_inputs build labelled fit_profiles rollout program knots power log_density whipple_bicycle events_in_one_step along_batches
-study_faults probed kept_parts bicycle_stability generated_scenes contacts_on_surfaces watched_between_saves traced_parameters quality structure_preserving
+study_faults probed opaque_calls bicycle_stability generated_scenes contacts_on_surfaces between_saved_times traced_parameters quality structure_preserving
 rattleback atlas cluster notebooks
 """
 

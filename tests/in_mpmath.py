@@ -20,7 +20,6 @@ NUMBERS: dict[str, Callable] = {
     "neg": lambda a: -a,
     "abs": abs,
     "exp2": lambda a: mpmath.power(2, a),
-    "log1p": lambda a: mpmath.log(1 + a),
     "cbrt": lambda a: mpmath.sign(a) * mpmath.cbrt(abs(a)),
     "logistic": lambda a: 1 / (1 + mpmath.exp(-a)),
     "round": mpmath.nint,

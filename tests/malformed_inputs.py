@@ -103,7 +103,7 @@ pose, moving = jj.pose_at(b, 0.0, two), jj.motion_at(b, 0.0, two, two)
 bead, rest, fixed = pose["bead"], jj.start(b), jj.fixed_point(o)
 run = jj.simulate(b, {"x_rate": 1.0}, t1=0.1, ts=[0.0, 0.1])
 lanes = jj.rollout(b, {"x_rate": np.array([0.5, 0.6])}, t1=0.1, ts=[0.0, 0.1], progress=False)
-data = jj.Measurements([0.0, 0.1], {"x": [0.0, 0.1]}, 0.01, start={})
+data = jj.Experiment([0.0, 0.1], {"x": [0.0, 0.1]}, 0.01, start={})
 jj.save(run, "run.npz")
 WHOLE = open("run.npz", "rb").read()
 ARRAYS = dict(np.load("run.npz"))
@@ -424,6 +424,10 @@ BATCHES: dict[str, Case] = {
     "jj.rollout(b, 3.0, t1=0.1)": ("ValueError", "`starts` is a float, expected a dictionary by name"),
     "jj.rollout(b, {'x': 1.0}, t1=0.1)": ("ValueError", "no lanes: give at least one start value or parameter as an array with one entry per lane"),
     "jj.rollout(b, {'x': []}, t1=0.1)": ("ValueError", "no lanes: give at least one start value or parameter"),
+    "jj.rollout(b, {'x': [1.0, 2.0]}, parameters={'mass': object()}, t1=0.1)": (
+        "ValueError",
+        "parameter `mass` is an object, expected real numbers; give an array with one entry per lane; a field that is a module varies by",
+    ),
     "jj.rollout(b, {'x': ['a', 'b']}, t1=0.1)": ("ValueError", "start `x` is a list, expected real numbers"),
     "jj.rollout(b, {'x': [1.0, 2.0], 'y': [1.0]}, t1=0.1)": (
         "ValueError",
@@ -548,20 +552,23 @@ ANALYSIS: dict[str, Case] = {
 }
 
 MEASURED: dict[str, Case] = {
-    "jj.Measurements([0.0, 0.0], {'x': [0.0, 0.0]}, 0.01, start={})": ("ValueError", "`ts` must be finite and strictly increasing; sort the samples by time"),
-    "jj.Measurements('ts', {'x': [0.0]}, 0.01, start={})": ("ValueError", "`ts` is the text 'ts', expected real numbers; give times in s"),
-    "jj.Measurements([0.0, 0.1], [0.0, 0.0], 0.01, start={})": ("ValueError", "`values` of `Measurements` is a list, expected a dictionary by name"),
-    "jj.Measurements([0.0, 0.1], {}, 0.01, start={})": ("ValueError", "`values` is empty; give at least one channel: name -> measured values"),
-    "jj.Measurements([0.0, 0.1], {'x': [0.0, inf]}, 0.01, start={})": ("ValueError", "channel `x` holds values that are infinite, the first at sample 1"),
-    "jj.Measurements([0.0, 0.1], {'x': ['a', 'b']}, 0.01, start={})": ("ValueError", "values of channel `x` is a list, expected real numbers"),
-    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, -1.0, start={})": ("ValueError", "sigma of channel `x` must be above zero (and not NaN)"),
-    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 'small', start={})": ("ValueError", "sigma of channel `x` is the text 'small', expected real numbers"),
-    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, {'y': 0.1}, start={})": ("ValueError", "`sigma` names channel `y`, which has no values; Valid names: `x`."),
-    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start=None)": ("ValueError", "`start` of `Measurements` is `None`, expected a dictionary by name"),
-    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, t0=0.5)": ("ValueError", "the start at t0 = 0.5 s comes after the first sample (0.0 s)"),
-    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, unknown_start=('x',))": ("ValueError", "unknown start value `x` has no first guess"),
-    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, sensors={'nose': len})": ("ValueError", "sensor `nose` has no measured values"),
-    "jj.Measurements([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, sensors=3)": ("ValueError", "`sensors` of `Measurements` is an int, expected a dictionary"),
+    "jj.Experiment([0.0, 0.0], {'x': [0.0, 0.0]}, 0.01, start={})": (
+        "ValueError",
+        "strictly increasing, but sample 1 is at 0 s after 0 s; sort the samples",
+    ),
+    "jj.Experiment('ts', {'x': [0.0]}, 0.01, start={})": ("ValueError", "`ts` is the text 'ts', expected real numbers; give times in s"),
+    "jj.Experiment([0.0, 0.1], [0.0, 0.0], 0.01, start={})": ("ValueError", "`values` of `Experiment` is a list, expected a dictionary by name"),
+    "jj.Experiment([0.0, 0.1], {}, 0.01, start={})": ("ValueError", "`values` is empty; give at least one channel: name -> measured values"),
+    "jj.Experiment([0.0, 0.1], {'x': [0.0, inf]}, 0.01, start={})": ("ValueError", "channel `x` holds values that are infinite, the first at sample 1"),
+    "jj.Experiment([0.0, 0.1], {'x': ['a', 'b']}, 0.01, start={})": ("ValueError", "values of channel `x` is a list, expected real numbers"),
+    "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, -1.0, start={})": ("ValueError", "sigma of channel `x` must be above zero (and not NaN)"),
+    "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 'small', start={})": ("ValueError", "sigma of channel `x` is the text 'small', expected real numbers"),
+    "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, {'y': 0.1}, start={})": ("ValueError", "`sigma` names channel `y`, which has no values; Valid names: `x`."),
+    "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start=None)": ("ValueError", "`start` of `Experiment` is `None`, expected a dictionary by name"),
+    "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, t0=0.5)": ("ValueError", "the start at t0 = 0.5 s comes after the first sample (0.0 s)"),
+    "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, unknown_start=('x',))": ("ValueError", "unknown start value `x` has no first guess"),
+    "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, sensors={'nose': len})": ("ValueError", "sensor `nose` has no measured values"),
+    "jj.Experiment([0.0, 0.1], {'x': [0.0, 0.1]}, 0.1, start={}, sensors=3)": ("ValueError", "`sensors` of `Experiment` is an int, expected a dictionary"),
     "jj.Sensor(3)": ("ValueError", "`quantity` of `Sensor` is an int, expected a coordinate, a speed, or a function of a motion"),
     "jj.Sensor('x', lag=-1.0)": ("ValueError", "`lag` of `Sensor` is -1 s, expected zero or more"),
     "jj.Sensor('x', gain='a')": ("ValueError", "`gain` of `Sensor` is the text 'a', expected real numbers; give a number, or an `Estimate`"),
@@ -572,8 +579,8 @@ MEASURED: dict[str, Case] = {
     "jj.unbounded(-1.0)": ("ValueError", "expected a positive scale, a typical change in the unit of the unknown"),
     "jj.unbounded('a')": ("ValueError", "`scale` of `unbounded` is the text 'a', expected real numbers"),
     "jj.fit(Bead, data, 'mass')": ("ValueError", "`scene` is the class `Bead`"),
-    "jj.fit(b, 3, 'mass')": ("ValueError", "`data` is an int, expected a `Measurements` or a sequence of at least one"),
-    "jj.fit(b, [data, 3], 'mass')": ("ValueError", "`data` holds an int, expected a `Measurements` or a sequence of at least one"),
+    "jj.fit(b, 3, 'mass')": ("ValueError", "`data` is an int, expected an `Experiment` or a sequence of at least one"),
+    "jj.fit(b, [data, 3], 'mass')": ("ValueError", "`data` holds an int, expected an `Experiment` or a sequence of at least one"),
     "jj.fit(b, data, ())": ("ValueError", "nothing is free; name parameters in `free` (`mass`, `stiffness`), or `unknown_start` values of a run"),
     "jj.fit(b, data, 'mas')": ("ValueError", "`free` names `mas`, which is no parameter of `Bead`; did you mean `mass`?"),
     "jj.fit(b, data, {'mass': 3})": (
@@ -581,16 +588,16 @@ MEASURED: dict[str, Case] = {
         "`mass` was given 3; expected `bounds(low, high)`, `positive()`, `unbounded()`, `Normal(...)`, `Estimate(...)` or None",
     ),
     "jj.fit(b, data, {'mass': jj.bounds(2.0, 3.0)})": ("ValueError", "first guess of `mass` is 1.0; expected a first guess between its bounds 2.0 and 3.0"),
-    "jj.fit(b, jj.Measurements([0.0, 0.1], {'z': [0.0, 0.1]}, 0.01, start={}), 'mass')": (
+    "jj.fit(b, jj.Experiment([0.0, 0.1], {'z': [0.0, 0.1]}, 0.01, start={}), 'mass')": (
         "ValueError",
         "run 0 of `Bead` has unknown channel `z`; Valid names:",
     ),
-    "jj.fit(b, jj.Measurements([0.0, 0.1], {'x': [[0.0, 0.1]]}, 0.01, start={}), 'mass')": (
+    "jj.fit(b, jj.Experiment([0.0, 0.1], {'x': [[0.0, 0.1]]}, 0.01, start={}), 'mass')": (
         "ValueError",
         "channel `x` of run 0 of `Bead` has shape (1, 2), expected (2,)",
     ),
     "jj.fit_batch(b, data, 'mass')": ("ValueError", "channel `x` of run 0 of `Bead` has shape (2,), expected (repeats, 2) for 2 times"),
-    "jj.log_likelihood(b, 3)": ("ValueError", "`data` is an int, expected a `Measurements` or a sequence of at least one"),
+    "jj.log_likelihood(b, 3)": ("ValueError", "`data` is an int, expected an `Experiment` or a sequence of at least one"),
     "jj.log_likelihood(b, data, rtol=-1.0)": ("ValueError", "`rtol` is -1, expected a positive finite number"),
 }
 

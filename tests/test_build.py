@@ -59,7 +59,7 @@ def test_what_was_built_stands_wherever_its_scene_does():
     np.testing.assert_array_equal(jj.linearize(built, state).A, jj.linearize(sleigh, state).A)
     assert str(jj.report(built)) == str(jj.report(sleigh))
     assert jj.lower(built) is jj.lower(sleigh)
-    data = jj.Measurements(ts, {"heading": jnp.array([0.1, 0.2])}, 0.01, start=start)
+    data = jj.Experiment(ts, {"heading": jnp.array([0.1, 0.2])}, 0.01, start=start)
     fits = [jj.fit(scene, data, free=["offset"]) for scene in (built, sleigh)]
     assert fits[0].estimates == fits[1].estimates
 
@@ -75,8 +75,9 @@ def test_a_start_and_a_diagnosis_are_bit_equal_however_often_they_are_asked_for(
     assert np.array_equal(found, jj.accelerations(scene, starts[-1].t, starts[-1].q, starts[-1].u).udot)
 
 
-@pytest.mark.parametrize("scene", [ChaplyginSleigh(), DoublePendulumRods()], ids=["minimal", "full"])
-def test_a_motion_and_its_diagnosis_are_bit_equal_however_often_they_are_asked_for(scene):
+@pytest.mark.parametrize("name", MODELS)
+def test_a_motion_and_its_diagnosis_are_bit_equal_however_often_they_are_asked_for(name):
+    scene = MODELS[name]()
     ts = jnp.linspace(0.0, 0.5, 4)
     motions = [jj.simulate(scene, scene.example, ts=ts) for _ in range(OFTEN)]
     inside = jax.jit(lambda start: jj.simulate(scene, start, ts=ts))
@@ -133,7 +134,7 @@ def batch(scene, ts, start) -> list:
 
 
 def fitted(scene, ts, start) -> list:
-    data = jj.Measurements(ts, {"x": 0.1 + ts, "z": 0.02 * ts}, 0.01, start=start)
+    data = jj.Experiment(ts, {"x": 0.1 + ts, "z": 0.02 * ts}, 0.01, start=start)
     return np.asarray(jj.fit(scene, data, free={"arm": None}, max_iterations=2).values).tolist()
 
 

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import runpy
 
 import code_map
 from test_layers import LAYERS, LONGEST
@@ -52,6 +53,13 @@ def test_the_page_on_the_packages_names_what_there_is():
     assert len(named) > 40
     missing = [f"{file}: {name}" for file, names in named for name in names.split(", ") if name not in names_in(file)]
     assert not missing, missing
+
+
+def test_the_drawing_of_the_packages_shows_the_steps_that_the_page_tells():
+    drawing = runpy.run_path(str(PAGE.with_name("draw_architecture.py")))
+    assert tuple(name for name, _, part in reversed(drawing["ROOMS"]) if not part) == LAYERS
+    told = [re.findall(r"^\d+\. \*\*([\w/]+)\.\*\*", section, re.MULTILINE) for section in PAGE.read_text(encoding="utf-8").split("\n## ")[1:]]
+    assert told == [[room for room, _ in steps] for _, _, steps in drawing["CALLS"]]
 
 
 def names_in(file: str) -> set[str]:

@@ -127,6 +127,7 @@ def test_the_scenes_of_the_guide_to_contacts_roll_on_their_grounds():
     names = {"jj": jj, "jnp": jnp}
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(block, names)
+    assert np.allclose([names["pushed"][name][-1] for name in ("plank", "x")], [0.65625, 0.1875], rtol=1e-9)
     for scene, contact, values in ((names["Bowl"](), "bowl", {"x": 0.1, "y": -0.05}), (names["DiscOnHill"](), "rim", {"x": 0.1, "y": 0.2, "lean": 0.3})):
         pose = jj.pose_at(scene, 0.0, scene.named(**values)[0])
         found = scene.contacts(pose)[contact]

@@ -22,12 +22,12 @@ def coloured(generator, ts, tau, shape=()) -> np.ndarray:
     return generator.normal(size=(*shape, len(ts))) @ factor.T
 
 
-def sleigh_run(seed: int, correlation_time, sigma=SIGMA, ts=TS, repeats=(), missing=()) -> jj.Measurements:
+def sleigh_run(seed: int, correlation_time, sigma=SIGMA, ts=TS, repeats=(), missing=()) -> jj.Experiment:
     motion = sleigh_oracle.motion(ts, mass=1.3, inertia=0.4, a=0.25, v0=-0.6, w0=0.9)
     generator = np.random.default_rng(seed)
     values = {name: motion[key] + SIGMA * coloured(generator, ts, TAU, repeats) for name, key in (("x", "x"), ("y", "y"), ("heading", "th"))}
     values["x"][..., list(missing)] = np.nan
-    return jj.Measurements(ts, values, sigma, start=START, correlation_time=correlation_time)
+    return jj.Experiment(ts, values, sigma, start=START, correlation_time=correlation_time)
 
 
 UNEVEN = np.cumsum(np.random.default_rng(3).uniform(0.02, 0.5, 30))
@@ -39,7 +39,7 @@ def test_the_likelihood_is_the_dense_normal_one_at_uneven_times_and_across_gaps(
     e = SIGMA * coloured(np.random.default_rng(0), UNEVEN, 0.9)
     known = np.ones(30, bool)
     known[[0, 7, 8, 20]] = False
-    data = jj.Measurements(UNEVEN, {"x": np.where(known, motion["x"] + e, np.nan)}, SIGMA, start=START, correlation_time=tau)
+    data = jj.Experiment(UNEVEN, {"x": np.where(known, motion["x"] + e, np.nan)}, SIGMA, start=START, correlation_time=tau)
     truth = jj.models.ChaplyginSleigh(mass=1.3, inertia=0.4, offset=0.25)
     ts, r = UNEVEN[known], e[known]
     V = SIGMA**2 * np.exp(-np.abs(ts[:, None] - ts) / tau)
@@ -52,7 +52,7 @@ def test_the_likelihood_has_finite_derivatives_in_a_correlation_time_with_missin
     values = sleigh_run(0, 0.0, missing=(0, 5, 6)).values
 
     def density(tau):
-        return jj.log_likelihood(GUESS, jj.Measurements(TS, values, SIGMA, start=START, correlation_time={"x": tau, "heading": 0.5}))
+        return jj.log_likelihood(GUESS, jj.Experiment(TS, values, SIGMA, start=START, correlation_time={"x": tau, "heading": 0.5}))
 
     slope = float(jax.grad(density)(0.7))
     assert slope == pytest.approx(float(density(0.7 + 1e-4) - density(0.7 - 1e-4)) / 2e-4, rel=1e-5)
@@ -107,7 +107,7 @@ def test_white_noise_gets_a_correlation_time_far_below_the_intervals():
     ts = np.linspace(0.0, 8.0, 161)
     motion = sleigh_oracle.motion(ts, mass=1.3, inertia=0.4, a=0.25, v0=-0.6, w0=0.9)
     values = {"x": motion["x"] + SIGMA * generator.normal(size=161), "heading": motion["th"] + SIGMA * generator.normal(size=161)}
-    fits = [jj.fit(GUESS, jj.Measurements(ts, values, SIGMA, start=START, correlation_time=tau), ("inertia", "offset")) for tau in (0.0, None)]
+    fits = [jj.fit(GUESS, jj.Experiment(ts, values, SIGMA, start=START, correlation_time=tau), ("inertia", "offset")) for tau in (0.0, None)]
     assert max(float(tau) for tau in fits[1].correlation_time.values()) < 0.036  # neighbours at 0.05 s: a correlation of 0.25, three standard deviations
     np.testing.assert_allclose(fits[1].values, fits[0].values, atol=0.5 * float(np.min(fits[0].standard_errors)))
 
@@ -119,7 +119,7 @@ def test_intervals_cover_the_truth_where_noise_has_a_memory():
     for name, truth in TRUTH.items():
         share = np.mean((found[name].low < truth) & (truth < found[name].high))
         assert 0.89 <= share <= 0.995, name  # of 150, three standard deviations about 95 %
-    one = jj.Measurements(data.ts, {name: x[4] for name, x in data.values.items()}, None, start=START, correlation_time=None)
+    one = jj.Experiment(data.ts, {name: x[4] for name, x in data.values.items()}, None, start=START, correlation_time=None)
     single = jj.fit(GUESS, one, ("inertia", "offset"))
     assert np.all(np.abs(single.values - found.values[4]) < 0.02 * single.standard_errors)
 
@@ -137,7 +137,7 @@ class Coasting(jj.Scene):
 def test_intervals_are_those_of_all_correlation_times_by_their_restricted_likelihood():
     ts, start = np.linspace(0.0, 8.0, 81), {"x": 0.5, "x_rate": -0.2}
     x = 0.5 - 0.2 * ts + SIGMA * coloured(np.random.default_rng(5), ts, TAU)
-    found = jj.fit(Coasting(), jj.Measurements(ts, {"x": x}, SIGMA, start=start, unknown_start=("x", "x_rate"), correlation_time=None))
+    found = jj.fit(Coasting(), jj.Experiment(ts, {"x": x}, SIGMA, start=start, unknown_start=("x", "x_rate"), correlation_time=None))
     # the same by dense covariances, on a fine grid of arcsin rho
     J, logs, estimates, variances = np.stack([np.ones(81), ts], axis=1), [], [], []
     angles = np.linspace(0.01, 1.5, 600)
@@ -162,8 +162,8 @@ def test_golden_section_finds_the_lowest_of_each():
     np.testing.assert_allclose(lowest(lambda x: (x - at) ** 2, np.full(3, -5.0), np.full(3, 5.0)), at, atol=1e-3)
 
 
-def one(correlation_time) -> jj.Measurements:
-    return jj.Measurements(TS, {"x": np.zeros(41)}, SIGMA, start=START, correlation_time=correlation_time)
+def one(correlation_time) -> jj.Experiment:
+    return jj.Experiment(TS, {"x": np.zeros(41)}, SIGMA, start=START, correlation_time=correlation_time)
 
 
 @pytest.mark.parametrize(

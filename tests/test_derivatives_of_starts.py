@@ -5,6 +5,7 @@ from itertools import pairwise
 import jax
 import jax.numpy as jnp
 import linkages
+import moving_linkages
 import numpy as np
 import pytest
 import small_scenes
@@ -13,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 import jourdain_jax as jj
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.least_change import least_change
+from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import put_on_rows
 
 STEP = 2e-3
@@ -58,6 +60,23 @@ def test_derivatives_are_those_of_what_is_computed(scene, held, off, native):
     forward = jax.jit(jax.jacfwd(put))(0.0)
     np.testing.assert_allclose(forward, _slope(jax.jit(put)), atol=1e-8 * np.max(np.abs(forward)))
     np.testing.assert_allclose(jax.jit(jax.grad(lambda s: weights @ put(s)))(0.0), weights @ forward, rtol=1e-10)
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_values_that_are_all_given_move_with_the_rows_in_derivatives(derivative):
+    """A longer rod moves the bob outwards, a rate along the rod is taken away: x = l sin a, z = -l cos a, also where x, z and both rates are given."""
+    sin, cos = 0.28, 0.96
+
+    def begins(length, along):
+        scene = moving_linkages.NarrowPendulum(length=length)
+        rates = {"x_rate": cos + along * sin, "z_rate": sin - along * cos}
+        state = as_state(scene, {"x": sin, "z": -cos, **rates}, onto_rows=True)
+        return jnp.concatenate([state.q, state.u])
+
+    np.testing.assert_allclose(begins(1.0, 0.0), [sin, -cos, cos, sin], atol=1e-15)
+    by_length, by_rate = jax.jit(derivative(begins, argnums=(0, 1)))(1.0, 0.0)
+    np.testing.assert_allclose(by_length, [sin, -cos, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(by_rate, np.zeros(4), atol=1e-12)
 
 
 def test_second_derivatives_are_differences_of_first_ones():

@@ -11,7 +11,7 @@ from jourdain_jax.build.structure import structure_of
 from jourdain_jax.build.trace import named_values
 from jourdain_jax.dynamics.accelerations import bare_accelerations
 from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.minimal import minimal_accelerations
+from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT, NullSpaceQR
 from jourdain_jax.lowering.lower import lowered
 from jourdain_jax.models.trailer_chain import TrailerChain
@@ -30,7 +30,7 @@ def dense_accelerations(scene, t, q, u):
 @eval_numpy
 def privileged_accelerations(scene, t, q, y):
     independent = structure_of(PlanarRobot(turned=0.4)).independent
-    return minimal_accelerations(scene, independent, t, q, y)[2].udot[jnp.array(independent)]
+    return accelerations_of(scene, minimal_kinematics(scene, independent, t, q, y), t, q)[1].udot[jnp.array(independent)]
 
 
 def at_states(scene, program, t, q, u, nodes):

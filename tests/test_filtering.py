@@ -45,7 +45,7 @@ def samples():
 def measured(unknown=(), values=None):
     values = samples() if values is None else values
     sensors = {"speedometer": jj.Sensor("x_rate", gain=2.0, bias=0.1)}
-    return jj.Measurements(TS, values, {"x": 0.02, "speedometer": 0.05}, start={"x": 0.3, "x_rate": -0.1}, unknown_start=unknown, sensors=sensors)
+    return jj.Experiment(TS, values, {"x": 0.02, "speedometer": 0.05}, start={"x": 0.3, "x_rate": -0.1}, unknown_start=unknown, sensors=sensors)
 
 
 @pytest.mark.parametrize("spread", [(0.0, 0.0), (0.1, 0.3)])
@@ -76,7 +76,7 @@ def test_undisturbed_sleigh_has_the_plain_likelihood():
     sleigh, start, ts = jj.models.ChaplyginSleigh(), {"x_rate": -0.6, "heading_rate": 0.9}, np.linspace(0.0, 2.0, 9)
     values = {"x": -0.5 * ts, "nose": np.stack([-0.5 * ts, 0.1 * ts, 0.0 * ts], axis=1)}
     sensors = {"nose": lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))}
-    runs = [jj.Measurements(ts + t0, values, 0.05, start=start, sensors=sensors) for t0 in (0.0, 1.0)]
+    runs = [jj.Experiment(ts + t0, values, 0.05, start=start, sensors=sensors) for t0 in (0.0, 1.0)]
     found = jj.filtered_log_likelihood(sleigh, runs, process_noise={})
     np.testing.assert_allclose(found, jj.log_likelihood(sleigh, runs), rtol=1e-6)
 
@@ -85,7 +85,7 @@ def test_dependent_coordinates_follow():
     """Two particles and a rod between them, undisturbed and with a start that is known."""
     scene, ts = jj.models.SpringAndRod(), np.linspace(0.1, 0.6, 6)
     motion = jj.simulate(scene, scene.example, t0=0.0, ts=ts)
-    run = jj.Measurements(ts, {name: np.asarray(motion[name]) + 0.01 for name in ("z1", "x2", "z2")}, 0.02, start=scene.example, t0=0.0)
+    run = jj.Experiment(ts, {name: np.asarray(motion[name]) + 0.01 for name in ("z1", "x2", "z2")}, 0.02, start=scene.example, t0=0.0)
     np.testing.assert_allclose(jj.filtered_log_likelihood(scene, run, process_noise={}), jj.log_likelihood(scene, run), rtol=1e-6)
 
 
@@ -102,14 +102,14 @@ def test_dependent_coordinates_follow():
     ],
 )
 def test_what_a_filter_does_not_know_is_said_by_name(noise, change, message):
-    run = jj.Measurements(TS, {"x": samples()["x"]}, **({"sigma": 0.02, "start": {"x": 0.3}} | change))
+    run = jj.Experiment(TS, {"x": samples()["x"]}, **({"sigma": 0.02, "start": {"x": 0.3}} | change))
     with pytest.raises(ValueError, match=message):
         jj.filtered_log_likelihood(Oscillator(), run, process_noise=noise)
 
 
 def test_quaternions_and_accelerometers_are_refused():
     with pytest.raises(ValueError, match="has quaternions"):
-        jj.filtered_log_likelihood(jj.models.FreeRigidBody(), jj.Measurements(TS, {"x": TS}, 0.1, start={}), process_noise={})
-    run = jj.Measurements(TS, {"imu": np.zeros((8, 3))}, 0.1, start={}, sensors={"imu": jj.Accelerometer("cart")})
+        jj.filtered_log_likelihood(jj.models.FreeRigidBody(), jj.Experiment(TS, {"x": TS}, 0.1, start={}), process_noise={})
+    run = jj.Experiment(TS, {"imu": np.zeros((8, 3))}, 0.1, start={}, sensors={"imu": jj.Accelerometer("cart")})
     with pytest.raises(ValueError, match="shows accelerations, and so the white disturbance itself"):
         jj.filtered_log_likelihood(Oscillator(), run, process_noise={})

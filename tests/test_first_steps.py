@@ -8,17 +8,17 @@ import jourdain_jax as jj
 from jourdain_jax.analysis import problem
 
 
-def _run(damping=0.3) -> jj.Measurements:
+def _run(damping=0.3) -> jj.Experiment:
     ts, generator = np.linspace(0.0, 6.0, 61), np.random.default_rng(3)
     x = np.asarray(jj.simulate(Oscillator(damping=damping), {"x": 0.5, "x_rate": 0.2}, ts=ts)["x"])
     x = x + 0.01 * generator.normal(size=61)
     x[7] = np.nan
-    return jj.Measurements(ts, {"x": x}, 0.01, start={"x": 0.45, "x_rate": 0.1}, unknown_start=("x", "x_rate"))
+    return jj.Experiment(ts, {"x": x}, 0.01, start={"x": 0.45, "x_rate": 0.1}, unknown_start=("x", "x_rate"))
 
 
-def _with_an_outlier() -> jj.Measurements:
+def _with_an_outlier() -> jj.Experiment:
     run = _run()
-    return jj.Measurements(run.ts, {"x": np.where(np.arange(61) == 20, 1.0, run.values["x"])}, 0.01, start=run.start, unknown_start=("x", "x_rate"))
+    return jj.Experiment(run.ts, {"x": np.where(np.arange(61) == 20, 1.0, run.values["x"])}, 0.01, start=run.start, unknown_start=("x", "x_rate"))
 
 
 CASES = {

@@ -12,16 +12,16 @@ TS = np.linspace(0.0, 4.0, 41)
 TRUTH = jj.models.ChaplyginSleigh(offset=0.25)
 
 
-def run(start=START, sigma=0.01, noise: int | None = 0, unknown=("heading_rate",), **more) -> jj.Measurements:
+def run(start=START, sigma=0.01, noise: int | None = 0, unknown=("heading_rate",), **more) -> jj.Experiment:
     motion, generator = jj.simulate(TRUTH, start, ts=TS), np.random.default_rng(noise or 0)
     values = {name: np.asarray(motion[name]) + (0 if noise is None else 0.01 * generator.normal(size=41)) for name in ("x", "heading")}
-    return jj.Measurements(TS, values, sigma, start=start, unknown_start=unknown, **more)
+    return jj.Experiment(TS, values, sigma, start=start, unknown_start=unknown, **more)
 
 
 def test_the_profile_of_a_linear_unknown_is_the_parabola_of_its_standard_error():
     sensor = jj.Sensor("heading", gain=jj.Estimate(1.1), bias=jj.Estimate(0.1))
     motion, noise = jj.simulate(TRUTH, START, ts=TS), np.random.default_rng(2)
-    data = jj.Measurements(TS, {"shown": np.asarray(motion["heading"]) + 0.05 * noise.normal(size=41)}, 0.05, start=START, sensors={"shown": sensor})
+    data = jj.Experiment(TS, {"shown": np.asarray(motion["heading"]) + 0.05 * noise.normal(size=41)}, 0.05, start=START, sensors={"shown": sensor})
     fit = jj.fit(TRUTH, data)
     for one in fit.profiles(data).values():
         e = fit[one.name]
@@ -37,7 +37,7 @@ def test_the_interval_ends_where_a_fit_with_the_unknown_held_is_that_much_worse(
     ts, names, skew = (TS[::10], ("x",), 0.1) if sigma else (TS[::5], ("x", "heading"), 0.04)
     motion, noise = jj.simulate(TRUTH, START, ts=ts), np.random.default_rng(4)
     values = {name: np.asarray(motion[name]) + (sigma or 0.05) * noise.normal(size=len(ts)) for name in names}
-    data = jj.Measurements(ts, values, sigma, start=START)
+    data = jj.Experiment(ts, values, sigma, start=START)
     fit = jj.fit(TRUTH, data, ("offset", "inertia"))
     (one,) = fit.profiles(data, "offset").values()
     assert abs((one.high - one.estimate) / (one.estimate - one.low) - 1) > skew
@@ -59,7 +59,7 @@ def test_a_short_run_that_hardly_tells_an_inertia_ends_at_its_bound_with_interva
     ts, noise = np.linspace(0.0, 0.5, 30), np.random.default_rng(1)
     motion = jj.simulate(TRUTH, START, ts=ts)
     values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=30) for name in ("x", "heading")}
-    data = jj.Measurements(ts, values, 0.01, start=START, unknown_start=("x_rate", "heading_rate"))
+    data = jj.Experiment(ts, values, 0.01, start=START, unknown_start=("x_rate", "heading_rate"))
     fit = jj.fit(TRUTH.replace(offset=0.4), data, ("offset", "inertia"))
     assert fit.converged
     assert fit.steps < 15
@@ -85,7 +85,7 @@ def test_a_damping_of_zero_has_a_one_sided_profile():
             return (jj.generalized_force(motion, x_rate=-self.damping * motion.u.x_rate - 5.0 * motion.q.x),)
 
     ts = np.linspace(0.0, 5.0, 51)
-    data = jj.Measurements(ts, {"x": 0.302 * np.cos(np.sqrt(2.5) * ts)}, 0.01, start={"x": 0.3})
+    data = jj.Experiment(ts, {"x": 0.302 * np.cos(np.sqrt(2.5) * ts)}, 0.01, start={"x": 0.3})
     fit = jj.fit(Oscillator(), data, ("damping",))
     assert bool(fit.at_bound[0])
     one = fit.profiles(data)["damping"]
@@ -185,7 +185,7 @@ def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
         values = {"x": np.asarray(motion["x"]) + 0.01 * noise.normal(size=41)}
         values["gyro"] = 1.1 * np.asarray(motion["heading_rate"]) + bias + 0.01 * noise.normal(size=41)
         begin = start | {"heading_rate": start["heading_rate"] + 0.05}
-        return jj.Measurements(TS, values, {"x": 0.01, "gyro": None}, start=begin, unknown_start=("heading_rate",), sensors={"gyro": gyro})
+        return jj.Experiment(TS, values, {"x": 0.01, "gyro": None}, start=begin, unknown_start=("heading_rate",), sensors={"gyro": gyro})
 
     fit = jj.fit(TRUTH.replace(offset=0.3), [with_gyro(START, 0.02, 0), with_gyro({"x_rate": -0.8, "heading_rate": 0.4}, -0.03, 1)], ("offset",))
     other = with_gyro({"x_rate": -0.5, "heading_rate": 0.6}, 0.05, 2)
@@ -193,7 +193,7 @@ def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
     # the same by a fit whose shared unknowns are known
     known = jj.Sensor("heading_rate", gain=float(fit["gyro.gain"].value), bias=jj.Estimate(0.0))
     by_hand = jj.fit(
-        fit.scene, jj.Measurements(TS, other.values, other.sigma | {"gyro": None}, start=other.start, unknown_start=("heading_rate",), sensors={"gyro": known})
+        fit.scene, jj.Experiment(TS, other.values, other.sigma | {"gyro": None}, start=other.start, unknown_start=("heading_rate",), sensors={"gyro": known})
     )
     for name, sigma in (("x", 0.01), ("gyro", float(by_hand.sigma["gyro"]))):
         np.testing.assert_allclose(found[name].error, sigma * by_hand.residuals[0][name], atol=2e-5)
@@ -205,6 +205,6 @@ def test_a_run_held_out_is_predicted_with_its_own_start_fitted_to_it():
 
 def test_runs_held_out_that_cannot_be_predicted_are_answered():
     fit = jj.fit(TRUTH, run(unknown=()), ("offset",))
-    scaled = jj.Measurements(TS, {"gyro": np.zeros(41)}, 0.01, start=START, sensors={"gyro": jj.Sensor("heading_rate", gain=jj.Estimate(1.0))})
+    scaled = jj.Experiment(TS, {"gyro": np.zeros(41)}, 0.01, start=START, sensors={"gyro": jj.Sensor("heading_rate", gain=jj.Estimate(1.0))})
     with pytest.raises(ValueError, match=r"runs held out share `gyro\.gain`, which was not estimated"):
         fit.predict(scaled)

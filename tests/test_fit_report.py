@@ -18,11 +18,11 @@ TS = jnp.linspace(0.0, 4.0, 41)
 TRUTH = jj.models.ChaplyginSleigh(offset=0.25)
 
 
-def measured(seed: int, start=START, ts=TS) -> jj.Measurements:
+def measured(seed: int, start=START, ts=TS) -> jj.Experiment:
     motion, noise = jj.simulate(TRUTH, start, ts=ts), np.random.default_rng(seed)
     values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=len(ts)) for name in ("x", "heading")}
     values["x"][3] = np.nan
-    return jj.Measurements(ts, values, {"x": 0.01, "heading": None}, start=start)
+    return jj.Experiment(ts, values, {"x": 0.01, "heading": None}, start=start)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def test_measurements_that_count_twice_are_named(fitted):
     assert not jj.fit(TRUTH, data, free=("offset",)).warnings
     twice = jj.fit(TRUTH, [data, data], free=("offset",))
     assert "`x` of run 0 and `x` of run 1 hold the same numbers" in str(twice.warnings)
-    both = jj.Measurements(data.ts, {"x": data.values["x"], "odometer": data.values["x"]}, 0.01, start=data.start, sensors={"odometer": "x"})
+    both = jj.Experiment(data.ts, {"x": data.values["x"], "odometer": data.values["x"]}, 0.01, start=data.start, sensors={"odometer": "x"})
     assert jj.fit(TRUTH, both, free=("offset",)).warning.startswith("`odometer` of run 0 and `x` of run 0 hold the same numbers")
 
 
@@ -162,9 +162,7 @@ def test_runs_held_out_are_predicted_in_table_and_drawing(fitted, tmp_path):
 def test_profiles_and_a_bootstrap_stand_beside_the_intervals(fitted, tmp_path):
     fit, data = fitted
     along = fit.profiles(data, "offset")
-    noise, motion = np.random.default_rng(5), jj.simulate(fit.scene, START, ts=TS)
-    values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=(40, 41)) for name in ("x", "heading")}
-    again = jj.fit_batch(fit.scene, jj.Measurements(TS, values, {"x": 0.01, "heading": None}, start=START), ("offset", "inertia"))
+    again = fit.bootstrap(data, 40)
     fit.report(tmp_path / "fit.html", profiles=along, bootstrap=again)
     rows = tables(tmp_path / "fit.html")["estimates"]
     offset, inertia = (dict(zip(rows[0], row, strict=True)) for row in rows[1:])
@@ -172,12 +170,15 @@ def test_profiles_and_a_bootstrap_stand_beside_the_intervals(fitted, tmp_path):
     assert float(offset["low (profile)"]) == pytest.approx(along["offset"].low, rel=1e-5)
     assert inertia["profile"] == "-"
     assert float(inertia["high (bootstrap)"]) == pytest.approx(np.quantile(again.values[:, 1], 0.975), rel=1e-5)
-    with pytest.raises(ValueError, match="`bootstrap` is a fit of offset"):
+    assert "quantiles of 40 fits of repeats; 0 did not converge" in (tmp_path / "fit.html").read_text(encoding="utf-8")
+    with pytest.raises(ValueError, match="`bootstrap` is Fit of ChaplyginSleigh"):
         fit.report(tmp_path / "fit.html", bootstrap=fit)
+    with pytest.raises(ValueError, match="profiles and a bootstrap are computed from the runs"):
+        fit.report(tmp_path / "fit.html", bootstrap=True)
 
 
 def test_report_tells_the_way_to_the_minimum(tmp_path):
-    data = jj.Measurements(TS, measured(0).values, 0.01, start=START)
+    data = jj.Experiment(TS, measured(0).values, 0.01, start=START)
     guess = TRUTH.replace(offset=0.3)
     fit = jj.fit(guess, data, free={"offset": jj.bounds(0.05, 1.0)}, guesses=4)
     (what, costs), logs = fit.trace[0], np.log(0.01 * np.sqrt(2 * np.pi)) * 81
@@ -198,7 +199,7 @@ def test_residuals_that_are_not_white_are_told_with_what_that_means(tmp_path):
     e = 0.01 * noise.normal(size=41)
     for k in range(1, 41):
         e[k] = 0.9 * e[k - 1] + np.sqrt(1 - 0.9**2) * e[k]
-    data = jj.Measurements(TS, {"heading": np.asarray(motion["heading"]) + e}, 0.01, start=START)
+    data = jj.Experiment(TS, {"heading": np.asarray(motion["heading"]) + e}, 0.01, start=START)
     fit = jj.fit(TRUTH, data, free=("offset",))
     fit.report(tmp_path / "fit.html", data)
     (row,) = tables(tmp_path / "fit.html")["whiteness"][1:]

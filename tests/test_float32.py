@@ -89,6 +89,10 @@ with warnings.catch_warnings(record=True) as caught:
     tight = jj.simulate(sleigh, sleigh.example, t1=0.1, rtol=1e-8, atol=1e-8)
 found["tight"] = {"warnings": [str(w.message) for w in caught], "finite": bool(jnp.all(jnp.isfinite(tight.q)))}
 found["few steps"] = motion_of(sleigh, sleigh.example, max_steps=3).message
+try:
+    found["contradiction"] = str(motion_of(MODELS["skate"](), {"heading": 0.0, "x_rate": 1.0, "y_rate": 0.1, "heading_rate": 0.0}).u[0])
+except ValueError as error:
+    found["contradiction"] = str(error)
 
 
 class Beside(jj.Scene):
@@ -257,6 +261,10 @@ def test_tolerances_below_single_precision_are_warned_of(single):
 
 def test_result_codes_hold_in_single_precision(single):
     assert single["few steps"].startswith("ran out of steps")
+
+
+def test_values_that_contradict_each_other_are_refused_in_single_precision(single):
+    assert single["contradiction"].startswith("the start of `Skate` contradicts row `edge`: residual 0.1 is left")  # not moved, as if it were round-off
 
 
 def test_increments_below_the_last_digit_of_a_state_add_up(single):

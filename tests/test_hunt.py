@@ -30,7 +30,7 @@ SHORT = (
 )
 
 
-SLOW = ("antiparallelogram", "kite", "rod-pendulum")  # closed linkages pass through flat positions also in `test_watched_between_saves.py`
+SLOW = ("antiparallelogram", "kite", "rod-pendulum")  # closed linkages pass through flat positions also in `test_between_saved_times.py`
 
 
 @pytest.mark.parametrize(("name", "seeds"), [pytest.param(*each, marks=[pytest.mark.slow] * (each[0] in SLOW), id=each[0]) for each in SHORT])

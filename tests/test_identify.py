@@ -17,10 +17,10 @@ from oracles import rattleback as rattleback_oracle
 import jourdain_jax as jj
 from jourdain_jax.analysis import predictions
 from jourdain_jax.analysis.arrow import arrow, triangle
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.fit import fit, fit_batch
 from jourdain_jax.analysis.information import hidden_combinations, information, students_t_95
 from jourdain_jax.analysis.likelihood import log_likelihood
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.ranges import bounds, unbounded
 from jourdain_jax.build.plausibility import impossible_bodies
 from jourdain_jax.models.chaplygin_sleigh import ChaplyginSleigh
@@ -34,14 +34,14 @@ GUESS = TRUTH.replace(inertia=0.6, offset=0.35)
 SLEIGH_START = {"x_rate": -0.6, "heading_rate": 0.9}
 
 
-def sleigh_data(seed: int, repeats: tuple[int, ...] = ()) -> Measurements:
+def sleigh_data(seed: int, repeats: tuple[int, ...] = ()) -> Experiment:
     """Position of the mass centre and heading of the default sleigh at 41 times over 8 s."""
     ts = np.linspace(0.0, 8.0, 41)
     parameters = {"mass": 1.3, "inertia": 0.4, "a": 0.25, "v0": -0.6, "w0": 0.9}
     motion = sleigh_oracle.motion(ts, **parameters)
     noise = np.random.default_rng(seed)
     exact = {"x": motion["x"], "y": motion["y"], "heading": motion["th"]}
-    return Measurements(ts, {k: v + SIGMA * noise.normal(size=(*repeats, 41)) for k, v in exact.items()}, SIGMA, start=SLEIGH_START)
+    return Experiment(ts, {k: v + SIGMA * noise.normal(size=(*repeats, 41)) for k, v in exact.items()}, SIGMA, start=SLEIGH_START)
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_the_rattleback_and_its_unknown_tilt_are_identified():
     motion = rattleback_oracle.motion(ts, **{**rattleback_oracle.RUN, **start})
     noise, sigma = np.random.default_rng(2), {"w1": 0.05, "w3": 0.02}
     values = {name: motion[name] + s * noise.normal(size=26) for name, s in sigma.items()}
-    data = Measurements(ts, values, sigma, start={**start, "alpha": 0.105}, unknown_start=("alpha",))
+    data = Experiment(ts, values, sigma, start={**start, "alpha": 0.105}, unknown_start=("alpha",))
     found = fit(Rattleback(D=-0.24e-4, h=0.0104), data, ("D", "h"), rtol=1e-7, atol=1e-7)
     assert found.warning == ""
     assert found.not_identifiable == ()
@@ -199,13 +199,13 @@ def cart_motion(ts, x0, v0, push):
     return x, -rate * (x - rest) + decay * w * (b * np.cos(w * ts) - a * np.sin(w * ts))
 
 
-def cart_run(x0=0.3, v0=0.0, push=1.0, ts=TS, **options) -> Measurements:
+def cart_run(x0=0.3, v0=0.0, push=1.0, ts=TS, **options) -> Experiment:
     """A run without noise; the push comes as samples."""
     x, v = cart_motion(ts, x0, v0, push)
     sampled = jj.Sampled(jnp.array([0.0, 10.0]), jnp.array([push, push]))
     given = {"values": {"x": x, "x_rate": v}, "sigma": {"x": 0.01, "x_rate": 0.02}, "start": {"x": x0, "x_rate": v0}}
     given |= {"inputs": {"push": sampled}} | options
-    return Measurements(ts, given.pop("values"), given.pop("sigma"), **given)
+    return Experiment(ts, given.pop("values"), given.pop("sigma"), **given)
 
 
 def test_several_runs_with_sampled_inputs_bounds_and_unknown_starts():
@@ -239,7 +239,7 @@ def test_runs_of_equal_shape_are_traced_once_and_repeated_fits_not_at_all():
     def run(x0):
         x, _ = cart_motion(TS, x0, 0.0, 0.0)
         path = np.stack([x, 0 * x, 0 * x], axis=1)
-        return Measurements(TS, {"cart": path}, 0.01, start={"x": x0, "x_rate": 0.0}, sensors={"cart": position})
+        return Experiment(TS, {"cart": path}, 0.01, start={"x": x0, "x_rate": 0.0}, sensors={"cart": position})
 
     first = fit(Cart(mass=1.5), [run(0.3)], ("mass",))
     alone = len(traces)
@@ -361,7 +361,7 @@ def test_sigmas_that_are_too_large_are_warned_of_by_channel():
 @pytest.mark.parametrize("guess", [1.7, 2.0], ids=["nearly", "exactly"])
 def test_measurements_without_noise_are_told_in_one_sentence(guess):
     motion = jj.simulate(CART, {"x": 0.3}, ts=TS)  # CART has the mass of 2 kg
-    run = Measurements(TS, {name: motion[name] for name in ("x", "x_rate")}, 0.01, start={"x": 0.3})
+    run = Experiment(TS, {name: motion[name] for name in ("x", "x_rate")}, 0.01, start={"x": 0.3})
     (warning,) = fit(Cart(mass=guess), run, ("mass",)).warnings
     assert "samples were smoothed or have no noise" in warning
 
@@ -389,6 +389,66 @@ def test_an_event_before_the_last_sample_is_named():
     assert f"before {np.sum(met <= TS)} of its samples" in warning
     cut = cart_run(push=0.0, values={"x": np.where(met <= TS, np.nan, x)}, sigma=1e-3)
     assert not any("event" in w for w in fit(Stopped(mass=1.9), cut, ("mass",)).warnings)
+    unfinished = fit(Stopped(mass=1.9), run, ("mass",), max_iterations=1)
+    assert not unfinished.converged
+    assert any("meets its event `buffer`" in w for w in unfinished.warnings)
+
+
+def test_the_time_of_a_light_gate_is_a_measurement():
+    # x = x0 cos(w t) is at the gate, x = 0, at t = pi / (2 w) with w^2 = k / m: dt / dk = - t / (2 k)
+    at, error = np.pi / 2 * np.sqrt(2.0 / 5.0), 0.002  # s
+    speed = 0.3 * np.sqrt(5.0 / 2.0)
+    run = Experiment([0.0, at], {"gate": [np.nan, 0.0]}, error * speed, start={"x": 0.3}, sensors={"gate": "x"}, inputs={"push": 0.0})
+    found = fit(Cart(damping=0.0, stiffness=5.3), run, ("stiffness",), rtol=1e-9, atol=1e-9)
+    assert float(found["stiffness"].value) == pytest.approx(5.0, rel=1e-6)
+    assert float(found["stiffness"].standard_error) == pytest.approx(2 * 5.0 / at * error, rel=1e-5)
+
+
+def test_samples_that_are_masked_are_missing():
+    run = cart_run()
+    masked = cart_run(values={"x": np.ma.masked_where(TS > 2.0, np.where(TS > 2.0, 99.0, run.values["x"]))}, sigma=0.01)
+    found = fit(Cart(mass=1.7), masked, ("mass",))
+    assert int(found.samples) == np.sum(TS <= 2.0)
+    assert float(found["mass"].value) == pytest.approx(2.0, rel=1e-4)
+
+
+def test_an_angle_that_was_wrapped_is_named_and_one_that_swings_is_not():
+    class Wheel(jj.Scene):
+        inertia: jnp.ndarray = jj.parameter(0.1, unit="kg m^2", positive=True)
+        drag: jnp.ndarray = jj.parameter(0.05, unit="N m s/rad", positive=True)
+        coordinates = jj.coordinates("angle")
+
+        def bodies(self, t, q):
+            return {"wheel": jj.RigidBody(1.0, jnp.diag(jnp.stack([self.inertia] * 3)), jnp.zeros(3), jj.rot_z(q.angle))}
+
+        def loads(self, motion):
+            return (jj.generalized_force(motion, angle_rate=-self.drag * motion.u.angle_rate),)
+
+    ts = np.linspace(0.0, 3.0, 61)
+    angle = 9.0 * 2.0 * (1 - np.exp(-0.5 * ts))
+    turned = lambda x, missing=0: np.where(np.arange(61) % 7 < missing, np.nan, x)  # noqa: E731
+    for x in (np.mod(angle + np.pi, 2 * np.pi) - np.pi, turned(np.mod(angle, 2 * np.pi), 1)):
+        run = Experiment(ts, {"encoder": x}, 0.01, start={"angle_rate": 9.0}, sensors={"encoder": "angle"})
+        with pytest.warns(UserWarning, match=r"channel `encoder` of run 0 jumps by -[56]\.\d+ at .* s and stays within one turn"):
+            log_likelihood(Wheel(), run)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for x in (angle, 3.1 * np.sin(9 * ts), np.random.default_rng(0).uniform(-3.1, 3.1, 61)):
+            log_likelihood(Wheel(), Experiment(ts, {"angle": x}, 0.01, start={"angle_rate": 9.0}))
+
+
+def test_a_gap_in_a_logged_input_is_named():
+    ts = np.linspace(0.0, 4.0, 81)
+    gap = (ts > 1.0) & (ts < 1.9)
+    log = lambda some: {"push": jj.Sampled(ts[some], np.sin(ts[some]))}  # noqa: E731
+    with pytest.warns(UserWarning, match=r"`push` of run 0 is sampled every 0.05 s, but not from 1 to 1.9 s, where it is a straight line"):
+        found = fit(Cart(mass=1.7), cart_run(inputs=log(~gap)), ("mass",))
+    assert "not from 1 to 1.9 s" in found.warning
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        steps = {"push": jj.Sampled([0.0, 1.0, 1.001, 4.0], [0.0, 0.0, 1.0, 1.0])}
+        for inputs in (log(ts >= 0), steps):
+            log_likelihood(CART, cart_run(inputs=inputs))
 
 
 def test_inputs_that_are_not_sampled_over_all_of_a_run_are_warned_of():
@@ -423,7 +483,7 @@ def test_one_bad_repeat_harms_no_other():
 THREE = ("mass", "damping", "stiffness")
 
 
-def noisy(seed: int, sigma=(0.01, 0.02), outlier=0.0, ts=TS, memory=0.0, **options) -> Measurements:
+def noisy(seed: int, sigma=(0.01, 0.02), outlier=0.0, ts=TS, memory=0.0, **options) -> Experiment:
     """A run of the cart with noise; `memory`: correlation of neighbouring samples of it; one sample of x is far out by `outlier` sigmas."""
     generator = np.random.default_rng(seed)
     x0 = options.pop("x0", 0.3)
@@ -445,7 +505,7 @@ def test_no_number_of_the_method_recompiles_and_a_new_lambda_per_run_is_one_chan
         x, _ = cart_motion(TS, x0, 0.0, 0.0)
         path = np.stack([x, 0 * x, 0 * x], axis=1)
         scale = jnp.asarray(2.0)
-        return Measurements(TS, {"cart": 2 * path}, 0.01, start={"x": x0, "x_rate": 0.0}, sensors={"cart": lambda motion: scale * motion["cart"].position})
+        return Experiment(TS, {"cart": 2 * path}, 0.01, start={"x": x0, "x_rate": 0.0}, sensors={"cart": lambda motion: scale * motion["cart"].position})
 
     first = fit(Cart(mass=1.5), [run(0.3), run(-0.5)], ("mass",))
     assert len(traces) == 1  # two lambdas, one program
@@ -688,7 +748,7 @@ def test_two_hidden_directions_and_a_parameter_that_does_nothing():
             lambda: fit(Cart(damping=0.0), cart_run(), ("damping",)),
             "first guess of `damping` is 0.0; expected a first guess above",
         ),
-        (lambda: fit(CART, [], ("mass",)), "`data` is empty, expected a `Measurements` or a sequence"),
+        (lambda: fit(CART, [], ("mass",)), "`data` is empty, expected an `Experiment` or a sequence"),
         (
             lambda: fit(CART, cart_run(values={"x_rat": TS}, sigma=1.0), ("mass",)),
             "unknown channel `x_rat`; did you mean `x_rate`",
@@ -725,8 +785,18 @@ def test_two_hidden_directions_and_a_parameter_that_does_nothing():
         (lambda: jj.student_t(np.inf), r"student_t\(inf\): expected a positive finite number"),
         (lambda: cart_run(values={}, sigma=1.0), "`values` is empty"),
         (lambda: cart_run(ts=TS[::-1]), "`ts` must be finite and strictly increasing"),
+        (lambda: cart_run(ts=np.where(TS[4] == TS, TS[3], TS)), "but sample 4 is at 0.6 s after 0.6 s; sort the samples by time and merge repeated"),
+        (lambda: Experiment([0.0, 1.0, np.inf, np.inf], {"x": np.zeros(4)}, 1.0, start={}), "but sample 2 is at inf s after 1 s"),
+        (lambda: Experiment([np.nan], {"x": [0.0]}, 1.0, start={}), "but sample 0 is at nan s; sort"),
+        (lambda: cart_run(ts=np.ma.masked_greater(TS, 3.0)), "`ts` is an array of shape .* some are masked"),
+        (lambda: fit(CART, cart_run(), ("mass",), rtoll=1e-6), "`rtoll` is no option of `simulate`; did you mean `rtol`"),
+        (lambda: fit(CART, cart_run(), ("mass",), ts=TS), "`ts` is no option here: each `Experiment` states start, times and inputs"),
+        (lambda: fit(CART, cart_run(), ("mass",), adjoint=diffrax.ForwardMode()), "`adjoint` is no option here: derivatives come by forward mode"),
+        (lambda: fit(CART, cart_run(values={"x": np.where(TS[4] == TS, 0.1, np.nan)}, sigma=None), ("mass",)), "1 measured values .* 1 unknowns and 1 sigmas"),
+        (lambda: fit(CART, cart_run(values={"a": TS}, sigma=1.0, sensors={"a": lambda motion: np.sin(motion.q.x)}), ("mass",)), "write it with `jax.numpy`"),
+        (lambda: fit(CART, cart_run(values={"a": TS}, sigma=1.0, sensors={"a": lambda m: abs(m.q.x) if m.q.x > 0 else 0.0}), ("mass",)), "without `if`"),
         (lambda: cart_run(ts=np.where(TS[4] == TS, np.nan, TS)), "`ts` must be finite and strictly increasing"),
-        (lambda: Measurements(TS[:0], {"x": TS}, 1.0, start={}), "expected a vector of at least one time"),
+        (lambda: Experiment(TS[:0], {"x": TS}, 1.0, start={}), "expected a vector of at least one time"),
         (lambda: cart_run(t0=1.0), "the start at t0 = 1.0 s comes after the first sample"),
         (lambda: cart_run(unknown_start=("y",)), "unknown start value `y` has no first guess"),
         (lambda: cart_run(sensors={"place": lambda motion: motion.q.x}), "sensor `place` has no measured values"),
@@ -745,7 +815,7 @@ def test_start_values_that_depend_on_each_other_are_refused():
     consistent = {"x_rate": -0.6, "y_rate": 0.25 * 0.9, "heading_rate": 0.9}
 
     def run(start, **options):
-        return Measurements(data.ts, data.values, SIGMA, start=start, **options)
+        return Experiment(data.ts, data.values, SIGMA, start=start, **options)
 
     # y_rate follows from the offset, which is to change
     with pytest.raises(ValueError, match=r"the start of run 0 no longer meets the constraints when the unknowns change.*`blade`"):
@@ -760,7 +830,7 @@ def test_the_last_step_is_taken_without_a_look_at_its_end_and_ends_at_the_minimu
     ts = jnp.linspace(0.0, 4.0, 41)
     truth, start = ChaplyginSleigh(offset=0.25), {"x_rate": -0.6, "heading_rate": 0.9}
     motion, noise = jj.simulate(truth, start, ts=ts), np.random.default_rng(3)
-    data = jj.Measurements(ts, {"x": motion["x"] + 0.01 * noise.normal(size=41)}, 0.01, start=start, unknown_start=("heading_rate",))
+    data = jj.Experiment(ts, {"x": motion["x"] + 0.01 * noise.normal(size=41)}, 0.01, start=start, unknown_start=("heading_rate",))
     found, exact = (jj.fit(truth.replace(offset=0.4), data, ("offset",), tolerance=tolerance) for tolerance in (1e-4, 1e-9))
     assert found.converged
     assert exact.converged

@@ -33,7 +33,7 @@ def exact(t):
 
 def data(seed, repeats=(), more=0.0):
     noise = SIGMA * np.random.default_rng(seed).normal(size=(*repeats, len(TS)))
-    return jj.Measurements(TS, {"x": exact(TS) + more + noise}, SIGMA, start={"x": 0.5})
+    return jj.Experiment(TS, {"x": exact(TS) + more + noise}, SIGMA, start={"x": 0.5})
 
 
 FREE = ("stiffness",)
@@ -54,7 +54,7 @@ def test_a_frequency_far_from_the_guess_is_found_over_growing_spans(factor):
 
 def test_spans_that_a_motion_follows_already_are_left_out(monkeypatch):
     quick = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
-    monkeypatch.setattr("jourdain_jax.analysis.fit._FOLLOWED", 0.0)
+    monkeypatch.setattr("jourdain_jax.analysis.search._FOLLOWED", 0.0)
     every = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
     assert quick.grown
     assert every.grown
@@ -64,7 +64,7 @@ def test_spans_that_a_motion_follows_already_are_left_out(monkeypatch):
 
 def test_whole_runs_that_lead_nowhere_are_given_up_soon(monkeypatch):
     quick = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
-    monkeypatch.setattr("jourdain_jax.analysis.fit._PATIENCE", None)
+    monkeypatch.setattr("jourdain_jax.analysis.search._PATIENCE", None)
     patient = jj.fit(Oscillator(stiffness=54.0), data(0), FREE)
     assert quick.grown
     assert patient.grown
@@ -74,9 +74,9 @@ def test_whole_runs_that_lead_nowhere_are_given_up_soon(monkeypatch):
 
 def test_a_fit_that_is_far_off_goes_on_where_growing_spans_do_not_help(monkeypatch):
     measured = data(0, more=0.05)  # no parameters give this
-    monkeypatch.setattr("jourdain_jax.analysis.fit._STEPS", 1)
+    monkeypatch.setattr("jourdain_jax.analysis.search._STEPS", 1)
     found = jj.fit(Oscillator(stiffness=18.9), measured, FREE)
-    monkeypatch.setattr("jourdain_jax.analysis.fit._STEPS", 50)
+    monkeypatch.setattr("jourdain_jax.analysis.search._STEPS", 50)
     at_once = jj.fit(Oscillator(stiffness=18.9), measured, FREE)
     assert found.chi_square < at_once.chi_square * (1 + 1e-6)
 
@@ -88,7 +88,7 @@ def test_repeats_that_end_in_a_local_minimum_are_fitted_again_alone():
     good = [0, 1, 2, 4]
     np.testing.assert_allclose(found["stiffness"].value[good], 18.0, atol=4 * found["stiffness"].standard_error[good].max())
     assert found.reduced_chi_square[3] > 100
-    alone = jj.fit(Oscillator(stiffness=50.0), jj.Measurements(TS, {"x": measured.values["x"][2]}, SIGMA, start={"x": 0.5}), FREE)
+    alone = jj.fit(Oscillator(stiffness=50.0), jj.Experiment(TS, {"x": measured.values["x"][2]}, SIGMA, start={"x": 0.5}), FREE)
     np.testing.assert_allclose(found.values[2], alone.values, rtol=1e-9)
 
 
@@ -118,7 +118,7 @@ def test_a_minimum_that_one_guess_alone_leads_to_is_warned_of():
 
 def test_first_guesses_fill_the_ranges_of_all_unknowns():
     scene, start = Oscillator(), {"x": 0.5, "x_rate": 0.0}
-    run = jj.Measurements(TS, {"x": exact(TS)}, SIGMA, start=start, unknown_start={"x": jj.bounds(0.0, 1.0), "x_rate": jj.unbounded(2.0)})
+    run = jj.Experiment(TS, {"x": exact(TS)}, SIGMA, start=start, unknown_start={"x": jj.bounds(0.0, 1.0), "x_rate": jj.unbounded(2.0)})
     unknowns = unknowns_of(scene, (run,), {"damping": jj.positive(), "stiffness": jj.bounds(10.0, 30.0)})
     guesses = unknowns.first_guesses(101)
     np.testing.assert_array_equal(guesses[0], [0.1, 18.0, 0.5, 0.0])
@@ -164,7 +164,7 @@ def test_a_minimum_that_undamped_steps_overshoot_is_found(curvature, large):
     """F = (x - 0.1)^2 + (R + a x^2 + a x^3 / 3)^2: at the minimum its second derivative is `curvature` times that of the linear problem."""
     a = (curvature - 1) / 2 / large
     sensors = {"curved": jj.Sensor(lambda motion: large + a * motion.q.x**2 + a * motion.q.x**3 / 3)}
-    run = jj.Measurements(jnp.ones(1), {"x": [0.1], "curved": [0.0]}, 1.0, start={"x": 0.3}, unknown_start=("x",), sensors=sensors, t0=0.0)
+    run = jj.Experiment(jnp.ones(1), {"x": [0.1], "curved": [0.0]}, 1.0, start={"x": 0.3}, unknown_start=("x",), sensors=sensors, t0=0.0)
     found = jj.fit(Resting(), run, ())
     slope = np.polynomial.Polynomial([-0.1, 1.0]) + np.polynomial.Polynomial([large, 0.0, a, a / 3]) * np.polynomial.Polynomial([0.0, 2 * a, a])
     least = min(slope.roots()[np.abs(slope.roots().imag) < 1e-9].real, key=abs)

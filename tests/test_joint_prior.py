@@ -32,7 +32,7 @@ class Cart(jj.Scene):
 
 def run():
     x = np.asarray(jj.simulate(Cart(), {"x": 0.3}, t0=0.0, ts=TS)["x"])
-    return jj.Measurements(TS, {"x": x + 0.01 * np.random.default_rng(3).normal(size=len(TS))}, 0.01, start={"x": 0.3}, t0=0.0)
+    return jj.Experiment(TS, {"x": x + 0.01 * np.random.default_rng(3).normal(size=len(TS))}, 0.01, start={"x": 0.3}, t0=0.0)
 
 
 def planned(scene, data):
@@ -58,7 +58,7 @@ def test_the_estimate_is_where_likelihood_and_prior_balance_and_its_information_
 def test_it_counts_beside_an_unknown_start_of_one_run_and_of_two():
     one = run()
     start = {"x": jj.Estimate(prior=jj.Normal(0.3, 0.01))}
-    data = [jj.Measurements(TS, one.values, 0.01, start={"x": 0.3}, unknown_start=start, t0=0.0)] * 2
+    data = [jj.Experiment(TS, one.values, 0.01, start={"x": 0.3}, unknown_start=start, t0=0.0)] * 2
     for count in (1, 2):
         found = jj.fit(Cart(), data[:count], TOGETHER)
         of_data, of_both = planned(found.scene, data[:count])
@@ -123,7 +123,7 @@ def test_pendulum_readings_give_a_joint_prior():
         (lambda: jj.joint_normal({"a": 1.0, "b": 1.0}, [[1.0, 0.0], [0.0, 0.0]]), "the variance of `b` is 0, expected one above zero"),
         (lambda: jj.joint_normal({"a": 1.0, "b": 1.0}, [[1.0, 0.5], [0.4, 1.0]]), "is not symmetric"),
         (lambda: jj.joint_normal({"a": 1.0, "b": 1.0}, [[1.0, 2.0], [2.0, 1.0]]), "its correlations have the eigenvalue -1"),
-        (lambda: jj.fit(Cart(), jj.Measurements(TS, {"x": TS}, 0.01, start={"x": 0.3}, unknown_start={"x": TOGETHER["mass"]}, t0=0.0)), "belongs to one run"),
+        (lambda: jj.fit(Cart(), jj.Experiment(TS, {"x": TS}, 0.01, start={"x": 0.3}, unknown_start={"x": TOGETHER["mass"]}, t0=0.0)), "belongs to one run"),
     ],
 )
 def test_what_is_no_joint_prior_is_refused(make, words):
@@ -137,7 +137,7 @@ def test_a_ride_and_the_pendulum_readings_of_a_bicycle_are_one_posterior_within_
     start = {"rear_spin_rate": 5.0 / float(truth.rR), "lean": 0.02, "lean_rate": 0.1, "steer": 0.0, "steer_rate": 0.0}
     motion, generator = jj.simulate(truth, start, ts=ts, rtol=1e-8, atol=1e-8), np.random.default_rng(0)
     values = {name: np.asarray(motion[name]) + 0.002 * generator.normal(size=101) for name in names}
-    ride = jj.Measurements(ts, values, 0.002, start=start, unknown_start=("lean", "lean_rate"))
+    ride = jj.Experiment(ts, values, 0.002, start=start, unknown_start=("lean", "lean_rate"))
     joint = bicycle.joint_prior
     found = jj.fit(bicycle.scene, ride, joint, rtol=1e-8, atol=1e-8)
     assert found.converged

@@ -24,7 +24,7 @@ def closed(start, damping, stiffness, mass=2.0):
 def runs(sigma=0.02, starts=(0.3, -0.2)):
     noise = np.random.default_rng(2)
     return [
-        jj.Measurements(TS, {"x": np.asarray(closed(x, 0.3, 5.0)) + 0.02 * noise.normal(size=len(TS))}, sigma, start={"x": x + 0.01}, unknown_start=("x",))
+        jj.Experiment(TS, {"x": np.asarray(closed(x, 0.3, 5.0)) + 0.02 * noise.normal(size=len(TS))}, sigma, start={"x": x + 0.01}, unknown_start=("x",))
         for x in starts
     ]
 
@@ -81,7 +81,7 @@ def test_whitened_density_is_that_of_the_same_unknowns_and_nearly_round():
 
 
 def remembering():
-    return [jj.Measurements(run.ts, run.values, None, start=run.start, unknown_start=run.unknown_start, correlation_time=None) for run in runs()]
+    return [jj.Experiment(run.ts, run.values, None, start=run.start, unknown_start=run.unknown_start, correlation_time=None) for run in runs()]
 
 
 def test_noise_with_an_unknown_memory_has_the_density_of_its_covariance():

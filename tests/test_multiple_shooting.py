@@ -24,7 +24,7 @@ def pendulum(span, seed=0, off=0.5):
     values = {name: np.asarray(motion[name]) + s * generator.normal(size=len(ts)) for name, s in sigma.items()}
     guess = truth.replace(**{name: getattr(truth, name) * (1 + generator.uniform(-off, off)) for name in FREE})
     begin = {name: x + (x or 3.0) * generator.uniform(-off, off) for name, x in start.items()}
-    return guess, truth, jj.Measurements(ts, values, sigma, start=begin, unknown_start=tuple(begin))
+    return guess, truth, jj.Experiment(ts, values, sigma, start=begin, unknown_start=tuple(begin))
 
 
 class Oscillator(jj.Scene):
@@ -50,7 +50,7 @@ def oscillations(channel="x", sigma=0.01, **options):
         motion = jj.simulate(Oscillator(), {"x": x, "x_rate": 0.3}, ts=ts[:count], inputs={"force": command})
         values = {channel: np.asarray(motion["x"]) + 0.01 * generator.normal(size=count)}
         start, unknown = {"x": guess, "x_rate": 0.3}, () if x == guess else ("x", "x_rate")
-        found.append(jj.Measurements(ts[:count], values, sigma, start=start, unknown_start=unknown, inputs={"force": force}, **options))
+        found.append(jj.Experiment(ts[:count], values, sigma, start=start, unknown_start=unknown, inputs={"force": force}, **options))
     return found
 
 
@@ -78,7 +78,7 @@ def test_a_chaotic_motion_is_found_from_afar_with_the_intervals_of_single_shooti
     assert found.shooting.pieces == (10,)
     assert found.shooting.continuity <= 1
     assert "found by multiple shooting in 10 pieces" in str(found)
-    near = jj.fit(found.scene, jj.Measurements(run.ts, run.values, run.sigma, start=found.starts[0], unknown_start=tuple(run.start)), FREE, **TIGHT)
+    near = jj.fit(found.scene, jj.Experiment(run.ts, run.values, run.sigma, start=found.starts[0], unknown_start=tuple(run.start)), FREE, **TIGHT)
     assert near.converged
     assert not near.grown
     np.testing.assert_allclose(found.values, near.values, atol=1e-2 * near.standard_errors.min())
@@ -139,7 +139,7 @@ def test_what_pieces_show_after_a_last_step_is_told_without_a_look_at_it():
 def test_pieces_lie_along_the_fit_though_an_unknown_at_its_bound_was_moved():
     ts = np.linspace(0.0, 4.0, 41)
     x = 0.5 * np.cos(3.0 * ts) * np.exp(-0.03 / 4 * ts) + 0.002 * np.random.default_rng(1).normal(size=41)  # a damping of 0.03
-    run = jj.Measurements(ts, {"x": x}, 0.005, start={"x": 0.5, "x_rate": 0.0}, unknown_start=("x",))
+    run = jj.Experiment(ts, {"x": x}, 0.005, start={"x": 0.5, "x_rate": 0.0}, unknown_start=("x",))
     found = jj.fit(Oscillator(), run, {"damping": jj.bounds(0.035, 2.0)}, shooting=jj.MultipleShooting(pieces=4), **TIGHT)
     assert found.at_bound[0]
     assert float(found["damping"].high) > 0.04
@@ -194,7 +194,7 @@ def shown_late(scene, start, ts, t0, true, sensors, guess, sigma=0.005, **inputs
     motion = jj.simulate(scene, start, t0=t0, ts=grid, rtol=1e-10, atol=1e-10, **inputs)
     values = {name: np.asarray(read(np.asarray(motion[what]), grid, ts, delay, lag)[0]) for name, (what, delay, lag) in true.items()}
     values = {name: x + sigma * generator.normal(size=len(ts)) for name, x in values.items()}
-    return jj.Measurements(ts, values, sigma, start=start | guess, unknown_start=tuple(guess), sensors=sensors, t0=t0, **inputs)
+    return jj.Experiment(ts, values, sigma, start=start | guess, unknown_start=tuple(guess), sensors=sensors, t0=t0, **inputs)
 
 
 def late_oscillations(true, sensors, counts):
@@ -230,7 +230,7 @@ def test_a_chaotic_motion_is_found_from_afar_through_late_sensors(monkeypatch):
     assert found.converged
     assert not found.warnings
     monkeypatch.setattr(grids, "FEWEST_INTERVALS", 640)  # so that the whole run is read between times as close as those of ten pieces
-    begin = jj.Measurements(run.ts, run.values, run.sigma, start=found.starts[0], unknown_start=tuple(run.start), sensors=sensors, t0=0.0)
+    begin = jj.Experiment(run.ts, run.values, run.sigma, start=found.starts[0], unknown_start=tuple(run.start), sensors=sensors, t0=0.0)
     near = jj.fit(found.scene, begin, FREE, **TIGHT)
     assert near.converged
     assert not near.grown
@@ -268,7 +268,7 @@ def test_pieces_begin_on_geometric_rows():
     scene, ts = jj.models.DoublePendulumRods(), np.linspace(0.0, 2.0, 41)
     motion, noise = jj.simulate(scene, ts=ts), np.random.default_rng(0)
     values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=41) for name in scene.coordinate_names}
-    same(scene.replace(mass2=0.9), jj.Measurements(ts, values, 0.01, start=dict(scene.example)), ("mass2", "gravity"))
+    same(scene.replace(mass2=0.9), jj.Experiment(ts, values, 0.01, start=dict(scene.example)), ("mass2", "gravity"))
 
 
 def test_pieces_begin_on_velocity_rows():
@@ -276,11 +276,11 @@ def test_pieces_begin_on_velocity_rows():
     motion, noise = jj.simulate(scene, {"x_rate": -0.6, "heading_rate": 0.9}, ts=ts), np.random.default_rng(0)
     values = {name: np.asarray(motion[name]) + 0.01 * noise.normal(size=41) for name in ("x", "y")}
     start = {"heading": 0.0, "x_rate": -0.5, "heading_rate": 0.8}
-    same(scene.replace(offset=0.2), jj.Measurements(ts, values, 0.01, start=start, unknown_start=tuple(start)), ("offset",))
+    same(scene.replace(offset=0.2), jj.Experiment(ts, values, 0.01, start=start, unknown_start=tuple(start)), ("offset",))
 
 
 def test_pieces_of_a_body_that_turns_begin_at_unit_quaternions():
     scene, ts = jj.models.FreeRigidBody(), np.linspace(0.0, 4.0, 41)
     motion, noise = jj.simulate(scene, ts=ts), np.random.default_rng(0)
     values = {"attitude": np.asarray(motion["attitude"]) + 0.01 * noise.normal(size=(41, 4))}
-    same(scene.replace(i1=1.05 * scene.i1), jj.Measurements(ts, values, 0.01, start=dict(scene.example)), ("i1",))
+    same(scene.replace(i1=1.05 * scene.i1), jj.Experiment(ts, values, 0.01, start=dict(scene.example)), ("i1",))

@@ -319,7 +319,7 @@ MUTANTS = [
         steps_end_at_knots,
         "knot",
     ),
-    Mutant("no dips", erk_step, "_watched", "dips = accept & dip.happens", "dips = accept & False", an_event_within_a_step_ends_the_motion, "passed over"),
+    Mutant("no dips", erk_step, "_monitored", "dips = accept & dip.happens", "dips = accept & False", an_event_within_a_step_ends_the_motion, "passed over"),
     Mutant("no cotangents of later stages", step_adjoint, "step_vjp", "as_in(b, g) * g + weighted(column, G)", "as_in(b, g) * g", TIMES, "derivative"),
     Mutant(
         "one stage without parameters",

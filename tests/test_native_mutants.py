@@ -252,8 +252,8 @@ MUTANTS = [
     Mutant("goals of another lane", loop, "_write_begin", "number * w.load", "0 * w.load", LANES, "lanes"),
     Mutant("states of another lane", loop, "_save", "(number * times + k)", "(0 * number + k)", LANES, "lanes"),
     Mutant("no projection", step, "_project", 'w.call("project", "void", p.pointer, t1, y1)', "None", CIRCLE, "circle"),
-    Mutant("no events", step, "_watched", "~search.no_event(w, c_1)", "~search.no_event(w, c_0)", EVENT, "event"),
-    Mutant("no dips", step, "_watched", "dips = accept & dips", "dips = accept & ~accept", DIP, "passed over"),
+    Mutant("no events", step, "_monitored", "~search.no_event(w, c_1)", "~search.no_event(w, c_0)", EVENT, "event"),
+    Mutant("no dips", step, "_monitored", "dips = accept & dips", "dips = accept & ~accept", DIP, "passed over"),
     Mutant("a bracket with the wrong end", search, "advance", "w.where(same_side, t[1], t[0])", "t[0]", EVENT, "event"),
     Mutant("rows by half", onto_rows, "_write_moved", "- w.where(moves, change, 0.0)", "- 0.5 * w.where(moves, change, 0.0)", ROWS, "coordinates|speeds"),
     Mutant(

@@ -65,7 +65,7 @@ BUILT = {
     "unbounded": lambda n, v: [jj.unbounded(n).scale],
     "stabilisation": lambda n, v: jj.Baumgarte(n, n),
     "samples": lambda n, v: jj.Sampled([0, 1, 2], v)(n),
-    "measurements": lambda n, v: jj.Measurements([1, 2, 3], {"x": v}, n, start={"x": n}, t0=0),
+    "measurements": lambda n, v: jj.Experiment([1, 2, 3], {"x": v}, n, start={"x": n}, t0=0),
 }
 
 

@@ -26,13 +26,13 @@ class Cart(jj.Scene):
 
 
 def plan(x=0.3, force=0.0, unknown=()):
-    return jj.Measurements(TS, {"x": TS}, 0.01, start={"x": x}, unknown_start=unknown, inputs={"force": force}, t0=0.0)
+    return jj.Experiment(TS, {"x": TS}, 0.01, start={"x": x}, unknown_start=unknown, inputs={"force": force}, t0=0.0)
 
 
 def test_planned_covariance_is_that_of_a_fit():
     unknown = {"x": jj.Estimate(prior=jj.Normal(0.3, 0.005))}
     values = {"x": jj.simulate(Cart(), {"x": 0.3}, t0=0.0, ts=TS, inputs={"force": 0.4})["x"]}
-    run = jj.Measurements(TS, values, 0.01, start={"x": 0.3}, unknown_start=unknown, inputs={"force": 0.4}, t0=0.0)
+    run = jj.Experiment(TS, values, 0.01, start={"x": 0.3}, unknown_start=unknown, inputs={"force": 0.4}, t0=0.0)
     fit = jj.fit(Cart(), run, ("mass", "stiffness"))
     found = jj.planned_information(Cart(), plan(force=0.4, unknown=unknown), ("mass", "stiffness"))
     assert found.labels == fit.labels == ("mass", "stiffness", "run 0: x")
@@ -98,7 +98,7 @@ def test_slope_in_the_samples_of_an_input_is_that_of_differences():
     [({"sigma": None}, "sigma of channel `x` is None"), ({"correlation_time": 0.1}, "has a correlation time")],
 )
 def test_a_plan_needs_to_know_its_noise(change, message):
-    run = jj.Measurements(TS, {"x": TS}, **({"sigma": 0.01, "start": {"x": 0.3}} | change))
+    run = jj.Experiment(TS, {"x": TS}, **({"sigma": 0.01, "start": {"x": 0.3}} | change))
     with pytest.raises(ValueError, match=message):
         jj.planned_information(Cart(), run, ("mass",))
 

@@ -1,5 +1,8 @@
 """Numbers that no body and no moving plane can have are refused by name where they are known, and left alone where they are traced."""
 
+from collections.abc import Callable
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -93,3 +96,47 @@ def test_a_moving_plane_whose_velocities_are_the_rates_of_its_pose_is_accepted(m
 def test_a_moving_plane_whose_velocities_are_not_the_rates_of_its_pose_is_refused(motion, sentence):
     with pytest.raises(ValueError, match=sentence):
         jj.structure_of(BallOnPlate(**motion))
+
+
+class OnSledge(jj.Scene):
+    """A ball on the back of a sledge, whose contact takes the sledge for its ground."""
+
+    ground: Callable = eqx.field(static=True, default=lambda pose, back: jj.Plane(back))
+    coordinates = jj.coordinates("sledge x roll")
+
+    def bodies(self, t, q):
+        o = 0.0 * q.x
+        return {
+            "sledge": jj.RigidBody.box(2.0, (1.0, 0.3, 0.1), position=jnp.stack([q.sledge, o, o]), orientation=jnp.eye(3)),
+            "post": jj.Particle(1.0, jnp.zeros(3)),
+            "ball": jj.RigidBody.ball(1.0, 0.1, position=jnp.stack([q.x, o, o + 0.15]), orientation=jj.rot_y(q.roll)),
+        }
+
+    def contacts(self, pose):
+        ground = self.ground(pose, pose["sledge"].place(jnp.array([0.0, 0.0, 0.05])))
+        return {"back": jj.ball_contact(pose["ball"], 0.1, ground=ground)}
+
+
+@pytest.mark.parametrize(
+    "ground",
+    [
+        lambda pose, back: jj.Plane(back),  # along the sledge's way the plane does not change, but what the ball rolls on does
+        lambda pose, back: jj.HeightMap(lambda x, y: 0.05 + 0.01 * (x - back[0])),
+        lambda pose, back: jj.Cylinder(3.0, (0.0, 1.0, 0.0), side="outside", origin=back - jnp.array([0.0, 0.0, 3.0])),
+    ],
+)
+def test_a_ground_that_another_body_carries_is_refused(ground):
+    with pytest.raises(ValueError, match="the ground of contact `back` of `OnSledge` moves with another body, but its `velocity` and"):
+        jj.structure_of(OnSledge(ground))
+
+
+@pytest.mark.parametrize(
+    "ground",
+    [
+        lambda pose, back: jj.Plane(pose["post"].position + jnp.array([0.0, 0.0, 0.05])),  # a body that stands still
+        lambda pose, back: jj.Plane(pose["ball"].position - jnp.array([0.0, 0.0, 0.1])),  # the plane that touches, where the coordinates know it
+        lambda pose, back: jj.Plane(back, velocity=(0.3, 0.0, 0.0)),  # its velocity is stated
+    ],
+)
+def test_a_ground_that_no_other_body_carries_unsaid_is_accepted(ground):
+    assert jj.structure_of(OnSledge(ground)).faults == ()

@@ -76,7 +76,7 @@ def test_a_fit_whose_moments_end_beyond_what_a_body_can_have_ends_at_a_body():
     ts, start = np.linspace(0.0, 4.0, 41), {"yaw": 0.8, "pitch": 1.0}
     motion, noise = jj.simulate(Turning(moments=truth), start, ts=ts), np.random.default_rng(3)
     values = {name: np.asarray(motion[name]) + 0.1 * noise.normal(size=41) for name in ("yaw", "pitch")}
-    data = jj.Measurements(ts, values, 0.1, start=start)
+    data = jj.Experiment(ts, values, 0.1, start=start)
     free, body = (jj.fit(scene, data, ("moments",)) for scene in (Turning(), TurningBody()))
     by_name = jj.fit(Turning(), data, {"body": jj.possible_inertia()})
     assert free.impossible

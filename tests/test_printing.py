@@ -16,7 +16,7 @@ RUN = {"t1": 0.2, "ts": jnp.linspace(0.0, 0.2, 5)}
 
 def measured():
     motion = jj.simulate(SLEIGH, {"x_rate": 0.6, "heading_rate": 0.9}, **RUN)
-    return jj.Measurements(motion.ts, {"heading": motion["heading"], "x": motion["x"]}, 0.01, start={"x_rate": 0.6, "heading_rate": 0.9})
+    return jj.Experiment(motion.ts, {"heading": motion["heading"], "x": motion["x"]}, 0.01, start={"x_rate": 0.6, "heading_rate": 0.9})
 
 
 def fitted():

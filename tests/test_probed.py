@@ -58,7 +58,7 @@ def by_jax(scene, t, q, q_beyond, u, u_other):
         "timed": jax.jvp(pieces, (t,), (jnp.ones_like(t),))[1] | explicit_rates(scene, motion),
         "inertia_rates": jax.jvp(lambda t, q: inertias(scene, t, q), (t, q), (jnp.ones_like(t), qdot))[1],
         "potential_rates": jax.jvp(lambda i: potentials_of(scene, motion_at(scene, t, q, u, i)), (inputs,), (inputs**2,))[1],
-        "numbers": numbers_of(scene, pose_at(scene, t, q)),
+        "numbers": numbers_of(scene, motion),
     }
 
 

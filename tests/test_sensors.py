@@ -55,7 +55,7 @@ def shown(ts, mass=MASS, damping=DAMPING, *, gain=1.0, bias=0.0, delay=0.0, lag=
     return gain * (lagged + rest) + bias
 
 
-def run(seed=None, repeats=(), truth=TRUTH, ts=TS, x0=0.3, sigma=0.005, unknown_start=(), **numbers) -> jj.Measurements:
+def run(seed=None, repeats=(), truth=TRUTH, ts=TS, x0=0.3, sigma=0.005, unknown_start=(), **numbers) -> jj.Experiment:
     """Place by an ideal sensor and speed by one with these `numbers`, in truth `truth`; samples before `SEEN` are missing from the latter."""
     noise = np.random.default_rng(seed)
     since = ts - ts[0]
@@ -63,7 +63,7 @@ def run(seed=None, repeats=(), truth=TRUTH, ts=TS, x0=0.3, sigma=0.005, unknown_
     if seed is not None:
         values = {name: x + s * noise.normal(size=(*repeats, len(ts))) for (name, x), s in zip(values.items(), (0.002, sigma), strict=True)}
     sensors = {"gyro": jj.Sensor("x_rate", **(truth | numbers))}
-    return jj.Measurements(ts, values, {"x": 0.002, "gyro": sigma}, start={"x": x0, "x_rate": 0.0}, sensors=sensors, unknown_start=unknown_start)
+    return jj.Experiment(ts, values, {"x": 0.002, "gyro": sigma}, start={"x": x0, "x_rate": 0.0}, sensors=sensors, unknown_start=unknown_start)
 
 
 GAIN = jj.Estimate(1.0)
@@ -219,11 +219,11 @@ def test_a_sensor_shows_functions_and_coordinates_under_other_names():
     seen = {"place": lambda motion: motion["cart"].position, "encoder": "x", "x_rate": jj.Sensor(gain=jj.Estimate(1.0))}
     x, v = shown(TS, order=0), shown(TS, gain=1.3)
     values = {"place": np.stack([x, 0 * x, 0 * x], axis=1), "encoder": x, "x_rate": v}
-    found = jj.fit(Cart(mass=1.8), jj.Measurements(TS, values, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors=seen), ("mass",))
+    found = jj.fit(Cart(mass=1.8), jj.Experiment(TS, values, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors=seen), ("mass",))
     np.testing.assert_allclose(found.values, [MASS, 1.3], rtol=1e-6)
     # a gain and a bias for each component
     each = jj.Sensor(lambda motion: motion["cart"].position, gain=jj.Estimate((1.0, 1.0, 1.0)), bias=jj.Estimate((0.0, 0.0, 0.0)), delay=0.0)
-    bent = jj.Measurements(TS, {"place": values["place"] * 0.9 + np.array([0.1, 0.2, 0.3])}, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors={"place": each})
+    bent = jj.Experiment(TS, {"place": values["place"] * 0.9 + np.array([0.1, 0.2, 0.3])}, 0.01, start={"x": 0.3, "x_rate": 0.0}, sensors={"place": each})
     found = jj.fit(Cart(), bent, ())
     np.testing.assert_allclose([found[f"place.bias[{i}]"].value for i in range(3)], [0.1, 0.2, 0.3], atol=1e-6)
     assert found["place.gain[0]"].value == pytest.approx(0.9, rel=1e-6)
@@ -257,12 +257,12 @@ def test_an_accelerometer_feels_centripetal_and_tangential_acceleration_and_grav
         sensor, missing = jj.Sensor(seen, delay=jj.Estimate(0.03, range=jj.bounds(0.0, 0.1))), TS < 0.1
         shown = np.stack([np.interp(TS - 0.05, TS, felt[:, i]) for i in range(3)], axis=1)
         rough = (4 * 0.05) ** 6 / 50  # of the reading between times, relative
-    data = jj.Measurements(TS, {"imu": np.where(missing[:, None], np.nan, shown)}, 0.01, start={"turn": 0.7}, sensors={"imu": sensor})
+    data = jj.Experiment(TS, {"imu": np.where(missing[:, None], np.nan, shown)}, 0.01, start={"turn": 0.7}, sensors={"imu": sensor})
     found = jj.fit(Swing(stiffness=7.5), data, ("stiffness",))
     assert found["stiffness"].value == pytest.approx(8.0, rel=1e-5 + rough)
     if late:
         assert found["imu.delay"].value == pytest.approx(0.05, abs=1e-5)
-    bad = jj.Measurements(TS, {"imu": felt}, 0.01, start={"turn": 0.7}, sensors={"imu": jj.Accelerometer("arn")})
+    bad = jj.Experiment(TS, {"imu": felt}, 0.01, start={"turn": 0.7}, sensors={"imu": jj.Accelerometer("arn")})
     with pytest.raises(ValueError, match="the accelerometer `imu` of run 0 of `Swing` sits on body `arn`, which is not there; did you mean `arm`"):
         jj.fit(Swing(), bad, ("stiffness",))
 
@@ -272,7 +272,7 @@ def test_a_load_cell_shows_what_the_ground_bears_and_tells_a_mass():
     motion = jj.simulate(disc, start, ts=TS, rtol=1e-10, atol=1e-10)
     force, felt = cell.over_times(motion), jj.Accelerometer("disc").over_times(motion)
     np.testing.assert_allclose(force, 1.3 * jnp.einsum("tij,tj->ti", motion.motions()["disc"].orientation, felt), atol=1e-9)  # F = m (a - g)
-    data = jj.Measurements(TS, {"plate": force}, 0.1, start=start, sensors={"plate": cell})
+    data = jj.Experiment(TS, {"plate": force}, 0.1, start=start, sensors={"plate": cell})
     found = jj.fit(disc.replace(mass=1.0), data, ("mass", "radius"))
     assert found["mass"].value == pytest.approx(1.3, rel=1e-6)
     assert found["radius"].value == pytest.approx(float(disc.radius), rel=1e-6)
@@ -287,7 +287,7 @@ def test_a_load_cell_shows_what_the_ground_bears_and_tells_a_mass():
     ids=["no such contact", "a force that two wheels share"],
 )
 def test_a_load_cell_that_shows_nothing_is_refused(scene, name, message):
-    data = jj.Measurements(TS, {"plate": np.ones((TS.size, 3))}, 1.0, start={}, sensors={"plate": jj.LoadCell(name)})
+    data = jj.Experiment(TS, {"plate": np.ones((TS.size, 3))}, 1.0, start={}, sensors={"plate": jj.LoadCell(name)})
     with pytest.raises(ValueError, match=message):
         jj.fit(scene, data, ("mass",))
     with pytest.raises(ValueError, match="`contact` of `LoadCell` is an int"):
@@ -301,11 +301,11 @@ def test_a_delay_that_is_not_there_is_at_its_bound():
     assert 0.0 < found["gyro.delay"].high < 0.02
 
 
-def late(seed, lag, delay=0.05, tau=0.05) -> jj.Measurements:
+def late(seed, lag, delay=0.05, tau=0.05) -> jj.Experiment:
     """Speed, 0.07 s late, through a low-pass with this lag; a sensor with an unknown delay, and a lag `tau` that is known or not."""
     values = np.where(TS < SEEN, np.nan, shown(TS, delay=0.07, lag=lag) + 0.002 * np.random.default_rng(seed).normal(size=len(TS)))
     sensor = jj.Sensor("x_rate", delay=jj.Estimate(delay, range=jj.bounds(0.0, SEEN)), lag=tau)
-    return jj.Measurements(TS, {"late": values}, 0.002, start={"x": 0.3}, sensors={"late": sensor})
+    return jj.Experiment(TS, {"late": values}, 0.002, start={"x": 0.3}, sensors={"late": sensor})
 
 
 def test_a_lag_of_zero_is_left_where_a_delay_stands_in_for_it():
@@ -402,13 +402,13 @@ def test_priors_of_starts_and_of_numbers_of_single_runs():
 # What cannot be told. -----------------------------------------------------------------------------------------------------
 
 
-def pushed(sensor: dict, actuator: dict, ts=TS) -> jj.Measurements:
+def pushed(sensor: dict, actuator: dict, ts=TS) -> jj.Experiment:
     """The cart at rest, pushed: place and speed as simulated."""
     knots = np.linspace(0.0, 4.0, 41)
     command = np.sin(2 * knots) + np.where(knots > 1, 0.3, 0.0)
     motion = jj.simulate(Cart(), {"x": 0.0, "x_rate": 0.0}, ts=ts, inputs={"push": jj.Sampled(knots, 1.5 * command)}, rtol=1e-10, atol=1e-10)
     inputs = {"push": jj.Actuator(jj.Sampled(knots, command), **actuator)}
-    return jj.Measurements(ts, {"x": motion["x"]}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs=inputs, sensors={"x": jj.Sensor(**sensor)})
+    return jj.Experiment(ts, {"x": motion["x"]}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs=inputs, sensors={"x": jj.Sensor(**sensor)})
 
 
 def test_gains_that_show_as_a_product_are_named():
@@ -436,7 +436,7 @@ def test_a_gain_and_the_parameters_that_scale_alike_are_named_and_a_prior_tells_
 # Actuators. ---------------------------------------------------------------------------------------------------------------
 
 
-def driven(truth: dict, **asked) -> jj.Measurements:
+def driven(truth: dict, **asked) -> jj.Experiment:
     """The cart under a command through an actuator with the numbers `truth`, of which some are asked for."""
     knots = np.linspace(0.0, 4.0, 41)
     command = jj.Sampled(knots, np.sin(2 * knots) + np.where(knots > 1, 0.3, 0.0))
@@ -444,7 +444,7 @@ def driven(truth: dict, **asked) -> jj.Measurements:
     signal = jj.Sampled(late, truth["gain"] * filtered(command.ts, command.values, truth["lag"]) + truth["bias"])
     motion = jj.simulate(Cart(), {"x": 0.3, "x_rate": 0.0}, ts=TS, inputs={"push": signal}, rtol=1e-10, atol=1e-10)
     inputs = {"push": jj.Actuator(command, **(truth | asked))}
-    return jj.Measurements(TS, {"x": motion["x"], "x_rate": motion["x_rate"]}, 0.001, start={"x": 0.3, "x_rate": 0.0}, inputs=inputs)
+    return jj.Experiment(TS, {"x": motion["x"], "x_rate": motion["x_rate"]}, 0.001, start={"x": 0.3, "x_rate": 0.0}, inputs=inputs)
 
 
 class Mass(jj.Scene):
@@ -482,7 +482,7 @@ def test_a_command_that_holds_keeps_each_value_until_the_next():
     linear = np.array([np.trapezoid(np.interp(np.linspace(0, t, 2001), knots + delay, command), np.linspace(0, t, 2001)) for t in ts])
     assert np.max(np.abs(exact - linear)) > 0.05
     actuator = jj.Actuator(jj.Sampled(knots, command), delay=jj.Estimate(0.05, range=jj.bounds(0.0, 0.1)), gain=GAIN, hold=True)
-    data = jj.Measurements(ts, {"x_rate": 1.3 * exact}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator})
+    data = jj.Experiment(ts, {"x_rate": 1.3 * exact}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator})
     found = jj.fit(Mass(), data, (), rtol=1e-9, atol=1e-9)
     assert found.converged
     np.testing.assert_allclose([found["push.delay"].value, found["push.gain"].value], [delay, 1.3], atol=1e-6)
@@ -493,7 +493,7 @@ def test_a_lag_after_a_command_that_holds():
     knots, command, ts = np.linspace(0.0, 2.0, 41), np.random.default_rng(0).normal(size=41), np.linspace(0.0, 2.0, 41)
     exact = speeds_of_held(knots, command, ts, lag=0.1)
     actuator = jj.Actuator(jj.Sampled(knots, command), lag=jj.Estimate(0.05), hold=True)
-    data = jj.Measurements(ts, {"x_rate": exact}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator})
+    data = jj.Experiment(ts, {"x_rate": exact}, 0.001, start={"x": 0.0, "x_rate": 0.0}, inputs={"push": actuator})
     found = jj.fit(Mass(), data, (), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found["push.lag"].value, 0.1, rtol=0.03)  # linear between samples, of half a lag
 
@@ -552,7 +552,7 @@ def test_a_likelihood_of_measurements_that_are_made_inside_jit_is_the_same():
     seen = np.where(ts < SEEN, np.nan, np.asarray(motion["x_rate"]))
 
     def value(stiffness):
-        data = jj.Measurements(ts, {"gyro": seen}, 0.05, start={"x": 0.3, "x_rate": 0.0}, sensors={"gyro": late})
+        data = jj.Experiment(ts, {"gyro": seen}, 0.05, start={"x": 0.3, "x_rate": 0.0}, sensors={"gyro": late})
         return jj.log_likelihood(scene.replace(stiffness=stiffness), data, rtol=1e-9, atol=1e-9)
 
     assert float(jax.jit(value)(scene.stiffness)) == pytest.approx(float(value(scene.stiffness)), rel=1e-3)
@@ -581,7 +581,7 @@ COMMAND = jj.Sampled([0.0, 4.0], [1.0, 1.0])
 
 
 def with_input(push) -> jj.Fit:
-    return jj.fit(Cart(), jj.Measurements(TS, {"x": TS}, 1.0, start={"x": 0.0}, inputs={"push": push}), ("mass",))
+    return jj.fit(Cart(), jj.Experiment(TS, {"x": TS}, 1.0, start={"x": 0.0}, inputs={"push": push}), ("mass",))
 
 
 @pytest.mark.parametrize(
@@ -605,9 +605,9 @@ def with_input(push) -> jj.Fit:
         (lambda: jj.Actuator(1.0), "`command` of `Actuator` is a float, expected `jj.Sampled"),
         (lambda: jj.Actuator(COMMAND, hold=1), "`hold` of `Actuator` is an? int.*expected True"),
         (lambda: jj.Actuator(COMMAND, gain=[1.0, 2.0]), r"`gain` of `Actuator` has shape \(2,\), expected one number"),
-        (lambda: jj.Measurements(TS, {"x": TS}, 1.0, start={}, sensors={"y": "x"}), "sensor `y` has no measured values; Valid names: `x`"),
+        (lambda: jj.Experiment(TS, {"x": TS}, 1.0, start={}, sensors={"y": "x"}), "sensor `y` has no measured values; Valid names: `x`"),
         (
-            lambda: jj.fit(Cart(), jj.Measurements(TS, {"gyro": TS}, 1.0, start={"x": 0.0}, sensors={"gyro": "x_rte"}), ("mass",)),
+            lambda: jj.fit(Cart(), jj.Experiment(TS, {"gyro": TS}, 1.0, start={"x": 0.0}, sensors={"gyro": "x_rte"}), ("mass",)),
             "run 0 of `Cart` has channel `gyro`, whose sensor measures an unknown quantity `x_rte`; did you mean `x_rate`",
         ),
         (lambda: fitted(delay=0.3), "`gyro` of run 0 of `Cart` begins at 0.2 s, and less its delay of up to 0.3 s that is before the start at t0 = 0 s"),
@@ -630,7 +630,7 @@ def with_input(push) -> jj.Fit:
         (
             lambda: jj.fit(
                 Cart(),
-                jj.Measurements(
+                jj.Experiment(
                     TS,
                     {"push": TS},
                     1.0,

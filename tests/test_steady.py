@@ -11,6 +11,7 @@ from jourdain_jax.analysis.steady import steady
 from jourdain_jax.models.double_pendulum_angles import DoublePendulumAngles
 from jourdain_jax.models.free_rigid_body import FreeRigidBody
 from jourdain_jax.models.tilting_disc import TiltingDisc
+from jourdain_jax.models.vertical_disc import VerticalDisc
 
 DISC = {"mass": 1.0, "radius": 0.5, "gravity": 9.81}
 GUESS = {"lean": 0.3, "yaw_rate": 2.0, "spin_rate": -3.0, "lean_rate": 0.3}
@@ -95,6 +96,44 @@ def test_a_motion_forbidden_to_move_comes_to_rest():
     found = steady(TiltingDisc(**DISC), {"lean": 0.1, "yaw_rate": 1.0, "spin_rate": 1.0}, moving=())
     np.testing.assert_allclose(found.state.u, np.zeros(5), atol=1e-10)
     assert float(found["lean"]) == pytest.approx(0.0, abs=1e-10)
+
+
+class Sprung(jj.Scene):
+    """A particle on a stiffening spring, pushed by an input and by a load that depends on time."""
+
+    coordinates = jj.coordinates("x")
+    inputs = jj.inputs("push")
+
+    def bodies(self, t, q):
+        return {"block": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+    def loads(self, motion):
+        return (jj.generalized_force(motion, x_rate=motion.inputs.push + jnp.cos(motion.t) - 4.0 * motion.q.x - motion.q.x**3),)
+
+
+def test_an_equilibrium_is_that_of_the_inputs_and_of_the_time():
+    # the load that depends on time is -1 N at pi s, and does not change there: 4 x + x^3 = 2.125
+    found = steady(Sprung(), {"x": 0.1}, t0=np.pi, inputs={"push": 3.125})
+    assert bool(found.converged)
+    assert float(found["x"]) == pytest.approx(0.5, rel=1e-12)
+    moving = steady(Sprung(), {"x": 0.1}, t0=1.0, inputs={"push": 3.125})
+    assert not bool(moving.converged)
+    assert float(moving.residual) == pytest.approx(np.sin(1.0), rel=1e-6)  # |d2y/dt2|
+
+
+def test_what_is_steady_depends_on_the_speeds_that_are_to_be_constant():
+    circle = {"heading_rate": 0.5, "roll_rate": 3.0}
+    rolled = lambda *speeds: steady(VerticalDisc(), circle, held=tuple(circle), privileged=speeds)  # noqa: E731
+    assert bool(rolled("roll_rate", "heading_rate").converged)
+    found = rolled("x_rate", "heading_rate")  # the velocity along x turns with the heading
+    assert not bool(found.converged)
+    assert float(found.residual) == pytest.approx(0.5**2 * abs(float(found["x_rate"])), rel=1e-6)  # |d2y/dt2|, where x_rate has its largest value
+
+
+def test_a_search_of_one_step_says_that_it_did_not_arrive():
+    found = steady(Sprung(), {"x": 10.0}, max_steps=1)
+    assert not bool(found.converged)
+    assert float(found.residual) > 1e-4
 
 
 def test_wrong_names_are_answered_with_valid_ones():

@@ -81,6 +81,7 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.analysis.body_inertia import possible_inertia
     from jourdain_jax.analysis.energy import Energy, EnergyBalance, energy, energy_balance
     from jourdain_jax.analysis.estimate import Estimate
+    from jourdain_jax.analysis.experiment import Experiment
     from jourdain_jax.analysis.filtering import filtered_log_likelihood
     from jourdain_jax.analysis.fit import fit, fit_batch
     from jourdain_jax.analysis.fit_result import Fit
@@ -91,7 +92,6 @@ if _typing.TYPE_CHECKING:  # what else there is, for static tools
     from jourdain_jax.analysis.linearize import Linearization, linearize
     from jourdain_jax.analysis.log_density import LogDensity, log_density
     from jourdain_jax.analysis.losses import huber, student_t
-    from jourdain_jax.analysis.measurements import Measurements
     from jourdain_jax.analysis.planning import PlannedInformation, planned_information
     from jourdain_jax.analysis.ranges import bounds, positive, unbounded
     from jourdain_jax.analysis.report import Report, report
@@ -128,6 +128,7 @@ _ON_FIRST_USE = {
     "analysis.body_inertia": "possible_inertia",
     "analysis.energy": "Energy EnergyBalance energy energy_balance",
     "analysis.estimate": "Estimate",
+    "analysis.experiment": "Experiment",
     "analysis.filtering": "filtered_log_likelihood",
     "analysis.fit": "fit fit_batch",
     "analysis.fit_result": "Fit",
@@ -138,7 +139,6 @@ _ON_FIRST_USE = {
     "analysis.linearize": "Linearization linearize",
     "analysis.log_density": "LogDensity log_density",
     "analysis.losses": "huber student_t",
-    "analysis.measurements": "Measurements",
     "analysis.planning": "PlannedInformation planned_information",
     "analysis.ranges": "bounds positive unbounded",
     "analysis.report": "Report report",
@@ -193,6 +193,7 @@ __all__ = [
     "EnergyBalance",
     "Estimate",
     "EventTime",
+    "Experiment",
     "Fit",
     "Formulation",
     "GibbsAppell",
@@ -212,7 +213,6 @@ __all__ = [
     "LogUniform",
     "Lowered",
     "MeanGradients",
-    "Measurements",
     "MultipleShooting",
     "Multipliers",
     "MuntheKaas",

@@ -55,7 +55,7 @@ class Arrow:
         return Arrow(*(x[members] for x in self.arrays))
 
     def scaled(self, size: Float[np.ndarray, "members unknowns"]) -> "Arrow":
-        """In unknowns divided by `size`."""
+        """This arrow in unknowns divided by `size`."""
         shared, local = self.split(size)
         whole = np.concatenate([local, np.broadcast_to(shared[:, None], (*local.shape[:2], shared.shape[1])), np.ones((*local.shape[:2], 1))], axis=-1)
         return Arrow(
@@ -135,7 +135,7 @@ class Arrow:
 def with_prior(
     arrow: Arrow, residual: Float[np.ndarray, "members unknowns"], mean: np.ndarray, sigma: np.ndarray, M: Float[np.ndarray, "shared shared"]
 ) -> Arrow:
-    """With one `residual` (theta - mean) / sigma more for each unknown that has a mean (not NaN); those of shared ones times M. The scores stay."""
+    """Adds one `residual` (theta - mean) / sigma for each unknown that has a mean (not NaN); those of shared ones times M. The scores stay."""
     slope = np.broadcast_to(np.where(np.isnan(mean), 0.0, 1 / sigma), residual.shape)
     (r_s, r_l), (J_s, J_l) = arrow.split(residual), arrow.split(slope)
     members, runs, m = r_l.shape
@@ -171,7 +171,7 @@ def by_singular_values(shared: np.ndarray, D: np.ndarray, damping: Float[np.ndar
 
 
 def arrow(triangles: Float[np.ndarray, "members runs width width"], local: int) -> Arrow:
-    """From the triangles of all runs, with `local` unknowns of their own in the first columns."""
+    """Makes an arrow of the triangles of all runs, with `local` unknowns of their own in the first columns."""
     members, runs, width, _ = triangles.shape
     if runs == 1 and not local:
         return Arrow(triangles[:, :, :0], triangles[:, 0], np.zeros((members, 1, width - 1)))  # there is nothing to compare one run with

@@ -7,11 +7,11 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.information import Information, information
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Linearised
 from jourdain_jax.analysis.likelihood import as_runs
 from jourdain_jax.analysis.losses import Loss
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
@@ -53,7 +53,7 @@ class TakenUp:
         return self.problem.linearised(theta, members)
 
     def residuals(self, run: int) -> dict[str, np.ndarray]:
-        """Of a run by channel, in units of sigma, at theta; NaN where a sample is missing."""
+        """Residuals of a run by channel, in units of sigma, at theta; NaN where a sample is missing."""
         return self.problem.by_channel(run, self.at, lambda x: x[0])
 
     def information(self) -> Information:
@@ -64,7 +64,7 @@ class TakenUp:
         return information(self.at.arrow, size, unknowns.estimated, bound, fails, self.asked.control.cutoff, True)
 
 
-def taken_up(fit, data: Measurements | Sequence[Measurements]) -> TakenUp:
+def taken_up(fit, data: Experiment | Sequence[Experiment]) -> TakenUp:
     """A `Fit` of one experiment where it ended, with residuals and derivatives computed anew. ValueError where `data` are not what it was fitted to."""
     again = for_runs(fit, data, fitted=True)
     unknowns = again.problem.unknowns
@@ -79,13 +79,13 @@ def taken_up(fit, data: Measurements | Sequence[Measurements]) -> TakenUp:
     return again
 
 
-def for_runs(fit, runs: Measurements | Sequence[Measurements], fitted: bool = False) -> TakenUp:
+def for_runs(fit, runs: Experiment | Sequence[Experiment], fitted: bool = False) -> TakenUp:
     """The problem of a `Fit` for these runs, at the first guesses; ValueError where they do not fit the scene.
 
     `fitted`: they are those of the fit, in pieces where it was found so.
     """
     asked = fit.asked
-    checked = as_runs(asked.scene, runs)
+    checked = as_runs(asked.scene, runs, asked.simulation)
     unknowns = unknowns_of(asked.scene, checked, asked.free)
     of_runs = asked.scene, checked, unknowns.layout, asked.simulation, None
     lanes = Piecewise(*of_runs, unknowns, asked.shooting) if fitted and asked.shooting is not None else Lanes(*of_runs, asked.loss)

@@ -53,7 +53,7 @@ class Around:
         return ((theta <= limits.low) | (theta >= limits.high)) & ~limits.fixed
 
     def rise(self, b: int, place: int, step: float) -> tuple[float, Minimum]:
-        """By how much F of member `b` rises when one unknown is moved by a step and held there (infinite where the motion fails), and the minimum there."""
+        """How much F of member `b` rises when one unknown is moved by a step and held there (infinite where the motion fails), and the minimum there."""
         theta = self.found.theta[b : b + 1].copy()
         theta[0, place] += step
         fixed = self.limits.fixed.copy()
@@ -63,7 +63,7 @@ class Around:
         return float(at.at.cost[0] - self.found.at.cost[b]), at
 
     def if_free(self, b: int, place: int) -> tuple[float, float]:
-        """Of an unknown at its bound: the standard error that it had if it were free, infinite where it does not show, and the size of the slope of F."""
+        """The standard error that an unknown at its bound had if it were free, infinite where it does not show, and the size of the slope of F."""
         others, estimated, arrow = self.at_bound[b : b + 1], np.flatnonzero(~self.limits.fixed), self.found.at.arrow.at([b])
         others[0, place] = False
         known = information(arrow, self.limits.size(self.found.theta[b : b + 1]), estimated, others, np.zeros(1, bool), self.control.cutoff, True)
@@ -100,7 +100,7 @@ def _look_inward(around: Around, told: AtBounds, b: int, place: int) -> None:
 
 
 def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, places: np.ndarray, labels: tuple[str, ...]) -> list[str]:
-    """Of the first member: which unknowns move further than the `reach` of their interval while one at its bound moves to its limit, one sentence each."""
+    """Says which unknowns of the first member move further than the `reach` of their interval while one at its bound moves to its limit, one sentence each."""
     sentences = []
     for (_, place), there in told.at_limit.items():
         far = [f"`{name}`" for name, shift, most in zip(labels, np.abs(there - theta)[places], reach, strict=True) if shift > most]
@@ -111,7 +111,7 @@ def moved_from_bounds(told: AtBounds, theta: np.ndarray, reach: np.ndarray, plac
 
 
 def too_narrow_near_bounds(around: Around, told: AtBounds, errors: Float[np.ndarray, "unknowns"], labels: tuple[str, ...]) -> list[str]:
-    """Of the first member: which intervals are too narrow, since the squares rise less than `errors` foretell, those of all unknowns that are not fixed.
+    """Says which intervals of the first member are too narrow, since the squares rise less than `errors` foretell, those of all unknowns that are not fixed.
 
     Looked at are bounds that an interval reaches, and where an unknown at its bound may leave it, the ends of the intervals of what runs share.
     """

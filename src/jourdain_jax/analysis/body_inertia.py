@@ -71,7 +71,7 @@ class BodyInertia:
 
     @property
     def labels(self) -> tuple[str, str]:
-        """Of D and of l."""
+        """Names of the entries of D and of l."""
         return f"{self.body} second moment", f"{self.body} shear"
 
     def numbers(self, scene: Scene) -> tuple[Float[Array, "moments"], Float[Array, "shears"]]:

@@ -1,4 +1,4 @@
-"""Channels that are functions of a `Motion`: looked at anew in every fit, and compared by what they compute.
+"""Channels that are functions of a `Motion`: every fit traces them anew, and two are equal that compute the same.
 
 A function is traced where it is handed over. What it closes over becomes arguments, what is left, the operations, is compared by value: a new lambda that
 does the same in every run is one channel, batched and compiled once; a function whose globals have changed is another one.
@@ -75,7 +75,11 @@ def _kept(function: Callable) -> dict:
 
 
 def _traced(function: Callable, scene: Scene) -> Channel:
-    closed, shape = jax.make_jaxpr(lambda motion: function(motion), return_shape=True)(motion_shape(scene))
+    try:
+        closed, shape = jax.make_jaxpr(lambda motion: function(motion), return_shape=True)(motion_shape(scene))
+    except TypeError as error:
+        advice = "write it with `jax.numpy`, without `if` of numbers of the motion, and return one array of numbers"
+        raise ValueError(f"a function of `sensors` cannot be called with a motion ({str(error).splitlines()[0]}); {advice}") from error
     if not hasattr(shape, "shape"):
         raise ValueError(f"a function of `sensors` returned {type(shape).__name__}, expected an array of numbers; return one array")
     return Channel(_one_of_equals(Operations(closed)), tuple(jnp.asarray(x) for x in closed.consts), shape.shape)

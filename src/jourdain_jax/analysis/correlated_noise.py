@@ -28,7 +28,7 @@ _TINY = 1e-7  # of the length of a column: what does not show adds a constant to
 
 
 def chain(weight: Float[Array | np.ndarray, "times *channel"], ts: Float[Array | np.ndarray, "times"], xp=np) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-    """Of each sample of a channel, the time index of the last one before it that is not missing (itself where there is none), and the time between, s.
+    """For each sample of a channel, the time index of the last one before it that is not missing (itself where there is none), and the time between, s.
 
     That time is infinite where there is none, and for samples that are missing. `weight` is zero where a sample is missing. Both have its shape.
     """
@@ -62,7 +62,7 @@ class Chains:
 
     @staticmethod
     def of(weights: Mapping[str, np.ndarray], ts: np.ndarray, taus: Mapping[str, np.ndarray], channels: Mapping[str, slice], has_members: bool) -> "Chains":
-        """From weights (runs, *members, times, *channel), times (runs, times) and correlation times (runs,) of some channels."""
+        """The chains of samples with weights (runs, *members, times, *channel), times (runs, times) and correlation times (runs,) of some channels."""
         before, gap, known, (runs, times) = [], [], [], ts.shape
         for name, where in channels.items():
             weight = weights[name]

@@ -45,7 +45,7 @@ def standard_errors(
     at_bound: Bool[np.ndarray, "*repeats shared"],
     cutoff: float,
 ) -> Float[np.ndarray, "*numbers"]:
-    """Of numbers with these slopes, which have an axis of repeats in front where the information has.
+    """Standard errors of numbers with these slopes, which have an axis of repeats in front where the information has.
 
     NaN for those that depend on a direction that does not show, or on an unknown at a bound.
     """

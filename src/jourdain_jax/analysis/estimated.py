@@ -43,7 +43,7 @@ class ChannelResiduals(Printed, eqx.Module):
 
 
 def summary(run: int, name: str, r: np.ndarray) -> ChannelResiduals:
-    """Of the residuals `r` of a channel, NaN where a sample is missing."""
+    """The summary of the residuals `r` of a channel, NaN where a sample is missing."""
     r = r[~np.isnan(r)]
     mean, rms, largest = (r.mean(), np.sqrt((r**2).mean()), np.abs(r).max()) if r.size else (np.nan,) * 3
     return ChannelResiduals(run, name, r.size, float(mean), float(rms), float(largest))

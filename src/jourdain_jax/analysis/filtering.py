@@ -21,10 +21,10 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.instruments import Instrument
 from jourdain_jax.analysis.joint_prior import Correlated
 from jourdain_jax.analysis.likelihood import as_runs, mapped
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.predictions import Run, equal_runs
 from jourdain_jax.analysis.sensors import Reading, ideal
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_speeds
@@ -44,7 +44,7 @@ _NODES = _NODES + 0.5
 
 
 @shown_from_users_lines
-def filtered_log_likelihood(scene: Scene | BuiltFor, data: Measurements | Sequence[Measurements], *, process_noise: Mapping, **simulation) -> Float[Array, ""]:
+def filtered_log_likelihood(scene: Scene | BuiltFor, data: Experiment | Sequence[Experiment], *, process_noise: Mapping, **simulation) -> Float[Array, ""]:
     """`log_likelihood` of a motion that is disturbed as it goes on, by an extended Kalman filter: a rider or rough ground is no noise of a sensor.
 
     **Arguments**
@@ -68,7 +68,7 @@ def filtered_log_likelihood(scene: Scene | BuiltFor, data: Measurements | Sequen
         jj.filtered_log_likelihood(sleigh, run, process_noise={"heading_rate": 0.01})      # (rad/s)^2 / s
     """
     scene = as_scene(scene)
-    runs = as_runs(scene, data)
+    runs = as_runs(scene, data, simulation)
     _check_supported(scene, runs)
     speeds = privileged_speeds(scene)
     intensities = _intensities(scene, speeds, process_noise)
@@ -98,7 +98,7 @@ class _Filter:
         self.held = (*(scene.coordinate_names.entries[i] for i in self.coordinates), *(scene.speed_names.entries[i] for i in speeds))
 
     def log_likelihood(self, unknown: tuple[str, ...], sigma: Float[Array, "unknown"]) -> Float[Array, ""]:
-        """Of all samples; `sigma`: standard deviations of start values."""
+        """The log-likelihood of all samples; `sigma`: standard deviations of start values."""
         run, begin = self.run, self.begin
         x = self._independent(begin.q, begin.u)
         P = jnp.zeros((x.size, x.size))
@@ -180,7 +180,7 @@ class _Filter:
         return jnp.concatenate(found)
 
 
-def _check_supported(scene: Scene, runs: Sequence[Measurements]) -> None:
+def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
     if scene.coordinates.quaternions:
         raise ValueError(f"`{type(scene).__name__}` has quaternions, whose spread a filter cannot tell yet; use a scene whose coordinates are angles")
     for index, run in enumerate(runs):
@@ -224,7 +224,7 @@ def _intensities(scene: Scene, speeds: tuple[int, ...], given: Mapping) -> Float
     return jnp.stack(list(found.values())) if found else jnp.zeros(0)
 
 
-def _begun(run: Measurements, names: tuple[str, ...]) -> Float[Array, "2 unknown"]:
+def _begun(run: Experiment, names: tuple[str, ...]) -> Float[Array, "2 unknown"]:
     """Means and standard deviations of these start values."""
     known = []
     for name in names:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.sensors import ideal
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import coordinate_rates
@@ -21,7 +21,7 @@ _SAMPLES = 5  # that a parabola goes through
 
 
 def first_nodes(
-    scene: Scene, run: Measurements, ends: Int[np.ndarray, "ends"], q: Float[np.ndarray, "coordinates"], u: Float[np.ndarray, "speeds"], member: int | None
+    scene: Scene, run: Experiment, ends: Int[np.ndarray, "ends"], q: Float[np.ndarray, "coordinates"], u: Float[np.ndarray, "speeds"], member: int | None
 ) -> Float[np.ndarray, "pieces states"]:
     """Nodes at the begin of all pieces of a run, the first one included; q, u: its start. `member`: which of the repeats."""
     ts = np.asarray(run.ts, float)

@@ -42,13 +42,13 @@ class Told(NamedTuple):
 
     @staticmethod
     def of(vector, unknowns: int) -> "Told":
-        """From such a vector."""
+        """The numbers that such a vector holds."""
         each = vector[5 : 5 + 5 * unknowns].reshape(5, unknowns)
         return Told(*(vector[k] for k in range(5)), *(each[k] for k in range(5)), counts=vector[5 + 5 * unknowns :])
 
     @staticmethod
     def length(unknowns: int, samples: int) -> int:
-        """Of such a vector."""
+        """The length of such a vector."""
         return 5 + 5 * unknowns + samples
 
 
@@ -75,7 +75,7 @@ class _At(NamedTuple):
 
     @staticmethod
     def of(vector, n: int) -> "_At":
-        """From such a vector, of NumPy or of JAX, of n unknowns."""
+        """The numbers that such a vector of NumPy or of JAX holds, for n unknowns."""
         ends = [*accumulate((0, 5, n, (n + 1) ** 2, n, ROOM + 1))]
         pace, x, products, d, costs = (vector[begin:end] for begin, end in pairwise(ends))
         return _At(pace, x, products.reshape(n + 1, n + 1), d, costs, *(vector[ends[-1] + k] for k in range(8)))

@@ -6,28 +6,27 @@ by Levenberg-Marquardt. Jacobians come by forward mode through the simulation, r
 Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; G. A. F. Seber and C. J. Wild, Nonlinear Regression (1989), chapter 3.
 """
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from jourdain_jax.analysis.asked import Asked
-from jourdain_jax.analysis.at_bounds import Around, AtBounds, limits_at_bounds
+from jourdain_jax.analysis.at_bounds import AtBounds
 from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.fit_statistics import statistics
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum
 from jourdain_jax.analysis.likelihood import as_runs, in_all_or_none
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Piecewise, Shot
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.analysis.ranges import Range
+from jourdain_jax.analysis.search import minimum, off_bounds, with_memory
 from jourdain_jax.analysis.shooting import MultipleShooting, check_shooting
 from jourdain_jax.analysis.shooting_steps import cutoff_of, shot
 from jourdain_jax.analysis.starts import check_first_guess, check_starts
@@ -39,23 +38,14 @@ from jourdain_jax.scene.names import as_names
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
-_POOR = 10.0  # times the sum of squares that noise alone leaves, one for each sample
-_SPANS = (1 / 32, 1 / 16, 1 / 8, 3 / 16, 1 / 4, 3 / 8, 1 / 2, 3 / 4)  # shares of the span that a fit grows over
-_PATIENCE = 3  # steps within which a fit of whole runs is to make F far smaller, or spans grow
-_STEPS, _ROUGHLY = 8, 1.0  # tried on each of them, and their tolerance
-_FOLLOWED = 100.0  # times the squares that noise leaves, up to which a motion is followed, and a longer span can be next
-_SOME = 12  # steps between two estimates of correlation times
 _SAME = 0.05  # of half the sum of squares, by which the same minimum is found lower from elsewhere
 _FEWEST_RUNS = 5  # that tell how much runs differ
-_WHOLE, _WITH_MEMORY = "whole runs", "whole runs, after a turn of correlation times"  # what is minimised
-_OFF_BOUND = "whole runs, off a bound"
-_TURNS, _SETTLED = 20, 1e-3  # of correlation times and unknowns at most; change of the correlation of neighbouring samples that ends them
 
 
 @shown_from_users_lines
 def fit(
     scene: Scene | BuiltFor,
-    data: Measurements | Sequence[Measurements],
+    data: Experiment | Sequence[Experiment],
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     *,
     cutoff: float = 1e-6,
@@ -88,8 +78,9 @@ def fit(
       unknowns, or within a factor of five of a `positive()` one. The lowest minimum counts; `Fit.agreeing` says how many led to it.
     - `shooting`: `MultipleShooting(duration=...)` or `MultipleShooting(pieces=...)` for unstable and chaotic motions: the runs are fitted in pieces with
       starts of their own, and continuity between them is an equation. What is minimised stays the same.
-    - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events are ignored, and `Fit.warnings` names
-      those that come before a sample.
+    - `simulation`: options of `simulate` such as `rtol`, `atol`, `solver`, `max_steps`. Stop events cut no run: what is given counts, and `Fit.warnings`
+      names those that the fitted motion meets before a sample. Give samples up to where the real motion met one; were runs cut where the fitted one does,
+      estimates whose motion ends early would have fewer residuals.
 
     Where that finds no minimum, or one whose residuals are far beyond their sigmas, the fit is made once more over growing spans (unless `shooting` is
     given): the first 1/32 of each run, then more of it, as far as the motion that was found follows the data, with the first guess as a weak prior (known to
@@ -108,7 +99,7 @@ def fit(
 
         truth, start, ts = jj.models.ChaplyginSleigh(offset=0.25), {"x_rate": 0.6, "heading_rate": 0.9}, jnp.linspace(0.0, 2.0, 21)
         motion = jj.simulate(truth, start, ts=ts)
-        data = jj.Measurements(ts, {"x": motion["x"], "heading": motion["heading"]}, 0.01, start=start)       # sigma: 0.01 m, 0.01 rad
+        data = jj.Experiment(ts, {"x": motion["x"], "heading": motion["heading"]}, 0.01, start=start)       # sigma: 0.01 m, 0.01 rad
         found = jj.fit(jj.models.ChaplyginSleigh(), data, free={"offset": jj.bounds(0.05, 1.0)})
         print(found)                                              # estimates with 95 % intervals, and what the data cannot tell
         found["offset"].value, found.scene.offset                 # near 0.25 m
@@ -120,7 +111,7 @@ def fit(
 
 def fit_batch(
     scene: Scene | BuiltFor,
-    data: Measurements | Sequence[Measurements],
+    data: Experiment | Sequence[Experiment],
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     *,
     cutoff: float = 1e-6,
@@ -140,14 +131,14 @@ def fit_batch(
 
 
 def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | None, errors: str, repeats: bool, guesses: int = 1, shooting=None) -> Fit:
-    scene = as_scene(scene)
+    scene, data = as_scene(scene), tuple(data) if isinstance(data, Iterator) else data
     if is_traced((scene, data, control.tolerance, control.cutoff, simulation)):
         raise DifferentiationModeError(
             "`fit` was called inside jit, vmap or a derivative, but its steps are chosen outside of compiled code. Call it with known numbers; "
             "for many repeats use `fit_batch`, for derivatives of the fit's objective `log_likelihood`."
         )
     _check_control(control)
-    runs = as_runs(scene, data, repeats=repeats)
+    runs = as_runs(scene, data, simulation, repeats=repeats)
     _check_choices(runs, loss, errors)
     check_shooting(shooting)
     free = free if isinstance(free, Mapping) else tuple(as_names(free))
@@ -162,7 +153,7 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
     theta = unknowns.first_guesses(guesses) if members is None else np.broadcast_to(unknowns.guess, (members, unknowns.guess.size))
     limits = Limits(*unknowns.ends, unknowns.fixed, unknowns.sizes)
     if pieces is None:
-        found = _minimum(problem, theta, limits, control, one_will_do=members is None)
+        found = minimum(problem, theta, limits, control, one_will_do=members is None)
     else:
         found = shot(problem, pieces, theta, limits, control)
     if not all(np.isfinite(trace[0][1][0]) for trace in found.trace):
@@ -173,89 +164,10 @@ def _fit(scene, data, free, simulation: dict, control: Control, loss: Loss | Non
             pieces.keep(int(np.argmin(found.at.cost)))
         control = replace(control, cutoff=cutoff_of(pieces, control, np.arange(len(pieces.at.theta))))
         asked = replace(asked, control=control)
-    found, at_bounds = _off_bounds(problem, _with_memory(problem, found if members else found.lowest(), limits, control), limits, control, pieces)
+    found, at_bounds = off_bounds(problem, with_memory(problem, found if members else found.lowest(), limits, control), limits, control, pieces)
     if pieces is not None:
         found.converged &= pieces.closed(np.arange(len(found.converged)))
     return _result(problem, found, limits, at_bounds, asked, errors, guesses, same, None if pieces is None else pieces.told())
-
-
-def _minimum(problem: "Problem", theta: np.ndarray, limits: Limits, control: Control, one_will_do: bool) -> Minimum:
-    """The minimum from each `theta`; where none is found, or residuals are far beyond their sigmas, the lower one of it and that over growing spans.
-
-    Over a short span a motion depends on its unknowns almost linearly, also an unstable one; each fit begins where that over the shorter span ended, and what
-    a short span does not tell stays near the first guess. After a few steps, what is far off gives way to growing spans, and goes on only where these do not
-    lead to small residuals either. `one_will_do`: spans grow only where no theta led to a minimum with small residuals.
-    """
-    samples = problem.samples
-    few = replace(control, most_steps=min(_STEPS, control.most_steps), patience=_PATIENCE, near=0.5 * _POOR * samples)
-    rest = replace(control, most_steps=control.most_steps - few.most_steps)
-    in_parts = samples > 0 and not (one_will_do and len(theta) > 1)
-    found = problem.minimum(theta, np.arange(len(theta)), limits, few if in_parts else control, _WHOLE)
-    unfinished = ~found.converged & ~found.stuck & in_parts & (rest.most_steps > 0)
-
-    def of(members: np.ndarray, begin: np.ndarray, how: Control) -> Minimum:
-        return problem.minimum(begin, members, limits, how, _WHOLE)
-
-    def far() -> np.ndarray:
-        return found.at.cost > 0.5 * _POOR * samples
-
-    if (near := np.flatnonzero(unfinished & ~far())).size:
-        found, unfinished[near] = found.replaced(near, of(near, found.theta[near], rest)), False
-    poor = np.flatnonzero(~found.converged | far())
-    if not poor.size or not samples or (one_will_do and np.argmin(found.at.cost) not in poor):
-        return found
-    ended, begin, steps, place = found.theta.copy(), theta[poor], found.steps[poor], np.zeros(len(poor), int)
-    trace = found.trace[poor]
-    problem.begun, problem.shares = theta, np.ones(len(theta))
-    while (some := np.flatnonzero(place < len(_SPANS))).size:
-        problem.shares[poor[some]] = np.array(_SPANS)[place[some]]
-        grown = of(poor[some], begin[some], replace(few, tolerance=_ROUGHLY, patience=None))
-        begin[some], steps[some] = grown.theta, steps[some] + grown.steps
-        for i, (_, costs), k in zip(some.tolist(), (of_one[0] for of_one in grown.trace), place[some].tolist(), strict=True):
-            trace[i] += ((f"the first {_SPANS[k]:.3g} of each run", costs),)
-        place[some] += 1
-        followed = problem.is_followed(grown.at, np.array(_SPANS), _FOLLOWED)
-        for k in range(1, len(_SPANS)):
-            place[some] += (place[some] == k) & followed[:, k]  # the next one is followed, and left out
-    problem.shares = None
-    grown = of(poor, begin, control)
-    steps, trace = steps + grown.steps, trace + grown.trace
-    found = found.lowered(poor, replace(grown, steps=steps, trace=trace, grown=np.ones(len(poor), bool)))
-    if (late := np.flatnonzero(unfinished & (~found.converged | far()))).size:
-        more = of(late, ended[late], rest)
-        found = found.lowered(late, replace(more, steps=found.steps[late] + more.steps, trace=found.trace[late] + more.trace))
-    return found
-
-
-def _with_memory(problem: Problem, found: Minimum, limits: Limits, control: Control) -> Minimum:
-    """The minimum with the correlation times of the noise estimated: these and the unknowns take turns, from what was found as if the noise were white."""
-    if not problem.with_memory:
-        return found
-    going = np.flatnonzero(np.isfinite(found.at.cost))
-    some = replace(control, most_steps=min(_SOME, control.most_steps))
-    for _ in range(_TURNS):
-        if not going.size:
-            break
-        changed = problem.restrict(found.theta[going], going)
-        again = problem.minimum(found.theta[going], going, limits, some, _WITH_MEMORY)
-        found = found.replaced(going, again)
-        going = going[(changed > _SETTLED) | ~again.converged]
-    found.converged[going] = False
-    return found
-
-
-def _off_bounds(problem: Problem, found: Minimum, limits: Limits, control: Control, pieces: Piecewise | None) -> tuple[Minimum, AtBounds]:
-    """The minimum, gone on from where unknowns at a bound let it be lower away from it; and what is known of those that stay."""
-    for _ in range(_TURNS):
-        with nullcontext() if pieces is None else pieces.unmoved():
-            told = limits_at_bounds(Around(problem.linearised, found, limits, control))
-        if not told.lower:
-            break
-        members = np.array(list(told.lower))
-        again = problem.minimum(np.stack([theta for _, theta in told.lower.values()]), members, limits, control, _OFF_BOUND)
-        again = replace(again, steps=found.steps[members] + again.steps, trace=found.trace[members] + again.trace, grown=found.grown[members])
-        found = _with_memory(problem, found.lowered(members, again), limits, control)
-    return found, told
 
 
 def _check_control(control: Control) -> None:
@@ -267,7 +179,7 @@ def _check_control(control: Control) -> None:
         raise ValueError(f"`max_iterations` is {control.most_steps!r}, expected a whole number of steps")
 
 
-def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:
+def _check_choices(runs: Sequence[Experiment], loss, errors) -> None:
     if loss is not None and not isinstance(loss, Loss):
         raise ValueError(f"`loss` is {loss!r}, expected `huber()`, `student_t()`, or None for least squares")
     if errors not in ("sigmas", "runs"):
@@ -285,18 +197,22 @@ def _check_choices(runs: Sequence[Measurements], loss, errors) -> None:
     in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
 
 
-def _repeats(runs: Sequence[Measurements]) -> int:
+def _repeats(runs: Sequence[Experiment]) -> int:
     counts = {values.shape[0] for run in runs for values in run.values.values()}
     if len(counts) != 1 or 0 in counts:
         raise ValueError(f"the channels hold {sorted(counts)} repeats; give every channel of every run the same leading axis, of one or more")
     return counts.pop()
 
 
-def _check_enough(runs: Sequence[Measurements], unknowns: Unknowns, repeats: bool) -> None:
-    samples = sum(math.prod(values.shape[int(repeats) :]) for run in runs for values in run.values.values()) + len(unknowns.with_prior)
-    if samples < len(unknowns.labels):
+def _check_enough(runs: Sequence[Experiment], unknowns: Unknowns, repeats: bool) -> None:
+    known = [np.isfinite(values) & np.isfinite(run.sigma_of(name, repeats)) for run in runs for name, values in run.values.items()]
+    counts = [one.reshape(*one.shape[: int(repeats)], -1).sum(axis=-1) for one in known]
+    samples, sigmas = int(np.max(sum(counts))) + len(unknowns.with_prior), len({name for run in runs for name in run.unknown_sigma})
+    if samples < len(unknowns.labels) + sigmas:
+        and_sigmas = f" and {sigmas} sigmas" if sigmas else ""
         raise ValueError(
-            f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns; measure more, or free fewer of {', '.join(unknowns.labels)}"
+            f"{samples} measured values cannot determine {len(unknowns.labels)} unknowns{and_sigmas}; measure more, or free fewer of "
+            f"{', '.join(unknowns.labels)}"
         )
 
 

@@ -41,7 +41,7 @@ def fit_page(
     bootstrap=None,
     units: Mapping[str, str] | None = None,
 ) -> str:
-    """The page of a `Fit` of one experiment; `fitted` and `held_out`: predictions by run, `bootstrap`: a fit of repeats, `units`: of channels."""
+    """The page of a `Fit` of one experiment; `fitted` and `held_out`: predictions by run, `bootstrap`: of repeats, `units`: of channels."""
     name = type(fit.scene).__name__
     profiles, units = profiles or {}, units or {}
     parts = [f"<h1>Fit of {html.escape(name)}</h1>", *_summary(fit), "<h2>Estimates</h2>", _estimates(fit, profiles, bootstrap), interval_widths(fit)]
@@ -102,16 +102,15 @@ def _estimates(fit, profiles: Mapping[str, Profile], bootstrap) -> str:
         if profiles:
             one = profiles.get(name)
             row += ["-"] * 3 if one is None else [one.kind, *(_end(x, closed) for x, closed in zip((one.low, one.high), one.is_closed, strict=True))]
-        if bootstrap is not None:
-            drawn = np.asarray(bootstrap.values)[np.asarray(bootstrap.converged), i]
-            row += [f"{x:.6g}" for x in np.quantile(drawn, (0.025, 0.975))] if drawn.size else ["-", "-"]
+        row += [_number(x) for x in (bootstrap[name].low, bootstrap[name].high)] if bootstrap is not None else []
         rows.append(tuple(row))
     tied = [_estimate(f"{name} (tied)", e) for name, e in fit.tied.items() if e.value.ndim == 0]
     rows += [(*row, *["-"] * (len(heads) - len(row))) for row in tied]
     more = ""
     if bootstrap is not None:
         good = int(np.sum(bootstrap.converged))
-        more = _note(f"Bootstrap: 2.5 and 97.5 % quantiles of {good} fits of samples drawn anew; {len(bootstrap.values) - good} did not converge.")
+        more = _note(f"Bootstrap: 2.5 and 97.5 % quantiles of {good} fits of repeats; {len(bootstrap.values) - good} did not converge.")
+        more += "".join(f'<p class="warning">{_words(sentence)}</p>' for sentence in bootstrap.warnings)
     return _table("estimates", tuple(heads), rows) + more
 
 

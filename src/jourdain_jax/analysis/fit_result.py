@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.analysis.asked import Asked, taken_up
+from jourdain_jax.analysis.bootstrap import Bootstrap, bootstrap
 from jourdain_jax.analysis.derived import derived, standard_errors
 from jourdain_jax.analysis.estimated import ChannelResiduals, Estimated, summary
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.fit_page import fit_page
 from jourdain_jax.analysis.fit_pictures import interval_widths
 from jourdain_jax.analysis.fit_statistics import Statistics
@@ -21,10 +23,10 @@ from jourdain_jax.analysis.information import Information, hidden_combinations
 from jourdain_jax.analysis.informed import informed
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Shot
 from jourdain_jax.analysis.weak_directions import CORRELATED, weak_combinations
 from jourdain_jax.build.plausibility import impossible_bodies
+from jourdain_jax.calculus.reals import described
 from jourdain_jax.scene.names import UnknownNameError, as_names, nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
@@ -110,7 +112,7 @@ class Fit(Printed):
 
     @property
     def residuals(self) -> tuple[dict[str, Float[np.ndarray, "..."]], ...]:
-        """Of each run by channel, (times, *channel): (prediction - value) / sigma; NaN where missing."""
+        """Residuals of each run by channel, (times, *channel): (prediction - value) / sigma; NaN where missing."""
         return self.statistics.residuals
 
     @property
@@ -166,8 +168,8 @@ class Fit(Printed):
 
     @property
     def reduced_chi_square(self) -> Float[np.ndarray, "*repeats"]:
-        """Sum of squared residuals per degree of freedom: near 1 where scene and sigmas are right."""
-        return np.asarray(self.chi_square / self.degrees_of_freedom)
+        """Sum of squared residuals per degree of freedom, near 1 where scene and sigmas are right; NaN where there are as many unknowns as samples."""
+        return np.asarray(self.chi_square / np.where(self.degrees_of_freedom > 0, self.degrees_of_freedom, np.nan))
 
     # Of one fit, not of a batch. -----------------------------------------------------------------------------------
 
@@ -213,7 +215,7 @@ class Fit(Printed):
 
     @property
     def autocorrelation(self) -> dict[str, tuple[float, float]]:
-        """Of each channel, the correlation of neighbouring whitened residuals over all runs, and what white ones hardly exceed (3.5 / sqrt(pairs))."""
+        """For each channel, the correlation of neighbouring whitened residuals over all runs, and what white ones hardly exceed (3.5 / sqrt(pairs))."""
         found = {}
         for name in dict.fromkeys(name for run in self.whitened for name in run):
             runs = [np.asarray(run[name]).reshape(len(run[name]), -1) for run in self.whitened if name in run]
@@ -255,7 +257,7 @@ class Fit(Printed):
         units = {name: about["unit"] for name, _, about in parameters_of(self.asked.scene)}
         return {name: self.derived(lambda scene, name=name: getattr(scene, name), units[name]) for name in self.layout.following}
 
-    def profiles(self, data: Measurements | Sequence[Measurements], names: str | Iterable[str] = ()) -> dict[str, Profile]:
+    def profiles(self, data: Experiment | Sequence[Experiment], names: str | Iterable[str] = ()) -> dict[str, Profile]:
         """The profile likelihood of the unknowns in `names` (default: all that are not of one run alone), by name: how far each may be moved, all others
         being fitted anew, before 2 (F - F_min) reaches 3.84, and whether that is "bounded", "one-sided" or "flat". `data`: the runs fitted.
 
@@ -268,7 +270,23 @@ class Fit(Printed):
         inflation = float(fitted.problem.inflation(self.residuals, self.samples, self.information.rank)[0])
         return profiles(fitted, as_names(names) or of_all, dict(zip(self.labels, self.standard_errors.tolist(), strict=True)), inflation)
 
-    def predict(self, runs: Measurements | Sequence[Measurements]) -> tuple[dict[str, Prediction], ...]:
+    def bootstrap(self, data: Experiment | Sequence[Experiment], repeats: int = 1000, *, seed: int = 0, noise: str = "sigmas") -> Bootstrap:
+        """The parametric bootstrap: measurements of so many repeats of the experiment, drawn about what the fit predicts, and fitted side by side.
+
+        `data`: the runs fitted. Noise is drawn as the fit takes it: of the sigmas, given or estimated; with its correlation times; of Student's t under that
+        loss. `noise="residuals"` draws it from the whitened residuals of each channel, whatever their sigmas and distribution. What is missing, start values
+        and inputs stay, means of priors are drawn anew. Repeats begin from the estimates, so that minima far away are not looked for.
+
+        **Returns** estimates with standard errors and 95 % intervals (quantiles) of the repeats, their bias, `converged` and `at_bound` of each, and
+        `warnings`. 1000 repeats tell an end of an interval to a tenth of a standard error; the same `seed` gives the same ones.
+
+        **Raises** ValueError for a fit of a batch, one that failed or has not converged, other data than the fit's, `errors="runs"`, and noise that `huber()`
+        does not state.
+        """
+        self._check_one()
+        return bootstrap(self, data, repeats, seed, noise)
+
+    def predict(self, runs: Experiment | Sequence[Experiment]) -> tuple[dict[str, Prediction], ...]:
         """What the fit predicts for `runs` that had no part in it, by channel: `prediction`, `error`, `rms` (in the unit of the channel) and `r_squared`.
 
         What all runs share is held at its estimate; start values that are unknown, and numbers of sensors of each run, are fitted to the run itself.
@@ -280,11 +298,11 @@ class Fit(Printed):
     def report(
         self,
         path: str | os.PathLike,
-        data: Measurements | Sequence[Measurements] = (),
+        data: Experiment | Sequence[Experiment] = (),
         *,
-        held_out: Measurements | Sequence[Measurements] = (),
+        held_out: Experiment | Sequence[Experiment] = (),
         profiles: "bool | str | Iterable[str] | Mapping[str, Profile]" = False,
-        bootstrap: "Fit | None" = None,
+        bootstrap: "bool | Bootstrap" = False,
         units: Mapping[str, str] | None = None,
     ) -> None:
         """Write this fit as one HTML file that loads nothing from elsewhere: estimates, warnings, what the data do not tell, correlations, residuals, the way
@@ -294,12 +312,12 @@ class Fit(Printed):
           told which run, channel and time span informs which unknown: shares a_k^2 / sum a^2, a = C J', of the variance of the estimate.
         - `held_out`: other runs, which are predicted as by `predict`.
         - `profiles`: True or names, to compute them now; or what `profiles` returned.
-        - `bootstrap`: a `fit_batch` of the same unknowns, of samples drawn anew; its 2.5 and 97.5 % quantiles stand beside the intervals.
+        - `bootstrap`: True, or what `bootstrap` returned, whose intervals stand beside those of standard errors.
         - `units`: channel -> its unit, for labels, such as `{"x": "m"}`; a scene knows the units of its parameters only.
 
-        ValueError for a path that is no .html file, a fit of a batch or one that failed, other data than the fit's, and a bootstrap of other unknowns.
+        ValueError for a path that is no .html file, a fit of a batch or one that failed, other data than the fit's, and the bootstrap of another fit.
         """
-        runs, others = ((x,) if isinstance(x, Measurements) else tuple(x) for x in (data, held_out))
+        runs, others = ((x,) if isinstance(x, Experiment) else tuple(x) for x in (data, held_out))
         if not str(path).lower().endswith((".html", ".htm")):
             raise ValueError(f"cannot write `{os.fspath(path)}`: the report of a fit is a .html file")
         self._check_one()
@@ -308,10 +326,10 @@ class Fit(Printed):
             raise ValueError(
                 f"`data` has {len(runs)} runs with channels {shapes(run.values for run in runs)}, expected those of the fit: {shapes(self.residuals)}"
             )
-        if bootstrap is not None and (bootstrap.labels != self.labels or bootstrap.values.ndim != 2):
-            raise ValueError(f"`bootstrap` is a fit of {', '.join(bootstrap.labels)}; expected a `fit_batch` of {', '.join(self.labels)}")
-        if profiles and not runs and not isinstance(profiles, Mapping):
-            raise ValueError("`profiles` are computed from the runs that were fitted; give them as `data`")
+        if not isinstance(bootstrap, bool) and not (isinstance(bootstrap, Bootstrap) and np.array_equal(bootstrap.fit.values, self.values)):
+            raise ValueError(f"`bootstrap` is {described(bootstrap)}, expected True, or what `bootstrap` of this fit returned")
+        if not runs and ((profiles and not isinstance(profiles, Mapping)) or bootstrap is True):
+            raise ValueError("profiles and a bootstrap are computed from the runs that were fitted; give them as `data`")
         along = profiles if isinstance(profiles, Mapping) else self.profiles(runs, () if profiles is True else profiles) if profiles else {}
         page = fit_page(
             self,
@@ -319,7 +337,7 @@ class Fit(Printed):
             shares=informed(taken_up(self, runs), MOST_INFORMED) if runs else None,
             held_out=self.predict(others) if others else (),
             profiles=along,
-            bootstrap=bootstrap,
+            bootstrap=self.bootstrap(runs) if bootstrap is True else bootstrap or None,
             units=units or {},
         )
         with open(path, "w", encoding="utf-8") as file:
@@ -327,7 +345,7 @@ class Fit(Printed):
 
     def _check_one(self) -> None:
         if self.values.ndim > 1 or not np.isfinite(self.chi_square):
-            raise ValueError("there is a report of one fit whose motion does not fail; of a batch, and of a failed fit, see `print`")
+            raise ValueError("this is told of one fit whose motion does not fail; of a batch, and of a failed fit, see `print`")
 
     def _repr_html_(self) -> str:
         one = self.values.ndim == 1 and np.isfinite(self.chi_square)

@@ -16,7 +16,7 @@ from jourdain_jax.analysis.at_bounds import Around, AtBounds, moved_from_bounds,
 from jourdain_jax.analysis.events_met import events_met
 from jourdain_jax.analysis.information import Information, information, students_t_95
 from jourdain_jax.analysis.levenberg_marquardt import LEAST, Limits, Minimum
-from jourdain_jax.analysis.measurements import held_inputs
+from jourdain_jax.analysis.oddities import oddities
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.scene.scene import Scene
 
@@ -44,15 +44,15 @@ class Statistics:
     chi_square: Float[np.ndarray, "*repeats"]
     samples: Int[np.ndarray, "*repeats"]
     from_prior: Float[np.ndarray, "*repeats unknowns"]  # in standard deviations of the prior; NaN where there is none
-    held_inputs: tuple[str, ...]  # sentences about inputs that are not sampled over all of a run
+    oddities: tuple[str, ...]  # sentences about what is odd in the runs
     events_met: tuple[str, ...]  # sentences about events before the end of a run; none in a batch, and where runs were fitted in pieces
     too_narrow: tuple[str, ...]  # sentences about intervals that bounds make too narrow; none in a batch
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of unknowns that no bound kept from growing beyond all measure
 def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, errors: str, at_bounds: AtBounds) -> Statistics:
-    """Of the minimum of each member; without the axis of members where the problem has none."""
-    control, looked_at = asked.control, problem.lanes.members is None and bool(found.converged[0])  # what takes further motions
-    unknowns, theta, single = problem.unknowns, found.theta, problem.lanes.members is None
+    """Statistics of the minimum of each member; without the axis of members where the problem has none."""
+    control, unknowns, theta, single = asked.control, problem.unknowns, found.theta, problem.lanes.members is None
     one = (lambda x: np.asarray(x[0])) if single else (lambda x: x)
     places, size, fails = unknowns.estimated, unknowns.sizes(theta), ~np.isfinite(found.at.cost)
     low, high = limits.low[places], limits.high[places]
@@ -76,7 +76,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
         known, quantiles = known.between_runs(one(found.at.arrow.scores)), students_t_95(len(problem.runs) - 1)
     reach = quantiles * known.standard_errors
     too_narrow = []
-    if looked_at:
+    if single and found.converged[0]:
         too_narrow = moved_from_bounds(at_bounds, theta[0], reach, places, unknowns.labels)
         if errors == "sigmas":
             too_narrow += too_narrow_near_bounds(Around(problem.linearised, found, limits, control), at_bounds, plain, unknowns.labels)
@@ -102,8 +102,8 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
         chi_square=np.where(one(fails), np.nan, sum(_sum_of_squares(r, single) for run in white for r in run.values())),
         samples=np.asarray(samples),
         from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
-        held_inputs=held_inputs(problem.scene, problem.runs),
-        events_met=events_met(problem, theta[0], asked.simulation) if looked_at and asked.shooting is None else (),
+        oddities=oddities(problem.scene, problem.runs, not single),
+        events_met=events_met(problem, theta[0], asked.simulation) if single and not fails[0] and asked.shooting is None else (),
         too_narrow=tuple(too_narrow),
     )
 

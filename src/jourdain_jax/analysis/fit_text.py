@@ -7,8 +7,9 @@ from jourdain_jax.analysis.table import table
 MOST_NAMED = 8  # combinations of unknowns that are told poorly, pairs that correlate
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def text(fit) -> str:
-    """Of a fit of one experiment: estimates with their intervals, warnings, what the data do not tell, residuals by channel."""
+    """The text of a fit of one experiment: estimates with their intervals, warnings, what the data do not tell, residuals by channel."""
     lines = [
         f"Fit of {type(fit.scene).__name__}: {'converged' if fit.converged else 'NOT CONVERGED'} in {int(fit.steps)} steps; "
         f"{int(fit.samples)} samples, {len(fit.labels)} unknowns, reduced chi-square {float(fit.reduced_chi_square):.4g}"
@@ -48,7 +49,7 @@ def _row(name: str, e, remark: str) -> tuple[str, ...]:
 
 
 def batch_text(fit) -> str:
-    """Of many fits: mean and spread of the estimates that converged."""
+    """The text of many fits: mean and spread of the estimates that converged."""
     good = np.asarray(fit.converged)
     rows = [("unknown", "unit", "mean", "std. deviation", "mean std. error")]
     for name, e in fit.estimates.items():

@@ -14,7 +14,7 @@ _SURE = 5.0  # standard deviations: a mean square that is further from 1 is no c
 
 
 def warnings_of(fit) -> tuple[str, ...]:
-    """Of a fit of one experiment, the most serious reason first, one sentence each."""
+    """Warnings of a fit of one experiment, the most serious reason first, one sentence each."""
     if not np.isfinite(fit.chi_square):
         return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`",)
     found = []
@@ -33,7 +33,7 @@ def warnings_of(fit) -> tuple[str, ...]:
         found.append(f"{', '.join(names)} {verb}; all standard errors lose their meaning: widen the bounds")
     found += fit.impossible
     found += fit.statistics.events_met
-    found += fit.statistics.held_inputs
+    found += fit.statistics.oddities
     found += fit.statistics.too_narrow
     found += _counted_twice(fit)
     if fit.guesses > 1 and fit.converged and fit.agreeing == 1:
@@ -88,8 +88,8 @@ def _by_chance(spread: float, deviations: float) -> float:
 
 
 def _sizes_of_residuals(fit) -> list[_Size]:
-    """Of all channels whose sigmas are known together, then one by one; under a robust loss that of most residuals, since some are far out."""
-    robust, determined = fit.asked.loss is not LEAST_SQUARES, int(fit.samples - fit.degrees_of_freedom)
+    """Sizes of the residuals of all channels whose sigmas are known, then of one by one; under a robust loss those of most, since some are far out."""
+    robust, determined = fit.asked.loss != LEAST_SQUARES, int(fit.samples - fit.degrees_of_freedom)
     names = [name for name in dict.fromkeys(name for run in fit.whitened for name in run) if name not in fit.sigma]
     found = []
     for channels in (names, *([name] for name in names)):

@@ -54,13 +54,13 @@ def _row_change(scene, t, q, u, direction, dq, inputs, typical):
     return value, change, jnp.max(jnp.abs(value), initial=1.0)
 
 
-def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], ways: tuple[str, ...], seed: int) -> list[Check]:
+def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds columns"], names: tuple[str, ...], seed: int) -> list[Check]:
     """Along one random direction: admissible (`Z`) in the coordinates, free in the speeds, relative in the parameters; for every reduction.
 
     None where no reduction applies.
     """
-    ways = tuple(name for name in ways if name != "gibbs-appell")  # its Hessian of a Hessian costs more than all others together
-    if not ways:
+    names = tuple(name for name in names if name != "gibbs-appell")  # its Hessian of a Hessian costs more than all others together
+    if not names:
         return []
     generator = np.random.default_rng(seed)
     moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
@@ -75,7 +75,7 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
             note = "left out: the rows lose rank at this very state, and accelerations have no derivative there"
             return [check(name, {}, u.dtype, note) for name in ("jvp against vjp", "differences")]
         note = "parameters left out: a change of them splits rows that are dependent, and accelerations have no derivative there"
-    arguments = (ways, weights, t, inputs, fixed, usual_rows(scene))
+    arguments = (names, weights, t, inputs, fixed, usual_rows(scene))
     point, direction = (moving, q, u), (relative, dq, du)
     forward, size = _forward(arguments, point, direction)
     reverse = _reverse(arguments, point, direction)
@@ -83,7 +83,7 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
     h = DIFFERENCE_STEP[u.dtype.name] / (1 + float(jnp.max(jnp.abs(u), initial=0.0)))
     along = [_outcome_of_numbers(arguments, jax.tree.map(lambda x, d, k=k: x + k * h * d, point, direction)) for k in (-2, -1, 1, 2)]
     difference = central_difference(along, h)
-    by_way = lambda error: {f"reduction `{name}`": float(e) for name, e in zip(ways, np.asarray(error / size), strict=True)}  # noqa: E731
+    by_way = lambda error: {f"reduction `{name}`": float(e) for name, e in zip(names, np.asarray(error / size), strict=True)}  # noqa: E731
     return [
         check("jvp against vjp", by_way(jnp.abs(forward - reverse)), u.dtype, note),
         check("differences", by_way(jnp.abs(forward - difference)), u.dtype, note),
@@ -92,12 +92,12 @@ def gradient_checks(scene: Scene, t, q, u, inputs, Z: Float[Array, "speeds colum
 
 def _outcome(arguments, point) -> Float[Array, "reductions"]:
     """A random combination of accelerations and constraint forces, by every reduction."""
-    ways, weights, t, inputs, fixed, usual = arguments
+    names, weights, t, inputs, fixed, usual = arguments
     parameters, q, u = point
     scene = eqx.combine(parameters, fixed)
     equations, rows = equations_and_rows(scene, t, q, u, inputs)
     rows = rows.judged_by(usual)
-    found = [by_reduction(reductions(scene)[way], scene, t, q, u, equations, rows) for way in ways]
+    found = [by_reduction(reductions(scene)[way], scene, t, q, u, equations, rows) for way in names]
     return jnp.stack([weights @ jnp.concatenate([a.udot, a.constraint_force]) for a in found])
 
 

@@ -43,13 +43,13 @@ class Information:
 
     @property
     def covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
-        """Of all unknowns, in their units; NaN where not identifiable."""
+        """The covariance of all unknowns, in their units; NaN where not identifiable."""
         both = self.identifiable[..., :, None] & self.identifiable[..., None, :]
         return np.where(both, self.whole_covariance, np.nan)
 
     @cached_property
     def whole_covariance(self) -> Float[np.ndarray, "*members unknowns unknowns"]:
-        """Of all unknowns, in their units, along the directions that show."""
+        """The covariance of all unknowns, in their units, along the directions that show."""
         runs, m, p = self.follow.shape[-3:]
         G = np.concatenate([np.broadcast_to(np.eye(p), (*self.shared.shape[:-2], p, p)), -self.follow.reshape(*self.follow.shape[:-3], runs * m, p)], axis=-2)
         whole = G @ self.shared @ np.swapaxes(G, -1, -2)
@@ -60,14 +60,14 @@ class Information:
         return whole[..., places[:, None], places]
 
     def times(self, factor: Float[np.ndarray, "*members"]) -> "Information":
-        """With all covariances multiplied by this factor."""
+        """The information with all covariances multiplied by this factor."""
         if np.all(factor == 1):
             return self
         f = factor[..., None]
         return replace(self, standard_errors=self.standard_errors * np.sqrt(f), shared=self.shared * f[..., None], own=self.own * f[..., None, None])
 
     def between_runs(self, scores: Float[np.ndarray, "*members runs shared"]) -> "Information":
-        """With the covariance of the shared unknowns from how much runs differ: C (sum g g') C n / (n - 1), g: scores of n runs, C: the covariance so far.
+        """Takes the covariance of the shared unknowns from how much runs differ: C (sum g g') C n / (n - 1), g: scores of n runs, C: the covariance so far.
 
         Own unknowns follow the shared ones; the spread of their own noise stays as it is. Source: K.-Y. Liang and S. L. Zeger, Biometrika 73 (1986) 13.
         """

@@ -40,7 +40,7 @@ class Accelerometer(Instrument):
     """Three accelerometers at a point of a body, along its axes: the specific force `R' (a - g)` in m/s^2, at rest upwards by g.
 
         imu = jj.Sensor(jj.Accelerometer("frame", (0.3, 0.0, 0.1)), bias=jj.Estimate((0.0, 0.0, 0.0)))
-        jj.Measurements(ts, {"imu": a}, 0.1, start=start, sensors={"imu": imu})                        # a: (times, 3), m/s^2
+        jj.Experiment(ts, {"imu": a}, 0.1, start=start, sensors={"imu": imu})                        # a: (times, 3), m/s^2
 
     - `body`: its name. `point`: where it sits, in m, in the body's frame, from its mass centre.
     - `gravity`: g in m/s^2, in the inertial frame.
@@ -84,7 +84,7 @@ class Accelerometer(Instrument):
 class LoadCell(Instrument):
     """A load cell under a rolling contact: the force of the ground on the body, in N.
 
-        jj.Measurements(ts, {"plate": force}, 2.0, start=start, sensors={"plate": jj.LoadCell("front")})                # force: (times, 3), N
+        jj.Experiment(ts, {"plate": force}, 2.0, start=start, sensors={"plate": jj.LoadCell("front")})                # force: (times, 3), N
 
     - `contact`: its name.
 

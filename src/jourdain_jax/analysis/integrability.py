@@ -47,8 +47,8 @@ class Growth:
     holonomic_rows_together: int | None  # all coordinates less the last dimension, at most the rank; None where not closed
 
 
-def row_integrability(scene: Scene, *, points: int = 6, seed: int = 0) -> RowIntegrability:
-    """Frobenius' criterion for every row by itself, at random admissible states of the scene's domain.
+def row_integrability(scene: Scene) -> RowIntegrability:
+    """Frobenius' criterion for every row by itself, at six random admissible states of the scene's domain.
 
     The violation is the largest value of the two-form dw on unit velocities that w admits, over all states, divided by the size
     of w and of its derivatives. Below 1e-9 (1e-4 in single precision) a row counts as integrable.
@@ -56,7 +56,7 @@ def row_integrability(scene: Scene, *, points: int = 6, seed: int = 0) -> RowInt
     names = structure_of(scene).row_names
     if not names:
         return RowIntegrability((), (), {})
-    t, q, u = (np.asarray(x, float) for x in sample_states(scene, points, seed))
+    t, q, u = (np.asarray(x, float) for x in sample_states(scene, 6))
     forms, derivatives, frames, nonlinear = _forms_at(RowsOverStates(scene), np.concatenate([t[:, None], q], axis=1), u)
     limit = INTEGRABLE if jnp.result_type(float) == jnp.float64 else 1e-4
     violations = {}
@@ -103,16 +103,16 @@ def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def _derivative_of_inverse(N: np.ndarray, inverse: np.ndarray, dN: np.ndarray) -> np.ndarray:
-    """Of the pseudo-inverse: `-N+ dN N+ + N+ N+' dN' (1 - N N+) + (1 - N+ N) dN' N+' N+` (Golub and Pereyra)."""
+    """The derivative of the pseudo-inverse: `-N+ dN N+ + N+ N+' dN' (1 - N N+) + (1 - N+ N) dN' N+' N+` (Golub and Pereyra)."""
     down, across = np.swapaxes(dN, 1, 2), np.swapaxes(inverse, 1, 2)
-    outside, unseen = np.eye(N.shape[1]) - N @ inverse, np.eye(N.shape[2]) - inverse @ N
-    return -inverse @ dN @ inverse + inverse @ across @ down @ outside + unseen @ down @ across @ inverse
+    off_range, of_null_space = np.eye(N.shape[1]) - N @ inverse, np.eye(N.shape[2]) - inverse @ N
+    return -inverse @ dN @ inverse + inverse @ across @ down @ off_range + of_null_space @ down @ across @ inverse
 
 
-def growth_vector(scene: Scene, *, depth: int = 4, points: int = 2, seed: int = 0) -> Growth:
+def growth_vector(scene: Scene, *, depth: int = 4) -> Growth:
     """Growth vector of the admissible velocities at generic states, by brackets of at most `depth` fields.
 
-    Of the states tried, the one with the largest dimensions is generic. A bracket counts as a new direction where it adds more
+    Of two random states, the one with the largest dimensions is generic. A bracket counts as a new direction where it adds more
     than `tolerance` (1e-6; 1e-2 in single precision) of the terms that it is made of.
     """
     structure = structure_of(scene)
@@ -121,7 +121,7 @@ def growth_vector(scene: Scene, *, depth: int = 4, points: int = 2, seed: int = 
     if not structure.affine:
         return Growth((), False, depth, tolerance, None)
     with_time = structure.timed_kinematics or structure.driven or not structure.homogeneous
-    states = zip(*sample_states(scene, points, seed), strict=True)
+    states = zip(*sample_states(scene, 2), strict=True)
     vector, closed = max(_grow(_Fields(scene, with_time, u), t, q, reachable, depth, tolerance) for t, q, u in states)
     # relations that the coordinate rates contain by themselves are no rows
     return Growth(vector, closed, depth, tolerance, min(reachable - vector[-1], structure.rank) if closed else None)

@@ -61,7 +61,7 @@ class JoinedArrow:
         return self.pieces.gradient + self._gathered(*((c[..., None, :] @ x)[..., 0, :] for x in slopes))
 
     def _of_joins(self, d: Float[np.ndarray, "members unknowns"]) -> Float[np.ndarray, "members pieces rows"]:
-        """By what the residuals of the joins change."""
+        """How much the residuals of the joins change."""
         shared, own = self.pieces.split(d)
         A, B, C, _ = self._parts
         following = np.concatenate([own[:, 1:], np.zeros_like(own[:, :1])], axis=1)

@@ -50,7 +50,7 @@ class Linearised:
         return Linearised(self.cost - promised, self.arrow.moved(d), rows, self.sigma)
 
     def replaced(self, members: Int[np.ndarray, "some"], new: "Linearised", chosen: Bool[np.ndarray, "some"]) -> "Linearised":
-        """With what is `new` of these members where it is `chosen`."""
+        """All members, with what is `new` of these where it is `chosen`."""
         if len(members) == len(self.cost) and chosen.all():
             return new
         found = self.at(np.arange(len(self.cost)))  # a copy
@@ -120,7 +120,7 @@ class Minimum:
         return int(np.sum(self.converged & (self.at.cost <= np.min(self.at.cost) + apart)))
 
     def lowered(self, members: Int[np.ndarray, "some"], other: "Minimum") -> "Minimum":
-        """With the minima of these members that were found in another way, where they are lower; and the steps of that one."""
+        """All members, with those minima of these that were found in another way, where they are lower; and the steps of that one."""
         lower = other.at.cost < self.at.cost[members]
         here = members[lower]
         self.at = self.at.replaced(members, other.at, lower)
@@ -131,7 +131,7 @@ class Minimum:
         return self
 
     def replaced(self, members: Int[np.ndarray, "some"], new: "Minimum") -> "Minimum":
-        """With what was found for these members once more; steps add up."""
+        """All members, with what was found for these once more; steps add up."""
         self.at = self.at.replaced(members, new.at, np.ones(len(members), bool))
         for kept, one in ((self.theta, new.theta), (self.converged, new.converged), (self.stuck, new.stuck)):
             kept[members] = one
@@ -185,7 +185,7 @@ class _Step:
 
     @property
     def promised(self) -> Float[np.ndarray, "some"]:
-        """By how much F falls, to second order."""
+        """How much F falls, to second order."""
         return self.fall - 0.5 * self.change
 
     def at(self, chosen: Bool[np.ndarray, "some"]) -> "_Step":

@@ -3,8 +3,9 @@
 r = (reading - value) / sigma,   log L = - sum r^2 / 2 - sum log(sigma sqrt(2 pi));      where noise has a memory, as in `correlated_noise`
 """
 
+import inspect
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 
 import equinox as eqx
@@ -13,31 +14,48 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.correlated_noise import log_density
-from jourdain_jax.analysis.measurements import Measurements, checked, held_inputs
+from jourdain_jax.analysis.experiment import Experiment, checked
+from jourdain_jax.analysis.oddities import oddities
 from jourdain_jax.analysis.predictions import Run, equal_runs
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import users_level
 
+_STATED = ("start", "t0", "t1", "ts", "saveat", "inputs", "events", "work")  # otherwise than by options
+_OPTIONS = tuple(name for name in inspect.signature(simulate).parameters if name not in (*_STATED, "scene"))
 
-def as_runs(scene: Scene, data: Measurements | Sequence[Measurements], *, repeats: bool = False) -> tuple[Measurements, ...]:
-    """One run or several, checked against the scene; ValueError as in `checked`, and where there is no run. Inputs that are held are warned of."""
+
+def as_runs(
+    scene: Scene, data: Experiment | Sequence[Experiment], simulation: Mapping, *, repeats: bool = False, forward: bool = True
+) -> tuple[Experiment, ...]:
+    """One run or several, checked against the scene; ValueError as in `checked`, where there is no run, and for options that a simulation of it does not have.
+
+    What is odd about a run (`oddities`) is warned of. `forward`: derivatives come by forward mode, whatever `adjoint` is.
+    """
     as_scene(scene)
-    if not isinstance(data, Measurements | Iterable):
-        raise ValueError(f"`data` is {described(data)}, expected a `Measurements` or a sequence of at least one")
-    runs = (data,) if isinstance(data, Measurements) else tuple(data)
-    wrong = [f"`data` holds {described(run)}" for run in runs if not isinstance(run, Measurements)] if runs else ["`data` is empty"]
+    for name in simulation:
+        if name == "adjoint" and forward:
+            raise ValueError("`adjoint` is no option here: derivatives come by forward mode; leave it out")
+        if name in _STATED:
+            raise ValueError(f"`{name}` is no option here: each `Experiment` states start, times and inputs, and its motion ends with its last sample")
+        if name not in _OPTIONS:
+            raise ValueError(f"`{name}` is no option of `simulate`; {nearest(name, _OPTIONS)}")
+    if not isinstance(data, Experiment | Iterable):
+        raise ValueError(f"`data` is {described(data)}, expected an `Experiment` or a sequence of at least one")
+    runs = (data,) if isinstance(data, Experiment) else tuple(data)
+    wrong = [f"`data` holds {described(run)}" for run in runs if not isinstance(run, Experiment)] if runs else ["`data` is empty"]
     if wrong:
-        raise ValueError(f"{wrong[0]}, expected a `Measurements` or a sequence of at least one")
+        raise ValueError(f"{wrong[0]}, expected an `Experiment` or a sequence of at least one")
     found = tuple(checked(scene, run, index, repeats) for index, run in enumerate(runs))
-    for sentence in held_inputs(scene, found):
+    for sentence in oddities(scene, found, repeats):
         warnings.warn(sentence, stacklevel=users_level())
     return found
 
 
-def in_all_or_none(runs: Sequence[Measurements], what: str, unknown: Callable[[Measurements], tuple[str, ...]]) -> tuple[str, ...]:
+def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Experiment], tuple[str, ...]]) -> tuple[str, ...]:
     """Channels of which something is not known; ValueError where it is None in one run and given in another."""
     names = tuple(sorted({name for run in runs for name in unknown(run)}))
     for name in names:
@@ -46,7 +64,7 @@ def in_all_or_none(runs: Sequence[Measurements], what: str, unknown: Callable[[M
     return names
 
 
-def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **simulation) -> Float[Array, ""]:
+def log_likelihood(scene: Scene, data: Experiment | Sequence[Experiment], **simulation) -> Float[Array, ""]:
     """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
     Differentiable in scene, start values, measured values, sigmas and numbers of sensors and actuators (reverse mode, unless `adjoint` says
@@ -57,7 +75,7 @@ def log_likelihood(scene: Scene, data: Measurements | Sequence[Measurements], **
 
     **Raises** ValueError for measurements that do not fit the scene.
     """
-    runs = as_runs(scene, data)
+    runs = as_runs(scene, data, simulation, forward=False)
     if unknown := sorted({name for run in runs for name in run.unknown_sigma}):
         raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a likelihood needs the standard deviation of its noise; give a number")
     if unknown := sorted({name for run in runs for name in run.unknown_correlation}):

@@ -51,7 +51,7 @@ class Profile(Printed, eqx.Module):
 
 
 def profiles(fitted: TakenUp, names: Iterable[str], errors: dict[str, float], inflation: float) -> dict[str, Profile]:
-    """Of the unknowns named. `errors`: standard errors by name, for the first step; `inflation`: by what the covariance was multiplied."""
+    """Profiles of the unknowns named. `errors`: standard errors by name, for the first step; `inflation`: by what the covariance was multiplied."""
     unknowns, found = fitted.problem.unknowns, {}
     for name in names:
         if name not in unknowns.labels:

@@ -17,7 +17,7 @@ from jourdain_jax.scene.scene import Scene
 
 @dataclass(frozen=True)
 class LinearRows:
-    """At many points; or, of these, the derivatives along one direction for each point."""
+    """Rows and coordinate rates at many points; or the derivatives of these along one direction for each point."""
 
     A: np.ndarray  # (points, rows, speeds)
     d: np.ndarray  # (points, rows)
@@ -58,7 +58,7 @@ class RowsOverStates:
         return here, along
 
     def _arranged(self, flat: np.ndarray, u: np.ndarray) -> LinearRows:
-        """Of values with a last axis of points."""
+        """The rows and coordinate rates in values with a last axis of points."""
         count, rows = self.shape[0], len(self.traced.at.phi)
         slopes = np.zeros((flat.shape[-1], *self.shape))
         if self.places:

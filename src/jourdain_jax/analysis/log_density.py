@@ -19,10 +19,10 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood import as_runs, in_all_or_none, mapped, of_run
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.predictions import Run, equal_runs
 from jourdain_jax.analysis.ranges import Range, bounds, positive
 from jourdain_jax.analysis.starts import check_starts
@@ -188,7 +188,7 @@ _density = quickly_compiled(LogDensity._at)
 @shown_from_users_lines
 def log_density(
     scene: Scene | BuiltFor,
-    data: Measurements | Sequence[Measurements],
+    data: Experiment | Sequence[Experiment],
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     **simulation,
 ) -> LogDensity:
@@ -213,7 +213,7 @@ def log_density(
         draws = density.named(positions)["radius"]                               # m, of the positions (draws, unknowns) that were sampled
     """
     scene = as_scene(scene)
-    runs = as_runs(scene, data)
+    runs = as_runs(scene, data, simulation, forward=False)
     sigmas = in_all_or_none(runs, "sigma", lambda run: run.unknown_sigma)
     with_memory = in_all_or_none(runs, "the correlation time", lambda run: run.unknown_correlation)
     limits = [correlation_limits([np.asarray(run.ts) for run in runs if name in run.values]) for name in with_memory]

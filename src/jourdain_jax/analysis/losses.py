@@ -47,7 +47,7 @@ class Loss:
         return rows if math.isinf(self.parameter) else xp.sqrt(self.weight(r, xp))[..., None] * rows
 
     def inflation(self, r: Float[np.ndarray, "samples"]) -> float:
-        """By what the covariance (J'WJ)^-1 is to be multiplied, from the residuals that count."""
+        """The factor by which the covariance (J'WJ)^-1 is to be multiplied, from the residuals that count."""
         k = self.parameter
         if not np.isfinite(k):
             return 1.0

@@ -28,7 +28,7 @@ Pace = tuple[float, ...] | Float[Array, "5"]
 
 
 def shrinkage(xp: ModuleType | SimpleNamespace, pace: Pace, length: Number) -> Number:
-    """By what factor a step is shorter than the last; one, unless steps have become short so fast that the problem is seen to be linear here."""
+    """The factor by which a step is shorter than the last; one, unless steps have become short so fast that the problem is seen to be linear here."""
     *_, before, last = pace
     linear = (length <= SHORT) & (last <= FAST * before) & (length <= FAST * last)
     return xp.where(linear, length / xp.maximum(last, TINY), 1.0)

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.joined import JoinedArrow
 from jourdain_jax.analysis.layout import Layout, Place
 from jourdain_jax.analysis.levenberg_marquardt import Linearised
 from jourdain_jax.analysis.losses import Loss
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.nodes import NODE
 from jourdain_jax.analysis.predictions import Lanes
 from jourdain_jax.analysis.problem import Problem, closed
@@ -98,7 +98,7 @@ class Piecewise:
     def __init__(
         self,
         scene: Scene,
-        runs: tuple[Measurements, ...],
+        runs: tuple[Experiment, ...],
         layout: Layout,
         simulation: dict,
         members: int | None,
@@ -222,7 +222,7 @@ class Piecewise:
         )
 
     def keep(self, member: int) -> None:
-        """Of all members, this one only."""
+        """Keeps this one of all members alone."""
         self.at, self.share = self.at.only([member]), self.share[[member]]
 
     def evaluate(self, shared, local, members):
@@ -241,7 +241,7 @@ class Piecewise:
             yield here, np.full(len(here), run), closed(rows, self.own + self.shared) if self.closing else rows
 
     def change(self, problem: Problem, sigma: np.ndarray, d: np.ndarray, members: np.ndarray) -> Float[np.ndarray, "members"]:
-        """By how much a step with its gaps closed changes all residuals, |J ds_i + S dtheta|, in units of sigma."""
+        """How much a step with its gaps closed changes all residuals, |J ds_i + S dtheta|, in units of sigma."""
         d_shared, d_own = self.unknowns.split(d)
         whole = np.concatenate([d_own[:, self.run_of], np.broadcast_to(d_shared[:, None], (len(d), len(self.parts), self.shared))], axis=2)
         ds = (self.at.slopes[members] @ whole[..., None])[..., 0] + self.at.gaps[members]
@@ -256,7 +256,7 @@ class Piecewise:
         return np.sqrt(squares)
 
     def growth(self, members: np.ndarray) -> Float[np.ndarray, "members"]:
-        """By what factor small changes of the unknowns grow from the first node to where they are largest, in sizes of states and unknowns."""
+        """The factor by which small changes of the unknowns grow from the first node to where they are largest, in sizes of states and unknowns."""
         shared, own = self.unknowns.split(self.unknowns.sizes(self.at.theta[members]))
         sizes = np.concatenate([own[:, self.run_of], np.broadcast_to(shared[:, None], (len(shared), len(self.parts), self.shared))], axis=2)
         slopes = self.at.slopes[members][:, :, self.own :] * sizes[:, :, None] / self.node_sizes[:, None]
@@ -330,7 +330,7 @@ class Piecewise:
         return found
 
     def _places_of(self, piece: int) -> tuple[np.ndarray, np.ndarray]:
-        """Of the residuals of a piece those that belong to its run, and their places there."""
+        """Those residuals of a piece that belong to its run, and their places there."""
         run = int(self.run_of[piece])
         before = piece - int(np.flatnonzero(self.run_of == run)[0])
         first, firsts = self.ends_of[run][before], owned(self.runs[run], self.ends_of[run])

@@ -16,10 +16,10 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.body_inertia import PossibleInertia
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.information import hidden_combinations
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood import as_runs
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.predictions import Run, run_of
 from jourdain_jax.analysis.ranges import Range
 from jourdain_jax.analysis.table import table
@@ -98,7 +98,7 @@ def _inverse(F: Float[Array, "unknowns unknowns"]) -> Float[Array, "unknowns unk
 
 @quickly_compiled
 def _log_det(F: Float[Array, "unknowns unknowns"], places: tuple[int, ...]) -> Float[Array, ""]:
-    """Of this block of the inverse."""
+    """The logarithm of the determinant of this block of the inverse."""
     some = np.array(places, int)
     return jnp.linalg.slogdet(_inverse(F)[some[:, None], some])[1]
 
@@ -106,7 +106,7 @@ def _log_det(F: Float[Array, "unknowns unknowns"], places: tuple[int, ...]) -> F
 @shown_from_users_lines
 def planned_information(
     scene: Scene | BuiltFor,
-    plan: Measurements | Sequence[Measurements],
+    plan: Experiment | Sequence[Experiment],
     free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]" = (),
     **simulation,
 ) -> PlannedInformation:
@@ -125,13 +125,13 @@ def planned_information(
     **Example**
 
         def told(spin):
-            plan = jj.Measurements(ts, {"lean": ts}, 0.005, start={"lean": 0.3, "spin_rate": spin})
+            plan = jj.Experiment(ts, {"lean": ts}, 0.005, start={"lean": 0.3, "spin_rate": spin})
             return jj.planned_information(disc, plan, free=("radius", "gravity")).log_det()
 
         slope = jax.jacfwd(told)(-3.0)
     """
     scene = as_scene(scene)
-    runs = as_runs(scene, plan)
+    runs = as_runs(scene, plan, simulation)
     for run in runs:
         for name in run.unknown_sigma:
             raise ValueError(f"sigma of channel `{name}` is None, but a plan needs the standard deviation of its noise; give a number")
@@ -164,7 +164,7 @@ def _sensitivities(scene: Scene, runs: tuple[Run, ...], theta: Float[Array, "pla
     return flat.T @ flat, J
 
 
-def _values(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> Float[Array | np.ndarray, "places"]:
+def _values(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> Float[Array | np.ndarray, "places"]:
     """All unknowns at the values that the scene and the runs have; those of parameters and starts may be traced."""
     shared, local = unknowns.split(unknowns.guess)
     of_bodies = {label: x for body in unknowns.layout.bodies for label, x in zip(body.labels, body.numbers(scene), strict=True)}

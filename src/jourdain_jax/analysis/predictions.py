@@ -21,11 +21,11 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.correlated_noise import Chains, whitened
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.first_steps import Told, first_steps, read
 from jourdain_jax.analysis.grids import grid, intervals
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.nodes import LAST, NODE, begin, ended
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
 from jourdain_jax.build.reference import Reference
@@ -89,7 +89,7 @@ class Run(NamedTuple):
         return self._replace(start=changed, sensors=with_numbers(self.sensors, known), drives=with_numbers(self.drives, known))
 
 
-def run_of(data: Measurements, xp=np, repeats: bool = False) -> Run:
+def run_of(data: Experiment, xp=np, repeats: bool = False) -> Run:
     """A run with weights; `xp`: NumPy, or `jax.numpy` where numbers are traced; `repeats`: values have a leading axis."""
     weights = {}
     for name, values in data.values.items():
@@ -107,7 +107,7 @@ def _on_equal_grids(runs: Sequence[Run]) -> list[Run]:
     return [run._replace(grid=grid(run.t0, run.ts, count, node)) for run, node in zip(runs, nodes, strict=True)]
 
 
-def equal_runs(data: Sequence[Measurements]) -> list[tuple[tuple[int, ...], Run]]:
+def equal_runs(data: Sequence[Experiment]) -> list[tuple[tuple[int, ...], Run]]:
     """Runs of equal structure and shapes stacked, with their numbers, for use where numbers may be traced."""
     groups: dict[tuple, list[tuple[int, Run]]] = {}
     for indices in _alike(data):
@@ -125,7 +125,7 @@ def equal_runs(data: Sequence[Measurements]) -> list[tuple[tuple[int, ...], Run]
 class Lanes:
     """All lanes of a problem; `evaluate` gives their weighted residuals with derivatives."""
 
-    def __init__(self, scene: Scene, data: Sequence[Measurements], layout: Layout, simulation: dict, members: int | None, loss: Loss = LEAST_SQUARES):
+    def __init__(self, scene: Scene, data: Sequence[Experiment], layout: Layout, simulation: dict, members: int | None, loss: Loss = LEAST_SQUARES):
         self.members, self._scene, self._layout = members, scene, layout
         self.takes_steps = False  # whether a run that is `alone` is evaluated by the program that takes steps, so that no other is compiled
         white = not any(run.unknown_sigma or run.correlation_time for run in data)
@@ -249,7 +249,7 @@ class _Group:
         return [(min(width, count - k * width), *np.divmod(some, len(self.indices))) for k, some in enumerate(lanes)]
 
     def first_steps(self, x: Float[np.ndarray, "unknowns"], told: Float[np.ndarray, "_"]) -> Float[np.ndarray, "_"]:
-        """Of the run, from unknowns with its own ones first; to be `read`."""
+        """The first steps of the run, from unknowns with its own ones first; to be `read`."""
         return np.asarray(self._steps(self._common, np.concatenate([self._rows[0], x, told])))
 
     def _begun(self, shared, local, members, b, j):
@@ -260,7 +260,7 @@ class _Group:
         return b[:kept], self._runs[j[:kept]], np.asarray(found)[:kept]
 
     def chained(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> tuple[np.ndarray | None, np.ndarray]:
-        """Of each sample of lanes, the place of the one before it (None: all noise is white) and their correlation."""
+        """For each sample of lanes, the place of the one before it (None: all noise is white) and their correlation."""
         if self.chains is None:
             return None, _WHITE
         places = [self.indices.index(run) for run in runs.tolist()]
@@ -335,10 +335,10 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, sampl
         fixed, x, of_steps = jnp.split(row, [row.shape[0] - told - unknowns, row.shape[0] - told])
         return first_steps(lambda x, common, fixed: each(common, fixed[None], x[None])[0], loss, x, (common, fixed), of_steps)
 
-    return quickly_compiled(lanes, jax.jit), lru_cache(maxsize=4)(lambda loss: sparingly_compiled(partial(steps, loss), loops=1))
+    return quickly_compiled(lanes, jax.jit), lru_cache(maxsize=4)(lambda loss: sparingly_compiled(partial(steps, loss), most_loops=1))
 
 
-def _alike(data: Sequence[Measurements]) -> list[list[int]]:
+def _alike(data: Sequence[Experiment]) -> list[list[int]]:
     """Indices of the runs, grouped by equal structure: names, sensors, kinds of inputs, shapes but for the number of times."""
     if len(data) == 1:
         return [[0]]

@@ -14,10 +14,10 @@ from jaxtyping import Bool, Float
 
 from jourdain_jax.analysis.arrow import Arrow, arrow, triangle, with_prior
 from jourdain_jax.analysis.correlated_noise import SHORTEST, correlation_limits, half_log_determinant, lowest
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.first_steps import ROOM, read
 from jourdain_jax.analysis.levenberg_marquardt import Begun, Control, Limits, Linearised, LinearisedLater, Minimum, minimise
 from jourdain_jax.analysis.losses import Loss
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.scene.scene import Scene
 
@@ -28,13 +28,14 @@ _NODES = np.linspace(-3.2, 3.2, 9)  # of arcsin rho, in its standard deviations:
 class Problem:
     """Residuals with their derivatives, of any members at any numbers. `lanes`: `Lanes`, or what predicts runs as they do (`Piecewise`)."""
 
-    def __init__(self, scene: Scene, runs: tuple[Measurements, ...], unknowns: Unknowns, lanes: Any, loss: Loss):
+    def __init__(self, scene: Scene, runs: tuple[Experiment, ...], unknowns: Unknowns, lanes: Any, loss: Loss):
         self.scene, self.runs, self.unknowns, self.lanes, self.loss = scene, runs, unknowns, lanes, loss
         self.estimated = tuple(sorted({name for run in runs for name in run.unknown_sigma}))  # channels whose sigma is
         largest = [max(float(np.nanmax(np.abs(run.values[name]))) for run in runs if name in run.values) for name in self.estimated]
         self._least = _LEAST_SIGMA * np.array([x or 1.0 for x in largest])  # sigma of each of these
         self.shares: np.ndarray | None = None  # of each run's span, from its start, by member: samples beyond do not count
         self.begun = np.zeros((0, 0))  # first guesses of the members, where spans grow
+        self.prior_mean = np.tile(unknowns.prior_mean, (lanes.members or 1, 1))  # by member
         self.with_memory = tuple(sorted({name for run in runs for name in run.unknown_correlation}))  # channels whose correlation time is estimated
         self.tau = np.zeros((lanes.members or 1, len(self.with_memory)))  # s, of these: at first as if their noise were white
         independent = not unknowns.with_prior.size or np.array_equal(unknowns.whitening, np.eye(len(unknowns.whitening)))
@@ -54,7 +55,7 @@ class Problem:
         return self._assembled(theta, members, evaluated, self.taus(members), self._share(members))
 
     def _share(self, members: np.ndarray) -> np.ndarray | None:
-        """Of the span, of each of these members; None: all of it."""
+        """The share of the span that each of these members takes; None: all of it."""
         return None if self.shares is None else self.shares[members]
 
     def minimum(self, theta: np.ndarray, members: np.ndarray, limits: Limits, control: Control, what: str) -> Minimum:
@@ -146,7 +147,8 @@ class Problem:
 
         Over part of the span the first guess is a weak prior, known to its own size: what so few samples do not tell stays there.
         """
-        mean, spread = (np.broadcast_to(x, theta.shape) for x in (self.unknowns.prior_mean, self.unknowns.prior_sigma))
+        mean = self.prior_mean[members if self.lanes.members else np.zeros(len(members), int)]
+        spread = np.broadcast_to(self.unknowns.prior_sigma, theta.shape)
         if shares is None:
             return mean, spread
         begun = self.begun[members]
@@ -230,7 +232,7 @@ class Problem:
         return parts
 
     def inflation(self, residuals, samples, rank) -> np.ndarray:
-        """By what the covariance of each member is to be multiplied: for the loss, and for sigmas that are estimated."""
+        """The factor by which the covariance of each member is to be multiplied: for the loss, and for sigmas that are estimated."""
         members = self.lanes.members or 1
         by_member = [np.concatenate([r.reshape(members, -1)[b] for run in residuals for r in run.values()]) for b in range(members)]
         of_loss = np.array([self.loss.inflation(r[np.isfinite(r)]) if np.isfinite(r).any() else np.nan for r in by_member])

@@ -28,6 +28,9 @@ class Report(Printed):
     """Facts about a scene, found by probing at random and symmetric states of its domain; `print(report)` shows a table.
 
     Row by row and taken together: eqs. (5)-(9), Frobenius; privileged velocities (25)-(31); cyclic coordinates (42).
+
+    A cyclic coordinate is one whose rate is not privileged and on which no equation depends. A coordinate that the Lagrangian of a system without rows
+    does not contain, whose momentum is conserved, is ignorable here: no acceleration depends on it.
     """
 
     scene: str
@@ -47,8 +50,8 @@ class Report(Printed):
     rheonomic: bool  # anything depends on time by itself
     depends_on_time: tuple[str, ...]  # what: rows, poses, inertias, coordinate rates, loads, potential
     affine: bool  # rows are linear or affine in the speeds
-    cyclic_coordinates: tuple[str, ...]
-    ignorable_coordinates: tuple[str, ...]
+    cyclic_coordinates: tuple[str, ...]  # of dependent rates; they appear in no equation
+    ignorable_coordinates: tuple[str, ...]  # no privileged acceleration depends on them
     privileged_velocities: tuple[str, ...]
     privileged_by_user: bool
     lowering: str  # operations of the scalar program that is integrated, or why there is none

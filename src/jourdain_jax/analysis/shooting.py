@@ -17,8 +17,8 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Int
 
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.grids import FEWEST_INTERVALS
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.nodes import LAST, NODE
 from jourdain_jax.analysis.sensors import latest
 from jourdain_jax.calculus.reals import Number, checked_real
@@ -56,7 +56,7 @@ class MultipleShooting:
                 raise ValueError(f"`duration` of `MultipleShooting` is {self.duration} s, expected a finite time above zero")
 
 
-def ends_of_pieces(run: Measurements, shooting: MultipleShooting, index: int) -> Int[np.ndarray, "ends"]:
+def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> Int[np.ndarray, "ends"]:
     """Samples at which pieces begin, and the last sample. ValueError where there are fewer intervals than pieces."""
     ts = np.asarray(run.ts)
     count = len(ts) - 1
@@ -71,13 +71,13 @@ def ends_of_pieces(run: Measurements, shooting: MultipleShooting, index: int) ->
     return np.unique([0, *nearest[(nearest > 0) & (nearest < count)], count])
 
 
-def numbers_of_filters(run: Measurements, repeats: bool) -> int:
+def numbers_of_filters(run: Experiment, repeats: bool) -> int:
     """How many numbers the low-passes of the sensors of a run that was `checked` have."""
     return sum(math.prod(x.shape[1 + repeats :]) for name, x in run.values.items() if name in run.readings and run.readings[name].has_filter)
 
 
-def owned(run: Measurements, ends: Int[np.ndarray, "ends"]) -> dict[str, Int[np.ndarray, "ends"]]:
-    """Of each channel the first sample that belongs to each piece, and one past the last of all.
+def owned(run: Experiment, ends: Int[np.ndarray, "ends"]) -> dict[str, Int[np.ndarray, "ends"]]:
+    """For each channel, the first sample that belongs to each piece, and one past the last of all.
 
     A sample at which two pieces meet belongs to the later one; of a sensor with a delay, to the piece that has begun the largest delay before.
     """
@@ -89,7 +89,7 @@ def owned(run: Measurements, ends: Int[np.ndarray, "ends"]) -> dict[str, Int[np.
     return found
 
 
-def in_pieces(run: Measurements, ends: Int[np.ndarray, "ends"], states: int, repeats: bool) -> list[Measurements]:
+def in_pieces(run: Experiment, ends: Int[np.ndarray, "ends"], states: int, repeats: bool) -> list[Experiment]:
     """The pieces of a run that was `checked`; all but the first begin at a node of so many numbers. Each goes on to the last sample that belongs to it."""
     found, firsts = [], owned(run, ends)
     for k, (first, end) in enumerate(pairwise(ends)):
@@ -118,7 +118,7 @@ def in_pieces(run: Measurements, ends: Int[np.ndarray, "ends"], states: int, rep
     return found
 
 
-def _cut(run: Measurements, t0: float, t1: float) -> "dict | Inputs | None":
+def _cut(run: Experiment, t0: float, t1: float) -> "dict | Inputs | None":
     """The inputs with the knots about this span only; those of actuators stay whole, since their numbers may move them."""
     if not isinstance(run.inputs, Inputs):
         return run.inputs

@@ -14,9 +14,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.first_nodes import first_nodes, goes_on
 from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, column_scaling, damped_step, minimise
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.piecewise import Piecewise
 from jourdain_jax.analysis.problem import Problem
 from jourdain_jax.motion.start import start as consistent_start
@@ -84,7 +84,7 @@ def _begun(problem: Problem, lanes: Piecewise, theta: np.ndarray) -> tuple[Probl
     return lanes.problem(problem.loss), guess
 
 
-def _start(problem: Problem, data: Measurements, theta: np.ndarray, run: int) -> tuple[np.ndarray, np.ndarray]:
+def _start(problem: Problem, data: Experiment, theta: np.ndarray, run: int) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates and speeds of the start of a run at the first guess."""
     shared, own = problem.unknowns.split(theta)
     layout = problem.unknowns.layout
@@ -110,7 +110,7 @@ def _put_starts(problem: Problem, lanes: Piecewise, local: np.ndarray, nodes: np
 
 
 def _closed(problem: Problem, lanes: Piecewise, theta: np.ndarray, limits: Limits, control: Control) -> Minimum:
-    """By sequential quadratic programming, from where the pieces are."""
+    """The minimum with all gaps closed, by sequential quadratic programming from where the pieces are."""
     lanes.closing = False
     count = len(theta)
     at = problem.linearised(theta, np.arange(count))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from jourdain_jax.analysis.measurements import Measurements
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.unknowns import Unknowns
 from jourdain_jax.motion.start import start as consistent_start
 from jourdain_jax.scene.scene import Scene
@@ -15,7 +15,7 @@ MOST = 4096  # kinds of starts that were found right, and are not looked at agai
 _right: dict[tuple, None] = {}
 
 
-def check_starts(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> None:
+def check_starts(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> None:
     """ValueError unless the start of each run meets the constraints at the first guess, and still does when the unknowns change.
 
     Where it did at other numbers of the unknowns, this is no matter of the numbers, and it is not looked at again: a look at new parameters takes longer than
@@ -34,13 +34,13 @@ def check_starts(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns)
             del _right[next(iter(_right))]
 
 
-def check_first_guess(scene: Scene, runs: Sequence[Measurements], unknowns: Unknowns) -> None:
+def check_first_guess(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> None:
     """ValueError unless the start of each run meets the constraints at the first guess."""
     for index, run in enumerate(runs):
         _check(scene, run, unknowns, unknowns.guess, index, "is not admissible")
 
 
-def _key(leaves: list, treedef, run: Measurements, unknowns: Unknowns, index: int) -> tuple:
+def _key(leaves: list, treedef, run: Experiment, unknowns: Unknowns, index: int) -> tuple:
     """What a start consists of, and its numbers but for those of unknowns. `leaves`, `treedef`: of the scene."""
     layout = unknowns.layout
     others, of_run = jax.tree.flatten((run.t0, run.inputs))
@@ -53,12 +53,12 @@ def _content(x):
     return x if callable(x) else np.asarray(x).tobytes()
 
 
-def _with(scene: Scene, run: Measurements, unknowns: Unknowns, theta: np.ndarray, index: int) -> tuple[Scene, dict]:
+def _with(scene: Scene, run: Experiment, unknowns: Unknowns, theta: np.ndarray, index: int) -> tuple[Scene, dict]:
     shared, local = unknowns.split(theta)
     return unknowns.layout.scene(scene, shared), unknowns.layout.start(run.start, local[index])
 
 
-def _check(scene: Scene, run: Measurements, unknowns: Unknowns, theta: np.ndarray, index: int, why: str) -> None:
+def _check(scene: Scene, run: Experiment, unknowns: Unknowns, theta: np.ndarray, index: int, why: str) -> None:
     moved, given = _with(scene, run, unknowns, theta, index)
     try:
         consistent_start(moved, t0=run.t0, inputs=run.inputs, **given)

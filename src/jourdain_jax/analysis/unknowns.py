@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float
 
 from jourdain_jax.analysis.body_inertia import BodyInertia, PossibleInertia, inertia_of_body
 from jourdain_jax.analysis.estimate import Estimate
+from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.joint_prior import Correlated, whitening
 from jourdain_jax.analysis.layout import Kind, Layout, Place
-from jourdain_jax.analysis.measurements import Measurements
 from jourdain_jax.analysis.ranges import Range, positive, unbounded
 from jourdain_jax.analysis.sensors import UNITS, default_range
 from jourdain_jax.analysis.ties import tied_by
@@ -94,12 +94,12 @@ class _Entry:
 
     @property
     def labels(self) -> list[str]:
-        """Of each number."""
+        """The name of each number."""
         return [self.label + "".join(f"[{i}]" for i in index) for index in np.ndindex(self.guess.shape)] if self.guess.ndim else [self.label]
 
 
 def unknowns_of(
-    scene: Scene, runs: Sequence[Measurements], free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]"
+    scene: Scene, runs: Sequence[Experiment], free: "Mapping[str, Range | Estimate | PossibleInertia | Callable | None] | Iterable[str]"
 ) -> Unknowns:
     """The unknowns that `free`, the runs' `unknown_start` and their sensors and actuators name.
 
@@ -175,7 +175,7 @@ def _parameters(kind: type[Scene]) -> dict[str, Mapping]:
 
 
 def _above_zero(entry: "_Entry") -> "_Entry":
-    """With a bound a little above zero in place of one at zero, where the scene has no motion."""
+    """The range with a bound a little above zero in place of one at zero, where the scene has no motion."""
     return replace(entry, range=replace(entry.range, low=_LEAST * float(entry.guess.min()))) if entry.range.low == 0 else entry
 
 
@@ -199,7 +199,7 @@ def _check_told_once(layout: Layout, functions: Mapping) -> None:
         told |= {entry.name: f"the possible inertia of `{body.body}`" for entry in body.entries}
 
 
-def _of_all_runs(runs: Sequence[Measurements]) -> dict[str, Estimate]:
+def _of_all_runs(runs: Sequence[Experiment]) -> dict[str, Estimate]:
     """Estimates of sensors and actuators by name; ValueError where runs state one differently."""
     found: dict[str, tuple[int, Estimate]] = {}
     for index, run in enumerate(runs):
@@ -213,7 +213,7 @@ def _of_all_runs(runs: Sequence[Measurements]) -> dict[str, Estimate]:
     return {label: estimate for label, (_, estimate) in found.items()}
 
 
-def _of_run(label: str, place: Place, run: Measurements) -> _Entry:
+def _of_run(label: str, place: Place, run: Experiment) -> _Entry:
     """An unknown of one run; where it is known there, or does not exist, it is held."""
     if place.of_sensor:
         estimate = run.estimates.get(place.name)

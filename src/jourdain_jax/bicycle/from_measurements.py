@@ -129,7 +129,7 @@ def _parameters(y: Values, hangings: dict[str, tuple[int, ...]], by_table: bool)
         found |= {f"miss {part}{k}": miss for k, miss in zip(numbers, misses, strict=True)}
         lengths[part] = jnp.sqrt(r @ r)
     found |= _moments_about_y(y, lengths) | _moments_in_plane(y, hangings, tilts)
-    return found if "G" not in hangings else found | _together(found)
+    return found if "G" not in hangings else found | _of_whole_bicycle(found)
 
 
 def _column(what: str, part: str, numbers: tuple[int, ...], y: Values) -> Float[Array, "hangings"]:
@@ -157,7 +157,7 @@ def _geometry(y: Values, known: Values, by_table: bool) -> Values:
 
 
 def _handlebar_to_axle(y: Values, lam: Scalar) -> Float[Array, "2"]:
-    """From where the handlebar hung to the front axle, (x, z), m; both lay on a table, with the steer axis level."""
+    """The vector from where the handlebar hung to the front axle, (x, z), m; both lay on a table, with the steer axis level."""
     across = y["h7"] - y["h6"] + (y["d5"] - y["d6"]) / 2
     along = jnp.sqrt((y["l"] - (y["d5"] + y["d6"]) / 2) ** 2 - across**2)
     return jnp.stack([along * jnp.sin(lam) - across * jnp.cos(lam), along * jnp.cos(lam) + across * jnp.sin(lam)])
@@ -212,7 +212,7 @@ def _moments_in_plane(y: Values, hangings: dict[str, tuple[int, ...]], tilts: di
     return dict(zip(names, newton_root(condition, guess, jnp.ones(len(names))).x, strict=True))
 
 
-def _together(found: Values) -> Values:
+def _of_whole_bicycle(found: Values) -> Values:
     """Handlebar G and fork S as one body H."""
     mass = found["mG"] + found["mS"]
     x, z = ((found["mG"] * found[f"{axis}G"] + found["mS"] * found[f"{axis}S"]) / mass for axis in "xz")

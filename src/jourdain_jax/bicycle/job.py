@@ -1,4 +1,4 @@
-"""The real job: measured bicycles in, stability speeds with honest uncertainty and simulated rides out.
+"""The study of measured bicycles: files in, stability speeds with their uncertainty and simulated rides out.
 
 For each file: build the nonlinear Whipple bicycle, linearise it, find weave, capsize and double-root speeds by root finding, propagate the
 measured standard deviations by Monte Carlo to 2.5 and 97.5 % limits, and ride it hands-free below, inside and above the stable range.

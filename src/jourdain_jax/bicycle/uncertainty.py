@@ -1,4 +1,4 @@
-"""From measured standard deviations to limits on what follows from the parameters, by Monte Carlo.
+"""Limits on what follows from the parameters, by Monte Carlo from measured standard deviations.
 
 Parameters are drawn from a normal distribution with the measured values and their covariance; where that is not known, as from files of parameters, each
 with its sigma independently of the others. A quantity that only some bicycles have (a capsize speed) is reported with the fraction of

@@ -84,7 +84,7 @@ class _Rows:
 
     @property
     def width(self) -> np.ndarray:
-        """Of the domain; 1 for a coordinate that has one value."""
+        """The width of the domain; 1 for a coordinate that has one value."""
         return np.where(self.high > self.low, self.high - self.low, 1.0)
 
 

@@ -18,10 +18,11 @@ from jax.extend.core import Literal, Primitive
 from jourdain_jax.build.domain import coordinate_bounds, speed_bounds
 from jourdain_jax.build.sampling import seen_of
 from jourdain_jax.build.trace import jaxpr_of_scene
+from jourdain_jax.calculus.jaxprs import called
 from jourdain_jax.calculus.reals import is_array, real_type
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.native import disk
-from jourdain_jax.program.interpret import inner_jaxpr, own_rule
+from jourdain_jax.program.interpret import own_rule
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -64,7 +65,7 @@ def name_of(kind: str, scene: Scene, of_inputs: tuple[int, ...], more: tuple) ->
 
 @once_per_class
 def _digest_of_trace(scene: Scene, of_inputs: tuple[int, ...]) -> bytes | None:
-    """Of what was traced of a scene; None where something in it has no name of its own."""
+    """The digest of what was traced of a scene; None where something in it has no name of its own."""
     closed, shape = jaxpr_of_scene(scene, of_inputs)
     labels = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(shape)]
     try:
@@ -129,7 +130,7 @@ def _of_equation(equation, number: dict) -> Iterable[bytes]:
         raise _Nameless
     yield f"\n{primitive.name} -> {[_said(v.aval) for v in equation.outvars]} ".encode()
     yield from _atoms(equation.invars, number)
-    inner = inner_jaxpr(primitive.name, equation.params)
+    inner = called(primitive.name, equation.params)
     if inner is not None:
         yield from _parts((equation.params.get("name"), inner))  # by their names, functions that bend by intention are told from others
         return

@@ -3,6 +3,7 @@
 m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
 n.n = 1,   gap = 0 where the coordinates keep a body on the ground
 d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's motion, stated twice: by o(t), n(t) and by v, w
+dg/dt along the motion of the other bodies = 0  or  v, w != 0      g: all that says where the ground of a contact is
 """
 
 import equinox as eqx
@@ -13,9 +14,10 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import pose_at
+from jourdain_jax.equations.rows import pose_rate
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import Contact
-from jourdain_jax.scene.motion_state import Pose
+from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of
 
@@ -31,12 +33,14 @@ class PoseNumbers(eqx.Module):
     inertia: dict[str, Float[Array, "*states 3 3"]]  # of rigid bodies only
     orientation: dict[str, Float[Array, "*states 3 3"]]
     planes: dict[str, Float[Array, "*states 3"]]  # normal velocity by origin and tilt, by velocity and angular velocity; size of both, m/s
+    carried: dict[str, Float[Array, "*states 3"]]  # rates of a ground along the motion of other bodies; size of that motion, and of the stated one, m/s
     normals: dict[str, Float[Array, "*states 2"]]  # squares of the lengths of the normals of contacts; and how far out the contact is, m
     gaps: dict[str, Float[Array, "*states 2"]]  # where the coordinates keep them closed; and the distance of the contact from the mass centre, m
 
 
-def numbers_of(scene: Scene, pose: Pose) -> PoseNumbers:
-    """What the scene gives for its bodies and planes, from known poses."""
+def numbers_of(scene: Scene, motion: Motion) -> PoseNumbers:
+    """What the scene gives for its bodies and planes, from known poses and velocities."""
+    pose = motion.pose()
     rigid = {name: body.body for name, body in pose.bodies.items() if isinstance(body.body, RigidBody)}
     contacts = contacts_of(scene, pose)
     return PoseNumbers(
@@ -45,6 +49,7 @@ def numbers_of(scene: Scene, pose: Pose) -> PoseNumbers:
         inertia={name: body.inertia for name, body in rigid.items()},
         orientation={name: body.orientation for name, body in rigid.items()},
         planes=_normal_velocities(scene, pose, contacts),
+        carried={name: _carried_speeds(scene, motion, name, contact) for name, contact in contacts.items() if contact.ground is not None},
         normals={name: _normal(contact) for name, contact in contacts.items()},
         gaps={name: _gap(pose, contact) for name, contact in contacts.items() if contact.height == "coordinates"},
     )
@@ -74,6 +79,24 @@ def _normal_velocities(scene: Scene, pose: Pose, contacts: dict[str, Contact]) -
         lengths = [jnp.sum(jnp.abs(x)) for x in (origin_rate, plane.velocity, arm, normal_rate, plane.angular_velocity)]
         found[name] = jnp.stack([by_pose, by_velocity, lengths[0] + lengths[1] + lengths[2] * (lengths[3] + lengths[4])])
     return found
+
+
+def _carried_speeds(scene: Scene, motion: Motion, name: str, contact: Contact) -> Float[Array, "3"]:
+    """How fast a ground moves with bodies other than the one that rolls on it, how fast these move, and how fast the ground is stated to move."""
+    others = {other: body for other, body in motion.bodies.items() if other != contact.body}
+    if not others:
+        return jnp.zeros(3, motion.t.dtype)
+    pose = motion.pose()
+
+    def where(bodies):
+        ground = contacts_of(scene, Pose(pose.t, pose.q, pose.bodies | bodies))[name].ground
+        return [getattr(ground, part) for part in ("origin", "normal", "axis", "radius") if hasattr(ground, part)], ground.value(contact.point)
+
+    rates = {other: BodyPose(other, pose_rate(body)) for other, body in others.items()}
+    _, moves = jax.jvp(where, ({other: pose.bodies[other] for other in others},), (rates,))
+    turns = [body.angular_velocity for body in others.values()]
+    parts = jax.tree.leaves(moves), [body.velocity for body in others.values()] + turns, [contact.plane.velocity, contact.plane.angular_velocity]
+    return jnp.stack([sum(jnp.sum(jnp.abs(x)) for x in part) for part in parts])
 
 
 def body_faults(scene: Scene, t, q) -> dict[str, Bool[Array, ""]]:
@@ -127,6 +150,7 @@ def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
     sentences += [_of_inertia(f"body `{name}` of `{who}`", I) for name, I in numbers.inertia.items()]
     sentences += [_of_orientation(f"body `{name}` of `{who}`", R) for name, R in numbers.orientation.items()]
     sentences += [_of_plane(f"the plane of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.planes.items()]
+    sentences += [_of_carried(f"the ground of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.carried.items()]
     sentences += [_of_normal(f"contact `{name}` of `{who}`", squares) for name, squares in numbers.normals.items()]
     sentences += [_of_gap(f"contact `{name}` of `{who}`", gaps) for name, gaps in numbers.gaps.items()]
     return tuple(sentence for sentence in sentences if sentence)
@@ -176,6 +200,16 @@ def _of_plane(what: str, speeds: np.ndarray) -> str:
     return (
         f"{what} moves along its normal at {by_pose[k]:.4g} m/s by `origin` and `tilt`, but at {by_velocity[k]:.4g} m/s by `velocity` and "
         "`angular_velocity`; state the motion in both: velocity = d origin/dt, angular_velocity = (0, d tilt/dt, 0)"
+    )
+
+
+def _of_carried(what: str, speeds: np.ndarray) -> str:
+    moves, bodies, stated = _finite(speeds).T
+    if np.any(stated > 0) or not np.any(moves > TOLERANCE * bodies + 1e-12):
+        return ""
+    return (
+        f"{what} moves with another body, but its `velocity` and `angular_velocity` are zero; where it is a body of the scene, leave the contact away and "
+        "write its rows in `velocity_constraints`: tangents @ (rolling.velocity_at(point) - ground.velocity_at(point))"
     )
 
 

@@ -12,7 +12,7 @@ TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")
 
 
 class Probed(eqx.Module):
-    """At one state, or with a leading axis at all; trees have arrays as leaves."""
+    """What is found at one state, or with a leading axis at all; trees have arrays as leaves."""
 
     q: Float[Entries, "*states coordinates"]  # on the geometric rows
     position_error: Float[Entries, "*states"]  # of these rows, as the next two from `Assembled`

@@ -97,7 +97,7 @@ def looked_at(scene: Scene) -> LookedAt:
 
 
 def _norms(scene: Scene, traced: TracedScene) -> list[int]:
-    """Of quaternions, as rows."""
+    """The unit norms of quaternions, as rows."""
     g, quaternions = traced.graph, [traced.q[first : first + 4].tolist() for first, _ in scene.coordinates.quaternions]
     return [g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)) for wxyz in quaternions]
 
@@ -186,7 +186,7 @@ class _AtStates:
         return _values(self.values, nodes)
 
     def real(self, x: np.ndarray) -> np.ndarray:
-        """In the precision that is in use; what is looked at is computed in double precision."""
+        """Numbers in the precision that is in use; what is looked at is computed in double precision."""
         return np.asarray(x, jnp.result_type(float))
 
     def _matrices(self, probes: Probes, entries: list[dict[int, int]], columns: list[int]) -> np.ndarray:

@@ -69,7 +69,7 @@ def redundant_rows(
 
 
 def _coefficients(found: Scaled, rest: list[int], s: int, rank: int) -> np.ndarray:
-    """Of the rows `rest` in row s, each in its usual length, at states where all rows have their rank; infinite where they do not give it."""
+    """The coefficients of the rows `rest` in row s, each in its usual length, at states where all rows have their rank; infinite where they do not give it."""
     tiny, made = np.finfo(found.A.dtype).tiny, []
     lengths = np.maximum(found.lengths, tiny)
     usual = np.median(lengths, axis=0)

@@ -1,4 +1,4 @@
-"""What a compiled function whose scene is traced was compiled for: the decisions that the numbers of some scene led to."""
+"""The scene whose numbers stand in for a traced one: a compiled function is kept for the decisions that these numbers lead to."""
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager

@@ -69,7 +69,7 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
 
 
 def _are_numbers(u: np.ndarray) -> np.ndarray:
-    """At which states the speeds are numbers, (states,); put on rows that are none, they are none."""
+    """Whether the speeds of each state are numbers, (states,); put on rows that are none, they are none."""
     return np.all(np.isfinite(u), axis=1)
 
 

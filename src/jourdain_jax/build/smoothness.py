@@ -83,7 +83,7 @@ def _quantities(scene: Scene, t, q, u) -> tuple[Float[Array, "differentiable"], 
 
 @eval_numpy
 def _along(scene, u, points, along) -> Float[np.ndarray, "points 2 entries"]:
-    """At many points (t, q): all quantities, and the rates along a direction of those that must be differentiable."""
+    """All quantities at many points (t, q), and the rates along a direction of those that must be differentiable."""
 
     def one(point, direction):
         (smooth, continuous), (rates, _) = jax.jvp(lambda x: _quantities(scene, x[0], x[1:], u), (point,), (direction,))

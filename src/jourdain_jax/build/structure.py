@@ -131,7 +131,7 @@ def _look(scene: Scene, *states_and_generic) -> Probed:
 
 
 def _looked_at_from_afar(scene: Scene, t, q, u, u_other, generic) -> Probed:
-    """At a few states far off as well: no graph says what calls do where the probes do not show it."""
+    """What was looked at, at a few states far off as well: no graph says what calls do where the probes do not show it."""
     generator = np.random.default_rng(1)
     far_q = q[:FAR_PROBES] * FAR ** generator.uniform(size=(FAR_PROBES, 1))
     for first, _ in scene.coordinates.quaternions:
@@ -217,8 +217,8 @@ def _probed_structure(scene: Scene) -> Structure:
     generator = np.random.default_rng(0)
     drawn = random_states(scene, RANDOM_PROBES, generator)
     t, u, generic, found = _at_probes(scene, *drawn)
-    serves = np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2))
-    near = None if serves[generic].any() else states_near_what_was_seen(scene, RANDOM_PROBES, generator)
+    finite = np.isfinite(found.error) & np.all(np.isfinite(found.A), axis=(1, 2))
+    near = None if finite[generic].any() else states_near_what_was_seen(scene, RANDOM_PROBES, generator)
     if near is not None:
         drawn = near
         t, u, generic, found = _at_probes(scene, *near)
@@ -305,7 +305,8 @@ def _check_inertia(scene: Scene, found: Scaled, rank: int) -> None:
     if not moved:
         return
     share = np.median([x / x.max() for x in moved], axis=0)
-    names = ", ".join(f"`{name}`" for name, part in zip(scene.speed_names.entries, share, strict=True) if part > 1e-3)
+    moving = [f"`{name}`" for name, part in zip(scene.speed_names.entries, share, strict=True) if part > 1e-3]
+    names = ", ".join(moving) + (" together" if len(moving) > 1 else "")
     raise ValueError(
         f"nothing in `{type(scene).__name__}` has inertia along {names}: no mass moves with it and no row holds it, so that its acceleration is not "
         "determined; give a body that moves with it a mass (or inertia), hold it by a row, or leave the coordinate out"

@@ -69,7 +69,7 @@ class Particulars(eqx.Module):
 
 def particulars_of(scene: Scene, motion: Motion) -> Particulars:
     """What only probing looks at, computed on numbers."""
-    return Particulars(numbers_of(scene, motion.pose()), potentials_of(scene, motion), explicit_rates(scene, motion))
+    return Particulars(numbers_of(scene, motion), potentials_of(scene, motion), explicit_rates(scene, motion))
 
 
 def potentials_of(scene: Scene, motion: Motion) -> Float[Array, "loads"]:

@@ -1,4 +1,4 @@
-"""What the rows of a motion usually are, for the parameters of that motion: by this a row that vanishes on the way is told from one that is short.
+"""The usual lengths of the rows of a motion, for the parameters of that motion: they tell a row that vanishes on the way from one that is short.
 
 Of a scene whose parameters are numbers, `structure_of` knows it. Where they are traced, the lengths are found while the motion runs, at the states that
 were probed with numbers near the class's defaults.
@@ -22,7 +22,7 @@ STATES = 12  # at which traced parameters are looked at
 
 
 class UsualLengths(eqx.Module):
-    """Of the rows in scaled speeds, with their rank; and of geometric rows and quaternion norms in the coordinates."""
+    """Usual lengths of the rows in scaled speeds, with their rank; and of geometric rows and quaternion norms in the coordinates."""
 
     rows: UsualRows
     closures: Float[Array, "closures"]

@@ -1,4 +1,5 @@
-"""Garbage collection off while many small objects are made that nearly all stay: looking through them again and again takes a tenth of the time or more."""
+"""A context without garbage collection, for making many small objects that nearly all stay: going through them again and again takes a tenth of
+the time or more."""
 
 import gc
 from collections.abc import Iterator

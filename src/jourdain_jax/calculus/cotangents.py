@@ -46,7 +46,7 @@ def _seen(*tangents, look: Callable):
     return list(tangents)
 
 
-def _seen_together(tangents, dims, *, look: Callable):
+def _seen_in_batch(tangents, dims, *, look: Callable):
     """Several directions at once, of `jacfwd`."""
     if not any(isinstance(tangent, jax.core.Tracer) for tangent in tangents):
         look([np.asarray(x)[None] if dim is None else np.moveaxis(np.asarray(x), dim, 0) for x, dim in zip(tangents, dims, strict=True)])
@@ -54,7 +54,7 @@ def _seen_together(tangents, dims, *, look: Callable):
 
 
 _tangents_p.def_impl(_seen)
-batching.primitive_batchers[_tangents_p] = _seen_together
+batching.primitive_batchers[_tangents_p] = _seen_in_batch
 ad.primitive_jvps[_forwards_p] = _pushed
 ad.deflinear2(_tangents_p, lambda cotangents, *values, look: [ad.instantiate_zeros(ct) for ct in cotangents])
 ad.primitive_jvps[_tangents_p] = lambda primals, tangents, *, look: (_tangents_p.bind(*primals, look=look), list(tangents))

@@ -2,7 +2,7 @@
 
     min |f(x)|^2:   x <- x - J' (J J' + damping)^-1 f,   J = df/dx
 
-No derivative passes through: take it at the root (`calculus.settling`). Runs under `jit` and `vmap`, where all lanes go on until the last has ended.
+No derivative passes through: take it at the root (`calculus/fixed_point.py`). Runs under `jit` and `vmap`, where all lanes go on until the last has ended.
 Source: J. Nocedal and S. Wright, Numerical Optimization (2006), section 10.3.
 """
 
@@ -72,9 +72,9 @@ def first_root(rows: Callable, guesses: Float[Array, "guesses unknowns"], size, 
     A root leaves at most `good`; all else is as for `damped_root`.
     """
     count = guesses.shape[0]
-    at_once = max(1, min(count, MOST_ENTRIES // max(1, jax.eval_shape(rows, guesses[0])[1].size)))
-    blocks = -(-count // at_once)
-    places = np.minimum(np.arange(blocks * at_once), count - 1).reshape(blocks, at_once)  # the last one may stand there several times
+    block = max(1, min(count, MOST_ENTRIES // max(1, jax.eval_shape(rows, guesses[0])[1].size)))
+    blocks = -(-count // block)
+    places = np.minimum(np.arange(blocks * block), count - 1).reshape(blocks, block)  # the last one may stand there several times
 
     def next_block(carried):
         k, best, number = carried

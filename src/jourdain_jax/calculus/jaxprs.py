@@ -1,9 +1,15 @@
-"""What JAX traced, without the operations that nobody asks for."""
+"""What JAX traced, read: which operations its results need, what a call stands for, and which loops it holds."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
-from jax.extend.core import ClosedJaxpr
+import jax
+from jax.extend.core import ClosedJaxpr, Jaxpr
 from jax.interpreters.partial_eval import dce_jaxpr
+
+LOOPS = ("while", "scan")
+# Where an operation that only calls a function keeps it, by the name of the operation.
+_CALLS = dict.fromkeys(("jit", "pjit", "remat", "remat2", "checkpoint"), "jaxpr")
+_CALLS |= dict.fromkeys(("closed_call", "core_call", "custom_jvp_call", "custom_vjp_call"), "call_jaxpr")
 
 
 def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> ClosedJaxpr:
@@ -11,3 +17,30 @@ def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> Cl
     jaxpr = closed.jaxpr
     of_wanted = jaxpr if outputs is None else jaxpr.replace(outvars=[jaxpr.outvars[i] for i in outputs])
     return ClosedJaxpr(dce_jaxpr(of_wanted, [True] * len(of_wanted.outvars), instantiate=True)[0], closed.consts)
+
+
+def called(name: str, params: Mapping) -> ClosedJaxpr | None:
+    """The function that an operation of this name calls, and nothing besides; None where it is no call."""
+    if name not in _CALLS:
+        return None
+    found = params[_CALLS[name]]
+    return found if hasattr(found, "consts") else ClosedJaxpr(found, [])
+
+
+def is_jaxpr(x) -> bool:
+    """Whether this is a traced function, closed or not."""
+    return hasattr(x, "eqns") or hasattr(x, "jaxpr")
+
+
+def inner_jaxprs(params: Mapping) -> list[Jaxpr]:
+    """The traced functions among the parameters of an operation."""
+    return [getattr(x, "jaxpr", x) for x in jax.tree.leaves(list(params.values()), is_leaf=is_jaxpr) if is_jaxpr(x)]
+
+
+def loops(jaxpr: Jaxpr) -> Iterator[str]:
+    """The names of its loops, in order, also of those inside of what it calls."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name in LOOPS:
+            yield equation.primitive.name
+        for inner in inner_jaxprs(equation.params):
+            yield from loops(inner)

@@ -35,7 +35,7 @@ def jumps(
 
 
 def _off(a: np.ndarray, b: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """By how much entries differ, in their sizes."""
+    """How much entries differ, in their sizes."""
     with np.errstate(invalid="ignore", over="ignore"):
         difference = np.max(np.abs(b - a) / size, axis=1)
     return np.where(np.isfinite(difference), difference, 0.0)

@@ -65,7 +65,7 @@ def checked_known(value, what: str, shape: tuple[int, ...] | None = None, *, adv
         array = np.asarray(value)
     except (TypeError, ValueError):
         array = np.array(None)
-    if array.dtype.kind in "OUSMm":
+    if array.dtype.kind in "OUSMm" or np.ma.is_masked(value):
         raise ValueError(f"{what} is {described(value)}, expected real numbers; {advice}")
     _check(array, what, shape, advice)
     return array.astype(real_type())
@@ -108,7 +108,8 @@ def described(value) -> str:
         return f"the class `{value.__name__}`"
     if hasattr(value, "dtype") and hasattr(value, "shape"):
         numbers = getattr(value.dtype, "kind", "O") not in "OUSMm"
-        return f"an array of shape {tuple(value.shape)}" if numbers else f"an array of {value.dtype}, shape {tuple(value.shape)}"
+        masked = ", of which some are masked" if np.ma.is_masked(value) else ""
+        return f"an array of shape {tuple(value.shape)}{masked}" if numbers else f"an array of {value.dtype}, shape {tuple(value.shape)}"
     name = type(value).__name__
     return f"an {name}" if name[0] in "aeioAEIO" else f"a {name}"
 

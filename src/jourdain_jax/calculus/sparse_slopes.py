@@ -39,7 +39,7 @@ class Pattern:
         return found
 
     def lengths(self, values: np.ndarray) -> np.ndarray:
-        """Of all rows, (states, rows)."""
+        """The lengths of all rows, (states, rows)."""
         return np.linalg.norm(self.dense(values), axis=2) if self.band is None else np.sqrt(summed(self.rows, self.shape[0], values**2))
 
     def shortest(self, values: np.ndarray, right: np.ndarray, inverses: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
@@ -56,7 +56,7 @@ class Pattern:
 
     @cached_property
     def band(self) -> "Band | None":
-        """Of the products of rows; None where that is not narrow."""
+        """The band of the products of rows; None where that is not narrow."""
         if self.shape[0] < self.fewest:
             return None
         found = Band.of(self)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
-from jourdain_jax.calculus.jaxprs import needed_only
+from jourdain_jax.calculus.jaxprs import called, needed_only
 from jourdain_jax.calculus.scalar_operations import VALUES
 from jourdain_jax.eager.indexing import gathered, scattered
 
@@ -34,7 +34,7 @@ def uncompiled(f: Callable) -> Callable:
         leaves = [np.asarray(x) for x in leaves]
         closed, shape = traced(treedef, tuple((x.shape, x.dtype) for x in leaves))
         with np.errstate(all="ignore"):
-            out = _run(closed.jaxpr, closed.consts, leaves)
+            out = _run(closed, leaves)
         return jax.tree.unflatten(jax.tree.structure(shape), out)
 
     return run
@@ -46,8 +46,9 @@ def traced_for_use(f: Callable, arguments):
     return needed_only(closed), shape
 
 
-def _run(jaxpr, constants, arguments) -> list[np.ndarray]:
-    values = dict(zip(jaxpr.constvars, map(np.asarray, constants), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
+def _run(closed, arguments) -> list[np.ndarray]:
+    jaxpr = closed.jaxpr
+    values = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
 
     def read(atom):
         return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
@@ -60,13 +61,12 @@ def _run(jaxpr, constants, arguments) -> list[np.ndarray]:
     return [read(x) for x in jaxpr.outvars]
 
 
-def _closed(inner, inputs):
-    return _run(inner.jaxpr, inner.consts, inputs) if hasattr(inner, "consts") else _run(inner, [], inputs)
-
-
 def applied(equation, inputs) -> list[np.ndarray]:
     """Results of one equation of a traced function."""
     name, params = equation.primitive.name, equation.params
+    inner = called(name, params)
+    if inner is not None:
+        return _run(inner, inputs)
     if name == "while":
         return _while(equation, inputs)
     if name in _CONTROL:
@@ -74,8 +74,8 @@ def applied(equation, inputs) -> list[np.ndarray]:
     if name in ENTRYWISE:
         with_type = ENTRYWISE[name](*inputs)
         return [np.asarray(with_type, equation.outvars[0].aval.dtype)]
-    if name in RULES and not any(params.get(flag) for flag in _WITHOUT_RULE):
-        result = RULES[name](equation, *inputs)
+    if name in RULES or name in RULES_WITH_LANES:
+        result = RULES[name](equation, *inputs) if name in RULES else RULES_WITH_LANES[name](equation, 0, *inputs)
         if result is not None:
             return result if isinstance(result, list) else [result]
     with jax.ensure_compile_time_eval():
@@ -93,7 +93,7 @@ def _scan(params, inputs) -> list[np.ndarray]:
     order = range(params["length"])
     before: list[np.ndarray] = []  # what was carried one turn ago
     for done, i in enumerate(reversed(order) if params["reverse"] else order, 1):
-        result = _closed(params["jaxpr"], [*constants, *carry, *(x[i] for x in xs)])
+        result = _run(params["jaxpr"], [*constants, *carry, *(x[i] for x in xs)])
         before_last, before, carry = before, carry, result[:carried]
         if not xs and not outs and (_equal(carry, before) or (_equal(carry, before_last) and (params["length"] - done) % 2 == 0)):
             return carry  # an iteration that has converged, or goes to and fro: the rest changes nothing
@@ -113,10 +113,10 @@ def _while(equation, inputs) -> list[np.ndarray]:
     a, b = params["cond_nconsts"], params["body_nconsts"]
     of_condition, of_body, carry = inputs[:a], inputs[a : a + b], inputs[a + b :]
     for _ in range(MOST_TURNS):
-        going = np.asarray(_closed(params["cond_jaxpr"], [*of_condition, *carry])[0])
+        going = np.asarray(_run(params["cond_jaxpr"], [*of_condition, *carry])[0])
         if not np.any(going):
             return carry
-        new = _closed(params["body_jaxpr"], [*of_body, *carry])
+        new = _run(params["body_jaxpr"], [*of_body, *carry])
         carry = new if going.ndim == 0 else [np.where(going.reshape(going.shape + (1,) * (n.ndim - going.ndim)), n, o) for n, o in zip(new, carry, strict=True)]
     if np.all(going):
         raise ValueError(
@@ -137,33 +137,24 @@ def _where(equation) -> str:
 
 
 def _cond(params, inputs) -> list[np.ndarray]:
-    return _closed(params["branches"][int(inputs[0])], inputs[1:])
+    return _run(params["branches"][int(inputs[0])], inputs[1:])
 
 
 def _linear_solve(params, inputs) -> list[np.ndarray]:
     lengths = params["const_lengths"]
     constants, right = np.split(np.arange(len(inputs)), [sum(lengths)])
     of_solve = constants[lengths.matvec + lengths.vecmat :][: lengths.solve]
-    return _closed(params["jaxprs"].solve, [inputs[i] for i in (*of_solve, *right)])
-
-
-def _call(key: str) -> Callable:
-    return lambda params, inputs: _closed(params[key], inputs)
+    return _run(params["jaxprs"].solve, [inputs[i] for i in (*of_solve, *right)])
 
 
 _CONTROL: dict[str, Callable] = {
     "scan": _scan,
     "cond": _cond,
-    "jit": _call("jaxpr"),
-    "pjit": _call("jaxpr"),
-    "closed_call": _call("call_jaxpr"),
-    "custom_jvp_call": _call("call_jaxpr"),
-    "custom_vjp_call": _call("call_jaxpr"),
     "custom_lin": lambda params, inputs: inputs,
     "custom_linear_solve": _linear_solve,
 }
 
-# Primitives.
+# Primitives. Where the second argument of a rule is `lanes`, so many axes of the arrays, none or one, are no axes of the primitive and come first.
 
 ENTRYWISE: dict[str, Callable] = {
     **VALUES,
@@ -183,33 +174,50 @@ ENTRYWISE: dict[str, Callable] = {
 del ENTRYWISE["select"], ENTRYWISE["round"]
 
 
-def _round(equation, x):
+def _round(equation, lanes, x):
     if equation.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN:
         return np.rint(x)
     whole = np.trunc(x)
     return whole + np.copysign(np.abs(x - whole) >= 0.5, x)  # half away from zero
 
 
-def _dot_general(equation, a, b):
-    (over_a, over_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
+def _axes(numbers, lanes: int) -> tuple[int, ...]:
+    """Axes of an array, by their numbers without those of lanes."""
+    return tuple(i + lanes for i in numbers)
+
+
+def _without_lanes(x: np.ndarray, lanes: int, shape) -> np.ndarray:
+    """An array in another shape, whose axes of lanes stay."""
+    return x.reshape((*x.shape[:lanes], *shape))
+
+
+def _dot_general(equation, lanes, a, b):
+    (over_a, over_b), (batch_a, batch_b) = [[_axes(part, lanes) for part in pair] for pair in equation.params["dimension_numbers"]]
+    batch_a, batch_b = (*range(lanes), *batch_a), (*range(lanes), *batch_b)
     free_a = [i for i in range(a.ndim) if i not in (*over_a, *batch_a)]
     free_b = [i for i in range(b.ndim) if i not in (*over_b, *batch_b)]
     batch, contracted = [a.shape[i] for i in batch_a], int(np.prod([a.shape[i] for i in over_a]))
     left = np.transpose(a, (*batch_a, *free_a, *over_a)).reshape(*batch, int(np.prod([a.shape[i] for i in free_a])), contracted)
     right = np.transpose(b, (*batch_b, *over_b, *free_b)).reshape(*batch, contracted, int(np.prod([b.shape[i] for i in free_b])))
-    return (left @ right).reshape(equation.outvars[0].aval.shape)
+    return _reshaped(equation, lanes, left @ right)
 
 
-def _broadcast_in_dim(equation, x, *dynamic):
+def _broadcast_in_dim(equation, lanes, x, *dynamic):
     shape = [1] * len(equation.params["shape"])
     for axis, place in enumerate(equation.params["broadcast_dimensions"]):
-        shape[place] = x.shape[axis]
-    return np.broadcast_to(x.reshape(shape), equation.params["shape"])
+        shape[place] = x.shape[axis + lanes]
+    return np.broadcast_to(_without_lanes(x, lanes, shape), (*x.shape[:lanes], *equation.params["shape"]))
 
 
-def _slice(equation, x):
+def _slice(equation, lanes, x):
     p = equation.params
-    return x[tuple(slice(*s) for s in zip(p["start_indices"], p["limit_indices"], p["strides"] or (1,) * x.ndim, strict=True))]
+    strides = p["strides"] or (1,) * (x.ndim - lanes)
+    return x[(slice(None),) * lanes + tuple(slice(*s) for s in zip(p["start_indices"], p["limit_indices"], strides, strict=True))]
+
+
+def _select(equation, lanes, which, *cases):
+    which = which.reshape((*which.shape, *(1,) * (cases[0].ndim - which.ndim)))
+    return np.where(np.asarray(which, bool), cases[1], cases[0]) if len(cases) == 2 else np.choose(which, cases)
 
 
 def _dynamic_slice(equation, x, *starts):
@@ -236,7 +244,7 @@ def _pad(equation, x, fill):
     return out
 
 
-def _svd(equation, A):
+def _svd(equation, lanes, A):
     p = equation.params
     if A.size == 0 or not np.all(np.isfinite(A)):
         good = np.all(np.isfinite(A), axis=(-2, -1), keepdims=True)
@@ -252,7 +260,7 @@ def _svd_of(A, p):
     return [s, U, V]
 
 
-def _cholesky(equation, A):
+def _cholesky(equation, lanes, A):
     try:
         return np.linalg.cholesky(np.tril(A) + np.swapaxes(np.tril(A, -1), -1, -2))
     except np.linalg.LinAlgError:
@@ -267,8 +275,10 @@ def _cholesky_or_nan(A):
         return np.full_like(A, np.nan)
 
 
-def _triangular_solve(equation, A, b):
+def _triangular_solve(equation, lanes, A, b):
     p = equation.params
+    if p["conjugate_a"]:
+        return None  # left to JAX
     A = np.tril(A) if p["lower"] else np.triu(A)
     A = np.swapaxes(A, -1, -2) if p["transpose_a"] else A
     if p["unit_diagonal"]:
@@ -279,7 +289,7 @@ def _triangular_solve(equation, A, b):
     return np.where(singular, np.nan, x)
 
 
-def _lu(equation, A):
+def _lu(equation, lanes, A):
     """LU decomposition with partial pivoting, as LAPACK's getrf: factors, row exchanges and their permutation, for all matrices together."""
     *lanes, rows, columns = A.shape
     LU = np.array(A).reshape(-1, rows, columns)
@@ -307,37 +317,31 @@ def _iota(equation, *dynamic):
 
 
 def _reduced(function: Callable, of_nothing=None) -> Callable:
-    def reduced(equation, x):
+    def reduced(equation, lanes, x):
         start = {} if of_nothing is None or x.dtype.kind != "f" else {"initial": of_nothing}
-        return np.asarray(function(x, axis=tuple(equation.params["axes"]), **start), equation.outvars[0].aval.dtype)
+        return np.asarray(function(x, axis=_axes(equation.params["axes"], lanes), **start), equation.outvars[0].aval.dtype)
 
     return reduced
 
 
-_WITHOUT_RULE = ("conjugate_a",)  # variants of `triangular_solve` that are left to JAX
-RULES: dict[str, Callable] = {
+def _reshaped(equation, lanes, x, *dynamic):
+    return _without_lanes(x, lanes, equation.outvars[0].aval.shape)
+
+
+RULES_WITH_LANES: dict[str, Callable] = {
+    **dict.fromkeys(("reshape", "squeeze", "expand_dims"), _reshaped),
     "dot_general": _dot_general,
     "broadcast_in_dim": _broadcast_in_dim,
-    "reshape": lambda e, x, *_: x.reshape(e.outvars[0].aval.shape),
-    "squeeze": lambda e, x: x.reshape(e.outvars[0].aval.shape),
-    "expand_dims": lambda e, x: x.reshape(e.outvars[0].aval.shape),
-    "transpose": lambda e, x: np.transpose(x, e.params["permutation"]),
-    "rev": lambda e, x: np.flip(x, e.params["dimensions"]),
-    "concatenate": lambda e, *xs: np.concatenate(xs, axis=e.params["dimension"]),
-    "stack": lambda e, *xs: np.stack(xs, axis=e.params["axis"]),
-    "unstack": lambda e, x: list(np.moveaxis(x, e.params["axis"], 0)),
-    "split": lambda e, x: np.split(x, np.cumsum(e.params["sizes"])[:-1], axis=e.params["axis"]),
+    "transpose": lambda e, lanes, x: np.transpose(x, (*range(lanes), *_axes(e.params["permutation"], lanes))),
+    "rev": lambda e, lanes, x: np.flip(x, _axes(e.params["dimensions"], lanes)),
+    "concatenate": lambda e, lanes, *xs: np.concatenate(xs, axis=e.params["dimension"] + lanes),
+    "stack": lambda e, lanes, *xs: np.stack(xs, axis=e.params["axis"] + lanes),
+    "unstack": lambda e, lanes, x: list(np.moveaxis(x, e.params["axis"] + lanes, 0)),
+    "split": lambda e, lanes, x: np.split(x, np.cumsum(e.params["sizes"])[:-1], axis=e.params["axis"] + lanes),
     "slice": _slice,
-    "dynamic_slice": _dynamic_slice,
-    "dynamic_update_slice": _dynamic_update_slice,
     "round": _round,
-    "select_n": lambda e, which, *cases: np.where(np.asarray(which, bool), cases[1], cases[0]) if len(cases) == 2 else np.choose(which, cases),
-    "integer_pow": lambda e, x: np.asarray(x ** e.params["y"] if e.params["y"] >= 0 else 1 / x ** -e.params["y"]),
-    "iota": _iota,
-    "pad": _pad,
-    "gather": gathered,
-    "scatter": scattered,
-    "platform_index": _platform,
+    "select_n": _select,
+    "integer_pow": lambda e, lanes, x: np.asarray(x ** e.params["y"] if e.params["y"] >= 0 else 1 / x ** -e.params["y"]),
     "svd": _svd,
     "lu": _lu,
     "cholesky": _cholesky,
@@ -348,6 +352,15 @@ RULES: dict[str, Callable] = {
     "reduce_prod": _reduced(np.prod),
     "reduce_and": _reduced(np.bitwise_and.reduce),
     "reduce_or": _reduced(np.bitwise_or.reduce),
+    "optimization_barrier": lambda e, lanes, *xs: list(xs),
+}
+RULES: dict[str, Callable] = {
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "iota": _iota,
+    "pad": _pad,
+    "gather": gathered,
+    "scatter": scattered,
+    "platform_index": _platform,
     "argmax": lambda e, x: np.argmax(x, axis=e.params["axes"][0]).astype(e.params["index_dtype"]),
-    "optimization_barrier": lambda e, *xs: list(xs),
 }

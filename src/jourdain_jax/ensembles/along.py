@@ -60,7 +60,7 @@ def integral(times: Float[Array, "times"], values: Float[Array, "times"], count:
     """The integral over time of the first `count` of `values`."""
 
     def over(i):
-        """From time i to the next: h (y_i + 4 p(middle) + y_next) / 6; the trapezoid of fewer values than a polynomial needs."""
+        """The integral from time i to the next: h (y_i + 4 p(middle) + y_next) / 6; the trapezoid of fewer values than a polynomial needs."""
         even = 0.5 * (values[i] + values[i + 1])
         middle = even
         if times.shape[0] >= FOR_INTEGRALS:

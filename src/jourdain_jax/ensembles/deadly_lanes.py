@@ -20,7 +20,7 @@ def without_deadly_lanes(store: Store, numbers, interrupted, compute: Callable, 
 
     - `compute(numbers, alone)`: a generator that yields `Done` for each chunk and returns the numbers of chunks that were under way when a process died.
     - `survives(first, last)`: whether a process survives lanes `first` to `last` - 1.
-    - `attempts`: how often a chunk on which a process died is tried alone, so that no other is blamed, before it is searched for the lane.
+    - `attempts`: how often a chunk on which a process died is tried alone, so that no other is suspected, before it is searched for the lane.
     """
     waiting, bad, before = list(numbers), [], store.skipped()
     while waiting and not interrupted():

@@ -97,7 +97,7 @@ class LogNormal(Distribution):
         return self.median * np.exp(self.sigma * special_functions().ndtri(u))
 
     def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """With x the value: x / median with respect to the median, x Phi^-1(u) with respect to sigma."""
+        """Derivatives of the value x: x / median with respect to the median, x Phi^-1(u) with respect to sigma."""
         x = self.values(u)
         return {"median": x / self.median, "sigma": x * special_functions().ndtri(u)}
 
@@ -120,7 +120,7 @@ class LogUniform(Distribution):
         return self.low * (self.high / self.low) ** u
 
     def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """With x the value: (1 - u) x / low with respect to `low`, u x / high with respect to `high`."""
+        """Derivatives of the value x: (1 - u) x / low with respect to `low`, u x / high with respect to `high`."""
         x = self.values(u)
         return {"low": (1 - u) * x / self.low, "high": u * x / self.high}
 

@@ -61,7 +61,7 @@ class End(Output):
 
 @dataclass(frozen=True)
 class _Along(Output):
-    """Of a `quantity` along the motion: the name of a coordinate or speed, or a function of a trajectory that gives its values at all times, such as
+    """A number of a `quantity` along the motion: the name of a coordinate or speed, or a function of a trajectory that gives its values at all times, such as
     `lambda motion: jnp.hypot(motion["x"], motion["y"])`. Between saved times it is a polynomial: a smooth quantity of which values are saved every h seconds
     is found to the fifth order of h, its integral to the fourth.
     """
@@ -121,7 +121,7 @@ class Integral(_Along):
 
 @dataclass(frozen=True)
 class OfEvent(Output):
-    """Of a stop event, by `event`, its name; of any where that is None."""
+    """A number of a stop event, by `event`, its name; of any where that is None."""
 
     event: str | None = None
     over_times = False

@@ -47,7 +47,7 @@ class Grid:
         return np.linspace(self.low[i], self.high[i], CELLS + 1)
 
     def as_dict(self) -> dict:
-        """For JSON; floats keep all their digits there."""
+        """The grid for JSON; floats keep all their digits there."""
         return {"low": self.low.tolist(), "high": self.high.tolist(), "centre": self.centre.tolist()}
 
     @classmethod

@@ -152,7 +152,7 @@ class Store:
         return number * self.chunk, min((number + 1) * self.chunk, self.lanes)
 
     def _file(self, name: str, number: int) -> Path:
-        """Of an array with more axes than that of lanes, which are not cut, every chunk has a folder of its own."""
+        """The file of a chunk: of an array with more axes than that of lanes, which are not cut, every chunk has a folder of its own."""
         more = len(self.columns[name].more)
         folder = self.path / name / "c"
         if not more:

@@ -110,7 +110,8 @@ def inertias(scene: Scene, t, q) -> Inertias:
 
 
 def inertias_of(pose: Pose | Motion) -> Inertias:
-    """Masses and inertias of all bodies, from known poses."""
+    """Masses and inertias of all bodies, from known poses; of an inertia its symmetric part, which is all that `w . I w` knows."""
     bodies = [body.body for body in pose.bodies.values()]
     zero = jnp.zeros((3, 3), pose.q.array.dtype)
-    return Inertias(jnp.stack([b.mass for b in bodies]), jnp.stack([b.inertia if isinstance(b, RigidBody) else zero for b in bodies]))
+    inertia = jnp.stack([b.inertia if isinstance(b, RigidBody) else zero for b in bodies])
+    return Inertias(jnp.stack([b.mass for b in bodies]), (inertia + inertia.mT) / 2)

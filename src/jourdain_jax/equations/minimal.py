@@ -56,13 +56,6 @@ def speeds_and_pivot(scene: Scene, independent: tuple[int, ...], t, q, y, inputs
     return found.u, Partition(jax.lax.stop_gradient(found.split.A), independent).signed_pivot()
 
 
-def minimal_accelerations(scene: Scene, independent: tuple[int, ...], t, q, y, inputs=None) -> tuple[Float[Array, "speeds"], Motion, Reduced]:
-    """All speeds, the motion they make, and the accelerations with the constraint force."""
-    known = minimal_kinematics(scene, independent, t, q, y, inputs)
-    motion, found = accelerations_of(scene, known, t, q, inputs)
-    return known.u, motion, found
-
-
 def accelerations_of(scene: Scene, known: MinimalKinematics, t, q, inputs=None) -> tuple[Motion, Reduced]:
     """The motion and the accelerations that go with known speeds."""
     value, rate, motion = rates_along_motion(scene, t, q, known.u, inputs)

@@ -70,12 +70,12 @@ def _rates_of_position_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
         return position_rows(scene, Pose(t, scene.coordinate_names.view(q), bodies))
 
     pose = motion.pose()
-    rates = {name: BodyPose(name, _pose_rate(body)) for name, body in motion.bodies.items()}
+    rates = {name: BodyPose(name, pose_rate(body)) for name, body in motion.bodies.items()}
     values = jax.jvp(g, (motion.t, motion.q.array, pose.bodies), (jnp.ones_like(motion.t), motion.qdot.array, rates))[1]
     return {name: values[name] for name in position_rows(scene, pose)}  # JAX returns dictionaries sorted by name
 
 
-def _pose_rate(body_motion):
+def pose_rate(body_motion):
     """Tangent of a body's pose: `rdot = v`, `Rdot = [omega] R`, nothing else changes."""
     zero = jax.tree.map(jnp.zeros_like, body_motion.body)
     if isinstance(zero, RigidBody):

@@ -10,7 +10,7 @@ import numpy as np
 
 from jourdain_jax.importers.identifiers import identifier
 from jourdain_jax.importers.mjcf_elements import IDLE_ELEMENTS, Defaults, attributes_of, check_attributes
-from jourdain_jax.importers.placing import about, by_euler_angles, by_quaternion, onto_axis, together
+from jourdain_jax.importers.placing import about, by_euler_angles, by_quaternion, combined, onto_axis
 from jourdain_jax.importers.solids import SIZES, moments, volume
 from jourdain_jax.importers.tree import Joint, Link, Look, Mass, Matrix, Motor, Tree, Vector
 from jourdain_jax.importers.tree_scene import tree_scene
@@ -164,7 +164,7 @@ class _Reader:
             return None
         masses = [self._mass_of_geom(geom, childclass, name) for geom in body.findall("geom")]
         heavy = [mass for mass in masses if mass is not None]
-        return together(heavy) if heavy else None
+        return combined(heavy) if heavy else None
 
     def _stated_mass(self, inertial: Element, what: str) -> Mass | None:
         given = dict(inertial.attrib)

@@ -45,7 +45,7 @@ def onto_axis(direction: Vector) -> Matrix:
     return np.eye(3) + cross_matrix(v) + cross_matrix(v) @ cross_matrix(v) / (1 + k[2])
 
 
-def together(masses: list[Mass]) -> Mass:
+def combined(masses: list[Mass]) -> Mass:
     """Several masses in one frame as one: mass centre, and inertia by the parallel axes,
 
     I = sum I_i + m_i (d_i.d_i - d_i d_i').

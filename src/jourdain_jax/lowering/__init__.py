@@ -1,4 +1,4 @@
-"""Lowering: a scene's equations as a lean scalar program.
+"""Lowering: a scene's equations as a short scalar program.
 
     scene -> jaxpr -> graph of scalars -> elimination of the rows -> normal forms -> straight-line code
 

@@ -37,7 +37,7 @@ class Strategy:
 
     @property
     def description(self) -> str:
-        """In words."""
+        """What was done, in words."""
         way = "dependent speeds put in before differentiation" if self.explicit else "rows differentiated through the bodies' velocities"
         solved = "accelerations by determinants in normal form" if self.by_determinants else "accelerations by elimination"
         return f"{way}, {solved}"
@@ -327,7 +327,7 @@ class _Kinematics:
         return list(nodes) if self.forms is None else [self.forms.simplified(n) for n in nodes]
 
     def _at(self, nodes) -> list[int]:
-        """At the held coordinates, simplified."""
+        """Nodes at the held coordinates, simplified."""
         return self._simple(self.graph.substituted(nodes, self.held))
 
     def _by(self, nodes, variables) -> list[list[int]]:

@@ -22,7 +22,7 @@ class Eliminated:
 
 
 def pivots_ok(pivots: list[int], probes: Probes | IdentityProbes) -> Bool[np.ndarray, "probes"]:
-    """At which probes what was divided by these pivots is more than round-off: none of them is small beside its usual size."""
+    """The probes at which what was divided by these pivots is more than round-off: none of them is small beside its usual size."""
     sizes = np.abs(probes(pivots))
     return np.all(sizes > SMALLEST_PIVOT * usual(sizes)[:, None], axis=0)
 
@@ -57,7 +57,7 @@ def eliminate(graph: Graph, A: list[list[int]], right: list[list[int]], probes: 
         ]
         found = [products(graph, b, pivot.inverse) for b in zip(*rest, strict=True)]
         solution |= dict(zip(pivot.columns, map(list, zip(*found, strict=True)), strict=True)) if found else {c: [] for c in pivot.columns}
-    return Eliminated([solution[c] for c in range(count)], [pivot.watched for pivot in order if graph.op[pivot.watched] != "const"])
+    return Eliminated([solution[c] for c in range(count)], [pivot.monitored for pivot in order if graph.op[pivot.monitored] != "const"])
 
 
 def quotient(graph: Graph, a: int, b: int) -> int:

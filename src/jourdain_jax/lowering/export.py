@@ -24,7 +24,7 @@ def summary(lowered) -> str:
         *([f"  rows left out, as the others imply them: {', '.join(lowered.left_out)}"] if lowered.left_out else []),
         f"  parameters, which stay inputs (SI units and radians): {_parameters(lowered) or 'none'}",
         f"  computed once per motion, from parameters alone: {len(lowered.fixed)} number{'' if len(lowered.fixed) == 1 else 's'}",
-        f"  must not vanish, pivots that are watched: {_shown(lowered, lowered.pivots)}",
+        f"  must not vanish, pivots that are monitored: {_shown(lowered, lowered.pivots)}",
         f"  must stay positive, signs that are relied on: {_shown(lowered, lowered.guards)}",
         f"  way: {lowered.way}; {lowered.seconds:.2f} s",
     ]

@@ -21,14 +21,14 @@ LARGEST_WORK = 100_000  # operations times variables: beyond, deriving takes lon
 LARGEST_GROWTH = 8  # operations of values and Jacobian over those of the values
 
 
-def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int], like: int, watched: Sequence[int] = ()) -> Callable[..., tuple]:
+def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int], like: int, monitored: Sequence[int] = ()) -> Callable[..., tuple]:
     """A function of the values of `variables` (all that the outputs depend on) that returns those of `outputs`, as arrays of one shape, in the precision
-    of the variable with number `like`; after them the values of the nodes `watched`, which have no derivatives.
+    of the variable with number `like`; after them the values of the nodes `monitored`, which have no derivatives.
     """
     scalars = [i for i, n in enumerate(variables) if graph.op[n] not in ARRAYS]
     count = len(outputs)
-    graph, nodes, variables = on_its_own(graph, [*outputs, *watched], variables)
-    outputs, watched = nodes[:count], nodes[count:]
+    graph, nodes, variables = on_its_own(graph, [*outputs, *monitored], variables)
+    outputs, monitored = nodes[:count], nodes[count:]
     entries = _entries(graph, outputs, variables)
 
     def values_of(nodes, values) -> tuple:
@@ -37,7 +37,7 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
         return tuple(jnp.broadcast_to(jnp.asarray(x, real), shape) for x in found)
 
     def program(*values):
-        found = values_of([*outputs, *watched], values)
+        found = values_of([*outputs, *monitored], values)
         return *found[:count], *map(jax.lax.stop_gradient, found[count:])
 
     if entries is None:
@@ -49,11 +49,11 @@ def differentiable(graph: Graph, outputs: Sequence[int], variables: Sequence[int
         moving = [not isinstance(v, jax.custom_derivatives.SymbolicZero) for v in tangents]
         used = [(i, j, node) for i, j, node in entries if moving[j]]
         varying = list(dict.fromkeys(node for *_, node in used if not graph.is_const(node)))
-        found = values_of([*outputs, *watched, *varying], values)
+        found = values_of([*outputs, *monitored, *varying], values)
         found = fused(found) if found[0].ndim == 0 else found  # measured: a quarter less time for one motion, a quarter more in batches
-        J = dict(zip(varying, found[count + len(watched) :], strict=True))
+        J = dict(zip(varying, found[count + len(monitored) :], strict=True))
         # d o_i = sum_j J_ij d x_j
-        along = [jnp.zeros_like(x) for x in found[: count + len(watched)]]
+        along = [jnp.zeros_like(x) for x in found[: count + len(monitored)]]
         for i, j, node in used:
             along[i] = along[i] + jnp.asarray(J.get(node, graph.value[node]) * tangents[j], along[i].dtype)
         return found[: len(along)], tuple(along)

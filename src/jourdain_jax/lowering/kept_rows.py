@@ -66,7 +66,7 @@ class KeptRows:
 
     @property
     def description(self) -> str:
-        """In words."""
+        """How the rows are kept, in words."""
         if self.by_partition:
             return "all speeds in the state, their accelerations by privileged ones"
         return "rows kept by multipliers, by elimination" + (", with inertia along the rows" if self.massless else "")

@@ -1,4 +1,4 @@
-"""From a scene to its lowered equations: candidates are built in several ways, compared with each other and with the dense path, and the
+"""The lowered equations of a scene: candidates are built in several ways, compared with each other and with the dense path, and the
 one with the fewest operations is kept. A scene that cannot be lowered says why.
 """
 

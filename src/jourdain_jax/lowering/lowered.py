@@ -166,7 +166,7 @@ class Lowered:
 
     def _rates_and(self, more: list[int]) -> Callable[..., tuple]:
         outputs = [*self.qdot, *self.ydot, *more, *self.guards]
-        return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, watched=self.pivots)
+        return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, monitored=self.pivots)
 
     @property
     def variables(self) -> list[int]:
@@ -233,7 +233,7 @@ class Lowered:
 
     @functools.cached_property
     def _fixed_shapes(self) -> dict[int, tuple[int, ...]]:
-        """Of the arrays among what is fixed: without lanes."""
+        """The shapes of the arrays among what is fixed, without lanes."""
         return {n: self.graph.value[n][-2] for n in self.fixed if self.graph.op[n] in ARRAYS}
 
     @functools.cached_property

@@ -38,7 +38,7 @@ class Pivot:
     rows: tuple[int, ...]
     columns: tuple[int, ...]
     inverse: tuple[tuple[int, ...], ...]  # of A[rows][columns]
-    watched: int  # must not vanish
+    monitored: int  # must not vanish
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class Pivots:
         if pair is not None:
             return pair
         good.sort(key=cost)
-        serving = next(((r, c) for r, c, entry in good if entry.fixed or self._serves_everywhere((r, c))), None)
+        serving = next(((r, c) for r, c, entry in good if entry.fixed or self._regular_everywhere((r, c))), None)
         if serving is not None:
             return self._single(*serving)
         r, c, _ = good[0] if good else max(judged, key=lambda place: place[2].worst)
@@ -141,13 +141,13 @@ class Pivots:
         graph = self.graph
         return not graph.varies[node] and (graph.is_const(node) or not any(turns(graph, n) for n in graph.reachable([node])))
 
-    def _single(self, row: int, column: int, watched: int | None = None) -> Pivot:
+    def _single(self, row: int, column: int, monitored: int | None = None) -> Pivot:
         entry = self.A[row][column]
-        return Pivot((row,), (column,), ((self.graph.div(self.graph.one, entry),),), entry if watched is None else watched)
+        return Pivot((row,), (column,), ((self.graph.div(self.graph.one, entry),),), entry if monitored is None else monitored)
 
     # judgement: at the probes of the domain, and at full turns of all angles where the system itself is regular
 
-    def _serves_everywhere(self, place: tuple[int, int]) -> bool:
+    def _regular_everywhere(self, place: tuple[int, int]) -> bool:
         """Whether an entry stays away from zero also outside of the domain, wherever the system is regular."""
         ratio = self._beside_row(place)
         ratio = ratio[self._regular & np.isfinite(ratio)]
@@ -164,7 +164,7 @@ class Pivots:
 
     @property
     def _regular(self) -> np.ndarray:
-        """At which probes the given system is: its rows and columns scaled, at the probes of the domain and the far ones."""
+        """The probes at which the given system is regular: its rows and columns scaled, at the probes of the domain and the far ones."""
         if self._kept_regular is None:
             count = len(self._given[0])
             A = np.moveaxis(self._at([n for row in self._given for n in row]).reshape(len(self._given), count, -1), -1, 0)
@@ -184,7 +184,7 @@ class Pivots:
         return near if self._far is None else np.concatenate([near, self._far()(nodes)], axis=1)
 
     def _size(self, row: int) -> np.ndarray:
-        """Of what a row was made of, at all probes."""
+        """The size of what a row was made of, at all probes."""
         if row not in self._sizes:
             self._sizes[row] = np.max(np.abs(self._at(self.A[row])), axis=0)
         return self._sizes[row]
@@ -226,8 +226,8 @@ class Pivots:
         graph, probes = self.graph, self.probes
         both = graph.mul(a, b), graph.mul(c, d)
         determinant = self.forms.simplified(graph.sub(*both))
-        serves = not graph.varies[determinant] and np.all(np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(both)), axis=0))
-        return determinant if serves else None
+        regular = not graph.varies[determinant] and np.all(np.abs(probes([determinant])) > GOOD * np.sum(np.abs(probes(both)), axis=0))
+        return determinant if regular else None
 
     # rows combined
 
@@ -267,7 +267,7 @@ class Pivots:
         return len(self.rows) > len(self.columns)
 
     def _weights(self, rows: list[int]) -> list[float]:
-        """Of rows in a combination: one where their sizes are alike."""
+        """The weights of rows in a combination: one where their sizes are alike."""
         sizes = [float(np.nanmedian(self._size(r))) for r in rows]
         largest = max(sizes)
         if min(sizes) * LIKE > largest:
@@ -315,7 +315,7 @@ class Pivots:
         return self._single(new, c, graph.call("sqrt", squares))
 
     def _determinant_left(self) -> int:
-        """Of the rows and columns that are left, by minors."""
+        """The determinant of the rows and columns that are left, by minors."""
         graph, rows, columns = self.graph, sorted(self.rows), sorted(self.columns)
         minors: dict[tuple[int, ...], int] = {(): graph.one}
         for size, r in enumerate(rows, 1):
@@ -335,7 +335,7 @@ class Pivots:
             return pivot
         others = self.graph.one
         for other in self._combined[:-1]:
-            others = self.graph.mul(others, other.watched)
+            others = self.graph.mul(others, other.monitored)
         return Pivot(pivot.rows, pivot.columns, pivot.inverse, self.graph.div(self._determinant, others))
 
 

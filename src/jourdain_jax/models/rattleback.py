@@ -107,8 +107,9 @@ class Rattleback(Scene):
         return jnp.stack([jnp.stack([self.A, self.D, o]), jnp.stack([self.D, self.B, o]), jnp.stack([o, o, self.C])])
 
 
-def _half_ball(rings: int = 10, around: int = 40) -> tuple[np.ndarray, list]:
+def _half_ball() -> tuple[np.ndarray, list]:
     """Corners and faces of the half of a ball of radius 1 that is down, along body axis 3."""
+    rings, around = 10, 40
     across, angle = np.linspace(0, np.pi / 2, rings + 1)[1:, None], 2 * np.pi * np.arange(around) / around
     grid = np.stack([np.sin(across) * np.cos(angle), np.sin(across) * np.sin(angle), np.cos(across) + 0 * angle], axis=-1)
     at = lambda i, j: 1 + i * around + j % around  # noqa: E731

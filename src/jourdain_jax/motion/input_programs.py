@@ -50,7 +50,7 @@ class TimeProgram:
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
-        """Of the arguments before the time: the plain numbers, and what the function closes over."""
+        """The shapes of the arguments before the time: the plain numbers, and what the function closes over."""
         return [x.shape for x in self.closed.in_avals[:-1]]
 
     def __call__(self, numbers, held, t):

@@ -64,7 +64,7 @@ class OwnSteps(Integrator):
         return self._by_either(lambda mode: partial(in_blocks, partial(_lanes_by_xla, mode), width(program)), eqx.filter_vmap, setups, begun)
 
     def _by_either(self, by_xla: Callable, mapped: Callable, setup: Setup, begun: Begun) -> Solved:
-        """By machine code where that serves; `mapped`: of a function of one motion, that of all lanes."""
+        """A motion by machine code where that serves; `mapped`: of a function of one motion, that of all lanes."""
         forward, reverse = by_xla("forward"), by_xla("reverse")
         if setup.reason_against_machine_code:
             return (forward if self.kind == "forward" else reverse)(setup, begun)

@@ -14,6 +14,7 @@ import jax
 import jax.extend.core
 
 from jourdain_jax.calculus.collecting import without_collecting
+from jourdain_jax.calculus.jaxprs import loops
 from jourdain_jax.calculus.reals import is_array_type
 
 QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
@@ -83,7 +84,7 @@ def quickly_compiled(f: Callable, compiler: Callable = compiled, options: dict |
     return run
 
 
-def sparingly_compiled(f: Callable, loops: int) -> Callable:
+def sparingly_compiled(f: Callable, most_loops: int) -> Callable:
     """`f` of arrays of the same shapes in each call, compiled for a CPU with the least effort where it has no more loops than these: then none of them is one
     of XLA's over the steps of a motion. Not inside another transformation."""
     chosen: list[Callable] = []
@@ -91,15 +92,11 @@ def sparingly_compiled(f: Callable, loops: int) -> Callable:
     def run(*arrays):
         if not chosen:
             plain = jax.jit(f)
-            few = jax.default_backend() == "cpu" and _loops(plain.trace(*arrays).jaxpr.jaxpr) <= loops
+            few = jax.default_backend() == "cpu" and sum(1 for _ in loops(plain.trace(*arrays).jaxpr.jaxpr)) <= most_loops
             chosen.append(jax.jit(f, compiler_options=RUN_SELDOM) if few else quickly_compiled(f, jax.jit))
         return chosen[0](*arrays)
 
     return run
-
-
-def _loops(jaxpr) -> int:
-    return sum((eqn.primitive.name in ("while", "scan")) + sum(map(_loops, _core.jaxprs_in_params(eqn.params))) for eqn in jaxpr.eqns)
 
 
 def nothing_is_traced() -> bool:

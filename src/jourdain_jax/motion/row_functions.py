@@ -51,20 +51,20 @@ def row_functions(program: RowProgram) -> RowFunctions:
         found = entries(scene, program.parameters)
         return jnp.concatenate(found) if found else jnp.zeros(0, real_type())
 
-    def together(given, t, *vectors):
+    def in_a_row(given, t, *vectors):
         first = parameters_of(given) if isinstance(given, Scene) else given
         return jnp.concatenate([jnp.asarray(x, real_type()) for x in (first, jnp.asarray(t)[None], *vectors)])
 
     def closures_at(given, t, q):
-        found = of_closures(together(given, t, q))
+        found = of_closures(in_a_row(given, t, q))
         return found[:closures], found[closures:].reshape(closures, coordinates)
 
     def rows_at(given, t, q, u, inputs):
-        found = of_rows(together(given, t, q, u, inputs))
+        found = of_rows(in_a_row(given, t, q, u, inputs))
         return found[:rows], found[rows:].reshape(rows, speeds)
 
     def masses_at(given, t, q):
-        return of_masses(together(given, t, q)).reshape(speeds, speeds)
+        return of_masses(in_a_row(given, t, q)).reshape(speeds, speeds)
 
     return RowFunctions(closures_at, rows_at, masses_at if program.M is not None else BY_AUTODIFF.masses, parameters_of)
 
@@ -113,7 +113,7 @@ def _function(graph: Graph, places: dict[int, int], size: int, variables: Sequen
     def pull(perturbed, arguments, found, g):
         return (back(*arguments, g),)
 
-    by_xla, quick = _ways(graph, places, size, variables)
+    by_xla, quick = _by_xla_and_machine_code(graph, places, size, variables)
     values = differentiated_as(by_xla, quick, "both", Rules(serve, push, pull), by_xla)
     return values
 
@@ -133,7 +133,7 @@ def _second(graph: Graph, places: dict[int, int], size: int, variables: Sequence
     found = {place: node for place, node in found.items() if node != graph.zero}
     if unsupported(graph, found.values()) or graph.operations(found.values()) > LARGEST_PROGRAM:
         return None
-    return _ways(graph, found, len(variables) if back else size, [*variables, *first, *last])[1]
+    return _by_xla_and_machine_code(graph, found, len(variables) if back else size, [*variables, *first, *last])[1]
 
 
 def _slopes(graph: Graph, places: dict[int, int], variables: Sequence[int]) -> tuple[Callable[[Array], Array], np.ndarray] | None:
@@ -147,11 +147,11 @@ def _slopes(graph: Graph, places: dict[int, int], variables: Sequence[int]) -> t
     found = list(entries.values())
     if unsupported(graph, found) or graph.operations([*places.values(), *found]) > LARGEST_PROGRAM:
         return None
-    values = differentiated_as(*_ways(graph, entries, len(rows) * len(variables), variables), "forward")
+    values = differentiated_as(*_by_xla_and_machine_code(graph, entries, len(rows) * len(variables), variables), "forward")
     return lambda x: values(x).reshape(len(rows), len(variables)), np.array(rows, int)
 
 
-def _ways(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> tuple[Callable, Callable]:
+def _by_xla_and_machine_code(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> tuple[Callable, Callable]:
     """Values of nodes at their places, as a function of the values of the variables: by XLA, and by machine code.
 
     Machine code returns the numbers that are not zero: a whole matrix of 32 trailers lay beyond the end of its stack.

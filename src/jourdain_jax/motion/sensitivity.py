@@ -1,4 +1,4 @@
-"""Derivatives through motions that amplify errors: what differentiation finds out anyway, said aloud.
+"""Warnings about derivatives through motions that amplify errors, by what differentiation finds out anyway.
 
 A value L of a motion has the cotangents g = dL/dy at the states it looks at and g_0 = dL/dy_0 at the start. With s = atol + rtol |y|, what the step-size
 control lets pass at one state,

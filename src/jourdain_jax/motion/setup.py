@@ -39,7 +39,7 @@ class Solved(eqx.Module):
     accepted: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
     last_step: Float[Array, "*lanes"]  # s, that the step-size control would take next; NaN where it keeps that to itself
-    pivot: Float[Array, "*lanes"]  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was watched
+    pivot: Float[Array, "*lanes"]  # smallest magnitude of a pivot in any step, negative where one changed its sign; infinite: none was monitored
 
 
 class Integrator(eqx.Module):

@@ -39,6 +39,7 @@ from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 FAR = 10.0  # widths of the domain: a coordinate that Newton's method moves by more has run away
 GUESSES = 8  # of each kind
+_TYPED = 1.5e-5  # of numbers that were typed with a few digits
 _OFF = 1e4  # units of round-off: a residual that is more
 NEAR = 0.1  # of the domain: how far the first guesses are from what was given
 
@@ -247,7 +248,8 @@ def _searched(scene: Scene, t, q, free, usual: Usual, guesses) -> _Put:
 
 
 def _tolerance(dtype) -> float:
-    return 1e3 * float(np.finfo(dtype).eps) ** 0.5
+    """The residual (m, rad) from which on given values contradict each other: that of numbers typed with a few digits, or of round-off."""
+    return max(_TYPED, _OFF * float(np.finfo(dtype).eps))
 
 
 _compiled_projection = quickly_compiled(_put_onto_constraints, options=RUN_SELDOM)  # one program for every choice of what is held
@@ -285,19 +287,18 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bo
 
 
 def _moved_if_near(scene: Scene, start: State, inputs, native: bool | None) -> State:
-    """The start moved onto the rows as a whole, where it is off them by more than round-off, and by less than what counts as a contradiction."""
-    near = is_off(start) & (start.residual < _tolerance(start.q.dtype))
+    """The start moved onto the rows as a whole, where it is off them by less than what counts as a contradiction.
 
-    def moved_again(start: State) -> State:
-        state = put_on_rows(scene, start.t, start.q, start.u, inputs, native=native)
-        moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
-        state = eqx.tree_at(lambda s: (s.moved_q, s.moved_u, s.guess), state, (*moved, start.guess))
-        return jax.tree.map(lambda x, y: jnp.where(near, x, y), state, start)
-
-    if is_traced(near):
-        # worked out once more on the way back of a derivative: what would be kept for it, of a branch that is rarely taken, costs as much as the start itself
-        return jax.lax.cond(eqxi.unvmap_any(near), jax.checkpoint(moved_again), lambda start: start, start)
-    return moved_again(start) if near else start
+    Where it is off by round-off alone, its numbers stay as they are, but what is traced gets the derivatives of a start that is moved: values that agree at
+    these parameters contradict each other at others.
+    """
+    near = start.residual < _tolerance(start.q.dtype)
+    if not is_traced(near) and not (near and is_off(start)):
+        return start
+    state = put_on_rows(scene, start.t, start.q, start.u, inputs, native=native)
+    moved = [jnp.maximum(a, b) for a, b in ((start.moved_q, state.moved_q), (start.moved_u, state.moved_u))]
+    state = eqx.tree_at(lambda s: (s.moved_q, s.moved_u, s.guess), state, (*moved, start.guess))
+    return jax.tree.map(lambda x, y: jnp.where(near, x, y), state, start)
 
 
 class _Named(NamedTuple):

@@ -1,4 +1,4 @@
-"""The machine that runs this process: whether machine code can be made for it, how many lanes it takes at once, and the making."""
+"""The machine that runs this process: whether machine code can be made for it, how many lanes it takes at once; and how code is made."""
 
 import ctypes
 import ctypes.util
@@ -7,7 +7,8 @@ import os
 import threading
 from typing import Any
 
-from jourdain_jax.native.math_functions import LIBM, PREFIX
+from jourdain_jax.native.libm import PREFIX
+from jourdain_jax.native.math_functions import LIBM
 
 try:
     from llvmlite import binding
@@ -35,7 +36,7 @@ def reason_against() -> str:
         llvm.initialize_native_asmprinter()
         _machine(0)
         libm = ctypes.CDLL(ctypes.util.find_library("m"))
-        for name in LIBM:
+        for name in LIBM.values():
             llvm.add_symbol(PREFIX + name, ctypes.cast(getattr(libm, name), ctypes.c_void_p).value)
     except (OSError, RuntimeError, AttributeError) as error:
         return f"LLVM does not know this machine ({str(error).splitlines()[0]})"
@@ -88,14 +89,14 @@ def object_code(text: str, effort: int) -> bytes:
     """Machine code of a module of LLVM IR; `effort`: 0, 1, or 2, as of `EFFORT`."""
     effort = min(effort, EFFORT)
     with _lock:
-        machine, seldom = _machine(effort), effort < 2
+        machine, few_passes = _machine(effort), effort < 2
         module = llvm.parse_assembly(text)
         module.triple = llvm.get_process_triple()
-        options = llvm.create_pipeline_tuning_options(speed_level=0 if seldom else effort)
+        options = llvm.create_pipeline_tuning_options(speed_level=0 if few_passes else effort)
         options.loop_vectorization = options.slp_vectorization = False
         builder = llvm.create_pass_builder(machine, options)
-        passes = llvm.create_new_module_pass_manager() if seldom else builder.getModulePassManager()
-        for add in ("add_sroa_pass", "add_simplify_cfg_pass") if seldom else ():
+        passes = llvm.create_new_module_pass_manager() if few_passes else builder.getModulePassManager()
+        for add in ("add_sroa_pass", "add_simplify_cfg_pass") if few_passes else ():
             getattr(passes, add, lambda: None)()  # older versions of llvmlite have not all of them
         passes.run(module, builder)
         return machine.emit_object(module)

@@ -216,6 +216,17 @@ class Writer:
         self._declared[function] = f"declare {result} @{function}({', '.join(a.type for a in arguments)})"
         return self.call(function, result, *arguments)
 
+    def shared(self, name: str, body: Callable[..., Value], *arguments: Value) -> Value:
+        """The result of a function of vectors that stands in the module once, so that each use takes one call to compile; `body(w, *arguments)` writes it."""
+        function = f"shared_{name}"
+        if function not in self._declared:
+            around, self._lines = (self._lines, self._entry), []
+            with self.function(function, self.real, {f"a{i}": a.type for i, a in enumerate(arguments)}, attributes="noinline") as given:
+                self.give(body(self, *given))
+            self._declared[function] = "\n".join(self._lines)
+            self._lines, self._entry = around
+        return self.call(function, self.real, *arguments)
+
     def intrinsic(self, name: str, a: Value, *more) -> Value:
         """A function of LLVM of one or more numbers of a type."""
         kind = f"v{self.lanes}f64" if a.type == self.real else "f64"

@@ -8,8 +8,9 @@ from operator import itemgetter
 from typing import Any
 
 from jourdain_jax.native import host
+from jourdain_jax.native.angles import sine_and_cosine
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.math_functions import FUNCTIONS, sine_and_cosine
+from jourdain_jax.native.math_functions import FUNCTIONS
 from jourdain_jax.native.registers import Turn, turns
 from jourdain_jax.program.graph import ARRAYS, Graph
 
@@ -23,7 +24,7 @@ _TRUTHS = {"and": "and", "or": "or"}
 
 def unsupported(graph: Graph, nodes: Iterable[int]) -> str:
     """Why the nodes cannot be written as machine code; empty where they can."""
-    known = {*FUNCTIONS, *_TRUTHS, *ARRAYS, "not", "select", "sin", "cos", "const", "input"}
+    known = {*FUNCTIONS, *_TRUTHS, *ARRAYS, "not", "select", "const", "input"}
     for node in graph.reachable(nodes):
         if graph.op[node] in ARRAYS or graph.op[node] == "entry":
             return "a part of it is kept as a call of JAX"

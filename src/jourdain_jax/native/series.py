@@ -13,8 +13,9 @@ Sums add the newest coefficients last: all others are known long before. Source:
 from collections.abc import Mapping, Sequence
 
 from jourdain_jax.calculus.scalar_operations import TABLE
+from jourdain_jax.native.angles import sine_and_cosine
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.math_functions import FUNCTIONS, sine_and_cosine
+from jourdain_jax.native.math_functions import FUNCTIONS
 from jourdain_jax.native.scalar_program import unsupported
 from jourdain_jax.program.graph import Graph
 
@@ -164,7 +165,7 @@ class Series:
 
 
 def _newest_last(js: Sequence[int], k: int) -> list[int]:
-    """In the order in which both factors of a_j b_{k-j} are known."""
+    """The numbers j in the order in which both factors of a_j b_{k-j} are known."""
     return sorted(js, key=lambda j: max(j, k - j))
 
 

@@ -8,7 +8,7 @@ from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.graph import Graph
 
 NONANALYTIC = frozenset(name for name, operation in TABLE.items() if operation.kind != "analytic")
-CALLS = frozenset({"kept"})
+CALLS = frozenset({"opaque"})
 
 
 def passes(graph: Graph, outputs: Iterable[int], kinds: Collection[str]) -> list[bool]:
@@ -19,12 +19,12 @@ def passes(graph: Graph, outputs: Iterable[int], kinds: Collection[str]) -> list
 def decided_by(graph: Graph, outputs: Iterable[int], variables: Iterable[int], kinds: Collection[str]) -> bool:
     """Whether an operation of these kinds on the way to the outputs depends on one of the variables."""
     outputs, variables = list(outputs), set(variables)
-    hiding = [n for n in graph.reachable(outputs) if graph.op[n] in kinds]
-    return any(depend_on(graph, hiding, variables))
+    decisions = [n for n in graph.reachable(outputs) if graph.op[n] in kinds]
+    return any(depend_on(graph, decisions, variables))
 
 
 def depend_on(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[bool]:
-    """Of each output, whether it needs one of the variables."""
+    """Whether each output needs one of the variables."""
     variables = set(variables)
     return _with(graph, outputs, lambda n: n in variables)
 

@@ -1,6 +1,6 @@
-"""What is kept of a traced function as it is: a call of JAX in a graph of scalars.
+"""Calls of JAX in a graph of scalars: the parts of a traced function that have no scalar form.
 
-    array   entries put together             kept    the results of a `Call` of arrays
+    array   entries put together             opaque  the results of a `Call` of arrays
     output  one of these results             entry   one entry of it, a scalar again
 
 The values of an array may have axes of lanes, which come last, as a scalar's do.
@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal, jaxpr_as_fun
 
+from jourdain_jax.calculus.jaxprs import loops
 from jourdain_jax.calculus.reals import is_array
 from jourdain_jax.eager.numpy_backend import uncompiled
 from jourdain_jax.program.graph import Unsupported
@@ -35,17 +36,17 @@ class Call:
 
     @property
     def reason(self) -> str:
-        """In words, without a verb."""
+        """Why it is a call, in words without a verb."""
         return " and ".join(self.reasons)
 
     @property
     def loop(self) -> str:
         """The name of a loop in it; empty where there is none."""
-        return _loop_in(self.closed.jaxpr)
+        return next(loops(self.closed.jaxpr), "")
 
     @functools.cache  # noqa: B019  (calls are few, and live as long as their graph)
     def slopes(self, moves: tuple[tuple[bool, ...], ...]) -> "Call":
-        """Of each result, its derivatives with respect to those entries of the operands that move, with a leading axis of these.
+        """The derivatives of each result with respect to those entries of the operands that move, with a leading axis of these.
 
         `Unsupported` where JAX has no forward derivative.
         """
@@ -106,20 +107,6 @@ class Call:
         return results
 
 
-def _loop_in(jaxpr) -> str:
-    for equation in jaxpr.eqns:
-        if equation.primitive.name in ("while", "scan"):
-            return equation.primitive.name
-        for inner in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_jaxpr):
-            if _is_jaxpr(inner) and (name := _loop_in(getattr(inner, "jaxpr", inner))):
-                return name
-    return ""
-
-
-def _is_jaxpr(x) -> bool:
-    return hasattr(x, "eqns") or hasattr(x, "jaxpr")
-
-
 def _array(shape_and_type, *entries):
     shape, dtype = shape_and_type
     lanes = jnp.broadcast_shapes(*map(jnp.shape, entries))
@@ -136,7 +123,7 @@ def _entry(index, x):
     return jax.lax.index_in_dim(x.reshape(-1, *x.shape[dimensions:]), number, keepdims=False)
 
 
-EMITTED: dict[str, Callable] = {"array": _array, "kept": lambda call, *operands: call.results(*operands), "output": _output, "entry": _entry}
+EMITTED: dict[str, Callable] = {"array": _array, "opaque": lambda call, *operands: call.results(*operands), "output": _output, "entry": _entry}
 
 
 def _array_at_probes(shape_and_type, *entries):
@@ -146,7 +133,7 @@ def _array_at_probes(shape_and_type, *entries):
 
 AT_PROBES: dict[str, Callable] = {
     "array": _array_at_probes,
-    "kept": lambda call, *operands: call.at_probes(*operands),
+    "opaque": lambda call, *operands: call.at_probes(*operands),
     "output": _output,
     "entry": lambda index, x: x.reshape(len(x), -1)[:, index[0]],
 }

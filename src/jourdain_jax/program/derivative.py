@@ -23,12 +23,12 @@ def derivatives(graph: Graph, outputs: Iterable[int], direction: dict[int, int])
 
 
 def jacobian(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[dict[int, int]]:
-    """Of each output, its derivatives with respect to the variables (nodes that are not looked into) on which it depends."""
+    """The derivatives of each output with respect to the variables (nodes that are not looked into) on which it depends."""
     return directional_derivative(graph, outputs, {n: {n: graph.one} for n in variables})
 
 
 def directional_derivative(graph: Graph, outputs: Iterable[int], directions: Mapping[int, Mapping[int, int]]) -> list[dict[int, int]]:
-    """Of each output, its derivatives along those named directions in which it changes, in one sweep; `directions[k][n]` is dn/ds in direction k.
+    """The derivatives of each output along those named directions in which it changes, in one sweep; `directions[k][n]` is dn/ds in direction k.
 
     Nodes in any direction are not looked into in any other.
     """
@@ -106,7 +106,7 @@ def _derivative(graph: Graph, node: int, dots: list):
     if op in TABLE:
         rule = TABLE[op].derivative
         return graph.zero if rule is None else rule(graph, node, *args, *dots)
-    if op == "kept":
+    if op == "opaque":
         return _of_call(graph, node, dots)
     value = graph.value[node]
     if op == "array":
@@ -126,7 +126,7 @@ def _of_call(graph: Graph, node: int, dots: list) -> tuple:
     )
     moving = [dx for pair in zip(rates, moves, strict=True) for dx, does in zip(*pair, strict=True) if does]
     found: list = []
-    slopes = graph.kept(call.slopes(moves), operands)
+    slopes = graph.opaque(call.slopes(moves), operands)
     for k, aval in enumerate(call.closed.out_avals):
         if not np.issubdtype(aval.dtype, np.floating):
             found.append(graph.zero)

@@ -39,7 +39,7 @@ def run(graph: Graph, outputs: Iterable[int], known: Mapping[int, jax.Array]) ->
             run_loop(part, values, {n for n in part.nodes.ravel().tolist() if last_use.get(n, -1) > k}, _operation)
         else:
             _run_in_a_row(graph, part, values)
-            values |= _together([n for n in part if last_use.get(n, -1) > k and graph.op[n] not in ARRAYS], values)
+            values |= _fused_by_shape([n for n in part if last_use.get(n, -1) > k and graph.op[n] not in ARRAYS], values)
     return [values[n] for n in outputs]
 
 
@@ -81,7 +81,7 @@ def _depth(graph: Graph, nodes: list[int]) -> int:
     return max(depth.values(), default=0)
 
 
-def _together(nodes: list[int], values: Mapping[int, jax.Array]) -> dict[int, jax.Array]:
+def _fused_by_shape(nodes: list[int], values: Mapping[int, jax.Array]) -> dict[int, jax.Array]:
     """The values of the nodes, those of one shape and type computed together."""
     alike: dict[tuple, list[int]] = {}
     for n in nodes:
@@ -145,7 +145,7 @@ def _polynomial(coefficients, x):
     return total
 
 
-UNROLLED = 2  # rounds that follow one another without a jump; measured: one is slower, four compile to more functions
+UNROLLED = 2  # iterations that follow one another without a jump; measured: one is slower, four compile to more functions
 
 
 class Values(dict):
@@ -153,20 +153,20 @@ class Values(dict):
 
     def __init__(self, known) -> None:
         super().__init__(known)
-        self._kept: dict[int, tuple[jax.Array, int]] = {}
+        self._in_arrays: dict[int, tuple[jax.Array, int]] = {}
 
     def __missing__(self, node: int) -> jax.Array:
-        array, k = self._kept[node]
+        array, k = self._in_arrays[node]
         self[node] = value = array[k]
         return value
 
     def keep(self, nodes: Sequence[int], array: jax.Array) -> None:
         """The values of the nodes, along the first axis of an array."""
-        self._kept |= {node: (array, k) for k, node in enumerate(nodes)}
+        self._in_arrays |= {node: (array, k) for k, node in enumerate(nodes)}
 
     def stacked(self, nodes: Sequence[int], shape: tuple[int, ...], real) -> jax.Array:
         """The values of the nodes along a new first axis: part of an array that is kept, where they follow one another in it."""
-        places = [self._kept[n] for n in nodes if n in self._kept]
+        places = [self._in_arrays[n] for n in nodes if n in self._in_arrays]
         steps = {b[1] - a[1] for a, b in pairwise(places)}
         if len(places) == len(nodes) and steps in ({1}, {-1}) and all(array is places[0][0] for array, _ in places):
             low, high = sorted((places[0][1], places[-1][1]))

@@ -17,7 +17,7 @@ from jourdain_jax.calculus.scalar_operations import BRANCHES, TABLE
 MOST_NODES = 500_000  # of one graph: some seconds of building
 MOST_FACTORS = 8  # of a product that is looked at for squares of sines
 MOST_MULTIPLICATIONS = 512  # of one product of matrices taken apart; measured: at 16 x 16 scalars are faster in batches, from 24 x 24 on a call is
-ARRAYS = {"array", "kept", "output"}  # what is no scalar (`calls.py`)
+ARRAYS = {"array", "opaque", "output"}  # what is no scalar (`calls.py`)
 _GROWING = threading.Lock()  # threads may derive on one graph
 OPERATIONS = {"add", "sub", "mul", "div", "neg", "sqrt", "sin", "cos"}  # what an operation count counts
 
@@ -256,9 +256,9 @@ class Graph:
             return whole
         return self._node("array", entries, (shape, dtype))
 
-    def kept(self, call, operands: Iterable[int]) -> int:
+    def opaque(self, call, operands: Iterable[int]) -> int:
         """A call of arrays."""
-        return self._node("kept", tuple(operands), call)
+        return self._node("opaque", tuple(operands), call)
 
     def results(self, call: int, shapes: Mapping[int, tuple[tuple[int, ...], str]]) -> list[int]:
         """Results of a call, by number, given their shapes and types."""
@@ -290,7 +290,7 @@ class Graph:
 
     def calls(self, nodes: Iterable[int]) -> list[int]:
         """The calls that the nodes need."""
-        return [n for n in self.reachable(nodes) if self.op[n] == "kept"]
+        return [n for n in self.reachable(nodes) if self.op[n] == "opaque"]
 
     def total(self, terms: Iterable[int]) -> int:
         """The sum of nodes."""
@@ -356,7 +356,7 @@ class Graph:
         new: dict[int, int] = {}
         for node in self.reachable(outputs):
             args = self.args[node]
-            divided = [(a, self.args[b][1]) for a, b in (args, args[::-1]) if self._serves_once(b, uses, outputs)] if self._is_product(node) else []
+            divided = [(a, self.args[b][1]) for a, b in (args, args[::-1]) if self._divides_once(b, uses, outputs)] if self._is_product(node) else []
             if divided:
                 new[node] = self._node("div", (new[divided[0][0]], new[divided[0][1]]))
             else:
@@ -366,7 +366,7 @@ class Graph:
     def _is_product(self, node: int) -> bool:
         return self.op[node] == "mul" and self.varies[node]
 
-    def _serves_once(self, node: int, uses: dict[int, int], outputs: list[int]) -> bool:
+    def _divides_once(self, node: int, uses: dict[int, int], outputs: list[int]) -> bool:
         """Whether a node is a varying reciprocal with one use."""
         reciprocal = self.op[node] == "div" and self.args[node][0] == self.one and self.varies[node]
         return reciprocal and uses[node] == 1 and node not in outputs

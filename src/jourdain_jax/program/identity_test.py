@@ -96,7 +96,7 @@ class IdentityProbes:
 
 
 def equal(a: Bounded, b: Bounded, regular: np.ndarray | bool = True) -> np.ndarray:
-    """Of each pair of rows, values of expressions at generic probes, whether they are equal but for round-off, at those that are `regular`."""
+    """Whether the rows of each pair, values of expressions at generic probes, are equal but for round-off, at those that are `regular`."""
     finite = np.isfinite(SURE * (a.error + b.error)) & regular & np.isfinite(np.asarray(b))
     return np.all(alike(a, b, regular), axis=1) & (np.count_nonzero(finite, axis=1) >= FEWEST)
 
@@ -244,7 +244,7 @@ def _generic(name: str) -> Callable:
     return function
 
 
-def _kept(call, *operands) -> np.ndarray:
+def _opaque(call, *operands) -> np.ndarray:
     """One number per probe, made from all entries of the operands."""
     return _generic(call.name)(*(column for x in operands for column in (x.T if x.ndim == 2 else [x])))
 
@@ -253,7 +253,7 @@ _KNOWN = {"const", "input", *(name for name, operation in TABLE.items() if opera
 _SCALARS = {name: operation.bounded or _generic(name) for name, operation in TABLE.items()}
 _ARRAYS: dict[str, Callable] = {
     "array": lambda shape_and_type, *entries: np.stack(entries, axis=-1) if entries else np.empty((0, 0)),
-    "kept": _kept,
+    "opaque": _opaque,
     "output": lambda which, number: _generic(f"output {which[0]}")(number),
     "entry": lambda index, x: _generic(f"entry {index[0]}")(x) if x.ndim == 1 else x[:, index[0]],
 }

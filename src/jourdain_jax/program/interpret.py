@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
 
+from jourdain_jax.calculus.jaxprs import called
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.eager.numpy_backend import applied
 from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
@@ -37,33 +38,8 @@ Value: TypeAlias = Nodes | np.ndarray
 
 def interpret(graph: Graph, closed, arguments: list[Value]) -> list[Value]:
     """Outputs of a closed jaxpr at the given arguments."""
-    return _run(graph, closed.jaxpr, [_known(c) for c in closed.consts], arguments)
-
-
-def effects_of(jaxpr) -> str:
-    """Which operation does more than compute, as printing does, in words without a verb; nothing where none does."""
-    for equation in jaxpr.eqns:
-        if equation.effects:
-            inner = inner_jaxpr(equation.primitive.name, equation.params)
-            return f"the operation `{equation.primitive.name}`, which has effects," if inner is None else effects_of(getattr(inner, "jaxpr", inner))
-    return ""
-
-
-def as_nodes(graph: Graph, value: Value) -> np.ndarray:
-    """The nodes of a value; numbers become constants."""
-    if isinstance(value, Nodes):
-        return value.ids
-    if value.size > LARGEST:
-        raise Unsupported(f"an array of {value.size} numbers")
-    return np.array([graph.const(x) for x in np.ravel(value)], dtype=np.int64).reshape(np.shape(value))
-
-
-def _known(constant) -> np.ndarray:
-    return np.asarray(constant)
-
-
-def _run(graph: Graph, jaxpr, constants, arguments) -> list[Value]:
-    environment: dict = dict(zip(jaxpr.constvars, constants, strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
+    jaxpr = closed.jaxpr
+    environment: dict = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
 
     def read(atom):
         return np.asarray(atom.val) if isinstance(atom, Literal) else environment[atom]
@@ -76,17 +52,34 @@ def _run(graph: Graph, jaxpr, constants, arguments) -> list[Value]:
     return [read(x) for x in jaxpr.outvars]
 
 
+def effects_of(jaxpr) -> str:
+    """Which operation does more than compute, as printing does, in words without a verb; nothing where none does."""
+    for equation in jaxpr.eqns:
+        if equation.effects:
+            inner = called(equation.primitive.name, equation.params)
+            return f"the operation `{equation.primitive.name}`, which has effects," if inner is None else effects_of(inner.jaxpr)
+    return ""
+
+
+def as_nodes(graph: Graph, value: Value) -> np.ndarray:
+    """The nodes of a value; numbers become constants."""
+    if isinstance(value, Nodes):
+        return value.ids
+    if value.size > LARGEST:
+        raise Unsupported(f"an array of {value.size} numbers")
+    return np.array([graph.const(x) for x in np.ravel(value)], dtype=np.int64).reshape(np.shape(value))
+
+
 def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
     """Results of one equation."""
     refuse(name, equation)
     if graph.keeps_rules and (rule := own_rule(name, equation.params)) and any(isinstance(x, Nodes) for x in inputs):
         raise Unsupported(rule)
-    inner = inner_jaxpr(name, equation.params)
+    inner = called(name, equation.params)
     if inner is not None:
-        return _run(graph, inner.jaxpr, [_known(c) for c in inner.consts], inputs) if hasattr(inner, "jaxpr") else _run(graph, inner, [], inputs)
+        return interpret(graph, inner, inputs)
     if name == "cond" and not isinstance(inputs[0], Nodes):
-        chosen = equation.params["branches"][int(inputs[0])]
-        return _run(graph, chosen.jaxpr, [_known(c) for c in chosen.consts], inputs[1:])
+        return interpret(graph, equation.params["branches"][int(inputs[0])], inputs[1:])
     if not equation.outvars:
         raise Unsupported(f"the operation `{name}`")
     symbolic = any(isinstance(x, Nodes) for x in inputs)
@@ -122,17 +115,6 @@ def refuse(name: str, equation) -> None:
         raise ValueError(f"a method of the scene draws random numbers (`{name}`); draw them outside, and give them as parameters or inputs")
 
 
-def inner_jaxpr(name: str, params):
-    """What a call of a function stands for; None where an equation is none."""
-    if name in ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"):
-        return params["jaxpr"]
-    if name == "custom_jvp_call":
-        return params["call_jaxpr"]
-    if name in ("custom_vjp_call", "custom_vjp_call_jaxpr"):
-        return params.get("call_jaxpr", params.get("fun_jaxpr"))
-    return None
-
-
 def own_rule(name: str, params) -> str:
     """What has a derivative that the graph does not know; nothing for functions of this package, whose rules are those of what they compute.
 
@@ -140,9 +122,10 @@ def own_rule(name: str, params) -> str:
     """
     if name == "stop_gradient":
         return "`stop_gradient`, whose derivative is zero by decree,"
-    if not name.startswith(("custom_jvp_call", "custom_vjp_call")):
+    function = called(name, params)
+    if function is None or not name.startswith("custom_"):
         return ""
-    info = getattr(inner_jaxpr(name, params).jaxpr.debug_info, "func_src_info", None) or "a function"
+    info = getattr(function.jaxpr.debug_info, "func_src_info", None) or "a function"
     return "" if _HOME in info else f"`{info.split(' at ')[0]}`, which has a derivative of its own,"
 
 

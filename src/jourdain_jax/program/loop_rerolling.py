@@ -1,9 +1,9 @@
-"""Repeated blocks of a program, found and rolled up into loops: each round applies the same operations to values of the round before or from outside.
+"""Loop re-rolling: repeated blocks of a program become loops, whose iterations apply the same operations to values of the iteration before or from outside.
 
-    k-th operation of round r:   n[r, k] = op[k](arguments)
-    each argument, the same way in all rounds, is    Here(k')      n[r, k'] of the same round
-                                                     Before(k')    n[r - 1, k'] of the round before; at r = 0 what is given
-                                                     Given         one value per round, known when the loop begins
+    k-th operation of iteration r:   n[r, k] = op[k](arguments)
+    each argument, alike in all iterations, is    Here(k')      n[r, k'] of the same iteration
+                                                  Before(k')    n[r - 1, k'] of the iteration before; at r = 0 what is given
+                                                  Given         one value per iteration, known when the loop begins
 
 Chains of bodies give such blocks, if operations are put in an order that follows the chain. The order decides; nothing has to be said by the scene.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.program.graph import ARRAYS, Graph
 
-LONGEST = 400  # operations of one round
+LONGEST = 400  # operations of one iteration
 LEAST = 48  # operations that one loop must save
 WORTHWHILE = 1000  # operations that all loops of a program must save: with fewer, a row compiles in seconds and runs up to a fifth faster
 _ALONE = {*ARRAYS, "entry", *(name for name, operation in TABLE.items() if not operation.is_number)}  # loops carry numbers
@@ -26,22 +26,22 @@ _COMMUTATIVE = {name for name, operation in TABLE.items() if operation.commutes}
 
 @dataclass(frozen=True)
 class Here:
-    """An operation of the same round."""
+    """An operation of the same iteration."""
 
     place: int
 
 
 @dataclass(frozen=True)
 class Before:
-    """An operation of the round before."""
+    """An operation of the iteration before."""
 
     place: int
-    first: int  # the node that stands for it in the first round
+    first: int  # the node that stands for it in the first iteration
 
 
 @dataclass(frozen=True)
 class Given:
-    """One node per round, all known when the loop begins."""
+    """One node per iteration, all known when the loop begins."""
 
     nodes: tuple[int, ...]
 
@@ -51,11 +51,11 @@ Argument: TypeAlias = Here | Before | Given
 
 @dataclass(frozen=True)
 class Loop:
-    """Rounds of the same operations."""
+    """Iterations of the same operations."""
 
     ops: tuple[str, ...]
     arguments: tuple[tuple[Argument, ...], ...]
-    nodes: np.ndarray  # (rounds, operations)
+    nodes: np.ndarray  # (iterations, operations)
 
 
 def deepest_first(graph: Graph, outputs: Sequence[int], known: Iterable[int]) -> list[int]:
@@ -92,8 +92,8 @@ def with_loops(graph: Graph, order: Sequence[int]) -> list[list[int] | Loop]:
     alone = np.array([graph.op[n] in _ALONE for n in order], bool)
     kinds[alone] = -1 - np.arange(np.count_nonzero(alone))
     parts: list[list[int] | Loop] = []
-    for begin, length, rounds in _periods(kinds, 0, len(order)):
-        for part in _parts(graph, order, begin, length, rounds):
+    for begin, length, iterations in _periods(kinds, 0, len(order)):
+        for part in _parts(graph, order, begin, length, iterations):
             if parts and isinstance(part, list) and isinstance(parts[-1], list):
                 parts[-1].extend(part)
             else:
@@ -103,16 +103,16 @@ def with_loops(graph: Graph, order: Sequence[int]) -> list[list[int] | Loop]:
 
 
 def _periods(kinds: np.ndarray, begin: int, end: int) -> Iterator[tuple[int, int, int]]:
-    """(begin, length of a round, rounds) of stretches in which the kinds repeat, and (begin, length, 1) of what lies between."""
+    """(begin, length of an iteration, iterations) of stretches in which the kinds repeat, and (begin, length, 1) of what lies between."""
     most, found = LEAST - 1, None
     for length in range(1, min(LONGEST, (end - begin) // 3) + 1):
         same = kinds[begin : end - length] == kinds[begin + length : end]
         breaks = np.flatnonzero(~same)
         starts, ends = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [len(same)]])
         longest = int(np.argmax(ends - starts))
-        rounds = 1 + int(ends[longest] - starts[longest]) // length
-        if rounds >= 3 and (rounds - 1) * length > most:
-            most, found = (rounds - 1) * length, (begin + int(starts[longest]), length, rounds)
+        iterations = 1 + int(ends[longest] - starts[longest]) // length
+        if iterations >= 3 and (iterations - 1) * length > most:
+            most, found = (iterations - 1) * length, (begin + int(starts[longest]), length, iterations)
     if found is None:
         if end > begin:
             yield begin, end - begin, 1
@@ -122,32 +122,32 @@ def _periods(kinds: np.ndarray, begin: int, end: int) -> Iterator[tuple[int, int
     yield from _periods(kinds, found[0] + found[1] * found[2], end)
 
 
-def _parts(graph: Graph, order: Sequence[int], begin: int, length: int, rounds: int) -> Iterator[list[int] | Loop]:
-    """The longest loop whose rounds find their arguments the same way, and what comes before and after it."""
-    nodes = np.array(order[begin : begin + length * rounds]).reshape(rounds, length)
-    if rounds == 1:
+def _parts(graph: Graph, order: Sequence[int], begin: int, length: int, iterations: int) -> Iterator[list[int] | Loop]:
+    """The longest loop whose iterations take their arguments from the same places, and what comes before and after it."""
+    nodes = np.array(order[begin : begin + length * iterations]).reshape(iterations, length)
+    if iterations == 1:
         yield nodes[0].tolist()
         return
     arguments = _aligned(graph, nodes)
-    ways = _ways(nodes, arguments)
-    first, last = _longest(ways, length)
+    origins = _origins(nodes, arguments)
+    first, last = _longest(origins, length)
     if (last - first - 1) * length < LEAST:
         yield nodes.ravel().tolist()
         return
     if first > 0:
         yield nodes[:first].ravel().tolist()
-    yield _loop(graph, nodes[first:last], arguments[first:last], ways[last - 1])
-    if last < rounds:
+    yield _loop(graph, nodes[first:last], arguments[first:last], origins[last - 1])
+    if last < iterations:
         yield nodes[last:].ravel().tolist()
 
 
 def _aligned(graph: Graph, nodes: np.ndarray) -> list[list[tuple[int, ...]]]:
-    """Arguments of every node, those of sums and products in the order of their counterparts in the round before."""
+    """Arguments of every node, those of sums and products in the order of their counterparts in the iteration before."""
     place = {n: divmod(k, nodes.shape[1]) for k, n in enumerate(nodes.ravel().tolist())}
     found: list[list[tuple[int, ...]]] = []
 
     def likeness(r, a, b):
-        """How much argument a in round r is like argument b in the round before."""
+        """How much argument a in iteration r is like argument b in the iteration before."""
         if a == b:
             return 3
         if a in place and b in place:
@@ -168,45 +168,45 @@ def _aligned(graph: Graph, nodes: np.ndarray) -> list[list[tuple[int, ...]]]:
     return found
 
 
-def _ways(nodes: np.ndarray, arguments) -> np.ndarray:
-    """Of each round, where its arguments are found: k in the same round, length + k in the one before, -1 before the loop, -2 elsewhere in it."""
-    rounds, length = nodes.shape
+def _origins(nodes: np.ndarray, arguments) -> np.ndarray:
+    """Where the arguments of each iteration are found: k in the same iteration, length + k in the one before, -1 before the loop, -2 elsewhere in it."""
+    iterations, length = nodes.shape
     place = {n: divmod(k, length) for k, n in enumerate(nodes.ravel().tolist())}
 
-    def way(r, a):
+    def origin(r, a):
         if a not in place:
             return -1
         back = r - place[a][0]
         return place[a][1] + back * length if back < 2 else -2
 
-    return np.array([[way(r, a) for args in arguments[r] for a in args] for r in range(rounds)])
+    return np.array([[origin(r, a) for args in arguments[r] for a in args] for r in range(iterations)])
 
 
-def _longest(ways: np.ndarray, length: int) -> tuple[int, int]:
-    """The longest stretch of rounds with the same ways; to its first round, what the others find in the round before may be given."""
+def _longest(origins: np.ndarray, length: int) -> tuple[int, int]:
+    """The longest stretch of iterations with the same origins; its first iteration may be given what the others take from the one before."""
     best, begin = (0, 0), 0
-    for r in range(1, len(ways) + 1):
-        if r == len(ways) or np.any(ways[r] != ways[begin]) or np.any(ways[r] == -2):
-            first = begin - 1 if begin and _may_begin(ways[begin - 1], ways[begin], length) else begin
-            if np.all(ways[begin] != -2) and r - first > best[1] - best[0]:
+    for r in range(1, len(origins) + 1):
+        if r == len(origins) or np.any(origins[r] != origins[begin]) or np.any(origins[r] == -2):
+            first = begin - 1 if begin and _may_begin(origins[begin - 1], origins[begin], length) else begin
+            if np.all(origins[begin] != -2) and r - first > best[1] - best[0]:
                 best = first, r
             begin = r
     return best
 
 
-def _may_begin(first: np.ndarray, way: np.ndarray, length: int) -> bool:
-    inside = (way >= 0) & (way < length)
-    return bool(np.all(np.where(inside, first == way, (first < 0) | (first >= length))))
+def _may_begin(first: np.ndarray, origin: np.ndarray, length: int) -> bool:
+    inside = (origin >= 0) & (origin < length)
+    return bool(np.all(np.where(inside, first == origin, (first < 0) | (first >= length))))
 
 
-def _loop(graph: Graph, nodes: np.ndarray, arguments, way: np.ndarray) -> Loop:
+def _loop(graph: Graph, nodes: np.ndarray, arguments, origin: np.ndarray) -> Loop:
     length = nodes.shape[1]
-    ways = iter(way.tolist())
+    origins = iter(origin.tolist())
     found = []
     for k in range(length):
         slots: list[Argument] = []
         for j in range(len(arguments[0][k])):
-            where = next(ways)
+            where = next(origins)
             given = tuple(args[k][j] for args in arguments)
             slots.append(Given(given) if where < 0 else Here(where) if where < length else Before(where - length, given[0]))
         found.append(tuple(slots))

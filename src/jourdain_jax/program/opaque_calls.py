@@ -1,9 +1,9 @@
 """A jaxpr run over scalars but for the parts that have no scalar form: these become calls in the graph.
 
-An equation without a rule is kept. So are those that hand large arrays to it, those that go on with large arrays from it, and what lies between
-two that are kept; so a network is one call. Kept equations that follow on one another, with nothing that is not kept in between, are one call:
+An equation without a rule is opaque. So are those that hand large arrays to it, those that go on with large arrays from it, and what lies between
+two opaque ones; so a network is one call. Opaque equations that follow on one another, with nothing else in between, are one call:
 
-    level of a scalar = the largest level of what it is made from,   level of what is kept = that, and one more behind a scalar
+    level of a scalar = the largest level of what it is made from,   level of an opaque equation = that, and one more behind a scalar
 
 and those of one level that hang together are put together.
 """
@@ -15,9 +15,10 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
+from jourdain_jax.calculus.jaxprs import called
 from jourdain_jax.program.calls import Call
 from jourdain_jax.program.graph import Graph, Unsupported
-from jourdain_jax.program.interpret import Nodes, Value, apply, inner_jaxpr, refuse
+from jourdain_jax.program.interpret import Nodes, Value, apply, refuse
 
 LARGE = 16  # entries of an array that is not taken apart beside a call
 LARGEST = 4096  # entries of an array of scalars
@@ -48,7 +49,7 @@ class _Step:
     around: Any  # the jaxpr it comes from
     inputs: list
     outputs: list[_Variable]
-    kept: bool = False
+    opaque: bool = False
     reason: str = ""
     level: int = 0
     part: "list[_Step]" = field(default_factory=list)
@@ -65,7 +66,7 @@ class _Step:
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _Opaque:
     """A value that is no array of scalars: the node of an array."""
 
     node: int
@@ -75,7 +76,7 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
     """Outputs of a closed jaxpr at the given arguments, as `interpret`, with calls for the parts that have no scalar form."""
     inputs: list[_Variable] = [_Variable(v.aval) for v in closed.jaxpr.invars]
     steps: list[_Step] = []
-    outputs = _flat(closed.jaxpr, closed.consts, inputs, steps)
+    outputs = _flat(closed, inputs, steps)
     steps = _needed(steps, outputs)
     numbers = _judged(Graph(graph.most_multiplications, graph.keeps_rules), steps, inputs)
     steps = [step for step in steps if any(v not in numbers for v in step.outputs)]
@@ -85,8 +86,8 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
     asked = {v for v in outputs if isinstance(v, _Variable)}
     _put_together(steps, users, asked)
     values: dict = dict(zip(inputs, arguments, strict=True)) | numbers
-    for step in sorted(steps, key=lambda step: (step.level, not step.kept)):  # otherwise in the order in which they came
-        if not step.kept:
+    for step in sorted(steps, key=lambda step: (step.level, not step.opaque)):  # otherwise in the order in which they came
+        if not step.opaque:
             results = apply(graph, step.equation.primitive.name, step.equation, [values[x] if isinstance(x, _Variable) else x for x in step.inputs])
             values |= dict(zip(step.outputs, results, strict=True))
         elif step is step.part[0]:
@@ -94,9 +95,10 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
     return [values[x] if isinstance(x, _Variable) else x for x in outputs]
 
 
-def _flat(jaxpr, constants, arguments, steps: list[_Step]) -> list:
+def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
     """Appends all equations, those of inner jaxprs in their place; functions with derivatives of their own stay whole."""
-    environment = dict(zip(jaxpr.constvars, map(np.asarray, constants), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
+    jaxpr = closed.jaxpr
+    environment = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
 
     def read(atom):
         return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else environment[atom]
@@ -104,12 +106,12 @@ def _flat(jaxpr, constants, arguments, steps: list[_Step]) -> list:
     for equation in jaxpr.eqns:
         name, inputs = equation.primitive.name, [read(x) for x in equation.invars]
         refuse(name, equation)
-        inner = None if name.startswith("custom_") else inner_jaxpr(name, equation.params)
+        inner = None if name.startswith("custom_") else called(name, equation.params)
         if inner is None:
             results = [_Variable(v.aval) for v in equation.outvars]
             steps.append(_Step(equation, jaxpr, inputs, results))
         else:
-            results = _flat(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), inputs, steps)
+            results = _flat(inner, inputs, steps)
         environment |= dict(zip(equation.outvars, results, strict=True))
     return [read(x) for x in jaxpr.outvars]
 
@@ -142,12 +144,12 @@ def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict
         size = max(v.aval.size for v in step.outputs)
         try:
             if any(x is None for x in given):
-                raise Unsupported("")  # it follows what is kept
+                raise Unsupported("")  # it follows an opaque one
             if size > LARGEST and any(isinstance(x, Nodes) for x in given):
                 raise Unsupported(f"an array of {size} numbers")
             results = apply(scratch, step.equation.primitive.name, step.equation, given)
         except Unsupported as reason:
-            step.kept, step.reason = True, str(reason)
+            step.opaque, step.reason = True, str(reason)
             results = [introduce(v) for v in step.outputs]
         values |= dict(zip(step.outputs, results, strict=True))
     return {v: x for v, x in values.items() if isinstance(x, np.ndarray)}
@@ -163,27 +165,27 @@ def _users(steps: list[_Step]) -> dict[_Variable, list[_Step]]:
 
 
 def _put_together(steps: list[_Step], users: dict[_Variable, list[_Step]], asked: set[_Variable]) -> None:
-    """Keeps what belongs to what is kept, and finds the parts that are one call."""
+    """Makes opaque what belongs to what is, and finds the parts that are one call."""
     maker = {v: step for step in steps for v in step.outputs}
     number = {id(step): k for k, step in enumerate(steps)}
 
-    def from_kept(step: _Step) -> list[_Variable]:
-        return [v for v in step.variables if v in maker and maker[v].kept]
+    def from_opaque(step: _Step) -> list[_Variable]:
+        return [v for v in step.variables if v in maker and maker[v].opaque]
 
     for step in steps:
-        step.kept = step.kept or any(v.is_large for v in from_kept(step))
+        step.opaque = step.opaque or any(v.is_large for v in from_opaque(step))
     for step in reversed(steps):
-        inside = all(v not in asked and v in users and all(user.kept for user in users[v]) for v in step.outputs)
-        step.kept = step.kept or (inside and (any(v.is_large for v in step.outputs) or bool(from_kept(step))))
+        inside = all(v not in asked and v in users and all(user.opaque for user in users[v]) for v in step.outputs)
+        step.opaque = step.opaque or (inside and (any(v.is_large for v in step.outputs) or bool(from_opaque(step))))
     for step in steps:
         made_by = [maker[v] for v in step.variables if v in maker]
-        if not step.kept:
+        if not step.opaque:
             step.level = max((other.level for other in made_by), default=0)
             continue
-        step.level = max((other.level + (not other.kept) for other in made_by), default=1)
+        step.level = max((other.level + (not other.opaque) for other in made_by), default=1)
         step.part = [step]
         for other in made_by:
-            if other.kept and other.level == step.level and other.part is not step.part:
+            if other.opaque and other.level == step.level and other.part is not step.part:
                 joined = sorted([*other.part, *step.part], key=lambda member: number[id(member)])
                 for member in joined:
                     member.part = joined
@@ -195,13 +197,13 @@ def _called(graph: Graph, part: list[_Step], values: dict, users: dict[_Variable
     operands = [v for v in dict.fromkeys(v for step in part for v in step.variables) if v not in made]
     results = [v for v in made if v in asked or any(user.part is not part for user in users.get(v, ()))]
     arrays = [_as_array(graph, values[v], v.aval) for v in operands]
-    found = graph.results(graph.kept(_call(part, operands, results), arrays), {k: (v.aval.shape, str(v.aval.dtype)) for k, v in enumerate(results)})
-    taken_apart = [v in asked or not all(user.kept for user in users[v]) for v in results]
-    return {v: Nodes(graph.entries(node)) if apart else _Kept(node) for v, node, apart in zip(results, found, taken_apart, strict=True)}
+    found = graph.results(graph.opaque(_call(part, operands, results), arrays), {k: (v.aval.shape, str(v.aval.dtype)) for k, v in enumerate(results)})
+    taken_apart = [v in asked or not all(user.opaque for user in users[v]) for v in results]
+    return {v: Nodes(graph.entries(node)) if apart else _Opaque(node) for v, node, apart in zip(results, found, taken_apart, strict=True)}
 
 
 def _as_array(graph: Graph, value, aval) -> int:
-    return value.node if isinstance(value, _Kept) else graph.array(value.ids.ravel().tolist(), aval.shape, str(aval.dtype))
+    return value.node if isinstance(value, _Opaque) else graph.array(value.ids.ravel().tolist(), aval.shape, str(aval.dtype))
 
 
 def _call(part: list[_Step], operands: list[_Variable], results: list[_Variable]) -> Call:

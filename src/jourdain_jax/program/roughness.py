@@ -5,16 +5,18 @@ That is necessary for a kink, not sufficient: a spline picks its piece by an ind
 
 from collections.abc import Collection, Sequence
 
-import jax
 import numpy as np
 from jax.extend.core import Literal
 
-ROUGH = {"floor", "ceil", "round", "sign", "max", "min", "abs", "rem", "clamp", "reduce_max", "reduce_min", "cummax", "cummin", "sort", "atan2", "select_n"}
+from jourdain_jax.calculus.jaxprs import inner_jaxprs
+from jourdain_jax.calculus.scalar_operations import BRANCHES
+
+ROUGH = BRANCHES | {"clamp", "reduce_max", "reduce_min", "cummax", "cummin", "sort", "atan2", "select_n"}
 _SMOOTH, _MOVES, _MAY_BEND = 0, 1, 2  # does not depend on the inputs; depends smoothly; may have kinks
 
 
 def may_bend(closed, variables: Collection[int], smooth: Collection[str] = ()) -> list[bool]:
-    """Of each output of a closed jaxpr, whether it may have kinks or jumps as a function of those inputs; functions named in `smooth` have none."""
+    """Whether each output of a closed jaxpr may have kinks or jumps as a function of those inputs; functions named in `smooth` have none."""
     marks = [_MOVES if k in variables else _SMOOTH for k in range(len(closed.jaxpr.invars))]
     return [mark == _MAY_BEND for mark in _marked(closed.jaxpr, marks, frozenset(smooth))]
 
@@ -49,17 +51,16 @@ def _results(equation, given: list[int], smooth: frozenset[str]) -> list[int]:
     if name == "cond":
         branches = [_marked(branch.jaxpr, given[1:], smooth) for branch in params["branches"]]
         return [_MAY_BEND if given[0] else max(marks) for marks in zip(*branches, strict=True)]
-    inner = [x for x in jax.tree.leaves(list(params.values()), is_leaf=_is_jaxpr) if _is_jaxpr(x)]
+    inner = inner_jaxprs(params)
     if inner:
-        jaxpr = getattr(inner[0], "jaxpr", inner[0])
-        alike = len(inner) == 1 and len(jaxpr.invars) == len(given) and len(jaxpr.outvars) == len(equation.outvars)
-        return _marked(jaxpr, given, smooth) if alike else [_MAY_BEND] * len(equation.outvars)
+        alike = len(inner) == 1 and len(inner[0].invars) == len(given) and len(inner[0].outvars) == len(equation.outvars)
+        return _marked(inner[0], given, smooth) if alike else [_MAY_BEND] * len(equation.outvars)
     decided = name in ROUGH or any(not np.issubdtype(v.aval.dtype, np.inexact) for v in equation.outvars)
     return [_MAY_BEND if decided else max(given)] * len(equation.outvars)
 
 
 def _repeated(jaxpr, given: list[int], constants: int, carried: int, smooth: frozenset[str]) -> list[int]:
-    """Of a loop: until nothing that is carried changes any more."""
+    """The marks of a loop, gone round until nothing that is carried changes any more."""
     given = list(given)
     while True:
         found = _marked(jaxpr, given, smooth)
@@ -67,7 +68,3 @@ def _repeated(jaxpr, given: list[int], constants: int, carried: int, smooth: fro
         if carry == given[constants : constants + carried]:
             return found
         given[constants : constants + carried] = carry
-
-
-def _is_jaxpr(x) -> bool:
-    return hasattr(x, "eqns") or hasattr(x, "jaxpr")

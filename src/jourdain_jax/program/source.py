@@ -56,7 +56,7 @@ def statements(graph: Graph, outputs: Sequence[int], names: Mapping[int, str], l
 def _needed(graph: Graph, outputs: Sequence[int], names: Mapping[int, str] | dict) -> list[int]:
     """What is to be written, in order; a ValueError where a call of JAX is among it."""
     nodes = graph.needed(outputs, names)
-    reasons = dict.fromkeys(graph.value[n].reason for n in nodes if graph.op[n] == "kept")
+    reasons = dict.fromkeys(graph.value[n].reason for n in nodes if graph.op[n] == "opaque")
     if reasons:
         raise ValueError(
             f"what is kept as a call of JAX ({'; '.join(reasons)}) cannot be written as text; "

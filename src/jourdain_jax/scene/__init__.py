@@ -1,1 +1,1 @@
-"""The nouns of a scene: coordinates, bodies, loads, constraints, contacts. No algorithms."""
+"""What a scene is made of: coordinates, bodies, loads, constraints, contacts. No algorithms."""

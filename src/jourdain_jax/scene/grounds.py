@@ -104,7 +104,7 @@ class Cylinder(eqx.Module):
         self.angular_velocity = checked_real(angular_velocity, "angular velocity of a cylinder", (3,))
 
     def arm_to(self, point: Vector) -> Float[Array, "3"]:
-        """From the nearest point of the axis to the `point` (m, inertial frame)."""
+        """The vector from the nearest point of the axis to the `point` (m, inertial frame)."""
         arm = as_real(point) - self.origin
         return arm - (arm @ self.axis) * self.axis
 
@@ -142,7 +142,7 @@ class Sphere(eqx.Module):
         self.angular_velocity = checked_real(angular_velocity, "angular velocity of a sphere", (3,))
 
     def arm_to(self, point: Vector) -> Float[Array, "3"]:
-        """From the sphere's centre to the `point` (m, inertial frame)."""
+        """The vector from the sphere's centre to the `point` (m, inertial frame)."""
         return as_real(point) - self.origin
 
     def value(self, point: Vector) -> Float[Array, ""]:

@@ -50,7 +50,7 @@ class Rollout(Printed, eqx.Module):
 
     lanes: Trajectory
     continued: tuple[int, ...] = eqx.field(static=True, default=())  # lanes that lost their privileged speeds and were run again with the full state
-    ways: tuple[tuple[int, tuple], ...] = eqx.field(static=True, default=())  # fallback -> how such lanes were run: `WAYS`
+    reruns: tuple[tuple[int, tuple], ...] = eqx.field(static=True, default=())  # fallback -> how such lanes were run: `WAYS`
 
     def __len__(self) -> int:
         return self.lanes.q.shape[0]
@@ -67,7 +67,7 @@ class Rollout(Printed, eqx.Module):
         if not -len(self) <= index < len(self):
             raise IndexError(f"lane {index} does not exist; this rollout has {len(self)} lanes, 0 to {len(self) - 1}")
         lane = jax.tree.map(lambda x: x[index], self.lanes)
-        ways = {} if is_traced(lane.fallback) else dict(self.ways)
+        ways = {} if is_traced(lane.fallback) else dict(self.reruns)
         return dataclasses.replace(lane, **dict(zip(WAYS, ways.get(int(lane.fallback), ()), strict=False))) if ways else lane
 
     @property
@@ -170,18 +170,19 @@ def rollout(
     for what, given in (("starts", starts), ("parameters", parameters)):
         if given is not None and not isinstance(given, Mapping) and not (what == "starts" and isinstance(given, State)):
             raise ValueError(f'`{what}` is {described(given)}, expected a dictionary by name, such as {{"x": jnp.linspace(0.0, 1.0, 8)}}')
-    parameters = {} if parameters is None else {name: checked_real(value, f"parameter `{name}`") for name, value in parameters.items()}
+    advice = "give an array with one entry per lane; a field that is a module varies by `equinox.filter_vmap` of `simulate`"
+    parameters = {name: checked_real(value, f"parameter `{name}`", advice=advice) for name, value in (parameters or {}).items()}
     fixed, varied, count = _lanes(scene, starts, parameters)
     chunk = _chunk(scene, count, chunk, options)
     options["inputs"] = as_inputs(scene, options.get("inputs"))
     _check_times_of_lanes(scene, starts, options)
     if is_traced((scene, fixed, varied, parameters, options)):
-        return Rollout(_together(scene, fixed, _with_arrays(options), varied, parameters))  # being differentiated or batched: one piece, no host loop
+        return Rollout(_run_lanes(scene, fixed, _with_arrays(options), varied, parameters))  # being differentiated or batched: one piece, no host loop
     pieces = []
     bar = tqdm(total=count, unit="lane", disable=not (count > chunk if progress is None else progress))
     for first in range(0, count, chunk):
         index = np.minimum(np.arange(first, first + chunk), count - 1)  # the last chunk is filled up with copies of its last lane
-        piece = _together(scene, fixed, _with_arrays(options), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+        piece = _run_lanes(scene, fixed, _with_arrays(options), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
         kept = min(chunk, count - first)
         pieces.append(jax.tree.map(lambda x, kept=kept: np.asarray(x)[:kept], piece))
         bar.update(kept)
@@ -194,7 +195,7 @@ def rollout(
             chosen, changed = np.flatnonzero(again == way), options | retry_options(way, options)
             for first in range(0, len(chosen), chunk):
                 index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
-                new = _together(scene, fixed, _with_arrays(changed), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+                new = _run_lanes(scene, fixed, _with_arrays(changed), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
                 lanes, ways[way] = _replaced(lanes, mark_retried(new, way), index), tuple(getattr(new, name) for name in WAYS)
     continued = np.flatnonzero(np.asarray(lanes.fallback) & results.FULL_STATE)
     return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(continued.tolist()), tuple(sorted(ways.items())))
@@ -220,7 +221,7 @@ def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:
 
 
 def _next_retries(scene: Scene, lanes: Trajectory, starts, options: dict) -> Int[np.ndarray, "lanes"]:
-    """In which ways each lane is run again, those it was run in already included; AS_ASKED: it is not."""
+    """How each lane is run again, all earlier changes of its run included; AS_ASKED: it is not."""
     own_times = isinstance(starts, State) and options.get("t0") is None
     first = 0.0 if options.get("t0") is None else options["t0"]
     begun = np.broadcast_to(np.asarray(starts.t if own_times else first), lanes.result.shape)
@@ -251,7 +252,7 @@ def _replaced(lanes: Trajectory, again: Trajectory, index: np.ndarray) -> Trajec
     return jax.tree.unflatten(treedef, new)
 
 
-def _together(scene, fixed, options, varied, parameters) -> Trajectory:
+def _run_lanes(scene, fixed, options, varied, parameters) -> Trajectory:
     """All given lanes in lockstep; compiled once for scenes and lanes of one shape."""
     compiled = _compiled_dense if _form(scene, options).lowered is None else _compiled_lowered
     return compiled(options["inputs"].programs)(Reference(scene), scene, fixed, options, varied, parameters)

@@ -37,7 +37,7 @@ def integrate(
 
 
 def ended(end: Progress, t0) -> Progress:
-    """With the code of how the motion from `t0` ended, where no time is left to go to."""
+    """Progress with the code of how the motion from `t0` ended, where no time is left to go to."""
     # the last steps against the average one
     shrank = (end.code == results.MAX_STEPS) & (end.h * end.accepted < _SHRANK * jnp.abs(end.t - t0))
     code = jnp.where(shrank, results.SHRANK, jnp.where(end.code == RUNNING, results.SUCCESS, end.code))

@@ -91,7 +91,7 @@ def begun(problem: Problem, y0: PyTree, t0: Float[Array, "*lanes"], dt0, directi
 
 
 def standing(problem: Problem, y: PyTree, t: Float[Array, "*lanes"], h: Float[Array, "*lanes"], direction) -> Progress:
-    """On the way, with no step behind and no event to search for."""
+    """Progress at a start: no step is behind, and no event is searched for."""
     zero = jnp.zeros(jnp.shape(t), jnp.int32)
     rest = jax.lax.stop_gradient(jax.tree.map(jnp.zeros_like, y)) if _rounding_adds_up(problem, y) else None
     return Progress(t, y, h, zero + RUNNING, problem.knots_passed(t, direction), zero, zero, zero - 1, None, no_pivot(t), rest)
@@ -125,7 +125,7 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     h = direction * size if p.search is None else jnp.where(locating, p.search.shift, direction * size)
     t1 = jnp.where(lands, target, p.t + h)
     h = t1 - p.t  # as rounded: the state and the time advance together
-    y1, slopes, _, pivots = stages(problem, method, p.t, p.y, h, watched=True)
+    y1, slopes, _, pivots = stages(problem, method, p.t, p.y, h, monitored=True)
     rest = p.rest
     if rest is not None:
         y1, rest = _compensated(p.y, rest, jax.tree.map(lambda k: as_in(h, k) * weighted(method.b, k), slopes))
@@ -155,7 +155,7 @@ def _tried(problem: Problem, method: Method, p: Progress, goal, last_goal, direc
     moved = Progress(jnp.where(accept, t1, p.t), y, jax.lax.stop_gradient(next_h), code, passed, accepted, rejected, p.event, p.search, p.pivot, rest)
     if problem.events is not None:
         slopes = [jax.tree.map(lambda k, i=i: k[i], slopes) for i in (0, method.at_the_end)]  # first and last
-        moved = _watched(problem, p, moved, h, slopes, accept & ~locating & (code == RUNNING))
+        moved = _monitored(problem, p, moved, h, slopes, accept & ~locating & (code == RUNNING))
     if pivots is None:
         return moved
     # what lies beyond an event does not count
@@ -197,17 +197,17 @@ class Stages(NamedTuple):
     pivots: Pivots | None
 
 
-def stages(problem: Problem, method: Method, t, y: PyTree, h, watched: bool = False) -> Stages:
-    """y_1; the slopes of all stages, and the states at which they were taken; what the pivots were, where they are `watched`."""
+def stages(problem: Problem, method: Method, t, y: PyTree, h, monitored: bool = False) -> Stages:
+    """y_1; the slopes of all stages, and the states at which they were taken; what the pivots were, where they are `monitored`."""
     leaves, treedef = jax.tree.flatten(y)
-    watched = watched and problem.rates_and_pivots is not None
+    monitored = monitored and problem.rates_and_pivots is not None
 
     def stage(carried, row):
         # k_i = f(y_i), then the next y_i: what is carried from stage to stage is computed once, whatever uses it
         at, slopes, extremes = carried
         c, i, next_A = row
         there = t + c * h, treedef.unflatten(at), problem.args
-        if watched:
+        if monitored:
             found, pivots = problem.rates_and_pivots(*there)
             extremes = jnp.minimum(extremes[0], pivots), jnp.maximum(extremes[1], pivots)
         else:
@@ -219,8 +219,8 @@ def stages(problem: Problem, method: Method, t, y: PyTree, h, watched: bool = Fa
     count = method.needed
     rows = (jnp.asarray(method.c[:count]), jnp.arange(count), jnp.asarray([*method.A[1:count], method.b]))
     slopes = [jnp.zeros((len(method.c), *y.shape), y.dtype) for y in leaves]
-    (y_1, slopes, extremes), at = jax.lax.scan(stage, (leaves, slopes, _no_extremes(problem, t, y) if watched else None), rows)
-    return Stages(treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at), _pivots(extremes) if watched else None)
+    (y_1, slopes, extremes), at = jax.lax.scan(stage, (leaves, slopes, _no_extremes(problem, t, y) if monitored else None), rows)
+    return Stages(treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at), _pivots(extremes) if monitored else None)
 
 
 def no_pivot(t: Float[Array, "*lanes"]) -> Float[Array, "*lanes"]:
@@ -246,11 +246,11 @@ def weighted(weights, slopes: Float[Array, "stages *shape"]) -> Float[Array, "*s
 
 
 def as_in(x, like) -> Array:
-    """In the precision of the state: time keeps its own."""
+    """A number in the precision of the state: time keeps its own."""
     return jnp.asarray(x, like.dtype)
 
 
-def _watched(problem: Problem, p: Progress, moved: Progress, h, slopes, accept) -> Progress:
+def _monitored(problem: Problem, p: Progress, moved: Progress, h, slopes, accept) -> Progress:
     """The step from `p` by `h` to `moved`, in which an event may have happened or is being located; `slopes`: at its ends, `accept`: a step of the motion."""
 
     def events(t, y):

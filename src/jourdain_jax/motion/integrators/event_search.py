@@ -52,7 +52,7 @@ class Bracket(eqx.Module):
         return jnp.argmin(jnp.where(after > 0, jnp.inf, share), axis=0).astype(jnp.int32)
 
     def narrowed(self, t: Float[Array, "*lanes"], c: Float[Array, "events *lanes"]) -> "Bracket":
-        """With the values at a time in between."""
+        """The bracket, narrowed by the values at a time in between."""
         same = no_event(c) == self.before
         older = (jnp.where(same, self.t[1], self.t[0]), jnp.where(same, self.t[0], self.t[1]))
         older_c = (jnp.where(same, self.c[1], self.c[0]), jnp.where(same, self.c[0], self.c[1]))
@@ -181,7 +181,7 @@ class Dip(eqx.Module):
 
 
 def dip(h: Float[Array, "*lanes"], c_0, c_dot_0, c_1, c_dot_1) -> Dip:
-    """By the cubics through values (those at the start positive) and rates (events, *lanes) at the ends of a step `h`.
+    """The dips of the cubics through values (those at the start positive) and rates (events, *lanes) at the ends of a step `h`.
 
     p(s) = c_0 + m_0 s + A s^2 + B s^3,   lowest at s = -m_0/(A + sqrt(A^2 - 3 B m_0))
     """

@@ -1,4 +1,4 @@
-"""A diffrax solver whose every step ends on the constraints, and is watched between its ends too.
+"""A diffrax solver whose every step ends on the constraints, and is checked between its ends too.
 
 The projection changes the end of the step, so the slope that first-same-as-last methods (Tsit5, Dopri) carry over is out of date: the
 next step is told that there was a jump, and recomputes it. What the projection removes is an error that the embedded estimate does not see: the

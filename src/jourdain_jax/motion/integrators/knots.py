@@ -43,7 +43,7 @@ def knots_between(holders: PyTree, rtol, t0, t1, ts: Float[Array, "times"]) -> F
 
 
 def bends(sampled: Sampled, share) -> Bool[Array, "samples"]:
-    """At which knots steps must end: the straight lines between them are off by `share` of the range of values at most, at the other knots."""
+    """The knots at which steps must end: the straight lines between them are off by `share` of the range of values at most, at the other knots."""
     t, v, share = jax.lax.stop_gradient((sampled.ts, sampled.values, share))
     allowed = jnp.maximum(share * (jnp.max(v) - jnp.min(v)), 16 * jnp.finfo(v.dtype).eps * jnp.max(jnp.abs(v)))
 

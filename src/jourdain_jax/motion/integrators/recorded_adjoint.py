@@ -41,7 +41,7 @@ class _Window(eqx.Module):
     last: Int[Array, ""]  # number of the last state
 
     def added(self, p: Progress, goal, restart=False) -> "_Window":
-        """With the state after a try of a step, which is a new one where time has passed for any lane; the first one at a `restart`."""
+        """The window with the state after a try of a step, which is a new one where time has passed for any lane; the first one at a `restart`."""
         i = jnp.where(restart, 0, self.last + self.passed(p)).astype(jnp.int32)
         t, y, goals = _put((self.t, self.y, self.goal), i, (p.t, p.y, goal))
         return _Window(t, y, goals, i)
@@ -73,7 +73,7 @@ class _Record(eqx.Module):
 
 
 class _Cotangents(eqx.Module):
-    """Of a state, of its time, and of what all steps share."""
+    """Cotangents of a state, of its time, and of what all steps share."""
 
     t: Float[Array, "*lanes"]
     y: PyTree
@@ -93,8 +93,8 @@ def motion(forward: Callable, problem: Problem, method: Method, y0: PyTree, t0, 
 
 def _problem(moving, control) -> Problem:
     (rates, project, args), events, knots, *_ = moving
-    norm, rtol, atol, shortest, max_steps, *watched = control[0]
-    return Problem(rates, args, project, events, norm, rtol, atol, shortest, max_steps, knots, *watched)
+    norm, rtol, atol, shortest, max_steps, *monitored = control[0]
+    return Problem(rates, args, project, events, norm, rtol, atol, shortest, max_steps, knots, *monitored)
 
 
 @eqx.filter_custom_vjp
@@ -171,7 +171,7 @@ def _vjp(residuals, cotangents, perturbed, moving, control, forward, method):
         return replace(problem, rates=rates, project=project, args=args)
 
     def past_goals(g: _Cotangents, first, count) -> _Cotangents:
-        """At a state where the goals number `first` to `count - 1` were reached."""
+        """Cotangents at a state where the goals number `first` to `count - 1` were reached."""
 
         def add(carry):
             y, k = carry

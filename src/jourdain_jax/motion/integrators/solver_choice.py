@@ -60,7 +60,7 @@ def time_origin(controller, t0):
 
 
 def since(saveat: "diffrax.SaveAt", origin) -> "diffrax.SaveAt":
-    """With times to save at that count from `origin`."""
+    """A `SaveAt` with times to save at that count from `origin`."""
     return saveat if saveat.subs.ts is None else eqx.tree_at(lambda saveat: saveat.subs.ts, saveat, saveat.subs.ts - origin)
 
 

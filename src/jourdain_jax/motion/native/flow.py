@@ -54,7 +54,7 @@ def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Fou
 
 
 def _along_times(form: Form, start: Start, found: Found, d: Found, goals, origin) -> Found:
-    """With what tangents of the goals and of the start's time add to a tangent."""
+    """A tangent with what those of the goals and of the start's time add to it."""
     code, accepted, count = found.rest[1], found.rest[2], found.rest[-1]
     reached = (jnp.arange(len(start.goals)) < count) | (start.goals == found.t[0])
     at = on_times(start, Stopped(found.y, reached, found.t[0], (code == results.EVENT) & (accepted > 0)))

@@ -25,7 +25,7 @@ INLINED = 120  # operations: so few are written anew at each stage
 
 @dataclass(frozen=True)
 class Form:
-    """What is integrated: a lowered scene, with or without work, projection, events and pivots that are watched."""
+    """What is integrated: a lowered scene, with or without work, projection, events and pivots that are monitored."""
 
     program: Lowered
     with_work: bool
@@ -54,7 +54,7 @@ class Form:
 
     @property
     def pivots(self) -> int:
-        """How many are watched."""
+        """How many are monitored."""
         return len(self.program.pivots) if self.has_pivots else 0
 
     @property

@@ -201,7 +201,7 @@ def _start(motion: Motion) -> Start:
 
 
 def known_of(args: tuple) -> list:
-    """Of each number that the rates are given: what depends on parameters alone, the numbers of functions of time, and constant inputs; None of samples."""
+    """What is known of the numbers that the rates are given: those of parameters alone, of functions of time, and constant inputs; None of samples."""
     _, _, inputs, fixed, _ = args
     functions = [x for channel in inputs.channels if isinstance(channel, FunctionOfTime) for x in numbers_of(channel)]
     return [*fixed, *functions, *(channel.value if isinstance(channel, Constant) else None for channel in _others(inputs))]

@@ -131,11 +131,11 @@ def write_solution(w: Writer, pattern: Pattern, places: Sequence[Value], left: V
     with w.counted(0, len(pattern.rows)) as e:
         k = at("columns", e)
         w.store(w.fma(w.load(w.real, S, e), w.load(w.real, shares, at("rows", e)), w.load(w.real, x, k)), x, k)
-    serves = w.load(w.real, size) < regular
-    with w.when(w.any(~serves)):
+    is_regular = w.load(w.real, size) < regular
+    with w.when(w.any(~is_regular)):
         other = w.room(w.real, columns)
         w.call("solved", "void", B, weights, left, other)
         with w.counted(0, columns) as k:
-            w.store(w.where(serves, w.load(w.real, x, k), w.load(w.real, other, k)), x, k)
+            w.store(w.where(is_regular, w.load(w.real, x, k), w.load(w.real, other, k)), x, k)
     with w.counted(0, columns) as k:
         w.store(w.load(w.real, x, k) * w.load(w.real, c, k), x, k)

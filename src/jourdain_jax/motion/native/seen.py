@@ -1,4 +1,4 @@
-"""What is seen of a motion beside its steps, as machine code: numbers that depend on parameters alone, and all speeds, pivots and energies at saved states.
+"""Numbers beside the steps of a motion, as machine code: those that depend on parameters alone, and all speeds, pivots and energies at saved states.
 
 Each is a function of JAX on one state or scene; under `vmap` all lanes go to one call. In batches of motions XLA sees the states: machine code, for which
 rows of numbers are put together, takes twice as long there. Derivatives are those of the same by XLA (`lowering/lowered.py`).
@@ -31,7 +31,7 @@ _TRUTHS = frozenset(("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not", "is
 
 
 @lru_cache(maxsize=MOST_KERNELS)
-def serves(program: Lowered) -> bool:
+def is_supported(program: Lowered) -> bool:
     """Whether all this can be machine code."""
     graph, nodes = program.graph, [*_seen_nodes(program), *program.fixed, *program.usual.values()]
     truths = any(_is_truth(graph, n) for n in program.fixed)  # which XLA hands on as such

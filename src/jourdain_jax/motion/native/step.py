@@ -13,10 +13,10 @@ from jourdain_jax.motion.integrators.event_search import DIFFERENTIABLE
 from jourdain_jax.motion.native import search
 from jourdain_jax.motion.native.functions import Form
 from jourdain_jax.motion.native.layout import Lanes, Layout
-from jourdain_jax.motion.native.taylor import TaylorSteps, at_time, jet, radius, slope, watched_at
+from jourdain_jax.motion.native.taylor import TaylorSteps, at_time, jet, monitored_at, radius, slope
 from jourdain_jax.motion.trajectories import results
+from jourdain_jax.native.exponentials import power
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.math_functions import power
 
 UNROLLED = 12  # numbers of a state; more are gone through by loops, whose code is short
 IDLE = -9.0  # code of a place that has no lane
@@ -30,7 +30,7 @@ class Trial(NamedTuple):
     y1: Value  # pointer: the state after it
     accept: Value
     next_h: Value  # positive
-    pivot: Value | None  # the smallest magnitude of a pivot that is watched
+    pivot: Value | None  # the smallest magnitude of a pivot that is monitored
 
 
 def write_step(w: Writer, form: Form, method: Method | TaylorSteps) -> None:
@@ -95,7 +95,7 @@ def _tried_by_series(w: Writer, form: Form, method: TaylorSteps, p: Lanes, k: Va
         w.store(at_time(w, series, step), y1, row)
         if form.has_events:
             w.store(at_time(w, slope(series), step), k, (method.order + 1) * count + row)
-    at_end = watched_at(w, form, p, t1, y1)
+    at_end = monitored_at(w, form, p, t1, y1)
     holds = at_start.holds & at_end.holds
     w.store(w.where(holds, w.load(w.real, y1), math.nan), y1)
     accept, length = accept & holds, w.where(at_start.holds, length, 0.0)
@@ -131,7 +131,7 @@ def _take(w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Valu
     new["taken"] = w.where(accept, step, 0.0)  # by how far the state has gone on
     each_row(w, rows, y1, lambda i: w.where(accept, w.load(w.real, y1, i), w.load(w.real, y, i)))
     if form.has_events:
-        new = _watched(w, form, method, p, k, step, accept, new, y1)
+        new = _monitored(w, form, method, p, k, step, accept, new, y1)
     if trial.pivot is not None:
         counts = accept & ~locating & new["code"].equals(float(RUNNING)) & new["t"].equals(t1)
         pivot = w.where(counts, w.smaller(p["pivot"], trial.pivot), p["pivot"])
@@ -229,7 +229,7 @@ def _count(w: Writer, happens: Value) -> Value:
     return w.where(happens, 1.0, w.number(0.0))
 
 
-def _watched(
+def _monitored(
     w: Writer, form: Form, method: Method | TaylorSteps, p: Lanes, k: Value, step: Value, accept: Value, new: dict[str, Value], y1: Value
 ) -> dict[str, Value]:
     """The step in which an event may have happened or is being located, or before which one has; changes `y1`."""

@@ -13,8 +13,8 @@ from typing import NamedTuple
 from jourdain_jax.motion.native.functions import Form, known_values, outputs_of
 from jourdain_jax.motion.native.layout import Lanes, Layout
 from jourdain_jax.native import series
+from jourdain_jax.native.exponentials import power
 from jourdain_jax.native.ir import Value, Writer
-from jourdain_jax.native.math_functions import power
 from jourdain_jax.native.scalar_program import as_real, written
 from jourdain_jax.native.series import Coefficients, Series
 
@@ -38,7 +38,7 @@ class TaylorSteps:
         return self.order
 
 
-class Watched(NamedTuple):
+class Monitored(NamedTuple):
     """What must not change its sign."""
 
     holds: Value  # whether all guards are positive
@@ -46,17 +46,17 @@ class Watched(NamedTuple):
 
 
 class Jet(NamedTuple):
-    """The coefficients of every number that is integrated, and what is watched at their start."""
+    """The coefficients of every number that is integrated, and what is monitored at their start."""
 
     rows: list[Coefficients]
-    watched: Watched
+    monitored: Monitored
 
 
 def jet(w: Writer, form: Form, p: Lanes, t: Value, order: int) -> Jet:
     """The Taylor series of the lanes' states, and of their tangents, at the time t."""
     program, layout, y = form.program, form.layout, p.pointer
     rates = rates_of(form)
-    own = outputs_of(form, [*rates, *_watched(form)], len(rates))
+    own = outputs_of(form, [*rates, *_monitored(form)], len(rates))
     first = len(program.fixed)  # time, then the state
     known = dict(zip(own.variables, known_values(w, form, y, t, y).values(), strict=True))
     states = own.variables[first + 1 : first + 1 + layout.coordinates + layout.speeds]
@@ -86,23 +86,23 @@ def rates_of(form: Form) -> list[int]:
     return [*program.qdot, *program.ydot, *([program.power] if form.with_work and program.power is not None else [])]
 
 
-def _watched(form: Form) -> list[int]:
+def _monitored(form: Form) -> list[int]:
     return [*form.program.guards, *form.program.pivots[: form.pivots]]
 
 
-def watched_at(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> Watched:
-    """What is watched, at a state in memory."""
+def monitored_at(w: Writer, form: Form, p: Lanes, t: Value, y: Value) -> Monitored:
+    """What is monitored, at a state in memory."""
     known = known_values(w, form, p.pointer, t, y)
-    return _evaluated(w, form, form.program.graph, _watched(form), known, known)
+    return _evaluated(w, form, form.program.graph, _monitored(form), known, known)
 
 
-def _evaluated(w: Writer, form: Form, graph, nodes: Sequence[int], values: Mapping[int, Value], known: Mapping[int, Value]) -> Watched:
+def _evaluated(w: Writer, form: Form, graph, nodes: Sequence[int], values: Mapping[int, Value], known: Mapping[int, Value]) -> Monitored:
     found, of_variables = [as_real(w, x) for x in written(w, graph, nodes, values)], list(known.values())
     count, holds = len(form.program.guards), w.literal(-1, w.truth)
     for guard in found[:count]:
         holds = holds & (guard > 0.0)
     sizes = [of_variables[form.program.variables.index(n)] for n in form.program.sizes] if form.pivots else []
-    return Watched(holds, [x / size for x, size in zip(found[count:], sizes, strict=True)])
+    return Monitored(holds, [x / size for x, size in zip(found[count:], sizes, strict=True)])
 
 
 def radius(w: Writer, layout: Layout, p: Lanes, rows: Sequence[Coefficients]) -> Value:

@@ -1,4 +1,4 @@
-"""Numbers that a motion carries to be trusted: drifts, residuals, conditioning, contact forces, and their printed summary."""
+"""Numbers by which a motion can be trusted: drifts, residuals, conditioning, contact forces, and their printed summary."""
 
 import html
 

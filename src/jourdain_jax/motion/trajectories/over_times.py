@@ -69,10 +69,10 @@ def _mapped(f, record: Record, by_inputs: bool):
         return eqx.filter_vmap(lambda record: _mapped(f, record, by_inputs))(record)
 
     one = partial(_at_one_time, f, record, by_inputs)
-    count, at_once = len(record.ts), _at_once(record)
-    if count <= at_once:
+    count, most = len(record.ts), _largest_block(record)
+    if count <= most:
         return jax.vmap(one)(record.ts, record.q, record.u)
-    block = next(k for k in range(at_once, 0, -1) if count % k == 0)  # without a rest, which would be compiled by itself
+    block = next(k for k in range(most, 0, -1) if count % k == 0)  # without a rest, which would be compiled by itself
     return jax.lax.map(lambda state: one(*state), (record.ts, record.q, record.u), batch_size=block)
 
 
@@ -87,14 +87,14 @@ def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
     return jax.tree.map(lambda x: jnp.where(reached, x, jnp.nan) if eqx.is_inexact_array(x) else x, values)
 
 
-def _at_once(record: Record) -> int:
-    """At how many times quantities are worked out together."""
+def _largest_block(record: Record) -> int:
+    """The number of times at which quantities are worked out together."""
     return max(1, MOST_ENTRIES // record.q.shape[-1] ** 2)
 
 
 def uncompiled_over_times(f, record: Record, by_inputs: bool = False):
     """As `map_over_times`, of one motion, on NumPy: compiling a function takes longer than running it once."""
-    by_time, size = (record.ts, record.q, record.u), _at_once(record)
+    by_time, size = (record.ts, record.q, record.u), _largest_block(record)
     blocks = [_uncompiled(f, record, by_inputs and _needs_rates(record), lanes=[x[k : k + size] for x in by_time]) for k in range(0, len(record.ts), size)]
     return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
 

@@ -6,7 +6,7 @@ sampled at `ts`), and `parameter:NAME` for every field that is an array. `header
 `speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
 `state_form`, `reduction`, `solver`, `projected`, `event_names`, `arrays` (names of all arrays), `versions`.
 `kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `continued` holds
-the numbers of the lanes that were run again with the full state; `ways` in its header says how lanes with a `fallback` were run.
+the numbers of the lanes that were run again with the full state; `reruns` in its header says how lanes with a `fallback` were run.
 
 What is absent, or is not what the names and the number of times ask for, is an error, and so is a parameter of the scene's class that the file lacks.
 """
@@ -38,7 +38,7 @@ from jourdain_jax.scene.scene import Scene
 
 _ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", *COUNTS, "last_step", "moved_q", "moved_u", "smallest_pivot")
 _TEXTS = ("state_form", "reduction", "solver", "projected")
-_HEADER = ("scene", "coordinates", "speeds", "input_names", "static", "event_names", *_TEXTS, "kind", "arrays", "ways")
+_HEADER = ("scene", "coordinates", "speeds", "input_names", "static", "event_names", *_TEXTS, "kind", "arrays", "reruns")
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
 
 
@@ -63,7 +63,7 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
     header = {name: getattr(trajectory, name) for name in _TEXTS} | {
         "format": 1,
         "kind": "rollout" if many else "trajectory",
-        "ways": motion.ways if isinstance(motion, Rollout) else (),
+        "reruns": motion.reruns if isinstance(motion, Rollout) else (),
         "scene": type(scene).__name__,
         "coordinates": scene.coordinate_names.entries,
         "speeds": scene.speed_names.entries,
@@ -152,7 +152,7 @@ def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout
     longest = max(len(times) for times, _ in lanes)  # lanes with fewer are filled up with their last sample
     arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in lanes])
     arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in lanes])
-    ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header["ways"])
+    ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header["reruns"])
     return Rollout(_lanes(path, kind, header, arrays), continued, ways)
 
 

@@ -30,16 +30,16 @@ def refused(path, sentence: str) -> ValueError:
 def check_header(path, header: dict) -> None:
     """ValueError for an entry of the header that is of another kind than `save` writes."""
     wanted: dict[str, tuple[type, str]] = dict.fromkeys(_TEXTS, (str, "a text")) | dict.fromkeys(_LISTS, (list, "a list of names"))
-    wanted |= {"static": (dict, "a dictionary"), "projected": (bool, "true or false"), "ways": (list, "a list")}
+    wanted |= {"static": (dict, "a dictionary"), "projected": (bool, "true or false"), "reruns": (list, "a list")}
     for name, (kind, text) in wanted.items():
         value = header.get(name, kind())
         if not isinstance(value, kind) or (isinstance(value, list) and name in _LISTS and not all(isinstance(x, str) for x in value)):
             raise refused(path, f"has {described(value)} as `{name}` of its header, expected {text}")
     if header["state_form"] not in ("minimal", "full"):
         raise refused(path, f"has the state form {header['state_form']!r}, expected 'minimal' or 'full'")
-    for way in header.get("ways", ()):
+    for way in header.get("reruns", ()):
         if not (isinstance(way, list) and len(way) == 2 and way[0] in FALLBACKS and isinstance(way[1], list) and len(way[1]) == 5):
-            raise refused(path, f"has {way!r} among the `ways` of its header, expected a code of a fallback and how such lanes were run")
+            raise refused(path, f"has {way!r} among the `reruns` of its header, expected a code of a fallback and how such lanes were run")
 
 
 def check_arrays(path, header: dict, arrays: dict) -> None:

@@ -62,7 +62,7 @@ class MinimalByMatrices(ByMatrices):
         return y.q, speeds_from_privileged(scene, self.independent, t, y.q, y.v, inputs)
 
     def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
-        """With the sign of det A_z in the pivot."""
+        """What is seen at a state, with the sign of det A_z in the pivot."""
         u, pivot = speeds_and_pivot(scene, self.independent, t, y.q, y.v, inputs)
         return Observed(y.q, u, pivot)
 
@@ -101,7 +101,7 @@ class FullByMatrices(ByMatrices):
         return y.q, y.v
 
     def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
-        """With the pivot of the reduction, without a sign; 1 where it has none."""
+        """What is seen at a state, with the pivot of the reduction, without a sign; 1 where it has none."""
         partitioned = isinstance(self.reduction, Privileged | GibbsAppell)
         pivot = bare_accelerations(scene, t, y.q, y.v, inputs, reduction=self.reduction).pivot if partitioned else jnp.ones(())
         return Observed(y.q, y.v, pivot)

@@ -15,7 +15,9 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.explicit_power import stored_by_inputs
 from jourdain_jax.build.trace import event_values
+from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.reductions import Reduction
 from jourdain_jax.equations.virtual_power import energies_at
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.scene.scene import Scene
@@ -48,7 +50,7 @@ class VectorField(eqx.Module):
     """
 
     independent: tuple[int, ...] | None = eqx.field(static=True)  # privileged speeds; None: the full state
-    reduction: object
+    reduction: Reduction | GibbsAppell
     with_work: bool = eqx.field(static=True)
     conserves: bool = eqx.field(static=True)  # T + V is constant along every motion
     projects_positions: bool = eqx.field(static=True)

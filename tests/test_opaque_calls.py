@@ -16,7 +16,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.build.trace import event_values, traced_scene
-from jourdain_jax.equations.minimal import minimal_accelerations
+from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics
 from jourdain_jax.models import ChaplyginSleigh, TiltingDisc
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph, Unsupported
@@ -115,7 +115,8 @@ def rates_of(scene):
         return jnp.stack([*qdot, *ydot])
 
     def dense(scene, q, y):
-        _, motion, found = minimal_accelerations(scene, program.independent, jnp.zeros(()), q, y, jnp.zeros(0))
+        known = minimal_kinematics(scene, program.independent, jnp.zeros(()), q, y)
+        motion, found = accelerations_of(scene, known, jnp.zeros(()), q)
         return jnp.concatenate([motion.qdot.array, found.udot[np.array(program.independent)]])
 
     return by_program, dense
@@ -384,7 +385,7 @@ def test_a_stop_event_without_a_scalar_form_is_a_call_and_leaves_the_program_as_
 SINGLE = """
 import json, sys
 sys.path[:0] = {path!r}
-import jax, numpy as np, test_kept_parts as here
+import jax, numpy as np, test_opaque_calls as here
 assert not jax.config.jax_enable_x64
 found = {{}}
 for name in ("network",):
@@ -459,4 +460,4 @@ def test_a_computation_of_too_many_scalars_is_refused_in_parts_too(monkeypatch):
 
 def test_chains_and_the_bicycle_have_no_calls():
     for scene in (jj.models.TrailerChain(trailers=16), jj.models.PendulumChain(links=16), jj.models.MODELS["whipple-bicycle"]()):
-        assert "kept" not in traced_scene(scene).graph.op
+        assert "opaque" not in traced_scene(scene).graph.op

@@ -1,9 +1,9 @@
-"""Measurements of one run of a scene: times, named channels with a sigma and a sensor each, the start, sampled inputs.
+"""An experiment, what was measured in one run of a scene: times, named channels with a sigma and a sensor each, the start, sampled inputs.
 
 value_k = reading of the channel's sensor at t_k + sigma_k e_k,   e_k independent, standard normal
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -23,17 +23,17 @@ from jourdain_jax.scene.scene import Scene, entries_named
 _NO_INPUTS = Inputs(())
 
 
-class Measurements(eqx.Module):
-    """One run.
+class Experiment(eqx.Module):
+    """What was measured in one run of a scene; several runs are a list of these.
 
-        Measurements(ts, {"x": x, "gyro": w}, {"x": 0.01, "gyro": 0.02}, start={"x_rate": 0.6}, sensors={"gyro": jj.Sensor("heading_rate", lag=0.01)})
+        Experiment(ts, {"x": x, "gyro": w}, {"x": 0.01, "gyro": 0.02}, start={"x_rate": 0.6}, sensors={"gyro": jj.Sensor("heading_rate", lag=0.01)})
 
     **Arguments**
     - `ts`: times in s, strictly increasing.
     - `values`: channel -> measured values, shape (times, *channel). A channel is a coordinate, a speed, or a name in `sensors`.
     - `sigma`: standard deviation of the noise, in the unit of the channel: channel -> number, (times,) or the shape of its
       values; or one number for all channels. None: not known; one sigma for all samples of the channel in all runs is estimated.
-      NaN in `values`, or an infinite sigma, marks a sample that is missing.
+      NaN in `values`, the mask of a masked array, or an infinite sigma marks a sample that is missing.
     - `correlation_time`: s, of noise with a memory, whose correlation falls as exp(-|t - t'| / correlation time): channel -> number, or one number for all;
       channels that are not named have white noise, as with zero. None: not known; one for all components of the channel in all runs is estimated.
     - `start`: coordinate or speed -> value at `t0`. These are held; what is not given is solved for, as by `jj.start`.
@@ -80,8 +80,8 @@ class Measurements(eqx.Module):
         _check_times(self.ts)
         for what, part in (("values", values), ("start", start), ("sensors", {} if sensors is None else sensors)):
             if not isinstance(part, Mapping):
-                raise ValueError(f'`{what}` of `Measurements` is {described(part)}, expected a dictionary by name, such as {{"x": ...}}')
-        self.values = _reals("values of channel", values)
+                raise ValueError(f'`{what}` of `Experiment` is {described(part)}, expected a dictionary by name, such as {{"x": ...}}')
+        self.values = _reals("values of channel", {name: _unmasked(value) for name, value in values.items()}, "give numbers, NaN where a sample is missing")
         given = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.values, sigma)
         self.unknown_sigma = tuple(sorted(name for name, value in given.items() if value is None))
         self.sigma = _reals("sigma of channel", {name: 1.0 if value is None else value for name, value in given.items()})
@@ -146,8 +146,13 @@ def _array(x) -> Array | np.ndarray:
     return (jnp if is_traced(x) else np).asarray(x, jnp.result_type(float))
 
 
-def _reals(what: str, given: Mapping) -> dict[str, Array | np.ndarray]:
-    return {name: checked_unless_traced(value, f"{what} `{name}`", advice="check how it is put together") for name, value in given.items()}
+def _reals(what: str, given: Mapping, advice: str = "check how it is put together") -> dict[str, Array | np.ndarray]:
+    return {name: checked_unless_traced(value, f"{what} `{name}`", advice=advice) for name, value in given.items()}
+
+
+def _unmasked(value):
+    """The values, with NaN where samples are masked."""
+    return np.ma.filled(value.astype(float), np.nan) if isinstance(value, np.ma.MaskedArray) and value.dtype.kind in "iuf" else value
 
 
 def _correlation_times(given: Mapping) -> dict[str, Array | np.ndarray]:
@@ -168,8 +173,16 @@ def _correlation_times(given: Mapping) -> dict[str, Array | np.ndarray]:
 def _check_times(ts) -> None:
     if ts.ndim != 1 or ts.size == 0:
         raise ValueError(f"`ts` has shape {ts.shape}, expected a vector of at least one time in s")
-    if not (_holds(np.isfinite, ts) and _holds(lambda t: np.diff(t) > 0, ts)):
-        raise ValueError("`ts` must be finite and strictly increasing; sort the samples by time and merge repeated ones")
+    if is_traced(ts):
+        return
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(ts) & (np.diff(ts, prepend=-np.inf) > 0)
+    if not good.all():
+        k = int(np.argmin(good))
+        after = f" after {ts[k - 1]:.10g} s" if k else ""
+        raise ValueError(
+            f"`ts` must be finite and strictly increasing, but sample {k} is at {ts[k]:.10g} s{after}; sort the samples by time and merge repeated ones"
+        )
 
 
 def _check_same_names(what: str, names, expected) -> None:
@@ -181,7 +194,7 @@ def _check_same_names(what: str, names, expected) -> None:
             raise ValueError(f"channel `{name}` has no {what}; give `{what}` a number for it, or one number for all channels")
 
 
-def checked(scene: Scene, run: Measurements, index: int, repeats: bool) -> Measurements:
+def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experiment:
     """The run with its inputs and sensors made ready, after its channels and shapes were compared with the scene.
 
     `repeats`: values have a leading axis. Raises ValueError for an unknown channel, start value or input, for wrong shapes, and for samples that may show
@@ -235,7 +248,7 @@ def _reading(sensor: Sensor, name: str, where: str, quantity, shape: tuple[int, 
     return Reading(None if named else quantity, quantity if named else "", numbers, unknown, used)
 
 
-def _check_begin(run: Measurements, name: str, where: str, repeats: bool) -> None:
+def _check_begin(run: Experiment, name: str, where: str, repeats: bool) -> None:
     """ValueError where a sample that counts may show a time before the start."""
     delay, values = run.sensors[name].delay, run.values[name]
     if is_traced((delay, run.ts, run.t0, values, run.sigma[name])) or latest(delay) == 0:
@@ -251,7 +264,7 @@ def _check_begin(run: Measurements, name: str, where: str, repeats: bool) -> Non
         )
 
 
-def _inputs(scene: Scene, run: Measurements, where: str, estimates: dict) -> tuple[Inputs, dict[str, Drive]]:
+def _inputs(scene: Scene, run: Experiment, where: str, estimates: dict) -> tuple[Inputs, dict[str, Drive]]:
     """All inputs, at the first guess of what is to be estimated; and the actuators that have such numbers."""
     if run.inputs is None and not len(scene.inputs):
         return _NO_INPUTS, {}
@@ -281,7 +294,7 @@ def _inputs(scene: Scene, run: Measurements, where: str, estimates: dict) -> tup
     return inputs, drives
 
 
-def _check_overlap(run: Measurements, name: str, signal, where: str) -> None:
+def _check_overlap(run: Experiment, name: str, signal, where: str) -> None:
     """ValueError where all samples of an input that changes lie before the run, or after it."""
     if not isinstance(signal, Sampled) or is_traced((signal, run.ts, run.t0)) or np.ptp(np.asarray(signal.values)) == 0:
         return
@@ -291,28 +304,6 @@ def _check_overlap(run: Measurements, name: str, signal, where: str) -> None:
             f"input `{name}` of {where} is sampled from {first} to {last} s, and the run is from {begin} to {end} s, where it would be constant; "
             "take both from one clock, or give a number"
         )
-
-
-def held_inputs(scene: Scene, runs: Sequence[Measurements]) -> tuple[str, ...]:
-    """One sentence for each input that changes and whose samples leave more than 1.5 of their intervals of a run, `checked`, at an end: it is held there.
-
-    The last interval may be a jump, such as those of commands that are held; then the one before it counts.
-    """
-    found: list[str] = []
-    for index, run in enumerate(runs):
-        for name, signal in zip(scene.inputs.entries, run.inputs.channels if isinstance(run.inputs, Inputs) else (), strict=False):
-            if not isinstance(signal, Sampled) or is_traced((signal, run.ts, run.t0)) or np.ptp(np.asarray(signal.values)) == 0:
-                continue
-            ts, last = np.asarray(signal.ts), float(run.ts[-1])
-            intervals = np.diff(ts)
-            spans = [f"its first value until {ts[0]:.6g} s"] if ts[0] - run.t0 > 1.5 * intervals[0] else []
-            spans += [f"its last value from {ts[-1]:.6g} to {last:.6g} s"] if last - ts[-1] > 1.5 * max(intervals[-2:]) else []
-            if spans:
-                found.append(
-                    f"input `{name}` of run {index} is not sampled over all of the run and keeps {' and '.join(spans)}; if it did so, repeat that value in its "
-                    "samples, otherwise give more of them, or measurements of less"
-                )
-    return tuple(found)
 
 
 def _named_shape(scene: Scene, name: str, channel_name: str, where: str) -> tuple[int, ...]:

@@ -1,0 +1,175 @@
+"""Single operations by machine code against XLA, the functions of C and mpmath, also of numbers that are no usual ones."""
+
+import functools
+from collections.abc import Callable
+
+import evaluated_natively
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from in_mpmath import in_mpmath
+
+from jourdain_jax.calculus.scalar_operations import TABLE
+from jourdain_jax.native import angles, exponentials, host
+from jourdain_jax.native.math_functions import BY_POLYNOMIALS
+from jourdain_jax.program import emit
+from jourdain_jax.program.graph import Graph
+
+pytestmark = pytest.mark.skipif(bool(host.reason_against()), reason=host.reason_against())
+
+ONE = ["neg", "sqrt", "sin", "cos", "tan", "exp", "log", "tanh", "sinh", "cosh", "abs", "sign", "asin", "acos", "atan", "asinh", "acosh", "atanh"]
+ONE += ["exp2", "expm1", "log1p", "cbrt", "floor", "ceil", "round", "logistic", "is_finite"]
+TWO = ["add", "sub", "mul", "div", "atan2", "pow", "rem", "max", "min", "lt", "le", "gt", "ge", "eq", "ne"]
+SPECIAL = [0.0, -0.0, 1.0, -1.0, 0.5, 2.5, -2.5, np.inf, -np.inf, np.nan, 1e308, -1e308, 1e-300, 710.0, -745.2, 3.5e5, 1e6, 1e22]
+EXACT = {"neg", "sqrt", "abs", "sign", "floor", "ceil", "round", "is_finite", *TWO} - {"atan2", "pow"}
+
+
+def _all_operations() -> tuple[Graph, list[int], list[int]]:
+    graph = Graph()
+    a, b = graph.input("a", True), graph.input("b", True)
+    return graph, [graph.call(op, a) for op in ONE] + [graph.call(op, a, b) for op in TWO], [a, b]
+
+
+def test_every_operation_of_the_table_is_there():
+    known = {*ONE, *TWO, "and", "or", "not", "select"}
+    assert known == {*emit.FUNCTIONS, "sin", "cos"}
+
+
+def test_single_operations_are_those_of_xla_also_of_what_is_no_usual_number():
+    graph, outputs, inputs = _all_operations()
+    random = np.random.default_rng(0)
+    points = np.array([(x, y) for x in SPECIAL for y in SPECIAL])
+    points = np.concatenate([points, random.normal(size=(999, 2)) * 10.0 ** random.integers(-8, 5, size=(999, 2)), random.uniform(-3, 3, size=(1002, 2))])
+    found = np.asarray(evaluated_natively.function(graph, outputs, inputs)(points))
+    expected = emit.run(graph, outputs, dict(zip(inputs, jnp.asarray(points.T), strict=True)))
+    for op, ours, theirs in zip(ONE + TWO, found.T, expected, strict=True):
+        theirs = np.asarray(theirs, float)
+        if op in ("sin", "cos"):  # those of `emit` are right for multiples of pi/2 of 20 bits
+            ours, theirs = ours[np.abs(points[:, 0]) < 5e5], theirs[np.abs(points[:, 0]) < 5e5]
+        with np.errstate(all="ignore"):
+            close = np.abs(ours - theirs) <= (0.0 if op in EXACT else 2e-13) * np.abs(theirs)  # XLA's own functions are right to 1e-13
+        right = (ours == theirs) | (np.isnan(ours) & np.isnan(theirs)) | close
+        assert right.all(), (op, points[: len(ours)][~right][0], ours[~right][0], theirs[~right][0])
+
+
+def test_numbers_below_the_normal_ones_count_as_zero_or_as_what_they_are():
+    graph, outputs, inputs = _all_operations()
+    small = [5e-324, -5e-324, 1e-310, -2e-308]
+    points = np.array([(x, y) for x in small for y in (0.0, 1.0, -2.5)] + [(y, x) for x in small for y in (0.0, 1.0, -2.5)])
+    function = evaluated_natively.function(graph, outputs, inputs)
+    found, at_zero = (np.asarray(function(x)) for x in (points, np.where(np.abs(points) < 2.0**-1022, np.copysign(0.0, points), points)))
+    with np.errstate(all="ignore"):
+        for op, ours, of_zero in zip(ONE + TWO, found.T, at_zero.T, strict=True):
+            true = TABLE[op].value(*points[:, : 1 if op in ONE else 2].T).astype(float)
+            right = [(ours == x) | (np.isnan(ours) & np.isnan(x)) | (np.abs(ours - x) <= 1e-13 * np.abs(x) + 2.0**-1022) for x in (of_zero, true)]
+            assert (right[0] | right[1]).all(), (op, points[~(right[0] | right[1])], ours, of_zero, true)
+
+
+def test_special_values_are_those_of_c_also_the_signs_of_zeros():
+    graph, _, inputs = _all_operations()
+    ops = ["pow", "atan2", *(op for op in (*BY_POLYNOMIALS, "sin") if op in ONE and op not in ("log", "acos", "exp2"))]
+    outputs = [graph.call(op, *inputs[: 1 if op in ONE else 2]) for op in ops]
+    roots = [graph.call("pow", inputs[0], graph.const(y)) for y in (0.5, 1.5)]
+    values = [0.0, -0.0, 1.0, -1.0, 2.0, -3.0, 0.5, 1.5, -2.5, 4e15 + 1, -4e15 - 1, 1e300, 1e-300, -1e-300, np.inf, -np.inf, np.nan]
+    points = np.array([(x, y) for x in values for y in values])
+    found = np.asarray(evaluated_natively.function(graph, [*outputs, *roots], inputs)(points))
+    with np.errstate(all="ignore"):
+        expected = [TABLE[op].value(*points[:, : 1 if op in ONE else 2].T) for op in ops]
+        expected += [np.power(points[:, 0], np.full(len(points), y)) for y in (0.5, 1.5)]
+        for op, ours, true in zip([*ops, "x^0.5", "x^1.5"], found.T, expected, strict=True):
+            right = (ours == true) | (np.abs(ours - true) <= 1e-15 * np.abs(true) + 2.0**-1022)
+            right = (np.isnan(ours) & np.isnan(true)) | (right & (np.signbit(ours) == np.signbit(true)))
+            assert right.all(), (op, points[~right][0], ours[~right][0], true[~right][0])
+
+
+def test_numbers_in_single_precision_give_what_they_give_by_xla():
+    graph, outputs, inputs = _all_operations()
+    values = np.array([*SPECIAL[:10], 3.0, -3.0, 3e38, -3e38, 1e-30, 88.0, -103.0, 700.0, 3.5e5], np.float32)
+    points = np.array([(x, y) for x in values for y in values])
+    found = np.asarray(evaluated_natively.function(graph, outputs, inputs)(points))
+    expected = emit.run(graph, outputs, dict(zip(inputs, jnp.asarray(points.T), strict=True)))
+    with np.errstate(over="ignore"):
+        for op, ours, theirs in zip(ONE + TWO, found.T.astype(np.float32), expected, strict=True):
+            np.testing.assert_allclose(ours, np.asarray(theirs, np.float32), rtol=1e-5, atol=2e-38, err_msg=op)
+
+
+GROWING = ("exp", "exp2", "expm1", "sinh", "cosh", "logistic")
+OWN = ["sin", "cos", *BY_POLYNOMIALS]
+
+
+@functools.cache
+def _our_own(lanes: int, fused: bool) -> Callable:
+    """Values of our own functions by machine code of other machines: (x, y) -> name -> value."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(host, "lanes", lambda: lanes)
+        patch.setattr(host, "fuses", lambda: fused)
+        graph = Graph()
+        inputs = [graph.input("x", True), graph.input("y", True)]
+        nodes = [graph.call(op, *inputs[: 1 if op in ONE else 2]) for op in OWN]
+        nodes.append(graph.call("pow", inputs[0], graph.const(1.5)))
+        function = evaluated_natively.function(graph, nodes, inputs)
+    return lambda x, y: dict(zip([*OWN, "x^1.5"], np.asarray(function(np.stack([x, y], axis=1))).T, strict=True))
+
+
+def _arguments(op: str) -> tuple[np.ndarray, np.ndarray]:
+    """Over the range in use, and near what a function does differently on either side."""
+    random = np.random.default_rng(1)
+    uniform = lambda low, high: random.uniform(low, high, 500)  # noqa: E731
+    edges = np.array([0.5, 1.0, 2**0.5, 0.5**0.5, 2**0.5 - 1, 2**0.5 + 1, np.log(2) / 2, 1.5 * np.log(2), -0.5])
+    spread, near_one = random.normal(size=500) * 10.0 ** random.integers(-6, 6, size=500), 1 - 10 ** uniform(-16, -1)
+    angles = np.concatenate([random.normal(size=500) * 10.0 ** random.integers(-6, 20, size=500), uniform(-5e5, 5e5), np.arange(1, 200) * (np.pi / 2)])
+    more = dict.fromkeys(("sin", "cos", "tan"), angles) | dict.fromkeys(GROWING, uniform(-700, 709))
+    more |= {"asin": near_one, "acos": [*near_one, *-near_one], "log1p": -near_one}
+    x = np.concatenate([spread, uniform(-3, 3), 10 ** uniform(-200, 200), *(edges * (1 + k * 2.0**-52) for k in range(-5, 6)), more.get(op, [])])
+    y = np.resize(np.concatenate([uniform(-10, 10), spread, x[::-1]]), len(x))
+    if op in ("pow", "x^1.5"):
+        x = np.abs(x)
+        y = np.where(np.abs(y * np.log(x)) < 700, y, 0.5)
+    domain = {"log": x > 0, "log1p": x > -1, "asin": np.abs(x) <= 1, "acos": np.abs(x) <= 1, "x^1.5": (x < 1e200) & (x > 1e-180)}
+    domain |= {"atan2": np.abs(x) > 1e-290 * np.abs(y)} | dict.fromkeys(GROWING, np.abs(x) < 709)
+    inside = domain.get(op, np.isfinite(x))
+    return x[inside], y[inside]
+
+
+@pytest.mark.parametrize("fused", [True, False])
+@pytest.mark.parametrize("op", [*OWN, "x^1.5"])
+def test_functions_of_our_own_are_right_to_the_last_digit(op, fused):
+    if fused and not host.fuses():
+        pytest.skip("sums and products are rounded one after the other here")
+    x, y = _arguments(op)
+    found = _our_own(host.lanes(), fused)(x, y)[op]
+    function = (lambda x: mpmath.sqrt(x) * x) if op == "x^1.5" else in_mpmath(op)
+    with mpmath.workdps(60):
+        exact = [function(*(mpmath.mpf(float(x)) for x in arguments)) for arguments in (zip(x, y, strict=True) if op in TWO else zip(x, strict=True))]
+        errors = [float(abs(mpmath.mpf(float(y)) - e)) / np.spacing(abs(float(e))) for e, y in zip(exact, found, strict=True)]
+    assert len(x) > 500
+    assert max(errors) < 0.9  # ulp
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_functions_of_our_own_are_the_same_beside_any_others(fused):
+    if fused and not host.fuses():
+        pytest.skip("sums and products are rounded one after the other here")
+    x = np.concatenate([SPECIAL, [1e-310, -1e-310], np.random.default_rng(2).normal(size=400) * 10.0 ** np.random.default_rng(3).integers(-5, 7, size=400)])
+    y = np.random.default_rng(4).permutation(x)
+    expected = _our_own(2, fused)(x, y)
+    for lanes in (4, 8):
+        order = np.random.default_rng(lanes).permutation(len(x))
+        found = _our_own(lanes, fused)(x[order], y[order])
+        for op, values in expected.items():
+            np.testing.assert_array_equal(found[op].view(np.int64), values[order].view(np.int64), err_msg=op)
+
+
+@pytest.mark.filterwarnings("ignore:Descending")
+def test_polynomials_are_those_of_chebyshev():
+    fits = {
+        exponentials.EXP: (lambda r: mpmath.hyp1f1(1, 3, r) / 2, [-mpmath.log(2) / 2, mpmath.log(2) / 2]),
+        exponentials.LOG: (lambda z: mpmath.hyp2f1(1, 3.5, 4.5, z) / 7, [0, (3 - 2 * mpmath.sqrt(2)) ** 2]),
+        angles.ATAN: (lambda z: -mpmath.hyp2f1(1, 1.5, 2.5, -z) / 3, [0, 3 - 2 * mpmath.sqrt(2)]),
+        angles.ASIN: (lambda z: (mpmath.asin(mpmath.sqrt(z)) / mpmath.sqrt(z) - 1) / z, [0, 0.25]),
+    }
+    with mpmath.workdps(60):
+        for numbers, (function, interval) in fits.items():
+            found = [float(x) for x in mpmath.chebyfit(function, interval, len(numbers))]
+            np.testing.assert_allclose(numbers, found, rtol=1e-13)
