@@ -291,7 +291,7 @@ MUTANTS = [
     Mutant("an event that stays while its tangent moves", back, "_moved_back", "w.load(w.real, added, asked)", "0.0 * g_dt", BENT, WRONG),
     Mutant(
         "cotangents of states for those of tangents",
-        flow_back,
+        native_motion,
         "flow_back",
         "jnp.concatenate([dg, g], axis=1)",
         "jnp.concatenate([dg, dg], axis=1)",

@@ -28,7 +28,7 @@ class BothWays(NamedTuple):
     places: list[int]
 
     def pushes(self, moving: list[int]) -> LinearMap:
-        """Of tangents of leaves, at the leaves and what is found."""
+        """The map of tangents of leaves, at the leaves and what is found."""
 
         def pushed(at, along):
             return self.rates(moving)(list(at[: len(self.leaves)]), *along)

@@ -33,7 +33,7 @@ class LinearMap:
 
 
 def shapes(arrays: Sequence) -> list[jax.ShapeDtypeStruct]:
-    """Of arrays, with their types."""
+    """Shapes of arrays, with their types."""
     return [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays]
 
 
