@@ -202,13 +202,15 @@ def gradients(quick: bool) -> Iterator[Figure]:
                 seconds = time.process_time() - begin
                 found[way] = np.asarray(runs[way](x))
                 if way != "solve" and where == "alone":
-                    yield figure(f"trace and compile the gradient by 8 numbers, {way} mode, s", name, seconds, *((6, 3) if way == "forward" else (10, 5)))
+                    yield figure(
+                        f"trace and compile the gradient with respect to 8 numbers, {way}, s", name, seconds, *((6, 3) if way == "forward" else (10, 5))
+                    )
             timed = least_processor_time({way: lambda run=run, x=x: jax.block_until_ready(run(x)) for way, run in runs.items()}, 7)
             scale = np.max(np.abs(found["reverse"]))
             np.testing.assert_allclose(found["forward"], found["reverse"], rtol=1e-5, atol=1e-5 * scale)
             print(f"  {name}, {where}: " + ", ".join(f"{way} {1e3 * t / lanes:.3f} ms" for way, t in timed.items()), flush=True)
             best = min(timed["forward"], timed["reverse"])
-            yield figure(f"gradient by 8 numbers / one solve, {where}", name, best / timed["solve"], AT_MOST[name], 3)
+            yield figure(f"gradient with respect to 8 numbers / one solve, {where}", name, best / timed["solve"], AT_MOST[name], 3)
 
 
 def second_derivatives(quick: bool) -> Iterator[Figure]:
@@ -228,9 +230,9 @@ def second_derivatives(quick: bool) -> Iterator[Figure]:
         differences = np.stack([(slope(x + h) - slope(x - h)) / (2 * np.sum(h)) for h in step])
         np.testing.assert_allclose(found, differences, rtol=1e-4, atol=1e-4 * np.max(np.abs(found)))
         timed = least_processor_time({way: lambda run=run, x=x: jax.block_until_ready(run(x)) for way, run in runs.items()}, 7)
-        print(f"  {name}: second derivatives by 8 numbers compiled in {seconds:.1f} s, {1e3 * timed['second']:.3f} ms", flush=True)
-        yield figure("trace and compile second derivatives by 8 numbers, s", name, seconds, 20, 10)
-        yield figure("second derivatives by 8 numbers / one solve", name, timed["second"] / timed["solve"], 64, 32)
+        print(f"  {name}: second derivatives with respect to 8 numbers compiled in {seconds:.1f} s, {1e3 * timed['second']:.3f} ms", flush=True)
+        yield figure("trace and compile second derivatives with respect to 8 numbers, s", name, seconds, 20, 10)
+        yield figure("second derivatives with respect to 8 numbers / one solve", name, timed["second"] / timed["solve"], 64, 32)
 
 
 NAMED = {

@@ -191,9 +191,9 @@ def times(quick: bool) -> Iterator[Figure]:
             seconds = least_processor_time(runs, 50)
             apart = abs(float(runs["native"]()) / float(runs["XLA"]()) - 1.0)
             for way in WAYS:
-                yield figure(f"slope by a delay, {mode}, {way}, trace and compile, s", name, compiled[way])
-                yield figure(f"slope by a delay, {mode}, {way}, ms", name, 1e3 * seconds[way])
-            yield figure(f"slope by a delay, {mode}, relative difference", name, apart, 1e-7)
+                yield figure(f"slope with respect to a delay, {mode}, {way}, trace and compile, s", name, compiled[way])
+                yield figure(f"slope with respect to a delay, {mode}, {way}, ms", name, 1e3 * seconds[way])
+            yield figure(f"slope with respect to a delay, {mode}, relative difference", name, apart, 1e-7)
 
 
 def watching(quick: bool) -> Iterator[Figure]:

@@ -27,7 +27,7 @@ def _slope(function, s: float = 0.0) -> np.ndarray:
     return (16 * D[1] - D[0]) / 15
 
 
-def _along(scene: jj.Scene, held: tuple[str, ...], off: float, native: bool | None):
+def _along(scene: jj.Scene, held: tuple[str, ...], off: float, native: bool):
     """What is put onto the rows as a function of one number, on which parameters, time, coordinates and speeds depend."""
     generator = np.random.default_rng(2)
     _, q, u = jj.sample_states(scene, 1)

@@ -226,7 +226,7 @@ def test_values_and_all_directions_of_a_jacobian_come_from_one_run():
 
     xs, runs = jnp.array([[0.4, 0.25, -0.6], [0.5, 0.2, 0.7]]), {}
     for simulate in (simulate_alongside, simulate_forward):
-        runs[simulate] = str(jax.make_jaxpr(places(simulate))(xs[0])).count("ffi_call[")
+        runs[simulate] = str(jax.make_jaxpr(places(simulate))(xs[0])).count("jourdain_machine_code[")
     assert runs[simulate_alongside] == runs[simulate_forward] - 1
     expected = eval_numpy(jax.vmap(places(simulate_forward)))(xs)
     along = places(simulate_alongside)

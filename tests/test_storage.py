@@ -1,5 +1,6 @@
 """Rollouts in files: every lane comes back as it was, failed ones with their codes; wrong files are refused with the reason."""
 
+import dataclasses
 import json
 
 import diffrax
@@ -59,9 +60,12 @@ def test_a_lane_with_wrong_parameters_comes_back_from_a_file_of_its_own(discs, t
 
 def test_lanes_that_were_continued_and_fields_that_are_counts_are_kept(tmp_path):
     lanes = jj.rollout(PendulumChain(links=1), parameters={"mass": np.array([[0.2], [0.3]])}, ts=TS, progress=False)
-    lanes = jj.Rollout(lanes.lanes, continued=(1,))
+    again = dataclasses.replace(lanes.lanes, fallback=jnp.array([0, results.FULL_STATE], jnp.int32))
+    lanes = jj.Rollout(again, continued=(1,), reruns=((results.FULL_STATE, ("full", "multipliers", "Dopri8", True)),))
     jj.save(lanes, tmp_path / "chains.npz")
-    assert_equal_to_the_bit(jj.load_rollout(tmp_path / "chains.npz", PendulumChain), lanes)
+    loaded = jj.load_rollout(tmp_path / "chains.npz", PendulumChain)
+    assert_equal_to_the_bit(loaded, lanes)
+    assert (loaded.lane(0).reduction, loaded.lane(1).reduction) == (lanes.lanes.reduction, "multipliers")
 
 
 def test_inputs_come_back_as_samples_at_the_saved_times(tmp_path):

@@ -112,7 +112,7 @@ def draw(entries: list[dict], out: Path) -> None:
     gradients = [e for e in entries if e.get("kind") == "gradient"]
     named = [name for name in TITLES if any(e["problem"] == name for e in gradients)]
     if named:
-        title, error = "Gradient by eight numbers through the whole motion (lower left is better)", "relative error of the gradient"
+        title, error = "Gradient with respect to eight numbers through the whole motion (lower left is better)", "relative error of the gradient"
         _chart(gradients, named, GRADIENT_LOOKS, _time, "time (ms)", title, out / "work_precision_gradients", error)
     batched = [e for e in entries if "batch" in e and e["note"].startswith("starts")]
     if batched:

@@ -58,7 +58,7 @@ def real_roots(coefficients: Sequence[Scalar], lower: Scalar, upper: Scalar) -> 
     """The real roots between `lower` and `upper`, ascending, then NaN for those that are not there.
 
     **Arguments:** `coefficients`, lowest power first (the highest may be zero); `lower` < `upper`.
-    **Returns:** as many numbers as the degree. They carry no derivative: see `implicit_root` for one.
+    **Returns:** as many numbers as the degree. They carry no derivative: see `newton_root` for one.
     """
     coefficients = [jax.lax.stop_gradient(coefficient) for coefficient in coefficients]
     return jnp.sort(_real_roots(coefficients, jax.lax.stop_gradient(lower), jax.lax.stop_gradient(upper)))

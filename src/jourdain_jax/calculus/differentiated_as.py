@@ -14,6 +14,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from jourdain_jax.calculus.both_ways import BothWays
+from jourdain_jax.calculus.elsewhere import or_elsewhere
 from jourdain_jax.calculus.guards import SECOND_ORDER_BY_XLA_MESSAGE
 from jourdain_jax.calculus.lanes_first import lanes_first
 from jourdain_jax.calculus.linear_maps import put, shapes
@@ -155,11 +156,15 @@ def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
 
 def _pulled(differentiable: Callable, rules: Rules | None, perturbed, arguments, found, g):
     """Cotangents of the arguments that vary, from those of what is found."""
-    if rules is not None and rules.pull is not None and rules.serve(1, *perturbed):
-        return rules.pull(perturbed, arguments, found, g)
-    moving, fixed = eqx.partition(arguments, perturbed)
-    _, pull = eqx.filter_vjp(lambda moving: differentiable(*eqx.combine(moving, fixed)), moving)
-    return pull(g)[0]
+
+    def by_autodiff(perturbed, arguments, found, g):
+        moving, fixed = eqx.partition(arguments, perturbed)
+        _, pull = eqx.filter_vjp(lambda moving: differentiable(*eqx.combine(moving, fixed)), moving)
+        return pull(g)[0]
+
+    if rules is None or rules.pull is None or not rules.serve(1, *perturbed):
+        return by_autodiff(perturbed, arguments, found, g)
+    return or_elsewhere(rules.pull, by_autodiff)(perturbed, arguments, found, g)
 
 
 def _is_number(x) -> bool:

@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal
+from jax.extend.core import ClosedJaxpr, Literal
 
 from jourdain_jax.calculus.jaxprs import called, needed_only
 from jourdain_jax.calculus.scalar_operations import VALUES
@@ -147,9 +147,15 @@ def _linear_solve(params, inputs) -> list[np.ndarray]:
     return _run(params["jaxprs"].solve, [inputs[i] for i in (*of_solve, *right)])
 
 
+def _here(params, inputs) -> list[np.ndarray]:
+    count = len(params["here"].constvars)
+    return _run(ClosedJaxpr(params["here"], inputs[:count]), inputs[count:])
+
+
 _CONTROL: dict[str, Callable] = {
     "scan": _scan,
     "cond": _cond,
+    "jourdain_or_elsewhere": _here,
     "custom_lin": lambda params, inputs: inputs,
     "custom_linear_solve": _linear_solve,
 }

@@ -30,7 +30,7 @@ _KINDS = {  # of diffrax, and an example
 }
 
 
-def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None, native: bool | None = None, onto_rows: bool = False) -> State:
+def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None, native: bool = True, onto_rows: bool = False) -> State:
     """A state from a `State`, a dictionary of named values (the rest is solved for, as by `jj.start`), or None for the scene's example.
 
     `inputs`: the scene's inputs at that instant, a vector or by name (default: zero); they count where velocity rows depend on them.

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.differentiated_as import Rules, derivatives_of, differentiated_as
+from jourdain_jax.calculus.elsewhere import or_elsewhere
+from jourdain_jax.calculus.guards import reverse_only
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
@@ -68,26 +70,22 @@ class OwnSteps(Integrator):
         forward, reverse = by_xla("forward"), by_xla("reverse")
         if setup.reason_against_machine_code:
             return (forward if self.kind == "forward" else reverse)(setup, begun)
-        rules = _rules(setup, mapped, self.alongside)
-        return differentiated_as(reverse if self.kind == "reverse" else forward, mapped(_by_machine_code), self.kind, rules, reverse)(setup, begun)
+        by = reverse if self.kind == "reverse" else forward
+        quick = or_elsewhere(mapped(_by_machine_code), by)
+        rules = _rules(setup, quick, mapped, self.alongside)
+        return differentiated_as(by, quick, self.kind, rules, lambda *given: reverse(*reverse_only(given)))(setup, begun)
 
 
 _once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
 
 
-def takes(solver, stepsize_controller, adjoint, saveat) -> bool:
-    """Whether our own loop has such a solver and such an adjoint (None: the default ones), and nothing else is stated."""
-    if stepsize_controller is not None or saveat is not None or not (solver is None or isinstance(solver, Method) or method_of(solver) is not None):
-        return False
-    return adjoint is None or _kind(adjoint) is not None
-
-
 def own_steps(solver, stepsize_controller, adjoint, saveat, **static) -> OwnSteps | None:
-    """Our own loop, where it takes these options."""
-    if not takes(solver, stepsize_controller, adjoint, saveat):
-        return None
+    """Our own loop, where it has such a solver and such an adjoint (None: the default one), and nothing else is stated."""
     method = solver if isinstance(solver, Method) else method_of(solver)
-    return _once(method, "both" if adjoint is None else _kind(adjoint), adjoint is not None and type(adjoint) is alongside.Alongside, **static)
+    kind = "both" if adjoint is None else _kind(adjoint)
+    if stepsize_controller is not None or saveat is not None or method is None or kind is None:
+        return None
+    return _once(method, kind, adjoint is not None and type(adjoint) is alongside.Alongside, **static)
 
 
 def _kind(adjoint) -> Mode | None:
@@ -155,8 +153,8 @@ def _most_steps(setup: Setup, knots) -> int:
     return setup.integrator.max_steps + (0 if knots is None else len(knots))
 
 
-def _rules(setup: Setup, mapped: Callable, alongside: bool) -> Rules:
-    """Derivatives by machine code; `mapped`: of a function of one motion, that of all lanes."""
+def _rules(setup: Setup, quick: Callable, mapped: Callable, alongside: bool) -> Rules:
+    """Derivatives of `quick` by machine code; `mapped`: of a function of one motion, that of all lanes."""
 
     form = native_motion.form_of(setup.field, setup.inputs, bool(setup.integrator.event_names))
 
@@ -167,7 +165,7 @@ def _rules(setup: Setup, mapped: Callable, alongside: bool) -> Rules:
     def pull(perturbed, arguments, found, g):
         return mapped(partial(_pulled, perturbed))(*arguments, found, g)
 
-    return Rules(serve, derivatives_of(mapped(_by_machine_code)).push, pull, alongside)
+    return Rules(serve, derivatives_of(quick).push, pull, alongside)
 
 
 def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solved) -> tuple:

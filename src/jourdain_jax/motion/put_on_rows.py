@@ -16,6 +16,7 @@ from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.row_program import RowProgram, row_program
 from jourdain_jax.build.structure import closure_lengths, plain_row_lengths, rows_are_affine, usual_rows
 from jourdain_jax.calculus.differentiated_as import derivatives_of, differentiated_as
+from jourdain_jax.calculus.elsewhere import or_elsewhere
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
@@ -110,7 +111,7 @@ def _by_either(usual: Usual, kind, affine: bool, by_xla, by_machine_code):
     of_rows = partial(by_xla, functions_of_rows(usual))
     if usual.program is None or _reason_against(rows := Rows(usual.program, kind, affine)):
         return of_rows
-    return differentiated_as(of_rows, by_machine_code(rows), "forward")
+    return differentiated_as(of_rows, or_elsewhere(by_machine_code(rows), of_rows), "forward")
 
 
 @lru_cache(maxsize=MOST_KERNELS)

@@ -23,7 +23,7 @@ from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted, 
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method, as_solver
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import marked
-from jourdain_jax.motion.own_steps import own_steps, reason_against_series, takes
+from jourdain_jax.motion.own_steps import own_steps, reason_against_series
 from jourdain_jax.motion.quick_compilation import nothing_is_traced
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
@@ -82,8 +82,8 @@ def simulate(
       `diffrax.ForwardMode()` for forward mode of any order; `diffrax.DirectAdjoint()` for all.
     - `formulation`: which equations are integrated, a `jj.Formulation(state, reduction, stabilisation)` (default: what serves the scene).
     - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code made for it, on CPUs, where llvmlite is installed and the solver is a
-      default one; "xla", that program compiled by XLA, as `jax.export` needs, and as third derivatives and those with respect to samples are in any case;
-      "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
+      default one; "xla", that program compiled by XLA, as third derivatives, those with respect to samples, and programs that are exported (`jax.export`)
+      or for other devices are in any case; "dense", the dense matrices; "auto" (default), the first of these that serves. The first two take the same steps.
     - `inputs`: name -> number, function of time, or `Sampled`.
     - `events`: stop where an event value of the scene falls through zero. `work`: integrate the work that no potential accounts for.
 
@@ -153,8 +153,7 @@ def _set_up(
     check_options(rtol=rtol, atol=atol, max_steps=max_steps, dt0=dt0, switches=switches, **objects)
     _check_adjoint(adjoint)
     check_solver(solver, stepsize_controller, dt0, saveat)
-    ours = takes(**objects)
-    native = (True if ours else None) if backend in ("auto", "native") else False  # with what is diffrax's, only numbers: the rest can be exported
+    native = backend in ("auto", "native")
     inputs = as_inputs(scene, inputs)
     t0, ts, t1 = span_and_times(scene, start, t0, t1, ts)
     start = _start(scene, start, t0, inputs, native, formulation.projects, searches)
@@ -165,7 +164,7 @@ def _set_up(
     if solver is None:
         solver = default_solver(rtol) if order is None else DOPRI8
     static = {"max_steps": max_steps, "event_names": field.event_names if events else ()}
-    integrator = own_steps(solver, stepsize_controller, adjoint, saveat, **static, native=backend in ("auto", "native"), order=order)
+    integrator = own_steps(solver, stepsize_controller, adjoint, saveat, **static, native=native, order=order)
     if integrator is None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
         saveat = None if saveat is None else _checked_saveat(saveat)
@@ -200,12 +199,12 @@ def _check_adjoint(adjoint) -> None:
         )
 
 
-def _start(scene: Scene, given, t0, inputs: Inputs, native: bool | None, projects: bool, searches: bool) -> State | Unmoved:
+def _start(scene: Scene, given, t0, inputs: Inputs, native: bool, projects: bool, searches: bool) -> State | Unmoved:
     """The start; numbers that are known are put onto the rows by the program that integrates, unless it takes a search."""
     if projects and not searches and nothing_is_traced():
         if isinstance(given, State):
-            return unmoved(scene, given, native is not False)
-        return named_unmoved(scene, named_values(scene, given), t0, inputs_at(inputs, t0), native is not False)
+            return unmoved(scene, given, native)
+        return named_unmoved(scene, named_values(scene, given), t0, inputs_at(inputs, t0), native)
     if isinstance(given, State):
         return put_on_rows(scene, t0, given.q, given.u, inputs_at(inputs, t0), native=native) if projects else given
     return as_state(scene, given, t0=t0, inputs=inputs_at(inputs, t0), native=native, onto_rows=projects)

@@ -89,8 +89,8 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
     return put_on_rows(scene, t, q, u, inputs, held=held)
 
 
-def put_on_rows(scene: Scene, t, q, u, inputs, *, held: tuple[str, ...] = (), native: bool | None = None) -> State:
-    """As `consistent`; `native`: whether machine code of our own may do it (None: to numbers, so that what is traced can be exported)."""
+def put_on_rows(scene: Scene, t, q, u, inputs, *, held: tuple[str, ...] = (), native: bool = True) -> State:
+    """As `consistent`; `native`: whether machine code of our own may do it."""
     t, q, u = _as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
     inputs = _as_input_vector(scene, inputs, q.dtype)
     coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
@@ -107,15 +107,14 @@ def _free(names: tuple[str, ...], held: tuple[str, ...]) -> Bool[np.ndarray, "en
     return np.array([name not in held for name in names], bool)
 
 
-def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable, *, native: bool | None, determined: bool = False) -> State:
+def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable, *, native: bool, determined: bool = False) -> State:
     """The nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`.
 
     `determined`: rows determine the speeds that are free; `native`: as in `put_on_rows`.
     """
     given = scene, t, q, u, inputs, free_q, free_u
-    traced = not nothing_is_traced() and is_traced(given)
-    arguments = *given, usual_sizes(scene, determined, not traced if native is None else native)
-    if traced:
+    arguments = *given, usual_sizes(scene, determined, native)
+    if not nothing_is_traced() and is_traced(given):
         return _put_onto_constraints(*arguments, guesses()).state
     # numbers are put onto the rows at once, also where a function around this call is being traced; elsewhere that would compile constants one by one
     with nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval():
@@ -271,7 +270,7 @@ def start(scene: Scene | BuiltFor, *, t0: Number = 0.0, inputs=None, **values) -
     return named_start(scene, values, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)))
 
 
-def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bool | None = None, onto_rows: bool = False) -> State:
+def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bool = True, onto_rows: bool = False) -> State:
     """A start from a dictionary of `values`, as of `start`, and the `inputs` at time `t0`: a vector, or by name (None: zero).
 
     `native`: as in `put_on_rows`. `onto_rows`: where given values contradict each other by so little that it passes for round-off of what was typed, they
@@ -286,7 +285,7 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bo
     return _moved_if_near(scene, state, inputs, native) if onto_rows and may_contradict(scene, named.known, free_q, free_u) else state
 
 
-def _moved_if_near(scene: Scene, start: State, inputs, native: bool | None) -> State:
+def _moved_if_near(scene: Scene, start: State, inputs, native: bool) -> State:
     """The start moved onto the rows as a whole, where it is off them by less than what counts as a contradiction.
 
     Where it is off by round-off alone, its numbers stay as they are, but what is traced gets the derivatives of a start that is moved: values that agree at

@@ -5,7 +5,7 @@ Integers and booleans that do not depend on inputs (indices, shapes, masks) stay
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TypeAlias
 
@@ -86,11 +86,8 @@ def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
     out = equation.outvars[0].aval
     if name == "convert_element_type" and symbolic:
         return [_converted(graph, as_nodes(graph, inputs[0]), equation.invars[0].aval.dtype, out.dtype)]
-    if name in _STRUCTURAL:
-        rule = _STRUCTURAL[name]
-        if symbolic and name in _MIXED:
-            inputs = [Nodes(as_nodes(graph, x)) if i in _MIXED[name](len(inputs)) else x for i, x in enumerate(inputs)]
-        return _boxed(rule(graph, inputs, equation.params, out), symbolic)
+    if symbolic and name in _MOVES:
+        return [Nodes(ids) for ids in _moved(graph, name, equation, inputs)]
     if not symbolic:
         return applied(equation, [np.asarray(x, v.aval.dtype) for x, v in zip(inputs, equation.invars, strict=True)])
     if out.dtype.kind in "iu" and name in _NOT_OF_INTEGERS:
@@ -129,48 +126,16 @@ def own_rule(name: str, params) -> str:
     return "" if _HOME in info else f"`{info.split(' at ')[0]}`, which has a derivative of its own,"
 
 
-def _boxed(result, symbolic: bool) -> list[Value]:
-    results = result if isinstance(result, list) else [result]
-    return [Nodes(r) if symbolic else r for r in results]
-
-
 # Primitives that move entries about. ---------------------------------------------------------------------------------
 
 
-def _ids(x) -> np.ndarray:
-    return x.ids if isinstance(x, Nodes) else np.asarray(x)
-
-
-def _broadcast_in_dim(graph, inputs, params, out):
-    x, axes = _ids(inputs[0]), params["broadcast_dimensions"]
-    shape = [1] * len(params["shape"])
-    for axis, place in enumerate(axes):
-        shape[place] = x.shape[axis]
-    return np.broadcast_to(x.reshape(shape), params["shape"])
-
-
-def _slice(graph, inputs, params, out):
-    strides = params["strides"] or (1,) * len(params["start_indices"])
-    return _ids(inputs[0])[tuple(slice(*s) for s in zip(params["start_indices"], params["limit_indices"], strides, strict=True))]
-
-
-def _index(value) -> int:
-    if isinstance(value, Nodes):
+def _moved(graph: Graph, name: str, equation, inputs: list[Value]) -> list[np.ndarray]:
+    """Nodes moved as numbers would be; numbers that stand among them become constants."""
+    entries = _MOVES[name](len(inputs))
+    if any(isinstance(x, Nodes) for i, x in enumerate(inputs) if i not in entries):
         raise Unsupported("an index that depends on the state")
-    return int(np.asarray(value))
-
-
-def _dynamic_slice(graph, inputs, params, out):
-    x, sizes = _ids(inputs[0]), params["slice_sizes"]
-    starts = [min(max(_index(i), 0), n - size) for i, n, size in zip(inputs[1:], x.shape, sizes, strict=True)]
-    return x[tuple(slice(i, i + size) for i, size in zip(starts, sizes, strict=True))]
-
-
-def _dynamic_update_slice(graph, inputs, params, out):
-    x, update = _ids(inputs[0]).copy(), _ids(inputs[1])
-    starts = [min(max(_index(i), 0), n - size) for i, n, size in zip(inputs[2:], x.shape, update.shape, strict=True)]
-    x[tuple(slice(i, i + size) for i, size in zip(starts, update.shape, strict=True))] = update
-    return x
+    given = [as_nodes(graph, x) if i in entries else x for i, x in enumerate(inputs)]
+    return [_OF_NODES[name](graph, given, equation.params)] if name in _OF_NODES else applied(equation, given)
 
 
 def _places(x, primitive, *operands, **params):
@@ -180,22 +145,17 @@ def _places(x, primitive, *operands, **params):
         return np.asarray(primitive.bind(jnp.asarray(positions), *(jnp.asarray(o) for o in operands), **params))
 
 
-def _gather(graph, inputs, params, out):
-    if isinstance(inputs[1], Nodes):
-        raise Unsupported("an index that depends on the state")
-    x = _ids(inputs[0])
+def _gather(graph, inputs, params):
+    x, indices = inputs
     params = dict(params, fill_value=-1) if params.get("fill_value") is not None or "fill_value" in params else params
-    places = _places(x, jax.lax.gather_p, inputs[1], **params)
+    places = _places(x, jax.lax.gather_p, indices, **params)
     if np.any(places < 0):
         raise Unsupported("an index out of bounds")
     return np.ravel(x)[places]
 
 
-def _scatter(graph, inputs, params, out):
+def _scatter(graph, inputs, params):
     x, indices, update = inputs
-    if isinstance(indices, Nodes):
-        raise Unsupported("an index that depends on the state")
-    x, update = _ids(x), _ids(update)
     count = x.size
     with jax.ensure_compile_time_eval():
         base = jnp.arange(count, dtype=jnp.int32).reshape(x.shape)
@@ -205,34 +165,46 @@ def _scatter(graph, inputs, params, out):
     return np.concatenate([np.ravel(x), np.ravel(update)])[places]
 
 
-def _scatter_add(graph, inputs, params, out):
+def _scatter_add(graph, inputs, params):
     x, indices, update = inputs
-    if not isinstance(x, Nodes):
-        raise Unsupported("the operation `scatter-add` on numbers")
-    target = _scatter(graph, [np.full(_ids(x).shape, -1), indices, np.arange(_ids(update).size).reshape(_ids(update).shape)], params, out)
+    target = _scatter(graph, [np.full(x.shape, -1), indices, np.arange(update.size).reshape(update.shape)], params)
     hit = np.ravel(target)
-    if len(set(hit[hit >= 0].tolist())) != _ids(update).size:
+    if len(set(hit[hit >= 0].tolist())) != update.size:
         raise Unsupported("the operation `scatter-add` with repeated places")
-    flat, added = np.ravel(_ids(x)).copy(), np.ravel(_ids(update))
+    flat, added = np.ravel(x).copy(), np.ravel(update)
     for place, source in enumerate(hit.tolist()):
         if source >= 0:
             flat[place] = graph.add(int(flat[place]), int(added[source]))
-    return flat.reshape(_ids(x).shape)
+    return flat.reshape(x.shape)
 
 
-def _pad(graph, inputs, params, out):
-    x, fill = _ids(inputs[0]), _ids(inputs[1])
+def _pad(graph, inputs, params):
+    x, fill = inputs
     if any(interior or low < 0 or high < 0 for low, high, interior in params["padding_config"]):
         raise Unsupported("the operation `pad` with gaps")
     return np.pad(x, [(low, high) for low, high, _ in params["padding_config"]], constant_values=fill.item())
 
 
-def _split(graph, inputs, params, out):
-    return np.split(_ids(inputs[0]), np.cumsum(params["sizes"])[:-1], axis=params["axis"])
+def _same(graph, inputs, params):
+    return inputs[0]
 
 
-def _same(graph, inputs, params, out):
-    return _ids(inputs[0])
+# Which operands hold entries; the others are indices.
+_MOVES: dict[str, Callable[[int], Collection[int]]] = {
+    **dict.fromkeys(("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "rev", "slice", "dynamic_slice", "split"), lambda n: (0,)),
+    **dict.fromkeys(("gather", "copy", "copy_p", "stop_gradient"), lambda n: (0,)),
+    **dict.fromkeys(("concatenate", "stack", "optimization_barrier"), range),
+    **dict.fromkeys(("pad", "dynamic_update_slice"), lambda n: (0, 1)),
+    **dict.fromkeys(("scatter", "scatter-add"), lambda n: (0, 2)),
+}
+# All others move numbers of nodes as `eager/numpy_backend.py` moves numbers.
+_OF_NODES: dict[str, Callable] = {
+    "gather": _gather,
+    "scatter": _scatter,
+    "scatter-add": _scatter_add,
+    "pad": _pad,
+    **dict.fromkeys(("copy", "copy_p", "stop_gradient"), _same),
+}
 
 
 def _is_rounded(dtype: np.dtype) -> bool:
@@ -257,40 +229,6 @@ def _converted(graph: Graph, ids: np.ndarray, old: np.dtype, new: np.dtype) -> N
     one = (lambda n: graph.call("select", n, graph.zero, graph.one)) if old.kind == "b" else (lambda n: graph.call("ne", n, graph.zero))
     return Nodes(np.array([one(n) for n in ids.ravel().tolist()], np.int64).reshape(ids.shape))
 
-
-_STRUCTURAL: dict[str, Callable] = {
-    "broadcast_in_dim": _broadcast_in_dim,
-    "reshape": lambda g, x, p, out: _ids(x[0]).reshape(out.shape),
-    "squeeze": lambda g, x, p, out: _ids(x[0]).reshape(out.shape),
-    "expand_dims": lambda g, x, p, out: _ids(x[0]).reshape(out.shape),
-    "transpose": lambda g, x, p, out: np.transpose(_ids(x[0]), p["permutation"]),
-    "rev": lambda g, x, p, out: np.flip(_ids(x[0]), p["dimensions"]),
-    "concatenate": lambda g, x, p, out: np.concatenate([_ids(y) for y in x], axis=p["dimension"]),
-    "stack": lambda g, x, p, out: np.stack([_ids(y) for y in x], axis=p["axis"]),
-    "slice": _slice,
-    "dynamic_slice": _dynamic_slice,
-    "dynamic_update_slice": _dynamic_update_slice,
-    "gather": _gather,
-    "scatter": _scatter,
-    "scatter-add": _scatter_add,
-    "pad": _pad,
-    "split": _split,
-    "copy": _same,
-    "copy_p": _same,
-    "stop_gradient": _same,
-    "optimization_barrier": lambda g, x, p, out: [_ids(y) for y in x],
-    "convert_element_type": lambda g, x, p, out: np.asarray(x[0]).astype(out.dtype),
-}
-
-# Which arguments hold entries, where the others are indices: numbers among them become constants as soon as one is a node.
-_MIXED: dict[str, Callable] = {
-    "concatenate": range,
-    "stack": range,
-    "pad": range,
-    "scatter": lambda n: (0, 2),
-    "scatter-add": lambda n: (0, 2),
-    "dynamic_update_slice": lambda n: (0, 1),
-}
 
 # Primitives on entries. ----------------------------------------------------------------------------------------------
 

@@ -41,7 +41,7 @@ from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines
 
 CHUNK = 512  # lanes whose stages fit the cache of a core
-WAYS = ("state_form", "reduction", "solver", "projected")  # static, of a trajectory
+RERUN_FIELDS = ("state_form", "reduction", "solver", "projected")  # of a trajectory, static: they say how a lane was run again
 MEMORY = 2**30  # bytes of saved states per chunk, at most
 
 
@@ -50,7 +50,7 @@ class Rollout(Printed, eqx.Module):
 
     lanes: Trajectory
     continued: tuple[int, ...] = eqx.field(static=True, default=())  # lanes that lost their privileged speeds and were run again with the full state
-    reruns: tuple[tuple[int, tuple], ...] = eqx.field(static=True, default=())  # fallback -> how such lanes were run: `WAYS`
+    reruns: tuple[tuple[int, tuple], ...] = eqx.field(static=True, default=())  # fallback -> `RERUN_FIELDS` of such lanes
 
     def __len__(self) -> int:
         return self.lanes.q.shape[0]
@@ -67,8 +67,8 @@ class Rollout(Printed, eqx.Module):
         if not -len(self) <= index < len(self):
             raise IndexError(f"lane {index} does not exist; this rollout has {len(self)} lanes, 0 to {len(self) - 1}")
         lane = jax.tree.map(lambda x: x[index], self.lanes)
-        ways = {} if is_traced(lane.fallback) else dict(self.reruns)
-        return dataclasses.replace(lane, **dict(zip(WAYS, ways.get(int(lane.fallback), ()), strict=False))) if ways else lane
+        reruns = {} if is_traced(lane.fallback) else dict(self.reruns)
+        return dataclasses.replace(lane, **dict(zip(RERUN_FIELDS, reruns.get(int(lane.fallback), ()), strict=False))) if reruns else lane
 
     @property
     def result(self) -> np.ndarray:
@@ -189,16 +189,16 @@ def rollout(
     bar.close()
     lanes = jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
 
-    ways: dict[int, tuple] = {}
+    reruns: dict[int, tuple] = {}
     while (again := _next_retries(scene, lanes, varied, options)).any():
         for way in np.unique(again[again > 0]).tolist():
             chosen, changed = np.flatnonzero(again == way), options | retry_options(way, options)
             for first in range(0, len(chosen), chunk):
                 index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
                 new = _run_lanes(scene, fixed, _with_arrays(changed), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
-                lanes, ways[way] = _replaced(lanes, mark_retried(new, way), index), tuple(getattr(new, name) for name in WAYS)
+                lanes, reruns[way] = _replaced(lanes, mark_retried(new, way), index), tuple(getattr(new, name) for name in RERUN_FIELDS)
     continued = np.flatnonzero(np.asarray(lanes.fallback) & results.FULL_STATE)
-    return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(continued.tolist()), tuple(sorted(ways.items())))
+    return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(continued.tolist()), tuple(sorted(reruns.items())))
 
 
 def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:

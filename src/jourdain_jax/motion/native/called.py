@@ -9,12 +9,17 @@ from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
+from jourdain_jax.calculus.elsewhere import or_elsewhere
+from jourdain_jax.calculus.lanes_first import with_lanes_first
 from jourdain_jax.native import ffi, host
 from jourdain_jax.native.ir import Writer
 from jourdain_jax.native.scalar_program import as_real, written_in_turn
 from jourdain_jax.native.threads import write_rows
+from jourdain_jax.program import emit
 from jourdain_jax.program.graph import Graph
 
 ALONE = 2  # places for the lanes of one motion; measured: 64 us with 2, 66 with 1 or 4, 99 with 8 (10 s of a disc at 1e-8)
@@ -27,25 +32,42 @@ def called(text: Callable[[int, int], str], shapes: Callable, of_samples: int = 
     """
 
     @cache
-    def name(lanes: int) -> str:
+    def handler(lanes: int) -> str:
         return ffi.registered(text(lanes, 1 if lanes == ALONE else host.threads()), effort)
 
     def call(lanes: int, *arguments):
-        results = tuple(jax.ShapeDtypeStruct((*arguments[-1].shape[:-1], *shape), arguments[-1].dtype) for shape in shapes(*arguments))
-        return tuple(jax.ffi.ffi_call(name(lanes), results, vmap_method="broadcast_all")(*arguments))
+        return tuple(_call_p.bind(*arguments, handler=handler, lanes=lanes, shapes=shapes))
 
     @jax.custom_batching.custom_vmap
     def run(*arguments):
         return call(ALONE, *arguments)
 
     @run.def_vmap
-    def run_many(count: int, batched: list[bool], *arguments):
+    def run_many(count, batched: list[bool], *arguments):
         stays = [has_axis or k < of_samples for k, has_axis in enumerate(batched)]
         every = [x if stay else jnp.broadcast_to(x, (count, *x.shape)) for x, stay in zip(arguments, stays, strict=True)]
         found = call(host.lanes(), *every)
         return found, (True,) * len(found)
 
     return run
+
+
+def _results(*arguments, shapes: Callable, **_) -> list:
+    return [arguments[-1].update(shape=(*arguments[-1].shape[:-1], *shape), weak_type=False) for shape in shapes(*arguments)]
+
+
+def _at_once(*arguments, handler: Callable, lanes: int, shapes: Callable) -> list:
+    results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in _results(*map(jax.typeof, arguments), shapes=shapes)]
+    return jax.ffi.ffi_call(handler(lanes), results)(*arguments)
+
+
+# The call itself: machine code is made where a program is lowered that holds it, not for what is only traced.
+_call_p = Primitive("jourdain_machine_code")
+_call_p.multiple_results = True
+_call_p.def_impl(_at_once)
+_call_p.def_abstract_eval(_results)
+mlir.register_lowering(_call_p, lambda ctx, *arguments, handler, lanes, shapes: jax.ffi.ffi_lowering(handler(lanes))(ctx, *arguments), platform="cpu")
+batching.primitive_batchers[_call_p] = lambda values, axes, **how: (found := _call_p.bind(*with_lanes_first(values, axes), **how), [0] * len(found))
 
 
 def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], effort: int = 1) -> Callable[[Array], Array]:
@@ -62,7 +84,11 @@ def nodes_called(graph: Graph, nodes: Sequence[int], variables: Sequence[int], e
         return w.text
 
     kernel = called(text, lambda *_: ((len(nodes),),), effort=effort)
-    return lambda x: kernel(x)[0]
+
+    def by_xla(x):
+        return jnp.stack([jnp.asarray(value, x.dtype) for value in emit.run(graph, nodes, dict(zip(variables, x, strict=True)))])
+
+    return or_elsewhere(lambda x: kernel(x)[0], by_xla)
 
 
 def unless_batched(times: int, function: Callable, by_xla: Callable) -> Callable:
@@ -70,7 +96,7 @@ def unless_batched(times: int, function: Callable, by_xla: Callable) -> Callable
     run = jax.custom_batching.custom_vmap(function)
 
     @run.def_vmap
-    def in_lanes(count: int, batched: list, *arguments):
+    def in_lanes(count, batched: list, *arguments):
         mapped = partial(jax.vmap, in_axes=jax.tree.map(lambda has_axis: 0 if has_axis else None, tuple(batched)), axis_size=count)
         found = (unless_batched(times - 1, mapped(function), mapped(by_xla)) if times else mapped(by_xla))(*arguments)
         return found, jax.tree.map(lambda _: True, found)

@@ -98,7 +98,7 @@ def _motion(layout: Layout, run: Callable) -> Callable[[Start], Found]:
         )
 
     @motion.def_vmap
-    def motions(count: int, batched: Sequence, start: Start):
+    def motions(count, batched: Sequence, start: Start):
         (given,) = batched
         found = jax.vmap(motion.fun, [jax.tree.map(lambda has_axis: 0 if has_axis else None, given)], axis_size=count)(start)
         base = any(jax.tree.leaves(given._replace(y=(), known=())))

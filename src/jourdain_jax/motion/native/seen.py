@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.row_program import RowProgram
 from jourdain_jax.calculus.differentiated_as import differentiated_as
+from jourdain_jax.calculus.elsewhere import or_elsewhere
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native.called import called, nodes_called, unless_batched
@@ -62,7 +63,7 @@ def fixed_values(program: Lowered, scene: Scene) -> tuple[Float[Array, ""], ...]
         found = _kernel_of_fixed(program)(jnp.concatenate(entries(scene, _needed(program))))[0]
         return tuple(jnp.squeeze(x, 0) for x in jnp.split(found, len(program.fixed)))
 
-    return differentiated_as(program.fixed_values, by_machine_code, "forward")(scene)
+    return differentiated_as(program.fixed_values, or_elsewhere(by_machine_code, program.fixed_values), "forward")(scene)
 
 
 def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
@@ -75,7 +76,7 @@ def speeds_and_pivot(program: Lowered, fixed, t, q, y, inputs) -> tuple[Float[Ar
         found = _seen(program, *state)
         return found[:-3], found[-3]
 
-    return differentiated_as(by_xla, unless_batched(1, by_machine_code, by_xla), "forward")(fixed, t, q, y, inputs)
+    return differentiated_as(by_xla, or_elsewhere(unless_batched(1, by_machine_code, by_xla), by_xla), "forward")(fixed, t, q, y, inputs)
 
 
 def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
@@ -84,7 +85,7 @@ def energies(program: Lowered, fixed, t, q, y, inputs) -> Float[Array, "2"]:
     def by_xla(fixed, t, q, y, inputs):
         return program.energy_values(fixed, t, tuple(q), tuple(y), inputs)
 
-    by_machine_code = unless_batched(1, lambda *state: _seen(program, *state)[-2:], by_xla)
+    by_machine_code = or_elsewhere(unless_batched(1, lambda *state: _seen(program, *state)[-2:], by_xla), by_xla)
     return differentiated_as(by_xla, by_machine_code, "forward")(*jax.lax.stop_gradient((fixed, t, q, y, inputs)))
 
 

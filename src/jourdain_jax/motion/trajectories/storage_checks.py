@@ -10,6 +10,7 @@ import numpy as np
 from jourdain_jax.build.trace import velocity_quantities
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.motion.batches.rollout import RERUN_FIELDS
 from jourdain_jax.motion.trajectories.results import BAD_PARAMETER, EVENT, FALLBACKS, MESSAGES, SUCCESS
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
@@ -38,7 +39,7 @@ def check_header(path, header: dict) -> None:
     if header["state_form"] not in ("minimal", "full"):
         raise refused(path, f"has the state form {header['state_form']!r}, expected 'minimal' or 'full'")
     for way in header.get("reruns", ()):
-        if not (isinstance(way, list) and len(way) == 2 and way[0] in FALLBACKS and isinstance(way[1], list) and len(way[1]) == 5):
+        if not (isinstance(way, list) and len(way) == 2 and way[0] in FALLBACKS and isinstance(way[1], list) and len(way[1]) == len(RERUN_FIELDS)):
             raise refused(path, f"has {way!r} among the `reruns` of its header, expected a code of a fallback and how such lanes were run")
 
 
