@@ -92,3 +92,21 @@ def test_first_order_reverse_mode_passes_the_marker_under_any_nesting(use):
 
 def test_forward_over_forward_passes_the_forward_only_marker():
     np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(forward)))(1.0), 2 * np.exp(-1.0), rtol=1e-8)
+
+
+@pytest.mark.parametrize("adjoint", [None, diffrax.ForwardMode()], ids=["reverse", "forward"])
+@pytest.mark.parametrize("backend", ["auto", "xla"])
+def test_a_wrong_parameter_has_derivatives_that_are_nan(adjoint, backend):
+    scene = jj.models.Skate()
+    derivative = jax.jacrev if adjoint is None else jax.jacfwd
+
+    def place(gravity_and_speed):
+        mass, speed = gravity_and_speed
+        return jj.simulate(scene.replace(mass=mass), {"x_rate": speed, "heading_rate": 0.7}, ts=[0.5], backend=backend, adjoint=adjoint).q[0]
+
+    numbers = jnp.array([[1.0, 0.5], [jnp.nan, 0.5], [-1.0, 0.5]])
+    slopes = jax.jit(jax.vmap(derivative(place)))(numbers)
+    alone = jax.jit(derivative(place))(numbers[0])
+    np.testing.assert_allclose(slopes[0], alone, rtol=1e-10, atol=1e-12)
+    assert np.isfinite(alone).all()
+    assert np.isnan(slopes[1:, :, 0]).all()

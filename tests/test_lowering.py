@@ -428,3 +428,21 @@ def test_stop_events_are_part_of_the_program():
     y = u[np.array(program.independent)]
     values = program.event_values(program.fixed_values(scene), t, tuple(q), tuple(y), jnp.zeros(0))
     np.testing.assert_allclose(values, event_values(scene, jj.motion_at(scene, t, q, u)), rtol=1e-14)
+
+
+class OnNarrowEllipse(jj.Scene):
+    """A bead on an ellipse whose eccentricity is near one: a tenth more, and it has no minor axis."""
+
+    eccentricity: jnp.ndarray = jj.parameter(0.97)
+    coordinates = jj.coordinates("angle")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([jnp.cos(q.angle), jnp.sqrt(1 - self.eccentricity**2) * jnp.sin(q.angle), 0.0 * q.angle]))}
+
+
+def test_a_parameter_near_the_end_of_its_range_does_not_keep_a_scene_from_its_program():
+    assert jj.lower(OnNarrowEllipse()).operations < 20
+    s, c, b = np.sin(0.3), np.cos(0.3), 1 - 0.97**2
+    motion = jj.simulate(OnNarrowEllipse(), {"angle": 0.3, "angle_rate": 2.0}, ts=[1.0], rtol=1e-11, atol=1e-11)
+    angle, rate = float(motion.q_end[0]), float(motion.u_end[0])
+    np.testing.assert_allclose(rate**2 * (np.sin(angle) ** 2 + b * np.cos(angle) ** 2), 4.0 * (s**2 + b * c**2), rtol=1e-9)  # its speed is constant

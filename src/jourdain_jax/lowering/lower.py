@@ -15,7 +15,7 @@ from jourdain_jax.build.kept_findings import kept_of_scene
 from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.sampling import random_states
 from jourdain_jax.build.structure import Structure, structure_of
-from jourdain_jax.build.trace import named_values, traced_scene
+from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.plain_text import as_text
 from jourdain_jax.lowering.appell import AppellOnGraph, Strategy
@@ -138,7 +138,7 @@ def _program(key: _Key, begin: float) -> Lowered:
         if loop := traced.graph.value[call].loop:
             # measured: a ball on a hill, whose point of contact is found by Newton's method, takes four times as long as by dense matrices
             raise Unsupported(f"the operation `{loop}`")
-    probes = _probes(scene, structure, traced.graph)
+    probes = _probes(scene, structure, traced)
     if key.every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
         probes = on_velocity_rows(probes, traced, structure.affine)
     quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
@@ -148,20 +148,28 @@ def _program(key: _Key, begin: float) -> Lowered:
     return _best(scene, structure, builder, begin)
 
 
-def _probes(scene: Scene, structure: Structure, graph) -> Probes:
+def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     """Configurations on the geometric rows, random and symmetric ones, as the structure was found at, with any speeds, and parameters off their values,
-    so that what is zero or equal by chance does not count.
+    so that what is zero or equal by chance does not count: larger by up to a tenth, or smaller where the scene has no numbers there.
     """
     generator = np.random.default_rng(1)
     t, q = structure.times[:PROBES], np.array(structure.coordinates[:PROBES], np.float64)
     for first, _ in scene.coordinates.quaternions:  # in single precision they are unit ones to seven digits
         q[:, first : first + 4] /= np.linalg.norm(q[:, first : first + 4], axis=1, keepdims=True)
     u = random_states(scene, len(t), generator)[2]
-    varied = jax.tree.map(lambda x: np.where(np.asarray(x) == 0, 0.05, np.asarray(x)) * (1 + 0.1 * generator.uniform(size=(len(t), *np.shape(x)))), scene)
+    given = [np.where(np.asarray(x) == 0, 0.05, np.asarray(x)) for x in jax.tree.leaves(scene)]
+    off = [0.1 * generator.uniform(size=(len(t), *np.shape(x))) for x in given]
     inputs = generator.normal(size=(len(t), len(scene.inputs)))
     values = named_values(scene, t, q, u, inputs)
-    values |= {f"p{k}_{i}": column for k, leaf in enumerate(jax.tree.leaves(varied)) for i, column in enumerate(np.reshape(leaf, (len(t), -1)).T)}
-    return Probes(graph, {name: np.asarray(value, np.float64) for name, value in values.items()})  # whatever precision motions have
+
+    def probes(sign) -> Probes:
+        columns = [np.reshape(x * (1 + np.reshape(sign, (-1, *[1] * x.ndim)) * dx), (len(t), -1)).T for x, dx in zip(given, off, strict=True)]
+        varied = {f"p{k}_{i}": column for k, of_leaf in enumerate(columns) for i, column in enumerate(of_leaf)}
+        return Probes(traced.graph, {name: np.asarray(value, np.float64) for name, value in (values | varied).items()})  # whatever precision motions have
+
+    larger = probes(np.ones(len(t)))
+    finite = np.all(np.isfinite(larger([n for part in traced.motion for n in part.ravel().tolist()])), axis=0)
+    return larger if finite.all() else probes(np.where(finite, 1.0, -1.0))
 
 
 def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: float) -> Lowered:

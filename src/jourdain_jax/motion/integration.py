@@ -11,11 +11,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.build.row_program import row_program
-from jourdain_jax.calculus.reals import in_default_precision
+from jourdain_jax.calculus.nan_where import nan_where
+from jourdain_jax.calculus.reals import in_default_precision, real_type
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
 from jourdain_jax.motion.arguments import times_fit
 from jourdain_jax.motion.energy_check import conserves, energies_near, energy_lost
@@ -114,7 +115,9 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     # start and end as two more saved states, so that all this is compiled once
     start_and_end = (jnp.zeros_like(solved.t_end), begun.y0, begun.timely), (solved.t_end, solved.y_end, begun.timely)
     all_states = jax.tree.map(lambda saved, first, last: jnp.concatenate([first[None], saved, last[None]]), (solved.ts, solved.ys, valid), *start_and_end)
-    (q, u, work), pivots, states = jax.vmap(saved_state)(*all_states)
+    found, pivots, states = jax.vmap(saved_state)(*all_states)
+    wrong = _wrong(begun.right, setup)
+    q, u, work = jax.tree.map(lambda x: jnp.where(begun.right, x, wrong), found)
     # negative where A_z was singular on the way; fmin passes over NaN, which stands for an end that is lost already
     # without rows all are one, which XLA would go through while it compiles, for seconds, were it to know them
     pivots = jax.lax.optimization_barrier(pivots)
@@ -164,6 +167,12 @@ def _without_faults(setup: Setup):
     else:
         right = seen.is_right(program, scene, t0, start.q)
     return right, eqx.tree_at(lambda s: (s.q, s.u), start, tuple(jnp.where(right, x, jnp.nan) for x in (start.q, start.u)))
+
+
+def _wrong(right: Bool[Array, ""], setup: Setup) -> Float[Array, ""]:
+    """NaN where a parameter is not right; so are its derivatives with respect to all parameters: no step was taken, and those of states stayed zero."""
+    numbers = [jnp.sum(x) for x in jax.tree.leaves(setup.scene) if eqx.is_inexact_array(x)]
+    return nan_where(~right, sum(numbers, jnp.zeros((), real_type())))
 
 
 def _result(code, y_end: Integrated, start: State, pivot):
