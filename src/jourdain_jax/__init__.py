@@ -38,6 +38,7 @@ with _without_collecting(all_stays=True):  # what a motion needs
     from jourdain_jax.calculus.guards import DifferentiationModeError
     from jourdain_jax.calculus.rotations import quaternion_from_axis_angle, quaternion_to_matrix, rot_x, rot_y, rot_z
     from jourdain_jax.dynamics.accelerations import Accelerations, Baumgarte, accelerations, reductions
+    from jourdain_jax.dynamics.newton_euler import newton_residual
     from jourdain_jax.equations.instant import constraint_rows
     from jourdain_jax.equations.kinematics import coordinate_rates, motion_at, partial_velocities, pose_at
     from jourdain_jax.equations.reductions import Multipliers, NullSpaceQR, NullSpaceSVD, Privileged, UdwadiaKalaba
@@ -45,7 +46,6 @@ with _without_collecting(all_stays=True):  # what a motion needs
     from jourdain_jax.equations.virtual_power import (
         generalized_forces,
         kinetic_energy,
-        newton_residual,
         potential_energy,
         unconstrained_equations,
         virtual_power,

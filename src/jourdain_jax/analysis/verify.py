@@ -25,7 +25,8 @@ from jourdain_jax.build.sampling import sample_states
 from jourdain_jax.build.structure import plain_row_lengths, structure_of, usual_rows
 from jourdain_jax.calculus.null_space import null_space_svd
 from jourdain_jax.calculus.reals import Numbers
-from jourdain_jax.dynamics.accelerations import reductions
+from jourdain_jax.dynamics.accelerations import diagnosed, reductions
+from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.power import power_of_nonconservative
 from jourdain_jax.dynamics.reactions import row_reactions
 from jourdain_jax.eager.eager import eval_numpy
@@ -33,9 +34,8 @@ from jourdain_jax.equations.gibbs_appell import gibbs_equations
 from jourdain_jax.equations.kinematics import coordinate_rates, inertias, motion_at, partial_velocities, shapes_along_motion, velocities
 from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
 from jourdain_jax.equations.listed import names_of_rows
-from jourdain_jax.equations.reductions import diagnosed
 from jourdain_jax.equations.scaling import row_scale, speed_scale
-from jourdain_jax.equations.virtual_power import energies_at, equations_and_rows, newton_residual
+from jourdain_jax.equations.virtual_power import energies_at, equations_and_rows
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene

@@ -14,10 +14,9 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import pose_at
-from jourdain_jax.equations.rows import pose_rate
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import Contact
-from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
+from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of
 
@@ -92,7 +91,7 @@ def _carried_speeds(scene: Scene, motion: Motion, name: str, contact: Contact) -
         ground = contacts_of(scene, Pose(pose.t, pose.q, pose.bodies | bodies))[name].ground
         return [getattr(ground, part) for part in ("origin", "normal", "axis", "radius") if hasattr(ground, part)], ground.value(contact.point)
 
-    rates = {other: BodyPose(other, pose_rate(body)) for other, body in others.items()}
+    rates = {other: body.rate_of_pose() for other, body in others.items()}
     _, moves = jax.jvp(where, ({other: pose.bodies[other] for other in others},), (rates,))
     turns = [body.angular_velocity for body in others.values()]
     parts = jax.tree.leaves(moves), [body.velocity for body in others.values()] + turns, [contact.plane.velocity, contact.plane.angular_velocity]

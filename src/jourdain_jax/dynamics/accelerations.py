@@ -4,16 +4,17 @@ kinematics -> virtual power (M, h, Q) -> rows (A, drift) -> reduction -> udot, l
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jourdain_jax.build.structure import structure_of, usual_rows
+from jourdain_jax.calculus.pseudo_inverse import numerical_rank, pseudo_inverse, singular_values
 from jourdain_jax.calculus.reals import checked_real, described
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.reductions import (
-    Accelerations,
     Multipliers,
     NullSpaceQR,
     NullSpaceSVD,
@@ -21,10 +22,11 @@ from jourdain_jax.equations.reductions import (
     Reduced,
     Reduction,
     UdwadiaKalaba,
-    diagnosed,
     reduce,
+    smallest_that_counts,
 )
 from jourdain_jax.equations.rows import ConstraintRows, UsualRows, position_residual
+from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, equations_and_rows
 from jourdain_jax.scene.arguments import ChangingInputs, as_coordinates, as_input_vector, as_scene, as_speeds, as_time
 from jourdain_jax.scene.names import nearest
@@ -40,6 +42,21 @@ class Baumgarte(eqx.Module):
 
     alpha: Float[Array, ""] = eqx.field(converter=lambda x: checked_real(x, "`alpha` of `Baumgarte`", ()), default=5.0)
     beta: Float[Array, ""] = eqx.field(converter=lambda x: checked_real(x, "`beta` of `Baumgarte`", ()), default=5.0)
+
+
+class Accelerations(eqx.Module):
+    """Accelerations of one state, with what is needed to trust them: `M udot + h = Q + A' lambda`, `A udot = -drift`.
+
+    Units are those of the speeds (per s) and of the rows; a `constraint_force` is per speed, in N or N m.
+    """
+
+    udot: Float[Array, "speeds"]
+    multipliers: Float[Array, "rows"]  # lambda of minimum norm: the constraint force on the speeds is A' lambda
+    constraint_force: Float[Array, "speeds"]  # A' lambda = M udot + h - Q
+    rank: Int[Array, ""]  # of the rows at this state
+    smallest_singular_value: Float[Array, ""]  # of the scaled rows, the last one of their usual rank (1 without rows); the reduction's own pivot where smaller
+    residual: Float[Array, ""]  # |A udot + drift| in scaled rows; large where rows contradict each other
+    applicable: Bool[Array, ""]  # whether this reduction works at this state
 
 
 def reductions(scene: Scene) -> dict[str, "Reduction | GibbsAppell"]:
@@ -112,6 +129,21 @@ def accelerations(
 @eager_if_concrete
 def _accelerations(scene: Scene, t, q, u, inputs, reduction, stabilisation, usual) -> Accelerations:
     return diagnosed(*_reduced(scene, t, q, u, inputs, reduction, stabilisation, usual))
+
+
+def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: ConstraintRows) -> Accelerations:
+    """Accelerations with multipliers of minimum norm, rank, conditioning and residual."""
+    problem = scaled(equations, rows)
+    sigma = singular_values(problem.A)
+    return Accelerations(
+        udot=found.udot,
+        multipliers=pseudo_inverse(rows.A).T @ found.constraint_force,
+        constraint_force=found.constraint_force,
+        rank=numerical_rank(sigma),
+        smallest_singular_value=jax.lax.stop_gradient(jnp.minimum(found.pivot, smallest_that_counts(sigma, rows.usual))),
+        residual=jnp.max(jnp.abs(problem.d * (rows.A @ found.udot + rows.drift)), initial=0.0),
+        applicable=found.applicable & jnp.all(jnp.isfinite(found.udot)),
+    )
 
 
 def bare_accelerations(

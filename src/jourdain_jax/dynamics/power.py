@@ -22,10 +22,12 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.build.explicit_power import explicit_rate, forces_for_potentials, power_of_loads
 from jourdain_jax.build.structure import Structure, structure_of
+from jourdain_jax.dynamics.accelerations import Accelerations
+from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.equations.kinematics import inertias, motion_at
 from jourdain_jax.equations.listed import has_load_without_potential
-from jourdain_jax.equations.reductions import Accelerations, Reduced
-from jourdain_jax.equations.virtual_power import newton_residual, potential_energy
+from jourdain_jax.equations.reductions import Reduced
+from jourdain_jax.equations.virtual_power import potential_energy
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 

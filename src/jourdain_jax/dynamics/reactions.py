@@ -16,14 +16,15 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.structure import plain_row_lengths
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse, rank_cutoff
+from jourdain_jax.dynamics.accelerations import Accelerations
+from jourdain_jax.dynamics.newton_euler import newton_residual
 from jourdain_jax.dynamics.normal_forces import Wrenches, normal_forces
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.kinematics import coordinate_rates, motion_at
 from jourdain_jax.equations.listed import names_of_rows
-from jourdain_jax.equations.reductions import Accelerations
 from jourdain_jax.equations.rows import flatten_rows, velocity_residual, velocity_rows
 from jourdain_jax.equations.scaling import row_scale
-from jourdain_jax.equations.virtual_power import newton_residual, resultants
+from jourdain_jax.equations.virtual_power import resultants
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.motion_state import BodyMotion, Motion
 from jourdain_jax.scene.names import Named, UnknownNameError, nearest

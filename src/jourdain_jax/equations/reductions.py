@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, pivots_qr, present
 from jourdain_jax.calculus.pseudo_inverse import numerical_rank, pseudo_inverse, rank_cutoff, singular_values
@@ -30,21 +30,6 @@ from jourdain_jax.equations.virtual_power import UnconstrainedEquations
 # Of the scaled A_z. Round-off grows as the inverse square of the pivot: at the first, accelerations agree to 1e-12 with the other reductions.
 APPLICABLE_PIVOT = 1e-2
 SMALLEST_PIVOT = 1e-3  # below it, privileged speeds do not serve as the state of a simulation either
-
-
-class Accelerations(eqx.Module):
-    """Accelerations of one state, with what is needed to trust them: `M udot + h = Q + A' lambda`, `A udot = -drift`.
-
-    Units are those of the speeds (per s) and of the rows; a `constraint_force` is per speed, in N or N m.
-    """
-
-    udot: Float[Array, "speeds"]
-    multipliers: Float[Array, "rows"]  # lambda of minimum norm: the constraint force on the speeds is A' lambda
-    constraint_force: Float[Array, "speeds"]  # A' lambda = M udot + h - Q
-    rank: Int[Array, ""]  # of the rows at this state
-    smallest_singular_value: Float[Array, ""]  # of the scaled rows, the last one of their usual rank (1 without rows); the reduction's own pivot where smaller
-    residual: Float[Array, ""]  # |A udot + drift| in scaled rows; large where rows contradict each other
-    applicable: Bool[Array, ""]  # whether this reduction works at this state
 
 
 class Reduction(eqx.Module):
@@ -77,21 +62,6 @@ def reduced(udot, pivot, applicable, equations: UnconstrainedEquations) -> Reduc
     """Known accelerations with the constraint force that goes with them."""
     # A' lambda = M udot + h - Q
     return Reduced(udot, equations.M @ udot + equations.h - equations.Q, pivot, applicable)
-
-
-def diagnosed(found: Reduced, equations: UnconstrainedEquations, rows: ConstraintRows) -> Accelerations:
-    """Accelerations with multipliers of minimum norm, rank, conditioning and residual."""
-    problem = scaled(equations, rows)
-    sigma = singular_values(problem.A)
-    return Accelerations(
-        udot=found.udot,
-        multipliers=pseudo_inverse(rows.A).T @ found.constraint_force,
-        constraint_force=found.constraint_force,
-        rank=numerical_rank(sigma),
-        smallest_singular_value=jax.lax.stop_gradient(jnp.minimum(found.pivot, smallest_that_counts(sigma, rows.usual))),
-        residual=jnp.max(jnp.abs(problem.d * (rows.A @ found.udot + rows.drift)), initial=0.0),
-        applicable=found.applicable & jnp.all(jnp.isfinite(found.udot)),
-    )
 
 
 def smallest_that_counts(sigma: Float[Array, "values"], usual: UsualRows | None = None) -> Float[Array, ""]:

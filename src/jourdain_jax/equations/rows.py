@@ -13,11 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.equations.kinematics import motion_at, pose_at
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
-from jourdain_jax.scene.bodies import RigidBody
-from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
+from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import contacts_of, geometric_constraints_of, prescribed_of, velocity_constraints_of
 
@@ -70,18 +68,9 @@ def _rates_of_position_rows(scene: Scene, motion: Motion) -> dict[str, Array]:
         return position_rows(scene, Pose(t, scene.coordinate_names.view(q), bodies))
 
     pose = motion.pose()
-    rates = {name: BodyPose(name, pose_rate(body)) for name, body in motion.bodies.items()}
+    rates = {name: body.rate_of_pose() for name, body in motion.bodies.items()}
     values = jax.jvp(g, (motion.t, motion.q.array, pose.bodies), (jnp.ones_like(motion.t), motion.qdot.array, rates))[1]
     return {name: values[name] for name in position_rows(scene, pose)}  # JAX returns dictionaries sorted by name
-
-
-def pose_rate(body_motion):
-    """Tangent of a body's pose: `rdot = v`, `Rdot = [omega] R`, nothing else changes."""
-    zero = jax.tree.map(jnp.zeros_like, body_motion.body)
-    if isinstance(zero, RigidBody):
-        turned = skew(body_motion.angular_velocity) @ body_motion.body.orientation
-        return eqx.tree_at(lambda b: (b.position, b.orientation), zero, (body_motion.velocity, turned))
-    return eqx.tree_at(lambda b: b.position, zero, body_motion.velocity)
 
 
 def _coordinate(scene: Scene, name: str) -> str:

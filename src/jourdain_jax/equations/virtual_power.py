@@ -15,13 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import described
-from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import (
     Inertias,
     Velocities,
-    bias_accelerations,
     coordinate_rates,
     inertias,
     inertias_of,
@@ -32,9 +30,8 @@ from jourdain_jax.equations.kinematics import (
 )
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.scene.arguments import as_coordinates, as_speeds
-from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.loads import Load
-from jourdain_jax.scene.motion_state import BodyPose, Motion, Pose
+from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import loads_of, potential_of
@@ -76,11 +73,8 @@ def resultants(
                 if name not in total:
                     raise ValueError(f"a load of `{type(scene).__name__}` acts on unknown {kind} `{name}`; {nearest(name, total)}")
                 total[name] = total[name] + value
-    return Resultants(_rows(force), _rows(torque), jnp.stack(list(direct.values())) if direct else jnp.zeros(0))
-
-
-def _rows(vectors: dict) -> Float[Array, "bodies 3"]:
-    return jnp.stack(list(vectors.values()))
+    force, torque = (jnp.stack(list(of_bodies.values())) for of_bodies in (force, torque))
+    return Resultants(force, torque, jnp.stack(list(direct.values())) if direct else jnp.zeros(0))
 
 
 def potential_energy(scene: Scene, motion: Motion, loads: tuple[Load, ...] | None = None) -> Float[Array, ""]:
@@ -129,7 +123,7 @@ def equations_and_rows(scene: Scene, t, q, u, inputs=None) -> tuple[Unconstraine
 def equations_of(scene: Scene, instant: Instant) -> UnconstrainedEquations:
     """M, h and Q of the equations without constraint forces, at a known instant."""
     partial = instant.by_speeds.bodies
-    force, torque = _inertia_resultants(instant.weights, instant.value.bodies, instant.rate.bodies)
+    force, torque = inertia_resultants(instant.weights, instant.value.bodies, instant.rate.bodies)
     h = jnp.einsum("bik,bi->k", partial.linear, force) + jnp.einsum("bik,bi->k", partial.angular, torque)
     return UnconstrainedEquations(mass_matrix(instant.weights, partial), h, _generalized_forces(scene, instant.motion, partial))
 
@@ -146,7 +140,7 @@ def mass_matrix_at(scene: Scene, t, q) -> Float[Array, "speeds speeds"]:
     return mass_matrix(inertias(scene, t, q), partial_velocities(scene, t, q, rest))
 
 
-def _inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: Velocities):
+def inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: Velocities):
     """`m a` and `I alpha + omega x I omega` per body."""
     momentum = jnp.einsum("bij,bj->bi", weights.inertia, velocity.angular)
     torque = jnp.einsum("bij,bj->bi", weights.inertia, acceleration.angular) + jnp.cross(velocity.angular, momentum)
@@ -184,48 +178,6 @@ def _potential_gradient(scene: Scene, motion: Motion) -> Float[Array, "speeds"]:
     dV = jax.grad(lambda q: potential_of(scene, pose_at(scene, t, q)))(q)
     N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
     return dV @ N
-
-
-def potential_resultants(scene: Scene, motion: Motion) -> Resultants:
-    """The scene's own potential as forces `-dV/dr`, torques `-dV/dtheta` on the bodies, and `-N' dV/dq` at fixed poses on the speeds."""
-    t, q, u, pose = motion.t, motion.q.array, motion.u.array, motion.pose()
-    zero = jnp.zeros((len(pose.bodies), 3), q.dtype)
-    if potential_of(scene, pose) is None:
-        return Resultants(zero, zero, jnp.zeros_like(u))
-
-    def V(shift, turn, q):
-        bodies = {name: _displaced(body, shift[j], turn[j]) for j, (name, body) in enumerate(pose.bodies.items())}
-        return potential_of(scene, Pose(t, scene.coordinate_names.view(q), bodies))
-
-    force, moment, direct = jax.grad(V, argnums=(0, 1, 2))(zero, zero, q)
-    N = jax.jacfwd(lambda u: coordinate_rates(scene, t, q, u))(u)
-    return Resultants(-force, -moment, -direct @ N)
-
-
-def _displaced(pose: BodyPose, shift, turn) -> BodyPose:
-    """A pose moved by `shift` and turned by the small rotation vector `turn` (inertial frame), to first order."""
-    moved = eqx.tree_at(lambda p: p.body.position, pose, pose.body.position + shift)
-    if isinstance(pose.body, RigidBody):
-        moved = eqx.tree_at(lambda p: p.body.orientation, moved, pose.body.orientation + skew(turn) @ pose.body.orientation)
-    return moved
-
-
-@eager_if_concrete
-def newton_residual(scene: Scene, t, q, u, udot, inputs=None) -> Velocities:
-    """The constraint force and torque on each body, `R = m a - F` (N) and `I alpha + omega x I omega - L` (N m, about the mass centre); (1)-(3).
-
-    Shape (bodies, 3), inertial frame, bodies sorted by name. `udot`: the accelerations. `inputs`: values of the scene's inputs (default: zero).
-    Impressed forces that a scene states on its speeds, not on bodies, cannot be told apart from constraint forces here.
-    """
-    q, u, udot = as_coordinates(scene, q), as_speeds(scene, u), as_speeds(scene, udot, "udot")
-    partial, weights = partial_velocities(scene, t, q, u), inertias(scene, t, q)
-    velocity, bias = bias_accelerations(scene, t, q, u)
-    acceleration = Velocities(bias.linear + partial.linear @ udot, bias.angular + partial.angular @ udot)
-    force, torque = _inertia_resultants(weights, velocity, acceleration)
-    motion = motion_at(scene, t, q, u, inputs)
-    loads, potential = resultants(scene, motion), potential_resultants(scene, motion)
-    orientation = jnp.stack([body.orientation for body in motion.bodies.values()])
-    return Velocities(force - loads.force - potential.force, jnp.einsum("bij,bj->bi", orientation, torque) - loads.torque - potential.torque)
 
 
 def virtual_power(scene: Scene, t, q, u, udot, virtual_velocity, inputs=None) -> Float[Array, ""]:

@@ -5,10 +5,12 @@ loads, velocity constraints and events. Velocities are those of the mass centres
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import checked_real
+from jourdain_jax.calculus.rotations import skew
 from jourdain_jax.scene.bodies import Body, RigidBody
 from jourdain_jax.scene.names import Named, UnknownNameError, nearest
 
@@ -89,6 +91,13 @@ class BodyMotion(eqx.Module):
         """The material point with body-frame coordinates `local` (m, relative to the mass centre)."""
         position = self.place(local)
         return Point(position, self.velocity_at(position), position - self.position, self.name)
+
+    def rate_of_pose(self) -> BodyPose:
+        """The rate of the pose, per s: `rdot = v`, `Rdot = [omega] R`; mass and inertia do not change."""
+        rate = eqx.tree_at(lambda b: b.position, jax.tree.map(jnp.zeros_like, self.body), self.velocity)
+        if isinstance(rate, RigidBody):
+            rate = eqx.tree_at(lambda b: b.orientation, rate, skew(self.angular_velocity) @ self.orientation)
+        return BodyPose(self.name, rate)
 
 
 class Pose(eqx.Module):
