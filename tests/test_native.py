@@ -228,7 +228,10 @@ def test_derivatives_of_a_rollout_are_those_of_xla():
     np.testing.assert_allclose(slope("native"), slope("xla"), rtol=1e-12)
 
 
-@pytest.mark.parametrize(("adjoint", "mode"), [(None, jax.jacfwd), (diffrax.ForwardMode(), jax.grad), (None, jax.hessian)])
+@pytest.mark.parametrize(
+    ("adjoint", "mode"),
+    [(diffrax.RecursiveCheckpointAdjoint(), jax.jacfwd), (diffrax.ForwardMode(), jax.grad), (diffrax.RecursiveCheckpointAdjoint(), jax.hessian)],
+)
 def test_modes_of_differentiation_that_do_not_work_are_named(adjoint, mode):
     with pytest.raises(jj.DifferentiationModeError):
         mode(_end("native", adjoint))(X)

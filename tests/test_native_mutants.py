@@ -182,11 +182,31 @@ def forward_mode_to_an_event():
     _at_an_event("forward")
 
 
-def forward_mode_to_an_event_twice():
-    found, expected = (jax.jit(jax.jacfwd(jax.jacfwd(end)))(START) for end in _ends_at_an_event("forward"))
+def _differentiated_twice(of: Callable, end: Callable, closed: Callable, at: dict) -> None:
+    found, expected = (jax.jit(derivative(f))(at) for derivative, f in ((of, end), (jax.hessian, closed)))
     for name, row in expected.items():
         for other, value in row.items():
             np.testing.assert_allclose(found[name][other], value, rtol=0, atol=1e-7, err_msg=f"derivative with respect to {name} and {other}")
+
+
+def forward_mode_to_an_event_twice():
+    _differentiated_twice(lambda f: jax.jacfwd(jax.jacfwd(f)), *_ends_at_an_event("forward"), START)
+
+
+def a_hessian_to_an_event():
+    _differentiated_twice(jax.hessian, *_ends_at_an_event("reverse"), START)
+
+
+def a_hessian_with_respect_to_times():
+    weights = jnp.cos(1.0 + jnp.arange(5.0))
+
+    def seen(x):
+        return weights @ pushed(x["x"], 0.4, x["k"], ts=x["ts"]).ys.q[:, 0]
+
+    def closed(x):
+        return weights @ pushed_position(x["ts"], x["x"], 0.4, x["k"])
+
+    _differentiated_twice(jax.hessian, seen, closed, {"x": 0.7, "k": 4.0, "ts": jnp.asarray(TIMES)})
 
 
 def reverse_mode_with_respect_to_times():
@@ -216,6 +236,7 @@ FORM, LANES, CIRCLE = motions_follow_the_closed_form, lanes_of_a_batch_follow_th
 EVENT, DIP, ROWS = an_event_is_found, an_event_within_a_step_is_found, a_start_is_put_onto_its_rows
 BACK, ALONG, TIME = reverse_mode_through_saved_times, forward_mode_through_saved_times, reverse_mode_with_respect_to_times
 EVENT_BACK, EVENT_ALONG, EVENT_TWICE = reverse_mode_to_an_event, forward_mode_to_an_event, forward_mode_to_an_event_twice
+BENT, TIMES_BENT = a_hessian_to_an_event, a_hessian_with_respect_to_times
 PROJECTED_BACK = reverse_mode_back_over_projections
 TRIED, WRONG = "_tried_by_stages", "derivative with respect to"
 MUTANTS = [
@@ -265,6 +286,20 @@ MUTANTS = [
     Mutant("the time of an event fixed", step, "_put_tangents_at_event", "-dc / slope", "0.0 * dc", EVENT_ALONG, WRONG),
     Mutant("the wrong way from an event", step, "_move_rows", "w.fma(w.load(w.real, k, i + rates), dt, before)", "before", EVENT_ALONG, WRONG),
     Mutant("tangents of an event by rates of before it moved", step, "_put_tangents_at_event", "if part > 1:", "if part > 9:", EVENT_TWICE, WRONG),
+    Mutant("the tangent at the time of an event", back, "_write_event_back", "dt * w.load(w.real, f, i)", "0.0 * dt", BENT, WRONG),
+    Mutant("the tangent of an event forgotten", back, "_moved_back", "w.where(usable, w.load(w.real, out, i), 0.0)", "w.number(0.0)", BENT, WRONG),
+    Mutant("an event that stays while its tangent moves", back, "_moved_back", "w.load(w.real, added, asked)", "0.0 * g_dt", BENT, WRONG),
+    Mutant(
+        "cotangents of states for those of tangents",
+        native_motion,
+        "flow_back",
+        "jnp.concatenate([dg, g], axis=1)",
+        "jnp.concatenate([dg, dg], axis=1)",
+        BENT,
+        WRONG,
+    ),
+    Mutant("goals that do not move cotangents", native_motion, "flow_back", "dg + by_states[:, :n]", "dg", TIMES_BENT, WRONG),
+    Mutant("numbers known that do not feel goals", native_motion, "flow_back", "jnp.sum(by_states[:, n:], axis=0)", "0.0", TIMES_BENT, WRONG),
     Mutant(
         "goals that do not move states",
         native_motion,
@@ -276,7 +311,7 @@ MUTANTS = [
     ),
 ]
 CHECKS = list(dict.fromkeys(mutant.check for mutant in MUTANTS))
-KEPT = (kernel.kernel, kernel.kernel_back, kernel.kernel_of_rates, put_on_rows._kernel, native_motion._reason_against_derivatives)
+KEPT = (kernel.kernel, kernel.kernel_back, kernel.kernel_of_rates, kernel.kernel_of_pulled_rates, put_on_rows._kernel, native_motion.reason_against_derivatives)
 
 
 @pytest.fixture(autouse=True)

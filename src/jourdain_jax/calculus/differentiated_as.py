@@ -3,7 +3,8 @@
 A function and its rule of differentiation must agree on which results have lanes and where: JAX takes that from the one that it batches first.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -11,10 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
 
+from jourdain_jax.calculus.both_ways import BothWays
 from jourdain_jax.calculus.elsewhere import or_elsewhere
+from jourdain_jax.calculus.guards import SECOND_ORDER_BY_XLA_MESSAGE
+from jourdain_jax.calculus.lanes_first import lanes_first
+from jourdain_jax.calculus.linear_maps import put, shapes
 from jourdain_jax.calculus.promotion import with_usual_promotion
 
 
@@ -27,13 +30,18 @@ class Rules(NamedTuple):
     together: bool = False  # whether `push` gives the result as well where tangents are asked for, to the first order, by `jvp` and `jacfwd` alone
 
 
-def differentiated_as(differentiable: Callable, quick: Callable, kind: Literal["forward", "reverse"], rules: Rules | None = None) -> Callable:
+def differentiated_as(
+    differentiable: Callable, quick: Callable, kind: Literal["forward", "reverse", "both"], rules: Rules | None = None, backwards: Callable | None = None
+) -> Callable:
     """A function that runs `quick`, which JAX cannot differentiate. Its derivatives are by `rules` where these serve, otherwise those of `differentiable`.
 
-    Both compute the same; they take trees of arrays and of anything else, and return trees of arrays. `kind`: the mode of differentiation of `differentiable`.
-    Derivatives of an order that the rules do not serve, of what they compute, are again those of `differentiable`.
+    Both compute the same; they take trees of arrays and of anything else, and return trees of arrays. `kind`: the mode of differentiation of `differentiable`;
+    "both": that is forward mode, and `backwards` computes the same for reverse mode. Derivatives of an order that the rules do not serve, of what they
+    compute, are again those of `differentiable`, but for second ones that are in reverse mode first or last: these are by rules or an error.
     """
-    return (_forward if kind == "forward" else _reverse)(differentiable, quick, rules)
+    if kind == "reverse":
+        return _reverse(differentiable, quick, rules)
+    return _forward(differentiable, quick, rules, backwards if kind == "both" else None)
 
 
 def derivatives_of(function: Callable) -> Rules:
@@ -46,50 +54,72 @@ def derivatives_of(function: Callable) -> Rules:
     return Rules(lambda *_: True, push)
 
 
-def _forward(differentiable: Callable, quick: Callable, rules: Rules | None) -> Callable:
+def _forward(differentiable: Callable, quick: Callable, rules: Rules | None, backwards: Callable | None = None) -> Callable:
     def run(*arguments):
         arrays, rest = eqx.partition(arguments, eqx.is_array)
         leaves, treedef = jax.tree.flatten(arrays)
+        nothing = [False] * len(leaves)  # functions that JAX keeps do not see the leaves
 
-        def of(function, leaves):
-            return function(*eqx.combine(jax.tree.unflatten(treedef, leaves), rest))
+        def given(leaves: Sequence):
+            return eqx.combine(jax.tree.unflatten(treedef, leaves), rest)
 
-        own = jax.custom_jvp(lambda *leaves: lanes_first(of(quick, leaves)))
+        own = jax.custom_jvp(lambda *leaves: lanes_first(quick(*given(leaves))))
+
+        def pushed(moving, leaves, *along):
+            return jax.jvp(lambda *new: differentiable(*given(put(leaves, moving, new))), tuple(leaves[i] for i in moving), along)
+
+        def pushed_by_rules(moving, leaves, *along):
+            assert rules is not None
+            return rules.push(given(leaves), jax.tree.unflatten(treedef, put([None] * len(nothing), moving, along)))
+
+        def serve(moving, order: int, varies: Sequence[bool], *_) -> bool:
+            varying = [i in moving or does for i, does in enumerate(varies)]
+            return rules is not None and rules.serve(order, *jax.tree.unflatten(treedef, varying))
+
+        def rates_along(moving) -> Callable:
+            """Tangents of what is found that has some, as a function of the leaves and of the tangents of those that are moving."""
+
+            def by_jax(*x):
+                return _with_tangents(pushed(moving, *x)[1])
+
+            def by_rules(*x):
+                return _with_tangents(pushed_by_rules(moving, *x)[1])
+
+            again = Rules(lambda order, *varies: serve(moving, order + 1, *varies), derivatives_of(by_rules).push)
+            return _forward(by_jax, by_rules, again) if serve(moving, 1, nothing) else lambda *x: lanes_first(by_jax(*x))
+
+        def pulled(structure, places, moving) -> Callable:
+            """Cotangents of the leaves that are moving, as a function of the leaves, of what is found and of cotangents of the numbers of that."""
+            perturbed = eqx.combine(jax.tree.unflatten(treedef, [i in moving for i in range(len(nothing))]), jax.tree.map(lambda _: False, rest))
+
+            def by_either(leaves, found, cotangents):
+                g = jax.tree.unflatten(structure, put([None] * len(found), places, cotangents))
+                found = jax.tree.unflatten(structure, found)
+                return jax.tree.leaves(_pulled(backwards, rules, perturbed, given(leaves), found, g))
+
+            return by_either
+
+        def reason_against_second(moving) -> str:
+            return "" if serve(moving, 2, nothing) else SECOND_ORDER_BY_XLA_MESSAGE
 
         @with_usual_promotion
         def rule(leaves, tangents):
             moving = [i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero)]
-
-            def pushed(leaves, *along):
-                def of_moving(*values):
-                    return of(differentiable, [dict(zip(moving, values, strict=True)).get(i, leaf) for i, leaf in enumerate(leaves)])
-
-                return jax.jvp(of_moving, tuple(leaves[i] for i in moving), along)
-
-            def serve(order: int, varies: list, *_) -> bool:
-                varying = [i in moving or does for i, does in enumerate(varies)]
-                return rules is not None and rules.serve(order, *jax.tree.unflatten(treedef, varying))
-
             along = [tangents[i] for i in moving]
-            if not serve(1, [False] * len(leaves)):
-                found, rates = pushed(leaves, *along)
+            if backwards is not None:
+                found = own(*leaves)
+                ends = jax.lax.stop_gradient(jax.tree.leaves(found))
+                places = [i for i, x in enumerate(ends) if _is_number(x)]
+                way = BothWays(rates_along, partial(pulled, jax.tree.structure(found), places), reason_against_second, shapes(leaves), shapes(ends), places)
+                return found, _without_gaps(found, way.pushes(moving)([*leaves, *ends], along))
+            if not serve(moving, 1, nothing):
+                found, rates = pushed(moving, leaves, *along)
                 return lanes_first(found), lanes_first(rates)
-
-            def pushed_by_rules(leaves, *along):
-                given = jax.tree.unflatten(treedef, [dict(zip(moving, along, strict=True)).get(i) for i in range(len(leaves))])
-                return rules.push(eqx.combine(jax.tree.unflatten(treedef, leaves), rest), given)
-
             if rules.together:
-                found, rates = pushed_by_rules(leaves, *along)
+                found, rates = pushed_by_rules(moving, leaves, *along)
                 return lanes_first(found), _without_gaps(found, lanes_first(_with_tangents(rates)))
-
-            def rates_by_rules(*x):
-                return _with_tangents(pushed_by_rules(*x)[1])
-
-            again = Rules(lambda order, *varies: serve(order + 1, *varies), derivatives_of(rates_by_rules).push)
             found = own(*leaves)
-            rates = _forward(lambda *x: _with_tangents(pushed(*x)[1]), rates_by_rules, again)(list(leaves), *along)
-            return found, _without_gaps(found, rates)
+            return found, _without_gaps(found, rates_along(moving)(list(leaves), *along))
 
         own.defjvp(rule, symbolic_zeros=True)
         return own(*leaves)
@@ -105,7 +135,7 @@ def _with_tangents(rates) -> list:
 def _without_gaps(found, rates: list):
     """The tangents of all that was found, given those of numbers."""
     left = iter(rates)
-    return jax.tree.map(lambda x: next(left) if jnp.issubdtype(x.dtype, jnp.inexact) else np.zeros(x.shape, jax.dtypes.float0), found)
+    return jax.tree.map(lambda x: next(left) if _is_number(x) else np.zeros(x.shape, jax.dtypes.float0), found)
 
 
 def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> Callable:
@@ -123,50 +153,30 @@ def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
     @own.def_bwd
     @with_usual_promotion
     def back(found, cotangents, perturbed, arguments):
-        g = jax.tree.map(_filled, found, cotangents, is_leaf=lambda x: x is None)
-
-        def by_autodiff(perturbed, arguments, found, g):
-            moving, fixed = eqx.partition(arguments, perturbed)
-            _, pull = eqx.filter_vjp(lambda moving: differentiable(*eqx.combine(moving, fixed)), moving)
-            return pull(g)[0]
-
-        serve = rules is not None and rules.serve(1, *perturbed)
-        return (or_elsewhere(rules.pull, by_autodiff) if serve else by_autodiff)(perturbed, arguments, found, g)
+        return _pulled(differentiable, rules, perturbed, arguments, found, jax.tree.map(_filled, found, cotangents, is_leaf=lambda x: x is None))
 
     return lambda *arguments: own(arguments)
 
 
+def _pulled(differentiable: Callable, rules: Rules | None, perturbed, arguments, found, g):
+    """Cotangents of the arguments that vary, from those of what is found."""
+
+    def by_autodiff(perturbed, arguments, found, g):
+        moving, fixed = eqx.partition(arguments, perturbed)
+        _, pull = eqx.filter_vjp(lambda moving: differentiable(*eqx.combine(moving, fixed)), moving)
+        return pull(g)[0]
+
+    if rules is None or rules.pull is None or not rules.serve(1, *perturbed):
+        return by_autodiff(perturbed, arguments, found, g)
+    return or_elsewhere(rules.pull, by_autodiff)(perturbed, arguments, found, g)
+
+
+def _is_number(x) -> bool:
+    return jnp.issubdtype(x.dtype, jnp.inexact)
+
+
 def _filled(found, cotangent):
     """Zeros in place of a cotangent that is missing; none where there can be none."""
-    if cotangent is None and found is not None and jnp.issubdtype(found.dtype, jnp.inexact):
+    if cotangent is None and found is not None and _is_number(found):
         return jnp.zeros_like(found)
     return cotangent
-
-
-def lanes_first(tree):
-    """The tree, unchanged; under `vmap` all its arrays get their axis of lanes first. Values without a tangent space pass."""
-    leaves, treedef = jax.tree.flatten(tree)
-    moved = [i for i, x in enumerate(leaves) if x.dtype != jax.dtypes.float0]
-    for i, x in zip(moved, lanes_first_p.bind(*(leaves[i] for i in moved)) if moved else (), strict=True):
-        leaves[i] = x
-    return jax.tree.unflatten(treedef, leaves)
-
-
-def with_lanes_first(values, axes) -> list:
-    """Arrays of which each has its lanes along an axis, or none (None), as a batching rule is given them: all have the first axis of lanes."""
-    count = next(x.shape[axis] for x, axis in zip(values, axes, strict=True) if axis is not None)
-    return [jnp.broadcast_to(x, (count, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(values, axes, strict=True)]
-
-
-def _batched(values, axes):
-    return lanes_first_p.bind(*with_lanes_first(values, axes)), [0] * len(values)
-
-
-lanes_first_p = Primitive("jourdain_lanes_first")
-lanes_first_p.multiple_results = True
-lanes_first_p.def_impl(lambda *values: list(values))
-lanes_first_p.def_abstract_eval(lambda *avals: list(avals))
-ad.primitive_jvps[lanes_first_p] = lambda primals, tangents: (lanes_first_p.bind(*primals), list(tangents))
-ad.primitive_transposes[lanes_first_p] = lambda cotangents, *values: list(cotangents)
-batching.primitive_batchers[lanes_first_p] = _batched
-mlir.register_lowering(lanes_first_p, mlir.lower_fun(lambda *values: list(values), multiple_results=True))

@@ -14,13 +14,22 @@ from jax.interpreters import ad, batching, mlir
 
 FORWARD_MESSAGE = (
     "`simulate` was differentiated in forward mode (jvp, jacfwd, hessian), but its adjoint is reverse-only. "
-    "Pass `adjoint=diffrax.ForwardMode()` for forward mode (cheapest for up to about 30 parameters), or "
+    'Leave `adjoint` at its default for both modes where machine code integrates (not with `backend="xla"`); elsewhere '
+    "pass `adjoint=diffrax.ForwardMode()` for forward mode (cheapest for up to about 30 parameters), or "
     "`adjoint=diffrax.DirectAdjoint()` for both modes and second derivatives; or use reverse mode (jax.grad, jax.vjp)."
 )
 SECOND_ORDER_MESSAGE = (
     "`simulate` was differentiated twice, but its adjoint supports first derivatives in reverse mode only. "
-    "Pass `adjoint=diffrax.DirectAdjoint()` for second derivatives in any mode, or `adjoint=diffrax.ForwardMode()` for "
-    "forward-over-forward (jax.jacfwd(jax.jacfwd(f)))."
+    'Leave `adjoint` at its default for second derivatives in any mode where machine code integrates (not with `backend="xla"`); pass '
+    "`adjoint=diffrax.DirectAdjoint()` for them elsewhere, or `adjoint=diffrax.ForwardMode()` for forward-over-forward (jax.jacfwd(jax.jacfwd(f)))."
+)
+SECOND_ORDER_BY_XLA_MESSAGE = (
+    "`simulate` was differentiated twice, first or last in reverse mode, where XLA has to differentiate it: with respect to samples of an input, or of a "
+    "scene whose derivatives are too large for machine code. Pass `adjoint=diffrax.ForwardMode()` for forward-over-forward (jax.jacfwd(jax.jacfwd(f)))."
+)
+THIRD_ORDER_MESSAGE = (
+    "`simulate` was differentiated three times, and not in forward mode alone. Pass `adjoint=diffrax.ForwardMode()` for forward mode of any order "
+    "(jax.jacfwd(jax.jacfwd(jax.jacfwd(f))))."
 )
 REVERSE_MESSAGE = (
     "`simulate` was differentiated in reverse mode (grad, vjp, jacrev), but its adjoint is forward-only. "

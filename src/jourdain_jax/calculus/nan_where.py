@@ -10,7 +10,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.differentiated_as import with_lanes_first
+from jourdain_jax.calculus.lanes_first import with_lanes_first
 
 
 @jax.custom_jvp

@@ -43,8 +43,7 @@ class Diffrax(Integrator):
     def name(self) -> str:
         return type(self.solver).__name__
 
-    @property
-    def mode(self) -> Literal["forward", "reverse", "any"]:
+    def mode(self, setup: Setup) -> Literal["forward", "reverse", "any"]:
         if isinstance(self.adjoint, diffrax.RecursiveCheckpointAdjoint):
             return "reverse"
         return "forward" if isinstance(self.adjoint, diffrax.ForwardMode) else "any"

@@ -66,7 +66,7 @@ _compiled = for_programs(_one_motion, partial(quickly_compiled, options=_compile
 def _prepared(setup: Setup) -> Setup:
     """The setup with all numbers in the default precision (derivatives keep the type of what is differentiated), marked by the mode of differentiation."""
     numbers = in_default_precision({name: getattr(setup, name) for name in ("scene", "start", "inputs", "t0", "t1", "ts")})
-    return setup._replace(**marked_inputs(setup.integrator.mode, numbers))
+    return setup._replace(**marked_inputs(setup.integrator.mode(setup), numbers))
 
 
 def _with_machine_code(setup: Setup) -> Setup:
@@ -97,7 +97,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     t0, field, integrator = setup.t0, setup.field, setup.integrator
     start, args = begun.start, begun.args
     _, scene, inputs, fixed, origin = args
-    solved = eqx.tree_at(lambda s: (s.ys, s.y_end, s.t_end), solved, marked_outputs(integrator.mode, (solved.ys, solved.y_end, solved.t_end)))
+    solved = eqx.tree_at(lambda s: (s.ys, s.y_end, s.t_end), solved, marked_outputs(integrator.mode(given), (solved.ys, solved.y_end, solved.t_end)))
     moving = field.projects
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
     direction = jnp.sign(setup.t1 - t0)

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jourdain_jax.calculus.differentiated_as import Rules, derivatives_of, differentiated_as
 from jourdain_jax.calculus.elsewhere import or_elsewhere
+from jourdain_jax.calculus.guards import reverse_only
 from jourdain_jax.motion.batches.lockstep import in_blocks, width
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.integrators import erk_loop, integrands
@@ -23,12 +24,14 @@ from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
 
+Mode = Literal["forward", "reverse"]
+
 
 class OwnSteps(Integrator):
     """Our own loop, with a solver's tableau or by Taylor series; a static object, the same for all calls with these options."""
 
     solver: Method = eqx.field(static=True)
-    kind: Literal["forward", "reverse"] = eqx.field(static=True)  # of derivatives
+    kind: Literal["forward", "reverse", "both"] = eqx.field(static=True)  # of derivatives
     alongside: bool = eqx.field(static=True)  # whether values and tangents come from one run
     max_steps: int = eqx.field(static=True)
     event_names: tuple[str, ...] = eqx.field(static=True)
@@ -42,8 +45,9 @@ class OwnSteps(Integrator):
     def name(self) -> str:
         return self.solver.name if self.order is None else "Taylor"
 
-    @property
-    def mode(self) -> Literal["forward", "reverse"]:
+    def mode(self, setup: Setup) -> Literal["forward", "reverse", "any"]:
+        if self.kind == "both":
+            return "reverse" if self.reason_against_machine_code(setup) else "any"
         return self.kind
 
     def reason_against_machine_code(self, setup: Setup) -> str:
@@ -53,20 +57,23 @@ class OwnSteps(Integrator):
         return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names))
 
     def solved(self, setup: Setup, begun: Begun) -> Solved:
-        return self._by_either(_by_xla, lambda f: f, setup, begun)
+        return self._by_either(lambda mode: partial(_by_xla, mode), lambda f: f, setup, begun)
 
     def lanes_solved(self, setups: Setup, begun: Begun) -> Solved:
         """Lanes: those of a scalar program in blocks; all arrays have a leading axis of lanes."""
         if (program := setups.field.lowered) is None:
             return super().lanes_solved(setups, begun)
-        return self._by_either(partial(in_blocks, _lanes_by_xla, width(program)), eqx.filter_vmap, setups, begun)
+        return self._by_either(lambda mode: partial(in_blocks, partial(_lanes_by_xla, mode), width(program)), eqx.filter_vmap, setups, begun)
 
     def _by_either(self, by_xla: Callable, mapped: Callable, setup: Setup, begun: Begun) -> Solved:
         """A motion by machine code where that serves; `mapped`: of a function of one motion, that of all lanes."""
+        forward, reverse = by_xla("forward"), by_xla("reverse")
         if setup.reason_against_machine_code:
-            return by_xla(setup, begun)
-        quick = or_elsewhere(mapped(_by_machine_code), by_xla)
-        return differentiated_as(by_xla, quick, self.mode, _rules(setup, quick, mapped, self.alongside))(setup, begun)
+            return (forward if self.kind == "forward" else reverse)(setup, begun)
+        by = reverse if self.kind == "reverse" else forward
+        quick = or_elsewhere(mapped(_by_machine_code), by)
+        rules = _rules(setup, quick, mapped, self.alongside)
+        return differentiated_as(by, quick, self.kind, rules, lambda *given: reverse(*reverse_only(given)))(setup, begun)
 
 
 _once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
@@ -75,13 +82,13 @@ _once: Callable[..., OwnSteps] = lru_cache(maxsize=64)(OwnSteps)
 def own_steps(solver, stepsize_controller, adjoint, saveat, **static) -> OwnSteps | None:
     """Our own loop, where it has such a solver and such an adjoint (None: the default one), and nothing else is stated."""
     method = solver if isinstance(solver, Method) else method_of(solver)
-    kind = "reverse" if adjoint is None else _kind(adjoint)
+    kind = "both" if adjoint is None else _kind(adjoint)
     if stepsize_controller is not None or saveat is not None or method is None or kind is None:
         return None
     return _once(method, kind, adjoint is not None and type(adjoint) is alongside.Alongside, **static)
 
 
-def _kind(adjoint) -> Literal["forward", "reverse"] | None:
+def _kind(adjoint) -> Mode | None:
     """The mode of derivatives of an adjoint of diffrax; None where ours has no such one."""
     if type(adjoint) is diffrax.RecursiveCheckpointAdjoint:
         return "reverse" if adjoint.checkpoints is None else None
@@ -94,17 +101,17 @@ def reason_against_series(setup: Setup, order: int) -> str:
     return reason or native_motion.reason_against_series(setup.field, setup.inputs, bool(setup.integrator.event_names), order)
 
 
-def _by_xla(setup: Setup, begun: Begun) -> Solved:
-    return _loop(setup, begun.y0, begun.args, setup.ts, setup.knots)
+def _by_xla(mode: Mode, setup: Setup, begun: Begun) -> Solved:
+    return _loop(mode, setup, begun.y0, begun.args, setup.ts, setup.knots)
 
 
-def _lanes_by_xla(setups: Setup, begun: Begun) -> Solved:
+def _lanes_by_xla(mode: Mode, setups: Setup, begun: Begun) -> Solved:
     """Lanes in lockstep: their axis comes first outside and last inside."""
     y0, ts, knots = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), (begun.y0, setups.ts, eqx.filter_vmap(lambda s: s.knots)(setups)))
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), _loop(setups, y0, begun.args, ts, knots))
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), _loop(mode, setups, y0, begun.args, ts, knots))
 
 
-def _loop(setup: Setup, y0, args, ts, knots) -> Solved:
+def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
     field, own = setup.field, _own(setup)
     goals = _goals(setup, ts)
     problem = erk_loop.Problem(
@@ -120,7 +127,7 @@ def _loop(setup: Setup, y0, args, ts, knots) -> Solved:
         knots=knots,
         rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
     )
-    ys, reached, end = erk_loop.integrate(problem, own.solver, y0, jnp.zeros_like(setup.t0), goals, setup.dt0, own.mode)
+    ys, reached, end = erk_loop.integrate(problem, own.solver, y0, jnp.zeros_like(setup.t0), goals, setup.dt0, mode)
     return _as_solved(goals, ys, reached, end)
 
 
@@ -149,10 +156,11 @@ def _most_steps(setup: Setup, knots) -> int:
 def _rules(setup: Setup, quick: Callable, mapped: Callable, alongside: bool) -> Rules:
     """Derivatives of `quick` by machine code; `mapped`: of a function of one motion, that of all lanes."""
 
+    form = native_motion.form_of(setup.field, setup.inputs, bool(setup.integrator.event_names))
+
     def serve(order: int, varies: Setup, begun: Begun) -> bool:
         of_samples = [channel for channel in (*varies.inputs.channels, *begun.args[2].channels) if isinstance(channel, Sampled)]
-        reason = native_motion.reason_against_derivatives(setup.field, setup.inputs, bool(setup.integrator.event_names), order)
-        return not any(jax.tree.leaves(of_samples)) and not reason
+        return not any(jax.tree.leaves(of_samples)) and not native_motion.reason_against_derivatives(form, order)
 
     def pull(perturbed, arguments, found, g):
         return mapped(partial(_pulled, perturbed))(*arguments, found, g)
@@ -165,13 +173,13 @@ def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solv
     motion = _motion(setup, begun)
     states = jax.tree.map(lambda g: jnp.concatenate([g, jnp.zeros((1, *g.shape[1:]))]), g.ys)  # nobody asks for the last one: it is that of the end
     varies, asked = perturbed[0], [bool(varies) for varies in native_motion.known_of(perturbed[1].args)]
-    by_start, by_known = native_motion.cotangents(motion, asked, states, g.y_end, g.t_end)
+    ys, reached = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), (found.ys, found.reached), (found.y_end, found.t_end == motion.goals[-1]))
+    ended = native_motion.stopped(ys, reached, found.t_end, (found.code == results.EVENT) & (found.accepted > 0))
+    by_start, by_known = native_motion.cotangents(motion, asked, ended, states, g.y_end, g.t_end)
     none_else = jax.tree.map(lambda varies, x: jnp.zeros_like(x) if varies else None, perturbed, (setup, begun))
     by_setup, (field, scene, inputs, fixed, origin) = none_else[0], none_else[1].args
     if varies.ts or varies.t0 or varies.t1 or perturbed[1].args[-1]:
-        ys, reached = jax.tree.map(lambda x, last: jnp.concatenate([x, last[None]]), (found.ys, found.reached), (found.y_end, found.t_end == motion.goals[-1]))
-        event = (found.code == results.EVENT) & (found.accepted > 0)
-        times = native_motion.cotangents_of_times(motion, (ys, reached, found.t_end, event), by_start, states, g.y_end, g.t_end)
+        times = native_motion.cotangents_of_times(motion, ended, by_start, states, g.y_end, g.t_end)
         goals = times.goals.at[:-1].add(g.ts)
         given = {"ts": goals[:-1], "t0": -jnp.sum(goals), "t1": goals[-1]}
         by_setup = by_setup._replace(**{name: by for name, by in given.items() if getattr(varies, name)})

@@ -23,7 +23,7 @@ from jourdain_jax.motion.native import onto_rows
 from jourdain_jax.motion.native.called import nodes_called
 from jourdain_jax.motion.native.seen import entries
 from jourdain_jax.native.scalar_program import unsupported
-from jourdain_jax.program.derivative import directional_derivative, jacobian
+from jourdain_jax.program.derivative import cotangents, directional_derivative, jacobian
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.scene.scene import Scene
@@ -79,37 +79,61 @@ def _function(graph: Graph, places: dict[int, int], size: int, variables: Sequen
     graph, nodes, variables = on_its_own(graph, list(places.values()), variables)
     places = dict(zip(places, nodes, strict=True))
     slopes = cache(lambda: _slopes(graph, places, variables))  # derived when the first derivative is asked for
-    curved = cache(lambda: _tangents_of_tangents(graph, places, size, variables))  # and when the second is
+    curved = cache(lambda: _second(graph, places, size, variables, back=False))  # and when the second is
+    bent = cache(lambda: _second(graph, places, size, variables, back=True))
 
-    @jax.custom_jvp
-    def along(x, dx):
+    def by_slopes(x, dx):
         J, rows = slopes()
         return jnp.zeros(size, dx.dtype).at[rows].set(J(x) @ dx, unique_indices=True, indices_are_sorted=True)
 
+    def by_slopes_back(x, g):
+        J, rows = slopes()
+        return J(x).T @ g[rows]
+
+    along, back = jax.custom_jvp(by_slopes), jax.custom_jvp(by_slopes_back)
+
     @along.defjvp
-    def rule(at, tangents):
-        return along(*at), curved()(jnp.concatenate([*at, *tangents]))
+    def along_rule(at, tangents):
+        if curved() is None:
+            return jax.jvp(by_slopes, at, tangents)
+        return along(*at), along(at[0], tangents[1]) + curved()(jnp.concatenate([*at, tangents[0]]))
+
+    @back.defjvp
+    def back_rule(at, tangents):
+        if bent() is None:
+            return jax.jvp(by_slopes_back, at, tangents)
+        return back(*at), back(at[0], tangents[1]) + bent()(jnp.concatenate([*at, tangents[0]]))
 
     def serve(order: int, *_) -> bool:
-        return order <= 2 and slopes() is not None and (order == 1 or curved() is not None)
+        return order <= 2 and slopes() is not None
 
     def push(arguments, tangents):
         return values(*arguments), along(*arguments, *tangents)
 
-    values = differentiated_as(*_by_xla_and_machine_code(graph, places, size, variables), "forward", Rules(serve, push))
+    def pull(perturbed, arguments, found, g):
+        return (back(*arguments, g),)
+
+    by_xla, quick = _by_xla_and_machine_code(graph, places, size, variables)
+    values = differentiated_as(by_xla, quick, "both", Rules(serve, push, pull), by_xla)
     return values
 
 
-def _tangents_of_tangents(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int]) -> Callable[[Array], Array] | None:
-    """The tangents of d o as a function of x and dx and of their tangents, in a row; None where they are too large, or no machine code."""
-    count, nodes = len(variables), list(places.values())
-    given = [*variables, *(graph.input(f"tangent {k} of variable {i}", True) for k in range(3) for i in range(count))]
-    for pairs in (zip(variables, given[count : 2 * count], strict=True), zip(given[: 2 * count], given[2 * count :], strict=True)):
-        nodes = [rate.get(0, graph.zero) for rate in directional_derivative(graph, nodes, {0: dict(pairs)})]
-    found = {place: node for place, node in zip(places, nodes, strict=True) if node != graph.zero}
+def _second(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int], back: bool) -> Callable[[Array], Array] | None:
+    """f''(x)(w, v) as a function of x, w and v in a row, or (`back`) g f''(x)(., v) of x, g and v; None where it is too large, or no machine code."""
+    first, last = ([graph.input(f"{name} {i}", True) for i in range(count)] for name, count in (("w", size if back else len(variables)), ("v", len(variables))))
+
+    def along(nodes, direction: list[int]) -> list[int]:
+        return [rate.get(0, graph.zero) for rate in directional_derivative(graph, nodes, {0: dict(zip(variables, direction, strict=True))})]
+
+    rates = along(places.values(), last)
+    if back:
+        found = dict(enumerate(cotangents(graph, rates, [first[place] for place in places], variables)))
+    else:
+        found = dict(zip(places, along(rates, first), strict=True))
+    found = {place: node for place, node in found.items() if node != graph.zero}
     if unsupported(graph, found.values()) or graph.operations(found.values()) > LARGEST_PROGRAM:
         return None
-    return _by_xla_and_machine_code(graph, found, size, given)[1]
+    return _by_xla_and_machine_code(graph, found, len(variables) if back else size, [*variables, *first, *last])[1]
 
 
 def _slopes(graph: Graph, places: dict[int, int], variables: Sequence[int]) -> tuple[Callable[[Array], Array], np.ndarray] | None:

@@ -13,6 +13,7 @@ Forward mode has tangents d instead, of the states saved and of the start, and s
 """
 
 import warnings
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -112,23 +113,26 @@ def warn_if_ill_conditioned(setup: Setup, integrate) -> Trajectory | None:
     """`integrate(setup)`; its derivative, taken outside of `jit`, warns where the motion amplifies errors too much."""
     if nothing_is_traced() or not is_traced(setup):
         return integrate(setup)
-    forward = setup.integrator.mode == "forward"
+    mode = setup.integrator.mode(setup)
     start, (rtol, atol) = setup.start, setup.tolerances
     known = _known((start.q, start.u, rtol, atol))
     if known is None:
         return integrate(setup)
     only_start = not is_traced(eqx.tree_at(lambda s: s.start, setup, None))
     tolerances = float(known[2]), float(known[3])
-    sizes = _Growth(*tolerances, only_start) if forward else _Sizes(*tolerances)
-    shown = tap_tangents if forward else tap_cotangents
-    at_start = shown((start.q, start.u), sizes.start(known[:2]))
+    sizes: list[tuple[Callable, _Growth | _Sizes]] = [] if mode == "reverse" else [(tap_tangents, _Growth(*tolerances, only_start))]
+    sizes += [] if mode == "forward" else [(tap_cotangents, _Sizes(*tolerances))]
+    at_start = start.q, start.u
+    for shown, size in sizes:
+        at_start = shown(at_start, size.start(known[:2]))
     motion = integrate(eqx.tree_at(lambda s: (s.start.q, s.start.u), setup, at_start))
     parts = (motion.q, motion.u, motion.q_end, motion.u_end)
     seen = _known((*parts, motion.accepted))
     if seen is None:
         return motion
-    at_ends = shown(parts, sizes.ends(seen[:-1], int(seen[-1])))
-    return eqx.tree_at(lambda m: (m.q, m.u, m.q_end, m.u_end), motion, at_ends)
+    for shown, size in sizes:
+        parts = shown(parts, size.ends(seen[:-1], int(seen[-1])))
+    return eqx.tree_at(lambda m: (m.q, m.u, m.q_end, m.u_end), motion, parts)
 
 
 def _known(values) -> tuple | None:

@@ -60,9 +60,8 @@ class Integrator(eqx.Module):
     def name(self) -> str:
         """The solver, as it stands in a trajectory."""
 
-    @property
     @abc.abstractmethod
-    def mode(self) -> Literal["forward", "reverse", "any"]:
+    def mode(self, setup: "Setup") -> Literal["forward", "reverse", "any"]:
         """The mode of differentiation that it supports."""
 
     @abc.abstractmethod

@@ -77,9 +77,9 @@ def simulate(
       rtol >= 1e-6, Dopri8 below, and where these run out of steps on a stiff motion, `RadauIIA`; `Taylor` for small scenes at
       tight tolerances; structure-preserving ones (`ImplicitMidpoint`,
       `DiscreteLagrangeDAlembert`, `DiscreteGradient`) take equal steps of at most `dt0` between saved times.
-      Default adjoint: `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order, by recorded steps; with `checkpoints=`, that of
-      diffrax); `diffrax.ForwardMode()`
-      for forward mode of any order; `diffrax.DirectAdjoint()` for all.
+      Default adjoint: forward and reverse mode, to the second order (`jax.hessian`), where machine code integrates; otherwise
+      `diffrax.RecursiveCheckpointAdjoint()` (reverse mode, first order, by recorded steps; with `checkpoints=`, that of diffrax);
+      `diffrax.ForwardMode()` for forward mode of any order; `diffrax.DirectAdjoint()` for all.
     - `formulation`: which equations are integrated, a `jj.Formulation(state, reduction, stabilisation)` (default: what serves the scene).
     - `backend`: "native", the scene's scalar program (`jj.lower`) as machine code made for it, on CPUs, where llvmlite is installed and the solver is a
       default one; "xla", that program compiled by XLA, as third derivatives, those with respect to samples, and programs that are exported (`jax.export`)

@@ -40,6 +40,10 @@ class _Slot:
     y: int
     k: int
 
+    @staticmethod
+    def of(form: Form, method: Method) -> "_Slot":
+        return _Slot(form.layout.integrated, form.layout.integrated * method.needed)
+
     @property
     def t(self) -> int:
         return self.y + self.k
@@ -57,7 +61,7 @@ class _Slot:
         return self.t + 3
 
 
-def written(form: Form, method: Method, lanes: int, fused: bool, threads: int, asked: Sequence[int]) -> str:
+def written(form: Form, method: Method, asked: Sequence[int], lanes: int, fused: bool, threads: int) -> str:
     """The module of LLVM IR; `asked`: of which of the numbers that the rates are given cotangents are asked."""
     w = Writer(lanes, fused)
     write_functions(w, form, method)
@@ -89,10 +93,10 @@ def _write_more_room(w: Writer) -> None:
 
 def _write_blocks(w: Writer, form: Form, method: Method, asked: int, job: Value) -> None:
     """Lanes side by side, forth and back, until none is left."""
-    layout, slot = form.layout, _Slot(form.layout.y, form.layout.y * method.needed)
+    layout, slot = form.layout, _Slot.of(form, method)
     size = slot.all * w.lanes * 8
     state, who, saved, begun = w.room(w.real, layout.all), w.room("i64", w.lanes), w.room(w.real), w.room(w.real)
-    g, by_known = w.room(w.real, layout.y), w.room(w.real, max(asked, 1))
+    g, by_known = w.room(w.real, layout.integrated), w.room(w.real, max(asked, 1))
     record, bytes_there, count = w.room("ptr"), w.room("i64"), w.room("i64")
     lanes = Lanes(w, layout, state)
     w.store(w.literal(FIRST_SLOTS * size, "i64"), bytes_there)
@@ -120,7 +124,7 @@ def _write_blocks(w: Writer, form: Form, method: Method, asked: int, job: Value)
                 w.store(w.load("i64", bytes_there) * 2, bytes_there)
             ended(~has_room())
             here = w.at(w.load("ptr", record), number * slot.all, w.real)
-            each_row(w, range(layout.y), here, lambda i: w.load(w.real, state, i))
+            each_row(w, range(layout.integrated), here, lambda i: w.load(w.real, state, i))
             w.store(lanes["t"], here, slot.t)
             w.call("step", "void", state, w.at(here, slot.y, w.real))
             w.store(lanes["taken"], here, slot.taken)
@@ -137,12 +141,12 @@ def _write_blocks(w: Writer, form: Form, method: Method, asked: int, job: Value)
 def _write_back(w: Writer, form: Form, method: Method, asked: int, job: Value, rooms: tuple[Value, ...]) -> None:
     """The way back of a block, and its results."""
     state, who, saved, begun, g, by_known, record, count = rooms
-    layout, slot = form.layout, _Slot(form.layout.y, form.layout.y * method.needed)
+    layout, slot = form.layout, _Slot.of(form, method)
     each_row(w, range(asked), by_known, lambda i: w.number(0.0))
-    ends, per_end = w.load("ptr", job, _TO_ENDS), layout.y + 1
+    ends, per_end = w.load("ptr", job, _TO_ENDS), layout.ends
     with w.counted(0, w.lanes) as lane:
         number = w.load("i64", who, lane)
-        with w.counted(0, layout.y) as row:
+        with w.counted(0, layout.integrated) as row:
             found = w.load("double", ends, w.where(number >= 0, number, 0) * per_end + row)
             w.store(w.where(number >= 0, found, w.literal(0.0, "double")), w.at(g, row * w.lanes + lane, "double"))
     # what was not reached repeats the last state
@@ -165,19 +169,19 @@ def _write_back(w: Writer, form: Form, method: Method, asked: int, job: Value, r
             w.call("step_back", "void", state, here, g, by_known)
         w.store(number - 1, count)
     w.call("added", "void", job, who, w.number(0.0), w.load(w.real, begun), g)
-    found, each = w.load("ptr", job, _FOUND), layout.y + asked
+    found, each = w.load("ptr", job, _FOUND), layout.integrated + asked
     with w.counted(0, w.lanes) as lane:
         number = w.load("i64", who, lane)
         with w.when(number >= 0):
-            with w.counted(0, layout.y) as row:
+            with w.counted(0, layout.integrated) as row:
                 w.store(w.load("double", g, row * w.lanes + lane), found, number * each + row)
             with w.counted(0, asked) as row:
-                w.store(w.load("double", by_known, row * w.lanes + lane), found, number * each + layout.y + row)
+                w.store(w.load("double", by_known, row * w.lanes + lane), found, number * each + layout.integrated + row)
 
 
 def _give_nan(w: Writer, form: Form, asked: int, job: Value, who: Value) -> None:
     """Where no memory is left: NaN for this block and for all lanes that are left."""
-    found, each = w.load("ptr", job, _FOUND), form.layout.y + asked
+    found, each = w.load("ptr", job, _FOUND), form.layout.integrated + asked
 
     def lost(number: Value) -> None:
         with w.counted(0, each) as row:
@@ -244,7 +248,7 @@ def _write_note(w: Writer, form: Form) -> None:
 
 def _write_added(w: Writer, form: Form) -> None:
     """`added(job, who, first, end, g)`: adds the cotangents of the states saved at the times number `first` to `end - 1`."""
-    count = form.layout.y
+    count = form.layout.integrated
     arguments = {"job": "ptr", "who": "ptr", "first": w.real, "end": w.real, "g": "ptr"}
     with w.function("added", "void", arguments, attributes="noinline") as (job, who, first, end, g):
         firsts, ends = w.room(w.real), w.room(w.real)
@@ -263,8 +267,8 @@ def _write_added(w: Writer, form: Form) -> None:
 
 def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
     """`step_back(state, here, g, by_known)`: back over the step in the slot `here`, in lanes that went on in it."""
-    layout, slot = form.layout, _Slot(form.layout.y, form.layout.y * method.needed)
-    rows, count = range(layout.y), layout.y
+    layout, slot = form.layout, _Slot.of(form, method)
+    rows, count = range(layout.integrated), layout.integrated
     arguments = dict.fromkeys(("state", "here", "g", "by_known"), "ptr")
     with w.function("step_back", "void", arguments, attributes="noinline") as (state, here, g, by_known):
         h, t = w.load(w.real, here, slot.taken), w.load(w.real, here, slot.t)
@@ -310,7 +314,7 @@ def _write_step_back(w: Writer, form: Form, method: Method, asked: int) -> None:
 def _project_back(w: Writer, form: Form, state: Value, t1: Value, free: Value, g: Value, added: Value) -> None:
     """Cotangents `g` of a state put back onto the rows become those of the state `free` before."""
     moves = form.moves
-    rows, count = range(form.layout.y), form.layout.y
+    rows, count = range(form.layout.integrated), form.layout.integrated
     before = w.room(w.real, count * len(moves))
     for number, q_moves in enumerate(moves):
         each_row(w, rows, w.at(before, number * count, w.real), lambda i: w.load(w.real, free, i))
@@ -323,33 +327,52 @@ def _project_back(w: Writer, form: Form, state: Value, t1: Value, free: Value, g
 
 def _write_event_back(w: Writer, form: Form, asked: int) -> None:
     """`event_back(job, state, who, g, by_known)`: cotangents at the time and state of an event become those of a state at a number for a time."""
-    layout, count = form.layout, form.layout.y
+    layout, count = form.layout, form.layout.integrated
     arguments = dict.fromkeys(("job", "state", "who", "g", "by_known"), "ptr")
     with w.function("event_back", "void", arguments, attributes="noinline") as (job, state, who, g, by_known):
         lanes = Lanes(w, layout, state)
         located = lanes["code"].equals(float(results.EVENT)) & (lanes["accepted"] > 0.0)
         with w.when(w.any(located)):
-            f, out, pivots, added = (w.room(w.real, max(n, 1)) for n in (count, count, form.pivots, asked))
+            f, out, pivots, added = (w.room(w.real, max(n, 1)) for n in (count, count, form.pivots, asked + 1))
             values, rates, weights = (w.room(w.real, layout.events) for _ in range(3))
-            t, g_t = lanes["t"], w.room(w.real)
-            with w.counted(0, w.lanes) as lane:
+            t, g_t = lanes["t"], w.room(w.real, 1 + len(form.moving))
+            with w.counted(0, w.lanes) as lane, w.counted(0, 1 + len(form.moving)) as row:
                 number = w.load("i64", who, lane)
-                there = w.load("double", w.load("ptr", job, _TO_ENDS), w.where(number >= 0, number, 0) * (count + 1) + count)
-                w.store(there, w.at(g_t, lane, "double"))
+                there = w.load("double", w.load("ptr", job, _TO_ENDS), w.where(number >= 0, number, 0) * layout.ends + count + row)
+                w.store(there, w.at(g_t, row * w.lanes + lane, "double"))
             w.call("rates", "void", state, t, state, f, pivots)
+            if form.moving:  # the tangent, and its rates, at a number for a time
+                dy, dt = w.at(state, layout.y, w.real), lanes["dt"]
+                each_row(w, range(layout.y), dy, lambda i: w.load(w.real, dy, i) - w.where(dt.differs(0.0), dt * w.load(w.real, f, i), 0.0))
+                lanes["dt"] = w.number(0.0)
+                w.call("rates", "void", state, t, state, f, pivots)
             w.call("events", "void", state, t, state, f, values, rates)
             rate = search.chosen(w, lanes["event"], [w.load(w.real, rates, i) for i in range(layout.events)])
+            usable = located & rate.differs(0.0) & (w.magnitude(rate) < math.inf)
+            each_row(w, range(asked + 1), added, lambda i: w.number(0.0))
             total = w.load(w.real, g_t)
+            if form.moving:
+                total = total + _moved_back(w, form, lanes, usable, (g, w.load(w.real, g_t, 1)), (out, added), asked)
             for i in range(count):
                 total = w.fma(w.load(w.real, g, i), w.load(w.real, f, i), total)
-            usable = located & rate.differs(0.0) & (w.magnitude(rate) < math.inf)
             flat = located & search.is_flat(w, lanes, rate) & total.differs(0.0)
             by_value = w.where(flat, math.nan, w.where(usable, -total / rate, 0.0))
             usable = usable | flat
             for i in range(layout.events):
                 w.store(w.where(lanes["event"].equals(float(i)), by_value, 0.0), weights, i)
-            each_row(w, range(asked), added, lambda i: w.number(0.0))
             w.call("pull_events", "void", state, t, state, weights, out, added)
             each_row(w, range(count), g, lambda i: w.load(w.real, g, i) + w.where(usable, w.load(w.real, out, i), 0.0))
             each_row(w, range(asked), by_known, lambda i: w.load(w.real, by_known, i) + w.where(usable, w.load(w.real, added, i), 0.0))
         w.give()
+
+
+def _moved_back(w: Writer, form: Form, lanes: Lanes, usable: Value, cotangents: tuple[Value, Value], rooms: tuple[Value, Value], asked: int) -> Value:
+    """The derivative along time of what an event adds to a tangent; changes the cotangents `g` of the state, the first of these, and adds to the others."""
+    (g, g_dt), (out, added), layout = cotangents, rooms, form.layout
+    given, count = w.room(w.real, layout.integrated + 2), layout.integrated
+    each_row(w, range(count), given, lambda i: w.load(w.real, g, i))
+    w.store(g_dt, given, count)
+    w.store(lanes["event"], given, count + 1)
+    w.call("pull_moved", "void", lanes.pointer, lanes["t"], lanes.pointer, given, out, added)
+    each_row(w, range(count), g, lambda i: w.load(w.real, given, i) + w.where(usable, w.load(w.real, out, i), 0.0))
+    return w.load(w.real, added, asked)

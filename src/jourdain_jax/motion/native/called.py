@@ -13,8 +13,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array
 
-from jourdain_jax.calculus.differentiated_as import with_lanes_first
 from jourdain_jax.calculus.elsewhere import or_elsewhere
+from jourdain_jax.calculus.lanes_first import with_lanes_first
 from jourdain_jax.native import ffi, host
 from jourdain_jax.native.ir import Writer
 from jourdain_jax.native.scalar_program import as_real, written_in_turn

@@ -37,10 +37,10 @@ def flow(form: Form, method: Method, order: int | None) -> Callable[[Start], Fou
     @partial(own.defjvp, symbolic_zeros=True)
     def rule(primals, tangents):
         (start,), (along,) = primals, tangents
-        if not all(map(_is_zero, along.of_samples[:1])):
+        if not all(map(is_zero, along.of_samples[:1])):
             raise DifferentiationModeError('machine code does not differentiate with respect to samples; `backend="xla"` does')
         raised, more = with_tangents(form, start, along)
-        times = None if _is_zero(along.goals) and _is_zero(along.origin) else (_filled(along.goals), _filled(along.origin))
+        times = None if is_zero(along.goals) and is_zero(along.origin) else (filled(along.goals), filled(along.origin))
         if times is not None:
             before = rates(form)(start, (jnp.zeros(()),) * len(start.y))
             more = more._replace(y=(*start.y, *(dy - scaled(f, times[1]) for dy, f in zip(more.y[len(start.y) :], before, strict=True))))
@@ -57,10 +57,10 @@ def _along_times(form: Form, start: Start, found: Found, d: Found, goals, origin
     """A tangent with what those of the goals and of the start's time add to it."""
     code, accepted, count = found.rest[1], found.rest[2], found.rest[-1]
     reached = (jnp.arange(len(start.goals)) < count) | (start.goals == found.t[0])
-    at = on_times(form, start, Stopped(found.y, reached, found.t[0], (code == results.EVENT) & (accepted > 0)))
-    absolute = jnp.where(at.by_goal, goals + origin, jnp.where(at.event, 0.0, origin))
-    states = tuple(dy + jax.vmap(scaled)(f, absolute) for dy, f in zip(d.y, at.slopes, strict=True))
-    end = tuple(dy + scaled(f[-1], absolute[-1]) for dy, f in zip(d.end, at.slopes, strict=True))
+    at = on_times(start, Stopped(found.y, reached, found.t[0], (code == results.EVENT) & (accepted > 0)))
+    absolute, slopes = at.absolute(goals, origin), slopes_of(form, start, found.y, at)
+    states = tuple(dy + jax.vmap(scaled)(f, absolute) for dy, f in zip(d.y, slopes, strict=True))
+    end = tuple(dy + scaled(f[-1], absolute[-1]) for dy, f in zip(d.end, slopes, strict=True))
     t = jnp.where(at.event, d.t[0] - origin, jnp.where(at.by_goal[-1], goals[-1], 0.0))
     return d._replace(y=states, end=end, t=(t, *d.t[1:]))
 
@@ -77,20 +77,28 @@ class Stopped(NamedTuple):
 class OnTimes(NamedTuple):
     """How the states at the goals, the last of which is the end, depend on times."""
 
-    slopes: tuple[Float[Array, "times y"], ...]
+    t: Float[Array, "times"]
     by_goal: Bool[Array, "times"]  # whether the time is the goal
     event: Bool[Array, ""]
 
+    def absolute(self, goals, origin) -> Float[Array, "times"]:
+        """Tangents of the times themselves, not since the start, from those of the goals and of the start's time; of an event, the loop has found them."""
+        return jnp.where(self.by_goal, goals + origin, jnp.where(self.event, 0.0, origin))
 
-def on_times(form: Form, start: Start, found: Stopped) -> OnTimes:
+
+def on_times(start: Start, found: Stopped) -> OnTimes:
     """How the states that were found depend on times."""
     by_goal = found.reached & ~(found.event & (start.goals == found.t))
-    at = jnp.where(by_goal, start.goals, found.t)
+    return OnTimes(jnp.where(by_goal, start.goals, found.t), by_goal, found.event)
+
+
+def slopes_of(form: Form, start: Start, states: tuple, at: OnTimes) -> tuple[Float[Array, "times y"], ...]:
+    """The rates of states, and of their tangents, at their times."""
 
     def slopes(y, t):
         return rates(form)(start._replace(y=y), (t, *[jnp.zeros(())] * (len(y) - 1)))
 
-    return OnTimes(jax.vmap(slopes)(found.y, at), by_goal, found.event)
+    return jax.vmap(slopes)(states, at.t)
 
 
 def rates(form: Form) -> Callable[[Start, tuple], tuple]:
@@ -107,8 +115,8 @@ def rates(form: Form) -> Callable[[Start, tuple], tuple]:
     def rule(primals, tangents):
         (state, t), (along, dt) = primals, tangents
         raised, more = with_tangents(form, state, along)
-        dt = [_filled(x) for x in dt]
-        dt[0] = dt[0] + _filled(along.origin)
+        dt = [filled(x) for x in dt]
+        dt[0] = dt[0] + filled(along.origin)
         found = rates(raised)(more, (*t, *dt))
         return found[: len(t)], found[len(t) :]
 
@@ -118,19 +126,21 @@ def rates(form: Form) -> Callable[[Start, tuple], tuple]:
 def with_tangents(form: Form, start: Start, along: Start) -> tuple[Form, Start]:
     """The form and the start that have these tangents too."""
     every = (tuple(range(len(start.known[0]))), *form.moving)
-    moves = [[not _is_zero(dx) for dx in part] for part in along.known]
+    moves = [[not is_zero(dx) for dx in part] for part in along.known]
     moving = tuple(tuple(i for i, does in zip(of, part, strict=True) if does) for of, part in zip(every, moves, strict=True))
-    known = tuple(tuple(dx for dx in part if not _is_zero(dx)) for part in along.known)
-    more = start._replace(y=(*start.y, *map(_filled, along.y)), known=(*start.known, *known))
+    known = tuple(tuple(dx for dx in part if not is_zero(dx)) for part in along.known)
+    more = start._replace(y=(*start.y, *map(filled, along.y)), known=(*start.known, *known))
     return replace(form, moving=(*form.moving, *moving)), more
 
 
-def _is_zero(tangent) -> bool:
+def is_zero(tangent) -> bool:
+    """Whether nothing changes."""
     return isinstance(tangent, SymbolicZero)
 
 
-def _filled(tangent):
-    return jnp.zeros(tangent.shape, tangent.dtype) if _is_zero(tangent) else tangent
+def filled(tangent):
+    """The tangent as an array."""
+    return jnp.zeros(tangent.shape, tangent.dtype) if is_zero(tangent) else tangent
 
 
 @jax.custom_jvp

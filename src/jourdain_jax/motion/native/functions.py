@@ -114,15 +114,21 @@ def outputs_of(form: Form, nodes: Sequence[int], pushed: int) -> Outputs:
 
 def _found(w: Writer, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> tuple[list[Value], list[list[Value]]]:
     """The values of outputs, and their tangents; `known`: as from `known_values`."""
+    given = given_values(w, form, own, known, state, tau, y)
+    found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *(n for part in own.tangents for n in part)], given)]
+    tangents = iter(found[len(own.values) :])
+    return found[: len(own.values)], [[next(tangents) for _ in part] for part in own.tangents]
+
+
+def given_values(w: Writer, form: Form, own: Outputs, known: dict[int, Value], state: Value, tau: Value, y: Value) -> dict[int, Value]:
+    """Values of all nodes of outputs that are given from outside; `known`: as from `known_values`."""
     given, lanes = dict(zip(own.variables, known.values(), strict=True)), Lanes(w, form.layout, state)
     for k, states in enumerate(own.states):
         given |= {n: w.load(w.real, y, (k + 1) * form.layout.y + i) for i, n in enumerate(states)}
     given |= dict(zip(own.known, lanes.every("dknown"), strict=True)) if own.known else {}
     given |= dict(zip(own.times, lanes.every("dt"), strict=True)) if own.times else {}
     given |= dict(zip(own.slopes, looked_up(w, form.layout, state, tau, True)[form.layout.sampled :], strict=True)) if own.slopes else {}
-    found = [as_real(w, x) for x in written(w, own.graph, [*own.values, *(n for part in own.tangents for n in part)], given)]
-    tangents = iter(found[len(own.values) :])
-    return found[: len(own.values)], [[next(tangents) for _ in part] for part in own.tangents]
+    return given
 
 
 def known_values(w: Writer, form: Form, state: Value, tau: Value, y: Value) -> dict[int, Value]:

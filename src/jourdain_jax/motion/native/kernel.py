@@ -114,17 +114,24 @@ def _motion(layout: Layout, run: Callable) -> Callable[[Start], Found]:
 def kernel_back(form: Form, method: Method, asked: tuple[int, ...]) -> Callable:
     """A function of samples, the rows of a start, cotangents of the states at the goals and of the end (with its time last), and the goals.
 
-    It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given.
+    It returns cotangents of the state at the start, and of the numbers `asked` for of those that the rates are given. A state has its tangent after it.
     """
-    count = form.layout.y + len(asked)
-    of_samples = samples.arguments(form.layout)
-    run_rows = called(lambda lanes, threads: back.written(form, method, lanes, host.fuses(), threads, asked), lambda *_: ((count,),), of_samples)
-    return lambda *arguments: run_rows(*arguments)[0]
+    return _one_row(lambda *how: back.written(form, method, asked, *how), form, form.layout.integrated + len(asked))
 
 
 @lru_cache(maxsize=MOST_KERNELS)
 def kernel_of_rates(form: Form) -> Callable:
     """A function of samples, rows as those of a start, and their times as an array of one: the rates of the states in these rows, and of their tangents."""
-    count, of_samples = form.layout.integrated, samples.arguments(form.layout)
-    run_rows = called(lambda lanes, threads: slopes.written(form, lanes, host.fuses(), threads), lambda *_: ((count,),), of_samples)
+    return _one_row(lambda *how: slopes.written(form, *how), form, form.layout.integrated)
+
+
+@lru_cache(maxsize=MOST_KERNELS)
+def kernel_of_pulled_rates(form: Form, asked: tuple[int, ...]) -> Callable:
+    """As `kernel_of_rates`, of cotangents of the rates in place of the times: those of the state, and of the numbers `asked` for."""
+    return _one_row(lambda *how: slopes.written_back(form, asked, *how), form, form.layout.y + len(asked))
+
+
+def _one_row(text: Callable[[int, bool, int], str], form: Form, count: int) -> Callable:
+    """Machine code that returns a row of so many numbers for each lane; `text`: for so many lanes, with or without fused operations, in so many threads."""
+    run_rows = called(lambda lanes, threads: text(lanes, host.fuses(), threads), lambda *_: ((count,),), samples.arguments(form.layout))
     return lambda *arguments: run_rows(*arguments)[0]

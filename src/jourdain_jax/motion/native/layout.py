@@ -42,6 +42,11 @@ class Layout:
         return self.y * (1 + len(self.moving))
 
     @property
+    def ends(self) -> int:
+        """Numbers of the state at the end and of its time, and of their tangents."""
+        return (self.y + 1) * (1 + len(self.moving))
+
+    @property
     def parts(self) -> list[range]:
         """Rows of the coordinates, of the speeds and of the work, where there are any."""
         ends = [0, self.coordinates, self.coordinates + self.speeds, self.y]

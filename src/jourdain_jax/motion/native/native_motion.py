@@ -17,10 +17,11 @@ from jourdain_jax.motion.inputs import Constant, Inputs, Sampled
 from jourdain_jax.motion.integrators.erk_loop import ended
 from jourdain_jax.motion.integrators.erk_step import Progress
 from jourdain_jax.motion.integrators.tableaus import Method
-from jourdain_jax.motion.native.flow import Stopped, flow, on_times, rates, scaled
+from jourdain_jax.motion.native.flow import Stopped, flow, on_times, rates, scaled, slopes_of
+from jourdain_jax.motion.native.flow_back import flow_back
 from jourdain_jax.motion.native.functions import Form, event_program, outputs_of
 from jourdain_jax.motion.native.functions_of_time import numbers_of, parts_from, with_functions
-from jourdain_jax.motion.native.kernel import MOST_KERNELS, Found, Start, kernel_back
+from jourdain_jax.motion.native.kernel import MOST_KERNELS, Found, Start
 from jourdain_jax.motion.native.layout import Layout
 from jourdain_jax.motion.native.pulled import pulled_program, steps_of
 from jourdain_jax.motion.native.taylor import rates_of
@@ -75,7 +76,7 @@ def reason_against(field: VectorField, scene: PyTree, inputs: Inputs, has_events
         return reason
     if has_events and not field.lowers_events:
         return "a stop event is no part of the scalar program"
-    return _reason_against_program(_form(field, inputs, has_events))
+    return _reason_against_program(form_of(field, inputs, has_events))
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -100,8 +101,7 @@ def _reason_against_program(form: Form) -> str:
 
 def reason_against_series(field: VectorField, inputs: Inputs, has_events: bool, order: int) -> str:
     """Why machine code that integrates a scene cannot do so by Taylor series, in words; empty where it can."""
-    assert isinstance(field, ByProgram)
-    return _reason_against_series(_form(field, inputs, has_events), order)
+    return _reason_against_series(form_of(field, inputs, has_events), order)
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -115,22 +115,15 @@ def _reason_against_series(form: Form, order: int) -> str:
     return f"its series take {count} products, more than {MOST_PRODUCTS}" if count > MOST_PRODUCTS else ""
 
 
-def reason_against_derivatives(field: VectorField, inputs: Inputs, has_events: bool, order: int) -> str:
-    """Why machine code that integrates a scene cannot differentiate it so many times, in words; empty where it can."""
-    assert isinstance(field, ByProgram)
+@lru_cache(maxsize=MOST_KERNELS)
+def reason_against_derivatives(form: Form, order: int) -> str:
+    """Why machine code that integrates a form cannot differentiate it so many times, in words; empty where it can."""
     if order > len(LARGEST_DERIVATIVE):
         return f"machine code has no derivatives of order {order}"
-    return _reason_against_derivatives(_form(field, inputs, has_events), order)
-
-
-@lru_cache(maxsize=MOST_KERNELS)
-def _reason_against_derivatives(form: Form, order: int) -> str:
     for nodes in steps_of(form).values():
         along = outputs_of(replace(form, moving=((),) * (2**order - 1)), nodes, len(nodes))
-        found = [(along.graph, [*along.values, *(n for part in along.tangents for n in part)])]
-        if order == 1:
-            found.append(pulled_program(form, nodes, ())[:2])
-        for graph, of_it in found:
+        back = pulled_program(replace(form, moving=((),) * (order - 1)), nodes, (), len(nodes))
+        for graph, of_it in ((along.graph, [*along.values, *(n for part in along.tangents for n in part)]), (back.graph, back.found)):
             if reason := unsupported(graph, of_it):
                 return reason
             if (operations := graph.operations(of_it)) > (most := LARGEST_DERIVATIVE[order - 1]):
@@ -145,7 +138,9 @@ def _driven(program: Lowered, inputs: Inputs) -> Lowered | str:
     return with_functions(program, tuple(channel.program if isinstance(channel, FunctionOfTime) else None for channel in inputs.channels))
 
 
-def _form(field: ByProgram, inputs: Inputs, has_events: bool) -> Form:
+def form_of(field: VectorField, inputs: Inputs, has_events: bool) -> Form:
+    """What machine code integrates."""
+    assert isinstance(field, ByProgram)
     sampled = tuple(i for i, channel in enumerate(_others(inputs)) if isinstance(channel, Sampled))
     program = _driven(field.program, inputs)
     assert not isinstance(program, str), program
@@ -154,7 +149,7 @@ def _form(field: ByProgram, inputs: Inputs, has_events: bool) -> Form:
 
 def _form_of(motion: Motion) -> Form:
     field, _, inputs, *_ = motion.args
-    return _form(field, inputs, motion.has_events)
+    return form_of(field, inputs, motion.has_events)
 
 
 def integrate(motion: Motion) -> tuple[Integrated, Bool[Array, "times"], Progress]:
@@ -170,25 +165,26 @@ class AlongTimes(NamedTuple):
     origin: Float[Array, ""]  # the start
 
 
-def cotangents(motion: Motion, asked: Sequence[bool], ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> tuple[Integrated, list]:
+def cotangents(motion: Motion, asked: Sequence[bool], found: Stopped, ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> tuple[Integrated, list]:
     """Cotangents of the start, and of each of the numbers that the rates are given, where it is `asked` for, from those of the states and of the end."""
     which = tuple(i for i, is_asked in enumerate(asked) if is_asked)
     form, start = _form_of(motion), _start(motion)
     ends = jnp.concatenate([_packed(y_end), t_end[None]])
-    found = kernel_back(form, motion.method, which)(*start.of_samples, start.rows(jnp.zeros(()), ()), jax.vmap(_packed)(ys), ends, motion.goals)
+    found = flow_back(form, motion.method, which)(start, found, jax.vmap(_packed)(ys), ends)
     known = dict(zip(which, found[form.layout.y :], strict=True))
     return _state(form.layout, found[: form.layout.y]), [known.get(i) for i in range(len(asked))]
 
 
-def cotangents_of_times(motion: Motion, found: tuple, by_start: Integrated, ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> AlongTimes:
-    """Cotangents of the times, from those of the start (as `cotangents` has it), of the states and of the end.
+def stopped(states: Integrated, reached: Bool[Array, "times"], t_end: Float[Array, ""], event: Bool[Array, ""]) -> Stopped:
+    """How a motion ended: its states at the goals, which of those were reached, the time of the end, and whether that was an event."""
+    return Stopped((jax.vmap(_packed)(states),), reached, t_end, event)
 
-    `found`: the states, which goals were reached, the time of the end, and whether that was an event.
-    """
+
+def cotangents_of_times(motion: Motion, found: Stopped, by_start: Integrated, ys: Integrated, y_end: Integrated, t_end: Float[Array, ""]) -> AlongTimes:
+    """Cotangents of the times, from those of the start (as `cotangents` has it), of the states and of the end."""
     form, start = _form_of(motion), _start(motion)
-    states, *rest = found
-    at = on_times(form, start, Stopped((jax.vmap(_packed)(states),), *rest))
-    (slopes,), (first,) = at.slopes, rates(form)(start, (jnp.zeros(()),))
+    at = on_times(start, found)
+    (slopes,), (first,) = slopes_of(form, start, found.y, at), rates(form)(start, (jnp.zeros(()),))
     by_states = jnp.sum(jax.vmap(scaled)(slopes, jax.vmap(_packed)(ys)), axis=1)
     by_end = jnp.sum(scaled(slopes[-1], _packed(y_end)))
     goals = jnp.where(at.by_goal, by_states, 0.0).at[-1].add(jnp.where(at.by_goal[-1], by_end + t_end, 0.0))

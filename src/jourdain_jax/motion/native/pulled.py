@@ -1,18 +1,34 @@
 """Cotangents through rates, projection and stop events of a lowered scene, as functions of machine code.
 
 G_y = (df/dy)' g,   G_p += (df/dp)' g          p: those of the numbers that the rates are given which are asked for
+
+A tangent that is pushed along belongs to the state: cotangents of a motion with its tangent are what second derivatives consist of.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from jourdain_jax.lowering.jacobian import on_its_own
-from jourdain_jax.motion.native.functions import Form, known_values
+from jourdain_jax.motion.native.functions import Form, Outputs, given_values, known_values, outputs_of
 from jourdain_jax.native.ir import Writer
 from jourdain_jax.native.scalar_program import as_real, written_in_turn
-from jourdain_jax.program.derivative import cotangents
+from jourdain_jax.program.derivative import cotangents, directional_derivative
 from jourdain_jax.program.graph import Graph
 
 _ARGUMENTS = ("state", "tau", "y", "g", "to_y", "to_known")
+
+
+class Pulled(NamedTuple):
+    """Cotangents of the state and of what is asked for, on a graph of their own."""
+
+    own: Outputs
+    found: list[int]
+    weights: dict[int, int]  # row of what is pulled -> input for its cotangent
+
+    @property
+    def graph(self) -> Graph:
+        """Where the nodes are."""
+        return self.own.graph
 
 
 def rates_of(form: Form) -> list[int]:
@@ -22,9 +38,20 @@ def rates_of(form: Form) -> list[int]:
 
 
 def write_pulled(w: Writer, form: Form, asked: Sequence[int]) -> None:
-    """`pull_rates`, `pull_q`, `pull_u` and `pull_events`, each `(state, tau, y, g, to_y, to_known)`; `asked`: which of the numbers known."""
+    """`pull_rates`, `pull_q`, `pull_u` and `pull_events`, each `(state, tau, y, g, to_y, to_known)`; `asked`: which of the numbers known.
+
+    Of a state with a tangent also `pull_moved`; events are then those of the state alone.
+    """
     for name, nodes in steps_of(form).items():
-        _write(w, form, f"pull_{name}", nodes, asked, work_stays=name in ("q", "u"))
+        _write(w, form, f"pull_{name}", pulled_program(form, nodes, asked, 0 if name == "events" else len(nodes)), work_stays=name in ("q", "u"))
+    if form.moving and form.has_events:
+        _write(w, form, "pull_moved", _moved(form, asked))
+
+
+def write_pulled_rates(w: Writer, form: Form, asked: Sequence[int]) -> None:
+    """`pull_rates` alone."""
+    nodes = rates_of(form)
+    _write(w, form, "pull_rates", pulled_program(form, nodes, asked, len(nodes)))
 
 
 def steps_of(form: Form) -> dict[str, list[int]]:
@@ -38,14 +65,52 @@ def steps_of(form: Form) -> dict[str, list[int]]:
     return found | ({"events": list(program.events)} if form.has_events else {})
 
 
-def pulled_program(form: Form, nodes: Sequence[int], asked: Sequence[int]) -> tuple[Graph, list[int], list[int], list[int]]:
-    """A program on a graph of its own: the cotangents of the state and of what is asked for, the variables, and inputs for the cotangents of the nodes."""
-    program, first = form.program, len(form.program.fixed) + 1
-    graph, values, variables = on_its_own(program.graph, nodes, program.variables)
-    weights = [graph.input(f"cotangent {i}", True) for i in range(len(nodes))]
-    count = form.layout.coordinates + form.layout.speeds
-    others = [*variables[: first - 1], *variables[first + count :]]
-    return graph, cotangents(graph, values, weights, [*variables[first : first + count], *(others[i] for i in asked)]), variables, weights
+def pulled_program(form: Form, nodes: Sequence[int], asked: Sequence[int], pushed: int) -> Pulled:
+    """Through nodes, the first `pushed` of them with their tangents."""
+    own = outputs_of(form, nodes, pushed)
+    if not form.moving:
+        graph, values, variables = on_its_own(own.graph, own.values, own.variables)
+        own = own._replace(graph=graph, values=values, variables=variables)
+    pulled = {part * form.layout.y + i: n for part, each in enumerate([own.values, *own.tangents]) for i, n in enumerate(each)}
+    weights = {row: own.graph.input(f"cotangent {row}", True) for row in pulled}
+    return Pulled(own, cotangents(own.graph, pulled.values(), weights.values(), _varying(form, own, asked)), weights)
+
+
+def _varying(form: Form, own: Outputs, asked: Sequence[int]) -> list[int]:
+    """The nodes of the state, with its tangent, and of what is asked for."""
+    first, count = len(form.program.fixed), form.layout.coordinates + form.layout.speeds
+    others = [*own.variables[:first], *own.variables[first + 1 + count :]]
+    return [*own.variables[first + 1 : first + 1 + count], *(n for part in own.states for n in part), *(others[i] for i in asked)]
+
+
+def _moved(form: Form, asked: Sequence[int]) -> Pulled:
+    """Through what a stop event adds to the tangent of a state at a number for a time, and through the tangent of its time,
+
+        dt = -dc/cdot,   dy <- dy + f dt,   dc = dc/dy dy + dc/dp dp,   cdot = dc/dt + dc/dy f
+
+    The row after the state is that of dt; after what is asked for comes the derivative of all along time.
+    """
+    nodes, layout, program = rates_of(form), form.layout, form.program
+    own = outputs_of(form, [*nodes, *program.events], len(nodes) + layout.events)
+    graph, first, count = own.graph, len(program.fixed), layout.coordinates + layout.speeds
+    f, c, dc = own.values[: len(nodes)], own.values[len(nodes) :], own.tangents[0][len(nodes) :]
+    along = dict(zip(own.variables[first : first + 1 + count], [graph.one, *f[:count]], strict=True))
+    slopes = [rate.get(0, graph.zero) for rate in directional_derivative(graph, c, {0: along})]
+    rows = [layout.integrated, *(layout.y + i for i in range(len(nodes))), layout.integrated + 1]
+    to_dt, *to_dy, which = weights = [graph.input(f"cotangent {row}", True) for row in rows]
+    total, rate, slope = to_dt, dc[0], slopes[0]
+    for g, x in zip(to_dy, f, strict=True):
+        total = graph.add(total, graph.mul(g, x))
+    for i in range(1, layout.events):
+        happens = graph.call("eq", which, graph.const(float(i)))
+        rate, slope = graph.call("select", happens, dc[i], rate), graph.call("select", happens, slopes[i], slope)
+    by_dt = graph.neg(graph.div(graph.mul(total, rate), slope))
+    times = [own.variables[first], *(own.variables[len(own.variables) - len(program.inputs) + i] for i in form.sampled)]
+    found = cotangents(graph, [by_dt], [graph.one], [*_varying(form, own, asked), *times])
+    by_time, *by_inputs = found[len(found) - len(times) :]
+    for n, rate in zip(by_inputs, own.slopes, strict=True):
+        by_time = graph.add(by_time, graph.mul(n, rate))
+    return Pulled(own, [*found[: len(found) - len(times)], by_time], dict(zip(rows, weights, strict=True)))
 
 
 def _state_nodes(form: Form) -> list[int]:
@@ -53,17 +118,17 @@ def _state_nodes(form: Form) -> list[int]:
     return form.program.variables[first : first + form.layout.coordinates + form.layout.speeds]
 
 
-def _write(w: Writer, form: Form, name: str, nodes: Sequence[int], asked: Sequence[int], work_stays: bool = False) -> None:
-    graph, found, variables, weights = pulled_program(form, nodes, asked)
-    count, work = form.layout.coordinates + form.layout.speeds, form.layout.with_work
+def _write(w: Writer, form: Form, name: str, pulled: Pulled, work_stays: bool = False) -> None:
+    layout, each = form.layout, form.layout.coordinates + form.layout.speeds
+    end = each * (1 + len(form.moving))
     with w.function(name, "void", dict.fromkeys(_ARGUMENTS, "ptr") | {"tau": w.real}, attributes="noinline") as (state, tau, y, g, to_y, to_known):
-        given = dict(zip(variables, known_values(w, form, state, tau, y).values(), strict=True))
-        given |= {n: w.load(w.real, g, i) for i, n in enumerate(weights)}
-        for i, x in written_in_turn(w, graph, found, given):
-            if i < count:
-                w.store(as_real(w, x), to_y, i)
+        given = given_values(w, form, pulled.own, known_values(w, form, state, tau, y), state, tau, y)
+        given |= {n: w.load(w.real, g, row) for row, n in pulled.weights.items()}
+        for i, x in written_in_turn(w, pulled.graph, pulled.found, given):
+            if i < end:
+                w.store(as_real(w, x), to_y, i // each * layout.y + i % each)
             else:
-                w.store(w.load(w.real, to_known, i - count) + as_real(w, x), to_known, i - count)
-        if work:
-            w.store(w.load(w.real, g, count) if work_stays else w.number(0.0), to_y, count)
+                w.store(w.load(w.real, to_known, i - end) + as_real(w, x), to_known, i - end)
+        for row in range(each, layout.integrated, layout.y) if layout.with_work else ():
+            w.store(w.load(w.real, g, row) if work_stays else w.number(0.0), to_y, row)
         w.give()
