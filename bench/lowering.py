@@ -342,7 +342,7 @@ class IteratedDisc(TiltingDisc):
         return (*super().loads(motion), jj.generalized_force(motion, spin_rate=-0.01 * root))
 
 
-def kept_parts(quick: bool) -> Iterator[Figure]:
+def opaque_calls(quick: bool) -> Iterator[Figure]:
     """2 s of a disc with a load that has no scalar form, alone and in a batch of 1024: our dense path relative to the lowered scene with a call."""
     if quick:
         return
@@ -452,7 +452,7 @@ def limit(quick: bool) -> Iterator[Figure]:
 
 FIGURES = {
     f.__name__: f
-    for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, second_derivatives, named_starts, cold_starts, growth, kept_parts, limit)
+    for f in (operation_ratios, evaluation_ratios, disc_motions, gradients, second_derivatives, named_starts, cold_starts, growth, opaque_calls, limit)
 }
 
 

@@ -1,6 +1,6 @@
 """How far estimates are spread over repeats of an experiment: the parametric bootstrap.
 
-    value* = prediction + sigma e       e of variance one: normal, Student's t under that loss, with the memory that the noise was fitted with
+    value* = prediction + sigma e       e: standard normal, or Student's t under that loss, with the memory that the noise was fitted with
     mean*  = theta + S M^-1 e           of priors: they were measured, too, and are drawn anew about the estimates; S, M: see `joint_prior`
 
 Each repeat is fitted as the data were, from the estimates on. Ends of the 95 % interval are the 2.5 and 97.5 % quantiles of what is found, bias is its mean

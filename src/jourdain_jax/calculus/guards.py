@@ -33,7 +33,7 @@ THIRD_ORDER_MESSAGE = (
 )
 REVERSE_MESSAGE = (
     "`simulate` was differentiated in reverse mode (grad, vjp, jacrev), but its adjoint is forward-only. "
-    "Leave `adjoint` at its default (`diffrax.RecursiveCheckpointAdjoint()`) for reverse mode, or pass `diffrax.DirectAdjoint()` for both."
+    "Leave `adjoint` at its default, or pass `diffrax.RecursiveCheckpointAdjoint()`, for reverse mode; `diffrax.DirectAdjoint()` serves both."
 )
 
 

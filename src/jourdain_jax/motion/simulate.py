@@ -195,7 +195,7 @@ def _check_adjoint(adjoint) -> None:
     if adjoint is not None and isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "`adjoint` is a diffrax.BacksolveAdjoint, which solves the motion backwards: it leaves the constraints and loses digits; use "
-            "diffrax.RecursiveCheckpointAdjoint() (the default), diffrax.ForwardMode() or diffrax.DirectAdjoint()"
+            "the default one, diffrax.RecursiveCheckpointAdjoint(), diffrax.ForwardMode() or diffrax.DirectAdjoint()"
         )
 
 
