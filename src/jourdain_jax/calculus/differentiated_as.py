@@ -95,7 +95,7 @@ def _forward(differentiable: Callable, quick: Callable, rules: Rules | None, bac
             def by_either(leaves, found, cotangents):
                 g = jax.tree.unflatten(structure, put([None] * len(found), places, cotangents))
                 found = jax.tree.unflatten(structure, found)
-                return jax.tree.leaves(_pulled(backwards, rules, perturbed, given(leaves), found, g))
+                return jax.tree.leaves(eqx.filter(_pulled(backwards, rules, perturbed, given(leaves), found, g), perturbed))  # rules may give more
 
             return by_either
 
