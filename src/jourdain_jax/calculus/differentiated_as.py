@@ -18,6 +18,7 @@ from jourdain_jax.calculus.elsewhere import or_elsewhere
 from jourdain_jax.calculus.guards import SECOND_ORDER_BY_XLA_MESSAGE
 from jourdain_jax.calculus.lanes_first import lanes_first
 from jourdain_jax.calculus.linear_maps import put, shapes
+from jourdain_jax.calculus.promotion import with_usual_promotion
 
 
 class Rules(NamedTuple):
@@ -101,6 +102,7 @@ def _forward(differentiable: Callable, quick: Callable, rules: Rules | None, bac
         def reason_against_second(moving) -> str:
             return "" if serve(moving, 2, nothing) else SECOND_ORDER_BY_XLA_MESSAGE
 
+        @with_usual_promotion
         def rule(leaves, tangents):
             moving = [i for i, t in enumerate(tangents) if not isinstance(t, SymbolicZero)]
             along = [tangents[i] for i in moving]
@@ -143,11 +145,13 @@ def _reverse(differentiable: Callable, quick: Callable, rules: Rules | None) -> 
 
     # What is kept for the way back is the same whatever varies: under `jit`, JAX keeps one structure of it for all calls that share a trace.
     @own.def_fwd
+    @with_usual_promotion
     def forth(perturbed, arguments):
         found = own(arguments)
         return found, found
 
     @own.def_bwd
+    @with_usual_promotion
     def back(found, cotangents, perturbed, arguments):
         return _pulled(differentiable, rules, perturbed, arguments, found, jax.tree.map(_filled, found, cotangents, is_leaf=lambda x: x is None))
 

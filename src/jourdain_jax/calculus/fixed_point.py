@@ -18,6 +18,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from jourdain_jax.calculus.promotion import with_usual_promotion
+
 QUIET = 2  # steps in a row
 ROUND_OFF = 1e3  # units of it, relative to 1 + |x|: a change
 
@@ -38,6 +40,7 @@ def _iterated(of: tuple, *, step: Callable, most: int, prepare: Callable | None)
 
 
 @_iterated.def_jvp
+@with_usual_promotion
 def _iterated_jvp(primals, tangents, *, step, most, prepare):
     (of,), (along,) = primals, tangents
     (moving, _), (fixed, _) = moves, _ = eqx.partition(of, jax.tree.map(lambda d: d is not None, along, is_leaf=lambda d: d is None))

@@ -16,6 +16,7 @@ from jax.interpreters import ad, batching, mlir
 
 from jourdain_jax.calculus.guards import THIRD_ORDER_MESSAGE, DifferentiationModeError
 from jourdain_jax.calculus.lanes_first import lanes_of, with_lanes_first
+from jourdain_jax.calculus.promotion import with_usual_promotion
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +115,7 @@ def _pulled(cotangents, *values, linear: LinearMap, count: int):
     return [None] * count + linear.transposed()(values[:count], [ad.instantiate_zeros(ct) for ct in cotangents])
 
 
+@with_usual_promotion
 def _evaluated(*values, linear: LinearMap, count: int) -> list:
     return list(linear.apply(values[:count], values[count:]))
 

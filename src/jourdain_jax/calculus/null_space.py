@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.calculus.promotion import with_usual_promotion
 from jourdain_jax.calculus.pseudo_inverse import numerical_rank, pseudo_inverse
 
 
@@ -70,6 +71,7 @@ _basis = jax.custom_jvp(_masked, nondiff_argnums=(1, 2))
 
 
 @_basis.defjvp
+@with_usual_promotion
 def _basis_jvp(method, cutoff, primals, tangents):
     (A,), (dA,) = primals, tangents
     Z = _basis(A, method, cutoff)

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jourdain_jax.calculus.promotion import with_usual_promotion
+
 
 def rank_cutoff(dtype: jnp.dtype) -> float:
     """Singular values below this fraction of the largest one count as zero: 4096 units of round-off of `dtype`."""
@@ -50,6 +52,7 @@ def pseudo_inverse(A: Float[Array, "rows columns"], cutoff: float | None = None)
 
 
 @pseudo_inverse.defjvp
+@with_usual_promotion
 def _pseudo_inverse_jvp(cutoff, primals, tangents):
     (A,), (dA,) = primals, tangents
     P = pseudo_inverse(A, cutoff)

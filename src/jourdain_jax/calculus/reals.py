@@ -42,16 +42,20 @@ def checked_real(value, what: str, shape: tuple[int, ...] | None = None, *, advi
     """`value` as a floating-point array.
 
     **Arguments**
-    - `value`: a number, an array, or a list of numbers; integers are converted, floating-point arrays keep their type.
+    - `value`: a number, an array, or a list of numbers; integers and extended precision are converted, other floating-point arrays keep their type.
     - `what`: the thing in words, for the error.
     - `shape`: the shape it must have; None: any. Shapes are known while a function is traced: the check costs nothing at run time.
     - `advice`: what to do, for the error.
 
     **Raises** ValueError: no real numbers, or another shape.
     """
+    kind = getattr(value, "dtype", None)
     try:
-        array = value if isinstance(value, jax.Array) else jnp.asarray(np.asarray(value, real_type()) if type(value) is float else value)
+        convert = type(value) is float or kind == np.longdouble  # the latter JAX does not have
+        array = value if isinstance(value, jax.Array) else jnp.asarray(np.asarray(value, real_type()) if convert else value)
     except (TypeError, ValueError):
+        if kind == np.clongdouble:
+            _check(value, what, shape, advice)
         raise ValueError(f"{what} is {described(value)}, expected real numbers; {advice}") from None
     _check(array, what, shape, advice)
     return as_real(array)

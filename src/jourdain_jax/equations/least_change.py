@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jourdain_jax.calculus.promotion import with_usual_promotion
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.equations.reductions import cholesky
 from jourdain_jax.equations.scaling import row_scale, speed_scale
@@ -83,6 +84,7 @@ def _least_change(of: tuple, *, free, typical, cutoff, determined) -> Change:
 
 
 @_least_change.def_jvp
+@with_usual_promotion
 def _least_change_jvp(primals, tangents, *, free, typical, cutoff, determined):
     ((A, r, M),), ((dA, dr, dM),) = primals, tangents
     (x, K), mu, d, c, L, definite = _solved(A, r, M, free, typical, cutoff)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Hashable
 from functools import wraps
+from threading import Lock
 
 import jax
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from jourdain_jax.scene.scene import Scene
 
 MOST_CASES = 1024  # that are kept of one function
+_UNKNOWN = object()
 
 
 def once_per_class(describe: Callable, most: int = MOST_CASES) -> Callable:
@@ -17,15 +19,19 @@ def once_per_class(describe: Callable, most: int = MOST_CASES) -> Callable:
     `most`: cases that are kept.
     """
     known: dict = {}
+    keeping = Lock()  # threads may ask at the same time; they may work the same out
 
     @wraps(describe)
     def of(scene: Scene, *case: Hashable):
         leaves, treedef = jax.tree.flatten(scene)
         key = (treedef, tuple(np.shape(x) for x in leaves), jax.config.jax_enable_x64, case)
-        if key not in known:
-            if len(known) >= most:
-                known.pop(next(iter(known)))  # the oldest
-            known[key] = describe(scene, *case)
-        return known[key]
+        found = known.get(key, _UNKNOWN)
+        if found is _UNKNOWN:
+            found = describe(scene, *case)
+            with keeping:
+                known[key] = found
+                if len(known) > most:
+                    known.pop(next(iter(known)))  # the oldest
+        return found
 
     return of

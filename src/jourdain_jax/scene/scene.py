@@ -4,6 +4,7 @@ them and what holds them. Everything else (velocities, partial velocities, mass 
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
+from threading import RLock
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -30,18 +31,20 @@ class _SceneClass(type(eqx.Module)):  # type: ignore[misc]
     """Every scene carries what its methods read as a part of its structure; the fields that `dataclasses.fields` lists are those that its author wrote."""
 
     hidden: ClassVar[dict] = {}
+    building: ClassVar = RLock()  # one class at a time: the fields of its bases change meanwhile
 
     def __new__(mcs, name, bases, namespace, **options):
         """The class, built with that field and shown without it."""
         scenes = {kind for base in bases for kind in base.__mro__ if isinstance(kind, mcs)}
-        for kind in scenes:
-            kind.__dataclass_fields__.update(mcs.hidden)
-        try:
-            new = super().__new__(mcs, name, bases, namespace, **options)
-        finally:
+        with mcs.building:
             for kind in scenes:
-                kind.__dataclass_fields__.pop("_read", None)
-        mcs.hidden["_read"] = new.__dataclass_fields__.pop("_read")
+                kind.__dataclass_fields__.update(mcs.hidden)
+            try:
+                new = super().__new__(mcs, name, bases, namespace, **options)
+            finally:
+                for kind in scenes:
+                    kind.__dataclass_fields__.pop("_read", None)
+            mcs.hidden["_read"] = new.__dataclass_fields__.pop("_read")
         return new
 
 

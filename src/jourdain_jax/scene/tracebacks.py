@@ -13,6 +13,8 @@ from typing import TypeVar
 
 import jax
 
+from jourdain_jax.calculus.promotion import with_usual_promotion
+
 F = TypeVar("F", bound=Callable)
 _OURS = str(Path(__file__).parents[1])
 _INSTALLED = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
@@ -20,13 +22,14 @@ _NOTE = "Lines of jourdain_jax between yours are left out of this traceback; JAX
 
 
 def shown_from_users_lines(function: F) -> F:
-    """The function, whose errors show users' lines where any of these was on the way: a method of a scene, an input, an event."""
+    """The function, whose errors show users' lines where any of these was on the way: a method of a scene, an input, an event; in usual modes of promotion."""
 
     @functools.wraps(function)
     def called(*args, **kwargs):
         __tracebackhide__ = True  # for IPython and pytest
         try:
-            return function(*args, **kwargs)
+            usual = jax.config.jax_numpy_dtype_promotion == "standard" and jax.config.jax_numpy_rank_promotion == "allow"
+            return (function if usual else with_usual_promotion(function))(*args, **kwargs)
         except Exception as error:
             if not _is_shortened(error):
                 raise

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jourdain_jax.calculus.promotion import with_usual_promotion
 from jourdain_jax.motion.integrators import step_adjoint
 from jourdain_jax.motion.integrators.erk_step import LOCATING, Method, Problem, Progress, advanced, begun, running, standing
 from jourdain_jax.motion.integrators.event_search import MOST_STEPS, chosen, is_flat
@@ -105,6 +106,7 @@ def _motion(moving, control, forward, method):
 
 
 @_motion.def_fwd
+@with_usual_promotion
 def _recorded(perturbed, moving, control, forward, method):
     *_, y0, t0, goals = moving
     problem = _problem(moving, control)
@@ -148,6 +150,7 @@ def _before_event(p: Progress, kept: Progress) -> Progress:
 
 
 @_motion.def_bwd
+@with_usual_promotion
 def _vjp(residuals, cotangents, perturbed, moving, control, forward, method):
     record, reached, end, slope = residuals
     shared, events, knots, y0, t0, goals = moving

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jourdain_jax.build.structure import structure_of, usual_rows
+from jourdain_jax.calculus.promotion import with_usual_promotion
 from jourdain_jax.calculus.reals import checked_real, is_traced
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions, contact_forces, row_reactions
@@ -54,6 +55,7 @@ class Record(Protocol):
     projected: bool
 
 
+@with_usual_promotion
 def map_over_times(f, record: Record, by_inputs: bool = False):
     """`f(scene, t, q, u, inputs)` at all times; NaN at times that were not reached. f must be a named function or a module (it is a cache key).
 
@@ -92,6 +94,7 @@ def _largest_block(record: Record) -> int:
     return max(1, MOST_ENTRIES // record.q.shape[-1] ** 2)
 
 
+@with_usual_promotion
 def uncompiled_over_times(f, record: Record, by_inputs: bool = False):
     """As `map_over_times`, of one motion, on NumPy: compiling a function takes longer than running it once."""
     by_time, size = (record.ts, record.q, record.u), _largest_block(record)
