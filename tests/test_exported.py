@@ -8,6 +8,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.elsewhere import or_elsewhere
+from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.native import ffi
 
 SKATE = jj.models.Skate()
@@ -55,6 +56,11 @@ def test_derivatives_in_forward_mode_are_exported():
 def test_second_derivatives_are_exported():
     second = jax.jit(jax.jacfwd(jax.jacfwd(lambda speed: _places(speed, adjoint=diffrax.ForwardMode()))))
     np.testing.assert_allclose(_exported(second, 1.0).call(1.0), second(1.0), rtol=1e-9, atol=1e-12)
+
+
+def test_an_exported_program_says_that_it_has_no_hessian_by_the_default_adjoint():
+    with pytest.raises(DifferentiationModeError, match=r"exported programs.* pass `adjoint=diffrax\.DirectAdjoint"):
+        _exported(jax.hessian(_total), 1.0)
 
 
 def test_the_device_of_the_program_decides_not_that_of_the_process():

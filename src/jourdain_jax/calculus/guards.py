@@ -14,13 +14,13 @@ from jax.interpreters import ad, batching, mlir
 
 FORWARD_MESSAGE = (
     "`simulate` was differentiated in forward mode (jvp, jacfwd, hessian), but its adjoint is reverse-only. "
-    'Leave `adjoint` at its default for both modes where machine code integrates (not with `backend="xla"`); elsewhere '
+    'Leave `adjoint` at its default for both modes where machine code integrates (not with `backend="xla"` or in exported programs); elsewhere '
     "pass `adjoint=diffrax.ForwardMode()` for forward mode (cheapest for up to about 30 parameters), or "
     "`adjoint=diffrax.DirectAdjoint()` for both modes and second derivatives; or use reverse mode (jax.grad, jax.vjp)."
 )
 SECOND_ORDER_MESSAGE = (
     "`simulate` was differentiated twice, but its adjoint supports first derivatives in reverse mode only. "
-    'Leave `adjoint` at its default for second derivatives in any mode where machine code integrates (not with `backend="xla"`); pass '
+    'Leave `adjoint` at its default for second derivatives in any mode where machine code integrates (not with `backend="xla"` or in exported programs); pass '
     "`adjoint=diffrax.DirectAdjoint()` for them elsewhere, or `adjoint=diffrax.ForwardMode()` for forward-over-forward (jax.jacfwd(jax.jacfwd(f)))."
 )
 SECOND_ORDER_BY_XLA_MESSAGE = (
