@@ -214,25 +214,37 @@ def gradients(quick: bool) -> Iterator[Figure]:
 
 
 def second_derivatives(quick: bool) -> Iterator[Figure]:
-    """Second derivatives of a final-state loss by 8 numbers, forward over forward, relative to one solve at the same tolerance; what they take to compile."""
+    """Second derivatives of a final-state loss by 8 numbers in two ways, relative to one solve at the same tolerance; what each takes to compile."""
     for name in ("tilting-disc",) if quick else BY_EIGHT:
         losses, values = final_losses(name)
         x = jnp.asarray(values)
 
-        def loss(x, losses=losses):
+        def forward(x, losses=losses):
             return losses(x[None], diffrax.ForwardMode())[0]
 
-        runs = {"solve": jax.jit(loss).lower(x).compile()}
-        begin = time.process_time()
-        runs["second"] = jax.jit(jax.jacfwd(jax.jacfwd(loss))).lower(x).compile()
-        seconds = time.process_time() - begin
-        found, slope, step = np.asarray(runs["second"](x)), jax.jit(jax.jacfwd(loss)), 1e-4 * np.diag(np.maximum(np.abs(values), 0.1))
+        def both(x, losses=losses):
+            return losses(x[None], None)[0]
+
+        def with_vector(x, v, both=both):
+            return jax.jvp(jax.grad(both), (x,), (v,))[1]
+
+        slope, step = jax.jit(jax.jacfwd(forward)), 1e-4 * np.diag(np.maximum(np.abs(values), 0.1))
         differences = np.stack([(slope(x + h) - slope(x - h)) / (2 * np.sum(h)) for h in step])
-        np.testing.assert_allclose(found, differences, rtol=1e-4, atol=1e-4 * np.max(np.abs(found)))
-        timed = least_processor_time({way: lambda run=run, x=x: jax.block_until_ready(run(x)) for way, run in runs.items()}, 7)
-        print(f"  {name}: second derivatives with respect to 8 numbers compiled in {seconds:.1f} s, {1e3 * timed['second']:.3f} ms", flush=True)
-        yield figure("trace and compile second derivatives with respect to 8 numbers, s", name, seconds, 20, 10)
-        yield figure("second derivatives with respect to 8 numbers / one solve", name, timed["second"] / timed["solve"], 64, 32)
+        runs, seconds = {}, {}
+        ways = {"solve": (forward, x), "jacfwd of jacfwd": (jax.jacfwd(jax.jacfwd(forward)), x), "hessian": (jax.hessian(both), x)}
+        for way, (f, *arguments) in (ways | {"hessian times a vector": (with_vector, x, x)}).items():
+            begin = time.process_time()
+            run = jax.jit(f).lower(*arguments).compile()
+            seconds[way] = time.process_time() - begin
+            runs[way] = lambda run=run, arguments=arguments: jax.block_until_ready(run(*arguments))
+        scale = np.max(np.abs(differences))
+        for way, expected in (("jacfwd of jacfwd", differences), ("hessian", differences), ("hessian times a vector", differences @ x)):
+            np.testing.assert_allclose(runs[way](), expected, rtol=1e-4, atol=1e-4 * scale)
+        timed = least_processor_time(runs, 7)
+        for way in ("jacfwd of jacfwd", "hessian", "hessian times a vector"):
+            print(f"  {name}: {way} with respect to 8 numbers compiled in {seconds[way]:.1f} s, {1e3 * timed[way]:.3f} ms", flush=True)
+            yield figure(f"trace and compile second derivatives with respect to 8 numbers, {way}, s", name, seconds[way], 20, 10)
+            yield figure(f"second derivatives with respect to 8 numbers, {way} / one solve", name, timed[way] / timed["solve"], 64, 32)
 
 
 NAMED = {

@@ -201,10 +201,12 @@ def a_hessian_with_respect_to_times():
     weights = jnp.cos(1.0 + jnp.arange(5.0))
 
     def seen(x):
-        return weights @ pushed(x["x"], 0.4, x["k"], ts=x["ts"]).ys.q[:, 0]
+        found = pushed(x["x"], 0.4, x["k"], ts=x["ts"]).ys
+        return weights @ (found.q[:, 0] + 0.3 * found.v[:, 0])
 
     def closed(x):
-        return weights @ pushed_position(x["ts"], x["x"], 0.4, x["k"])
+        position = lambda t: pushed_position(t, x["x"], 0.4, x["k"])  # noqa: E731
+        return weights @ (position(x["ts"]) + 0.3 * jax.vmap(jax.grad(position))(x["ts"]))
 
     _differentiated_twice(jax.hessian, seen, closed, {"x": 0.7, "k": 4.0, "ts": jnp.asarray(TIMES)})
 
@@ -295,7 +297,7 @@ MUTANTS = [
         "flow_back",
         "jnp.concatenate([dg, g], axis=1)",
         "jnp.concatenate([dg, dg], axis=1)",
-        BENT,
+        TIMES_BENT,
         WRONG,
     ),
     Mutant("goals that do not move cotangents", native_motion, "flow_back", "dg + by_states[:, :n]", "dg", TIMES_BENT, WRONG),

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Jaxpr, Primitive
+from jax.extend.core import ClosedJaxpr, Jaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 
 
@@ -53,7 +53,7 @@ def _bound(here: Callable, elsewhere: Callable, values: Sequence) -> list:
 
 def _as_function(here: Jaxpr) -> Callable:
     count = len(here.constvars)
-    return lambda *values: jax.core.eval_jaxpr(here, values[:count], *values[count:])
+    return lambda *values: jaxpr_as_fun(ClosedJaxpr(here, values[:count]))(*values[count:])
 
 
 def _lowered(ctx, *values, here, elsewhere):

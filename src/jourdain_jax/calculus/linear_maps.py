@@ -123,7 +123,7 @@ def _evaluated(*values, linear: LinearMap, count: int) -> list:
 linear_map_p = Primitive("jourdain_linear_map")
 linear_map_p.multiple_results = True
 linear_map_p.def_impl(_evaluated)
-linear_map_p.def_abstract_eval(lambda *avals, linear, count: [jax.core.ShapedArray(x.shape, x.dtype) for x in linear.shapes])
+linear_map_p.def_abstract_eval(lambda *avals, linear, count: [avals[-1].update(shape=x.shape, dtype=x.dtype, weak_type=False) for x in linear.shapes])
 ad.primitive_jvps[linear_map_p] = _pushed
 ad.primitive_transposes[linear_map_p] = _pulled
 batching.primitive_batchers[linear_map_p] = _batched

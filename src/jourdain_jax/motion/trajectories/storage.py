@@ -152,8 +152,8 @@ def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout
     longest = max(len(times) for times, _ in lanes)  # lanes with fewer are filled up with their last sample
     arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in lanes])
     arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in lanes])
-    reruns = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header["reruns"])
-    return Rollout(_lanes(path, kind, header, arrays), continued, reruns)
+    ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header["reruns"])
+    return Rollout(_lanes(path, kind, header, arrays), continued, ways)
 
 
 def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
@@ -226,8 +226,6 @@ def _read(path, kind: str) -> tuple[dict, dict]:
         raise ValueError(f"there is no file `{path}`; check the path") from None
     except (OSError, ValueError, TypeError, AttributeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ValueError(f"`{path}` is no {kind} file, or is damaged ({error}); expected an .npz written by `save`") from None
-    if "ways" in header:  # as `reruns` was called until November 2026
-        header["reruns"] = header.pop("ways")
     if header.get("format") != 1 or isinstance(header["format"], bool):
         raise ValueError(f"`{path}` has format {header.get('format')}, expected 1; read it with the version of jourdain-jax that wrote it")
     found = header.get("kind")
