@@ -152,9 +152,14 @@ def _here(params, inputs) -> list[np.ndarray]:
     return _run(ClosedJaxpr(params["here"], inputs[:count]), inputs[count:])
 
 
+def _linear_map(params, inputs) -> list[np.ndarray]:
+    return uncompiled(params["linear"].apply)(inputs[: params["count"]], inputs[params["count"] :])
+
+
 _CONTROL: dict[str, Callable] = {
     "scan": _scan,
     "cond": _cond,
+    "jourdain_linear_map": _linear_map,
     "jourdain_or_elsewhere": _here,
     "custom_lin": lambda params, inputs: inputs,
     "custom_linear_solve": _linear_solve,

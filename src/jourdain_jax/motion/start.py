@@ -115,7 +115,7 @@ def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable
     given = scene, t, q, u, inputs, free_q, free_u
     arguments = *given, usual_sizes(scene, determined, native)
     if not nothing_is_traced() and is_traced(given):
-        return _put_onto_constraints(*arguments, guesses()).state
+        return _compiled_projection(*arguments, guesses()).state
     # numbers are put onto the rows at once, also where a function around this call is being traced; elsewhere that would compile constants one by one
     with nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval():
         found = _compiled_projection(*arguments, None)
