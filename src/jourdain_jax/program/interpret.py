@@ -12,9 +12,8 @@ from typing import TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal
 
-from jourdain_jax.calculus.jaxprs import called
+from jourdain_jax.calculus.jaxprs import called, evaluated
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.eager.numpy_backend import applied
 from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
@@ -38,18 +37,7 @@ Value: TypeAlias = Nodes | np.ndarray
 
 def interpret(graph: Graph, closed, arguments: list[Value]) -> list[Value]:
     """Outputs of a closed jaxpr at the given arguments."""
-    jaxpr = closed.jaxpr
-    environment: dict = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
-
-    def read(atom):
-        return np.asarray(atom.val) if isinstance(atom, Literal) else environment[atom]
-
-    for equation in jaxpr.eqns:
-        name, inputs = equation.primitive.name, [read(x) for x in equation.invars]
-        results = apply(graph, name, equation, inputs)
-        for variable, result in zip(equation.outvars, results, strict=True):
-            environment[variable] = result
-    return [read(x) for x in jaxpr.outvars]
+    return evaluated(closed, arguments, lambda equation, inputs: apply(graph, equation, inputs), lambda x, aval: np.asarray(x))
 
 
 def effects_of(jaxpr) -> str:
@@ -70,9 +58,10 @@ def as_nodes(graph: Graph, value: Value) -> np.ndarray:
     return np.array([graph.const(x) for x in np.ravel(value)], dtype=np.int64).reshape(np.shape(value))
 
 
-def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
+def apply(graph: Graph, equation, inputs) -> list[Value]:
     """Results of one equation."""
-    refuse(name, equation)
+    name = equation.primitive.name
+    refuse(equation)
     if graph.keeps_rules and (rule := own_rule(name, equation.params)) and any(isinstance(x, Nodes) for x in inputs):
         raise Unsupported(rule)
     inner = called(name, equation.params)
@@ -106,10 +95,10 @@ def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
     raise Unsupported(f"the operation `{name}`")
 
 
-def refuse(name: str, equation) -> None:
+def refuse(equation) -> None:
     """ValueError where an equation can be no part of a scene."""
     if any(jnp.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in (*equation.invars, *equation.outvars)):
-        raise ValueError(f"a method of the scene draws random numbers (`{name}`); draw them outside, and give them as parameters or inputs")
+        raise ValueError(f"a method of the scene draws random numbers (`{equation.primitive.name}`); draw them outside, and give them as parameters or inputs")
 
 
 def own_rule(name: str, params) -> str:

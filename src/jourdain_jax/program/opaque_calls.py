@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
-from jourdain_jax.calculus.jaxprs import called
+from jourdain_jax.calculus.jaxprs import called, evaluated
 from jourdain_jax.program.calls import Call
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, Value, apply, refuse
@@ -88,7 +88,7 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
     values: dict = dict(zip(inputs, arguments, strict=True)) | numbers
     for step in sorted(steps, key=lambda step: (step.level, not step.opaque)):  # otherwise in the order in which they came
         if not step.opaque:
-            results = apply(graph, step.equation.primitive.name, step.equation, [values[x] if isinstance(x, _Variable) else x for x in step.inputs])
+            results = apply(graph, step.equation, [values[x] if isinstance(x, _Variable) else x for x in step.inputs])
             values |= dict(zip(step.outputs, results, strict=True))
         elif step is step.part[0]:
             values |= _called(graph, step.part, values, users, asked)
@@ -97,23 +97,17 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
 
 def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
     """Appends all equations, those of inner jaxprs in their place; functions with derivatives of their own stay whole."""
-    jaxpr = closed.jaxpr
-    environment = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
 
-    def read(atom):
-        return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else environment[atom]
-
-    for equation in jaxpr.eqns:
-        name, inputs = equation.primitive.name, [read(x) for x in equation.invars]
-        refuse(name, equation)
+    def results(equation, inputs: list) -> list:
+        name = equation.primitive.name
+        refuse(equation)
         inner = None if name.startswith("custom_") else called(name, equation.params)
-        if inner is None:
-            results = [_Variable(v.aval) for v in equation.outvars]
-            steps.append(_Step(equation, jaxpr, inputs, results))
-        else:
-            results = _flat(inner, inputs, steps)
-        environment |= dict(zip(equation.outvars, results, strict=True))
-    return [read(x) for x in jaxpr.outvars]
+        if inner is not None:
+            return _flat(inner, inputs, steps)
+        steps.append(_Step(equation, closed.jaxpr, inputs, [_Variable(v.aval) for v in equation.outvars]))
+        return steps[-1].outputs
+
+    return evaluated(closed, arguments, results)
 
 
 def _needed(steps: list[_Step], outputs: list) -> list[_Step]:
@@ -147,7 +141,7 @@ def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict
                 raise Unsupported("")  # it follows an opaque one
             if size > LARGEST and any(isinstance(x, Nodes) for x in given):
                 raise Unsupported(f"an array of {size} numbers")
-            results = apply(scratch, step.equation.primitive.name, step.equation, given)
+            results = apply(scratch, step.equation, given)
         except Unsupported as reason:
             step.opaque, step.reason = True, str(reason)
             results = [introduce(v) for v in step.outputs]
