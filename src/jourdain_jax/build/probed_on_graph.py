@@ -20,6 +20,7 @@ from jourdain_jax.build.probed import Probed, generic_inputs
 from jourdain_jax.build.row_lengths import speed_scales
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.calculus.sparse_slopes import Pattern
+from jourdain_jax.equations.virtual_power import mass_matrix
 from jourdain_jax.program.analyticity import CALLS, NONANALYTIC, decided_by, depend_on, passes
 from jourdain_jax.program.derivative import derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes
@@ -205,10 +206,9 @@ class _AtStates:
 
     def _mass_matrix(self) -> np.ndarray:
         """`M = sum m beta' beta + gamma' I gamma`."""
-        beta, gamma = np.split(self._matrices(self.values, self.nodes.velocities, self.traced.u.tolist()), 2, axis=1)
         mass, inertia = self._at(self.traced.at.mass), self._at(self.traced.at.inertia)
-        turned = np.einsum("sbij,sbjk->sbik", inertia, gamma.reshape(*inertia.shape[:-1], -1)).reshape(gamma.shape)
-        return np.swapaxes(beta, 1, 2) @ (np.repeat(mass, 3, axis=1)[..., None] * beta) + np.swapaxes(gamma, 1, 2) @ turned
+        partial = self._matrices(self.values, self.nodes.velocities, self.traced.u.tolist())
+        return mass_matrix(mass, inertia, *np.moveaxis(partial.reshape(len(partial), 2, *self.traced.at.v.shape, -1), 1, 0))
 
     def speeds_on_rows(self) -> np.ndarray:
         """`u <- u - M^-1 A' (A M^-1 A')+ phi`, in scaled speeds."""

@@ -12,7 +12,6 @@ The same graph serves probing (`probed_on_graph`) and lowering. What JAX traced 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -22,7 +21,7 @@ from jaxtyping import Array, Float, Num, PyTree
 
 from jourdain_jax.build.explicit_power import explicit_power
 from jourdain_jax.build.plausibility import PoseNumbers, numbers_of
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import Entries, is_traced
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, velocities_of
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import energies_at, impressed, potential_energy, resultants
@@ -34,8 +33,6 @@ from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import events_of, loads_of
 from jourdain_jax.scene.what_is_read import names_of_what_is_traced
-
-Entries: TypeAlias = Array | np.ndarray
 
 
 class VelocityQuantities(eqx.Module):
