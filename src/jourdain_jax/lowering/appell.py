@@ -19,7 +19,7 @@ from jourdain_jax.build.trace import TracedScene, VelocityQuantities
 from jourdain_jax.lowering.elimination import eliminate, pivots_ok, solve_symmetric
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.multipliers import projected_coordinates
-from jourdain_jax.program.derivative import columns, derivatives, directional_derivative, jacobian
+from jourdain_jax.program.derivative import columns, derivatives, directional_derivative, jacobian, matrix
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.identity_test import IdentityProbes, equal, identity_probes, on_rows, unaffected
 from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
@@ -98,11 +98,9 @@ class AppellOnGraph:
         if self.kept and self.multiplied:
             ydot, sines, margins, usual = self.kept.accelerations(M, f, *kinematics.rows_along_motion(self.multiplied), forms)
         else:
-            ydot, sines, margins = self._solved(M, f, forms_of_equations if strategy.by_determinants else None), [], []
-            usual = {}
+            ydot, sines, margins, usual = self._solved(M, f, forms_of_equations, strategy.by_determinants), [], [], {}
         z, qdot, pivots = self._true_rates(kinematics, forms) if held else (kinematics.z, kinematics.qdot, [])
-        guards = {node for made in (forms, forms_of_equations) if made is not None for node in made.guards}
-        guards |= set(margins)
+        guards = forms.guards | forms_of_equations.guards | set(margins)
         power = self._power(kinematics, ydot)
         if strategy.by_determinants:
             *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
@@ -164,21 +162,20 @@ class AppellOnGraph:
         u = dict(zip(self.dependent, k.z, strict=True)) | dict(zip(self.independent, k.y, strict=True))
         return g.sub(g.total(terms), g.total(g.mul(int(at.direct[i]), n) for i, n in u.items()))
 
-    def _solved(self, M, f, forms) -> list[int]:
-        if forms is not None and 1 <= len(f) <= 3:
+    def _solved(self, M, f, forms: NormalForms, by_determinants: bool) -> list[int]:
+        if by_determinants and 1 <= len(f) <= 3:
             try:
                 return forms.cramer(M, f)
             except TooLarge:
                 pass
         return solve_symmetric(self.graph, M, [f]).solution[0]
 
-    def _true_rates(self, kinematics: "_Kinematics", forms) -> tuple[list[int], list[int], list[int]]:
+    def _true_rates(self, kinematics: "_Kinematics", forms: NormalForms) -> tuple[list[int], list[int], list[int]]:
         """Dependent speeds and rates at the true coordinates: those that do not depend on held ones are taken over, the others follow."""
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
-        simple = (lambda nodes: list(nodes)) if forms is None else (lambda nodes: [forms.simplified(n) for n in nodes])
         phi = [int(at.phi[s]) for s in self.rows]
         phi = g.substituted(phi, unaffected(self.identity_probes, [*phi, *at.qdot.tolist()], kinematics.held))
-        A = [list(row) for row in zip(*columns(g, phi, u), strict=True)]
+        A = matrix(g, phi, u)
         phi_0 = g.substituted(phi, dict.fromkeys(u, g.zero))
         y = {k: u[k] for k in self.independent}
 
@@ -191,24 +188,21 @@ class AppellOnGraph:
         same = equal(generic(kinematics.z), generic([row[0] for row in whole.solution]), pivots_ok(whole.pivots, generic))
         known = y | {k: n for k, n, s in zip(self.dependent, kinematics.z, same, strict=True) if s}
         left = [k for k in self.dependent if k not in known]
-        A, phi_0 = [simple(row) for row in A], simple(phi_0)
+        A, phi_0 = [forms.all_simplified(row) for row in A], forms.all_simplified(phi_0)
         found = solved(left, known)
-        known |= {k: row[0] for k, row in zip(left, (simple(r) for r in found.solution), strict=True)}
+        known |= {k: row[0] for k, row in zip(left, map(forms.all_simplified, found.solution), strict=True)}
         z = [known[k] for k in self.dependent]
-        return z, simple(g.substituted(at.qdot.tolist(), {u[k]: n for k, n in known.items() if k not in self.independent})), found.pivots
+        return z, forms.all_simplified(g.substituted(at.qdot.tolist(), {u[k]: n for k, n in known.items() if k not in self.independent})), found.pivots
 
-    def _forms(self, most_terms: int):
-        if most_terms == 0:
-            return None
+    def _forms(self, most_terms: int) -> NormalForms:
         squares: dict[int, Polynomial] = {}
         for first in self.quaternions:
             w, *xyz = (int(n) for n in self.traced.q[first : first + 4])
             squares[w] = {(): 1.0} | {(n, n): -1.0 for n in xyz}
         return NormalForms(self.graph, most_terms, self.probes.sign, squares)
 
-    def _equations(self, k: "_Kinematics", forms) -> tuple[list[list[int]], list[int]]:
+    def _equations(self, k: "_Kinematics", forms: NormalForms) -> tuple[list[list[int]], list[int]]:
         g, at = self.graph, k.at
-        simple = (lambda node: node) if forms is None else forms.simplified
         freedoms = range(len(self.independent))
         inertia = at.inertia.tolist()
         M = [[g.zero] * len(freedoms) for _ in freedoms]
@@ -230,17 +224,18 @@ class AppellOnGraph:
                 for j in moving[: moving.index(i) + 1]:
                     M[i][j] = g.total([M[i][j], g.mul(mass, g.dot(beta[i], beta[j])), g.dot(gamma[j], turned)])
         for i in freedoms:
-            f[i] = simple(f[i])
+            f[i] = forms.simplified(f[i])
             for j in range(i + 1):
-                M[i][j] = M[j][i] = simple(M[i][j])
+                M[i][j] = M[j][i] = forms.simplified(M[i][j])
         return M, f
 
 
 class _Kinematics:
     """Velocities, partial velocities and accelerations at ydot = 0, with some coordinates held (after differentiation)."""
 
-    def __init__(self, build: AppellOnGraph, forms, held: dict[int, int], explicit: bool, free_z: bool = False):
+    def __init__(self, build: AppellOnGraph, forms: NormalForms, held: dict[int, int], explicit: bool, free_z: bool = False):
         self.build, self.graph, self.forms, self.held, self.free_z = build, build.graph, forms, held, free_z
+        self._simple = forms.all_simplified
         self.u, self.y = build.traced.u.tolist(), [int(build.traced.u[k]) for k in build.independent]
         self.phi = [int(build.traced.at.phi[s]) for s in build.rows]
         (self._explicitly if explicit else self._implicitly)()
@@ -248,12 +243,12 @@ class _Kinematics:
     # Explicit: the dependent speeds are put into the velocities, which are then differentiated.
 
     def _explicitly(self) -> None:
-        A = [list(row) for row in zip(*(self._at(column) for column in self._by(self.phi, self.u)), strict=True)]
+        A = [list(row) for row in zip(*(self._at(column) for column in columns(self.graph, self.phi, self.u)), strict=True)]
         self._solve(A, self._at(self.graph.substituted(self.phi, dict.fromkeys(self.u, self.graph.zero))))
         unheld = self.known if not self.held else _Kinematics(self.build, self.forms, {}, True).known
         raw, simple = self._velocities(unheld)
         self._quantities()
-        partial = [self._simple(column) for column in self._by(simple, self.y)]
+        partial = [self._simple(column) for column in columns(self.graph, simple, self.y)]
         self._shape(simple, partial, self._along(simple, raw, self.qdot))
 
     # Implicit: speeds are differentiated as they stand; the rows are differentiated through the velocities of the bodies they are made of.
@@ -262,7 +257,7 @@ class _Kinematics:
         g, build, at = self.graph, self.build, self.build.traced.at
         raw, simple = self._velocities({})
         qdot = self._at(at.qdot.tolist())
-        by_speed = [self._simple(column) for column in self._by(simple, self.u)]
+        by_speed = [self._simple(column) for column in columns(g, simple, self.u)]
         at_fixed_speeds = self._along(simple, raw, qdot)
         value = self._parts(simple)
         rotation = [self._simple(self._at(R.ravel().tolist())) for R in at.orientation]
@@ -318,21 +313,14 @@ class _Kinematics:
         """Jacobian in the speeds and drift of some rows, at the held coordinates."""
         raw = [int(self.build.traced.at.phi[s]) for s in rows]
         simple = self._at(raw)
-        columns = [self._simple(column) for column in self._by(simple, self.u)]
-        return [list(row) for row in zip(*columns, strict=True)], self._along(simple, raw, self.qdot)
+        by_speed = [self._simple(column) for column in columns(self.graph, simple, self.u)]
+        return [list(row) for row in zip(*by_speed, strict=True)], self._along(simple, raw, self.qdot)
 
     # helpers
-
-    def _simple(self, nodes):
-        return list(nodes) if self.forms is None else [self.forms.simplified(n) for n in nodes]
 
     def _at(self, nodes) -> list[int]:
         """Nodes at the held coordinates, simplified."""
         return self._simple(self.graph.substituted(nodes, self.held))
-
-    def _by(self, nodes, variables) -> list[list[int]]:
-        """Derivatives, one list per variable."""
-        return columns(self.graph, nodes, variables)
 
     def _turned(self, R, w) -> list[int]:
         if all(n == self.graph.zero for n in w):

@@ -98,6 +98,12 @@ def columns(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> l
     return [[row.get(n, graph.zero) for row in rows] for n in variables]
 
 
+def matrix(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[list[int]]:
+    """The Jacobian row by row, zeros among them."""
+    variables = list(variables)
+    return [[row.get(n, graph.zero) for n in variables] for row in jacobian(graph, outputs, variables)]
+
+
 def _derivative(graph: Graph, node: int, dots: list):
     """The rate of a node, given those of its arguments. That of an array is a tuple, entry by entry; that of a call a tuple of these."""
     op, args = graph.op[node], graph.args[node]

@@ -6,7 +6,7 @@ factors are taken out greedily (Horner's scheme in several variables).
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from jourdain_jax.program.graph import ARRAYS, Graph
 
@@ -21,6 +21,7 @@ class TooLarge(Exception):
 class NormalForms:
     """Normal forms of nodes of one graph; squares of sines are replaced by those of cosines (the other way took fewer operations in no model).
 
+    - `most_terms`: of a normal form; 0: none are made, and nodes stay as they are.
     - `sign`: 1, -1 or 0 (unknown) for a node: |x| becomes x or -x where it is known, and x is noted in `guards` (with its sign).
     - `squares`: atoms whose squares are other polynomials (one entry of a unit quaternion).
     """
@@ -47,8 +48,12 @@ class NormalForms:
             self._simplified[node] = self._smaller(node)
         return self._simplified[node]
 
+    def all_simplified(self, nodes: Iterable[int]) -> list[int]:
+        """Every node `simplified`."""
+        return [self.simplified(n) for n in nodes]
+
     def _smaller(self, node: int) -> int:
-        if self.graph.op[node] in ("const", "input"):
+        if not self.most_terms or self.graph.op[node] in ("const", "input"):
             return node
         try:
             form = self.rebuilt(self.expanded(node))
