@@ -64,11 +64,6 @@ class Particulars(eqx.Module):
     explicit: dict[str, PyTree]  # rates in time of loads and potentials while the motion is held
 
 
-def particulars_of(scene: Scene, motion: Motion) -> Particulars:
-    """What only probing looks at, computed on numbers."""
-    return Particulars(numbers_of(scene, motion), potentials_of(scene, motion), explicit_rates(scene, motion))
-
-
 def potentials_of(scene: Scene, motion: Motion) -> Float[Array, "loads"]:
     """The potential of each load, zero where it has none."""
     stored = [0.0 * motion.t if load.potential is None else load.potential for load in loads_of(scene, motion)]
@@ -134,6 +129,18 @@ class TracedScene(Variables):
     at: VelocityQuantities
     particulars: Particulars
     effects: str  # what in the scene does more than compute, as printing does; nothing: no part of it
+    quaternions: tuple[int, ...]  # the coordinate that is the first part of each
+
+    @property
+    def attitudes(self) -> list[list[int]]:
+        """The four parts of each quaternion."""
+        return [self.q[first : first + 4].tolist() for first in self.quaternions]
+
+    @property
+    def closures(self) -> list[int]:
+        """Geometric rows, and the unit norms of quaternions as rows."""
+        g = self.graph
+        return [*self.at.closure.tolist(), *(g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)) for wxyz in self.attitudes)]
 
     @property
     def motion(self) -> list[np.ndarray]:
@@ -168,7 +175,8 @@ def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
     def quantities(leaves, t, q, u, inputs):
         scene = jax.tree.unflatten(treedef, leaves)
         motion = motion_at(scene, t, q, u, inputs)
-        return velocity_quantities(scene, motion, of_inputs), particulars_of(scene, motion)
+        particulars = Particulars(numbers_of(scene, motion), potentials_of(scene, motion), explicit_rates(scene, motion))
+        return velocity_quantities(scene, motion, of_inputs), particulars
 
     closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
     if is_traced(closed.consts):
@@ -188,7 +196,8 @@ def _on_graph(scene: Scene, closed, shape, interpreted: Callable) -> TracedScene
     t, q, u, inputs = (_inputs(graph, name, size, True) for name, size in sizes.items())
     found = interpreted(graph, closed, [Nodes(x) for x in (*parameters, t, q, u, inputs)])
     at, particulars = jax.tree.unflatten(jax.tree.structure(shape), [as_nodes(graph, x) for x in found])
-    return TracedScene(graph, int(t), q, u, inputs, parameters, at, particulars, effects_of(closed.jaxpr))
+    quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
+    return TracedScene(graph, int(t), q, u, inputs, parameters, at, particulars, effects_of(closed.jaxpr), quaternions)
 
 
 def _inputs(graph: Graph, name: str, shape, varies: bool) -> np.ndarray:

@@ -201,7 +201,7 @@ def _dynamic_update_slice(equation, x, update, *starts):
 
 
 def _pad(equation, x, fill):
-    out = np.full(equation.outvars[0].aval.shape, fill, equation.outvars[0].aval.dtype)
+    out = np.full(equation.outvars[0].aval.shape, fill)
     places, kept = [], []
     for (low, _, interior), size, total in zip(equation.params["padding_config"], x.shape, out.shape, strict=True):
         at = low + (interior + 1) * np.arange(size)

@@ -5,8 +5,6 @@ C' M C ydot = C' (f - M c)                                                      
 z <- z + dz,   A_z dz = -phi(t, q, u)         speeds put back onto the rows
 """
 
-import numpy as np
-
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.lowering.elimination import eliminate, solve_symmetric
 from jourdain_jax.lowering.multipliers import Accelerations, Columns, accelerations_by_multipliers, projected_speeds, with_inertia_of_rows
@@ -69,9 +67,4 @@ class KeptRows:
         return Accelerations([graph.add(graph.dot([column[k] for column in C], ydot), c[k]) for k in speeds], found.pivots, [], {})
 
     def _inertia(self, M: Columns, A: Columns) -> Columns:
-        """M, with inertia added along the rows where it may be singular: of the size of its own."""
-        if not self.massless:
-            return M
-        heavy = np.nanmedian(np.max(np.abs(self.probes([row[i] for i, row in enumerate(M)])), axis=0))
-        sizes = [np.nanmedian(np.sum(self.probes(row) ** 2, axis=0)) for row in A]
-        return with_inertia_of_rows(self.graph, M, A, [float(2.0 ** np.round(np.log2(heavy / size))) if size > 0 else 1.0 for size in sizes])
+        return with_inertia_of_rows(self.graph, M, A, self.probes) if self.massless else M

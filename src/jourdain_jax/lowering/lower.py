@@ -129,10 +129,9 @@ def _built(key: _Key) -> Lowered:
         probes = _probes(scene, structure, traced)
         if every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
             probes = on_velocity_rows(probes, traced, structure.affine)
-        quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
-        far = full_turns(probes, traced, quaternions)
+        far = full_turns(probes, traced)
         kept = KeptRows(traced.graph, structure, key.massless, probes, far) if every_speed and structure.row_names else None
-        return _best(scene, structure, AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference(), quaternions))
+        return _best(scene, structure, AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference()))
     except Unsupported as reason:
         raise NotLowered(f"{reason} has no scalar form") from None
     except ZeroDivisionError:
@@ -193,9 +192,9 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered
         if count < fewest and agree(values_at(candidate, probes), expected):
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
-    put_back = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
+    put_q, put_u = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
     groups = {name: getattr(best, name) for name in ("qdot", "ydot", "z", "pivots", "guards", "power", "events", "energies")}
-    groups |= {"power": [best.power], "projected_q": put_back.q, "projected_u": put_back.u}
+    groups |= {"power": [best.power], "projected_q": put_q, "projected_u": put_u}
     outputs = graph.with_quotients(_with_equal_calls_once(builder.identity_probes, [n for group in groups.values() for n in group]))
     rest = iter(outputs)
     nodes = {name: tuple(islice(rest, len(group))) for name, group in groups.items()}

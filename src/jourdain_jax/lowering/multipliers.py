@@ -63,10 +63,13 @@ def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Colu
     return Accelerations(udot, sines, margins, usual)
 
 
-def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, weights: list[float]) -> Columns:
-    """`M + A' W A`, positive definite where M is for the velocities that the rows admit."""
+def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -> Columns:
+    """`M + A' W A`, positive definite where M is for the velocities that the rows admit; the inertia that is added is of the size of M's own."""
     made, speeds = [list(row) for row in M], range(len(M))
-    for w, row in zip(weights, A, strict=True):
+    heavy = np.nanmedian(np.max(np.abs(probes([row[i] for i, row in enumerate(M)])), axis=0))
+    for row in A:
+        size = np.nanmedian(np.sum(probes(row) ** 2, axis=0))
+        w = float(2.0 ** np.round(np.log2(heavy / size))) if size > 0 else 1.0
         weighted = [graph.mul(graph.const(w), n) for n in row]
         for i in (i for i in speeds if row[i] != graph.zero):
             for j in (j for j in speeds if row[j] != graph.zero):

@@ -139,7 +139,15 @@ AT_PROBES: dict[str, Callable] = {
 }
 
 
-def description(x, details: Callable = lambda equation: equation.params, of_other: Callable = lambda x: x if isinstance(x, Hashable) else id(x)) -> Hashable:
+def _itself(x) -> Hashable:
+    try:
+        hash(x)
+    except TypeError:
+        return id(x)
+    return x
+
+
+def description(x, details: Callable = lambda equation: equation.params, of_other: Callable = _itself) -> Hashable:
     """What tells a jaxpr, or a parameter of an operation, from another; two traces of one function have the same, unless they hold new functions.
 
     `details`: what tells an equation from others of the same operation; `of_other`: what tells a thing from others that is neither jaxpr nor array nor tuple.
@@ -152,12 +160,13 @@ def description(x, details: Callable = lambda equation: equation.params, of_othe
         return "closed", of(x.jaxpr), tuple(map(of, x.consts))
     if hasattr(x, "eqns"):
         number = {v: k for k, v in enumerate([*x.constvars, *x.invars])}
+        atom = lambda v: of(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else number[v]  # noqa: E731
         lines: list = [tuple(_said(v.aval) for v in number)]
         for equation in x.eqns:
-            inputs = tuple(of(v.val) if isinstance(v, Literal) else number[v] for v in equation.invars)
+            inputs = tuple(map(atom, equation.invars))
             number |= {v: len(number) + k for k, v in enumerate(equation.outvars)}
             lines.append((equation.primitive, inputs, of(details(equation)), tuple(_said(v.aval) for v in equation.outvars)))
-        return *lines, tuple(of(v.val) if isinstance(v, Literal) else number[v] for v in x.outvars)
+        return *lines, tuple(map(atom, x.outvars))
     if isinstance(x, dict):
         return tuple((key, of(value)) for key, value in sorted(x.items()))
     if isinstance(x, tuple | list):

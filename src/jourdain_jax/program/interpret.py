@@ -127,17 +127,12 @@ def _moved(graph: Graph, name: str, equation, inputs: list[Value]) -> list[np.nd
     return [_OF_NODES[name](graph, given, equation.params)] if name in _OF_NODES else applied(equation, given)
 
 
-def _places(x, primitive, *operands, **params):
-    """Where each entry of a gather comes from (or a scatter goes to): the primitive itself run on the positions."""
-    positions = np.arange(x.size, dtype=np.int32).reshape(x.shape)
-    with jax.ensure_compile_time_eval():
-        return np.asarray(primitive.bind(jnp.asarray(positions), *(jnp.asarray(o) for o in operands), **params))
-
-
 def _gather(graph, inputs, params):
+    """Where each entry comes from is what the operation makes of the positions."""
     x, indices = inputs
-    params = dict(params, fill_value=-1) if params.get("fill_value") is not None or "fill_value" in params else params
-    places = _places(x, jax.lax.gather_p, indices, **params)
+    with jax.ensure_compile_time_eval():
+        positions = jnp.arange(x.size, dtype=jnp.int32).reshape(x.shape)
+        places = np.asarray(jax.lax.gather_p.bind(positions, jnp.asarray(indices), **params | {"fill_value": -1}))
     if np.any(places < 0):
         raise Unsupported("an index out of bounds")
     return np.ravel(x)[places]
@@ -167,13 +162,6 @@ def _scatter_add(graph, inputs, params):
     return flat.reshape(x.shape)
 
 
-def _pad(graph, inputs, params):
-    x, fill = inputs
-    if any(interior or low < 0 or high < 0 for low, high, interior in params["padding_config"]):
-        raise Unsupported("the operation `pad` with gaps")
-    return np.pad(x, [(low, high) for low, high, _ in params["padding_config"]], constant_values=fill.item())
-
-
 def _same(graph, inputs, params):
     return inputs[0]
 
@@ -191,7 +179,6 @@ _OF_NODES: dict[str, Callable] = {
     "gather": _gather,
     "scatter": _scatter,
     "scatter-add": _scatter_add,
-    "pad": _pad,
     **dict.fromkeys(("copy", "copy_p", "stop_gradient"), _same),
 }
 

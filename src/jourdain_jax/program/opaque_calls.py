@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
-from jourdain_jax.calculus.jaxprs import called, evaluated
+from jourdain_jax.calculus.jaxprs import called, evaluated, needed_only
 from jourdain_jax.program.calls import Call
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, Value, apply, refuse
@@ -76,8 +76,7 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
     """Outputs of a closed jaxpr at the given arguments, as `interpret`, with calls for the parts that have no scalar form."""
     inputs: list[_Variable] = [_Variable(v.aval) for v in closed.jaxpr.invars]
     steps: list[_Step] = []
-    outputs = _flat(closed, inputs, steps)
-    steps = _needed(steps, outputs)
+    outputs = _flat(needed_only(closed), inputs, steps)
     numbers = _judged(Graph(graph.most_multiplications, graph.keeps_rules), steps, inputs)
     steps = [step for step in steps if any(v not in numbers for v in step.outputs)]
     for step in steps:
@@ -108,16 +107,6 @@ def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
         return steps[-1].outputs
 
     return evaluated(closed, arguments, results)
-
-
-def _needed(steps: list[_Step], outputs: list) -> list[_Step]:
-    """Those on which the outputs depend."""
-    wanted, found = {x for x in outputs if isinstance(x, _Variable)}, []
-    for step in reversed(steps):
-        if not wanted.isdisjoint(step.outputs):
-            found.append(step)
-            wanted.update(step.variables)
-    return found[::-1]
 
 
 def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict:

@@ -35,7 +35,6 @@ class NormalForms:
     ):
         self.graph, self.most_terms, self._sign = graph, most_terms, sign
         self.guards: set[int] = set()  # nodes that must stay positive
-        self._square_of, self._square_into = "sin", "cos"
         self._expanded: dict[int, Polynomial | None] = {graph.zero: {}}
         self._squares: dict[int, Polynomial] = dict(squares or {})
         self._simplified: dict[int, int] = {}
@@ -136,8 +135,8 @@ class NormalForms:
         if len(p) == 2:
             (small, c), (large, d) = sorted(p.items(), key=lambda item: len(item[0]))
             extra = _rest(large, small)
-            if c == -d and len(extra) == 2 and extra[0] == extra[1] and self.graph.op[extra[0]] == self._square_into:
-                return [self.graph.call(self._square_of, self.graph.args[extra[0]][0])], {small: c}
+            if c == -d and len(extra) == 2 and extra[0] == extra[1] and self.graph.op[extra[0]] == "cos":
+                return [self.graph.call("sin", self.graph.args[extra[0]][0])], {small: c}
         return None
 
     def _absolute(self, p: Polynomial) -> Polynomial:
@@ -175,8 +174,8 @@ class NormalForms:
 
     def _atom(self, atom: int) -> Polynomial:
         graph, op = self.graph, self.graph.op[atom]
-        if op == self._square_of and atom not in self._squares:
-            other = graph.call(self._square_into, graph.args[atom][0])
+        if op == "sin" and atom not in self._squares:
+            other = graph.call("cos", graph.args[atom][0])
             self._squares[atom] = {(): 1.0, (other, other): -1.0}
         elif op == "sqrt" and atom not in self._squares:
             self._squares[atom] = self.expanded(graph.args[atom][0])
