@@ -139,6 +139,9 @@ AT_PROBES: dict[str, Callable] = {
 }
 
 
+_SEVERAL = tuple, list  # a union of types is made anew wherever it stands
+
+
 def _itself(x) -> Hashable:
     try:
         hash(x)
@@ -154,11 +157,19 @@ def description(x, details: Callable = lambda equation: equation.params, of_othe
     """
 
     def of(x) -> Hashable:
-        return description(x, details, of_other)
+        if isinstance(x, _SEVERAL):
+            return tuple(map(of, x))
+        if isinstance(x, dict):
+            return tuple((key, of(value)) for key, value in sorted(x.items()))
+        if hasattr(x, "consts") and hasattr(x, "jaxpr"):
+            return "closed", of(x.jaxpr), tuple(map(of, x.consts))
+        if hasattr(x, "eqns"):
+            return of_jaxpr(x)
+        if (is_array(x) and not np.asarray(x).dtype.hasobject) or isinstance(x, float):
+            return str(np.asarray(x).dtype), np.shape(x), np.asarray(x).tobytes()
+        return of_other(x)
 
-    if hasattr(x, "consts") and hasattr(x, "jaxpr"):
-        return "closed", of(x.jaxpr), tuple(map(of, x.consts))
-    if hasattr(x, "eqns"):
+    def of_jaxpr(x) -> Hashable:
         number = {v: k for k, v in enumerate([*x.constvars, *x.invars])}
         atom = lambda v: of(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else number[v]  # noqa: E731
         lines: list = [tuple(_said(v.aval) for v in number)]
@@ -167,13 +178,8 @@ def description(x, details: Callable = lambda equation: equation.params, of_othe
             number |= {v: len(number) + k for k, v in enumerate(equation.outvars)}
             lines.append((equation.primitive, inputs, of(details(equation)), tuple(_said(v.aval) for v in equation.outvars)))
         return *lines, tuple(map(atom, x.outvars))
-    if isinstance(x, dict):
-        return tuple((key, of(value)) for key, value in sorted(x.items()))
-    if isinstance(x, tuple | list):
-        return tuple(map(of, x))
-    if (is_array(x) and not np.asarray(x).dtype.hasobject) or isinstance(x, float):
-        return str(np.asarray(x).dtype), np.shape(x), np.asarray(x).tobytes()
-    return of_other(x)
+
+    return of(x)
 
 
 @functools.lru_cache(maxsize=1024)

@@ -124,7 +124,7 @@ def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict
         values[v] = introduce(v)
     for step in steps:
         given = [values[x] if isinstance(x, _Variable) else x for x in step.inputs]
-        size = max(v.aval.size for v in step.outputs)
+        size = max((v.aval.size for v in step.outputs), default=0)
         try:
             if any(x is None for x in given):
                 raise Unsupported("")  # it follows an opaque one
