@@ -96,14 +96,7 @@ class Piecewise:
     alone = takes_steps = False
 
     def __init__(
-        self,
-        scene: Scene,
-        runs: tuple[Experiment, ...],
-        layout: Layout,
-        simulation: dict,
-        members: int | None,
-        unknowns: Unknowns,
-        shooting: MultipleShooting,
+        self, scene: Scene, runs: tuple[Experiment, ...], layout: Layout, simulation: dict, members: int | None, unknowns: Unknowns, shooting: MultipleShooting
     ):
         self.scene, self.runs, self.unknowns = scene, runs, unknowns
         of_runs = [len(scene.coordinate_names) + len(scene.speed_names) + numbers_of_filters(run, members is not None) for run in runs]
