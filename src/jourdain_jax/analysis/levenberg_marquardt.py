@@ -29,6 +29,7 @@ from jourdain_jax.analysis.pace import BEGIN, LEAST, MOST, NUMBERS, SLOW, SURELY
 
 LEAST_COLUMN = 1e-8  # of the longest column of J, both times the sizes of their unknowns: what counts as zero
 SHRINKS = 0.1  # by what factor an unknown whose bound is above zero may shrink in one step: with far smaller masses and lengths, motions take long
+ROUGHLY = 1e-2  # standard errors: tolerance where the value of F matters, not the place
 RELEASES = 8  # times that unknowns which would pass a bound are put there and the others solved for again
 
 
@@ -175,6 +176,13 @@ def minimise(
         if (step := way.foretold(way.next_step())).members.size:
             way.take(step)
     return way.minimum(what)
+
+
+def minimum_beside(evaluate: Callable, theta: Float[np.ndarray, "1 unknowns"], place: int, value: float, limits: Limits, control: Control) -> Minimum:
+    """The minimum over all unknowns but one, which is held at this value; to one per cent of a standard error."""
+    begin, fixed = np.clip(theta, limits.low, limits.high), limits.fixed.copy()
+    begin[0, place], fixed[place] = value, True
+    return minimise(evaluate, begin, replace(limits, fixed=fixed), replace(control, tolerance=max(control.tolerance, ROUGHLY)))
 
 
 @dataclass

@@ -20,8 +20,8 @@ from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.information import hidden_combinations
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood import as_runs
-from jourdain_jax.analysis.predictions import Run, run_of
 from jourdain_jax.analysis.ranges import Range
+from jourdain_jax.analysis.runs import Run, run_of
 from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.reference import Reference
