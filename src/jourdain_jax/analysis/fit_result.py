@@ -40,7 +40,12 @@ MOST_INFORMED = 24  # unknowns of which the report says what informs them
 
 def _of_minimum(part: Callable[[Statistics], T], doc: str) -> T:
     """A part of `Fit.statistics` as a property of the fit."""
-    return property(lambda fit: part(fit.statistics), doc=doc)  # type: ignore[return-value]
+
+    def read(self):
+        return part(self.statistics)
+
+    read.__doc__ = doc
+    return property(read)  # type: ignore[return-value]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
