@@ -1,4 +1,4 @@
-"""The same numbers by fewer products and quotients of what varies: a Taylor series of order p takes p (p + 1)/2 multiplications for each of these.
+"""Equal numbers by fewer products and quotients of what varies: a Taylor series of order p takes p (p + 1)/2 multiplications for each of these.
 
 Sums and products are taken apart into terms c x y .. with coefficients c that do not vary. Then, one after the other, whatever saves most products is shared:
 
