@@ -212,7 +212,7 @@ class _Reader:
         self._seen.add(id(x))
         self.by_identity.append(x)
         self.members += members
-        return self._identity(type(x)), tuple((name, self.key(y, depth + 1)) for part in members for name, y in part.items())
+        return self.key(type(x), depth + 1), tuple((name, self.key(y, depth + 1)) for part in members for name, y in part.items())
 
     def _identity(self, x) -> Hashable:
         self.by_identity.append(x)
@@ -259,7 +259,7 @@ class _Reader:
 
 def _is_bookkeeping(name: str) -> bool:
     """Whether a member of a class is what Python, dataclasses or Equinox put there."""
-    return (name.startswith("__") and name.endswith("__") and name != "__call__") or name.startswith("_abc_")
+    return (name.startswith("__") and name.endswith("__") and name not in ("__call__", "__getattr__", "__getitem__")) or name.startswith("_abc_")
 
 
 def _content(x) -> Hashable:
