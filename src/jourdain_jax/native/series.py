@@ -55,6 +55,7 @@ class Series:
         self.of[clock] = [known[clock], w.number(1.0)]
         self.state: list[Coefficients] = [[value] for value in start]
         self.of |= {node: series for node, series in zip(states, self.state, strict=True) if node is not None}
+        self._rates = {node: rate for node, rate in zip(states, rates, strict=True) if node is not None}
         self._partial: dict[tuple[int, int], int] = {}  # of a function and the number of an argument: the derivative's node
         self._scaled: dict[tuple[int, int], Value | None] = {}
         self._inverse: dict[int, Value] = {}
@@ -139,6 +140,8 @@ class Series:
 
     def _times_order(self, node: int, j: int) -> Value | None:
         """j a_j"""
+        if node in self._rates and j > 1:
+            return self.at(self._rates[node], j - 1)
         if (node, j) not in self._scaled:
             a = self.at(node, j)
             self._scaled[node, j] = a if a is None or j == 1 else a * float(j)

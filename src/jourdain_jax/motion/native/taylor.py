@@ -13,7 +13,7 @@ from typing import NamedTuple
 from jourdain_jax.motion.native.functions import Form, known_values, outputs_of
 from jourdain_jax.motion.native.layout import Lanes, Layout
 from jourdain_jax.native import series
-from jourdain_jax.native.exponentials import power
+from jourdain_jax.native.exponentials import exponential, logarithm
 from jourdain_jax.native.ir import Value, Writer
 from jourdain_jax.native.scalar_program import as_real, written
 from jourdain_jax.native.series import Coefficients, Series
@@ -118,17 +118,16 @@ def radius(w: Writer, layout: Layout, p: Lanes, rows: Sequence[Coefficients]) ->
     """How long a step may be; zero where a coefficient is no number."""
     rtol, atol, count = p["rtol"], p["atol"], layout.coordinates + layout.speeds
     inverse = [1.0 / w.fma(rtol, w.magnitude(w.load(w.real, p.pointer, i)), atol) for i in range(count)]
-    order, length = len(rows[0]) - 1, w.number(math.inf)
+    order, least = len(rows[0]) - 1, w.number(math.inf)  # of log h
     for k in (order - 1, order):
         square = w.number(0.0)  # of N_k, times `count`
         for x, share in zip(rows, inverse, strict=False):
             if x[k] is not None:
                 relative = x[k] * share
                 square = w.fma(relative, relative, square)
-        reach = power(w, square * (1.0 / count), -0.5 / k)
-        reach = w.where(square.equals(0.0), math.inf, w.where(square < math.inf, reach, 0.0))
-        length = w.smaller(length, reach)
-    return SAFETY * length
+        least = w.smaller(least, (-0.5 / k) * logarithm(w, square * (1.0 / count)))
+    reach = w.where(least < math.inf, exponential(w, least), least)
+    return SAFETY * w.where(w.is_nan(reach), 0.0, reach)
 
 
 def at_time(w: Writer, series: Coefficients, s: Value) -> Value:
