@@ -78,11 +78,7 @@ class IdentityProbes:
 
     def exchanged(self, names: Collection[str]) -> Self:
         """Probes at each of which the named inputs have the value that they had at another probe; all others are kept."""
-
-        def next_one(x):
-            return np.roll(np.broadcast_to(x, self.count), 1)
-
-        return self.with_inputs({name: next_one(self.inputs[name]) for name in names}, {name: next_one(self._errors.get(name, 0.0)) for name in names})
+        return self.exchanged_in_turn([names], np.arange(self.count))
 
     def exchanged_in_turn(self, groups: Sequence[Collection[str]], at: np.ndarray) -> Self:
         """The probes numbered `at` as `exchanged` makes them, group of names after group."""
@@ -189,7 +185,7 @@ def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinat
         here = probes.with_inputs(dict(zip(moved, q, strict=True)), exact)
         found = here(rows)
         values, J = np.nan_to_num(np.asarray(found)), np.nan_to_num(np.asarray(here(slopes))).T
-        step = pattern.shortest(J[moving], values.T[moving], _pseudo_inverses).T
+        step = pattern.shortest(J[moving], values.T[moving], lambda J, g: (_pseudo_inverses(J) @ g[..., None])[..., 0]).T
         moves = np.any(np.abs(step) > EPS * np.max(np.abs(q[:, moving]), axis=0), axis=0)
         if turn == STEPS or not moves.any():
             break
