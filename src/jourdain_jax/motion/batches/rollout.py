@@ -16,15 +16,14 @@ from tqdm import tqdm
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.calculus.reals import checked_real, described, is_traced
 from jourdain_jax.motion.arguments import as_end, check_options, check_span, check_times, saved_times
-from jourdain_jax.motion.input_programs import by_itself, for_programs
+from jourdain_jax.motion.input_programs import for_programs
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
 from jourdain_jax.motion.integration import integrate_lanes
-from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.quick_compilation import quickly_compiled
-from jourdain_jax.motion.retries import lost_codes, mark_retried, next_retry, retry_options
+from jourdain_jax.motion.retries import OUT_OF_STEPS, lost_codes, mark_retried, next_retry, retry_options
 from jourdain_jax.motion.setup import TOLERANCE
 from jourdain_jax.motion.simulate import default_solver, set_up, warn_float32
 from jourdain_jax.motion.start import State
@@ -267,7 +266,7 @@ def _lanes_in_lockstep(reference: Reference, scene, fixed, options, varied, para
         return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
 
 
-_compiled_dense, _compiled_lowered = (for_programs(_lanes_in_lockstep, compiled_by) for compiled_by in (by_itself, quickly_compiled))
+_compiled_dense, _compiled_lowered = for_programs(_lanes_in_lockstep), for_programs(_lanes_in_lockstep, quickly_compiled)
 
 
 def _with_arrays(options: dict) -> dict:

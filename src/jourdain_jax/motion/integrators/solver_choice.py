@@ -3,7 +3,6 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.motion.integrators.of_diffrax import diffrax, discrete_gradient, fixed_step, munthe_kaas, step_to_times
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.vector_fields.field import VectorField
@@ -67,13 +66,3 @@ def since(saveat: "diffrax.SaveAt", origin) -> "diffrax.SaveAt":
 def steps_are_given(controller) -> bool:
     """Whether the user says where each step ends."""
     return controller is not None and isinstance(controller, diffrax.StepTo)
-
-
-def marked_inputs(mode: str, tree):
-    """Inputs of the integration: forward mode raises our own error where the adjoint supports reverse mode alone."""
-    return reverse_only(tree) if mode == "reverse" else tree
-
-
-def marked_outputs(mode: str, tree):
-    """Outputs of the integration: reverse mode, which comes to them first, raises our own error where the adjoint supports forward mode alone."""
-    return forward_only(tree) if mode == "forward" else tree

@@ -15,7 +15,7 @@ from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
-from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record, energies, map_over_times, uncompiled_over_times
+from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record, map_over_times, uncompiled_over_times
 from jourdain_jax.motion.trajectories.results import FALLBACKS
 
 
@@ -67,11 +67,6 @@ class ContactExtremes(eqx.Module):
     def honest(self) -> bool:
         """Whether the contact only ever pushed, or bore nothing."""
         return not bool(self.pulls)
-
-
-def energies_of(record: Record, work) -> Energies:
-    """Kinetic and potential energy, and the work where it is tracked (`work` is None where it is not)."""
-    return Energies(*energies(record), work)
 
 
 def diagnose(trajectory: Record) -> Diagnostics:
