@@ -114,9 +114,9 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
         y = integrands.project(tau, y, args) if moving and not integrator.projects_saved else y
         t = origin + tau
-        seen = field.observed(scene, fixed, t, y, inputs(t))
-        work = None if y.work is None else y.work + field.stored(scene, t, seen.q, inputs(t)) - stored_first
-        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (seen.q, seen.u, work)), seen.pivot, (t, y)
+        u, pivot = field.speeds_and_pivot(scene, fixed, t, y, inputs(t))
+        work = None if y.work is None else y.work + field.stored(scene, t, y.q, inputs(t)) - stored_first
+        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, work)), pivot, (t, y)
 
     # start and end as two more saved states, so that all this is compiled once
     start_and_end = (jnp.zeros_like(solved.t_end), begun.y0, begun.timely), (solved.t_end, solved.y_end, begun.timely)

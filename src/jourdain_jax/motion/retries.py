@@ -55,11 +55,14 @@ def next_retry(field: VectorField, motion: Trajectory, t0, options: dict) -> int
 
 def retry_options(retries: int, options: dict) -> dict:
     """The options of `simulate` that make these retries; `options`: those that were given."""
-    full = {"formulation": as_formulation(options.get("formulation")).with_state("full"), "backend": "dense"} if retries & results.FULL_STATE else {}
-    if full and isinstance(options.get("solver"), Taylor):  # which dense matrices do not have
-        full["solver"] = DOPRI8
-    implicit = {"solver": radau.RadauIIA(), "max_steps": max(1, options.get("max_steps", MOST_STEPS) // _SHARE)} if retries & results.IMPLICIT else {}
-    return full | implicit
+    changed: dict = {}
+    if retries & results.FULL_STATE:
+        changed = {"formulation": dataclasses.replace(as_formulation(options.get("formulation")), state="full"), "backend": "dense"}
+        if isinstance(options.get("solver"), Taylor):  # which dense matrices do not have
+            changed["solver"] = DOPRI8
+    if retries & results.IMPLICIT:
+        changed |= {"solver": radau.RadauIIA(), "max_steps": max(1, options.get("max_steps", MOST_STEPS) // _SHARE)}
+    return changed
 
 
 def mark_retried(motion: Motions, retries: int) -> Motions:

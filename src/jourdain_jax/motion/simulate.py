@@ -203,8 +203,8 @@ def _start(scene: Scene, given, t0, inputs: Inputs, native: bool, projects: bool
     """The start; numbers that are known are put onto the rows by the program that integrates, unless it takes a search."""
     if projects and not searches and nothing_is_traced():
         if isinstance(given, State):
-            return unmoved(scene, given, native)
-        return named_unmoved(scene, named_values(scene, given), t0, inputs_at(inputs, t0), native)
+            return unmoved(scene, given.q, given.u, native)
+        return named_unmoved(scene, named_values(scene, given), t0, inputs_at(inputs, t0), native).start
     if isinstance(given, State):
         return put_on_rows(scene, t0, given.q, given.u, inputs_at(inputs, t0), native=native) if projects else given
     return as_state(scene, given, t0=t0, inputs=inputs_at(inputs, t0), native=native, onto_rows=projects)

@@ -5,14 +5,10 @@ Minimal state z = (q, y), y the privileged speeds; H(z) = T + V = y' m(q) y/2 + 
     qdot =  W m^-1 H_y                                        m = H_yy
     ydot = -m^-1 W' H_q + m^-1 G m^-1 H_y                     G(q, y) skew: G y = r,  r = m ydot + W' H_q
 
-r is quadratic in y and does no work, y.r = 0; so that G = (r_y - r_y')/3. One step puts S at the midpoint and Gonzalez's discrete gradient
-in the place of grad H:
+r is quadratic in y and does no work, y.r = 0; so that G = (r_y - r_y')/3. S comes from the rates themselves by autodiff, whatever the reduction. One step puts
+S at the midpoint and Gonzalez's discrete gradient in the place of grad H, whence H(z_1) - H(z_0) = gbar.(z_1 - z_0) = 0:
 
     z_1 - z_0 = h S(z_m) gbar,   gbar = grad H(z_m) + (H(z_1) - H(z_0) - grad H(z_m).(z_1 - z_0)) (z_1 - z_0)/|z_1 - z_0|^2
-
-whence H(z_1) - H(z_0) = gbar.(z_1 - z_0) = 0. S comes from the rates themselves by autodiff, whatever the reduction.
-Source: E. Celledoni, M. Farre Puiggali, E. H. Hoiseth and D. Martin de Diego, Energy-preserving integrators applied to nonholonomic systems,
-J. Nonlinear Sci. 29 (2019) 1523, arXiv 1605.02845; O. Gonzalez, Time integration and discrete Hamiltonian systems, J. Nonlinear Sci. 6 (1996) 449.
 """
 
 import equinox as eqx
@@ -44,7 +40,8 @@ class DiscreteGradient(FixedStepSolver):
     Worth it where an energy that drifts would decide the answer: long motions of conservative scenes, also of those where the other methods drift
     because no symmetry helps them. Other integrals are kept to the order of the method only, and it is the dearest of these methods per step.
 
-    Source: Celledoni et al., J. Nonlinear Sci. 29 (2019) 1523 (arXiv 1605.02845); Gonzalez, J. Nonlinear Sci. 6 (1996) 449.
+    Source: E. Celledoni, M. Farre Puiggali, E. H. Hoiseth and D. Martin de Diego, Energy-preserving integrators applied to nonholonomic systems,
+    J. Nonlinear Sci. 29 (2019) 1523, arXiv 1605.02845; O. Gonzalez, Time integration and discrete Hamiltonian systems, J. Nonlinear Sci. 6 (1996) 449.
     """
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
@@ -114,8 +111,8 @@ def _rates(args, t, q, v):
 def _energy(args, t, z, n: int) -> Float[Array, ""]:
     """H = T + V in J."""
     field, scene, inputs, fixed, _ = args
-    q, u = field.unpack(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t))
-    return sum(energies_at(scene, motion_at(scene, t, q, u, inputs(t))))
+    u = field.speeds(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t))
+    return sum(energies_at(scene, motion_at(scene, t, z[:n], u, inputs(t))))
 
 
 def _fault(scene: Scene, field: VectorField, asked: str) -> str:

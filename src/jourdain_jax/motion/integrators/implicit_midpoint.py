@@ -1,9 +1,4 @@
-"""The implicit midpoint rule, on whatever form of the state is integrated.
-
-    y_1 = y_0 + h f(t_0 + h/2, (y_0 + y_1)/2)
-
-Source: E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration (2006), sections II.1.2 and IV.2.
-"""
+"""The implicit midpoint rule, on whatever form of the state is integrated."""
 
 import jax
 import jax.numpy as jnp

@@ -5,8 +5,8 @@ Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `
 sampled at `ts`), and `parameter:NAME` for every field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
 `speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
 `state_form`, `reduction`, `solver`, `projected`, `event_names`, `arrays` (names of all arrays), `versions`.
-`kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `continued` holds
-the numbers of the lanes that were run again with the full state; `reruns` in its header says how lanes with a `fallback` were run.
+`kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `reruns` in its header
+says how lanes with a `fallback` were run.
 
 What is absent, or is not what the names and the number of times ask for, is an error, and so is a parameter of the scene's class that the file lacks.
 """
@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.reals import described
-from jourdain_jax.motion.batches.rollout import Rollout
+from jourdain_jax.motion.batches.rollout import RERUN_FIELDS, Rollout
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.trajectories.storage_checks import AXES, HEADER, check_arrays, check_header, check_scenes, refused
@@ -35,7 +35,6 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 _ARRAYS = tuple(name for name in AXES if name not in ("inputs", "work"))
-_TEXTS = ("state_form", "reduction", "solver", "projected")
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
 
 
@@ -53,9 +52,7 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
     arrays = {name: np.asarray(getattr(trajectory, name)) for name in (*_ARRAYS, "work") if getattr(trajectory, name) is not None}
     arrays["inputs"] = np.asarray((jax.vmap(_sampled) if isinstance(motion, Rollout) else _sampled)(trajectory.inputs, trajectory.ts))
     arrays |= {f"parameter:{name}": np.asarray(value) for name, value in parameters.items()}
-    if isinstance(motion, Rollout):
-        arrays["continued"] = np.array(motion.continued, int)
-    header = {name: getattr(trajectory, name) for name in _TEXTS} | {
+    header = {name: getattr(trajectory, name) for name in RERUN_FIELDS} | {
         "format": 1,
         "kind": kind,
         "reruns": reruns,
@@ -135,9 +132,8 @@ def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout
     format, holds one trajectory, or belongs to another scene.
     """
     header, arrays, kind = _read(path, scene, "rollout")
-    continued = tuple(arrays.pop("continued").tolist())
     ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header["reruns"])
-    return Rollout(_lanes(path, kind, header, arrays), continued, ways)
+    return Rollout(_lanes(path, kind, header, arrays), ways)
 
 
 def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
@@ -175,7 +171,7 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
         inputs=Inputs(tuple(Sampled(arrays["input_ts"], column) for column in arrays["inputs"].T)),
         event_names=tuple(header["event_names"]),
         **{name: jnp.asarray(arrays[name]) for name in _ARRAYS},
-        **{name: header[name] for name in _TEXTS},
+        **{name: header[name] for name in RERUN_FIELDS},
     )
 
 
@@ -224,7 +220,7 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
     found = header.get("kind")
     if found != kind:
         raise ValueError(f"`{path}` holds a {found}, expected a {kind}; read it with `{_READERS.get(str(found), 'the version of jourdain-jax that wrote it')}`")
-    missing = [name for name in (*_ARRAYS, "inputs", *(["continued"] if kind == "rollout" else [])) if name not in arrays]
+    missing = [name for name in (*_ARRAYS, "inputs") if name not in arrays]
     missing += [name for name in HEADER if name not in header]
     if not missing:
         check_header(path, header)

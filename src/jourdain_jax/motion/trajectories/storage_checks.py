@@ -46,8 +46,7 @@ def check_header(path, header: dict) -> None:
 
 def check_arrays(path, header: dict, arrays: dict) -> None:
     """ValueError for an array of another shape or type than the others ask for, or with numbers that no motion has."""
-    many = header["kind"] == "rollout"
-    lead = arrays["result"].shape[:1] if many else ()
+    lead = arrays["result"].shape[:1] if header["kind"] == "rollout" else ()
     times = arrays["ts"].shape[-1] if arrays["ts"].ndim else 0
     sizes = {"times": times} | {name: len(header[name]) for name in ("coordinates", "speeds", "input_names")}
     for name in ("q", "u", "inputs"):
@@ -63,8 +62,6 @@ def check_arrays(path, header: dict, arrays: dict) -> None:
         kinds, text = ("iu", "whole numbers") if name in COUNTS else ("f", "floating-point numbers")
         if array.dtype.kind not in kinds:
             raise refused(path, f"has `{name}` of type {array.dtype}, expected {text}")
-    if many and (arrays["continued"].ndim != 1 or arrays["continued"].dtype.kind not in "iu" or not np.all(np.isin(arrays["continued"], np.arange(lead[0])))):
-        raise refused(path, f"names lanes that were continued, {arrays['continued']}, expected numbers from 0 to {lead[0] - 1}")
     _check_codes(path, header, arrays)
     _check_finite(path, arrays)
 

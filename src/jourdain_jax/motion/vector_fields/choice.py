@@ -1,6 +1,5 @@
 """Which equations are integrated, given what was asked: the form of the state, how accelerations are found, what keeps the state on its constraints."""
 
-from dataclasses import replace
 from typing import Any, Literal
 
 import equinox as eqx
@@ -68,10 +67,6 @@ class Formulation(eqx.Module):
     def baumgarte(self) -> Baumgarte | None:
         """The terms added to the rows; None where there are none."""
         return self.stabilisation if isinstance(self.stabilisation, Baumgarte) else None
-
-    def with_state(self, state: Literal["auto", "minimal", "full"]) -> "Formulation":
-        """This formulation with another form of the state."""
-        return replace(self, state=state)
 
 
 _DEFAULT = Formulation()
