@@ -1,28 +1,37 @@
-"""Stop events of a scene that fitted motions go through, though samples come later: a disc that has fallen, a handlebar that has met the frame."""
+"""Stop events of a scene that fitted motions go through, though samples come later (a disc that has fallen), or that were observed and are not met."""
+
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.analysis.predictions import run_of
 from jourdain_jax.analysis.problem import Problem
+from jourdain_jax.analysis.stop_events import LATEST, StopEvent
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.scene import Scene
 
 
 def events_met(problem: Problem, theta: Float[np.ndarray, "places"], simulation: dict) -> tuple[str, ...]:
-    """One sentence for each run whose motion, with these unknowns, meets an event before a sample that counts."""
+    """One sentence for each run whose motion, with these unknowns, meets an event before a sample that counts, or not the one that was observed."""
     if type(problem.scene).events is Scene.events:
         return ()
     shared, local = problem.unknowns.split(theta)
     found, layout = [], problem.unknowns.layout
     for index, run in enumerate(problem.runs):
         one = run_of(run).at(layout, shared, local[index])
-        motion = one.motion(layout.scene(problem.scene, shared), simulate, one.ts, **simulation)
+        motion = partial(one.motion, layout.scene(problem.scene, shared), simulate, **simulation)
+        if run.ended_by:
+            if not np.isfinite(StopEvent(run.ended_by).time(motion, one.t0, one.ts)):
+                found.append(f"the motion of run {index} does not meet `{run.ended_by}` before {LATEST:g} times the observed time; start nearer")
+            continue
+        motion = motion(one.ts)
         late = np.asarray(one.ts) > float(motion.t_end)
         samples = sum(int(np.count_nonzero(weight[late])) for weight in one.weights.values())
         if motion.event >= 0 and samples:
             event = f"its event `{motion.event_names[int(motion.event)]}` at {float(motion.t_end):.4g} s"
             found.append(
-                f"the motion of run {index} meets {event}, before {samples} of its samples: it is fitted as if it went on; leave these out, or give NaN"
+                f"the motion of run {index} meets {event}, before {samples} of its samples: it is fitted as if it went on; leave these out, or give "
+                "the time at which it was observed, in `events`"
             )
     return tuple(found)

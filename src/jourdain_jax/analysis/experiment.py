@@ -14,7 +14,8 @@ from jourdain_jax.analysis.channels import channel
 from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.instruments import Instrument
 from jourdain_jax.analysis.ranges import Range
-from jourdain_jax.analysis.sensors import Actuator, Drive, Reading, Sensor, latest, numbers_of
+from jourdain_jax.analysis.sensors import Actuator, Drive, Reading, Sensor, ideal, latest, numbers_of
+from jourdain_jax.analysis.stop_events import StopEvent, cut
 from jourdain_jax.calculus.reals import Number, checked_unless_traced, described, is_traced
 from jourdain_jax.motion.inputs import Inputs, Sampled, as_inputs
 from jourdain_jax.scene.names import as_names, nearest
@@ -43,9 +44,11 @@ class Experiment(eqx.Module):
     - `sensors`: channel -> `Sensor`; or what an ideal one shows: a coordinate, a speed, an `Accelerometer`, a `LoadCell`, or a function of a `Motion`
       (one instant), such as `lambda motion: motion["sleigh"].place((0.3, 0.0, 0.0))`.
     - `t0`: time of the start in s; default: the first of `ts`.
+    - `events`: the stop event of the scene that ended the run, with the time at which it was observed and its sigma, both in s:
+      `events={"has_fallen": (1.83, 0.005)}`. The time at which the motion stops there, less that one, is a residual. Samples after it do not count.
 
     **Raises** ValueError for times that do not increase, values that are infinite, channels without any value, sigmas that are not positive, names
-    that do not match, and samples that may show what was before the start.
+    that do not match, more than one event, one that is not after the start, and samples that may show what was before the start.
     """
 
     ts: Float[Array | np.ndarray, "times"]  # s; all on NumPy where it is known
@@ -62,6 +65,7 @@ class Experiment(eqx.Module):
     correlation_time: dict[str, Float[Array | np.ndarray, ""]]  # s, of channels whose noise has a memory; zero where it is to be estimated
     unknown_sigma: tuple[str, ...] = eqx.field(static=True)  # channels; their sigma here is 1
     unknown_correlation: tuple[str, ...] = eqx.field(static=True)  # channels
+    ended_by: str = eqx.field(static=True)  # the event whose time was observed, among the channels; empty: none
 
     def __init__(
         self,
@@ -75,10 +79,11 @@ class Experiment(eqx.Module):
         sensors: "Mapping[str, Sensor | str | Callable | Instrument] | None" = None,
         t0: Number | None = None,
         correlation_time: "Mapping | Number | None" = 0.0,
+        events: Mapping | None = None,
     ):
         self.ts = checked_unless_traced(ts, "`ts`", advice="give times in s")
         _check_times(self.ts)
-        for what, part in (("values", values), ("start", start), ("sensors", {} if sensors is None else sensors)):
+        for what, part in (("values", values), ("start", start), ("sensors", sensors or {}), ("events", events or {})):
             if not isinstance(part, Mapping):
                 raise ValueError(f'`{what}` of `Experiment` is {described(part)}, expected a dictionary by name, such as {{"x": ...}}')
         self.values = _reals("values of channel", {name: _unmasked(value) for name, value in values.items()}, "give numbers, NaN where a sample is missing")
@@ -94,6 +99,9 @@ class Experiment(eqx.Module):
         self.sensors = {name: one if isinstance(one, Sensor) else Sensor(one) for name, one in (sensors or {}).items()}
         self.readings, self.drives, self.estimates = {}, {}, {}
         self.t0 = _array(self.ts[0] if t0 is None else t0)
+        self.ended_by = next(iter(events or {}), "")
+        if events:
+            self.ts, self.values, self.sigma = cut(events, self.t0, self.ts, self.values, self.sigma)
 
     def __check_init__(self):
         if not _holds(lambda t: (t[0] <= t[1]) & (t[0] < t[2]), [self.t0, self.ts[0], self.ts[-1]]):
@@ -101,7 +109,7 @@ class Experiment(eqx.Module):
                 f"the start at t0 = {self.t0} s comes after the first sample ({self.ts[0]} s), or not before the last ({self.ts[-1]} s); give an earlier `t0`"
             )
         if not self.values:
-            raise ValueError("`values` is empty; give at least one channel: name -> measured values")
+            raise ValueError("`values` is empty; give at least one channel: name -> measured values; or the time of an event, in `events`")
         _check_same_names("sigma", self.sigma, self.values)
         for name in self.correlation_time:
             if name not in self.values:
@@ -109,6 +117,8 @@ class Experiment(eqx.Module):
         for name in self.sensors:
             if name not in self.values:
                 raise ValueError(f"sensor `{name}` has no measured values; {nearest(name, self.values)}")
+        if self.ended_by in (*self.sensors, *self.correlation_time):
+            raise ValueError(f"`{self.ended_by}` is an event, whose time has no sensor and no correlation time; leave them out, or rename the channel")
         for name in self.unknown_start:
             if name not in self.start:
                 raise ValueError(f"unknown start value `{name}` has no first guess; give one in `start`. {nearest(name, self.start)}")
@@ -206,7 +216,10 @@ def checked(scene: Scene, run: Experiment, index: int, repeats: bool) -> Experim
     readings: dict[str, Reading] = {}
     estimates: dict[str, Estimate] = {}
     for name, values in run.values.items():
-        quantity, shape = _quantity(scene, run.sensors[name].quantity if name in run.sensors else None, name, where)
+        if name == run.ended_by:
+            readings[name], shape = ideal("", StopEvent.of(scene, name, where)), ()
+        else:
+            quantity, shape = _quantity(scene, run.sensors[name].quantity if name in run.sensors else None, name, where)
         if name in run.sensors:
             readings[name] = _reading(run.sensors[name], name, where, quantity, shape, estimates)
             _check_begin(run, name, where, repeats)

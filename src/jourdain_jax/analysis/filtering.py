@@ -27,6 +27,7 @@ from jourdain_jax.analysis.joint_prior import Correlated
 from jourdain_jax.analysis.likelihood import as_runs, mapped
 from jourdain_jax.analysis.predictions import Run, equal_runs
 from jourdain_jax.analysis.sensors import Reading, ideal
+from jourdain_jax.analysis.stop_events import StopEvent
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_speeds
 from jourdain_jax.calculus.reals import checked_unless_traced, is_traced
 from jourdain_jax.equations.kinematics import motion_at
@@ -200,6 +201,8 @@ def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
 
 
 def _check_reading(name: str, reading: Reading, index: int) -> None:
+    if isinstance(reading.operation, StopEvent):
+        raise ValueError(f"run {index} gives the time of its event `{name}`, which a filter does not use; leave it out, and samples after it")
     if reading.is_late:
         raise ValueError(f"sensor `{name}` of run {index} has a delay or a lag, which a filter does not know; shift its times by the delay, or use `fit`")
     if isinstance(reading.operation, Instrument):

@@ -45,7 +45,7 @@ class Statistics:
     samples: Int[np.ndarray, "*repeats"]
     from_prior: Float[np.ndarray, "*repeats unknowns"]  # in standard deviations of the prior; NaN where there is none
     oddities: tuple[str, ...]  # sentences about what is odd in the runs
-    events_met: tuple[str, ...]  # sentences about events before the end of a run; none in a batch, and where runs were fitted in pieces
+    events_met: tuple[str, ...]  # sentences about events before the end of a run, or not met; none in a batch, and where runs were fitted in pieces
     too_narrow: tuple[str, ...]  # sentences about intervals that bounds make too narrow; none in a batch
 
 
@@ -103,7 +103,7 @@ def statistics(problem: Problem, found: Minimum, limits: Limits, asked: Asked, e
         samples=np.asarray(samples),
         from_prior=(values - unknowns.prior_mean[places]) / unknowns.prior_sigma[places],
         oddities=oddities(problem.scene, problem.runs, not single),
-        events_met=events_met(problem, theta[0], asked.simulation) if single and not fails[0] and asked.shooting is None else (),
+        events_met=events_met(problem, theta[0], asked.simulation) if single and asked.shooting is None else (),
         too_narrow=tuple(too_narrow),
     )
 

@@ -16,7 +16,7 @@ _SURE = 5.0  # standard deviations: a mean square that is further from 1 is no c
 def warnings_of(fit) -> tuple[str, ...]:
     """Warnings of a fit of one experiment, the most serious reason first, one sentence each."""
     if not np.isfinite(fit.chi_square):
-        return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`",)
+        return ("the motion fails at the first guess, so that there is nothing to fit; look at it with `simulate`", *fit.statistics.events_met)
     found = []
     if fit.stuck:
         found.append("no step leads to a better fit, and yet this is no minimum: nearby the motion fails, or it is rougher than its tolerance; start elsewhere")

@@ -28,6 +28,7 @@ from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
 from jourdain_jax.analysis.nodes import LAST, NODE, begin, ended
 from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
+from jourdain_jax.analysis.stop_events import StopEvent
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.motion.forward_mode import simulate_alongside
@@ -72,11 +73,14 @@ class Run(NamedTuple):
         found, filters, place = {}, [], len(scene.coordinate_names) + len(scene.speed_names)
         for name, weight in self.weights.items():
             sensor, at_first = self.sensors.get(name, ideal(name)), None
-            x = sensor.quantity(motion, states)
-            if sensor.has_filter and NODE in self.start:
-                place, at_first = place + x[0].size, self.start[NODE][place : place + x[0].size]
-            shown, y = sensor.shown(x, self.grid, self.ts, at_first)
-            filters += [y] if sensor.has_filter else []
+            if isinstance(sensor.operation, StopEvent):
+                shown = sensor.operation.time(lambda ts: self.motion(scene, simulate, ts, **simulation), self.t0, self.ts)
+            else:
+                x = sensor.quantity(motion, states)
+                if sensor.has_filter and NODE in self.start:
+                    place, at_first = place + x[0].size, self.start[NODE][place : place + x[0].size]
+                shown, y = sensor.shown(x, self.grid, self.ts, at_first)
+                filters += [y] if sensor.has_filter else []
             found[name] = jnp.where(weight > 0, (shown - self.values[name]) * weight, 0.0)
         return found | ended(motion, filters, self.start, ts)
 

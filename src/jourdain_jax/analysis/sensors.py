@@ -19,6 +19,7 @@ from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.instruments import Instrument
 from jourdain_jax.analysis.lagged import filtered, filtered_held, held, read
 from jourdain_jax.analysis.ranges import positive, unbounded
+from jourdain_jax.analysis.stop_events import StopEvent
 from jourdain_jax.calculus.reals import checked_real, described, is_traced
 from jourdain_jax.motion.inputs import Sampled
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
@@ -137,7 +138,7 @@ def default_range(name: str):
 class Reading(eqx.Module):
     """A sensor of one run made ready: its quantity looked up, numbers in place of what is to be estimated."""
 
-    operation: Channel | Instrument | None  # None: a coordinate or speed by name
+    operation: Channel | Instrument | StopEvent | None  # None: a coordinate or speed by name
     name: str = eqx.field(static=True)  # of that
     numbers: dict[str, Float[Array | np.ndarray, "..."] | float]
     unknown: tuple[str, ...] = eqx.field(static=True)  # names of numbers that are estimated
@@ -168,9 +169,9 @@ class Reading(eqx.Module):
         return x + self.numbers["bias"] if "bias" in self.used else x, y
 
 
-def ideal(name: str) -> Reading:
-    """An ideal sensor of a coordinate or speed."""
-    return Reading(None, name, dict(NUMBERS), (), ())
+def ideal(name: str, event: StopEvent | None = None) -> Reading:
+    """An ideal sensor of a coordinate or speed; or what shows the time of an event."""
+    return Reading(event, name, dict(NUMBERS), (), ())
 
 
 class Drive(eqx.Module):

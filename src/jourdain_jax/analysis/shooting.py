@@ -57,7 +57,9 @@ class MultipleShooting:
 
 
 def ends_of_pieces(run: Experiment, shooting: MultipleShooting, index: int) -> Int[np.ndarray, "ends"]:
-    """Samples at which pieces begin, and the last sample. ValueError where there are fewer intervals than pieces."""
+    """Samples at which pieces begin, and the last sample. ValueError where there are fewer intervals than pieces, and for a run that ended by an event."""
+    if run.ended_by:
+        raise ValueError(f"run {index} gives the time of its event `{run.ended_by}`, which `shooting` does not use; leave it out, and samples after it")
     ts = np.asarray(run.ts)
     count = len(ts) - 1
     pieces = shooting.pieces

@@ -109,8 +109,8 @@ def read_bicycle(path: str | Path) -> MeasuredBicycle:
     values: dict[str, float] = {}
     sigmas: dict[str, float] = {}
     lines: dict[str, int] = {}
-    lines_of = _yaml_lines if path.suffix.lower() in (".yml", ".yaml") else text_lines
-    for number, line in lines_of(read_text(path), str(path)):
+    text = read_text(path)
+    for number, line in _yaml_lines(text, path) if path.suffix.lower() in (".yml", ".yaml") else text_lines(text):
         where = f"{path}, line {number}"
         name, value, sigma = _read_line(line, where)
         if name in lines:
@@ -170,7 +170,7 @@ def read_text(path: Path) -> str:
     return text
 
 
-def text_lines(text: str, _: str) -> Iterator[tuple[int, str]]:
+def text_lines(text: str) -> Iterator[tuple[int, str]]:
     """Number and content of the lines that hold a parameter, without comments."""
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.partition("#")[0].strip()
@@ -178,7 +178,7 @@ def text_lines(text: str, _: str) -> Iterator[tuple[int, str]]:
             yield number, content
 
 
-def _yaml_lines(text: str, path: str) -> Iterator[tuple[int, str]]:
+def _yaml_lines(text: str, path: Path) -> Iterator[tuple[int, str]]:
     """Numbers and content of the lines of a set in YAML, written as in a text file: those of the section `values`, or all where there is none."""
     lines = [(number, line.partition("#")[0].rstrip()) for number, line in enumerate(text.splitlines(), start=1)]
     has_section = any(line.partition(":")[0] == "values" for _, line in lines)

@@ -26,11 +26,8 @@ from jourdain_jax.bicycle.parameter_files import listed, read_number, read_text,
 
 _FORM = "`name = reading+/-sigma`, or several readings with commas between, for example `TcB1 = 1.7173+/-0.0001`"
 _FRAME, _TABLE = ("w", "gamma", "f"), ("h1", "h2", "h3", "h4", "h5", "d1", "d2", "d3", "d4", "d")
-_WHOLE_FORK, _SPLIT_FORK = ("mH",), ("mG", "mS", "h6", "h7", "d5", "d6", "l")
-_ALWAYS = (
-    *("g", "dR", "nR", "dF", "nF", "mR", "mF", "mB", "lR", "lF", "TcR1", "TcF1", "TtR1", "TtF1", "mP", "lP", "dP", "TtP1"),
-    *("TcB1",),
-)
+_WHOLE_FORK, _SPLIT_FORK = ("mH", "TcH1"), ("mG", "mS", "h6", "h7", "d5", "d6", "l", "TcG1", "TcS1")
+_ALWAYS = ("g", "dR", "nR", "dF", "nF", "mR", "mF", "mB", "lR", "lF", "TcR1", "TcF1", "TtR1", "TtF1", "mP", "lP", "dP", "TtP1", "TcB1")
 _FEWEST = 3  # hangings, for three numbers in the plane of symmetry
 
 
@@ -49,11 +46,6 @@ class Readings(eqx.Module):
         """Whether wheelbase and fork offset follow from heights and diameters on a table."""
         return "w" not in self.means
 
-    @property
-    def split(self) -> bool:
-        """Whether handlebar and fork were measured by themselves."""
-        return "S" in self.hangings
-
 
 def holds_readings(path: Path) -> bool:
     """Whether a file is one of raw measurements, by its name."""
@@ -71,7 +63,7 @@ def read_readings(path: str | Path) -> Readings:
     sigmas: dict[str, float] = {}
     lines: dict[str, int] = {}
     without: list[str] = []
-    for number, line in text_lines(read_text(path), str(path)):
+    for number, line in text_lines(read_text(path)):
         where = f"{path}, line {number}"
         name, _, right = (part.strip() for part in line.partition("="))
         if not right or not re.fullmatch(r"\w+", name):
@@ -85,7 +77,6 @@ def read_readings(path: str | Path) -> Readings:
             without.append(name)
     split = "mS" in means or "mG" in means
     needed = [*_ALWAYS, *(_SPLIT_FORK if split else _WHOLE_FORK), *(_FRAME if "w" in means else _TABLE)]
-    needed += ["TcG1", "TcS1"] if split else ["TcH1"]
     hangings = {part: _hangings(means, part) for part in ("BGS" if split else "BH")}
     missing = [name for name in needed if name not in means]
     for part, found in hangings.items():

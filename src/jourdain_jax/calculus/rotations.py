@@ -86,6 +86,23 @@ def quaternion_to_matrix(quaternion: Real[Array | np.ndarray, "4"] | Sequence[Nu
     )
 
 
+def matrices_to_quaternions(rotations: Float[np.ndarray, "matrices 3 3"]) -> Float[np.ndarray, "matrices 4"]:
+    """Unit quaternions (w, x, y, z) of known rotation matrices, body to space; of the two signs either.
+
+    The largest of 4 w^2, 4 x^2, 4 y^2, 4 z^2 is found from the diagonal, the others by dividing by its root (Shepperd 1978).
+    """
+    R = np.asarray(rotations, float)
+    trace = np.trace(R, axis1=1, axis2=2)
+    fours = np.stack([1 + trace, *(1 + 2 * R[:, k, k] - trace for k in range(3))], axis=1)
+    found = np.empty((len(R), 4))
+    for n, best in enumerate(fours.argmax(axis=1)):
+        skew = [R[n, 2, 1] - R[n, 1, 2], R[n, 0, 2] - R[n, 2, 0], R[n, 1, 0] - R[n, 0, 1]]
+        found[n] = [0.0, *skew] if best == 0 else [skew[best - 1], *(R[n, best - 1] + R[n, :, best - 1])]
+        found[n, best] = fours[n, best]
+        found[n] /= np.linalg.norm(found[n])
+    return found
+
+
 def quaternion_rate(quaternion: Float[Array, "4"], omega_body: Float[Array, "3"]) -> Float[Array, "4"]:
     """`d quaternion / dt = 1/2 quaternion (0, omega_body)` for the body angular velocity `omega_body` (rad/s)."""
     return 0.5 * quaternion_product(quaternion, jnp.concatenate([jnp.zeros_like(omega_body[:1]), omega_body]))

@@ -16,6 +16,7 @@ from jourdain_jax.motion.trajectories.results import EVENT, FALLBACKS, SUCCESS
 from jourdain_jax.motion.trajectories.storage import save
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.animation import animate, check_suffix
+from jourdain_jax.plotting.backend import check_folder
 from jourdain_jax.plotting.quantities import check_format, plot
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -132,16 +133,19 @@ def _description(row: dict) -> str:
 
 
 def _report(options) -> bool:
-    found = report(_scene(options))
-    print(json.dumps({"model": options.model, **found.as_dict()}, indent=2) if options.json else found)
+    _show(report(_scene(options)), options)
     return True
 
 
 def _verify(options) -> bool:
     scene = _scene(options)
     found = verify(scene, _state(scene, options))
-    print(json.dumps({"model": options.model, **found.as_dict()}, indent=2) if options.json else found)
+    _show(found, options)
     return bool(found.passed)
+
+
+def _show(found, options) -> None:
+    print(json.dumps({"model": options.model, **found.as_dict()}, indent=2) if options.json else found)
 
 
 def _simulate(options) -> bool:
@@ -168,11 +172,9 @@ def _simulate(options) -> bool:
 
 def _check_files(options) -> None:
     """Before a long run, not after it: the files can be written."""
-    for path in (options.out, options.plot, options.animate):
-        folder = os.path.dirname(path or "") or "."
-        if not os.path.isdir(folder):
-            raise ValueError(f"cannot write `{path}`: there is no folder `{folder}`; make it first")
-        if path and os.path.isdir(path):
+    for path in filter(None, (options.out, options.plot, options.animate)):
+        check_folder(path)
+        if os.path.isdir(path):
             raise ValueError(f"cannot write `{path}`: it is a folder; give the name of a file in it")
     if options.plot:
         check_format(options.plot)

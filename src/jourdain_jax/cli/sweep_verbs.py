@@ -31,7 +31,7 @@ from pathlib import Path
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.ensembles.distributions import Levels, LogNormal, LogUniform, Normal, Uniform
 from jourdain_jax.ensembles.outputs import End, EventTime, Happened, Integral, Largest, LargestMagnitude, Smallest
-from jourdain_jax.ensembles.result import StudyResult, load_study, merge_studies
+from jourdain_jax.ensembles.result import LEVELS, StudyResult, load_study, merge_studies
 from jourdain_jax.ensembles.study import Study
 from jourdain_jax.models.registry import model
 from jourdain_jax.scene.names import nearest
@@ -167,11 +167,11 @@ def _show(found: StudyResult, options) -> None:
         return
     outputs = {}
     for i, name in enumerate(found.outputs if found.counts else ()):
-        limits = {str(level): [_or_none(x) for x in found.quantile(name, level)] for level in (0.025, 0.5, 0.975)}
+        limits = {str(level): [_or_none(x) for x in found.quantile(name, level)] for level in LEVELS}
         numbers = {"mean": _or_none(found.mean(name)), "deviation": _or_none(found.deviation(name)), "quantiles": limits}
         outputs[name] = {"lanes": int(found.statistics.lanes[i, i])} | numbers
-    print(json.dumps({"folder": str(found.store.path), "lanes": len(found), "complete": found.complete, "counts": found.counts,
-                      "failed": found.failed.tolist(), "outputs": outputs}, indent=2))  # fmt: skip
+    about = {"folder": str(found.store.path), "lanes": len(found), "complete": found.complete, "counts": found.counts, "failed": found.failed.tolist()}
+    print(json.dumps(about | {"outputs": outputs}, indent=2))
 
 
 def _or_none(x: float) -> float | None:

@@ -31,7 +31,7 @@ def on_cluster(task: Task, client) -> Callable[..., Iterator[tuple[int, int]]]:
         raise ValueError(f"`client` is {described(client)}, expected a `dask.distributed.Client`")
     sent = sent_to_others(task)
 
-    def workers(task: Task, store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
+    def workers(store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
         path = str(store.path.resolve())
         study = client.submit(bytes, sent, pure=False)  # a task, and no scattered data: the scheduler knows how to have it again when a worker died
         asked = study, path, os.getpid(), _places(distributed, client)
@@ -109,4 +109,4 @@ def _chunk(number: int, sent: bytes, path: str, asking: int, places: dict | None
             _runners[which] = Runner(pickle.loads(sent), Store(path))
         runner = _runners[which]
         receipt = runner.store.receipt(number)
-        return (receipt.last - receipt.first, receipt.arrays["failed"].size) if receipt else runner.run(number)
+        return receipt.lanes if receipt else runner.run(number)

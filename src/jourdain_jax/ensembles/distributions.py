@@ -27,16 +27,15 @@ class Distribution:
         """Derivatives of `values(u)` with respect to the numbers of the distribution, by their names."""
 
 
-def _check(owner, **numbers: Any) -> None:
-    for name, value in numbers.items():
-        object.__setattr__(owner, name, float(checked_known(value, f"`{name}` of {type(owner).__name__}", (), advice="give one number")))
+def _check(owner: Distribution) -> None:
+    """Make the numbers of a distribution floats; ValueError where one is not finite, or `low` is not below `high`."""
+    kind = type(owner).__name__
+    for name, value in vars(owner).items():
+        object.__setattr__(owner, name, float(checked_known(value, f"`{name}` of {kind}", (), advice="give one number")))
         if not np.isfinite(getattr(owner, name)):
-            raise ValueError(f"`{name}` of {type(owner).__name__} is {value}, expected a finite number")
-
-
-def _check_order(owner, low: float, high: float) -> None:
-    if not low < high:
-        raise ValueError(f"{type(owner).__name__} has low = {low:g} and high = {high:g}, expected low < high")
+            raise ValueError(f"`{name}` of {kind} is {value}, expected a finite number")
+    if isinstance(owner, Uniform | LogUniform) and not owner.low < owner.high:
+        raise ValueError(f"{kind} has low = {owner.low:g} and high = {owner.high:g}, expected low < high")
 
 
 @dataclass(frozen=True)
@@ -47,16 +46,14 @@ class Normal(Distribution):
     sigma: Any
 
     def __post_init__(self):
-        _check(self, mean=self.mean, sigma=self.sigma)
+        _check(self)
         if self.sigma < 0:
             raise ValueError(f"`sigma` of Normal is {self.sigma:g}, expected a standard deviation of at least 0")
 
     def values(self, u: np.ndarray) -> np.ndarray:
-        """The values at the probabilities `u`: mean + sigma Phi^-1(u)."""
         return self.mean + self.sigma * special_functions().ndtri(u)
 
     def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """1 with respect to the mean, Phi^-1(u) with respect to sigma."""
         return {"mean": np.ones_like(u), "sigma": special_functions().ndtri(u)}
 
 
@@ -68,15 +65,12 @@ class Uniform(Distribution):
     high: Any
 
     def __post_init__(self):
-        _check(self, low=self.low, high=self.high)
-        _check_order(self, self.low, self.high)
+        _check(self)
 
     def values(self, u: np.ndarray) -> np.ndarray:
-        """The values at the probabilities `u`: low + (high - low) u."""
         return self.low + (self.high - self.low) * u
 
     def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """1 - u with respect to `low`, u with respect to `high`."""
         return {"low": 1 - u, "high": u}
 
 
@@ -88,16 +82,14 @@ class LogNormal(Distribution):
     sigma: Any
 
     def __post_init__(self):
-        _check(self, median=self.median, sigma=self.sigma)
+        _check(self)
         if self.median <= 0 or self.sigma < 0:
             raise ValueError(f"LogNormal has median {self.median:g} and sigma {self.sigma:g}, expected a positive median and sigma >= 0")
 
     def values(self, u: np.ndarray) -> np.ndarray:
-        """The values at the probabilities `u`: median exp(sigma Phi^-1(u))."""
         return self.median * np.exp(self.sigma * special_functions().ndtri(u))
 
     def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """Derivatives of the value x: x / median with respect to the median, x Phi^-1(u) with respect to sigma."""
         x = self.values(u)
         return {"median": x / self.median, "sigma": x * special_functions().ndtri(u)}
 
@@ -110,17 +102,14 @@ class LogUniform(Distribution):
     high: Any
 
     def __post_init__(self):
-        _check(self, low=self.low, high=self.high)
-        _check_order(self, self.low, self.high)
+        _check(self)
         if self.low <= 0:
             raise ValueError(f"`low` of LogUniform is {self.low:g}, expected a positive number")
 
     def values(self, u: np.ndarray) -> np.ndarray:
-        """The values at the probabilities `u`: low (high / low)^u."""
         return self.low * (self.high / self.low) ** u
 
     def derivatives(self, u: np.ndarray) -> dict[str, np.ndarray]:
-        """Derivatives of the value x: (1 - u) x / low with respect to `low`, u x / high with respect to `high`."""
         x = self.values(u)
         return {"low": (1 - u) * x / self.low, "high": u * x / self.high}
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from jourdain_jax.ensembles.distributions import Distribution
 from jourdain_jax.ensembles.outputs import OfEvent
-from jourdain_jax.ensembles.task import AT_START, Task
+from jourdain_jax.ensembles.task import Task
 from jourdain_jax.motion.forward_mode import rollout_forward
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.sensitivity import SensitivityWarning
@@ -103,9 +103,8 @@ def _of_block(task: Task, columns: Sequence[str]):
     """Columns by name -> outputs (lanes, outputs), their derivatives with respect to each column (columns, lanes, outputs), and how lanes ended (lanes,)."""
 
     def outputs(drawn: Mapping):
-        parameters = {name: column for name, column in drawn.items() if not name.endswith(AT_START)}
-        starts = {name.removesuffix(AT_START): column for name, column in drawn.items() if name.endswith(AT_START)}
-        rolled = rollout_forward(task.scene, dict(task.constants) | starts, parameters=parameters or None, **task.options).lanes
+        starts, parameters = task.starts_and_parameters(drawn)
+        rolled = rollout_forward(task.scene, starts, parameters=parameters or None, **task.options).lanes
         found = eqx.filter_vmap(task.outputs_of_lane)(rolled)
         return found, jnp.where(rolled.result == results.EVENT, rolled.event, jnp.where(rolled.succeeded, -1, -2))
 

@@ -30,7 +30,7 @@ class Output:
         """The number, of one `motion`; by operations of JAX."""
 
     def check(self, scene: Scene) -> None:
-        """ValueError where the scene has not what the output names."""
+        """ValueError where the `scene` has not what the output names."""
 
 
 def _check_name(output: Output, name, scene: Scene) -> None:
@@ -48,11 +48,9 @@ class End(Output):
     over_times = False
 
     def check(self, scene: Scene) -> None:
-        """ValueError where the scene has no such coordinate or speed."""
         _check_name(self, self.name, scene)
 
     def of(self, motion: Trajectory) -> Float[Array, ""]:
-        """The last value of the `motion`."""
         names = motion.scene.coordinate_names
         if self.name in names.entries:
             return motion.q_end[names.entries.index(self.name)]
@@ -70,7 +68,6 @@ class _Along(Output):
     unit: str = ""
 
     def check(self, scene: Scene) -> None:
-        """ValueError where the scene has no such coordinate or speed."""
         if not callable(self.quantity):
             _check_name(self, self.quantity, scene)
 
@@ -83,7 +80,6 @@ class Largest(_Along):
     """
 
     def of(self, motion: Trajectory) -> Float[Array, ""]:
-        """The largest value along the `motion`."""
         return largest(*sampled(motion, self.quantity))
 
 
@@ -92,7 +88,6 @@ class Smallest(_Along):
     """The smallest value of a `quantity`, found as `Largest` finds the largest. `unit`: text that is kept with it."""
 
     def of(self, motion: Trajectory) -> Float[Array, ""]:
-        """The smallest value along the `motion`."""
         times, values, count = sampled(motion, self.quantity)
         return -largest(times, -values, count)
 
@@ -102,7 +97,6 @@ class LargestMagnitude(_Along):
     """The largest magnitude of a `quantity`, found as `Largest` finds the largest. `unit`: text that is kept with it."""
 
     def of(self, motion: Trajectory) -> Float[Array, ""]:
-        """The largest magnitude along the `motion`."""
         times, values, count = sampled(motion, self.quantity)
         return jnp.maximum(largest(times, values, count), largest(times, -values, count))
 
@@ -115,7 +109,6 @@ class Integral(_Along):
     """
 
     def of(self, motion: Trajectory) -> Float[Array, ""]:
-        """The integral along the `motion`."""
         return integral(*sampled(motion, self.quantity))
 
 
@@ -145,7 +138,6 @@ class EventTime(OfEvent):
     unit = "s"
 
     def of(self, motion: Trajectory) -> Float[Array, ""]:
-        """When the event ended the `motion`."""
         return jnp.where(self._happened(motion), motion.t_end, jnp.nan)
 
 
@@ -154,7 +146,6 @@ class Happened(OfEvent):
     """1 where the stop event `event` ended the motion (default: any event), otherwise 0: its mean is the fraction of lanes."""
 
     def of(self, motion: Trajectory) -> Float[Array, ""]:
-        """Whether the event ended the `motion`."""
         return jnp.where(self._happened(motion), 1.0, 0.0)
 
 
@@ -169,7 +160,6 @@ class Quantity(Output):
     unit: str = ""
 
     def of(self, motion: Trajectory) -> Float[Array, ""]:
-        """The number of one `motion`."""
         found = self.function(motion)
         shape = getattr(found, "shape", None if not isinstance(found, int | float) else ())
         if shape != ():

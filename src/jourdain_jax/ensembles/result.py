@@ -68,20 +68,16 @@ class StudyResult(Printed):
             place, more = receipt.arrays["cells"]
             cells[place] += more
         extremes = np.stack([[np.full(count, np.inf), np.full(count, -np.inf)], *(r.arrays["extremes"] for r in receipts)])
-        none = np.zeros(0, np.int64)
         return {
             "chunks": len(receipts),
             "codes": sum((r.arrays["codes"] for r in receipts), np.zeros(len(CODES), np.int64)),
             "again": sum(int(r.arrays["again"][0]) for r in receipts),
             "steps": sum((r.arrays["steps"] for r in receipts), np.zeros(2, np.int64)),
-            "failed": np.concatenate([none, *(r.arrays["failed"] for r in receipts)]),
-            "failed_codes": np.concatenate([none, *(r.arrays["failed_codes"] for r in receipts)]),
+            "failed": np.concatenate([np.zeros(0, np.int64), *(r.arrays["failed"] for r in receipts)]),
             "sums": [r.arrays["sums"] for r in receipts],
             "cells": cells.reshape(count, CELLS + 2),
             "extremes": np.stack([extremes[:, 0].min(axis=0), extremes[:, 1].max(axis=0)]),
         }
-
-    # How far, and what became of the lanes. ------------------------------------------------------------------------
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -120,8 +116,6 @@ class StudyResult(Printed):
         if self.store.columns:
             kept = {name: float(array[number]) for name, array in self.to_xarray().items() if array.dims == ("lane",)}
         return Lane(self.task, number, first, {name: float(value[0]) for name, value in parameters.items()}, kept)
-
-    # Statistics. ---------------------------------------------------------------------------------------------------
 
     @cached_property
     def statistics(self) -> Statistics:
@@ -177,8 +171,6 @@ class StudyResult(Printed):
         if output not in self.outputs:
             raise ValueError(f"the study has no output `{output}`; {nearest(output, self.outputs)}")
         return self.outputs.index(output)
-
-    # Arrays, files, pictures. --------------------------------------------------------------------------------------
 
     def to_xarray(self):
         """All arrays as an `xarray.Dataset` with names and units, read where they are used; lanes that are not done are NaN, their result is -1."""

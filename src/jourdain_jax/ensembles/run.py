@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -99,20 +99,16 @@ def bounded(task: Task, path, chunk: int | None, allowed: int | None, *, here: b
 
 def opened(task: Task, path, chunk: int | None, command: str) -> Store:
     """The folder of the task: a new one, or the one that holds it already; ValueError where it holds another study."""
-    _check_names(task)
-    if not Store.is_taken(path):
-        store = Store.make(path, _study(task, chunk, command), task.columns(), _constants(task), attributes(task))
-    else:
-        store = Store(path)
-    _check_same(store, task, chunk)
-    return store
-
-
-def _check_names(task: Task) -> None:
     names = task.column_names()
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ValueError(f"`{twice[0]}` would name two arrays of the study; arrays are {', '.join(map(repr, names))}: call the output otherwise")
+    if Store.is_taken(path):
+        store = Store(path)
+    else:
+        store = Store.make(path, _study(task, chunk, command), task.columns(), _constants(task), attributes(task))
+    _check_same(store, task, chunk)
+    return store
 
 
 def _constants(task: Task) -> dict[str, tuple]:
@@ -215,21 +211,21 @@ def _interruptions() -> Iterator[Callable[[], bool]]:
 def run(task: Task, path, *, chunk: int | None, progress: bool, shard: tuple[int, int], command: str, workers: Callable) -> Store:
     """Compute what is missing of a task in the folder `path`.
 
-    `shard`: (k, n), the chunks whose number is k - 1 modulo n; `workers`: (task, store, numbers, interrupted) -> numbers of lanes and of failed lanes, chunk
-    by chunk.
+    `shard`: (k, n), the chunks whose number is k - 1 modulo n; `workers`: (store, numbers, interrupted) -> numbers of lanes and of failed lanes, chunk by
+    chunk.
     """
     store = opened(task, path, chunk, command)
     with store.lock():
         done, torn = store.done()
         if torn:
-            warnings.warn(f"{len(torn)} chunks of `{path}` are damaged and are computed again: {_listed(torn)}", stacklevel=3)
-        whole = set(done)
-        missing = [number for number in range(shard[0] - 1, store.chunks, shard[1]) if number not in whole]
+            some = ", ".join(map(str, torn[:10])) + (" ..." if len(torn) > 10 else "")
+            warnings.warn(f"{len(torn)} chunks of `{path}` are damaged and are computed again: {some}", stacklevel=3)
+        missing = sorted({*range(shard[0] - 1, store.chunks, shard[1])}.difference(done))
         known = _lanes(store, done)
         bar = tqdm(total=known + _lanes(store, missing), initial=known, unit="lane", unit_scale=True, disable=not progress, smoothing=0.1)
         failed, finished, began = 0, 0, time.monotonic()
         with bar, _interruptions() as interrupted:
-            for lanes, wrong in workers(task, store, missing, interrupted):
+            for lanes, wrong in workers(store, missing, interrupted):
                 failed, finished = failed + wrong, finished + 1
                 bar.update(lanes)
                 bar.set_postfix_str(f"{100 * failed / max(1, bar.n - known):.2g} % failed", refresh=False)
@@ -252,7 +248,3 @@ def in_this_process(task: Task, store: Store, numbers, interrupted) -> Iterator[
 
 def _lanes(store: Store, numbers) -> int:
     return sum(last - first for first, last in map(store.span, numbers))
-
-
-def _listed(numbers: Mapping | list[int]) -> str:
-    return ", ".join(map(str, list(numbers)[:10])) + (" ..." if len(numbers) > 10 else "")

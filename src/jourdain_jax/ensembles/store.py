@@ -54,6 +54,11 @@ class Receipt:
     arrays: Mapping[str, np.ndarray]  # result codes and their counts, failed lanes, sums per block, cells and their counts, extremes
     checksums: Mapping[str, int]
 
+    @property
+    def lanes(self) -> tuple[int, int]:
+        """How many lanes the chunk has, and how many of them failed."""
+        return self.last - self.first, self.arrays["failed"].size
+
 
 class Store:
     """A study's folder, `path`."""
@@ -63,8 +68,6 @@ class Store:
         self.study = self._read_study()
         self.lanes, self.chunk = int(self.study["samples"]), int(self.study["chunk"])
         self.columns = {name: Column(**{**entry, "more": tuple(map(tuple, entry["more"]))}) for name, entry in self.study["columns"].items()}
-
-    # Making and opening. -------------------------------------------------------------------------------------------
 
     @staticmethod
     def make(path: str | os.PathLike, study: Mapping, columns: Mapping[str, Column], constants: Mapping[str, tuple], attributes: Mapping) -> "Store":
@@ -140,8 +143,6 @@ class Store:
         """A context in which no other process can run this study."""
         return locked(self.path / "run" / "lock")
 
-    # Chunks. -------------------------------------------------------------------------------------------------------
-
     @property
     def chunks(self) -> int:
         """How many there are."""
@@ -153,11 +154,14 @@ class Store:
 
     def _file(self, name: str, number: int) -> Path:
         """The file of a chunk: of an array with more axes than that of lanes, which are not cut, every chunk has a folder of its own."""
-        more = len(self.columns[name].more)
-        folder = self.path / name / "c"
-        if not more:
-            return folder / str(number)
-        return folder.joinpath(str(number), *["0"] * more)
+        return (self.path / name / "c" / str(number)).joinpath(*["0"] * len(self.columns[name].more))
+
+    def _write(self, name: str, number: int, content: bytes) -> None:
+        """Put the file of a chunk in its place."""
+        file = self._file(name, number)
+        if self.columns[name].more:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(file, content)
 
     def _receipt_file(self, number: int) -> Path:
         return self.path / "run" / "chunks" / str(number)
@@ -172,10 +176,7 @@ class Store:
                 full[: len(values[name])] = values[name]
                 content = full.tobytes()
                 checksums[name] = crc32c.value(content)
-                file = self._file(name, number)
-                if column.more:
-                    file.parent.mkdir(parents=True, exist_ok=True)
-                write_whole(file, content + checksums[name].to_bytes(4, "little"))
+                self._write(name, number, content + checksums[name].to_bytes(4, "little"))
             write_whole(self._receipt_file(number), _packed(Receipt(*self.span(number), arrays, checksums), crc32c))
         except OSError as error:
             done = len(self.receipts())
@@ -205,55 +206,45 @@ class Store:
             except FileNotFoundError:
                 return False
             size = np.dtype(column.dtype).itemsize * (self.chunk // column.every) * math.prod(length for _, length in column.more)
-            if len(content) != size + 4 or int.from_bytes(content[-4:], "little") != receipt.checksums[name]:
-                return False
-            if crc32c.value(content[:-4]) != receipt.checksums[name]:
+            if len(content) != size + 4 or not int.from_bytes(content[-4:], "little") == receipt.checksums[name] == crc32c.value(content[:-4]):
                 return False
         return True
 
     def done(self) -> tuple[list[int], list[int]]:
         """Numbers of the chunks that are whole, and of those that have a receipt and are not; the receipts of the latter are removed."""
-        whole: list[int] = []
-        torn: list[int] = []
-        for number in self.receipts():
-            (whole if self.is_whole(number) else torn).append(number)
+        receipts = self.receipts()
+        whole = [number for number in receipts if self.is_whole(number)]
+        torn = sorted(set(receipts) - set(whole))
         for number in torn:
             self._receipt_file(number).unlink()
         return whole, torn
 
-    # The grid of the statistics. ------------------------------------------------------------------------------------
-
     def read_grid(self) -> dict | None:
         """What `write_grid` kept; None where nothing was, or it is damaged (it is then found again)."""
-        try:
-            return json.loads((self.path / "run" / "grid.json").read_bytes())
-        except (FileNotFoundError, ValueError):
-            return None
+        return self._read("grid.json", None)
 
     def write_grid(self, grid: dict) -> None:
-        """Keep the grid."""
+        """Keep the grid of the statistics."""
         write_whole(self.path / "run" / "grid.json", json.dumps(grid).encode(), wait=True)
 
-    # Lanes on which processes died. ---------------------------------------------------------------------------------
-
     def skipped(self) -> tuple[int, ...]:
-        """Numbers of the lanes that `skip` noted."""
-        try:
-            return tuple(json.loads((self.path / "run" / "skipped.json").read_bytes()))
-        except (FileNotFoundError, ValueError):
-            return ()
+        """Numbers of the lanes that `skip` noted, since processes died on them."""
+        return tuple(self._read("skipped.json", ()))
 
     def skip(self, lane: int) -> None:
         """Note that a lane is not to be computed."""
         write_whole(self.path / "run" / "skipped.json", json.dumps(sorted({*self.skipped(), lane})).encode(), wait=True)
 
+    def _read(self, name: str, otherwise):
+        try:
+            return json.loads((self.path / "run" / name).read_bytes())
+        except (FileNotFoundError, ValueError):
+            return otherwise
+
     def take_chunk(self, other: "Store", number: int) -> None:
         """Copy a chunk that another folder of the same study holds."""
-        for name, column in self.columns.items():
-            file = self._file(name, number)
-            if column.more:
-                file.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(file, other._file(name, number).read_bytes())
+        for name in self.columns:
+            self._write(name, number, other._file(name, number).read_bytes())
         write_whole(self._receipt_file(number), other._receipt_file(number).read_bytes())
 
 

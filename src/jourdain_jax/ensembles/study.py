@@ -4,7 +4,7 @@ import inspect
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -179,7 +179,7 @@ class Study(Printed):
             raise ValueError("`client` and `processes` are both given; the workers of a cluster compute, or processes of this machine")
         here = client is None and processes == 1
         task, chunk = bounded(task, path, chunk, None if memory is None else of_each(memory, processes), here=here)
-        compute = in_this_process if here else on_cluster(task, client) if client is not None else in_processes(task, processes)
+        compute = partial(in_this_process, task) if here else on_cluster(task, client) if client is not None else in_processes(task, processes)
         store = run(task, path, chunk=chunk, progress=progress, shard=shards, command=command, workers=compute)
         return StudyResult(store, task)
 

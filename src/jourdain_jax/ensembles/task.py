@@ -79,25 +79,19 @@ class Task:
         return sum(np.dtype(column.dtype).itemsize * math.prod(length for _, length in column.more) / column.every for column in self.columns().values())
 
     @property
-    def blocks(self) -> int:
-        """How many there are."""
-        return -(-len(self.design) // self.block)
-
-    @property
     def ts(self) -> np.ndarray:
         """Saved times, s."""
         return np.asarray(self.options["ts"])
 
-    # Lanes. --------------------------------------------------------------------------------------------------------
-
     def arguments(self, first: int, last: int, places: np.ndarray | None = None) -> tuple[dict, dict]:
         """Start values and parameters of some lanes, counted from `first`: those at `places`, or all."""
         values = self.design.values(first, last)
-        if places is not None:
-            values = {name: column[places] for name, column in values.items()}
-        parameters = {name: column for name, column in values.items() if not name.endswith(AT_START)}
+        return self.starts_and_parameters(values if places is None else {name: column[places] for name, column in values.items()})
+
+    def starts_and_parameters(self, values: Mapping) -> tuple[dict, dict]:
+        """Start values, those that all lanes share among them, and parameters, from the columns of the design by name."""
         starts = {name.removesuffix(AT_START): column for name, column in values.items() if name.endswith(AT_START)}
-        return dict(self.constants) | starts, parameters
+        return dict(self.constants) | starts, {name: column for name, column in values.items() if not name.endswith(AT_START)}
 
     def simulated(self, lane: int, **options) -> Trajectory:
         """The motion of one lane alone; `options` replace those of the study."""
@@ -138,7 +132,7 @@ class Task:
         with nan_is_a_mark():
             outputs = np.array(self._outputs_of(rolled))[: last - first]
         if self.save == "statistics":
-            return Lanes({**self._of_lanes(rolled, last - first)}, outputs)
+            return Lanes(self._of_lanes(rolled, last - first), outputs)
         columns = self.design.values(first, last) | self._of_lanes(rolled, last - first) | dict(zip(self.outputs, outputs.T, strict=True))
         if self.save == "trajectories":
             kept = slice(-first % self.every, last - first, self.every)
@@ -163,8 +157,6 @@ class Task:
 
     def __getstate__(self):
         return {name: value for name, value in vars(self).items() if name != "_outputs_of"}  # what was compiled stays in its process
-
-    # What is kept. -------------------------------------------------------------------------------------------------
 
     def columns(self) -> dict[str, Column]:
         """The arrays of the store."""
@@ -222,7 +214,6 @@ def receipt_of(task: Task, grid: Grid, blocks: Mapping[int, Lanes]) -> dict[str,
         "again": np.array([sum(int(np.sum(lanes.columns["retries"] > 0)) for lanes in blocks.values())]),
         "steps": np.array([sum(int(np.sum(lanes.columns[name], dtype=np.int64)) for lanes in blocks.values()) for name in ("steps", "rejected_steps")]),
         "failed": np.concatenate([number * task.block + index for number, index in wrong.items()]).astype(np.int64),
-        "failed_codes": np.concatenate([code[number][index] for number, index in wrong.items()]),
         "sums": np.stack([sums_of_block(grid, lanes.outputs) for lanes in blocks.values()]),
         "cells": np.stack([place := np.flatnonzero(cells), cells.reshape(-1)[place]]).astype(np.int32),
         "extremes": np.stack([extremes[:, 0].min(axis=0), extremes[:, 1].max(axis=0)]),

@@ -27,7 +27,7 @@ def in_processes(task: Task, count: int) -> Callable[..., Iterator[tuple[int, in
     """What `run` takes as its workers; ValueError where the task cannot be sent to another process."""
     sent = sent_to_others(task)
 
-    def workers(task: Task, store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
+    def workers(store: Store, numbers: list[int], interrupted: Callable[[], bool]) -> Iterator[tuple[int, int]]:
         def compute(numbers: list[int], alone: bool):
             return _until_a_worker_dies(sent, store, numbers, 1 if alone else count, interrupted)
 
@@ -78,14 +78,9 @@ def _until_a_worker_dies(sent: bytes, store: Store, numbers: list[int], count: i
                     yield future.result()
                     del running[future]
         except BrokenProcessPool:
-            suspects = []
-            for number in running.values():
-                receipt = store.receipt(number)
-                if receipt is None:
-                    suspects.append(number)
-                else:  # kept before the worker died
-                    yield receipt.last - receipt.first, receipt.arrays["failed"].size
-            return suspects
+            receipts = {number: store.receipt(number) for number in running.values()}
+            yield from (receipt.lanes for receipt in receipts.values() if receipt is not None)  # kept before the worker died
+            return [number for number, receipt in receipts.items() if receipt is None]
 
 
 def _pool(sent: bytes, store: Store, count: int) -> ProcessPoolExecutor:

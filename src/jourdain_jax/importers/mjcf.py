@@ -8,6 +8,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from jourdain_jax.calculus.rotations import matrices_to_quaternions
 from jourdain_jax.importers.identifiers import identifier
 from jourdain_jax.importers.mjcf_elements import IDLE_ELEMENTS, Defaults, attributes_of, check_attributes
 from jourdain_jax.importers.placing import about, by_euler_angles, by_quaternion, combined, onto_axis
@@ -107,19 +108,10 @@ class _Reader:
         self._children(body, name, childclass)
 
     def _free_start(self, joint: Joint, position: Vector, turn: Matrix) -> None:
-        """The stated pose as the start; a quaternion of a rotation matrix by its largest entry (Shepperd 1978)."""
-        w = np.array([np.trace(turn), *np.diag(turn)])
-        k = int(np.argmax(w))
-        skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-        if k == 0:
-            q = np.array([1 + w[0], *skew])
-        else:
-            q = np.array([skew[k - 1], *(turn[k - 1] + turn[:, k - 1])])
-            q[k] = 1 + 2 * turn[k - 1, k - 1] - w[0]
-        q /= np.linalg.norm(q)
+        """The stated pose as the start."""
         name = identifier(joint.name)
         self.start |= {f"{name}_{axis}": float(x) for axis, x in zip("xyz", position, strict=True)}
-        self.start |= {f"{name}_attitude_{part}": float(x) for part, x in zip("wxyz", q, strict=True)}
+        self.start |= {f"{name}_attitude_{part}": float(x) for part, x in zip("wxyz", matrices_to_quaternions(turn[None])[0], strict=True)}
 
     def _joint(self, element: Element, childclass: str | None, body: str, number: int) -> Joint:
         name = element.get("name") or (f"{body}_joint" if number == 0 else f"{body}_joint{number + 1}")
@@ -206,7 +198,7 @@ class _Reader:
     def _solid(self, given: dict[str, str], kind: str, what: str) -> tuple[Vector, Matrix, np.ndarray]:
         """Middle, axes and size of a geom."""
         position, turn = self._place(given, what)
-        size = self.file.numbers(given.get("size"), (), f"size of {what}")
+        size = self.file.numbers(given.get("size"), None, f"size of {what}")
         if "fromto" in given and kind != "sphere":
             ends = self.file.numbers(given["fromto"], 6, f"fromto of {what}")
             along = ends[3:] - ends[:3]
@@ -276,4 +268,4 @@ class _Reader:
             check_attributes(self.file, "motor", given, f"motor `{name}`")
             if given.get("joint") not in names:
                 raise self.file.fault(f"motor `{name}` pushes `{given.get('joint')}`, which is no hinge or slide; {nearest(str(given.get('joint')), names)}")
-            yield Motor(name, given["joint"], float(self.file.numbers(given.get("gear"), (), f"gear of motor `{name}`", [1.0])[0]))
+            yield Motor(name, given["joint"], float(self.file.numbers(given.get("gear"), None, f"gear of motor `{name}`", [1.0])[0]))

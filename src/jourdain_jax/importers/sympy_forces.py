@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jourdain_jax.importers.formulas import sympy_package
-from jourdain_jax.importers.sympy_kinematics import STATES, AffineRows, Pose, RandomStates
+from jourdain_jax.importers.sympy_kinematics import AffineRows, Pose, RandomStates
 from jourdain_jax.importers.sympy_system import MechanicalSystem
 
 _IMPLIED = 1e-9  # of a row: what of it the geometric rows leave, relative
@@ -54,13 +54,9 @@ def velocity_rows(system: MechanicalSystem, states: RandomStates) -> list[Any]:
     if not rows or not system.configuration:
         return rows
     own, rates = AffineRows(system, rows), AffineRows(system, [sympy.sympify(row).diff(system.time) for row in system.configuration])
-    kept, seen = np.zeros(len(rows), bool), 0
-    for leaves in states.leaves(own.symbols | rates.symbols):
-        given, implied = own.coefficients(leaves), rates.coefficients(leaves)
-        if np.isfinite(given).all() and np.isfinite(implied).all():
-            left = given - given @ np.linalg.pinv(implied) @ implied
-            kept |= np.max(np.abs(left), axis=1) > _IMPLIED * np.max(np.abs(given), axis=1)
-            seen += 1
-        if seen == STATES:
-            return [row for row, keep in zip(rows, kept, strict=True) if keep]
-    raise ValueError("a row has no finite value at random states; check its expressions and the values of its constants")
+    kept = np.zeros(len(rows), bool)
+    for found in states.finite(own.symbols | rates.symbols, lambda leaves: {"own": own.coefficients(leaves), "rates": rates.coefficients(leaves)}, "a row"):
+        given, implied = found["own"], found["rates"]
+        left = given - given @ np.linalg.pinv(implied) @ implied
+        kept |= np.max(np.abs(left), axis=1) > _IMPLIED * np.max(np.abs(given), axis=1)
+    return [row for row, keep in zip(rows, kept, strict=True) if keep]

@@ -9,8 +9,8 @@ one for each axis of the inertial frame along which there is one while the rows 
 alike; and an angle for a frame that has an angular velocity about an axis of another frame, but no orientation.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -47,7 +47,7 @@ class RandomStates:
         self._known: list[dict[Any, float]] = [{} for _ in range(_TRIES)]
         self._generator = np.random.default_rng(0)
 
-    def leaves(self, symbols: Iterable[Any]) -> list[dict[Any, float]]:
+    def _leaves(self, symbols: Iterable[Any]) -> list[dict[Any, float]]:
         """As many assignments as are tried, with a number for each of the symbols."""
         for symbol in sorted(set(symbols) - self._known[0].keys(), key=str):
             given = self._constants.get(str(symbol))
@@ -59,10 +59,13 @@ class RandomStates:
     def numbers(self, lists: dict[str, list], what: str) -> list[dict[str, np.ndarray]]:
         """The values of expressions at the first states where all are finite. ValueError, with `what` they belong to, where there are too few."""
         symbols = symbols_in(expression for expressions in lists.values() for expression in expressions)
-        formulas = Formulas(lists, list(symbols))
+        return self.finite(symbols, Formulas(lists, list(symbols)).numbers, what)
+
+    def finite(self, symbols: Iterable[Any], numbers: Callable[[dict], dict[str, np.ndarray]], what: str) -> list[dict[str, np.ndarray]]:
+        """What `numbers` gives at the first states where all of it is finite. ValueError, with `what` it belongs to, where there are too few."""
         found = []
-        for leaves in self.leaves(symbols):
-            values = formulas.numbers(leaves)
+        for leaves in self._leaves(symbols):
+            values = numbers(leaves)
             if all(np.isfinite(x).all() for x in values.values()):
                 found.append(values)
             if len(found) == STATES:
@@ -222,8 +225,8 @@ def _check_angular_velocity(system: MechanicalSystem, states: RandomStates, pose
         return
     stated = list(system.resolved(pose.frame.ang_vel_in(system.frame).to_matrix(system.frame)))
     name = f"the orientation of body `{pose.name}`"
-    for values, rates in zip(*_along_the_motion(system, states, {"R": list(pose.orientation)}, {"omega": stated}, name), strict=True):
-        R, Rdot = values["R"].reshape(3, 3), rates["R"].reshape(3, 3)
+    for values in _along_the_motion(system, states, {"R": list(pose.orientation)}, {"omega": stated}, name):
+        R, Rdot = values["R"].reshape(3, 3), values["R rate"].reshape(3, 3)
         S = Rdot @ R.T
         omega = np.array([S[2, 1], S[0, 2], S[1, 0]])
         if np.max(np.abs(omega - values["omega"])) > _SAME * (1.0 + np.max(np.abs(omega))):
@@ -234,14 +237,14 @@ def _check_angular_velocity(system: MechanicalSystem, states: RandomStates, pose
 
 
 def _along_the_motion(system: MechanicalSystem, states: RandomStates, positions: dict, speeds: dict, what: str, rows: AffineRows | None = None):
-    """Values of expressions at random states that meet the `rows`, and the rates of those in `positions` there, by differences."""
+    """Values of expressions at random states that meet the `rows`, and there, as "r rate", the rates of those in `positions`, by differences."""
     rates = [system.rates[q.diff(system.time)] for q in system.coordinates]
     lists = positions | speeds | {"rates": rates}
     symbols = symbols_in(e for expressions in lists.values() for e in expressions) | set(system.coordinates)
     formulas = Formulas(lists, list(symbols))
-    values, derivatives = [], []
-    known = states.leaves(symbols if rows is None else symbols | rows.symbols)
-    for leaves in known if rows is None else map(rows.met, known):
+
+    def numbers(leaves):
+        leaves = leaves if rows is None else rows.met(leaves)
         here = formulas.numbers(leaves)
         forward, back = (
             formulas.numbers(
@@ -251,12 +254,9 @@ def _along_the_motion(system: MechanicalSystem, states: RandomStates, positions:
             )
             for step in (_STEP, -_STEP)
         )
-        if all(np.isfinite(x).all() for found in (here, forward, back) for x in found.values()):
-            values.append(here)
-            derivatives.append({name: (forward[name] - back[name]) / (2 * _STEP) for name in positions})
-        if len(values) == STATES:
-            return values, derivatives
-    raise ValueError(f"{what} has no finite value at random states; check its expressions and the values of its constants")
+        return here | {f"{name} rate": (forward[name] - back[name]) / (2 * _STEP) for name in positions}
+
+    return states.finite(symbols if rows is None else symbols | rows.symbols, numbers, what)
 
 
 def _moved(system: MechanicalSystem, states: RandomStates, poses: list[Pose]) -> tuple[MechanicalSystem, list[Pose]]:
@@ -268,8 +268,8 @@ def _moved(system: MechanicalSystem, states: RandomStates, poses: list[Pose]) ->
     missing = []  # of each body: stated velocity less rate of the position, at all states
     for pose, velocity in zip(poses, stated, strict=True):
         lists = {"r": list(pose.position)}, {"v": list(velocity)}
-        values, rates = _along_the_motion(system, states, *lists, f"the position or velocity of body `{pose.name}`", rows)
-        difference = np.array([found["v"] - rate["r"] for found, rate in zip(values, rates, strict=True)])
+        values = _along_the_motion(system, states, *lists, f"the position or velocity of body `{pose.name}`", rows)
+        difference = np.array([found["v"] - found["r rate"] for found in values])
         missing.append(np.where(np.abs(difference) > _SAME * (1.0 + max(np.max(np.abs(found["v"])) for found in values)), difference, 0.0))
     if not any(np.any(difference) for difference in missing):
         return system, poses
@@ -295,6 +295,5 @@ def _moved(system: MechanicalSystem, states: RandomStates, poses: list[Pose]) ->
             shift[int(axis)] = sympy.physics.mechanics.dynamicsymbols(name)
             added[shift[int(axis)]] = difference[int(axis)]
         for k in group:
-            pose = poses[k]
-            new[k] = Pose(pose.name, pose.mass, pose.inertia, pose.position + shift, pose.orientation, pose.centre, pose.frame)
+            new[k] = replace(poses[k], position=poses[k].position + shift)
     return system.with_coordinates(added), new

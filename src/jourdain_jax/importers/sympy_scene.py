@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import checked_real, described
 from jourdain_jax.importers.formulas import Formulas, sympy_package
 from jourdain_jax.importers.identifiers import class_name, identifiers
-from jourdain_jax.importers.scene_class import Parameter, scene_class
+from jourdain_jax.importers.scene_class import scene_class
 from jourdain_jax.importers.sympy_forces import Forces, forces_of, velocity_rows
 from jourdain_jax.importers.sympy_kinematics import Pose, RandomStates, poses_of, symbols_in
 from jourdain_jax.importers.sympy_system import MechanicalSystem, mechanical_system
@@ -18,6 +18,7 @@ from jourdain_jax.scene.bodies import Particle, RigidBody
 from jourdain_jax.scene.coordinates import coordinates, inputs, speeds
 from jourdain_jax.scene.loads import Load
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 
 
@@ -31,13 +32,9 @@ class _Expressions:
     inputs: tuple[Any, ...]
     fields: dict[Any, str]  # constant -> name of the field
     is_rigid: dict[str, bool]  # body -> whether it is a rigid one
-    weights: tuple[str, ...]  # bodies with a constant force
-    forces: tuple[str, ...]
-    torques: tuple[str, ...]
-    generalized: tuple[str, ...]  # names of speeds
     bodies: Formulas
     rates: Formulas
-    loads: Formulas
+    loads: Formulas  # by body, or name of a speed, and kind: "disc force"
     geometric: Formulas
     velocity: Formulas
 
@@ -67,17 +64,16 @@ class SympyScene(Scene):
 
     def loads(self, motion):
         """SymPy's loads; those that are constant have a potential."""
-        known = self._expressions
-        values = {name: _vector(value) for name, value in known.loads.values(self._leaves_of(motion)).items()}
-        weights = {name: values[f"{name} weight"] for name in known.weights}
-        forces = {name: values[f"{name} force"] for name in known.forces}
-        torques = {name: values[f"{name} torque"] for name in known.torques}
-        generalized = {name: values[f"{name} generalized"][0] for name in known.generalized}
+        kinds = {"weight": {}, "force": {}, "torque": {}, "generalized": {}}
+        for key, value in self._expressions.loads.values(self._leaves_of(motion)).items():
+            name, _, kind = key.rpartition(" ")
+            kinds[kind][name] = _vector(value)
+        weights, forces, torques, generalized = kinds.values()
         found = ()
         if weights:
             found += (Load(forces=weights, potential=-sum(force @ motion[name].position for name, force in weights.items())),)
         if forces or torques or generalized:
-            found += (Load(forces, torques, generalized),)
+            found += (Load(forces, torques, {name: value[0] for name, value in generalized.items()}),)
         return found
 
     def geometric_constraints(self, pose):
@@ -189,13 +185,9 @@ def _scene_class(system: MechanicalSystem, poses: list[Pose], forces: Forces, ro
         tuple(unknown),
         {constant: fields[str(constant)] for constant in constants},
         {pose.name: pose.orientation is not None for pose in poses},
-        tuple(forces.weights),
-        tuple(forces.forces),
-        tuple(forces.torques),
-        tuple(u_names[_name_of(speed)] for speed in forces.generalized),
         **formulas,
     )
-    parameters = {fields[str(x)]: Parameter(given[str(x)], about=f"{x} of SymPy", positive=bool(x.is_positive)) for x in constants}
+    parameters = {fields[str(x)]: parameter(given[str(x)], about=f"{x} of SymPy", positive=bool(x.is_positive)) for x in constants}
     attributes = {
         "coordinates": coordinates(" ".join(q_names.values())),
         "speeds": speeds(" ".join(u_names.values())),

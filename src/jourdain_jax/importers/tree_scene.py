@@ -10,12 +10,13 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.rotations import quaternion_to_matrix
 from jourdain_jax.importers.identifiers import class_name, identifiers
 from jourdain_jax.importers.placing import cross_matrix, onto_axis
-from jourdain_jax.importers.scene_class import Parameter, scene_class
+from jourdain_jax.importers.scene_class import scene_class
 from jourdain_jax.importers.tree import Joint, Link, Look, Tree
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.coordinates import Quaternion, coordinates, inputs, quaternion
 from jourdain_jax.scene.loads import Load, generalized_force
 from jourdain_jax.scene.names import nearest
+from jourdain_jax.scene.parameters import parameter
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.visuals import Visual
 
@@ -181,20 +182,21 @@ def tree_scene(tree: Tree, source: str) -> type[Scene]:
     link_names = identifiers([link.name for link in tree.links], "link")
     joint_names = identifiers([joint.name for joint in joints if joint.name], "joint")
     names = {"": ""} | link_names | joint_names | identifiers([motor.name for motor in tree.motors], "motor")
-    parameters: dict[str, Parameter] = {}
+    parameters: dict[str, Any] = {}
     for link in tree.links:
         name = link_names[link.name]
         if link.name in tree.free:
-            parameters[f"{name}_origin"] = Parameter(link.position, "m", f"of the frame of {link.name}, in that of {link.parent or 'the ground'}")
+            about = f"of the frame of {link.name}, in that of {link.parent or 'the ground'}"
+            parameters[f"{name}_origin"] = parameter(link.position, unit="m", about=about)
         if link.name in moving and link.mass is not None:
             parameters |= _mass_parameters(link, name)
     for joint in joints:
         turns = joint.kind == "hinge"
         for what, unit in (("damping", "N m s" if turns else "N s/m"), ("stiffness", "N m" if turns else "N/m")):
             if getattr(joint, what):
-                parameters[f"{names[joint.name]}_{what}"] = Parameter(getattr(joint, what), unit, f"of {joint.name}")
+                parameters[f"{names[joint.name]}_{what}"] = parameter(getattr(joint, what), unit=unit, about=f"of {joint.name}")
     if np.any(tree.gravity):
-        parameters["gravity"] = Parameter(float(np.linalg.norm(tree.gravity)), "m/s^2")
+        parameters["gravity"] = parameter(float(np.linalg.norm(tree.gravity)), unit="m/s^2")
     limits = {names[joint.name]: joint.limits for joint in joints if joint.limits is not None and joint.kind in ("hinge", "slide")}
     attributes = {
         "coordinates": coordinates(*(part for joint in joints for part in parts_of(joint, names[joint.name]))),
@@ -208,16 +210,16 @@ def tree_scene(tree: Tree, source: str) -> type[Scene]:
     return scene_class(TreeScene, class_name(tree.name), about, parameters, attributes)
 
 
-def _mass_parameters(link: Link, name: str) -> dict[str, Parameter]:
+def _mass_parameters(link: Link, name: str) -> dict[str, Any]:
     assert link.mass is not None
     inertia = link.mass.inertia
     is_diagonal = not np.any(inertia - np.diag(np.diag(inertia)))
     found = {
-        f"{name}_mass": Parameter(link.mass.mass, "kg", positive=True),
-        f"{name}_inertia": Parameter(np.diag(inertia) if is_diagonal else inertia, "kg m^2", "about its mass centre, along its axes"),
+        f"{name}_mass": parameter(link.mass.mass, unit="kg", positive=True),
+        f"{name}_inertia": parameter(np.diag(inertia) if is_diagonal else inertia, unit="kg m^2", about="about its mass centre, along its axes"),
     }
     if np.any(link.mass.centre):
-        found[f"{name}_mass_centre"] = Parameter(link.mass.centre, "m", f"in the frame of {link.name}")
+        found[f"{name}_mass_centre"] = parameter(link.mass.centre, unit="m", about=f"in the frame of {link.name}")
     return found
 
 

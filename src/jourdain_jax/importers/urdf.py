@@ -19,7 +19,6 @@ _KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "flo
 _BASES = ("fixed", "planar", "free")
 _READ = ("link", "joint", "material")
 _READ_IN_JOINT = ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
-_WITHOUT_EFFECT_IN_JOINT = ("calibration", "safety_controller")
 
 
 def from_urdf(
@@ -119,7 +118,7 @@ class _Reader:
         if kind not in _KINDS:
             raise self.file.fault(f"joint `{label}` is of the type `{kind}`; {nearest(str(kind), _KINDS)}")
         for element in joint:
-            if element.tag in _WITHOUT_EFFECT_IN_JOINT or element.tag not in _READ_IN_JOINT:
+            if element.tag not in _READ_IN_JOINT:
                 self.file.leave_out(element.tag)
         position, turn = self._origin(joint, f"joint `{label}`")
         moved = (self._joint(joint, label, _KINDS[kind], kind),) if _KINDS[kind] else ()

@@ -64,20 +64,18 @@ class XmlFile:
             raise self.fault(f"a {what} has no `name`; give it one")
         return name
 
-    def numbers(self, text: str | None, counts: int | tuple[int, ...], what: str, default=None) -> Float[np.ndarray, "_"]:
-        """The numbers in an attribute, as many as one of `counts` (none: any). `default` where there is no attribute; ValueError without one."""
+    def numbers(self, text: str | None, count: int | None, what: str, default=None) -> Float[np.ndarray, "_"]:
+        """The numbers in an attribute, as many as `count` (None: any). `default` where there is no attribute; ValueError without one."""
         if text is None:
             if default is None:
                 raise self.fault(f"{what} is missing")
             return np.asarray(default, float)
-        counts = (counts,) if isinstance(counts, int) else counts
         try:
             found = np.array([float(word) for word in text.split()], float)
         except ValueError:
             raise self.fault(f"{what} is `{text}`, expected numbers") from None
-        if (counts and len(found) not in counts) or not np.all(np.isfinite(found)):
-            expected = " or ".join(map(str, counts)) if counts else "finite"
-            raise self.fault(f"{what} is `{text}`, expected {expected} number{'' if counts == (1,) else 's'}")
+        if len(found) != (count or len(found)) or not np.all(np.isfinite(found)):
+            raise self.fault(f"{what} is `{text}`, expected {count or 'finite'} number{'' if count == 1 else 's'}")
         return found
 
     def number(self, text: str | None, what: str, default: float | None = None) -> float:

@@ -112,7 +112,8 @@ def animate(
     axes.view_init(*view)
     _label(axes)
     low, high = drawn.extent()
-    radius = _radius(drawn, follow, low, high)
+    size = max(np.max(high - low) for low, high in drawn.boxes) * 0.62 if follow else np.max(high - low) / 2 * 1.05
+    radius = float(max(size, 1e-3))  # half the side of the cube that is shown
     grounded = _ground(axes, low, high, radius)
 
     def draw(i):
@@ -134,17 +135,9 @@ def animate(
     plt.close(figure)
 
 
-def _radius(drawn: _Figure, follow: bool, low, high) -> float:
-    """Half the side of the cube that is shown."""
-    if not follow:
-        return float(max(np.max(high - low) / 2 * 1.05, 1e-3))
-    return float(max(max(np.max(high - low) for low, high in drawn.boxes) * 0.62, 1e-3))
-
-
 def _frame(axes, centre, radius: float) -> None:
-    axes.set_xlim(centre[0] - radius, centre[0] + radius)
-    axes.set_ylim(centre[1] - radius, centre[1] + radius)
-    axes.set_zlim(centre[2] - radius, centre[2] + radius)
+    for set_limits, middle in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), centre, strict=True):
+        set_limits(middle - radius, middle + radius)
     axes.set_box_aspect((1, 1, 1), zoom=1.0)  # beyond, the labels of the axes are cut off
 
 
@@ -157,10 +150,8 @@ def _ground(axes, low, high, radius: float) -> bool:
     ys = np.arange(np.floor((low[1] - radius) / step), np.ceil((high[1] + radius) / step) + 1) * step
     if len(xs) + len(ys) > 160:  # a long ride: a grid so fine would be a grey smear
         return True
-    for x in xs:
-        axes.plot([x, x], [ys[0], ys[-1]], [0, 0], color="0.85", lw=0.6, zorder=0)
-    for y in ys:
-        axes.plot([xs[0], xs[-1]], [y, y], [0, 0], color="0.85", lw=0.6, zorder=0)
+    for x, y in [([x, x], ys[[0, -1]]) for x in xs] + [(xs[[0, -1]], [y, y]) for y in ys]:
+        axes.plot(x, y, [0, 0], color="0.85", lw=0.6, zorder=0)
     return True
 
 

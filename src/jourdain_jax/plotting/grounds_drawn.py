@@ -21,7 +21,9 @@ def grounds_of(trajectory: Trajectory, drawn: Drawn, low: np.ndarray, high: np.n
     for name, contact in drawn.contacts.items():
         if _moves(contact):  # the body that carries it shows it, or the tangent planes of a ground that was not given
             continue
-        found += [ground for ground in (_ground(trajectory, drawn, name, contact, low, high),) if not any(_same(ground, other) for other in found)]
+        ground = _ground(trajectory, drawn, name, contact, low, high)
+        if not any(_same(ground, other) for other in found):
+            found.append(ground)
     return found or [_floor(low, high)]
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jourdain_jax.calculus.rotations import matrices_to_quaternions
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.grounds_drawn import grounds_of
 from jourdain_jax.plotting.looks import Drawn, DrawnBody, Look, corners_of, looks_of
@@ -34,29 +35,18 @@ class Numbers:
         return np.concatenate(self.parts).astype("<f4").tobytes()
 
 
-@dataclass(frozen=True)
-class Box:
-    """Corners (3,) of a box, m."""
-
-    low: np.ndarray
-    high: np.ndarray
-
-    @property
-    def longest(self) -> float:
-        return float(np.max(self.high - self.low))
-
-
 def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dict, Numbers]:
     """The description of the page, and its numbers."""
     drawn = [_thinned(looks_of(motion, "show")) for motion in motions]
     numbers, first = Numbers(), drawn[0]
     near, far = _near(drawn), _far(drawn)
+    size, reach = (float(np.max(high - low)) for low, high in (near, far))
     colours = {name: body.colour for one in drawn for name, body in one.bodies.items() if name}
-    follow = first.sized and far.longest > _LONG * near.longest and not _at_rest(first) if options["follow"] is None else options["follow"]
-    shown = near.longest if follow else max(near.longest, far.longest / 3)
+    follow = first.sized and reach > _LONG * size and not _at_rest(first) if options["follow"] is None else options["follow"]
+    shown = size if follow else max(size, reach / 3)
     arrows, longest = _arrows(motions, drawn, shown) if options["forces"] else ([[] for _ in drawn], "")
     tile = _round_number(shown / 4)
-    grounds = grounds_of(motions[0], first, far.low, far.high)
+    grounds = grounds_of(motions[0], first, *far)
     squares = f"squares of the ground: {tile:g} m" if any(ground["kind"] == "plane" for ground in grounds) else ""
     notes = [squares, longest]
     parts = zip(motions, drawn, arrows, strict=True)
@@ -67,11 +57,11 @@ def page_data(motions: list[Trajectory], title: str, options: dict) -> tuple[dic
         "span": [float(first.ts[0]), float(first.ts[-1])],
         "motions": [_motion(numbers, motion, one, own, options) for motion, one, own in parts],
         "grounds": [_ground(numbers, ground) for ground in grounds],
-        "size": near.longest,
-        "reach": far.longest,
-        "near": [near.low.tolist(), near.high.tolist()],
-        "far": [far.low.tolist(), far.high.tolist()],
-        "ground": 12 * far.longest + 60 * near.longest,
+        "size": size,
+        "reach": reach,
+        "near": near.tolist(),
+        "far": far.tolist(),
+        "ground": 12 * reach + 60 * size,
         "tile": tile,
         "thickness": 0.018 * shown,
         "follow": bool(follow),
@@ -134,20 +124,7 @@ def _ground(numbers: Numbers, ground: dict) -> dict:
 
 def quaternions_of(rotations: np.ndarray) -> np.ndarray:
     """Quaternions (times, 4), x y z w, of rotation matrices (times, 3, 3), each as near to the one before as its sign lets it."""
-    R = np.asarray(rotations, float)
-    trace = np.trace(R, axis1=1, axis2=2)
-    # the largest of 4 w^2, 4 x^2, ... says which entry to divide by
-    fours = np.stack([1 + 2 * R[:, k, k] - trace for k in range(3)] + [1 + trace], axis=1)
-    best, found = fours.argmax(axis=1), np.empty((len(R), 4))
-    for n, k in enumerate(best):
-        if k == 3:
-            raw = [R[n, 2, 1] - R[n, 1, 2], R[n, 0, 2] - R[n, 2, 0], R[n, 1, 0] - R[n, 0, 1], fours[n, 3]]
-        else:
-            i, j = (k + 1) % 3, (k + 2) % 3
-            raw = [0.0] * 4
-            raw[k], raw[i], raw[j], raw[3] = fours[n, k], R[n, i, k] + R[n, k, i], R[n, j, k] + R[n, k, j], R[n, j, i] - R[n, i, j]
-        found[n] = raw
-    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    found = matrices_to_quaternions(rotations)[:, [1, 2, 3, 0]]
     signs = np.sign(np.sum(found[1:] * found[:-1], axis=1))
     found[1:] *= np.cumprod(np.where(signs == 0, 1, signs))[:, None]
     return found
@@ -198,14 +175,14 @@ def _extents(body: DrawnBody) -> np.ndarray:
     return np.einsum("tij,tpj->tpi", body.orientations, local) + body.positions[:, None]
 
 
-def _far(drawn: list[Drawn]) -> Box:
-    """The box that holds all bodies at all times."""
+def _far(drawn: list[Drawn]) -> np.ndarray:
+    """The lowest and the highest corner (2, 3), m, of the box that holds all bodies at all times."""
     points = np.concatenate([_extents(body).reshape(-1, 3) for one in drawn for body in one.bodies.values()])
-    return Box(points.min(axis=0), points.max(axis=0))
+    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
-def _near(drawn: list[Drawn]) -> Box:
-    """The box around the bodies that holds them at any one time, from their middle."""
+def _near(drawn: list[Drawn]) -> np.ndarray:
+    """The corners (2, 3), m, of the box around the bodies that holds them at any one time, from their middle."""
     lows, highs = [], []
     for one in drawn:
         moving = [body for name, body in one.bodies.items() if name and _moves(body)]
@@ -213,7 +190,7 @@ def _near(drawn: list[Drawn]) -> Box:
         points = np.concatenate([_extents(body) for body in moving or one.bodies.values()], axis=1) - middle[:, None]
         lows.append(points.min(axis=(0, 1)))
         highs.append(points.max(axis=(0, 1)))
-    return Box(np.min(lows, axis=0), np.max(highs, axis=0))
+    return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
 
 
 def _arrows(motions: list[Trajectory], drawn: list[Drawn], size: float) -> tuple[list, str]:

@@ -9,7 +9,7 @@ from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
-from jourdain_jax.plotting.backend import pyplot
+from jourdain_jax.plotting.backend import check_folder, pyplot
 from jourdain_jax.plotting.units import checked_units
 from jourdain_jax.scene.names import UnknownNameError, nearest
 
@@ -20,9 +20,7 @@ _DARK, _PALE = 0.4, 0.2  # opacity of the narrowest band, and of the others
 def check_format(path: str | os.PathLike) -> None:
     """ValueError where matplotlib knows no picture with the suffix of this path."""
     known = pyplot().FigureCanvasBase.get_supported_filetypes()
-    folder = os.path.dirname(path) or "."
-    if not os.path.isdir(folder):
-        raise ValueError(f"cannot write `{os.fspath(path)}`: there is no folder `{folder}`; make it first")
+    check_folder(path)
     suffix = os.path.splitext(os.fspath(path))[1].removeprefix(".").lower()
     if suffix not in known:
         raise ValueError(f"cannot write `{path}`: a plot is a .png, .svg or .pdf file, and matplotlib knows no `{suffix or 'file without suffix'}`")
@@ -80,7 +78,8 @@ def plot(
     axes[-1].set_xlabel(f"t in {unit_of_time}")
     figure = axes[0].figure
     if title is None and len(motions) == 1 and isinstance(motions[0], Rollout):
-        title = _how_many(motions[0])
+        stopped = int(np.sum(motions[0].result == results.EVENT))
+        title = f"{len(motions[0])} lanes; {stopped} stopped at an event, {motions[0].failed.size} failed"
     _head(figure if own else axes[0], axes[0], title, columns=len(motions))
     if path is not None:
         figure.savefig(path, dpi=150)
@@ -130,7 +129,7 @@ def _kinds(motions: Sequence) -> dict[str, tuple[str, ...]]:
 
 
 def _draw(axis, motion, y: np.ndarray, second: float, bands: Sequence[float], colour: str, label: str) -> None:
-    """A line; of a rollout the median and the bands around it, widest first, `y` as in `_levels`."""
+    """A line; of a rollout the bands, widest first, and the median, `y` as `_values` gives them."""
     if not isinstance(motion, Rollout):
         axis.plot(np.asarray(motion.ts) / second, y, color=colour, lw=1.5, label=label)
         return
@@ -155,22 +154,14 @@ def _head(place, axis, title: str | None, columns: int) -> None:
         place.legend(*zip(*shown, strict=True), fontsize="small", ncols=min(columns if columns > 1 else len(shown), 4), **where)
 
 
-def _levels(bands: Sequence[float]) -> list[float]:
-    return [level for part in bands for level in ((1 - part) / 2, (1 + part) / 2)] + [0.5]
-
-
-def _how_many(rollout: Rollout) -> str:
-    stopped = int(np.sum(rollout.result == results.EVENT))
-    return f"{len(rollout)} lanes; {stopped} stopped at an event, {rollout.failed.size} failed"
-
-
 def _values(motion: Trajectory | Rollout, name: str, bands: Sequence[float]) -> np.ndarray:
+    """Values at all times; of a rollout the lower and the upper end of each band in turn, and the median last."""
     many, scene = isinstance(motion, Rollout), _scene(motion)
     valid = (*scene.coordinate_names.entries, *scene.speed_names.entries, *(() if many else ENERGIES))
     if name not in valid:
         raise UnknownNameError(f"nothing named `{name}` to plot; {nearest(name, valid)}")
     if isinstance(motion, Rollout):
-        return motion.quantiles(name, _levels(bands))
+        return motion.quantiles(name, [level for part in bands for level in ((1 - part) / 2, (1 + part) / 2)] + [0.5])
     if name in ENERGIES:
         energies = motion.energies()
         return np.asarray({"energy": energies.balance, "kinetic energy": energies.kinetic, "potential energy": energies.potential}[name])

@@ -9,7 +9,7 @@ from jourdain_jax.motion.start import start
 from jourdain_jax.plotting.looks import looks_at
 from jourdain_jax.plotting.solids import parts_in_space
 from jourdain_jax.plotting.still import VIEWS, lit
-from jourdain_jax.plotting.still_axes import GRID, GROUND, SHADOW, camera_at
+from jourdain_jax.plotting.still_axes import GRID, GROUND, SHADOW, camera_at, floor_under, shadows
 
 _WIDE, _HIGH, _RIM = 300, 190, 6  # pixels
 
@@ -37,12 +37,9 @@ def scene_svg(scene) -> str:
     solid = [polygon for part in painted for polygon in part.polygons]
     corners = np.concatenate(solid)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    side = float(max(high - low))
-    base = 0.0 if -0.05 * side < low[2] < 0.2 * side else low[2] - 0.05 * side
+    side, base = float(max(high - low)), floor_under(low, high)
     x, y = ((low[k] - 0.15 * side, high[k] + 0.15 * side) for k in range(2))
     floor = np.array([(x[0], y[0], base), (x[1], y[0], base), (x[1], y[1], base), (x[0], y[1], base)])
-    fallen = [polygon - np.outer((polygon[:, 2] - base) / camera.light[2], camera.light) for polygon in solid]
-    shadows = [np.column_stack([np.clip(p[:, 0], *x), np.clip(p[:, 1], *y), np.full(len(p), base)]) for p in fallen]
     shown = camera.flat(np.concatenate([corners, floor]))
     least, most = shown.min(axis=0), shown.max(axis=0)
     scale = min((_WIDE - 2 * _RIM) / (most[0] - least[0]), (_HIGH - 2 * _RIM) / (most[1] - least[1]))
@@ -50,7 +47,10 @@ def scene_svg(scene) -> str:
     def outline(points: np.ndarray) -> str:
         return "M" + " ".join(f"{_RIM + scale * (u - least[0]):.1f},{_RIM + scale * (most[1] - v):.1f}" for u, v in camera.flat(points)) + "Z"
 
-    parts = [f"<path d='{outline(floor)}' fill='{GROUND}' stroke='{GRID}'/>", f"<path d='{''.join(map(outline, shadows))}' fill='{SHADOW}'/>"]
+    parts = [
+        f"<path d='{outline(floor)}' fill='{GROUND}' stroke='{GRID}'/>",
+        f"<path d='{''.join(map(outline, shadows(camera, solid, x, y, base)))}' fill='{SHADOW}'/>",
+    ]
     for colour, faces in groupby(((c, p) for part in painted for c, p in zip(part.colours, part.polygons, strict=True)), key=lambda face: _written(face[0])):
         parts.append(f"<path d='{''.join(outline(polygon) for _, polygon in faces)}' fill='{colour}' stroke='{colour}' stroke-width='0.4'/>")
     width, height = scale * (most - least) + 2 * _RIM

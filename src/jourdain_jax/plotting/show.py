@@ -14,6 +14,7 @@ import numpy as np
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
+from jourdain_jax.plotting.backend import check_folder
 from jourdain_jax.plotting.page_data import page_data
 from jourdain_jax.scene.names import nearest
 
@@ -132,6 +133,4 @@ def _file(name: str) -> str:
 def _check_suffix(path: str | os.PathLike) -> None:
     if not str(path).lower().endswith((".html", ".htm")):
         raise ValueError(f"cannot write `{os.fspath(path)}`: a 3D view is a .html file; for a .gif use `jj.animate`, for figures `jj.plot`")
-    folder = os.path.dirname(os.fspath(path)) or "."
-    if not os.path.isdir(folder):
-        raise ValueError(f"cannot write `{os.fspath(path)}`: there is no folder `{folder}`; make it first")
+    check_folder(path)

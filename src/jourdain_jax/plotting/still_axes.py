@@ -43,14 +43,25 @@ def draw_plane(axes, camera: Camera, corners: np.ndarray, upwards: str) -> None:
     _limits(axes, camera.flat(corners), 0.06)
 
 
+def floor_under(low: np.ndarray, high: np.ndarray) -> float:
+    """Height (m) of a floor under the box from `low` to `high`: z = 0 where bodies stand on it, else below them."""
+    side = float(max(high - low))
+    return 0.0 if -0.05 * side < low[2] < 0.2 * side else low[2] - 0.05 * side
+
+
+def shadows(camera: Camera, polygons: list[np.ndarray], xs, ys, base: float) -> list[np.ndarray]:
+    """Shadows (corners, 3) of polygons on the floor at height `base`, within the spans that `xs` and `ys` begin and end with."""
+    fallen = [polygon - np.outer((polygon[:, 2] - base) / camera.light[2], camera.light) for polygon in polygons]
+    return [np.column_stack([np.clip(p[:, 0], xs[0], xs[-1]), np.clip(p[:, 1], ys[0], ys[-1]), np.full(len(p), base)]) for p in fallen]
+
+
 def draw_floor(axes, camera: Camera, corners: np.ndarray, polygons: list[np.ndarray]) -> None:
-    """A tiled floor (the plane z = 0 where bodies stand on it, else below them), shadows of the polygons, and three axes in m along its edges."""
+    """A tiled floor, shadows of the polygons on it, and three axes in m along its edges."""
     from matplotlib.collections import PolyCollection
 
     axes.set_axis_off()
     low, high = corners.min(axis=0), corners.max(axis=0)
-    side = float(max(high - low))
-    base = 0.0 if -0.05 * side < low[2] < 0.2 * side else low[2] - 0.05 * side
+    side, base = float(max(high - low)), floor_under(low, high)
     xs, ys = (_ticks(low[k], high[k], 0.25 * side, max(1, round(5 * (high[k] - low[k]) / side))) for k in range(2))
     zs = [z for z in _ticks(base, high[2], 0.15 * side, 3) if z >= base - 1e-9 * side]
     flat = lambda *point: camera.flat(np.array(point))  # noqa: E731
@@ -58,9 +69,8 @@ def draw_floor(axes, camera: Camera, corners: np.ndarray, polygons: list[np.ndar
     axes.add_collection(PolyCollection([[flat(*corner, base) for corner in rim]], facecolors=GROUND, edgecolors=GRID, zorder=0))
     lines = [[flat(x, ys[0], base), flat(x, ys[-1], base)] for x in xs] + [[flat(xs[0], y, base), flat(xs[-1], y, base)] for y in ys]
     axes.add_collection(PolyCollection(lines, facecolors="none", edgecolors=GRID, linewidths=0.7, closed=False, zorder=1))
-    fallen = [polygon - np.outer((polygon[:, 2] - base) / camera.light[2], camera.light) for polygon in polygons]
-    inside = [np.column_stack([np.clip(p[:, 0], xs[0], xs[-1]), np.clip(p[:, 1], ys[0], ys[-1]), np.full(len(p), base)]) for p in fallen]
-    axes.add_collection(PolyCollection([camera.flat(p) for p in inside], facecolors=SHADOW, edgecolors=SHADOW, linewidths=0.3, zorder=2))
+    inside = [camera.flat(shadow) for shadow in shadows(camera, polygons, xs, ys, base)]
+    axes.add_collection(PolyCollection(inside, facecolors=SHADOW, edgecolors=SHADOW, linewidths=0.3, zorder=2))
     near_x, near_y = xs[-1] if camera.towards[0] > 0 else xs[0], ys[0] if camera.towards[1] < 0 else ys[-1]
     pole = min(rim, key=lambda corner: flat(*corner, base)[0])
     heights = np.array([flat(*pole, base), *(flat(*pole, z) for z in zs)])

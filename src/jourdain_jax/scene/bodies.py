@@ -49,7 +49,9 @@ class RigidBody(eqx.Module):
 
     def __init__(self, mass, inertia, position, orientation, outline=None):
         self.mass = checked_real(mass, "mass of a rigid body", ())
-        self.inertia = _as_inertia(inertia)
+        what, advice = "inertia of a rigid body", "give three principal moments or a 3x3 matrix, kg m^2, about the mass centre"
+        matrix = checked_real(inertia, what, advice=advice)
+        self.inertia = jnp.diag(matrix) if matrix.shape == (3,) else checked_real(matrix, what, (3, 3), advice=advice)
         self.position = checked_real(position, "position of a rigid body", (3,))
         self.orientation = checked_real(orientation, "orientation of a rigid body", (3, 3), advice="give a rotation matrix, body to space: jj.rot_z(q.yaw)")
         self.outline = jnp.zeros((0, 3)) if outline is None else checked_real(outline, "outline of a rigid body")
@@ -80,7 +82,7 @@ class RigidBody(eqx.Module):
         """
         mass, radius = checked_real(mass, "mass of a ball", ()), checked_real(radius, "radius of a ball", ())
         moment = checked_real(factor, "factor of a ball", (), advice="give 2/5 for a solid ball, 2/3 for a shell") * mass * radius**2
-        return RigidBody(mass, _stack([moment] * 3), position, orientation, radius * _ball_outline())
+        return RigidBody(mass, _stack([moment] * 3), position, orientation, radius * np.concatenate([_wheel_outline(k)[:41] for k in range(3)]))
 
     @staticmethod
     def rod(mass, length, *, axis: str, position, orientation) -> "RigidBody":
@@ -121,15 +123,6 @@ def _axis_index(axis: str) -> int:
     return _AXES[axis]
 
 
-def _as_inertia(inertia) -> Float[Array, "3 3"]:
-    """Central inertia from a matrix or three principal moments."""
-    what = "inertia of a rigid body"
-    matrix = checked_real(inertia, what, advice="give three principal moments or a 3x3 matrix, kg m^2")
-    if matrix.shape == (3,):
-        return jnp.diag(matrix)
-    return checked_real(matrix, what, (3, 3), advice="give three principal moments or a 3x3 matrix, kg m^2, about the mass centre")
-
-
 def _wheel_outline(k: int) -> np.ndarray:
     """A circle with one diameter drawn, in the plane normal to axis `k`."""
     angle = np.linspace(0, 2 * np.pi, 41)
@@ -139,10 +132,6 @@ def _wheel_outline(k: int) -> np.ndarray:
     points[41, i] = -1.0
     points[42, i] = 0.0
     return points
-
-
-def _ball_outline() -> np.ndarray:
-    return np.concatenate([_wheel_outline(k)[:41] for k in range(3)])
 
 
 def _box_outline() -> np.ndarray:

@@ -72,13 +72,7 @@ class Contact(eqx.Module):
 
 
 def ball_contact(
-    body: BodyPose,
-    radius,
-    *,
-    centre=None,
-    ground: Ground | None = None,
-    height: str = "coordinates",
-    carried: tuple[str, ...] | None = None,
+    body: BodyPose, radius, *, centre=None, ground: Ground | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None
 ) -> Contact:
     """Rolling of a ball on a ground, without slip; the contact point is `c - a n`.
 
@@ -97,22 +91,13 @@ def ball_contact(
 
 
 def ellipsoid_contact(
-    body: BodyPose,
-    semi_axes,
-    *,
-    centre=None,
-    ground: Ground | None = None,
-    height: str = "coordinates",
-    carried: tuple[str, ...] | None = None,
+    body: BodyPose, semi_axes, *, centre=None, ground: Ground | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None
 ) -> Contact:
     """Rolling of an ellipsoid on a ground, without slip; the contact point is `c - R S n'/sqrt(n'.S n')`, `n' = R' n`, `S = diag(a^2, b^2, c^2)`.
 
     - `body`: `pose["name"]`; `semi_axes` (a, b, c) in m, along the axes of its body frame. `centre` (3,) of the ellipsoid in m, body frame (default: the
       mass centre).
-    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
-    - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
-    - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
-      `height="coordinates"`.
+    - `ground`, `height`, `carried`: as in `ball_contact`.
 
     Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown height. On all but planes the point is found by Newton's method.
     """
@@ -124,14 +109,7 @@ def ellipsoid_contact(
 
 
 def disc_contact(
-    body: BodyPose,
-    radius,
-    *,
-    axis: str = "y",
-    centre=None,
-    ground: Ground | None = None,
-    height: str = "coordinates",
-    carried: tuple[str, ...] | None = None,
+    body: BodyPose, radius, *, axis: str = "y", centre=None, ground: Ground | None = None, height: str = "coordinates", carried: tuple[str, ...] | None = None
 ) -> Contact:
     """Rolling of the edge of a thin disc on a ground, without slip.
 
@@ -139,10 +117,7 @@ def disc_contact(
     a disc lying flat.
 
     - `body`: `pose["name"]`; `radius` a in m; `axis`: the body axis k, "x", "y" or "z". `centre` c (3,) in m, body frame (default: the mass centre).
-    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
-    - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
-    - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
-      `height="coordinates"`.
+    - `ground`, `height`, `carried`: as in `ball_contact`.
 
     Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown axis or height. On a plane and a sphere the point is in closed form.
     """
@@ -167,10 +142,7 @@ def wheel_contact(
 
     - `body`: `pose["name"]`; `radius` R and `tyre` r in m, `0 <= r < R`; `axis`: the body axis k, "x", "y" or "z". `centre` c (3,) in m, body frame
       (default: the mass centre).
-    - `ground`: `jj.Plane`, `Cylinder`, `Sphere`, `Surface` or `HeightMap` (default: z = 0 at rest).
-    - `height`: "coordinates" where they keep the body on the ground by themselves, "row" for a geometric row.
-    - `carried`: names of the bodies that this contact holds up, with whatever other contacts touch them (default: all), for the normal force where
-      `height="coordinates"`.
+    - `ground`, `height`, `carried`: as in `ball_contact`.
 
     Two velocity rows (m/s), along the ground's tangents; ValueError for an unknown axis or height. On a plane and a sphere the point is in closed form.
     """

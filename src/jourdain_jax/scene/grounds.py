@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import Vector, as_real, checked_real, described, is_traced
+from jourdain_jax.calculus.rotations import rot_y
 
 _SIDES = ("inside", "outside")
 _UNIT = 1e-4  # a typed unit vector may have a few digits; a mistake is larger
@@ -53,9 +54,7 @@ class Plane(eqx.Module):
             self.normal = unit_vector(normal, "normal of a plane")
             tangents = tangents_of(self.normal)
         self.tangents = tangents if along is None else _tangents_along(self.normal, along)
-        self.origin = checked_real(origin, "origin of a plane", (3,))
-        self.velocity = checked_real(velocity, "velocity of a plane", (3,))
-        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a plane", (3,))
+        self.origin, self.velocity, self.angular_velocity = _rigid_motion("a plane", origin, velocity, angular_velocity)
 
     @property
     def axes(self) -> Float[Array, "3 3"]:
@@ -99,9 +98,7 @@ class Cylinder(eqx.Module):
         """A cylinder of `radius` (m) about the line through `origin` along the unit vector `axis`, touched from its `side`."""
         self.radius, self.side = positive_length(radius, "radius of a cylinder"), _checked_side(side)
         self.axis = unit_vector(axis, "axis of a cylinder")
-        self.origin = checked_real(origin, "origin of a cylinder", (3,))
-        self.velocity = checked_real(velocity, "velocity of a cylinder", (3,))
-        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a cylinder", (3,))
+        self.origin, self.velocity, self.angular_velocity = _rigid_motion("a cylinder", origin, velocity, angular_velocity)
 
     def arm_to(self, point: Vector) -> Float[Array, "3"]:
         """The vector from the nearest point of the axis to the `point` (m, inertial frame)."""
@@ -137,9 +134,7 @@ class Sphere(eqx.Module):
     def __init__(self, radius, *, side: str, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
         """A sphere of `radius` (m) about `origin` (m), touched from its `side`."""
         self.radius, self.side = positive_length(radius, "radius of a sphere"), _checked_side(side)
-        self.origin = checked_real(origin, "origin of a sphere", (3,))
-        self.velocity = checked_real(velocity, "velocity of a sphere", (3,))
-        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a sphere", (3,))
+        self.origin, self.velocity, self.angular_velocity = _rigid_motion("a sphere", origin, velocity, angular_velocity)
 
     def arm_to(self, point: Vector) -> Float[Array, "3"]:
         """The vector from the sphere's centre to the `point` (m, inertial frame)."""
@@ -173,9 +168,7 @@ class Surface(eqx.Module):
     def __init__(self, f, *, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
         """The surface on which `f(x, y, z)` is zero."""
         self.f = _function(f, "a surface", "lambda x, y, z: z - 0.1 * x**2")
-        self.origin = checked_real(origin, "origin of a surface", (3,))
-        self.velocity = checked_real(velocity, "velocity of a surface", (3,))
-        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a surface", (3,))
+        self.origin, self.velocity, self.angular_velocity = _rigid_motion("a surface", origin, velocity, angular_velocity)
 
     def value(self, point: Vector) -> Float[Array, ""]:
         """f at a `point` (m, inertial frame)."""
@@ -205,9 +198,7 @@ class HeightMap(eqx.Module):
     def __init__(self, h, *, origin=(0.0, 0.0, 0.0), velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0)):
         """The surface of height `h(x, y)`."""
         self.h = _function(h, "a height map", "lambda x, y: 0.1 * x**2")
-        self.origin = checked_real(origin, "origin of a height map", (3,))
-        self.velocity = checked_real(velocity, "velocity of a height map", (3,))
-        self.angular_velocity = checked_real(angular_velocity, "angular velocity of a height map", (3,))
+        self.origin, self.velocity, self.angular_velocity = _rigid_motion("a height map", origin, velocity, angular_velocity)
 
     def height_at(self, x, y) -> Float[Array, ""]:
         """h (m) at `x`, `y` (m)."""
@@ -271,15 +262,17 @@ def positive_length(value, what: str) -> Float[Array, ""]:
     return length
 
 
+def _rigid_motion(what: str, origin, velocity, angular_velocity) -> list[Float[Array, "3"]]:
+    """`origin` (m), `velocity` (m/s) and `angular_velocity` (rad/s) of a ground, checked."""
+    given = {"origin": origin, "velocity": velocity, "angular velocity": angular_velocity}
+    return [checked_real(value, f"{name} of {what}", (3,)) for name, value in given.items()]
+
+
 def _turned(tilt) -> Float[Array, "3 3"]:
-    """Columns: the turned x, y, z."""
-    tilt = checked_real(tilt, "tilt of a plane", advice="give one angle in rad, or a rotation matrix, such as jj.rot_x(0.1)")
-    if tilt.shape == (3, 3):
-        return tilt
-    tilt = checked_real(tilt, "tilt of a plane", (), advice="give one angle in rad, or a rotation matrix, such as jj.rot_x(0.1)")
-    c, s = jnp.cos(tilt), jnp.sin(tilt)
-    o, i = jnp.zeros_like(c), jnp.ones_like(c)
-    return jnp.stack([jnp.stack([c, o, s]), jnp.stack([o, i, o]), jnp.stack([-s, o, c])])
+    """Columns: x, y and z, turned about y."""
+    advice = "give one angle in rad, or a rotation matrix, such as jj.rot_x(0.1)"
+    tilt = checked_real(tilt, "tilt of a plane", advice=advice)
+    return tilt if tilt.shape == (3, 3) else rot_y(checked_real(tilt, "tilt of a plane", (), advice=advice))
 
 
 def _tangents_along(n, along) -> Float[Array, "2 3"]:

@@ -56,7 +56,7 @@ def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
 def point_force(point: Point, force) -> Load:
     """A `force` (3,) (N, inertial frame) on a `point` of a body, `motion["body"].point(local)`; no potential."""
     point = _as_point(point, "point of a force")
-    return _on_point(point, checked_real(force, f"force on a point of `{point.body}`", (3,), advice="give three components in the inertial frame, N"), None)
+    return _on_point(point, checked_real(force, f"force on a point of `{point.body}`", (3,), advice="give three components in the inertial frame, N"))
 
 
 def torque(motion: Motion, body: str, moment, *, reaction: str | None = None) -> Load:
@@ -124,21 +124,18 @@ def _line(a: Point, b: Point, what: str):
     a, b = _as_point(a, f"first end of a {what}"), _as_point(b, f"second end of a {what}")
     apart = b.position - a.position
     squared = apart @ apart
-    apart_is_nonzero = squared > 0
-    length = jnp.where(apart_is_nonzero, jnp.sqrt(jnp.where(apart_is_nonzero, squared, 1.0)), 0.0)
-    direction = apart / jnp.where(apart_is_nonzero, length, 1.0)
-    return apart, length, direction
+    is_apart = squared > 0
+    length = jnp.where(is_apart, jnp.sqrt(jnp.where(is_apart, squared, 1.0)), 0.0)
+    return apart, length, apart / jnp.where(is_apart, length, 1.0)
 
 
-def _on_point(point: Point, force, potential) -> Load:
-    if point.body is None:
-        return Load(potential=potential)
-    return Load({point.body: force}, {point.body: jnp.cross(point.arm, force)}, {}, potential)
+def _on_point(point: Point, force) -> Load:
+    return Load() if point.body is None else Load({point.body: force}, {point.body: jnp.cross(point.arm, force)})
 
 
 def _between(a: Point, b: Point, pull, potential) -> Load:
     """`pull` acts on `a` towards `b`, and its opposite on `b`."""
     if a.body is not None and a.body == b.body:
         return Load(potential=potential)  # an internal force of one rigid body does no virtual power
-    first, second = _on_point(a, pull, None), _on_point(b, -pull, None)
+    first, second = _on_point(a, pull), _on_point(b, -pull)
     return Load(first.forces | second.forces, first.torques | second.torques, {}, potential)

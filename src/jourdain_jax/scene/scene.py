@@ -89,8 +89,6 @@ class Scene(eqx.Module, metaclass=_SceneClass):
         hold_functions(self)
         check_parameters(self)
 
-    # What a scene says. -------------------------------------------------------------------------------------------
-
     def bodies(self, t: Float[Array, ""], q: Named) -> dict[str, Body]:
         """Poses of all bodies by name at time t (s) and coordinates q, `q.name`; in the inertial frame. Required."""
         raise NotImplementedError(f"scene `{type(self).__name__}` does not say where its bodies are; define `bodies(self, t, q)`")
@@ -149,8 +147,6 @@ class Scene(eqx.Module, metaclass=_SceneClass):
         Bodies that are left out are drawn by their `outline`, what rolls in their contacts, or their inertia.
         """
         return {}
-
-    # What can be asked of any scene. ------------------------------------------------------------------------------
 
     @property
     def coordinate_names(self) -> Names:

@@ -76,8 +76,7 @@ def gauge_of(scene: Scene, pose: Pose) -> Float[Array, ""] | None:
 def prescribed_of(scene: Scene, t) -> dict[str, Float[Array, ""]]:
     """Prescribed coordinates and their values."""
     given = _dictionary(scene, "prescribed", scene.prescribed(t), '{"x": 0.1 * jnp.sin(t)}')
-    advice = "prescribe every coordinate by its own name"
-    return {name: checked_real(value, f"prescribed value of `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in given.items()}
+    return _checked(scene, "prescribed value of", given, (), "prescribe every coordinate by its own name")
 
 
 def geometric_constraints_of(scene: Scene, pose: Pose) -> dict[str, Array]:
@@ -91,9 +90,7 @@ def velocity_constraints_of(scene: Scene, motion: Motion) -> dict[str, Array]:
 
 
 def _rows(scene: Scene, method: str, given) -> dict[str, Array]:
-    rows = _dictionary(scene, method, given, '{"edge": value}')
-    advice = "return numbers that vanish where the constraint is met"
-    return {name: checked_real(value, f"row `{name}` of `{_name(scene)}`", advice=advice) for name, value in rows.items()}
+    return _checked(scene, "row", _dictionary(scene, method, given, '{"edge": value}'), None, "return numbers that vanish where the constraint is met")
 
 
 def contacts_of(scene: Scene, pose: Pose) -> dict[str, Contact]:
@@ -109,14 +106,13 @@ def events_of(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
     """Values of the stop events by name."""
     events = _dictionary(scene, "events", scene.events(motion), '{"fallen": 1.4 - motion.q.lean}')
     advice = "return a number, positive while the motion may go on, such as `1.4 - motion.q.lean`; give every condition a name of its own"
-    return {name: checked_real(value, f"event `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in events.items()}
+    return _checked(scene, "event", events, (), advice)
 
 
 def invariants_of(scene: Scene, motion: Motion) -> dict[str, Float[Array, ""]]:
     """Values of the conserved quantities by name."""
     given = _dictionary(scene, "invariants", scene.invariants(motion), '{"momentum x": body.mass * body.velocity[0]}')
-    advice = "give every component a name of its own"
-    return {name: checked_real(value, f"invariant `{name}` of `{_name(scene)}`", (), advice=advice) for name, value in given.items()}
+    return _checked(scene, "invariant", given, (), "give every component a name of its own")
 
 
 def visuals_of(scene: Scene, pose: Pose) -> dict[str, tuple[Visual, ...]]:
@@ -141,6 +137,10 @@ def _dictionary(scene: Scene, method: str, given, example: str) -> dict:
         if not isinstance(name, str):
             raise ValueError(f"`{method}` of `{_name(scene)}` returned a dictionary with the key {name!r}, expected names (texts) as keys")
     return given
+
+
+def _checked(scene: Scene, what: str, given: dict, shape: tuple[int, ...] | None, advice: str) -> dict[str, Array]:
+    return {name: checked_real(value, f"{what} `{name}` of `{_name(scene)}`", shape, advice=advice) for name, value in given.items()}
 
 
 def _name(scene: Scene) -> str:
