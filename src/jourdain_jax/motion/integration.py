@@ -46,8 +46,8 @@ def _one_motion(setup: Setup) -> tuple[Trajectory, Bool[Array, ""]]:
     """The motion, and whether its start came onto the rows."""
     setup, arrived = _with_machine_code(_prepared(setup)), jnp.array(True)
     if not isinstance(setup.start, State):
-        found = moved_onto_rows(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0))
-        setup, arrived = setup._replace(start=found.state), found.arrived
+        start, arrived = moved_onto_rows(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0))
+        setup = setup._replace(start=start)
     begun, fitting = _begin(setup), setup.fitting()
     return _finish(setup, fitting, begun, setup.integrator.solved(fitting, begun)), arrived
 

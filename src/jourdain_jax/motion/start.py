@@ -125,14 +125,14 @@ def _consistent(scene: Scene, t, start: Unmoved, inputs, guesses: Callable) -> S
     """The nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`."""
     given = scene, t, start, inputs
     if not nothing_is_traced() and is_traced(given):
-        return _compiled_projection(*given, guesses()).state
+        return _compiled_projection(*given, guesses())[0]
     # numbers are put onto the rows at once, also where a function around this call is being traced; elsewhere that would compile constants one by one
     with nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval():
-        found = _compiled_projection(*given, None)
-        if not np.asarray(found.arrived) and len(start.usual.closures):  # rare, and long to compile
+        state, arrived = _compiled_projection(*given, None)
+        if not np.asarray(arrived) and len(start.usual.closures):  # rare, and long to compile
             by_xla = start._replace(usual=replace(start.usual, program=None))
-            found = jax.tree.map(jnp.asarray, _uncompiled_projection(scene, t, by_xla, inputs, guesses()))
-    return found.state
+            state = jax.tree.map(jnp.asarray, _uncompiled_projection(scene, t, by_xla, inputs, guesses())[0])
+    return state
 
 
 def _as_time(t):
@@ -145,21 +145,14 @@ def _as_input_vector(scene: Scene, inputs, dtype):
     return inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, dtype)
 
 
-class Found(eqx.Module):
-    """A state on the rows; its residual is infinite where a number is not finite."""
+def moved_onto_rows(scene: Scene, t, start: Unmoved, inputs) -> tuple[State, Bool[Array, ""]]:
+    """The state on the rows nearest to `start`, by Newton's method alone, as a part of a larger compiled function; and whether it arrived.
 
-    state: State
-    arrived: Bool[Array, ""]  # whether the coordinates did, and are within reach of the domain
-
-
-def moved_onto_rows(scene: Scene, t, start: Unmoved, inputs) -> Found:
-    """The state on the rows nearest to `start`, by Newton's method alone, as a part of a larger compiled function.
-
-    Where something is held, it has arrived when nothing but round-off is left of the rows.
+    Where something is held, it has when nothing but round-off is left of the rows.
     """
-    found = _put_onto_constraints(scene, t, start, inputs, None)
+    state, arrived = _put_onto_constraints(scene, t, start, inputs, None)
     holds = ~(jnp.all(start.free_q) & jnp.all(start.free_u))
-    return Found(found.state, found.arrived & ~(holds & is_off(found.state)))
+    return state, arrived & ~(holds & is_off(state))
 
 
 def is_off(state: State) -> Bool[Array | np.ndarray, ""]:
@@ -167,8 +160,11 @@ def is_off(state: State) -> Bool[Array | np.ndarray, ""]:
     return ~(state.residual <= _OFF * np.finfo(state.q.dtype).eps)
 
 
-def _put_onto_constraints(scene: Scene, t, start: Unmoved, inputs, guesses) -> Found:
-    """The start on the constraints; no search where `guesses` is None."""
+def _put_onto_constraints(scene: Scene, t, start: Unmoved, inputs, guesses) -> tuple[State, Bool[Array, ""]]:
+    """The start on the constraints, and whether its coordinates arrived, within reach of the domain; no search where `guesses` is None.
+
+    The residual is infinite where a number is not finite.
+    """
     given_q, u, free, usual = jnp.asarray(start.q), jnp.asarray(start.u), jnp.asarray(start.free_q), start.usual
     q = given_q
     here, at, begin = jax.lax.stop_gradient((scene, t, q))
@@ -188,7 +184,7 @@ def _put_onto_constraints(scene: Scene, t, start: Unmoved, inputs, guesses) -> F
     moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - given_q, near_u - u, left))
     names = scene.coordinate_names, scene.speed_names
     state = State(jnp.asarray(t), near_q, near_u, moved_q, moved_u, jnp.where(finite, residual, jnp.inf), names, guess.astype(q.dtype))
-    return Found(state, arrived)
+    return state, arrived
 
 
 def _left(g: Float[Array, "closures"]) -> Float[Array, ""]:

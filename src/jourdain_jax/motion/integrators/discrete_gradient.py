@@ -14,7 +14,7 @@ S at the midpoint and Gonzalez's discrete gradient in the place of grad H, whenc
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.newton import newton_root
@@ -22,7 +22,7 @@ from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.virtual_power import energies_at
-from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step, Stepped
+from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
@@ -53,13 +53,13 @@ class DiscreteGradient(FixedStepSolver):
             raise ValueError(f"`DiscreteGradient` does not apply to `{type(scene).__name__}`: {fault}; use solver=jj.ImplicitMidpoint()")
         return field
 
-    def stepped(self, step: Step, y: Integrated) -> Stepped:
-        """The state `y` after one `step`."""
+    def stepped(self, step: Step, y: Integrated) -> tuple[Integrated, Bool[Array, ""]]:
+        """The state `y` after one `step`, and whether its equations were solved."""
         return _stepped(step.args, step.args[4] + step.t + step.h / 2, jnp.asarray(step.h, y.q.dtype), y)
 
 
 @eqx.filter_jit  # traced once, not wherever diffrax looks at a step
-def _stepped(args, t, h, y: Integrated) -> Stepped:
+def _stepped(args, t, h, y: Integrated) -> tuple[Integrated, Bool[Array, ""]]:
     n, z0 = y.q.shape[0], jnp.concatenate([y.q, y.v])
     H0 = _energy(args, t, z0, n)
     guess = h * jnp.concatenate(_rates(args, t, y.q, y.v))
@@ -67,7 +67,7 @@ def _stepped(args, t, h, y: Integrated) -> Stepped:
     scale = jnp.broadcast_to(jnp.where(size == 0, 1.0, size), z0.shape)
     found = newton_root(lambda d: _residual(args, t, h, n, z0, H0, d), guess, jax.lax.stop_gradient(scale))
     z1 = z0 + found.x
-    return Stepped(Integrated(z1[:n], z1[n:], y.work), found.converged)
+    return Integrated(z1[:n], z1[n:], y.work), found.converged
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced

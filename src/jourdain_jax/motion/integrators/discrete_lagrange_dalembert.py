@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.newton import newton_root
@@ -29,7 +29,7 @@ from jourdain_jax.equations.lagrange import speeds_are_rates
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.rows import position_residual, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at, resultants
-from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step, Stepped
+from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step
 from jourdain_jax.motion.vector_fields.by_matrices import full_without_projection
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.names import nearest
@@ -147,13 +147,13 @@ class DiscreteLagrangeDAlembert(FixedStepSolver):
         equations = f"discrete Lagrange-d'Alembert equations, {self.rule} rule"
         return full_without_projection(field, scene, equations)
 
-    def stepped(self, step: Step, y: Integrated) -> Stepped:
-        """The state `y` after one `step`."""
+    def stepped(self, step: Step, y: Integrated) -> tuple[Integrated, Bool[Array, ""]]:
+        """The state `y` after one `step`, and whether its equations were solved."""
         return _stepped(step.args, Interval(step.args[4] + step.t, step.h, self.rule), y)
 
 
 @eqx.filter_jit  # traced once, not wherever diffrax looks at a step
-def _stepped(args, over: Interval, y: Integrated) -> Stepped:
+def _stepped(args, over: Interval, y: Integrated) -> tuple[Integrated, Bool[Array, ""]]:
     _, scene, inputs, *_ = args
     q0, u0, h = y.q, y.v, over.h
     n = q0.shape[0]
@@ -166,7 +166,7 @@ def _stepped(args, over: Interval, y: Integrated) -> Stepped:
     found = newton_root(lambda x: _residual(args, over, q0, p0, A0, x), guess, jax.lax.stop_gradient(scale))
     q1 = q0 + found.x[:n]
     u1 = _projected(args, over, q0, q1)
-    return Stepped(Integrated(q1, u1, _work(args, over, y, q1, u1)), found.converged & jnp.all(jnp.isfinite(u1)))
+    return Integrated(q1, u1, _work(args, over, y, q1, u1)), found.converged & jnp.all(jnp.isfinite(u1))
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced

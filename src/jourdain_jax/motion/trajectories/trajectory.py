@@ -83,7 +83,8 @@ class Trajectory(Record):
 
     def energies(self) -> Energies:
         """Kinetic and potential energy, and the work where it is tracked, in J; `.balance` is constant for a right motion."""
-        return Energies(*map_over_times(over_times.energies, self), self.work)
+        kinetic, potential = map_over_times(over_times.energies, self)
+        return Energies(kinetic, potential, self.work)
 
     def accelerations(self) -> Accelerations:
         """Accelerations, multipliers, rank and smallest singular value at all times."""
