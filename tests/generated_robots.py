@@ -123,7 +123,7 @@ class BeadOnCurve(jj.Scene):
         return {"arc": x * vy - y * vx - m.u.s_rate} | ({"curve": x * vx + y * vy} if self.by_rate else {})
 
     def loads(self, m):
-        return (jj.gravity(m, 9.81, (0.3, -1.0, 0.0)),)
+        return (jj.gravity(m, 9.81 * 1.09**0.5, np.array((0.3, -1.0, 0.0)) / 1.09**0.5),)
 
     def start(self, speed=9.0):
         """On the curve, fast enough to go round."""

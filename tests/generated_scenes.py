@@ -269,7 +269,7 @@ class Generated(jj.Scene):
         bodies = [None if i == GROUND else motion[body_name(i)] for i in part.on]
         ends = [jj.fixed_point((0.2, -0.9, 1.4)) if body is None else body.point((0.1, 0.2, 0.1)) for body in bodies[:2]]
         if part.kind == "weight":
-            return jj.gravity(motion, self.gravity, (0.1, -0.6, -0.7))
+            return jj.gravity(motion, self.gravity, np.array((0.1, -0.6, -0.7)) / 0.86**0.5)
         if part.kind == "spring":
             return jj.spring(*ends, strength, 0.3)
         if part.kind == "damper":

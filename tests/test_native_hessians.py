@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from ends_of_models import end_of_model
-from test_native_second import FORWARD, Falling, X, _exact, _seen
+from test_native_second import FORWARD, LANES, Falling, X, _seen, seconds_of_the_closed_form
 
 import jourdain_jax as jj
 from jourdain_jax.calculus.guards import DifferentiationModeError
@@ -21,9 +21,6 @@ MODES = {
     "reverse of reverse": lambda f: jax.jacrev(jax.jacrev(f)),
     "forward of forward": lambda f: jax.jacfwd(jax.jacfwd(f)),
 }
-LANES = X * (1 + 0.05 * np.random.default_rng(0).normal(size=(3, 7)))
-
-
 MOTIONS = [*((mode, True, None) for mode in MODES), *((mode, False, None) for mode in list(MODES)[:3:2]), ("forward of reverse", True, jj.Taylor())]
 
 
@@ -31,9 +28,8 @@ MOTIONS = [*((mode, True, None) for mode in MODES), *((mode, False, None) for mo
 def test_all_modes_are_those_of_the_closed_form(mode, events, solver, monkeypatch):
     """With respect to parameters, a start, an input, the start's time, a time saved and the end; or up to an event."""
     monkeypatch.setattr(erk_loop, "integrate", lambda *a: pytest.fail("the loop of XLA was traced"))
-    seen, exact = lambda x: _seen(x, events, solver=solver, adjoint=None, max_steps=1357), lambda x: _exact(x, events)
-    found, expected = (np.asarray(jax.jit(jax.vmap(of(f)))(LANES)) for of, f in ((MODES[mode], seen), (MODES["forward of forward"], exact)))
-    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+    found = np.asarray(jax.jit(jax.vmap(MODES[mode](lambda x: _seen(x, events, solver=solver, adjoint=None, max_steps=1357))))(LANES))
+    np.testing.assert_allclose(found, seconds_of_the_closed_form(events), rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(found, np.swapaxes(found, 2, 3), rtol=1e-9, atol=1e-9)
 
 

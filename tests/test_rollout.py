@@ -134,3 +134,19 @@ def test_lanes_that_are_given_to_devices_move_as_those_of_vmap():
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("lanes",))
     on_devices = jax.shard_map(jax.vmap(end), mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False)
     np.testing.assert_allclose(jax.jit(on_devices)(speeds), [end(speed) for speed in speeds], rtol=1e-12, atol=1e-15)
+
+
+def test_a_number_in_a_plain_field_is_a_leaf_of_every_lane():
+    class Oscillator(jj.Scene):
+        stiffness: float = 2.0
+        coordinates = jj.coordinates("x")
+
+        def bodies(self, t, q):
+            return {"bob": jj.Particle(1.0, jnp.stack([q.x, 0.0 * q.x, 0.0 * q.x]))}
+
+        def loads(self, motion):
+            return (jj.generalized_force(motion, x_rate=-self.stiffness * motion.q.x),)
+
+    lanes = jj.rollout(Oscillator(), {"x": np.array([1.0, -2.0])}, **OPTIONS)
+    np.testing.assert_allclose(lanes["x"], np.outer([1.0, -2.0], np.cos(np.sqrt(2.0) * OPTIONS["ts"])), atol=1e-8)
+    assert lanes.lane(1).scene.stiffness == 2.0

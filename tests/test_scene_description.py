@@ -39,6 +39,9 @@ def described(**members):
         ("prescribe", "prescribed"),
         ("coordinate_rate", "coordinate_rates"),
         ("invariant", "invariants"),
+        ("forces", "loads"),
+        ("constraints", "velocity_constraints"),
+        ("holonomic_constraints", "geometric_constraints"),
     ],
 )
 def test_a_method_whose_name_is_misspelt_does_not_drop_physics_silently(name, meant):
@@ -51,6 +54,21 @@ def test_an_attribute_whose_name_is_misspelt_is_named():
         described(priviledged=("x_rate",))()
     with pytest.raises(ValueError, match=r"has a method `exemple`, .* did you mean `example`\?"):
         described(exemple=property(lambda self: {}))()
+
+
+def test_a_helper_of_a_base_class_may_be_overridden():
+    class Pushed(Bead):
+        def loads(self, motion):
+            return (self.forces(motion),)
+
+        def forces(self, motion):
+            return jj.generalized_force(motion, x_rate=1.0)
+
+    class Pulled(Pushed):
+        def forces(self, motion):
+            return jj.generalized_force(motion, x_rate=-3.0)
+
+    assert float(jj.accelerations(Pulled(), 0.0, jnp.zeros(2), jnp.zeros(2)).udot[0]) == -3.0
 
 
 def test_own_methods_parameters_and_helpers_beside_the_real_method_are_left_alone():

@@ -16,6 +16,7 @@ from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 
 ERRORS = 100.0  # of a configuration: singular values below are of the error, not of the rows
 LARGE_COEFFICIENT, TAIL = 20.0, 3.0  # of the rows that stay, in a row that is left out: at any probe; with both signs, beside the median
+CONTRADICTED = 1e-4  # of the largest row: numbers may be typed with a few digits, mistakes are larger
 
 
 class Scaled(eqx.Module):
@@ -41,6 +42,29 @@ def ranks_of(A: Float[np.ndarray, "states rows speeds"], errors: Float[np.ndarra
         return [0] * len(A)
     sigma = np.linalg.svd(A, compute_uv=False)
     return np.sum(sigma > np.maximum(rank_cutoff(A.dtype), ERRORS * errors)[:, None] * sigma[:, :1], axis=1).tolist()
+
+
+def contradictions(
+    who: str, names: tuple[str, ...], A: Float[np.ndarray, "states rows speeds"], at_rest: Float[np.ndarray, "states rows"], ranks: list[int]
+) -> tuple[str, ...]:
+    """Which rows no speeds meet together at any of some random states, as a sentence.
+
+    A u + phi_0 = 0 has a solution where phi_0 is in the range of A:   (1 - U U') phi_0 = 0,   A = U S V'
+
+    `A`, `at_rest`: scaled rows and their values phi_0 at u = 0, of rows that are affine in the speeds.
+    """
+    U = np.linalg.svd(A, full_matrices=False)[0]
+    U = U * (np.arange(U.shape[2]) < np.array(ranks)[:, None])[:, None]
+    left = at_rest - (U @ (U.transpose(0, 2, 1) @ at_rest[..., None]))[..., 0]
+    unmet = np.abs(left) > CONTRADICTED * np.max(np.abs(at_rest), axis=1, initial=0.0, keepdims=True)
+    if not unmet.size or not unmet.any(axis=1).all():
+        return ()
+    wrong = [(name, s) for s, name in enumerate(names) if unmet[:, s].any()]
+    idle = [name for name, s in wrong if not A[:, s].any()]
+    if idle:
+        return (f"velocity row `{idle[0]}` of `{who}` depends on no speed and is not zero; state what holds between coordinates in `geometric_constraints`",)
+    several = ", ".join(f"`{name}`" for name, _ in wrong)
+    return (f"rows {several} of `{who}` contradict each other: no speeds meet them together at any of {len(A)} random states; leave one out, or mend it",)
 
 
 def redundant_rows(

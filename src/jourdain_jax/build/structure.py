@@ -16,7 +16,7 @@ from jourdain_jax.build.plausibility import implausible
 from jourdain_jax.build.privileged import best_privileged, pivots_at, privileged_by_user, worst_pivot
 from jourdain_jax.build.probed import TIMED, Probed
 from jourdain_jax.build.probed_on_graph import follow_from_others, probed_on_graph
-from jourdain_jax.build.rank import Scaled, ranks_of, redundant_rows, scaled_states
+from jourdain_jax.build.rank import Scaled, contradictions, ranks_of, redundant_rows, scaled_states
 from jourdain_jax.build.reference_parameters import once_per_values
 from jourdain_jax.build.row_lengths import speed_scales, typical_row_lengths
 from jourdain_jax.build.sampling import no_numbers, random_states, states_near_what_was_seen, symmetric_configurations, usable_states
@@ -59,7 +59,7 @@ class Structure:
     potentials_of_inputs: tuple[int, ...]  # numbers of the loads whose potential depends on inputs
     rows_of_inputs: bool  # rows depend on inputs, so that the accelerations depend on their rates
     chosen_by_user: bool
-    faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, as sentences
+    faults: tuple[str, ...]  # numbers of bodies and planes that cannot be, and rows that contradict each other, as sentences
     row_lengths: np.ndarray = field(compare=False, repr=False)  # typical ones, in scaled speeds: what the length of a row is judged by
     plain_row_lengths: np.ndarray = field(compare=False, repr=False)  # in the speeds as they are
     times: np.ndarray = field(compare=False, repr=False)  # of the probed states on the geometric rows
@@ -163,7 +163,7 @@ def structure_of(scene: Scene) -> Structure:
 
     Probed once per class and parameter values, at random and symmetric states of the domain; concrete numbers stand in for traced parameters.
     ValueError where no admissible state is found, where bodies do not move smoothly, where a motion that the rows leave free has no inertia, or
-    `privileged` names unknown or too few speeds; for known parameters also where numbers of its bodies or planes cannot be.
+    `privileged` names unknown or too few speeds; for known parameters also where numbers of its bodies or planes cannot be, or rows contradict each other.
     """
     structure = _whatever_its_faults(scene)
     if structure.faults and not is_traced(scene):  # numbers that stand in for traced parameters prove nothing
@@ -248,6 +248,13 @@ def _probed_structure(scene: Scene) -> Structure:
     dependent = [i for i in range(count) if i not in independent]
     pivots = pivots_at(candidates, dependent, rank)
     full_everywhere, eps, unproved = all(r == rank for r in ranks), float(np.finfo(found.A.dtype).eps), found.unproved
+    affine = "nonlinear" not in unproved and not _exceeds(found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None])
+    # near round-off: work that turns out as zero does less harm than work left out
+    homogeneous = "rows at rest" not in unproved and not _exceeds(found.phi_at_rest, 32 * eps, _speeds(found, u))
+    rows_of_inputs = "rows of inputs" in unproved or _moves(found.row_rates_of_inputs)
+    if affine and not (faults or homogeneous or rows_of_inputs) and rank < len(names):
+        at_rest = (found.phi_at_rest / np.where(scaled.lengths > 0, scaled.lengths, 1))[generic]
+        faults = contradictions(type(scene).__name__, names, scaled.A[generic], at_rest, [r for r, is_random in zip(ranks, generic, strict=True) if is_random])
     redundant = redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
     return Structure(
         row_names=names,
@@ -261,15 +268,14 @@ def _probed_structure(scene: Scene) -> Structure:
         independent=independent,
         worst_pivot=worst_pivot(candidates, dependent, rank, pivots) if full_everywhere else 0.0,
         typical_pivot=float(np.median(pivots)) if pivots.size else 1.0,
-        affine="nonlinear" not in unproved and not _exceeds(found.A - found.A_other, np.sqrt(eps), _sizes(found)[..., None]),
-        # near round-off: work that turns out as zero does less harm than work left out
-        homogeneous="rows at rest" not in unproved and not _exceeds(found.phi_at_rest, 32 * eps, _speeds(found, u)),
+        affine=affine,
+        homogeneous=homogeneous,
         timed=tuple(name for name in TIMED if name in unproved or _moves(found.timed[name])),
         driven="motion at rest" in unproved or _moves(found.motion_at_rest),
         massless=_is_singular(scaled.M[generic]),
         varying_inertia="inertia" in unproved or _moves(found.inertia_rates),
         potentials_of_inputs=tuple(k for k, rate in enumerate(found.potential_rates.T) if f"potential {k}" in unproved or _moves(rate)),
-        rows_of_inputs="rows of inputs" in unproved or _moves(found.row_rates_of_inputs),
+        rows_of_inputs=rows_of_inputs,
         chosen_by_user=by_user,
         faults=faults,
         row_lengths=typical,

@@ -44,7 +44,7 @@ def named_values(scene: Scene, given, what: str = "start") -> Mapping:
     if given is not None and not isinstance(given, Mapping):
         raise ValueError(
             f"`{what}` is {described(given)}, expected a State (from `jj.start` or `jj.consistent`), a dictionary of named values, or None for the "
-            "scene's example"
+            f"scene's example{'; write `.state` after it' if isinstance(getattr(given, 'state', None), State) else ''}"
         )
     return scene.example if given is None else given
 
@@ -77,7 +77,7 @@ def check_options(*, rtol=1e-8, atol=1e-8, max_steps=1, dt0=None, switches: dict
 def _meant(value, kind: type) -> str:
     """The object that a text or a class may stand for."""
     if isinstance(value, type) and issubclass(value, kind):
-        return f"diffrax.{value.__name__}()"
+        return f"{'jj' if value.__module__.startswith('jourdain_jax') else 'diffrax'}.{value.__name__}()"
     if not isinstance(value, str):
         return ""
     members = {name.lower(): name for name in dir(diffrax) if isinstance(member := getattr(diffrax, name), type) and issubclass(member, kind)}

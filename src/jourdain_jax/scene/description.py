@@ -30,6 +30,15 @@ METHODS = (
     "visuals",
 )
 ATTRIBUTES = ("coordinates", "speeds", "inputs", "privileged", "domain", "conventions", "example", "example_span")
+_MEANT = {  # what other programs and textbooks call them
+    "forces": "loads",
+    "applied_forces": "loads",
+    "torques": "loads",
+    "constraints": "velocity_constraints",
+    "nonholonomic_constraints": "velocity_constraints",
+    "holonomic_constraints": "geometric_constraints",
+    "position_constraints": "geometric_constraints",
+}
 _ALIKE = 0.85  # of two names: `load` and `loads` are, `contact_arm` and `contacts` are not
 
 
@@ -84,8 +93,9 @@ def _misspelt(kind: type, base: type) -> str:
             if known or isinstance(member, type | staticmethod | classmethod):
                 continue
             callable_ = callable(member) or isinstance(member, property)
-            near = difflib.get_close_matches(name, (*METHODS, *ATTRIBUTES) if callable_ else ATTRIBUTES, n=1, cutoff=_ALIKE)
-            if near and near[0] not in vars(owner):  # beside the real one it is a helper
+            near = [_MEANT[name]] if callable_ and name in _MEANT else []
+            near = near or difflib.get_close_matches(name, (*METHODS, *ATTRIBUTES) if callable_ else ATTRIBUTES, n=1, cutoff=_ALIKE)
+            if near and not any(name in vars(one) and near[0] in vars(one) for one in kind.__mro__):  # beside the real one it is a helper
                 what = "a method" if callable_ else "an attribute"
                 return (
                     f"`{kind.__name__}` has {what} `{name}`, which nothing calls; did you mean `{near[0]}`? "

@@ -39,6 +39,8 @@ class Named(eqx.Module):
         for slot, first, length in self.slots:
             if slot == name:
                 return self.array[..., first] if length == 0 else self.array[..., first : first + length]
+        if not isinstance(name, str):
+            raise TypeError(f"entries are reached by name, and `{name}` was given; write `q.yaw`, `q['yaw']`, or `q.array[0]` for the first of all")
         raise UnknownNameError(f"no `{name}` here; {nearest(name, [slot for slot, _, _ in self.slots])}")
 
     def __getattr__(self, name: str):

@@ -86,7 +86,7 @@ class Scene(eqx.Module, metaclass=_SceneClass):
         if not isinstance(getattr(self, "coordinates", None), Coordinates):
             raise ValueError(f"scene `{type(self).__name__}` has no `coordinates`; state them as a class attribute: coordinates = jj.coordinates('x y ...')")
         check_description(self, Scene)
-        hold_functions(self)
+        hold_leaves(self)
         check_parameters(self)
 
     def bodies(self, t: Float[Array, ""], q: Named) -> dict[str, Body]:
@@ -245,11 +245,14 @@ class HeldFunction(eqx.Module):
         return self.function(*args, **kwargs)
 
 
-def hold_functions(scene) -> None:
-    """Holds the functions in a scene that is being built, however deep in its fields; a ValueError for texts, which nothing can hold but a static field."""
+def hold_leaves(scene) -> None:
+    """Holds the functions in a scene that is being built, however deep in its fields, and makes arrays of floats, as parameters are.
+
+    A ValueError for texts, which nothing can hold but a static field.
+    """
 
     def held(leaf):
-        return HeldFunction(leaf) if callable(leaf) else leaf
+        return HeldFunction(leaf) if callable(leaf) else jnp.asarray(leaf) if type(leaf) is float else leaf
 
     static = tuple(value for field in fields(scene) if field.metadata.get("static") and is_function(value := getattr(scene, field.name)))
     object.__setattr__(scene, "_read", is_read_by(type(scene), *static))
@@ -264,5 +267,5 @@ def hold_functions(scene) -> None:
                 f"field `{field.name}` of `{type(scene).__name__}` holds {described(text)}, expected numbers; "
                 f"for what is no number write `{field.name}: str = eqx.field(static=True, default={text!r})`"
             )
-        if any(callable(leaf) for leaf in leaves):
+        if any(callable(leaf) or type(leaf) is float for leaf in leaves):
             object.__setattr__(scene, field.name, jax.tree.map(held, value))
