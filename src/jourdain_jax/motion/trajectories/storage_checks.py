@@ -98,8 +98,10 @@ def _check_finite(path, arrays: dict) -> None:
 def check_scenes(path, scene: Scene, result) -> None:
     """ValueError where parameters of lanes are wrong in a motion that did not end for it, or of shapes that do not make the scene."""
     for name, fault in jax.vmap(parameter_faults)(scene).items():
-        if np.any(np.asarray(fault) & (np.asarray(result) != BAD_PARAMETER)):
-            raise refused(path, f"has a value of the parameter `{name}` that is not finite or has the wrong sign, in a motion that did not fail for it")
+        wrong = np.flatnonzero(np.asarray(fault) & (np.asarray(result) != BAD_PARAMETER))
+        if wrong.size:
+            value = f"{np.asarray(getattr(scene, name))[wrong[0]]} as a value of the parameter `{name}`"
+            raise refused(path, f"has {value}, which is not finite or has the wrong sign, in a motion that did not fail for it")
 
     def quantities(scene):
         q, u, _ = scene.named()

@@ -34,8 +34,6 @@ class Trajectory(Record):
     loss to be minimised, takes `motion.nan_if_failed()`, or looks at `motion.succeeded`.
     """
 
-    # Named access. -------------------------------------------------------------------------------------------------
-
     def __getitem__(self, name: str) -> Float[Array, "times *shape"]:
         """A coordinate, speed, quaternion or angular velocity by name, at all times; `"t"` for the times."""
         if name == "t":
@@ -69,8 +67,6 @@ class Trajectory(Record):
         if self.q_end.ndim > 1:
             return eqx.filter_vmap(lambda motion: motion.end)(self)
         return consistent(self.scene, self.t_end, self.q_end, self.u_end, inputs_at(self.inputs, self.t_end))
-
-    # Derived quantities. -------------------------------------------------------------------------------------------
 
     def motions(self) -> Motion:
         """Poses and velocities (inertial frame) of all bodies at all times (leading axis: times)."""
@@ -133,8 +129,6 @@ class Trajectory(Record):
     def _outline(self) -> str:
         """What is shown of many motions, and of one whose numbers are not known."""
         return shapes_of(self) if is_traced(self) else f"Trajectories of {type(self.scene).__name__}, lanes {self.q.shape[:-2]}"
-
-    # How it ended. -------------------------------------------------------------------------------------------------
 
     @property
     def message(self) -> str:
