@@ -207,8 +207,8 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
         raise ValueError(f"`path` is {described(path)}, expected the name of a file")
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        header = json.loads(str(arrays.pop("header")))
+            arrays = {name: file[name] for name in file.files if name in AXES or name.startswith("parameter:")}
+            header = json.loads(str(file["header"]))
         if not isinstance(header, dict):
             raise ValueError("its header is no dictionary")
     except FileNotFoundError:
@@ -224,7 +224,7 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
     missing += [name for name in HEADER if name not in header]
     if not missing:
         check_header(path, header)
-        missing = [name for name in header["arrays"] if name not in arrays and not name.startswith("parameter:")]
+        missing = [name for name in header["arrays"] if name in AXES and name not in arrays]
     if missing:
         raise refused(path, f"lacks `{missing[0]}`")
     check_arrays(path, header, arrays)
