@@ -207,8 +207,8 @@ def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type
         raise ValueError(f"`path` is {described(path)}, expected the name of a file")
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files if name in AXES or name.startswith("parameter:")}
-            header = json.loads(str(file["header"]))
+            arrays = {name: file[name] for name in file.files if name in (*AXES, "header") or name.startswith("parameter:")}
+        header = json.loads(str(arrays.pop("header")))
         if not isinstance(header, dict):
             raise ValueError("its header is no dictionary")
     except FileNotFoundError:
