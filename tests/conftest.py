@@ -24,10 +24,11 @@ LAYERS = ("equations", "dynamics", "motion", "analysis", "ensembles", "models", 
 
 # What takes longest for its number of tests, longest first: started last, one of these would keep one worker busy while the others have nothing to do.
 LONGEST = """
-every_model identify native sensors mutants linearize native_derivatives call_costs feasible_starts simulate what_probes_do_not_show studies readme from_sympy
-stiff lowering malformed_inputs build labelled fit_profiles rollout program knots power log_density whipple_bicycle events_in_one_step along_batches
-study_faults probed opaque_calls bicycle_stability generated_scenes contacts_on_surfaces between_saved_times traced_parameters quality structure_preserving
-rattleback atlas cluster notebooks
+every_model sensors identify native_mutants native_hessians native_seen mutants exported native plain_numbers float32 multiple_shooting native_starts
+native_functions bootstrap feasible_starts linearize simulate lowering differentiation_guards long_chains native_derivatives native_second along_batches
+native_samples studies derivatives_of_starts log_density what_probes_do_not_show row_functions piecewise_motion malformed_inputs rank_of_vanishing_rows stiff
+knots changed_globals verify power native_operations call_costs build inertia joint_prior both_ways trajectory inputs energy_lost operations program readme
+events_in_one_step study_faults cluster notebooks
 """
 
 
@@ -66,14 +67,19 @@ def _findings_are_not_kept():
 
 @pytest.fixture(autouse=True, scope="module")
 def _compiled_programs_are_dropped():
-    """Compiled programs hold memory maps, of which a process may have 65530 on Linux: without this a long run aborts inside the compiler."""
+    """Compiled programs hold memory maps, of which a process may have 65530 on Linux: without this a long run aborts inside the compiler.
+
+    What a file leaves behind is kept by caches: it is not looked through for garbage until these are emptied, which would take seconds each time.
+    """
     yield
     maps = Path("/proc/self/maps")
     if not maps.exists() or maps.read_bytes().count(b"\n") > 35_000:
         import jax
 
         jax.clear_caches()
+        gc.unfreeze()
         gc.collect()
+    gc.freeze()
 
 
 def pytest_configure(config: pytest.Config) -> None:

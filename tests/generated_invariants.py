@@ -19,7 +19,7 @@ from jourdain_jax.calculus.null_space import null_space_qr, null_space_svd, pres
 from jourdain_jax.dynamics.accelerations import diagnosed
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.dynamics.reactions import row_reactions
-from jourdain_jax.eager.numpy_backend import uncompiled
+from jourdain_jax.eager.lanes import uncompiled
 from jourdain_jax.equations import virtual_power as equations_module
 from jourdain_jax.equations.gibbs_appell import GibbsAppell
 from jourdain_jax.equations.projection import closure_residual, project_positions, project_speeds

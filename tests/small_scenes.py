@@ -26,6 +26,16 @@ class DiscWithHeightRow(jj.Scene):
         return {"rim": jj.disc_contact(pose["disc"], self.radius, axis="y", height="row")}
 
 
+class Bead(jj.Scene):
+    """A bead on a plane."""
+
+    mass: object = jj.parameter(1.0, unit="kg", positive=True)
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
+
+
 class BeadOnTurningWire(jj.Scene):
     """A bead on a straight wire that is turned at a given rate about the vertical: pose given as a function of time."""
 

@@ -152,7 +152,7 @@ def _row_forgotten(rows_of):
 
 
 def _M_not_symmetric(mass_matrix):
-    return lambda weights, partial: mass_matrix(weights, partial) + jnp.triu(mass_matrix(weights, partial), 1) * 1e-6
+    return lambda *of: mass_matrix(*of) + jnp.triu(mass_matrix(*of), 1) * 1e-6
 
 
 def _gradient_of_potential_halved(gradient):

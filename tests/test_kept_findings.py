@@ -31,7 +31,7 @@ def _never(*_):
 
 def _program(scene) -> tuple:
     known = structure._structure.__wrapped__(scene)
-    key = lower._Key(scene, known, not known.has_minimal_state or not known.row_names, known.massless and bool(known.row_names))
+    key = lower._Key.of(scene, known, not known.has_minimal_state or not known.row_names, known.massless and bool(known.row_names))
     found = lower._built_or_kept(key)
     *graph, told = from_text(kept_programs.program_as_text(found))
     return as_text(vars(known)), as_text(graph), {name: as_text(value) for name, value in told.items() if name != "seconds"}

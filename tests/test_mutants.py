@@ -256,8 +256,8 @@ BUILD, KINEMATICS, VJP = appell.AppellOnGraph, appell._Kinematics, recorded_adjo
 DISC, BOARD = a_tilting_disc_accelerates_as_by_dense_matrices, a_snakeboard_accelerates_as_by_dense_matrices
 STEPS, TIMES, EVENT = steps_follow_a_closed_form, reverse_mode_through_saved_times, reverse_mode_to_an_event
 MUTANTS = [
-    Mutant("no gyroscopic torque", BUILD, "_equations", "g.sub(L, g.add(i, w)) for L", "g.sub(L, i) for L", DISC, DENSE),
-    Mutant("no a_0", BUILD, "_equations", "g.sub(F, g.mul(mass, a)) for F", "F for F", DISC, DENSE),
+    Mutant("no gyroscopic torque", BUILD, "_inertia_resultants", "g.add(g.dot(row, alpha), w)", "g.dot(row, alpha)", DISC, DENSE),
+    Mutant("no a_0", BUILD, "_inertia_resultants", "g.mul(int(at.mass[b]), x) for x in a", "g.zero for x in a", DISC, DENSE),
     Mutant(
         "one mass twice", BUILD, "_equations", "g.mul(mass, g.dot(beta[i], beta[j]))", "g.mul(g.mul(g.const(2.0), mass), g.dot(beta[i], beta[j]))", DISC, DENSE
     ),
@@ -267,7 +267,7 @@ MUTANTS = [
         "no inertia in the power of contacts",
         BUILD,
         "_power",
-        "g.sub(g.add(turning[i], gyroscopic[i]), int(at.torque[b][i]))",
+        "g.sub(torque[i], int(at.torque[b][i]))",
         "g.neg(int(at.torque[b][i]))",
         a_ball_on_a_turntable_is_given_the_power_of_its_contact,
         "power",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jourdain_jax as jj
-from jourdain_jax.eager.numpy_backend import uncompiled
+from jourdain_jax.eager.lanes import uncompiled
 from jourdain_jax.program.derivative import derivatives
 from jourdain_jax.program.emit import run
 from jourdain_jax.program.evaluate import Probes

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from jourdain_jax.calculus.scalar_operations import TABLE
-from jourdain_jax.eager.numpy_backend import uncompiled
+from jourdain_jax.eager.lanes import uncompiled
 from jourdain_jax.program.derivative import derivatives, directional_derivative
 from jourdain_jax.program.emit import run, sine_and_cosine
 from jourdain_jax.program.evaluate import Probes

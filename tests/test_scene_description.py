@@ -6,20 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
+from small_scenes import Bead
 
 import jourdain_jax as jj
 from jourdain_jax.models import MODELS
 from jourdain_jax.scene import description
-
-
-class Bead(jj.Scene):
-    """A bead on a plane."""
-
-    mass: object = jj.parameter(1.0, unit="kg", positive=True)
-    coordinates = jj.coordinates("x y")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
 
 
 def described(**members):

@@ -2,23 +2,14 @@
 
 import jax.numpy as jnp
 import pytest
+from small_scenes import Bead
 
 import jourdain_jax as jj
 
 
-class Slider(jj.Scene):
-    """A bead on a plane."""
-
-    mass: object = jj.parameter(1.0, unit="kg", positive=True)
-    coordinates = jj.coordinates("x y")
-
-    def bodies(self, t, q):
-        return {"bead": jj.Particle(self.mass, jnp.stack([q.x, q.y, 0.0 * q.x]))}
-
-
 def described(**methods):
     """The bead with some methods replaced."""
-    return type("Described", (Slider,), methods)()
+    return type("Described", (Bead,), methods)()
 
 
 def test_a_scene_without_coordinates_says_how_to_state_them():

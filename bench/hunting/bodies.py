@@ -167,8 +167,8 @@ class SleighAhead(ChaplyginSleigh):
     domain = {"heading": (-0.3, 0.3)}
 
 
-def _sleigh_truth(n, ts):
-    """v' = a w^2, w' = -a v w/k^2, k^2 = I/m + a^2; x, y of the mass centre."""
+def sleigh_states(n, ts):
+    """v' = a w^2, w' = -a v w/k^2, k^2 = I/m + a^2; x, y of the mass centre, heading and its rate."""
     k2 = n["inertia"] / n["m"] + n["a"] ** 2
 
     def rates(_, y):
@@ -177,8 +177,7 @@ def _sleigh_truth(n, ts):
         return np.stack([v * c - n["a"] * w * s, v * s + n["a"] * w * c, w, n["a"] * w * w, -n["a"] * v * w / k2], axis=1)
 
     o = 0.0 * n["v"]
-    y = integrate(rates, np.stack([o, o, o, n["v"], n["w"]], axis=1), ts, width=0.05)
-    return Truth(y[..., [0, 1, 2, 4]])
+    return integrate(rates, np.stack([o, o, o, n["v"], n["w"]], axis=1), ts)[..., [0, 1, 2, 4]]
 
 
 def _disc_truth(n, ts):
@@ -286,7 +285,8 @@ SLEIGH = {
     "draw": lambda r: {"m": r.uniform(0.5, 2), "inertia": r.uniform(0.2, 1), "a": r.uniform(-0.3, 0.3), "v": r.uniform(-1, 1),
                        "w": r.choice([-1, 1]) * r.uniform(0.5, 4), "span": r.uniform(1, 6)},
     "start": lambda n: {"x": 0.0 * n["a"], "y": 0.0 * n["a"], "heading": 0.0 * n["a"], "x_rate": n["v"], "y_rate": n["a"] * n["w"], "heading_rate": n["w"]},
-    "truth": _sleigh_truth, "names": ("x", "y", "heading", "heading_rate"), "parameters": lambda n: {"mass": n["m"], "inertia": n["inertia"], "offset": n["a"]},
+    "truth": lambda n, ts: Truth(sleigh_states(n, ts)), "names": ("x", "y", "heading", "heading_rate"),
+    "parameters": lambda n: {"mass": n["m"], "inertia": n["inertia"], "offset": n["a"]},
 }  # fmt: skip
 FAMILIES = (
     _top("free-body", "a free rigid body with a quaternion", 0.0),

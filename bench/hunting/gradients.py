@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jourdain_jax as jj
+from hunting.bodies import sleigh_states
 from hunting.family import Family
 from hunting.pendulums import ROD, G
 from hunting.record import BY_CODE, BY_WARNING, RIGHT, WRONG, Record, refusal
@@ -108,18 +109,6 @@ def _rod_end(n):
     return np.stack([l * s, -l * c, l * c * rate, l * s * rate], axis=1)
 
 
-def _sleigh_end(n):
-    k2 = n["inertia"] / n["m"] + n["a"] ** 2
-
-    def rates(_, y):
-        _, _, th, v, w = y.T
-        c, s = np.cos(th), np.sin(th)
-        return np.stack([v * c - n["a"] * w * s, v * s + n["a"] * w * c, w, n["a"] * w * w, -n["a"] * v * w / k2], axis=1)
-
-    o = 0.0 * n["v"]
-    return integrate(rates, np.stack([o, o, o, n["v"], n["w"]], axis=1), np.real(n["span"])[:, None])[:, -1][:, [0, 1, 2, 4]]
-
-
 def _flight_end(n):
     """Where and when a ball in a room meets the floor or the wall, whichever comes first."""
     fall = (n["vz"] + np.sqrt(n["vz"] ** 2 + 2 * G * n["z"])) / G
@@ -151,7 +140,7 @@ def families() -> tuple[Slopes, ...]:
     )
     return (
         Slopes("gradient-rod", "gradients of the pendulum with a rod and a narrow domain", rod, _rod_end),
-        Slopes("gradient-sleigh", "gradients of Chaplygin's sleigh", sleigh, _sleigh_end),
+        Slopes("gradient-sleigh", "gradients of Chaplygin's sleigh", sleigh, lambda n: sleigh_states(n, np.real(n["span"])[:, None])[:, -1]),
         Slopes("gradient-room", "gradients of where a ball in a room is stopped", room, _flight_end),
         Slopes("gradient-parallelogram", "gradients of a parallelogram laid flat", bar, _bar_end, cases=15, slack=1e5),
     )

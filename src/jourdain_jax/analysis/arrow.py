@@ -59,9 +59,7 @@ class Arrow:
         shared, local = self.split(size)
         whole = np.concatenate([local, np.broadcast_to(shared[:, None], (*local.shape[:2], shared.shape[1])), np.ones((*local.shape[:2], 1))], axis=-1)
         return Arrow(
-            self.local * whole[:, :, None],
-            self.shared * np.concatenate([shared, np.ones((len(shared), 1))], axis=-1)[:, None],
-            self.scores * shared[:, None],
+            self.local * whole[:, :, None], self.shared * np.concatenate([shared, np.ones((len(shared), 1))], axis=-1)[:, None], self.scores * shared[:, None]
         )
 
     def split(self, x: Shaped[np.ndarray, "members unknowns"]) -> tuple[np.ndarray, np.ndarray]:

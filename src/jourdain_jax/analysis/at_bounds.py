@@ -7,14 +7,14 @@ Source: D. J. Venzon and S. H. Moolgavkar, Applied Statistics 37 (1988) 87.
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jourdain_jax.analysis.information import information
-from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, minimise
+from jourdain_jax.analysis.levenberg_marquardt import Control, Limits, Minimum, minimum_beside
 
 ONE_SIDED = 2.7055434540954146 / 2  # of F
 RISE_95 = 3.841458820694124  # of 2 F
@@ -54,12 +54,8 @@ class Around:
 
     def rise(self, b: int, place: int, step: float) -> tuple[float, Minimum]:
         """How much F of member `b` rises when one unknown is moved by a step and held there (infinite where the motion fails), and the minimum there."""
-        theta = self.found.theta[b : b + 1].copy()
-        theta[0, place] += step
-        fixed = self.limits.fixed.copy()
-        fixed[place] = True
-        roughly = replace(self.control, tolerance=max(self.control.tolerance, 1e-2))  # to one per cent of a standard error is enough
-        at = minimise(lambda x, _: self.evaluate(x, np.array([b])), theta, replace(self.limits, fixed=fixed), roughly)
+        theta = self.found.theta[b : b + 1]
+        at = minimum_beside(lambda x, _: self.evaluate(x, np.array([b])), theta, place, theta[0, place] + step, self.limits, self.control)
         return float(at.at.cost[0] - self.found.at.cost[b]), at
 
     def if_free(self, b: int, place: int) -> tuple[float, float]:

@@ -5,8 +5,8 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from jourdain_jax.analysis.predictions import run_of
 from jourdain_jax.analysis.problem import Problem
+from jourdain_jax.analysis.runs import run_of
 from jourdain_jax.analysis.stop_events import LATEST, StopEvent
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.scene import Scene

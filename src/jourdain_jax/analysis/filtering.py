@@ -25,7 +25,7 @@ from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.instruments import Instrument
 from jourdain_jax.analysis.joint_prior import Correlated
 from jourdain_jax.analysis.likelihood import as_runs, mapped
-from jourdain_jax.analysis.predictions import Run, equal_runs
+from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.sensors import Reading, ideal
 from jourdain_jax.analysis.stop_events import StopEvent
 from jourdain_jax.analysis.tangent import dependent_coordinates, others, privileged_speeds

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt of one run in the program that evaluates it: the steps of `levenberg_marquardt`, until one may be the last or would pass a bound.
+"""Levenberg-Marquardt in the program that evaluates all runs: the steps of `levenberg_marquardt`, until one may be the last or would pass a bound.
 
 From one motion of a short run to the next, calls of compiled code and of NumPy take longer than the motion itself (a disc: four times as long). `minimise`
 goes on from where these end, by the same rules. The damped step is

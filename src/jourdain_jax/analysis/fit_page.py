@@ -115,11 +115,7 @@ def _estimates(fit, profiles: Mapping[str, Profile], bootstrap) -> str:
 
 
 def _untold(fit) -> list[str]:
-    kinds = (
-        ("Not at all", fit.not_identifiable),
-        ("Poorly: weak directions", fit.weak),
-        ("Not one by one: estimates that correlate", fit.correlated),
-    )
+    kinds = (("Not at all", fit.not_identifiable), ("Poorly: weak directions", fit.weak), ("Not one by one: estimates that correlate", fit.correlated))
     parts = ["<h2>What the data do not tell</h2>"]
     for head, sentences in kinds:
         parts += [f"<h3>{head}</h3>"] if sentences else []

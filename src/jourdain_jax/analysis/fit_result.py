@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -19,7 +20,7 @@ from jourdain_jax.analysis.fit_statistics import Statistics
 from jourdain_jax.analysis.fit_text import batch_text, text
 from jourdain_jax.analysis.fit_warnings import warnings_of
 from jourdain_jax.analysis.held_out import Prediction, of_fitted, of_held_out
-from jourdain_jax.analysis.information import Information, hidden_combinations
+from jourdain_jax.analysis.information import hidden_combinations
 from jourdain_jax.analysis.informed import informed
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood_profiles import Profile, profiles
@@ -32,8 +33,19 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
+T = TypeVar("T")
 MOST_COMPARED = 1000  # unknowns
 MOST_INFORMED = 24  # unknowns of which the report says what informs them
+
+
+def _of_minimum(part: Callable[[Statistics], T], doc: str) -> T:
+    """A part of `Fit.statistics` as a property of the fit."""
+
+    def read(self):
+        return part(self.statistics)
+
+    read.__doc__ = doc
+    return property(read)  # type: ignore[return-value]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,75 +82,22 @@ class Fit(Printed):
     def __getstate__(self) -> dict:
         return vars(self) | {"statistics": self.statistics, "work_out": None}  # what was compiled stays in its process
 
-    @property
-    def scene(self) -> Scene:
-        """The scene with the estimates."""
-        return self.statistics.scene
-
-    @property
-    def starts(self) -> tuple[dict[str, Float[Array | np.ndarray, "..."]], ...]:
-        """Initial values of each run, with the estimates."""
-        return self.statistics.starts
-
-    @property
-    def sizes(self) -> Float[np.ndarray, "*repeats unknowns"]:
-        """Magnitudes of the unknowns, against which the rank is judged."""
-        return self.statistics.sizes
-
-    @property
-    def standard_errors(self) -> Float[np.ndarray, "*repeats unknowns"]:
-        """Standard errors; NaN where not identifiable."""
-        return self.statistics.standard_errors
-
-    @property
-    def low(self) -> Float[np.ndarray, "*repeats unknowns"]:
-        """Lower ends of the 95 % intervals; NaN where not identifiable."""
-        return self.statistics.low
-
-    @property
-    def high(self) -> Float[np.ndarray, "*repeats unknowns"]:
-        """Upper ends of the 95 % intervals; NaN where not identifiable."""
-        return self.statistics.high
-
-    @property
-    def at_bound(self) -> Bool[np.ndarray, "*repeats unknowns"]:
-        """Which estimates lie at a bound: no standard error, and a one-sided interval."""
-        return self.statistics.at_bound
-
-    @property
-    def information(self) -> Information:
-        """Covariance in blocks, and the directions that do not show."""
-        return self.statistics.information
-
-    @property
-    def residuals(self) -> tuple[dict[str, Float[np.ndarray, "..."]], ...]:
-        """Residuals of each run by channel, (times, *channel): (prediction - value) / sigma; NaN where missing."""
-        return self.statistics.residuals
-
-    @property
-    def whitened(self) -> tuple[dict[str, Float[np.ndarray, "..."]], ...]:
-        """Residuals, where their noise has a memory less what the sample before foretells."""
-        return self.statistics.whitened
-
-    @property
-    def sigma(self) -> dict[str, Float[np.ndarray, "*repeats"]]:
-        """Sigmas of channels whose noise was estimated."""
-        return self.statistics.sigma
-
-    @property
-    def correlation_time(self) -> dict[str, Float[np.ndarray, "*repeats"]]:
-        """Correlation times in s, of channels where they were estimated; near zero: white."""
-        return self.statistics.correlation_time
-
-    @property
-    def chi_square(self) -> Float[np.ndarray, "*repeats"]:
-        """Sum of squared whitened residuals; NaN where the motion fails."""
-        return self.statistics.chi_square
-
-    @property
-    def samples(self) -> Int[np.ndarray, "*repeats"]:
-        """How many samples have a finite sigma."""
-        return self.statistics.samples
+    scene = _of_minimum(lambda found: found.scene, "The scene with the estimates.")
+    starts = _of_minimum(lambda found: found.starts, "Initial values of each run, with the estimates.")
+    sizes = _of_minimum(lambda found: found.sizes, "Magnitudes of the unknowns, against which the rank is judged.")
+    standard_errors = _of_minimum(lambda found: found.standard_errors, "Standard errors; NaN where not identifiable.")
+    low = _of_minimum(lambda found: found.low, "Lower ends of the 95 % intervals; NaN where not identifiable.")
+    high = _of_minimum(lambda found: found.high, "Upper ends of the 95 % intervals; NaN where not identifiable.")
+    at_bound = _of_minimum(lambda found: found.at_bound, "Which estimates lie at a bound: no standard error, and a one-sided interval.")
+    information = _of_minimum(lambda found: found.information, "Covariance in blocks, and the directions that do not show.")
+    residuals = _of_minimum(
+        lambda found: found.residuals, "Residuals of each run by channel: (prediction - value) / sigma, (times, *channel); NaN where missing."
+    )
+    whitened = _of_minimum(lambda found: found.whitened, "Residuals, where their noise has a memory less what the sample before foretells.")
+    sigma = _of_minimum(lambda found: found.sigma, "Sigmas of channels whose noise was estimated.")
+    correlation_time = _of_minimum(lambda found: found.correlation_time, "Correlation times in s, of channels where they were estimated; near zero: white.")
+    chi_square = _of_minimum(lambda found: found.chi_square, "Sum of squared whitened residuals; NaN where the motion fails.")
+    samples = _of_minimum(lambda found: found.samples, "How many samples have a finite sigma.")
 
     def __getitem__(self, name: str) -> Estimated:
         if name not in self.labels:

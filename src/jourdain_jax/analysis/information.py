@@ -73,11 +73,14 @@ class Information:
         """
         runs = scores.shape[-2]
         shared = self.shared @ (np.swapaxes(scores, -1, -2) @ scores) @ self.shared * runs / (runs - 1)
-        of_shared = np.diagonal(shared, axis1=-2, axis2=-1)
-        of_own = np.diagonal(self.own, axis1=-2, axis2=-1) + np.einsum("...kij,...jl,...kil->...ki", self.follow, shared, self.follow)
-        variance = np.concatenate([of_shared, of_own.reshape(*of_own.shape[:-2], -1)], axis=-1)[..., np.array(self.estimated, int)]
-        errors = np.where(self.identifiable, np.sqrt(variance), np.nan)
-        return replace(self, standard_errors=errors, shared=shared)
+        variance = variances(shared, self.own, self.follow)[..., np.array(self.estimated, int)]
+        return replace(self, standard_errors=np.where(self.identifiable, np.sqrt(variance), np.nan), shared=shared)
+
+
+def variances(shared: np.ndarray, own: np.ndarray, follow: np.ndarray) -> Float[np.ndarray, "*members places"]:
+    """Those of shared unknowns and of the runs' own ones, from the blocks of an `Information`."""
+    of_own = np.diagonal(own, axis1=-2, axis2=-1) + np.einsum("...kij,...jl,...kil->...ki", follow, shared, follow)
+    return np.concatenate([np.diagonal(shared, axis1=-2, axis2=-1), of_own.reshape(*of_own.shape[:-2], -1)], axis=-1)
 
 
 def students_t_95(degrees):
@@ -121,7 +124,7 @@ def _information(arrow: Arrow, size: Float[np.ndarray, "places"], estimated: np.
     shows_s = cutoff * largest < S_s
     covariance = Vt_s.T @ (np.where(shows_s, 1 / np.where(shows_s, S_s, 1.0) ** 2, 0.0)[:, None] * Vt_s)
     hidden = _hidden_directions(Vt[~shows], np.nonzero(~shows)[0], Vt_s[~shows_s], follow, held)
-    variance = np.concatenate([np.diagonal(covariance), (np.diagonal(own, axis1=1, axis2=2) + np.einsum("kij,jl,kil->ki", follow, covariance, follow)).ravel()])
+    variance = variances(covariance, own, follow)
     least_part = np.minimum(np.sqrt(cutoff), np.sqrt(variance) * least_move(cutoff, largest))
     has_part = np.linalg.norm(hidden, axis=0) > least_part
     identifiable = ~has_part[estimated] & ~bound[estimated] & usable

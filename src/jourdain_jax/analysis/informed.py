@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.analysis.asked import TakenUp
-from jourdain_jax.analysis.information import Information
+from jourdain_jax.analysis.information import variances
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def informed(fitted: TakenUp, most: int) -> Informed:
     some = np.flatnonzero(known.identifiable)[:most]
     places, labels = unknowns.estimated[some], tuple(unknowns.labels[i] for i in some)
     runs, m, _ = known.follow.shape
-    variance = np.concatenate([np.diagonal(known.shared), _of_own(known).ravel()])[places]
+    variance = variances(known.shared, known.own, known.follow)[places]
     found: list[dict[str, np.ndarray]] = [{}] * runs
     taus = problem.taus(np.array([0]))
     for b, j, plain in lanes.evaluate(*unknowns.split(fitted.theta), np.array([0])):
@@ -78,8 +78,3 @@ def informed(fitted: TakenUp, most: int) -> Informed:
             by_channel = lanes.by_channel(run, share)
             found[run] = {name: np.nansum(x, axis=tuple(range(2, x.ndim))) for name, x in by_channel.items()}
     return Informed(labels, tuple(found), tuple(np.asarray(run.ts) for run in problem.runs))
-
-
-def _of_own(known: Information) -> Float[np.ndarray, "runs own"]:
-    """Variances of the runs' own unknowns."""
-    return np.diagonal(known.own, axis1=1, axis2=2) + np.einsum("kij,jl,kil->ki", known.follow, known.shared, known.follow)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.analysis.correlated_noise import log_density
 from jourdain_jax.analysis.experiment import Experiment, checked
 from jourdain_jax.analysis.oddities import oddities
-from jourdain_jax.analysis.predictions import Run, equal_runs
+from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.calculus.reals import described
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import as_scene

@@ -9,7 +9,6 @@ one before it ended. Correlation times are held. Source: D. J. Venzon and S. H. 
 """
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
@@ -17,7 +16,7 @@ from jaxtyping import Float
 
 from jourdain_jax.analysis.asked import TakenUp
 from jourdain_jax.analysis.at_bounds import RISE_95
-from jourdain_jax.analysis.levenberg_marquardt import minimise
+from jourdain_jax.analysis.levenberg_marquardt import minimum_beside
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.printing import Printed
 
@@ -27,7 +26,6 @@ _JUMP = 3.0  # times the rise at the end of an interval: with more between two p
 _STEP = 0.6  # of sqrt(rise), from point to point
 _FAR = 1e3  # sizes of the unknown, beyond which nothing is looked for
 _LOWER = 0.02  # of the rise, by which a lower minimum is found
-_TOLERANCE = 1e-2  # standard errors
 
 
 class Profile(Printed, eqx.Module):
@@ -74,9 +72,6 @@ class _Side:
 
     def __init__(self, fitted: TakenUp, place: int, error: float, inflation: float, way: float):
         self._fitted, self._place, self._inflation, self._way = fitted, place, inflation, way
-        fixed = fitted.limits.fixed.copy()
-        fixed[place] = True
-        self._limits = replace(fitted.limits, fixed=fixed)
         self._size = float(fitted.problem.unknowns.sizes(fitted.theta)[0, place])
         self._first = _STEP * error if np.isfinite(error) and error > 0 else 0.1 * self._size
         self._bound = float((fitted.limits.low if way < 0 else fitted.limits.high)[place])
@@ -113,10 +108,7 @@ class _Side:
 
     def _solved(self, theta: np.ndarray, value: float) -> tuple[float, np.ndarray]:
         """The rise at a value of the unknown, and all others there; infinite where the motion fails."""
-        begin = np.clip(theta, self._limits.low, self._limits.high)
-        begin[0, self._place] = value
-        control = self._fitted.asked.control
-        found = minimise(self._fitted.evaluate, begin, self._limits, replace(control, tolerance=max(control.tolerance, _TOLERANCE)))
+        found = minimum_beside(self._fitted.evaluate, theta, self._place, value, self._fitted.limits, self._fitted.asked.control)
         if np.isfinite(found.at.cost[0]) and not found.converged[0]:
             self.note = f"no minimum over the others was found near {value:.4g}, so that the interval may be too narrow"
         return 2 * float(found.at.cost[0] - self._fitted.at.cost[0]) / self._inflation, found.theta

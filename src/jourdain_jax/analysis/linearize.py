@@ -15,16 +15,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 
 from jourdain_jax.analysis.table import linearization_text
-from jourdain_jax.analysis.tangent import (
-    Flow,
-    carried_along,
-    dependent_coordinates,
-    eliminated,
-    flow_of,
-    others,
-    perturbations,
-    privileged_speeds,
-)
+from jourdain_jax.analysis.tangent import Flow, carried_along, dependent_coordinates, eliminated, flow_of, others, perturbations, privileged_speeds
 from jourdain_jax.calculus.reals import Numbers
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.start import State

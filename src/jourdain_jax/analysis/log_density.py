@@ -23,8 +23,8 @@ from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.fit_result import Fit
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood import as_runs, in_all_or_none, mapped, of_run
-from jourdain_jax.analysis.predictions import Run, equal_runs
 from jourdain_jax.analysis.ranges import Range, bounds, positive
+from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.starts import check_starts
 from jourdain_jax.analysis.transforms import Transforms
 from jourdain_jax.analysis.unknowns import unknowns_of

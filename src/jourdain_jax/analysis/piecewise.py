@@ -45,7 +45,7 @@ class Shot:
 class PieceLanes:
     """Lanes of all pieces, which keep the states at their ends aside. `states`: how many numbers each piece ends at."""
 
-    alone = takes_steps = False
+    together = takes_steps = False
 
     def __init__(self, lanes: Lanes, states: Int[np.ndarray, "pieces"]):
         self._lanes, self._states, pieces = lanes, states, len(states)
@@ -93,17 +93,10 @@ class _Standing:
 class Piecewise:
     """Lanes of whole runs that are worked out in pieces; what `Lanes` offers, and the same with nodes as unknowns."""
 
-    alone = takes_steps = False
+    together = takes_steps = False
 
     def __init__(
-        self,
-        scene: Scene,
-        runs: tuple[Experiment, ...],
-        layout: Layout,
-        simulation: dict,
-        members: int | None,
-        unknowns: Unknowns,
-        shooting: MultipleShooting,
+        self, scene: Scene, runs: tuple[Experiment, ...], layout: Layout, simulation: dict, members: int | None, unknowns: Unknowns, shooting: MultipleShooting
     ):
         self.scene, self.runs, self.unknowns = scene, runs, unknowns
         of_runs = [len(scene.coordinate_names) + len(scene.speed_names) + numbers_of_filters(run, members is not None) for run in runs]

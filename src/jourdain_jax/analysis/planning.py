@@ -20,8 +20,8 @@ from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.information import hidden_combinations
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.likelihood import as_runs
-from jourdain_jax.analysis.predictions import Run, run_of
 from jourdain_jax.analysis.ranges import Range
+from jourdain_jax.analysis.runs import Run, run_of
 from jourdain_jax.analysis.table import table
 from jourdain_jax.analysis.unknowns import Unknowns, unknowns_of
 from jourdain_jax.build.reference import Reference
@@ -168,11 +168,7 @@ def _values(scene: Scene, runs: Sequence[Experiment], unknowns: Unknowns) -> Flo
     """All unknowns at the values that the scene and the runs have; those of parameters and starts may be traced."""
     shared, local = unknowns.split(unknowns.guess)
     of_bodies = {label: x for body in unknowns.layout.bodies for label, x in zip(body.labels, body.numbers(scene), strict=True)}
-    of_kind = {
-        "scene": lambda place: getattr(scene, place.name),
-        "sensor": lambda place: place.of(shared),
-        "inertia": lambda place: of_bodies[place.name],
-    }
+    of_kind = {"scene": lambda place: getattr(scene, place.name), "sensor": lambda place: place.of(shared), "inertia": lambda place: of_bodies[place.name]}
     rows = [of_kind[place.kind](place) for place in unknowns.layout.shared]
     for run, own in zip(runs, local, strict=True):
         rows += [run.start.get(place.name, place.of(own)) for place in unknowns.layout.local]

@@ -1,6 +1,4 @@
-"""What a scene predicts for the measurements of a run, against what was measured; and the same with derivatives for many runs, in one compiled program.
-
-r = (reading - value) / sigma, zero where a sample is missing
+"""What a scene predicts for the measurements of many runs, against what was measured, with derivatives, in one compiled program.
 
 A lane is one run of one member (a repeat of the experiment, or a first guess of its own). Some lanes at a time go through one program, which is
 compiled once for runs of equal structure, whatever their number: memory does not grow with it. Short runs are filled up to the length of the longest.
@@ -13,130 +11,41 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache, partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jourdain_jax.analysis.channels import Channel
 from jourdain_jax.analysis.correlated_noise import Chains, whitened
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.first_steps import Told, first_steps, read
-from jourdain_jax.analysis.grids import grid, intervals
 from jourdain_jax.analysis.layout import Layout
 from jourdain_jax.analysis.losses import LEAST_SQUARES, Loss
-from jourdain_jax.analysis.nodes import LAST, NODE, begin, ended
-from jourdain_jax.analysis.sensors import Drive, Reading, ideal, with_numbers
-from jourdain_jax.analysis.stop_events import StopEvent
+from jourdain_jax.analysis.runs import Run, filled_up, grouped, is_array, most_knots, on_equal_grids, run_of
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.motion.forward_mode import simulate_alongside
-from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.quick_compilation import quickly_compiled, sparingly_compiled
-from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.scene.scene import Scene
 
 TOUCHED = 2**18  # bytes of saved states with their tangents in one loop: far below what XLA compiles into one function (see `jourdain_jax`)
 MOST_LANES = 64
 AHEAD = 4  # groups of lanes that are begun before the first is read
 _WHITE, _NONE = np.zeros((1, 1)), np.zeros(0)
-FILLED = 1e-6  # of a run's span: between the times that fill up a short one
-
-
-class Run(NamedTuple):
-    """A run made ready: its measurements with weights 1 / sigma, zero where a sample is missing."""
-
-    t0: Float[Array | np.ndarray, ""]
-    ts: Float[Array | np.ndarray, "times"]
-    grid: Float[Array | np.ndarray, "grid"] | None  # s, at equal intervals: where sensors are late, the motion is worked out there
-    values: dict[str, Float[Array | np.ndarray, "..."]]
-    weights: dict[str, Float[Array | np.ndarray, "..."]]
-    start: dict[str, Float[Array | np.ndarray, "..."]]
-    inputs: dict | Inputs | None
-    sensors: dict[str, Reading]
-    drives: dict[str, Drive]
-    correlation_time: dict[str, Float[Array | np.ndarray, ""]]  # s, of channels whose noise has a memory
-
-    def motion(self, scene: Scene, simulate: Callable, ts, **simulation) -> Trajectory:
-        """The motion at these times."""
-        inputs = self.inputs
-        for drive in self.drives.values():
-            inputs = eqx.tree_at(lambda i, k=drive.index: i.channels[k], inputs, drive.signal())
-        return simulate(scene, begin(scene, self.start, self.t0), t0=self.t0, ts=ts, inputs=inputs, work=False, **simulation)
-
-    def residuals(self, scene: Scene, simulate: Callable, simulation: dict) -> dict[str, Float[Array | np.ndarray, "..."]]:
-        """`(reading - value) / sigma` by channel; of a piece of a run also what it ends at."""
-        ts = self.ts if self.grid is None else self.grid
-        motion = self.motion(scene, simulate, ts, events=False, **simulation)
-        states = motion.motions() if any(isinstance(sensor.operation, Channel) for sensor in self.sensors.values()) else None
-        found, filters, place = {}, [], len(scene.coordinate_names) + len(scene.speed_names)
-        for name, weight in self.weights.items():
-            sensor, at_first = self.sensors.get(name, ideal(name)), None
-            if isinstance(sensor.operation, StopEvent):
-                shown = sensor.operation.time(lambda ts: self.motion(scene, simulate, ts, **simulation), self.t0, self.ts)
-            else:
-                x = sensor.quantity(motion, states)
-                if sensor.has_filter and NODE in self.start:
-                    place, at_first = place + x[0].size, self.start[NODE][place : place + x[0].size]
-                shown, y = sensor.shown(x, self.grid, self.ts, at_first)
-                filters += [y] if sensor.has_filter else []
-            found[name] = jnp.where(weight > 0, (shown - self.values[name]) * weight, 0.0)
-        return found | ended(motion, filters, self.start, ts)
-
-    def at(self, layout: Layout, shared, local) -> "Run":
-        """The run with these unknowns."""
-        changed = layout.start(self.start, local)
-        if not layout.numbers:
-            return self._replace(start=changed)
-        known = layout.known(shared, local)
-        return self._replace(start=changed, sensors=with_numbers(self.sensors, known), drives=with_numbers(self.drives, known))
-
-
-def run_of(data: Experiment, xp=np, repeats: bool = False) -> Run:
-    """A run with weights; `xp`: NumPy, or `jax.numpy` where numbers are traced; `repeats`: values have a leading axis."""
-    weights = {}
-    for name, values in data.values.items():
-        sigma, known = data.sigma_of(name, repeats), xp.isfinite(xp.asarray(values))
-        weights[name] = xp.where(known & xp.isfinite(sigma), 1.0 / sigma, 0.0)
-    measured = {name: xp.where(weights[name] > 0, xp.asarray(values), 0.0) for name, values in data.values.items()}
-    found = Run(data.t0, data.ts, None, measured, weights, data.start, data.inputs, data.readings, data.drives, data.correlation_time)
-    return _on_equal_grids([found])[0] if any(sensor.is_late for sensor in data.readings.values()) else found
-
-
-def _on_equal_grids(runs: Sequence[Run]) -> list[Run]:
-    """The runs on grids of as many intervals as the longest needs."""
-    nodes = [run.start.get(LAST) for run in runs]
-    count = max(intervals(run.t0, run.ts, node) for run, node in zip(runs, nodes, strict=True))
-    return [run._replace(grid=grid(run.t0, run.ts, count, node)) for run, node in zip(runs, nodes, strict=True)]
-
-
-def equal_runs(data: Sequence[Experiment]) -> list[tuple[tuple[int, ...], Run]]:
-    """Runs of equal structure and shapes stacked, with their numbers, for use where numbers may be traced."""
-    groups: dict[tuple, list[tuple[int, Run]]] = {}
-    for indices in _alike(data):
-        for i in indices:
-            run = run_of(data[i], jnp)
-            groups.setdefault((indices[0], *(x.shape for x in jax.tree.leaves(eqx.filter(run, _is_array)))), []).append((i, run))
-    found = []
-    for members in groups.values():
-        numbers, runs = zip(*members, strict=True)
-        stacked = jax.tree.map(lambda *xs: jnp.stack(xs), *(eqx.filter(run, _is_array) for run in runs))
-        found.append((numbers, eqx.combine(stacked, eqx.filter(runs[0], _is_array, inverse=True))))
-    return found
 
 
 class Lanes:
     """All lanes of a problem; `evaluate` gives their weighted residuals with derivatives."""
 
     def __init__(self, scene: Scene, data: Sequence[Experiment], layout: Layout, simulation: dict, members: int | None, loss: Loss = LEAST_SQUARES):
-        self.members, self._scene, self._layout = members, scene, layout
-        self.takes_steps = False  # whether a run that is `alone` is evaluated by the program that takes steps, so that no other is compiled
-        white = not any(run.unknown_sigma or run.correlation_time for run in data)
-        self.alone = white and members is None and len(data) == 1 and real_type() == np.float64  # of single precision, J'J would tell little
+        self.members = members
+        self.takes_steps = False  # whether runs that go `together` are evaluated by the program that takes steps, so that no other is compiled
+        white = not any(run.unknown_sigma or run.correlation_time for run in data) and real_type() == np.float64  # of single precision, J'J would tell little
         ready = lambda i: run_of(data[i], repeats=members is not None)  # noqa: E731
-        self._groups = [_Group(scene, indices, list(map(ready, indices)), layout, simulation, members, loss) for indices in _alike(data)]
-        self.samples, self.first_steps = self._groups[0].samples, self._groups[0].first_steps  # of a run that is `alone`
+        self._groups = [_Group(scene, indices, list(map(ready, indices)), layout, simulation, members, loss) for indices in grouped(data)]
+        equal = members is None and len(self._groups) == 1 and (len(data) == 1 or not layout.sizes[1])
+        self.together = white and equal and self._groups[0].is_one_chunk  # all runs in one program, without unknowns of their own beside others
+        self.first_steps = self._groups[0].first_steps  # of these
         self.lengths = [run.ts.shape[0] for run in data]
         self._of_run = {run: group for group in self._groups for run in group.indices}
 
@@ -189,22 +98,22 @@ class _Group:
 
     def __init__(self, scene: Scene, indices: list[int], runs: list[Run], layout: Layout, simulation: dict, members: int | None, loss: Loss):
         self.indices, self._members, self._runs = indices, members, np.array(indices)
-        times, knots = max(run.ts.shape[0] for run in runs), _most_knots(runs)
-        equal = runs if runs[0].grid is None or len(runs) == 1 else _on_equal_grids(runs)
-        filled = [_filled(run, times, knots, 0 if members is None else 1) for run in equal]
+        times, knots = max(run.ts.shape[0] for run in runs), most_knots(runs)
+        equal = runs if runs[0].grid is None or len(runs) == 1 else on_equal_grids(runs)
+        filled = [filled_up(run, times, knots, 0 if members is None else 1) for run in equal]
         leaves, treedef = jax.tree.flatten(((scene, simulation), filled[0]))
         # numbers of a run in one row, since each array that is handed over costs as much as some of the steps of a motion
         repeated = {id(x) for part in (filled[0].values, filled[0].weights) for x in part.values()} if members is not None else set()
         common = treedef.children()[0].num_leaves
         of_first = leaves[common:]
-        self._common = np.concatenate([_NONE, *(np.ravel(x) for x in leaves[:common] if _is_array(x))])
-        alike = [k for k, x in enumerate(of_first) if _is_array(x) and id(x) not in repeated]
+        self._common = np.concatenate([_NONE, *(np.ravel(x) for x in leaves[:common] if is_array(x))])
+        alike = [k for k, x in enumerate(of_first) if is_array(x) and id(x) not in repeated]
         by_member = [k for k, x in enumerate(of_first) if id(x) in repeated]
         of_runs = [of_first, *map(jax.tree.leaves, filled[1:])]
         self._rows = np.stack([np.concatenate([_NONE, *(np.ravel(run[k]) for k in alike)]) for run in of_runs])
         count = members or 1
         self._own_rows = np.stack([np.concatenate([np.zeros((count, 0)), *(run[k].reshape(count, -1) for k in by_member)], axis=1) for run in of_runs])
-        marks = [_Number(x.shape[int(id(x) in repeated) :], x.dtype, k >= common, id(x) in repeated) if _is_array(x) else x for k, x in enumerate(leaves)]
+        marks = [_Number(x.shape[int(id(x) in repeated) :], x.dtype, k >= common, id(x) in repeated) if is_array(x) else x for k, x in enumerate(leaves)]
         reference = Reference.where_free(scene, layout.parameters)
         self.weights = {name: np.array([run.weights[name] for run in filled]) for name in filled[0].weights}  # (runs, *members, times, *channel)
         self._t0, self._ts = np.array([run.t0 for run in filled]), np.array([run.ts for run in filled])
@@ -222,16 +131,26 @@ class _Group:
         self._width = int(min(MOST_LANES, max(1, TOUCHED // states)))
         self._kept: dict[int, list] = {}
 
+    @property
+    def is_one_chunk(self) -> bool:
+        """Whether all runs of one member go through the program at once."""
+        return len(self._chunks(1)) == 1
+
     def evaluate(self, shared, local, members, takes_steps):
         if takes_steps and len(members) == 1:
             x = np.concatenate([local[0, 0], shared[0]])
-            only = np.zeros(1, int)
-            yield only, only, read(self.first_steps(x, np.zeros(Told.length(x.size, self.samples))), x.size)[-1][None]
+            nothing = np.zeros((len(self.indices), self.samples))
+            yield np.zeros(len(nothing), int), self._runs, self.first_steps(x, np.zeros(Told.length(x.size, 0)), nothing)[-1]
             return
         if len(members) not in self._kept:
             self._kept = {len(members): self._chunks(len(members))}
         first, *chunks = self._kept[len(members)]
-        lanes = lambda kept, b, j: self._ended(kept, b, j, self._begun(shared, local, members, b, j))  # noqa: E731
+
+        def lanes(kept: int, b: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            own = self._own_rows[j, members[b] if self._members is not None else 0]
+            found = self._run(self._common, np.concatenate([self._rows[j], own, local[b, self._runs[j]], shared[b]], axis=1))
+            return b[:kept], self._runs[j[:kept]], np.asarray(found)[:kept]
+
         yield lanes(*first)  # compiles, where that is needed
         waiting: list[Future] = []
         try:
@@ -252,16 +171,12 @@ class _Group:
         lanes = np.minimum(np.arange(-(-count // width) * width), count - 1).reshape(-1, width)
         return [(min(width, count - k * width), *np.divmod(some, len(self.indices))) for k, some in enumerate(lanes)]
 
-    def first_steps(self, x: Float[np.ndarray, "unknowns"], told: Float[np.ndarray, "_"]) -> Float[np.ndarray, "_"]:
-        """The first steps of the run, from unknowns with its own ones first; to be `read`."""
-        return np.asarray(self._steps(self._common, np.concatenate([self._rows[0], x, told])))
-
-    def _begun(self, shared, local, members, b, j):
-        own = members[b] if self._members is not None else 0
-        return self._run(self._common, np.concatenate([self._rows[j], self._own_rows[j, own], local[b, self._runs[j]], shared[b]], axis=1))
-
-    def _ended(self, kept, b, j, found):
-        return b[:kept], self._runs[j[:kept]], np.asarray(found)[:kept]
+    def first_steps(self, x: Float[np.ndarray, "unknowns"], told: Float[np.ndarray, "_"], counts: Float[np.ndarray, "runs samples"]):
+        """The first steps of all runs together, from unknowns with own ones first, as `read` gives them; [J r] of each run."""
+        (kept, _, j), *_ = self._chunks(1)
+        of_lanes = np.concatenate([self._rows[j], np.where(np.arange(len(j))[:, None] < kept, counts[j], 0.0)], axis=1)
+        *found, rows = read(np.asarray(self._steps(self._common, np.concatenate([x, told]), of_lanes)), x.size)
+        return *found, rows.reshape(len(j), self.samples, -1)[:kept]
 
     def chained(self, runs: np.ndarray, members: np.ndarray, taus: dict[str, np.ndarray]) -> tuple[np.ndarray | None, np.ndarray]:
         """For each sample of lanes, the place of the one before it (None: all noise is white) and their correlation."""
@@ -330,67 +245,17 @@ def _program(reference: Reference, treedef, leaves: tuple, layout: Layout, sampl
             r, J = jax.vmap(lambda e: jax.jvp(flat, (x,), (e,)), out_axes=(None, 1))(np.eye(unknowns, dtype=x.dtype))
         return jnp.concatenate([J, r[:, None]], axis=1)
 
-    each, told = jax.vmap(lane, (None, 0, 0)), Told.length(unknowns, samples)
+    each = jax.vmap(lane, (None, 0, 0))
 
     def lanes(common: Float[Array, "shared"], rows: Float[Array, "lanes own"]) -> Float[Array, "lanes samples width"]:
         return each(common, *jnp.split(rows, [rows.shape[1] - unknowns], axis=1))
 
-    def steps(loss: Loss, common: Float[Array, "shared"], row: Float[Array, "own"]) -> Float[Array, "_"]:
-        fixed, x, of_steps = jnp.split(row, [row.shape[0] - told - unknowns, row.shape[0] - told])
-        return first_steps(lambda x, common, fixed: each(common, fixed[None], x[None])[0], loss, x, (common, fixed), of_steps)
+    def steps(loss: Loss, common: Float[Array, "shared"], x_and_told: Float[Array, "_"], rows: Float[Array, "lanes own_and_counts"]) -> Float[Array, "_"]:
+        fixed, counts = jnp.split(rows, [rows.shape[1] - samples], axis=1)
+
+        def evaluate(x, common, fixed):
+            return each(common, fixed, jnp.broadcast_to(x, (fixed.shape[0], unknowns))).reshape(-1, unknowns + 1)
+
+        return first_steps(evaluate, loss, x_and_told[:unknowns], (common, fixed), jnp.concatenate([x_and_told[unknowns:], counts.ravel()]))
 
     return quickly_compiled(lanes, jax.jit), lru_cache(maxsize=4)(lambda loss: sparingly_compiled(partial(steps, loss), most_loops=1))
-
-
-def _alike(data: Sequence[Experiment]) -> list[list[int]]:
-    """Indices of the runs, grouped by equal structure: names, sensors, kinds of inputs, shapes but for the number of times."""
-    if len(data) == 1:
-        return [[0]]
-    groups: dict[tuple, list[int]] = {}
-    for index, run in enumerate(data):
-        parts = run.start, run.readings, run.inputs, run.drives, run.correlation_time
-        arrays, rest = eqx.partition((*parts[:2], _without_knots(parts[2:4])), _is_array)
-        kind = (jax.tree.structure((*parts, dict.fromkeys(run.values, 0))), tuple(jax.tree.leaves(rest)))
-        groups.setdefault((*kind, tuple(x.shape for x in jax.tree.leaves(arrays))), []).append(index)
-    return list(groups.values())
-
-
-def _is_array(x) -> bool:
-    return isinstance(x, np.ndarray | jax.Array)
-
-
-def _is_sampled(x) -> bool:
-    return isinstance(x, Sampled)
-
-
-def _without_knots(inputs):
-    return jax.tree.map(lambda x: None if _is_sampled(x) else x, inputs, is_leaf=_is_sampled)
-
-
-def _most_knots(runs: Sequence[Run]) -> list[int]:
-    counts = [[x.ts.shape[0] for x in jax.tree.leaves((run.inputs, run.drives), is_leaf=_is_sampled) if _is_sampled(x)] for run in runs]
-    return [max(column) for column in zip(*counts, strict=True)]
-
-
-def _filled(run: Run, times: int, knots: list[int], axis: int) -> Run:
-    """The run with as many times and knots as these; what is added is close behind its end, and does not count."""
-    more = times - run.ts.shape[0]
-    if not (more or knots):
-        return run
-    counts = iter(knots)
-
-    def longer(x):
-        if not _is_sampled(x):
-            return x
-        extra = next(counts) - x.ts.shape[0]
-        span = np.asarray(x.ts[-1] - x.ts[0] + 1.0)
-        ts = np.concatenate([x.ts, max(x.ts[-1], run.ts[-1]) + span * np.arange(1, extra + 1)])
-        return eqx.tree_at(lambda s: (s.ts, s.values), x, (ts, np.concatenate([x.values, np.full(extra, x.values[-1])])))
-
-    inputs, drives = jax.tree.map(longer, (run.inputs, run.drives), is_leaf=_is_sampled)
-    run = run._replace(inputs=inputs, drives=drives)
-    if not more:
-        return run
-    pad = lambda x: np.concatenate([x, np.zeros((*x.shape[:axis], more, *x.shape[axis + 1 :]))], axis=axis)  # noqa: E731
-    ts = np.concatenate([run.ts, run.ts[-1] + FILLED * (run.ts[-1] - run.t0) * np.arange(1, more + 1)])
-    return run._replace(ts=ts, values={n: pad(x) for n, x in run.values.items()}, weights={n: pad(x) for n, x in run.weights.items()})

@@ -68,10 +68,7 @@ def perturbations(scene: Scene, q: Float[Array, "coordinates"]) -> Perturbations
         group = names[first].removesuffix("_w")
         names[here] = [f"{group}_w", *(f"{group}_turn_{axis}" for axis in "xyz")]
         times = _left_product(q[here])
-        E, D = (
-            E.at[here, here].set(times / 2),
-            D.at[here, here].set(2 * times.T),
-        )  # q is a unit quaternion: the inverse is the transpose
+        E, D = E.at[here, here].set(times / 2), D.at[here, here].set(2 * times.T)  # q is a unit quaternion: the inverse is the transpose
         dropped.append(first)
     kept = others(dropped, len(names))
     return Perturbations(E[:, kept], D[kept], tuple(names[i] for i in kept))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jourdain_jax.build.row_lengths import usual_lengths_of
-from jourdain_jax.calculus.sparse_slopes import REGULAR, Pattern
+from jourdain_jax.calculus.sparse_slopes import Pattern
 
 ITERATIONS = 25  # of Gauss-Newton, at most
 _DAMPED_ITERATIONS = 60
@@ -115,7 +115,7 @@ def _newton(rows: _Rows, q: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, 
     q, last, moving = np.array(q, float), np.full(len(q), np.inf), which
     for _ in range(ITERATIONS):
         residual, G = rows.look(q[moving], moving)
-        shift = _shortest(rows.pattern, G, residual, rows.typical)
+        shift = rows.pattern.shortest(G, residual, lambda G, g: shortest(G, g, rows.typical), rows.typical)
         q[moving] -= shift
         last[moving] = np.max(np.abs(shift), axis=1, initial=0.0) / (1 + np.max(np.abs(q[moving]), axis=1, initial=0.0))
         moving = moving[~(last[moving] <= 4 * np.finfo(float).eps) & np.isfinite(last[moving])]
@@ -164,19 +164,6 @@ def _damped_step(pattern: Pattern, J: np.ndarray, f: np.ndarray, damping: np.nda
     system, diagonal = J @ np.swapaxes(J, 1, 2), np.arange(J.shape[1])
     system[:, diagonal, diagonal] += damping[:, None]
     return -np.einsum("smn,sm->sn", J, np.linalg.solve(system, f[..., None])[..., 0])
-
-
-def _shortest(pattern: Pattern, G: np.ndarray, residual: np.ndarray, typical: np.ndarray) -> np.ndarray:
-    """As `shortest`: by elimination of `G G'` within its band, where that is narrow and rows are surely independent."""
-    if pattern.band is None:
-        return shortest(pattern.dense(G), residual, typical)
-    d = 1 / np.maximum(pattern.lengths(G), typical)
-    scaled = d[:, pattern.rows] * G
-    y, size = pattern.band.solved(scaled, np.zeros(len(G)), d * residual)
-    x = pattern.transposed_times(scaled, y)
-    for k in np.flatnonzero(~(size < REGULAR)):
-        x[k] = shortest(pattern.dense(G[k : k + 1]), residual[k : k + 1], typical)[0]
-    return x
 
 
 def shortest(G: np.ndarray, residual: np.ndarray, typical: np.ndarray) -> np.ndarray:

@@ -16,8 +16,7 @@ from jourdain_jax.build.reference_parameters import with_reference_parameters
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows
-from jourdain_jax.equations.projection import closure_residual
-from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.equations.projection import BY_AUTODIFF
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
@@ -44,16 +43,11 @@ def _slopes(scene: Scene, of: Literal["closures", "rows"]) -> Float[np.ndarray, 
     """G or A at some states of the domain."""
     known = structure_of(scene)
     states = slice(0, min(known.random, MOST_STATES))
-    every = _of_closures if of == "closures" else _of_rows
-    return every(with_reference_parameters(scene), known.times[states], known.coordinates[states])
+    return _evaluated(of, with_reference_parameters(scene), known.times[states], known.coordinates[states])
 
 
 @eval_numpy
-def _of_closures(scene: Scene, times, coordinates):
-    return jax.vmap(lambda t, q: jax.jacfwd(lambda q: closure_residual(scene, t, q))(q))(times, coordinates)
-
-
-@eval_numpy
-def _of_rows(scene: Scene, times, coordinates):
+def _evaluated(of: str, scene: Scene, times, coordinates):
     u = jnp.zeros(len(scene.speed_names))
-    return jax.vmap(lambda t, q: jax.jacfwd(lambda u: velocity_residual(scene, t, q, u))(u))(times, coordinates)
+    slope = {"closures": lambda t, q: BY_AUTODIFF.closures(scene, t, q)[1], "rows": lambda t, q: BY_AUTODIFF.rows(scene, t, q, u, None)[1]}[of]
+    return jax.vmap(slope)(times, coordinates)

@@ -7,21 +7,21 @@ another one, such as a function of Python that a callback runs, makes a scene na
 
 import enum
 import hashlib
-from collections.abc import Callable, Iterable
-from functools import cache, lru_cache
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import jax
 import numpy as np
-from jax.extend.core import Literal, Primitive
 
 from jourdain_jax.build.domain import coordinate_bounds, speed_bounds
 from jourdain_jax.build.sampling import seen_of
 from jourdain_jax.build.trace import jaxpr_of_scene
 from jourdain_jax.calculus.jaxprs import called
-from jourdain_jax.calculus.reals import is_array, real_type
+from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.native import disk
+from jourdain_jax.program.calls import description
 from jourdain_jax.program.interpret import own_rule
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.parameters import parameters_of
@@ -29,8 +29,6 @@ from jourdain_jax.scene.scene import Scene
 
 _READ = ("calculus", "eager", "program", "scene", "equations", "build", "dynamics", "lowering")  # packages whose code decides what is found
 
-
-_SEVERAL = tuple, list  # kept as tuples: a union of types is made anew wherever it stands
 _PLAIN = bool, int, float, str, bytes, np.dtype, enum.Enum, type(None)
 
 
@@ -75,10 +73,7 @@ def _digest_of_trace(scene: Scene, of_inputs: tuple[int, ...]) -> bytes | None:
 
 
 def _digest(begun: bytes, x) -> bytes:
-    digest = hashlib.sha256(begun)
-    for part in _parts(x):
-        digest.update(part)
-    return digest.digest()
+    return hashlib.sha256(begun + repr(description(x, _details, _plain)).encode()).digest()
 
 
 @cache
@@ -94,57 +89,15 @@ def _source() -> bytes:
     return digest.digest()
 
 
-def _parts(x) -> Iterable[bytes]:
-    """What tells an object from others."""
-    if isinstance(x, _SEVERAL):
-        yield f"{len(x)} of {type(x).__name__}: ".encode()
-        for y in x:
-            yield from _parts(y)
-    elif is_array(x):
-        x = np.asarray(x)
-        if x.dtype.hasobject:
-            raise _Nameless
-        yield f"array {x.dtype} {x.shape} ".encode() + x.tobytes()
-    elif isinstance(x, _PLAIN):
-        yield f"{type(x).__name__} {x!r};".encode()
-    elif hasattr(x, "jaxpr") and hasattr(x, "consts"):
-        yield from _of_jaxpr(x.jaxpr)
-        yield from _parts(tuple(x.consts))
-    elif hasattr(x, "eqns"):
-        yield from _of_jaxpr(x)
-    else:
+def _details(equation):
+    name, params = equation.primitive.name, equation.params
+    if equation.effects or own_rule(name, params):
         raise _Nameless
+    inner = called(name, params)
+    return params if inner is None else (params.get("name"), inner)  # by their names, functions that bend by intention are told from others
 
 
-def _of_jaxpr(jaxpr) -> Iterable[bytes]:
-    number = {v: k for k, v in enumerate([*jaxpr.constvars, *jaxpr.invars])}
-    for equation in jaxpr.eqns:
-        yield from _of_equation(equation, number)
-        number |= {v: len(number) + k for k, v in enumerate(equation.outvars)}
-    yield from _atoms(jaxpr.outvars, number)
-
-
-def _of_equation(equation, number: dict) -> Iterable[bytes]:
-    primitive: Primitive = equation.primitive
-    if equation.effects or own_rule(primitive.name, equation.params):
+def _plain(x):
+    if not isinstance(x, _PLAIN):
         raise _Nameless
-    yield f"\n{primitive.name} -> {[_said(v.aval) for v in equation.outvars]} ".encode()
-    yield from _atoms(equation.invars, number)
-    inner = called(primitive.name, equation.params)
-    if inner is not None:
-        yield from _parts((equation.params.get("name"), inner))  # by their names, functions that bend by intention are told from others
-        return
-    for key, value in sorted(equation.params.items()):
-        yield key.encode()
-        yield from _parts(value)
-
-
-@lru_cache(maxsize=1024)
-def _said(aval) -> str:
-    """Type and shape as text, which JAX makes anew each time."""
-    return str(aval)
-
-
-def _atoms(atoms, number: dict) -> Iterable[bytes]:
-    for atom in atoms:
-        yield from _parts((_said(atom.aval), np.asarray(atom.val))) if isinstance(atom, Literal) else (f"{number[atom]},".encode(),)
+    return x

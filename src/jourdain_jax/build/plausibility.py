@@ -6,6 +6,9 @@ d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's moti
 dg/dt along the motion of the other bodies = 0  or  v, w != 0      g: all that says where the ground of a contact is
 """
 
+from functools import reduce
+from itertools import combinations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.eager.eager import eval_numpy
-from jourdain_jax.equations.kinematics import pose_at
+from jourdain_jax.equations.kinematics import inertias_of, pose_at
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import Contact
 from jourdain_jax.scene.motion_state import Motion, Pose
@@ -100,8 +103,9 @@ def _carried_speeds(scene: Scene, motion: Motion, name: str, contact: Contact) -
 
 def body_faults(scene: Scene, t, q) -> dict[str, Bool[Array, ""]]:
     """Body name -> whether its mass is negative, or its inertia has a negative principal moment; also under jit and vmap. What is NaN is no fault of a body."""
-    bodies = {name: body.body for name, body in pose_at(scene, t, q).bodies.items()}
-    return {name: (body.mass < 0) | (_is_negative(body.inertia) if isinstance(body, RigidBody) else False) for name, body in bodies.items()}
+    pose = pose_at(scene, t, q)
+    weights = inertias_of(pose)
+    return dict(zip(pose.bodies, are_negative(weights.mass, weights.inertia), strict=True))
 
 
 def impossible_bodies(scene: Scene, q) -> tuple[str, ...]:
@@ -130,14 +134,17 @@ def _masses_and_inertias(scene: Scene, q) -> dict:
     return {name: (body.mass, body.inertia if isinstance(body, RigidBody) else None) for name, body in bodies.items()}
 
 
-def _is_negative(I) -> Bool[Array, ""]:
-    """Whether a symmetric matrix has an eigenvalue below zero: by its principal minors."""
-    I = jax.lax.stop_gradient(I)
-    size = jnp.max(jnp.abs(I))
-    I = I / jnp.where(size > 0, size, 1.0) + TOLERANCE * jnp.eye(3, dtype=I.dtype)
-    minors = [I[i, i] for i in range(3)] + [I[i, i] * I[j, j] - I[i, j] * I[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
-    whole = sum(I[0, i] * (I[1, (i + 1) % 3] * I[2, (i + 2) % 3] - I[1, (i + 2) % 3] * I[2, (i + 1) % 3]) for i in range(3))
-    return jnp.any(jnp.stack([*minors, whole]) < 0)
+def are_negative(mass: Float[Array, "bodies"], inertia: Float[Array, "bodies 3 3"]) -> Bool[Array, "bodies"]:
+    """Whether a mass is below zero, or an eigenvalue of a symmetric inertia: by its principal minors, relative to its largest entry."""
+    I = jnp.moveaxis(inertia, 0, 2)
+    size = reduce(jnp.maximum, (jnp.abs(x) for row in I for x in row))
+    I = I / jnp.where(size > 0, size, 1.0) + TOLERANCE * jnp.eye(3, dtype=I.dtype)[..., None]
+
+    def minor(i: int, j: int, k: int, m: int):
+        return I[i, k] * I[j, m] - I[i, m] * I[j, k]
+
+    whole = sum(I[0, i] * minor(1, 2, (i + 1) % 3, (i + 2) % 3) for i in range(3))
+    return reduce(jnp.logical_or, (x < 0 for x in (mass, *(I[i, i] for i in range(3)), *(minor(i, j, i, j) for i, j in combinations(range(3), 2)), whole)))
 
 
 def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from jourdain_jax.build.plausibility import PoseNumbers
-from jourdain_jax.build.trace import Entries
+from jourdain_jax.calculus.reals import Entries
 from jourdain_jax.scene.scene import Scene
 
 TIMED = ("rows", "poses", "inertias", "coordinate rates", "loads", "potential")

@@ -20,11 +20,12 @@ from jourdain_jax.build.probed import Probed, generic_inputs
 from jourdain_jax.build.row_lengths import speed_scales
 from jourdain_jax.build.trace import TracedScene, named_values, traced_scene
 from jourdain_jax.calculus.sparse_slopes import Pattern
+from jourdain_jax.equations.virtual_power import mass_matrix
 from jourdain_jax.program.analyticity import CALLS, NONANALYTIC, decided_by, depend_on, passes
 from jourdain_jax.program.derivative import derivatives, jacobian
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
-from jourdain_jax.program.identity_test import identity_probes, is_combination, on_rows
+from jourdain_jax.program.identity_test import IdentityProbes, identity_probes, is_combination, on_rows
 from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 
@@ -78,7 +79,7 @@ def looked_at(scene: Scene) -> LookedAt:
     vanishing = {"rows at rest": at_rest[0], "motion at rest": at_rest[1], "inertia": inertia_rates, "rows of inputs": row_rates}
     vanishing |= {f"potential {k}": [rate] for k, rate in enumerate(potential_rates)} | timed
     vanishing["rank"] = [*at_rest[0].tolist(), *(node for row in by_speed[:rows] for node in row.values())]
-    closures = [*at.closure.tolist(), *_norms(scene, traced)]
+    closures = traced.closures
     return LookedAt(
         traced=traced,
         rows=by_speed[:rows],
@@ -94,12 +95,6 @@ def looked_at(scene: Scene) -> LookedAt:
         in_calls=_passing(CALLS, traced, vanishing, by_speed[:rows]),
         nonanalytic=_passing(NONANALYTIC, traced, vanishing, by_speed[:rows]),
     )
-
-
-def _norms(scene: Scene, traced: TracedScene) -> list[int]:
-    """The unit norms of quaternions, as rows."""
-    g, quaternions = traced.graph, [traced.q[first : first + 4].tolist() for first, _ in scene.coordinates.quaternions]
-    return [g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)) for wxyz in quaternions]
 
 
 def _passing(kinds, traced: TracedScene, vanishing: dict, rows: list[dict[int, int]]) -> frozenset[str]:
@@ -132,14 +127,20 @@ def follow_from_others(scene: Scene, t, q, u, rows: Sequence[int]) -> bool:
     """
     at = _AtStates(looked_at(scene), scene, t, q, u, generic_inputs(scene), np.ones(len(t), bool))
     graph, traced = at.graph, at.traced
-    attitudes = {f"q_{first + i}": int(traced.q[first + i]) for first, _ in scene.coordinates.quaternions for i in range(4)}
-    generic = on_rows(identity_probes(at.values, attitudes), at.values, at.nodes.closures, {f"q_{i}": n for i, n in enumerate(traced.q.tolist())})
+    generic = generic_states(traced, at.values)
     columns_of_rows = [[row.get(n, graph.zero) for row in at.nodes.rows] for n in traced.u.tolist()] + [at.nodes.phi_at_rest.tolist()]
     found = generic([n for column in columns_of_rows for n in column])
     shape = len(columns_of_rows), len(traced.at.phi), -1
     A, E = (np.moveaxis(np.reshape(x, shape), (2, 1), (0, 1)) for x in (np.asarray(found), found.error))
     kept = [s for s in range(len(traced.at.phi)) if s not in rows]
     return all(is_combination(A[:, s], E[:, s], A[:, kept], E[:, kept]) for s in rows)
+
+
+def generic_states(traced: TracedScene, near: Probes) -> IdentityProbes:
+    """Generic states on the geometric rows, at generic parameters; found from those `near`."""
+    coordinates = {f"q_{i}": n for i, n in enumerate(traced.q.tolist())}
+    attitudes = [f"q_{first + i}" for first in traced.quaternions for i in range(4)]
+    return on_rows(identity_probes(near, attitudes), near, traced.closures, coordinates)
 
 
 class _AtStates:
@@ -205,10 +206,9 @@ class _AtStates:
 
     def _mass_matrix(self) -> np.ndarray:
         """`M = sum m beta' beta + gamma' I gamma`."""
-        beta, gamma = np.split(self._matrices(self.values, self.nodes.velocities, self.traced.u.tolist()), 2, axis=1)
         mass, inertia = self._at(self.traced.at.mass), self._at(self.traced.at.inertia)
-        turned = np.einsum("sbij,sbjk->sbik", inertia, gamma.reshape(*inertia.shape[:-1], -1)).reshape(gamma.shape)
-        return np.swapaxes(beta, 1, 2) @ (np.repeat(mass, 3, axis=1)[..., None] * beta) + np.swapaxes(gamma, 1, 2) @ turned
+        partial = self._matrices(self.values, self.nodes.velocities, self.traced.u.tolist())
+        return mass_matrix(mass, inertia, *np.moveaxis(partial.reshape(len(partial), 2, *self.traced.at.v.shape, -1), 1, 0))
 
     def speeds_on_rows(self) -> np.ndarray:
         """`u <- u - M^-1 A' (A M^-1 A')+ phi`, in scaled speeds."""

@@ -2,15 +2,14 @@
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
 from functools import lru_cache
 from numbers import Real
 
 import jax
 import numpy as np
 
-from jourdain_jax.build.reference_parameters import Values, reference_parameters, with_reference_parameters
-from jourdain_jax.build.structure import decisions_of
+from jourdain_jax.build.reference_parameters import Values, defaults, reference_parameters, with_reference_parameters
+from jourdain_jax.build.structure import structure_whatever_its_faults
 from jourdain_jax.calculus.reals import real_type
 from jourdain_jax.scene.scene import Scene
 
@@ -26,14 +25,14 @@ class Reference:
     def where_free(scene: Scene, free: Collection[str]) -> "Reference":
         """That of a scene some of whose parameters, `free`, are going to change: the defaults of its class stand in for these, where it has states there."""
         leaves, treedef = jax.tree.flatten(scene)
-        for place, default in _defaults(treedef, frozenset(free)):
-            if np.shape(default) == np.shape(leaves[place]):
-                leaves[place] = default
+        for place, (name, default) in enumerate(defaults(scene)):
+            if name in free and isinstance(default, Real | np.ndarray | jax.Array) and np.shape(default) == np.shape(leaves[place]):
+                leaves[place] = np.asarray(default, real_type())
         return _of_values(Values(leaves, treedef)) or Reference(scene)
 
     def __init__(self, scene: Scene):
         self._scene = with_reference_parameters(scene)
-        self._key = jax.tree.structure(scene), decisions_of(self._scene), jax.config.jax_enable_x64
+        self._key = jax.tree.structure(scene), structure_whatever_its_faults(self._scene).decisions, jax.config.jax_enable_x64
 
     @contextmanager
     def stands_in(self) -> Iterator[None]:
@@ -55,11 +54,3 @@ def _of_values(values: Values) -> Reference | None:
         return Reference(values.scene)
     except (TypeError, ValueError):
         return None
-
-
-@lru_cache(maxsize=256)
-def _defaults(treedef, free: frozenset[str]) -> tuple[tuple[int, np.ndarray], ...]:
-    """Which leaves of a scene these parameters are, and the defaults of its class for them."""
-    places = jax.tree.unflatten(treedef, range(treedef.num_leaves))  # no new scene by its class: that takes half a millisecond
-    named = {f.name: f.default for f in fields(places) if f.name in free and isinstance(getattr(places, f.name), int)}
-    return tuple((getattr(places, name), np.asarray(x, real_type())) for name, x in named.items() if isinstance(x, Real | np.ndarray | jax.Array))

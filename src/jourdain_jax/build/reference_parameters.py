@@ -10,6 +10,7 @@ from contextvars import ContextVar
 from dataclasses import fields
 from functools import lru_cache, wraps
 from operator import is_
+from typing import Any
 
 import jax
 import numpy as np
@@ -96,16 +97,16 @@ def with_reference_parameters(scene: Scene) -> Scene:
     leaves, treedef = jax.tree.flatten(scene)
     if not any(_is_traced(x) for x in leaves):
         return scene
-    near = _defaults(scene)
+    near = [default for _, default in defaults(scene)]
     known = _STAND_IN.get()
     if known is not None and jax.tree.structure(known) == treedef:
-        near = [y if _is_number(y) and np.shape(y) == np.shape(x) else d for x, y, d in zip(leaves, jax.tree.leaves(known), near, strict=True)]
+        near = [y if not _is_traced(y) and np.shape(y) == np.shape(x) else d for x, y, d in zip(leaves, jax.tree.leaves(known), near, strict=True)]
     numbers = [_generic(x, y, place) if _is_traced(x) else x for place, (x, y) in enumerate(zip(leaves, near, strict=True))]
     return jax.tree.unflatten(treedef, numbers)
 
 
-def _defaults(scene: Scene) -> list:
-    """The class's default for every leaf of a scene, or None."""
+def defaults(scene: Scene) -> list[tuple[str, Any]]:
+    """For every leaf of a scene the name of its field, and the class's default for it, or None."""
     found: list = []
     for field in fields(scene):
         if field.metadata.get("static", False):
@@ -114,16 +115,12 @@ def _defaults(scene: Scene) -> list:
         default = jax.tree.leaves(field.default)
         if len(default) != len(leaves):
             default = [field.default if len(leaves) == 1 else None] * len(leaves)
-        found += default
+        found += [(field.name, x) for x in default]
     return found
 
 
 def _is_traced(x) -> bool:
     return isinstance(x, jax.core.Tracer)
-
-
-def _is_number(x) -> bool:
-    return x is not None and not _is_traced(x)
 
 
 def _generic(x, near, place: int) -> np.ndarray:

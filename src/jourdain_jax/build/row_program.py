@@ -7,16 +7,21 @@ Unit norms of quaternions count as geometric rows. The program is kept on disk b
 
 from dataclasses import dataclass
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jourdain_jax.build.faults_on_graph import right_on_graph
 from jourdain_jax.build.kept_findings import kept_of_scene
+from jourdain_jax.build.plausibility import are_negative
 from jourdain_jax.build.probed_on_graph import LookedAt, looked_at
 from jourdain_jax.build.reference_parameters import with_reference_parameters
+from jourdain_jax.build.trace import TracedScene
 from jourdain_jax.calculus.plain_text import as_text, from_text
 from jourdain_jax.program.graph import Graph, Unsupported
+from jourdain_jax.program.interpret import Nodes, as_nodes, interpret
 from jourdain_jax.program.part import part
 from jourdain_jax.scene.once_per_class import once_per_class
+from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
 MOST_PRODUCTS = 20_000  # of entries of velocities in a mass matrix that is written out
@@ -62,7 +67,7 @@ def _as_text(scene: Scene) -> bytes:
     g, phi = [int(n) for n in nodes.closures], traced.at.phi.tolist()
     G, A = _entries(nodes.of_closures, q), _entries(nodes.rows, u)
     M = _mass_matrix(nodes, u)
-    right = right_on_graph(scene, traced)
+    right = _right(scene, traced)
     needed = [right, *g, *G.values(), *phi, *A.values(), *({} if M is None else M).values()]
     if graph.calls(needed):
         return _TEXTLESS
@@ -77,6 +82,20 @@ def _as_text(scene: Scene) -> bytes:
 
     variables = [every(x) for x in traced.parameters], int(place[traced.t]), *map(every, (traced.q, traced.u, traced.inputs))
     return as_text([rows, *variables, every(g), places(G), every(phi), places(A), None if M is None else places(M), int(place[right])])
+
+
+def _right(scene: Scene, traced: TracedScene) -> int:
+    """The node of a truth value: every parameter is finite and has its sign, no mass and no principal moment of inertia is below zero."""
+    nodes = [*traced.parameters, traced.at.mass, traced.at.inertia]
+    treedef = jax.tree.structure(scene)
+
+    def right(*given):
+        *leaves, mass, inertia = given
+        return ~jnp.any(jnp.stack([*parameter_faults(jax.tree.unflatten(treedef, leaves)).values(), jnp.any(are_negative(mass, inertia))]))
+
+    closed = jax.make_jaxpr(right)(*(jax.ShapeDtypeStruct(x.shape, jnp.result_type(float)) for x in nodes))
+    (found,) = interpret(traced.graph, closed, [Nodes(x) for x in nodes])
+    return int(as_nodes(traced.graph, found))
 
 
 def _entries(rows: list[dict[int, int]], variables: list[int]) -> dict[tuple[int, int], int]:

@@ -165,29 +165,25 @@ def structure_of(scene: Scene) -> Structure:
     ValueError where no admissible state is found, where bodies do not move smoothly, where a motion that the rows leave free has no inertia, or
     `privileged` names unknown or too few speeds; for known parameters also where numbers of its bodies or planes cannot be, or rows contradict each other.
     """
-    structure = _whatever_its_faults(scene)
+    structure = structure_whatever_its_faults(scene)
     if structure.faults and not is_traced(scene):  # numbers that stand in for traced parameters prove nothing
         raise ValueError(structure.faults[0])
     return structure
 
 
-def _whatever_its_faults(scene: Scene) -> Structure:
+def structure_whatever_its_faults(scene: Scene) -> Structure:
+    """Static facts about a scene whose numbers may be wrong."""
     return _structure(as_scene(scene))
 
 
 def plain_row_lengths(scene: Scene) -> Float[np.ndarray, "rows"]:
     """Typical lengths of the rows of `A` in the units of the speeds; of a scene whose parameters are traced, as in `usual_rows`."""
-    return _whatever_its_faults(scene).plain_row_lengths * (TRACED if is_traced(scene) else 1.0)
-
-
-def decisions_of(scene: Scene) -> tuple:
-    """`Structure.decisions` of a scene, whatever its faults."""
-    return _whatever_its_faults(scene).decisions
+    return structure_whatever_its_faults(scene).plain_row_lengths * (TRACED if is_traced(scene) else 1.0)
 
 
 def rows_are_affine(scene: Scene) -> bool:
     """Whether all rows are linear or affine in the speeds."""
-    return _whatever_its_faults(scene).affine
+    return structure_whatever_its_faults(scene).affine
 
 
 def closure_lengths(scene: Scene) -> Float[np.ndarray, "closures"]:
@@ -201,7 +197,7 @@ def usual_rows(scene: Scene) -> UsualRows:
 
     Of a scene whose parameters are traced, numbers stand in that may be of another order: only what is shorter than a thousandth of those lengths counts less.
     """
-    known = _whatever_its_faults(scene)
+    known = structure_whatever_its_faults(scene)
     return UsualRows(known.row_lengths * (TRACED if is_traced(scene) else 1.0), np.asarray(known.rank, np.int32))
 
 

@@ -12,7 +12,6 @@ The same graph serves probing (`probed_on_graph`) and lowering. What JAX traced 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -22,7 +21,7 @@ from jaxtyping import Array, Float, Num, PyTree
 
 from jourdain_jax.build.explicit_power import explicit_power
 from jourdain_jax.build.plausibility import PoseNumbers, numbers_of
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import Entries, is_traced
 from jourdain_jax.equations.kinematics import inertias_of, motion_at, velocities_of
 from jourdain_jax.equations.rows import flatten_rows, position_rows, velocity_rows
 from jourdain_jax.equations.virtual_power import energies_at, impressed, potential_energy, resultants
@@ -34,8 +33,6 @@ from jourdain_jax.scene.once_per_class import once_per_class
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import events_of, loads_of
 from jourdain_jax.scene.what_is_read import names_of_what_is_traced
-
-Entries: TypeAlias = Array | np.ndarray
 
 
 class VelocityQuantities(eqx.Module):
@@ -65,11 +62,6 @@ class Particulars(eqx.Module):
     numbers: PoseNumbers
     potentials: Num[Entries, "loads"]  # of the loads; zero where a load has none
     explicit: dict[str, PyTree]  # rates in time of loads and potentials while the motion is held
-
-
-def particulars_of(scene: Scene, motion: Motion) -> Particulars:
-    """What only probing looks at, computed on numbers."""
-    return Particulars(numbers_of(scene, motion), potentials_of(scene, motion), explicit_rates(scene, motion))
 
 
 def potentials_of(scene: Scene, motion: Motion) -> Float[Array, "loads"]:
@@ -137,6 +129,18 @@ class TracedScene(Variables):
     at: VelocityQuantities
     particulars: Particulars
     effects: str  # what in the scene does more than compute, as printing does; nothing: no part of it
+    quaternions: tuple[int, ...]  # the coordinate that is the first part of each
+
+    @property
+    def attitudes(self) -> list[list[int]]:
+        """The four parts of each quaternion."""
+        return [self.q[first : first + 4].tolist() for first in self.quaternions]
+
+    @property
+    def closures(self) -> list[int]:
+        """Geometric rows, and the unit norms of quaternions as rows."""
+        g = self.graph
+        return [*self.at.closure.tolist(), *(g.mul(g.const(0.5), g.sub(g.dot(wxyz, wxyz), g.one)) for wxyz in self.attitudes)]
 
     @property
     def motion(self) -> list[np.ndarray]:
@@ -171,7 +175,8 @@ def jaxpr_of_scene(scene: Scene, of_inputs: tuple[int, ...]):
     def quantities(leaves, t, q, u, inputs):
         scene = jax.tree.unflatten(treedef, leaves)
         motion = motion_at(scene, t, q, u, inputs)
-        return velocity_quantities(scene, motion, of_inputs), particulars_of(scene, motion)
+        particulars = Particulars(numbers_of(scene, motion), potentials_of(scene, motion), explicit_rates(scene, motion))
+        return velocity_quantities(scene, motion, of_inputs), particulars
 
     closed, shape = jax.make_jaxpr(quantities, return_shape=True)(numbers, *state)
     if is_traced(closed.consts):
@@ -191,7 +196,8 @@ def _on_graph(scene: Scene, closed, shape, interpreted: Callable) -> TracedScene
     t, q, u, inputs = (_inputs(graph, name, size, True) for name, size in sizes.items())
     found = interpreted(graph, closed, [Nodes(x) for x in (*parameters, t, q, u, inputs)])
     at, particulars = jax.tree.unflatten(jax.tree.structure(shape), [as_nodes(graph, x) for x in found])
-    return TracedScene(graph, int(t), q, u, inputs, parameters, at, particulars, effects_of(closed.jaxpr))
+    quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
+    return TracedScene(graph, int(t), q, u, inputs, parameters, at, particulars, effects_of(closed.jaxpr), quaternions)
 
 
 def _inputs(graph: Graph, name: str, shape, varies: bool) -> np.ndarray:

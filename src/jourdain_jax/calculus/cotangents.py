@@ -8,22 +8,11 @@ from collections.abc import Callable
 
 import jax
 import numpy as np
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad, batching
 
+from jourdain_jax.calculus.identities import identity
 
-def _identity(name: str) -> Primitive:
-    """A primitive that is the identity of several arrays."""
-    primitive = Primitive(name)
-    primitive.multiple_results = True
-    primitive.def_impl(lambda *values, look: list(values))
-    primitive.def_abstract_eval(lambda *values, look: list(values))
-    mlir.register_lowering(primitive, lambda ctx, *values, look: list(values))
-    batching.primitive_batchers[primitive] = lambda values, dims, *, look: (primitive.bind(*values, look=look), dims)
-    return primitive
-
-
-_shown_p, _forwards_p, _tangents_p = (_identity(f"jourdain_shown_{name}") for name in ("backwards", "forwards", "tangents"))
+_shown_p, _forwards_p, _tangents_p = (identity(f"jourdain_shown_{name}") for name in ("backwards", "forwards", "tangents"))
 
 
 def _transposed(cotangents, *values, look: Callable):

@@ -12,6 +12,8 @@ import jax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jourdain_jax.calculus.identities import identity
+
 FORWARD_MESSAGE = (
     "`simulate` was differentiated in forward mode (jvp, jacfwd, hessian), but its adjoint is reverse-only. "
     'Leave `adjoint` at its default for both modes where machine code integrates (not with `backend="xla"` or in exported programs); elsewhere '
@@ -56,19 +58,9 @@ def _raise_second(*args, **kwargs):
     raise DifferentiationModeError(SECOND_ORDER_MESSAGE)
 
 
-def _identity(name: str) -> Primitive:
-    """A primitive that is the identity of one array."""
-    primitive = Primitive(name)
-    primitive.def_impl(lambda x: x)
-    primitive.def_abstract_eval(lambda x: x)
-    mlir.register_lowering(primitive, lambda ctx, x: [x])
-    batching.primitive_batchers[primitive] = lambda args, dims: (primitive.bind(*args), dims[0])
-    return primitive
-
-
-_reverse_only_p = _identity("jourdain_reverse_only")
-_first_order_only_p = _identity("jourdain_first_order_only")
-_forward_only_p = _identity("jourdain_forward_only")
+_reverse_only_p = identity("jourdain_reverse_only")
+_first_order_only_p = identity("jourdain_first_order_only")
+_forward_only_p = identity("jourdain_forward_only")
 
 # The tangent in reverse-only programs: it can be transposed, but neither evaluated nor compiled. It exists only after differentiation, so that
 # a batching rule meets it only in programs that were pushed forward (jacfwd, vmap of jvp). It is given the value, too: where that alone has lanes, what
@@ -81,7 +73,7 @@ batching.primitive_batchers[_tangent_p] = _raise_forward
 ad.primitive_jvps[_tangent_p] = _raise_forward
 ad.primitive_transposes[_tangent_p] = lambda cotangent, tangent, value: [cotangent, None]
 
-ad.primitive_jvps[_reverse_only_p] = lambda primals, tangents: (_first_order_only_p.bind(*primals), _push(tangents[0], *primals))
+ad.primitive_jvps[_reverse_only_p] = lambda primals, tangents: (_first_order_only_p.bind(*primals), [_push(tangents[0], *primals)])
 ad.primitive_jvps[_first_order_only_p] = _raise_second
 ad.deflinear2(_forward_only_p, _raise_reverse)
 
@@ -90,15 +82,15 @@ def _push(tangent, value):
     return tangent if type(tangent) is ad.Zero else _tangent_p.bind(tangent, value)
 
 
-def _on_floats(f, tree):
-    return jax.tree.map(lambda x: f(x) if eqx.is_inexact_array(x) else x, tree)
+def _on_floats(marker: Primitive, tree):
+    return jax.tree.map(lambda x: marker.bind(x)[0] if eqx.is_inexact_array(x) else x, tree)
 
 
 def reverse_only(tree):
     """The identity on a pytree; forward mode and second derivatives through it raise `DifferentiationModeError`."""
-    return _on_floats(_reverse_only_p.bind, tree)
+    return _on_floats(_reverse_only_p, tree)
 
 
 def forward_only(tree):
     """The identity on a pytree; reverse mode through it raises `DifferentiationModeError`."""
-    return _on_floats(_forward_only_p.bind, tree)
+    return _on_floats(_forward_only_p, tree)

@@ -1,15 +1,29 @@
 """What JAX traced, read: which operations its results need, what a call stands for, and which loops it holds."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import jax
-from jax.extend.core import ClosedJaxpr, Jaxpr
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jax.interpreters.partial_eval import dce_jaxpr
 
 LOOPS = ("while", "scan")
 # Where an operation that only calls a function keeps it, by the name of the operation.
 _CALLS = dict.fromkeys(("jit", "pjit", "remat", "remat2", "checkpoint"), "jaxpr")
 _CALLS |= dict.fromkeys(("closed_call", "core_call", "custom_jvp_call", "custom_vjp_call"), "call_jaxpr")
+
+
+def evaluated(closed: ClosedJaxpr, arguments: Sequence, results: Callable, number: Callable = lambda x, aval: np.asarray(x, aval.dtype)) -> list:
+    """Outputs at the given arguments: `results(equation, inputs)` are those of one operation, and `number(x, aval)` stands for a constant."""
+    jaxpr = closed.jaxpr
+    values = {v: number(x, v.aval) for v, x in zip(jaxpr.constvars, closed.consts, strict=True)} | dict(zip(jaxpr.invars, arguments, strict=True))
+
+    def read(atom):
+        return number(atom.val, atom.aval) if isinstance(atom, Literal) else values[atom]
+
+    for equation in jaxpr.eqns:
+        values |= zip(equation.outvars, results(equation, [read(x) for x in equation.invars]), strict=True)
+    return [read(x) for x in jaxpr.outvars]
 
 
 def needed_only(closed: ClosedJaxpr, outputs: Sequence[int] | None = None) -> ClosedJaxpr:

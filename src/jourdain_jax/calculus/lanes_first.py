@@ -2,8 +2,9 @@
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad, batching
+
+from jourdain_jax.calculus.identities import identity
 
 
 def lanes_first(tree):
@@ -30,11 +31,7 @@ def _batched(values, axes):
     return lanes_first_p.bind(*with_lanes_first(values, axes)), [0] * len(values)
 
 
-lanes_first_p = Primitive("jourdain_lanes_first")
-lanes_first_p.multiple_results = True
-lanes_first_p.def_impl(lambda *values: list(values))
-lanes_first_p.def_abstract_eval(lambda *avals: list(avals))
+lanes_first_p = identity("jourdain_lanes_first")
 ad.primitive_jvps[lanes_first_p] = lambda primals, tangents: (lanes_first_p.bind(*primals), list(tangents))
 ad.primitive_transposes[lanes_first_p] = lambda cotangents, *values: list(cotangents)
 batching.primitive_batchers[lanes_first_p] = _batched
-mlir.register_lowering(lanes_first_p, mlir.lower_fun(lambda *values: list(values), multiple_results=True))

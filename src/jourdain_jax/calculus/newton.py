@@ -52,14 +52,10 @@ def newton_root(residual: Callable, guess: Float[Array, "unknowns"], scale: Floa
         x, size, _, _ = jax.lax.while_loop(running, iterate, start)
         return x, (size <= eps**0.6).astype(x0.dtype)
 
-    x, converged = jax.lax.custom_root(residual, jax.lax.stop_gradient(guess), solve, _tangent_solve, has_aux=True)
+    x, converged = jax.lax.custom_root(residual, jax.lax.stop_gradient(guess), solve, lambda f, y: jnp.linalg.solve(_matrix(f, y), y), has_aux=True)
     return Root(x, converged > 0)
 
 
 def _matrix(linear: Callable, like) -> Float[Array, "unknowns unknowns"]:
     """The matrix of a linear function, column by column."""
     return jax.vmap(linear, in_axes=1, out_axes=1)(jnp.eye(like.shape[0], dtype=like.dtype))
-
-
-def _tangent_solve(linear: Callable, y):
-    return jnp.linalg.solve(_matrix(linear, y), y)

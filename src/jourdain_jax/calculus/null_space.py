@@ -9,6 +9,8 @@ To keep shapes static where the rank is not known in advance, a basis has as man
 the null space are zero, and `present` says which are.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -19,7 +21,7 @@ from jourdain_jax.calculus.pseudo_inverse import numerical_rank, pseudo_inverse
 
 def null_space_svd(A: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
     """Null-space basis from the full singular value decomposition; columns of the row space are zero."""
-    return _null_space(A, "svd")
+    return _null_space(A, _svd_basis, None)
 
 
 def null_space_qr(A: Float[Array, "rows columns"], cutoff: float | None = None) -> Float[Array, "columns columns"]:
@@ -27,7 +29,7 @@ def null_space_qr(A: Float[Array, "rows columns"], cutoff: float | None = None) 
 
     Pivots below `cutoff` times the largest count as zero (default: `rank_cutoff`).
     """
-    return _null_space(A, "qr", cutoff)
+    return _null_space(A, _qr_basis, cutoff)
 
 
 def pivots_qr(A: Float[Array, "rows columns"]) -> Float[Array, "values"]:
@@ -43,12 +45,6 @@ def present(Z: Float[Array, "columns columns"]) -> Bool[Array, "columns"]:
     return jnp.any(jax.lax.stop_gradient(Z) != 0, axis=0)
 
 
-def _null_space(A, method, cutoff=None):
-    if A.shape[0] == 0:
-        return jnp.eye(A.shape[1], dtype=A.dtype)
-    return _basis(A, method, cutoff)
-
-
 def _svd_basis(A, cutoff):
     _, sigma, right = jnp.linalg.svd(A, full_matrices=True)
     return right.T, numerical_rank(sigma, cutoff)
@@ -59,20 +55,17 @@ def _qr_basis(A, cutoff):
     return Q, numerical_rank(jnp.abs(jnp.diagonal(R)), cutoff)
 
 
-_BASES = {"svd": _svd_basis, "qr": _qr_basis}
-
-
-def _masked(A, method, cutoff):
-    basis, rank = _BASES[method](A, cutoff)
+@partial(jax.custom_jvp, nondiff_argnums=(1, 2))
+def _null_space(A, decomposed, cutoff):
+    if A.shape[0] == 0:
+        return jnp.eye(A.shape[1], dtype=A.dtype)
+    basis, rank = decomposed(A, cutoff)
     return jnp.where(jnp.arange(A.shape[1]) >= rank, basis, 0)
 
 
-_basis = jax.custom_jvp(_masked, nondiff_argnums=(1, 2))
-
-
-@_basis.defjvp
+@_null_space.defjvp
 @with_usual_promotion
-def _basis_jvp(method, cutoff, primals, tangents):
+def _null_space_jvp(decomposed, cutoff, primals, tangents):
     (A,), (dA,) = primals, tangents
-    Z = _basis(A, method, cutoff)
+    Z = _null_space(A, decomposed, cutoff)
     return Z, -pseudo_inverse(A, cutoff) @ (dA @ Z)

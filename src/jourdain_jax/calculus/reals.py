@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from jax import dtypes
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
+Entries: TypeAlias = Array | np.ndarray
 Number = ArrayLike  # one number
 Numbers = Real[Array | np.ndarray, "_"] | Sequence[ArrayLike]  # any count of them
 Vector = Real[Array | np.ndarray, "3"] | Sequence[ArrayLike]  # three numbers

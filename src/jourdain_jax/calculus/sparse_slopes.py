@@ -42,16 +42,20 @@ class Pattern:
         """The lengths of all rows, (states, rows)."""
         return np.linalg.norm(self.dense(values), axis=2) if self.band is None else np.sqrt(summed(self.rows, self.shape[0], values**2))
 
-    def shortest(self, values: np.ndarray, right: np.ndarray, inverses: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """The shortest x with `G x = right` at every state; within the band where rows are surely independent, or by the `inverses` of dense matrices."""
+    def shortest(self, values: np.ndarray, right: np.ndarray, solved: Callable, typical: np.ndarray | float = 0.0) -> np.ndarray:
+        """The shortest x with `G x = right` at every state; within the band where rows are surely independent, or `solved(G, right)` of dense matrices.
+
+        `typical`: lengths of the rows, where one may be shorter.
+        """
         if self.band is None:
-            return (inverses(self.dense(values)) @ right[..., None])[..., 0]
-        lengths = self.lengths(values)
+            return solved(self.dense(values), right)
+        lengths = np.maximum(self.lengths(values), typical)
         d = 1 / np.where(lengths > 0, lengths, 1.0)
         scaled = d[:, self.rows] * values
         y, size = self.band.solved(scaled, np.zeros(len(values)), d * right)
         found, others = self.transposed_times(scaled, y), ~(size < REGULAR)
-        found[others] = (inverses(self.dense(values[others])) @ right[others, :, None])[..., 0]
+        if others.any():
+            found[others] = solved(self.dense(values[others]), right[others])
         return found
 
     @cached_property

@@ -11,7 +11,6 @@ import numpy as np
 
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.eager.lanes import uncompiled_lanes
-from jourdain_jax.eager.numpy_backend import uncompiled
 
 
 def eval_numpy(f: Callable) -> Callable:
@@ -21,17 +20,16 @@ def eval_numpy(f: Callable) -> Callable:
     """
 
     @lru_cache(maxsize=32)
-    def program(treedef, rest, x64, of_lanes):
-        whole = lambda numbers, *lane: f(*eqx.combine(numbers, jax.tree.unflatten(treedef, rest)), *lane)  # noqa: E731
-        return uncompiled_lanes(whole, shared=1) if of_lanes else uncompiled(whole)
+    def program(treedef, rest, x64):
+        return uncompiled_lanes(lambda numbers, *lane: f(*eqx.combine(numbers, jax.tree.unflatten(treedef, rest)), *lane), shared=1)
 
     @wraps(f)
     def run(*arguments, lanes=()):
         # a truth value is no number here: it decides what is traced
         arguments = jax.tree.map(lambda x: np.asarray(x) if eqx.is_array_like(x) and not isinstance(x, bool) else x, arguments)
         numbers, others = eqx.partition(arguments, eqx.is_array)
-        rest, treedef = jax.tree.flatten(others, is_leaf=_is_none)
-        return program(treedef, tuple(rest), jax.config.jax_enable_x64, bool(lanes))(numbers, *lanes)
+        rest, treedef = jax.tree.flatten(others, is_leaf=lambda x: x is None)
+        return program(treedef, tuple(rest), jax.config.jax_enable_x64)(numbers, *lanes)
 
     return run
 
@@ -51,7 +49,3 @@ def eager_if_concrete(f: Callable) -> Callable:
         return f(*arguments) if is_traced(arguments) else jax.tree.map(jnp.asarray, known(*arguments))
 
     return run
-
-
-def _is_none(x) -> bool:
-    return x is None

@@ -1,4 +1,4 @@
-"""A function traced for one lane, run on NumPy for many at once.
+"""A traced function run on NumPy, one operation after another: for one set of arguments, or for many lanes at once, traced for one of them.
 
 With JAX's `vmap` of what was traced in its place, a first result took 7 % longer (tilting disc, bicycle), and 32 trailers were lowered in 4.0 s of processor
 time in place of 1.9: every number of lanes would be traced by itself.
@@ -11,11 +11,10 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jax.extend.core import Literal
 
-from jourdain_jax.calculus.jaxprs import called
+from jourdain_jax.calculus.jaxprs import called, evaluated, needed_only
 from jourdain_jax.eager.indexing import gathered
-from jourdain_jax.eager.numpy_backend import ENTRYWISE, RULES_WITH_LANES, applied, traced_for_use
+from jourdain_jax.eager.numpy_backend import ENTRYWISE, RULES_WITH_LANES, applied, linear_solve
 
 
 class _Value(NamedTuple):
@@ -23,42 +22,46 @@ class _Value(NamedTuple):
     by_lane: bool  # whether it has an axis of lanes, the first one
 
 
-def uncompiled_lanes(f: Callable, shared: int = 0) -> Callable:
-    """`f`, of trees of arrays of one lane, run on NumPy for arrays with an axis of lanes first; the first `shared` arguments are those of all lanes."""
+def uncompiled(f: Callable) -> Callable:
+    """`f`, of trees of arrays, run on NumPy; also while something else is being traced."""
+    return uncompiled_lanes(f, shared=None)
+
+
+def uncompiled_lanes(f: Callable, shared: int | None = 0) -> Callable:
+    """`f`, of trees of arrays of one lane, run on NumPy for arrays with an axis of lanes first.
+
+    The first `shared` arguments are those of all lanes; None: all are, and there are no lanes.
+    """
 
     @lru_cache(maxsize=64)
     def traced(treedef, shapes):
-        return traced_for_use(f, jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(*s) for s in shapes]))
+        closed, shape = jax.make_jaxpr(f, return_shape=True)(*jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(*s) for s in shapes]))
+        return needed_only(closed), jax.tree.structure(shape)
 
     @wraps(f)
     def run(*arguments):
         leaves, treedef = jax.tree.flatten(arguments)
         without = len(jax.tree.leaves(arguments[:shared]))
-        values = [_Value(np.asarray(x), i >= without) for i, x in enumerate(leaves)]
-        count = len(values[without].array)
-        closed, shape = traced(treedef, tuple((x.array.shape[x.by_lane :], x.array.dtype) for x in values))
+        arrays = [np.asarray(x) for x in leaves]
+        closed, structure = traced(treedef, tuple((x.shape[i >= without :], x.dtype) for i, x in enumerate(arrays)))
         with np.errstate(all="ignore"):
-            found = _run(closed, values, count)
-        return jax.tree.unflatten(jax.tree.structure(shape), [_of_all(x, count) for x in found])
+            if without == len(arrays):
+                return jax.tree.unflatten(structure, evaluated(closed, arrays, applied))
+            count = len(arrays[without])
+            found = _run(closed, [_Value(x, i >= without) for i, x in enumerate(arrays)], count)
+        return jax.tree.unflatten(structure, [_of_all(x, count) for x in found])
 
     return run
 
 
 def _run(closed, arguments: list[_Value], count: int) -> list[_Value]:
-    jaxpr = closed.jaxpr
-    values = {v: _Value(np.asarray(x), False) for v, x in zip(jaxpr.constvars, closed.consts, strict=True)} | dict(zip(jaxpr.invars, arguments, strict=True))
-    for equation in jaxpr.eqns:
-        inputs = [_Value(np.asarray(x.val, x.aval.dtype), False) if isinstance(x, Literal) else values[x] for x in equation.invars]
-        if any(x.by_lane for x in inputs):
-            results = _applied(equation, inputs, count)
-        else:
-            results = [_Value(x, False) for x in applied(equation, [x.array for x in inputs])]
-        values |= zip(equation.outvars, results, strict=True)
-    return [_Value(np.asarray(x.val, x.aval.dtype), False) if isinstance(x, Literal) else values[x] for x in jaxpr.outvars]
+    return evaluated(closed, arguments, lambda equation, inputs: _applied(equation, inputs, count), lambda x, aval: _Value(np.asarray(x, aval.dtype), False))
 
 
 def _applied(equation, inputs: list[_Value], count: int) -> list[_Value]:
-    """Results of an equation of which some inputs differ from lane to lane."""
+    """Results of an equation."""
+    if not any(x.by_lane for x in inputs):
+        return [_Value(x, False) for x in applied(equation, [x.array for x in inputs])]
     name, params = equation.primitive.name, equation.params
     inner = called(name, params)
     if inner is not None:
@@ -66,9 +69,7 @@ def _applied(equation, inputs: list[_Value], count: int) -> list[_Value]:
     if name == "cond" and not inputs[0].by_lane:
         return _run(params["branches"][int(inputs[0].array)], inputs[1:], count)
     if name == "custom_linear_solve":
-        lengths = params["const_lengths"]
-        of_solve = inputs[lengths.matvec + lengths.vecmat :][: lengths.solve]
-        return _run(params["jaxprs"].solve, [*of_solve, *inputs[sum(lengths) :]], count)
+        return _run(*linear_solve(params, inputs), count)
     found = None
     if name in ENTRYWISE and name != "unvmap_any":
         found = np.asarray(ENTRYWISE[name](*_aligned(equation, inputs)), equation.outvars[0].aval.dtype)

@@ -1,19 +1,18 @@
-"""A traced function run on NumPy arrays, one primitive after another: for what is looked at once, where compiling takes longer than running.
+"""Operations of JAX on NumPy arrays: for what is looked at once, where compiling takes longer than running.
 
 Primitives without a rule here run one by one in JAX, which compiles each: tens of milliseconds.
 """
 
 import os
 from collections.abc import Callable
-from functools import lru_cache, wraps
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr
 
-from jourdain_jax.calculus.jaxprs import called, needed_only
+from jourdain_jax.calculus.jaxprs import called, evaluated
 from jourdain_jax.calculus.scalar_operations import VALUES
 from jourdain_jax.eager.indexing import gathered, scattered
 
@@ -21,52 +20,12 @@ MOST_TURNS = 5000  # of a loop that states none: more of them are for ever
 _NOT_THE_USERS = (str(Path(__file__).parents[1]), f"{os.sep}site-packages{os.sep}")
 
 
-def uncompiled(f: Callable) -> Callable:
-    """`f` of trees of arrays, run on NumPy; also while something else is being traced."""
-
-    @lru_cache(maxsize=64)
-    def traced(treedef, shapes):
-        return traced_for_use(f, jax.tree.unflatten(treedef, [jax.ShapeDtypeStruct(*s) for s in shapes]))
-
-    @wraps(f)
-    def run(*arguments):
-        leaves, treedef = jax.tree.flatten(arguments)
-        leaves = [np.asarray(x) for x in leaves]
-        closed, shape = traced(treedef, tuple((x.shape, x.dtype) for x in leaves))
-        with np.errstate(all="ignore"):
-            out = _run(closed, leaves)
-        return jax.tree.unflatten(jax.tree.structure(shape), out)
-
-    return run
-
-
-def traced_for_use(f: Callable, arguments):
-    """`f` traced, without the operations that no result needs, and the shapes of its results."""
-    closed, shape = jax.make_jaxpr(f, return_shape=True)(*arguments)
-    return needed_only(closed), shape
-
-
-def _run(closed, arguments) -> list[np.ndarray]:
-    jaxpr = closed.jaxpr
-    values = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
-
-    def read(atom):
-        return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else values[atom]
-
-    for equation in jaxpr.eqns:
-        inputs = [read(x) for x in equation.invars]
-        results = applied(equation, inputs)
-        for variable, result in zip(equation.outvars, results, strict=True):
-            values[variable] = result
-    return [read(x) for x in jaxpr.outvars]
-
-
 def applied(equation, inputs) -> list[np.ndarray]:
     """Results of one equation of a traced function."""
     name, params = equation.primitive.name, equation.params
     inner = called(name, params)
     if inner is not None:
-        return _run(inner, inputs)
+        return evaluated(inner, inputs, applied)
     if name == "while":
         return _while(equation, inputs)
     if name in _CONTROL:
@@ -93,7 +52,7 @@ def _scan(params, inputs) -> list[np.ndarray]:
     order = range(params["length"])
     before: list[np.ndarray] = []  # what was carried one turn ago
     for done, i in enumerate(reversed(order) if params["reverse"] else order, 1):
-        result = _run(params["jaxpr"], [*constants, *carry, *(x[i] for x in xs)])
+        result = evaluated(params["jaxpr"], [*constants, *carry, *(x[i] for x in xs)], applied)
         before_last, before, carry = before, carry, result[:carried]
         if not xs and not outs and (_equal(carry, before) or (_equal(carry, before_last) and (params["length"] - done) % 2 == 0)):
             return carry  # an iteration that has converged, or goes to and fro: the rest changes nothing
@@ -113,10 +72,10 @@ def _while(equation, inputs) -> list[np.ndarray]:
     a, b = params["cond_nconsts"], params["body_nconsts"]
     of_condition, of_body, carry = inputs[:a], inputs[a : a + b], inputs[a + b :]
     for _ in range(MOST_TURNS):
-        going = np.asarray(_run(params["cond_jaxpr"], [*of_condition, *carry])[0])
+        going = np.asarray(evaluated(params["cond_jaxpr"], [*of_condition, *carry], applied)[0])
         if not np.any(going):
             return carry
-        new = _run(params["body_jaxpr"], [*of_body, *carry])
+        new = evaluated(params["body_jaxpr"], [*of_body, *carry], applied)
         carry = new if going.ndim == 0 else [np.where(going.reshape(going.shape + (1,) * (n.ndim - going.ndim)), n, o) for n, o in zip(new, carry, strict=True)]
     if np.all(going):
         raise ValueError(
@@ -136,33 +95,30 @@ def _where(equation) -> str:
     return "a function of the scene"
 
 
-def _cond(params, inputs) -> list[np.ndarray]:
-    return _run(params["branches"][int(inputs[0])], inputs[1:])
-
-
-def _linear_solve(params, inputs) -> list[np.ndarray]:
+def linear_solve(params, inputs: list) -> tuple[ClosedJaxpr, list]:
+    """The function that solves a linear system, and its arguments among the inputs."""
     lengths = params["const_lengths"]
-    constants, right = np.split(np.arange(len(inputs)), [sum(lengths)])
-    of_solve = constants[lengths.matvec + lengths.vecmat :][: lengths.solve]
-    return _run(params["jaxprs"].solve, [inputs[i] for i in (*of_solve, *right)])
+    of_solve = inputs[lengths.matvec + lengths.vecmat :][: lengths.solve]
+    return params["jaxprs"].solve, [*of_solve, *inputs[sum(lengths) :]]
 
 
 def _here(params, inputs) -> list[np.ndarray]:
     count = len(params["here"].constvars)
-    return _run(ClosedJaxpr(params["here"], inputs[:count]), inputs[count:])
+    return evaluated(ClosedJaxpr(params["here"], inputs[:count]), inputs[count:], applied)
 
 
 def _linear_map(params, inputs) -> list[np.ndarray]:
-    return uncompiled(params["linear"].apply)(inputs[: params["count"]], inputs[params["count"] :])
+    closed = jax.make_jaxpr(params["linear"].apply)(inputs[: params["count"]], inputs[params["count"] :])
+    return evaluated(closed, inputs, applied)
 
 
 _CONTROL: dict[str, Callable] = {
     "scan": _scan,
-    "cond": _cond,
+    "cond": lambda params, inputs: evaluated(params["branches"][int(inputs[0])], inputs[1:], applied),
     "jourdain_linear_map": _linear_map,
     "jourdain_or_elsewhere": _here,
     "custom_lin": lambda params, inputs: inputs,
-    "custom_linear_solve": _linear_solve,
+    "custom_linear_solve": lambda params, inputs: evaluated(*linear_solve(params, inputs), applied),
 }
 
 # Primitives. Where the second argument of a rule is `lanes`, so many axes of the arrays, none or one, are no axes of the primitive and come first.
@@ -245,7 +201,7 @@ def _dynamic_update_slice(equation, x, update, *starts):
 
 
 def _pad(equation, x, fill):
-    out = np.full(equation.outvars[0].aval.shape, fill, equation.outvars[0].aval.dtype)
+    out = np.full(equation.outvars[0].aval.shape, fill)
     places, kept = [], []
     for (low, _, interior), size, total in zip(equation.params["padding_config"], x.shape, out.shape, strict=True):
         at = low + (interior + 1) * np.arange(size)
@@ -256,34 +212,17 @@ def _pad(equation, x, fill):
 
 
 def _svd(equation, lanes, A):
-    p = equation.params
-    if A.size == 0 or not np.all(np.isfinite(A)):
-        good = np.all(np.isfinite(A), axis=(-2, -1), keepdims=True)
-        found = _svd_of(np.where(good, A, 0.0), p)
-        return [np.where(good if x.ndim == A.ndim else good[..., 0], x, np.nan) for x in found]
-    return _svd_of(A, p)
-
-
-def _svd_of(A, p):
-    if not p["compute_uv"]:
-        return [np.linalg.svd(A, compute_uv=False)]
-    U, s, V = np.linalg.svd(A, full_matrices=p["full_matrices"])
-    return [s, U, V]
+    good = np.all(np.isfinite(A), axis=(-2, -1), keepdims=True)
+    found = np.linalg.svd(np.where(good, A, 0.0), full_matrices=equation.params["full_matrices"], compute_uv=equation.params["compute_uv"])
+    found = [found[1], found[0], found[2]] if equation.params["compute_uv"] else [found]
+    return [np.where(good if x.ndim == A.ndim else good[..., 0], x, np.nan) for x in found]
 
 
 def _cholesky(equation, lanes, A):
     try:
         return np.linalg.cholesky(np.tril(A) + np.swapaxes(np.tril(A, -1), -1, -2))
     except np.linalg.LinAlgError:
-        flat = A.reshape(-1, *A.shape[-2:])
-        return np.stack([_cholesky_or_nan(a) for a in flat]).reshape(A.shape)
-
-
-def _cholesky_or_nan(A):
-    try:
-        return np.linalg.cholesky(np.tril(A) + np.tril(A, -1).T)
-    except np.linalg.LinAlgError:
-        return np.full_like(A, np.nan)
+        return np.full_like(A, np.nan) if A.ndim == 2 else np.stack([_cholesky(equation, lanes, a) for a in A])
 
 
 def _triangular_solve(equation, lanes, A, b):

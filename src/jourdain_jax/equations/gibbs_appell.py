@@ -18,7 +18,7 @@ from jourdain_jax.equations.reductions import APPLICABLE_PIVOT, Partition, Reduc
 from jourdain_jax.equations.rows import ConstraintRows
 from jourdain_jax.equations.scaling import scaled
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces
-from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_speeds, as_time
+from jourdain_jax.scene.arguments import as_coordinates, as_speeds
 from jourdain_jax.scene.scene import Scene
 
 
@@ -36,19 +36,14 @@ def gibbs_function(scene: Scene, t, q, u, udot) -> Float[Array, ""]:
     return 0.5 * jnp.sum(weights.mass * jnp.sum(a * a, 1)) + 0.5 * jnp.einsum("bi,bij,bj->", alpha, weights.inertia, alpha) + jnp.sum(alpha * gyroscopic)
 
 
+@eager_if_concrete
 def gibbs_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
     """M, h and Q of `M udot + h = Q` from the Gibbs function: its Hessian, and its gradient at `udot = 0`; (12)-(17).
 
     `inputs`: values of the scene's inputs (default: zero).
     """
-    f = None if inputs is None else as_input_vector(scene, inputs)
-    return _gibbs_equations(scene, as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f)
-
-
-@eager_if_concrete
-def _gibbs_equations(scene: Scene, t, q, u, inputs) -> UnconstrainedEquations:
-    zero = jnp.zeros_like(u)
-    h, M = _gradient_and_hessian(lambda a: gibbs_function(scene, t, q, u, a), zero)
+    q, u = as_coordinates(scene, q), as_speeds(scene, u)
+    h, M = _gradient_and_hessian(lambda a: gibbs_function(scene, t, q, u, a), jnp.zeros_like(u))
     return UnconstrainedEquations(M, h, generalized_forces(scene, t, q, u, inputs))
 
 

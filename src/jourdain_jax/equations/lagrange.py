@@ -11,10 +11,11 @@ import jax.numpy as jnp
 
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.virtual_power import UnconstrainedEquations, generalized_forces, kinetic_energy
-from jourdain_jax.scene.arguments import as_coordinates, as_input_vector, as_speeds, as_time
+from jourdain_jax.scene.arguments import as_coordinates, as_speeds, as_time
 from jourdain_jax.scene.scene import Scene
 
 
+@eager_if_concrete
 def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquations:
     """M, h and Q of `M udot + h = Q` from derivatives of the kinetic energy: `d/dt dT/dqdot - dT/dq = Q`; eq. (11).
 
@@ -24,12 +25,8 @@ def lagrange_equations(scene: Scene, t, q, u, inputs=None) -> UnconstrainedEquat
         raise ValueError(
             f"Lagrange's equations hold for coordinate rates, and the speeds of `{type(scene).__name__}` are quasi-velocities; use Appell's equations"
         )
-    f = None if inputs is None else as_input_vector(scene, inputs)
-    return _lagrange_equations(scene, as_time(t), as_coordinates(scene, q), as_speeds(scene, u), f)
+    t, q, u = as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
 
-
-@eager_if_concrete
-def _lagrange_equations(scene: Scene, t, q, u, inputs) -> UnconstrainedEquations:
     def momentum(t, q, u):
         return jax.grad(kinetic_energy, argnums=3)(scene, t, q, u)
 

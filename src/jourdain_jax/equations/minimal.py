@@ -38,7 +38,7 @@ def minimal_kinematics(scene: Scene, independent: tuple[int, ...], t, q, y, inpu
     at_rest = jnp.zeros(len(scene.speed_names), q.dtype).at[jnp.array(independent, jnp.int32)].set(y)
     partial, value, motion = derivatives_in_speeds(scene, t, q, at_rest, inputs)
     weights = inertias_of(motion)
-    c = speed_scale(mass_matrix(weights, partial.bodies))
+    c = speed_scale(mass_matrix(weights.mass, weights.inertia, partial.bodies.linear, partial.bodies.angular))
     d = row_scale(partial.rows * c)
     split = Partition(d[:, None] * partial.rows * c, independent)
     # A (u - at_rest) = -phi(at_rest), with a difference in the dependent speeds only

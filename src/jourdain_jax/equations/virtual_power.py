@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import described
+from jourdain_jax.calculus.reals import Entries, described
 from jourdain_jax.eager.eager import eager_if_concrete
 from jourdain_jax.equations.instant import Instant, instant_at, rows_of
 from jourdain_jax.equations.kinematics import (
@@ -125,19 +125,31 @@ def equations_of(scene: Scene, instant: Instant) -> UnconstrainedEquations:
     partial = instant.by_speeds.bodies
     force, torque = inertia_resultants(instant.weights, instant.value.bodies, instant.rate.bodies)
     h = jnp.einsum("bik,bi->k", partial.linear, force) + jnp.einsum("bik,bi->k", partial.angular, torque)
-    return UnconstrainedEquations(mass_matrix(instant.weights, partial), h, _generalized_forces(scene, instant.motion, partial))
+    M = mass_matrix(instant.weights.mass, instant.weights.inertia, partial.linear, partial.angular)
+    return UnconstrainedEquations(M, h, _generalized_forces(scene, instant.motion, partial))
 
 
-def mass_matrix(weights: Inertias, partial: Velocities) -> Float[Array, "speeds speeds"]:
-    """`M = sum m beta' beta + gamma' I gamma`."""
-    beta, gamma = partial.linear, partial.angular
-    return jnp.einsum("b,bik,bil->kl", weights.mass, beta, beta) + jnp.einsum("bik,bij,bjl->kl", gamma, weights.inertia, gamma)
+def mass_matrix(
+    mass: Float[Entries, "*states bodies"],
+    inertia: Float[Entries, "*states bodies 3 3"],
+    beta: Float[Entries, "*states bodies 3 speeds"],
+    gamma: Float[Entries, "*states bodies 3 speeds"],
+) -> Float[Entries, "*states speeds speeds"]:
+    """`M = sum m beta' beta + gamma' I gamma`, of arrays of JAX or NumPy; also at many states."""
+    return _summed(beta, mass[..., None, None] * beta) + _summed(gamma, inertia @ gamma)
+
+
+def _summed(x, y):
+    """`sum x' y` over the bodies."""
+    x, y = (z.reshape(*z.shape[:-3], -1, z.shape[-1]) for z in (x, y))
+    return x.mT @ y
 
 
 def mass_matrix_at(scene: Scene, t, q) -> Float[Array, "speeds speeds"]:
     """M at (t, q); it does not depend on u."""
     rest = jnp.zeros(len(scene.speed_names), q.dtype)
-    return mass_matrix(inertias(scene, t, q), partial_velocities(scene, t, q, rest))
+    weights, partial = inertias(scene, t, q), partial_velocities(scene, t, q, rest)
+    return mass_matrix(weights.mass, weights.inertia, partial.linear, partial.angular)
 
 
 def inertia_resultants(weights: Inertias, velocity: Velocities, acceleration: Velocities):

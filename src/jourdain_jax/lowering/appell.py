@@ -14,14 +14,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jourdain_jax.build.probed_on_graph import generic_states
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import TracedScene, VelocityQuantities
 from jourdain_jax.lowering.elimination import eliminate, pivots_ok, solve_symmetric
 from jourdain_jax.lowering.kept_rows import KeptRows
 from jourdain_jax.lowering.multipliers import projected_coordinates
-from jourdain_jax.program.derivative import columns, derivatives, directional_derivative, jacobian
+from jourdain_jax.program.derivative import columns, derivatives, directional_derivative, jacobian, matrix
 from jourdain_jax.program.evaluate import Probes
-from jourdain_jax.program.identity_test import IdentityProbes, equal, identity_probes, on_rows, unaffected
+from jourdain_jax.program.identity_test import equal, unaffected
 from jourdain_jax.program.polynomial import NormalForms, Polynomial, TooLarge
 
 
@@ -50,8 +51,6 @@ class Equations:
     qdot: list[int]
     ydot: list[int]
     z: list[int]  # the dependent speeds
-    M: list[list[int]]
-    f: list[int]
     pivots: list[int]  # must not vanish
     guards: list[int] = field(default_factory=list)  # must stay positive
     power: int = 0  # `rate_of_work`; for scenes that no prescribed pose drives
@@ -60,33 +59,17 @@ class Equations:
     usual: dict[int, int] = field(default_factory=dict)  # inputs that stand for what a node usually is, with that node
 
 
-@dataclass
-class Projection:
-    """Nodes of the state after it was put back onto the rows."""
-
-    q: list[int]
-    u: list[int]  # none where rows are eliminated
-
-
 class AppellOnGraph:
     """The construction for one scene."""
 
-    def __init__(self, traced: TracedScene, structure: Structure, kept: KeptRows | None, probes: Probes, far, reference, quaternions: tuple[int, ...]):
+    def __init__(self, traced: TracedScene, structure: Structure, kept: KeptRows | None, probes: Probes, far, reference):
         self.traced, self.graph, self.structure, self.probes = traced, traced.graph, structure, probes
         self.rows_work = not (structure.affine and structure.homogeneous)
         every, rows = range(len(traced.u)), [s for s, name in enumerate(structure.row_names) if name not in structure.redundant_rows]
         self.independent = list(every) if kept or not rows else list(structure.independent)
         self.dependent = [k for k in every if k not in self.independent]
         self.kept, self.rows, self.multiplied = kept, *(([], rows) if kept else (rows, []))
-        self.reference, self.quaternions, self.far = reference, quaternions, far
-        self.identity_probes = self._made_identity_probes()
-
-    def _made_identity_probes(self) -> IdentityProbes:
-        """Generic states on the geometric rows, at generic parameters."""
-        g, q = self.graph, self.traced.q.tolist()
-        attitudes = {f"q_{first + i}": q[first + i] for first in self.quaternions for i in range(4)}
-        norms = [g.sub(g.total(g.mul(n, n) for n in q[first : first + 4]), g.one) for first in self.quaternions]
-        return on_rows(identity_probes(self.probes, attitudes), self.probes, [*self.traced.at.closure.tolist(), *norms], {f"q_{i}": n for i, n in enumerate(q)})
+        self.reference, self.far, self.identity_probes = reference, far, generic_states(traced, probes)
 
     def build(self, strategy: Strategy) -> Equations:
         """The equations by one strategy."""
@@ -98,11 +81,9 @@ class AppellOnGraph:
         if self.kept and self.multiplied:
             ydot, sines, margins, usual = self.kept.accelerations(M, f, *kinematics.rows_along_motion(self.multiplied), forms)
         else:
-            ydot, sines, margins = self._solved(M, f, forms_of_equations if strategy.by_determinants else None), [], []
-            usual = {}
+            ydot, sines, margins, usual = self._solved(M, f, forms_of_equations, strategy.by_determinants), [], [], {}
         z, qdot, pivots = self._true_rates(kinematics, forms) if held else (kinematics.z, kinematics.qdot, [])
-        guards = {node for made in (forms, forms_of_equations) if made is not None for node in made.guards}
-        guards |= set(margins)
+        guards = forms.guards | forms_of_equations.guards | set(margins)
         power = self._power(kinematics, ydot)
         if strategy.by_determinants:
             *ydot, power = self.graph.substituted([*ydot, power], kinematics.known)
@@ -114,30 +95,30 @@ class AppellOnGraph:
         elif held:
             true_power = self._power(_Kinematics(self, forms, {}, explicit=False), ydot)
             power = power if equal(self.identity_probes([power]), self.identity_probes([true_power])).all() else true_power
-        return Equations(qdot, ydot, z, M, f, list(dict.fromkeys([*kinematics.pivots, *pivots, *sines])), sorted(guards), power, events, [T, V], usual)
+        return Equations(qdot, ydot, z, list(dict.fromkeys([*kinematics.pivots, *pivots, *sines])), sorted(guards), power, events, [T, V], usual)
 
     def _at_reference(self, held: tuple[int, ...]) -> dict[int, int]:
         return {int(self.traced.q[i]): self.graph.const(self.reference[i]) for i in held}
 
-    def projection(self, most_terms: int, ignorable: tuple[int, ...]) -> "Projection":
-        """Nodes of the state put back onto quaternion norms and geometric rows, and (where rows are kept by multipliers) onto velocity rows."""
+    def projection(self, most_terms: int, ignorable: tuple[int, ...]) -> tuple[list[int], list[int]]:
+        """Coordinates put back onto quaternion norms and geometric rows; speeds put back onto velocity rows, none where these are eliminated."""
         g, at, q = self.graph, self.traced.at, self.traced.q.tolist()
         redundant = {s for s in range(len(at.closure)) if s not in self.rows and s not in self.multiplied}
         closure = [int(n) for s, n in enumerate(at.closure) if s not in redundant]
         closure = g.substituted(closure, unaffected(self.identity_probes, closure, self._at_reference(ignorable)))
-        norms = [g.total(g.mul(n, n) for n in q[first : first + 4]) for first in self.quaternions]
         moved = list(q)
         if closure:
-            moved = projected_coordinates(g, q, [*closure, *(g.mul(g.const(0.5), g.sub(n, g.one)) for n in norms)])
+            moved = projected_coordinates(g, q, [*closure, *self.traced.closures[len(at.closure) :]])
         else:
-            for first, n in zip(self.quaternions, norms, strict=True):
-                moved[first : first + 4] = [g.div(part, g.call("sqrt", n)) for part in q[first : first + 4]]
+            for first, wxyz in zip(self.traced.quaternions, self.traced.attitudes, strict=True):
+                n = g.dot(wxyz, wxyz)
+                moved[first : first + 4] = [g.div(part, g.call("sqrt", n)) for part in wxyz]
         if not (self.kept and self.multiplied):
-            return Projection(moved, [])
+            return moved, []
         forms = self._forms(most_terms)
         M, _ = self._equations(_Kinematics(self, forms, {}, explicit=True), forms)
         phi = [int(at.phi[s]) for s in self.multiplied]
-        return Projection(moved, self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms))
+        return moved, self.kept.projected_speeds(M, self.traced.u.tolist(), phi, forms)
 
     def _power(self, k: "_Kinematics", ydot: list[int]) -> int:
         """Power of loads without a potential and of potentials in time, and `(A' lambda).u` where rows do work.
@@ -150,35 +131,37 @@ class AppellOnGraph:
         still = dict.fromkeys(self.traced.u.tolist(), g.zero)
         v_0, omega_0 = (g.substituted(g.substituted(x.ravel().tolist(), still), k.held) for x in (self.traced.at.v, self.traced.at.omega))
         terms = [int(at.power)]
-        for b, (mass, inertia) in enumerate(zip(at.mass.tolist(), at.inertia.tolist(), strict=True)):
+        for b in range(len(at.mass)):
             a = [g.add(a0, g.dot([beta[b][i] for beta in k.beta], ydot)) for i, a0 in enumerate(k.a0[b])]
             alpha = [g.add(a0, g.dot([gamma[b][i] for gamma in k.gamma], ydot)) for i, a0 in enumerate(k.alpha0[b])]
-            omega = at.omega[b].tolist()
-            momentum, turning = [g.dot(row, omega) for row in inertia], [g.dot(row, alpha) for row in inertia]
-            gyroscopic = [g.sub(g.mul(omega[i - 2], momentum[i - 1]), g.mul(omega[i - 1], momentum[i - 2])) for i in range(3)]
+            force, torque = self._inertia_resultants(at, b, a, alpha)
             for i in range(3):
-                force = g.sub(g.mul(mass, a[i]), int(at.force[b][i]))
-                torque = g.sub(g.add(turning[i], gyroscopic[i]), int(at.torque[b][i]))
-                terms.append(g.mul(force, g.sub(int(at.v[b][i]), v_0[3 * b + i])))
-                terms.append(g.mul(torque, g.sub(omega[i], omega_0[3 * b + i])))
+                terms.append(g.mul(g.sub(force[i], int(at.force[b][i])), g.sub(int(at.v[b][i]), v_0[3 * b + i])))
+                terms.append(g.mul(g.sub(torque[i], int(at.torque[b][i])), g.sub(int(at.omega[b][i]), omega_0[3 * b + i])))
         u = dict(zip(self.dependent, k.z, strict=True)) | dict(zip(self.independent, k.y, strict=True))
         return g.sub(g.total(terms), g.total(g.mul(int(at.direct[i]), n) for i, n in u.items()))
 
-    def _solved(self, M, f, forms) -> list[int]:
-        if forms is not None and 1 <= len(f) <= 3:
+    def _inertia_resultants(self, at: VelocityQuantities, b: int, a: list[int], alpha: list[int]) -> tuple[list[int], list[int]]:
+        """`m a` and `I alpha + omega x I omega` of body b."""
+        g, inertia, omega = self.graph, at.inertia[b].tolist(), at.omega[b].tolist()
+        momentum = [g.dot(row, omega) for row in inertia]
+        gyroscopic = [g.sub(g.mul(omega[i - 2], momentum[i - 1]), g.mul(omega[i - 1], momentum[i - 2])) for i in range(3)]
+        return [g.mul(int(at.mass[b]), x) for x in a], [g.add(g.dot(row, alpha), w) for row, w in zip(inertia, gyroscopic, strict=True)]
+
+    def _solved(self, M, f, forms: NormalForms, by_determinants: bool) -> list[int]:
+        if by_determinants and 1 <= len(f) <= 3:
             try:
                 return forms.cramer(M, f)
             except TooLarge:
                 pass
         return solve_symmetric(self.graph, M, [f]).solution[0]
 
-    def _true_rates(self, kinematics: "_Kinematics", forms) -> tuple[list[int], list[int], list[int]]:
+    def _true_rates(self, kinematics: "_Kinematics", forms: NormalForms) -> tuple[list[int], list[int], list[int]]:
         """Dependent speeds and rates at the true coordinates: those that do not depend on held ones are taken over, the others follow."""
         g, at, u = self.graph, self.traced.at, self.traced.u.tolist()
-        simple = (lambda nodes: list(nodes)) if forms is None else (lambda nodes: [forms.simplified(n) for n in nodes])
         phi = [int(at.phi[s]) for s in self.rows]
         phi = g.substituted(phi, unaffected(self.identity_probes, [*phi, *at.qdot.tolist()], kinematics.held))
-        A = [list(row) for row in zip(*columns(g, phi, u), strict=True)]
+        A = matrix(g, phi, u)
         phi_0 = g.substituted(phi, dict.fromkeys(u, g.zero))
         y = {k: u[k] for k in self.independent}
 
@@ -191,24 +174,20 @@ class AppellOnGraph:
         same = equal(generic(kinematics.z), generic([row[0] for row in whole.solution]), pivots_ok(whole.pivots, generic))
         known = y | {k: n for k, n, s in zip(self.dependent, kinematics.z, same, strict=True) if s}
         left = [k for k in self.dependent if k not in known]
-        A, phi_0 = [simple(row) for row in A], simple(phi_0)
+        A, phi_0 = [forms.all_simplified(row) for row in A], forms.all_simplified(phi_0)
         found = solved(left, known)
-        known |= {k: row[0] for k, row in zip(left, (simple(r) for r in found.solution), strict=True)}
+        known |= {k: row[0] for k, row in zip(left, map(forms.all_simplified, found.solution), strict=True)}
         z = [known[k] for k in self.dependent]
-        return z, simple(g.substituted(at.qdot.tolist(), {u[k]: n for k, n in known.items() if k not in self.independent})), found.pivots
+        return z, forms.all_simplified(g.substituted(at.qdot.tolist(), {u[k]: n for k, n in known.items() if k not in self.independent})), found.pivots
 
-    def _forms(self, most_terms: int):
-        if most_terms == 0:
-            return None
+    def _forms(self, most_terms: int) -> NormalForms:
         squares: dict[int, Polynomial] = {}
-        for first in self.quaternions:
-            w, *xyz = (int(n) for n in self.traced.q[first : first + 4])
+        for w, *xyz in self.traced.attitudes:
             squares[w] = {(): 1.0} | {(n, n): -1.0 for n in xyz}
         return NormalForms(self.graph, most_terms, self.probes.sign, squares)
 
-    def _equations(self, k: "_Kinematics", forms) -> tuple[list[list[int]], list[int]]:
+    def _equations(self, k: "_Kinematics", forms: NormalForms) -> tuple[list[list[int]], list[int]]:
         g, at = self.graph, k.at
-        simple = (lambda node: node) if forms is None else forms.simplified
         freedoms = range(len(self.independent))
         inertia = at.inertia.tolist()
         M = [[g.zero] * len(freedoms) for _ in freedoms]
@@ -217,12 +196,8 @@ class AppellOnGraph:
             f[i] = g.total([int(at.direct[self.independent[i]]), *(g.mul(row[i], int(at.direct[d])) for row, d in zip(k.B, self.dependent, strict=True))])
         for b, mass in enumerate(at.mass.tolist()):
             beta, gamma = [k.beta[i][b] for i in freedoms], [k.gamma[i][b] for i in freedoms]
-            omega = at.omega[b].tolist()
-            momentum = [g.dot(row, omega) for row in inertia[b]]
-            gyroscopic = [g.sub(g.mul(omega[i - 2], momentum[i - 1]), g.mul(omega[i - 1], momentum[i - 2])) for i in range(3)]
-            force = [g.sub(F, g.mul(mass, a)) for F, a in zip(at.force[b].tolist(), k.a0[b], strict=True)]
-            turning = [g.dot(row, k.alpha0[b]) for row in inertia[b]]
-            torque = [g.sub(L, g.add(i, w)) for L, i, w in zip(at.torque[b].tolist(), turning, gyroscopic, strict=True)]
+            impressed, resisting = (at.force[b].tolist(), at.torque[b].tolist()), self._inertia_resultants(at, b, k.a0[b], k.alpha0[b])
+            force, torque = ([g.sub(F, ma) for F, ma in zip(*pair, strict=True)] for pair in zip(impressed, resisting, strict=True))
             moving = [i for i in freedoms if any(n != g.zero for n in (*beta[i], *gamma[i]))]
             for i in moving:
                 f[i] = g.total([f[i], g.dot(beta[i], force), g.dot(gamma[i], torque)])
@@ -230,17 +205,18 @@ class AppellOnGraph:
                 for j in moving[: moving.index(i) + 1]:
                     M[i][j] = g.total([M[i][j], g.mul(mass, g.dot(beta[i], beta[j])), g.dot(gamma[j], turned)])
         for i in freedoms:
-            f[i] = simple(f[i])
+            f[i] = forms.simplified(f[i])
             for j in range(i + 1):
-                M[i][j] = M[j][i] = simple(M[i][j])
+                M[i][j] = M[j][i] = forms.simplified(M[i][j])
         return M, f
 
 
 class _Kinematics:
     """Velocities, partial velocities and accelerations at ydot = 0, with some coordinates held (after differentiation)."""
 
-    def __init__(self, build: AppellOnGraph, forms, held: dict[int, int], explicit: bool, free_z: bool = False):
+    def __init__(self, build: AppellOnGraph, forms: NormalForms, held: dict[int, int], explicit: bool, free_z: bool = False):
         self.build, self.graph, self.forms, self.held, self.free_z = build, build.graph, forms, held, free_z
+        self._simple = forms.all_simplified
         self.u, self.y = build.traced.u.tolist(), [int(build.traced.u[k]) for k in build.independent]
         self.phi = [int(build.traced.at.phi[s]) for s in build.rows]
         (self._explicitly if explicit else self._implicitly)()
@@ -248,12 +224,12 @@ class _Kinematics:
     # Explicit: the dependent speeds are put into the velocities, which are then differentiated.
 
     def _explicitly(self) -> None:
-        A = [list(row) for row in zip(*(self._at(column) for column in self._by(self.phi, self.u)), strict=True)]
+        A = [list(row) for row in zip(*(self._at(column) for column in columns(self.graph, self.phi, self.u)), strict=True)]
         self._solve(A, self._at(self.graph.substituted(self.phi, dict.fromkeys(self.u, self.graph.zero))))
         unheld = self.known if not self.held else _Kinematics(self.build, self.forms, {}, True).known
         raw, simple = self._velocities(unheld)
         self._quantities()
-        partial = [self._simple(column) for column in self._by(simple, self.y)]
+        partial = [self._simple(column) for column in columns(self.graph, simple, self.y)]
         self._shape(simple, partial, self._along(simple, raw, self.qdot))
 
     # Implicit: speeds are differentiated as they stand; the rows are differentiated through the velocities of the bodies they are made of.
@@ -262,7 +238,7 @@ class _Kinematics:
         g, build, at = self.graph, self.build, self.build.traced.at
         raw, simple = self._velocities({})
         qdot = self._at(at.qdot.tolist())
-        by_speed = [self._simple(column) for column in self._by(simple, self.u)]
+        by_speed = [self._simple(column) for column in columns(g, simple, self.u)]
         at_fixed_speeds = self._along(simple, raw, qdot)
         value = self._parts(simple)
         rotation = [self._simple(self._at(R.ravel().tolist())) for R in at.orientation]
@@ -318,21 +294,14 @@ class _Kinematics:
         """Jacobian in the speeds and drift of some rows, at the held coordinates."""
         raw = [int(self.build.traced.at.phi[s]) for s in rows]
         simple = self._at(raw)
-        columns = [self._simple(column) for column in self._by(simple, self.u)]
-        return [list(row) for row in zip(*columns, strict=True)], self._along(simple, raw, self.qdot)
+        by_speed = [self._simple(column) for column in columns(self.graph, simple, self.u)]
+        return [list(row) for row in zip(*by_speed, strict=True)], self._along(simple, raw, self.qdot)
 
     # helpers
-
-    def _simple(self, nodes):
-        return list(nodes) if self.forms is None else [self.forms.simplified(n) for n in nodes]
 
     def _at(self, nodes) -> list[int]:
         """Nodes at the held coordinates, simplified."""
         return self._simple(self.graph.substituted(nodes, self.held))
-
-    def _by(self, nodes, variables) -> list[list[int]]:
-        """Derivatives, one list per variable."""
-        return columns(self.graph, nodes, variables)
 
     def _turned(self, R, w) -> list[int]:
         if all(n == self.graph.zero for n in w):

@@ -5,9 +5,9 @@
 
     M = sum m beta' beta + gamma' I gamma
     f = sum beta' (F - m a_0) + gamma' (L - I alpha_0 - omega x I omega) + Q_direct
-    udot = C yddot + c,   A C = 0,   A c = -drift,   C' (M udot - f) = 0            (25)-(31), (41)
+    udot = Z zeta + c,   A Z = 0,   A c = -drift,   Z' (M udot - f) = 0            (71)-(73)
 
-C and c are those of the privileged speeds, or where all speeds stay in the state those of the null space. Source: Wang and Pao (2003).
+Source: Wang and Pao (2003).
 """
 
 from dataclasses import dataclass
@@ -16,11 +16,14 @@ import jax
 import numpy as np
 from jax.extend.core import jaxpr_as_fun
 
+from jourdain_jax.build.assembling import shortest, typical_lengths
+from jourdain_jax.build.row_lengths import speed_scales
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.build.trace import VelocityQuantities, jaxpr_of_scene
 from jourdain_jax.calculus.jaxprs import needed_only
 from jourdain_jax.calculus.pseudo_inverse import rank_cutoff
 from jourdain_jax.eager.lanes import uncompiled_lanes
+from jourdain_jax.equations.virtual_power import mass_matrix
 from jourdain_jax.scene.scene import Scene
 
 LANES = 2048  # states times directions that are worked out at once
@@ -82,84 +85,41 @@ class _Traced:
 
 
 def _rates(traced: _Traced, structure: Structure, kept: list[int], independent: tuple[int, ...], parameters: Scene, t, q, u, inputs) -> DenseRates:
-    states, count = u.shape
-    dependent = [i for i in range(count) if i not in independent]
-    if dependent:
-        u = np.where(np.isin(np.arange(count), independent), u, 0.0)
+    every = np.arange(u.shape[1])
+    dependent = np.setdiff1d(every, independent)
+    u = np.where(np.isin(every, dependent), 0.0, u)
     (_, _, phi), (beta, gamma, A) = traced.by_speeds(parameters, t, q, u, inputs)
-    if dependent:  # A (u - y) = -phi(y)
-        u[:, dependent] = -_from_rows(A[:, kept][:, :, dependent], phi[:, kept, None])[..., 0]
+    if dependent.size:  # A (u - y) = -phi(y)
+        A_z = A[:, kept][:, :, dependent]
+        u[:, dependent] = -shortest(A_z, phi[:, kept], typical_lengths(np.linalg.norm(A_z, axis=2)))
     at = traced.values(parameters, t, q, u, inputs)
-    still = np.zeros_like(u)
-    _, (a, alpha, drift) = traced.along((np.ones(states), at["qdot"], still), parameters, t, q, u, inputs)
+    _, (a, alpha, drift) = traced.along((np.ones(len(u)), at["qdot"], np.zeros_like(u)), parameters, t, q, u, inputs)
     # M and f = Q - h
-    m, I, omega = at["mass"][..., None], at["inertia"], at["omega"]
-    turned = lambda x: np.einsum("sbij,sbj...->sbi...", I, x)  # noqa: E731
-    flat = lambda x: x.reshape(states, -1, x.shape[-1])  # noqa: E731
-    M = np.swapaxes(flat(beta), 1, 2) @ flat(m[..., None] * beta) + np.swapaxes(flat(gamma), 1, 2) @ flat(turned(gamma))
-    force, torque = at["force"] - m * a, at["torque"] - turned(alpha) - np.cross(omega, turned(omega))
+    m, I, omega = at["mass"], at["inertia"], at["omega"]
+    turned = lambda x: np.einsum("sbij,sbj->sbi", I, x)  # noqa: E731
+    M = mass_matrix(m, I, beta, gamma)
+    force, torque = at["force"] - m[..., None] * a, at["torque"] - turned(alpha) - np.cross(omega, turned(omega))
     f = np.einsum("sbik,sbi->sk", beta, force) + np.einsum("sbik,sbi->sk", gamma, torque) + at["direct"]
-    udot = _accelerations(M, f, A, drift, structure, kept, list(independent), dependent)
-    return DenseRates(at["qdot"], udot[:, list(independent)], at["events"])
+    return DenseRates(at["qdot"], _accelerations(M, f, A, drift, structure.row_lengths)[:, list(independent)], at["events"])
 
 
-def _accelerations(M, f, A, drift, structure: Structure, kept: list[int], independent: list[int], dependent: list[int]) -> np.ndarray:
-    """`udot = C yddot + c`, in speeds scaled by their inertia and rows by their length."""
-    states, count = f.shape
-    diagonal = np.diagonal(M, axis1=1, axis2=2)
-    scale = np.where(diagonal > 0, 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), 1.0)
+def _accelerations(M, f, A, drift, row_lengths: np.ndarray) -> np.ndarray:
+    """`udot = Z zeta + c`, in speeds scaled by their inertia and rows by their length; NaN where it is not determined."""
+    scale = speed_scales(M)
     M, f, A = scale[:, :, None] * M * scale[:, None], scale * f, A * scale[:, None]
-    if dependent:
-        A, drift = A[:, kept], drift[:, kept]
-        C, c = np.zeros((states, count, len(independent))), np.zeros((states, count))
-        C[:, independent] = np.eye(len(independent))
-        C[:, dependent] = -_from_rows(A[:, :, dependent], A[:, :, independent])
-        c[:, dependent] = -_from_rows(A[:, :, dependent], drift[..., None])[..., 0]
-    elif A.shape[1]:
-        length = np.maximum(np.linalg.norm(A, axis=2), structure.row_lengths)
-        d = np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 1.0)
-        C, c = _null_space(d[..., None] * A, -d * drift)
-    else:
-        C, c = np.tile(np.eye(count), (states, 1, 1)), np.zeros((states, count))
-    S = np.swapaxes(C, 1, 2) @ M @ C
-    lone = np.all(C == 0, axis=1)  # columns that stand for nothing
-    S[:, np.arange(S.shape[1]), np.arange(S.shape[1])] += lone
-    right = np.swapaxes(C, 1, 2) @ (f[..., None] - M @ c[..., None])
-    return scale * ((C @ _solved_definite(S, right))[..., 0] + c)
+    Z, c = np.broadcast_to(np.eye(f.shape[1]), M.shape), np.zeros_like(f)
+    if A.shape[1]:
+        length = np.maximum(np.linalg.norm(A, axis=2), row_lengths)
+        A = A / np.where(length > 0, length, 1.0)[..., None]
+        Z, c = _null_space(A), shortest(A, -drift / np.where(length > 0, length, 1.0), np.ones(A.shape[1]))
+    S = Z.mT @ M @ Z + np.all(Z == 0, axis=1)[:, None] * np.eye(Z.shape[2])  # columns that stand for nothing
+    determined = np.min(np.linalg.eigvalsh(np.nan_to_num(S)), axis=1, initial=1.0) > 16 * S.shape[1] * np.finfo(S.dtype).eps
+    zeta = np.linalg.solve(np.where(determined[:, None, None], S, np.eye(S.shape[1])), Z.mT @ (f[..., None] - M @ c[..., None]))
+    return np.where(determined[:, None], scale * ((Z @ zeta)[..., 0] + c), np.nan)
 
 
-def _null_space(A: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """An orthonormal basis of the null space, in as many columns as there are speeds (the others are zero), and the shortest c with `A c = b`."""
-    finite = np.all(np.isfinite(A), axis=(1, 2)) & np.all(np.isfinite(b), axis=1)
-    U, sigma, V = np.linalg.svd(np.where(finite[:, None, None], A, 0.0), full_matrices=True)
-    counts = sigma > rank_cutoff(A.dtype) * sigma[:, :1]
-    inverse = np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0)
-    most = sigma.shape[1]
-    c = (np.swapaxes(V[:, :most], 1, 2) @ (inverse[..., None] * (np.swapaxes(U[:, :, :most], 1, 2) @ b[..., None])))[..., 0]
-    free = np.arange(A.shape[2]) >= np.count_nonzero(counts, axis=1)[:, None]
-    return np.swapaxes(V, 1, 2) * free[:, None], np.where(finite[:, None], c, np.nan)
-
-
-def _from_rows(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """`A^-1 b` of every state; by least squares where there are more rows than speeds, since rows depend on each other."""
-    if A.shape[1] == A.shape[2]:
-        return _solved(A, b)
-    length = np.linalg.norm(A, axis=2, keepdims=True)
-    d = np.where(length > 0, 1 / np.where(length > 0, length, 1.0), 1.0)
-    finite = np.all(np.isfinite(A), axis=(1, 2), keepdims=True)
-    return np.where(finite, np.linalg.pinv(np.where(finite, d * A, 0.0), rcond=rank_cutoff(A.dtype)) @ (d * b), np.nan)
-
-
-def _solved(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """`A^-1 b` of every state; NaN where there is none."""
-    try:
-        return np.linalg.solve(A, b)
-    except np.linalg.LinAlgError:
-        return np.concatenate([_solved(A[k : k + 1], b[k : k + 1]) for k in range(len(A))]) if len(A) > 1 else np.full(b.shape, np.nan)
-
-
-def _solved_definite(A: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """`A^-1 b` of every state; NaN where A is not positive definite beyond round-off: there the accelerations are not determined."""
-    smallest = np.min(np.linalg.eigvalsh(np.nan_to_num(A)), axis=1, initial=1.0)
-    determined = smallest > 16 * A.shape[1] * np.finfo(A.dtype).eps
-    return np.where(determined[:, None, None], _solved(np.where(determined[:, None, None], A, np.eye(A.shape[1])), b), np.nan)
+def _null_space(A: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of the null space, in as many columns as there are speeds (the others are zero)."""
+    _, sigma, V = np.linalg.svd(np.where(np.all(np.isfinite(A), axis=(1, 2), keepdims=True), A, 0.0), full_matrices=True)
+    rank = np.count_nonzero(sigma > rank_cutoff(A.dtype) * sigma[:, :1], axis=1)
+    return V.mT * (np.arange(A.shape[2]) >= rank[:, None])[:, None]

@@ -2,8 +2,8 @@
 rows, since dependent rows have a solution only there.
 """
 
-from collections.abc import Callable, Sequence
-from functools import cache, partial
+from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 
@@ -18,31 +18,29 @@ LARGE = 16
 STEPS, CLOSED = 12, 1e-9  # of Newton's method
 
 
-def full_turns(probes: Probes, traced: TracedScene, quaternions: Sequence[int]) -> Callable[[], Probes]:
+def full_turns(probes: Probes, traced: TracedScene) -> Callable[[], Probes]:
     """Probes with coordinates up to half a turn away from those given, put onto the geometric rows where Newton's method arrives; made when first asked for.
 
-    `quaternions`: the numbers of the first part of each, which are drawn anew.
+    Quaternions are drawn anew.
     """
-    return cache(lambda: _at_full_turns(probes, traced, quaternions))
+    return cache(lambda: _at_full_turns(probes, traced))
 
 
-def _at_full_turns(probes: Probes, traced: TracedScene, quaternions: Sequence[int]) -> Probes:
+def _at_full_turns(probes: Probes, traced: TracedScene) -> Probes:
     coordinates = traced.q.tolist()
     count, generator = MANY if len(coordinates) <= LARGE else FEW, np.random.default_rng(3)
     places = np.arange(count) % probes.count
     inputs = {name: np.broadcast_to(value, probes.count)[places] for name, value in probes.inputs.items()}
-    attitudes = {first + i for first in quaternions for i in range(4)}
+    attitudes = {first + i for first in traced.quaternions for i in range(4)}
     for i in (i for i in range(len(coordinates)) if i not in attitudes):
         inputs[f"q_{i}"] = inputs[f"q_{i}"] + generator.uniform(-np.pi, np.pi, count)
-    for first in quaternions:
+    for first in traced.quaternions:
         wxyz = generator.normal(size=(4, count))
         inputs |= {f"q_{first + k}": part for k, part in enumerate(wxyz / np.linalg.norm(wxyz, axis=0))}
     graph = probes.graph
-    norms = [graph.sub(graph.total(graph.mul(n, n) for n in coordinates[first : first + 4]), graph.one) for first in quaternions]
-    for name in {str(graph.value[graph.args[n][0]]) for n in range(len(graph.op)) if turns(graph, n)}:
+    for name in sorted({str(graph.value[graph.args[n][0]]) for n in range(len(graph.op)) if turns(graph, n)}):
         inputs[name] = inputs[name] + generator.uniform(-np.pi, np.pi, count)
-    far = probes.with_inputs(inputs)
-    return _on_rows(far, [*traced.at.closure.tolist(), *norms], coordinates)
+    return _on_rows(probes.with_inputs(inputs), traced.closures, coordinates)
 
 
 def _on_rows(probes: Probes, rows: list[int], coordinates: list[int]) -> Probes:
@@ -56,7 +54,7 @@ def _on_rows(probes: Probes, rows: list[int], coordinates: list[int]) -> Probes:
     for _ in range(STEPS):
         here = probes.with_inputs(dict(zip(moved, q, strict=True)))
         values, J = np.nan_to_num(here(rows)), np.nan_to_num(here(slopes))
-        q = q - pattern.shortest(J.T, values.T, partial(np.linalg.pinv, rcond=1e-9)).T
+        q = q - pattern.shortest(J.T, values.T, lambda J, g: (np.linalg.pinv(J, rcond=1e-9) @ g[..., None])[..., 0]).T
         if np.median(np.max(np.abs(values), axis=0)) < CLOSED:
             break
     left = np.max(np.abs(probes.with_inputs(dict(zip(moved, q, strict=True)))(rows)), axis=0)

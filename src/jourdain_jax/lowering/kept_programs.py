@@ -1,6 +1,6 @@
 """Scalar programs as text, and back: of the graph only the nodes that the program needs, so that it is the same whether it was kept or built just now."""
 
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 
@@ -33,9 +33,8 @@ def program_as_text(found: Lowered) -> bytes:
     return as_text([rows, place[of.t], nodes[of.q], nodes[of.u], nodes[of.inputs], [np.asarray(nodes[x]) for x in of.parameters], told])
 
 
-def program_from_text(text: bytes, seconds: float) -> Lowered:
-    """The program; `seconds`: that it took to get it."""
+def program_from_text(text: bytes) -> Lowered:
+    """The program."""
     rows, t, q, u, inputs, parameters, told = from_text(text)
     variables = Variables(Graph.of_rows(rows), t, q, u, inputs, list(parameters))
-    found = Lowered(traced=variables, **told | {"stages": tuple(Stage(*stage) for stage in told["stages"])})
-    return replace(found, seconds=seconds)
+    return Lowered(traced=variables, **told | {"stages": tuple(Stage(*stage) for stage in told["stages"])})

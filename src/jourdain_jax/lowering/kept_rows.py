@@ -5,31 +5,54 @@ C' M C ydot = C' (f - M c)                                                      
 z <- z + dz,   A_z dz = -phi(t, q, u)         speeds put back onto the rows
 """
 
-import numpy as np
-
 from jourdain_jax.build.structure import Structure
 from jourdain_jax.lowering.elimination import eliminate, solve_symmetric
 from jourdain_jax.lowering.multipliers import Accelerations, Columns, accelerations_by_multipliers, projected_speeds, with_inertia_of_rows
-from jourdain_jax.program.derivative import columns
+from jourdain_jax.program.derivative import matrix
 from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.polynomial import NormalForms
 
 
-class Partition:
-    """Speeds divided into the `independent` ones (numbers) and all others; pivots are judged at `probes` and, where needed, `far`."""
+class KeptRows:
+    """How they are kept. `massless`: M may be singular; pivots of privileged speeds are judged at `probes` and, where needed, `far`."""
 
-    def __init__(self, graph: Graph, independent, probes, far):
-        self.graph, self.independent, self.probes, self.far = graph, tuple(independent), probes, far
+    def __init__(self, graph: Graph, structure: Structure, massless: bool, probes, far):
+        self.graph, self.probes, self.far, self.independent = graph, probes, far, structure.independent
+        self.by_partition = (massless or structure.dependent_rows) and structure.well_conditioned
+        self.massless = massless and not self.by_partition
+
+    @property
+    def description(self) -> str:
+        """How the rows are kept, in words."""
+        if self.by_partition:
+            return "all speeds in the state, their accelerations by privileged ones"
+        return "rows kept by multipliers, by elimination" + (", with inertia along the rows" if self.massless else "")
+
+    def accelerations(self, M: Columns, f: list[int], A: Columns, drift: list[int], forms: NormalForms) -> Accelerations:
+        """The accelerations under all rows, and what must not vanish on the way."""
+        if self.by_partition:
+            return self._accelerations_by_partition(M, f, A, drift, forms)
+        return accelerations_by_multipliers(self.graph, self._inertia(M, A), f, A, drift, self.probes, forms)
+
+    def projected_speeds(self, M: Columns, u: list[int], phi: list[int], forms: NormalForms) -> list[int]:
+        """The speeds on `phi = 0`; where privileged speeds serve, these as they are."""
+        A = matrix(self.graph, phi, u)
+        if not self.by_partition:
+            return projected_speeds(self.graph, self._inertia(M, A), A, u, phi, forms)
+        dependent, moved = self._dependent(len(u)), list(u)
+        change = eliminate(self.graph, [[row[k] for k in dependent] for row in A], [[self.graph.neg(n)] for n in phi], self.probes, self.far).solution
+        for k, (dz,) in zip(dependent, change, strict=True):
+            moved[k] = self.graph.add(u[k], dz)
+        return moved
 
     def _dependent(self, count: int) -> list[int]:
         return [k for k in range(count) if k not in self.independent]
 
-    def accelerations(self, M: Columns, f: list[int], A: Columns, drift: list[int], forms=None) -> Accelerations:
-        """The accelerations under all rows."""
+    def _accelerations_by_partition(self, M: Columns, f: list[int], A: Columns, drift: list[int], forms: NormalForms) -> Accelerations:
         graph, speeds, dependent = self.graph, range(len(f)), self._dependent(len(f))
-        simple = (lambda n: n) if forms is None else forms.simplified
         right = [[*(graph.neg(row[k]) for k in self.independent), graph.neg(d)] for row, d in zip(A, drift, strict=True)]
         found = eliminate(graph, [[row[k] for k in dependent] for row in A], right, self.probes, self.far)
-        by_speed = {k: [simple(n) for n in row] for k, row in zip(dependent, found.solution, strict=True)}
+        by_speed = {k: forms.all_simplified(row) for k, row in zip(dependent, found.solution, strict=True)}
         freedoms = range(len(self.independent))
         for i, k in enumerate(self.independent):
             by_speed[k] = [graph.one if j == i else graph.zero for j in (*freedoms, None)]
@@ -39,55 +62,9 @@ class Partition:
         inertia = [[graph.zero] * len(C) for _ in C]
         for i in freedoms:
             for j in range(i + 1):
-                inertia[i][j] = inertia[j][i] = simple(graph.dot(C[i], moved[j]))
-        ydot = solve_symmetric(graph, inertia, [[simple(graph.dot(column, rest)) for column in C]]).solution[0]
+                inertia[i][j] = inertia[j][i] = forms.simplified(graph.dot(C[i], moved[j]))
+        ydot = solve_symmetric(graph, inertia, [[forms.simplified(graph.dot(column, rest)) for column in C]]).solution[0]
         return Accelerations([graph.add(graph.dot([column[k] for column in C], ydot), c[k]) for k in speeds], found.pivots, [], {})
 
-    def projected_speeds(self, u: list[int], phi: list[int]) -> list[int]:
-        """The speeds on `phi = 0`, the independent ones as they are."""
-        graph, dependent = self.graph, self._dependent(len(u))
-        by_speed = columns(graph, phi, [u[k] for k in dependent])
-        A_z = [list(row) for row in zip(*by_speed, strict=True)]
-        change = eliminate(graph, A_z, [[graph.neg(n)] for n in phi], self.probes, self.far).solution
-        moved = list(u)
-        for k, (dz,) in zip(dependent, change, strict=True):
-            moved[k] = graph.add(u[k], dz)
-        return moved
-
-
-class KeptRows:
-    """How they are kept. `massless`: M may be singular; `probes`, `far`: as in `Partition`."""
-
-    def __init__(self, graph: Graph, structure: Structure, massless: bool, probes, far):
-        self.graph, self.probes = graph, probes
-        self.by_partition = (massless or structure.dependent_rows) and structure.well_conditioned
-        self.massless = massless and not self.by_partition
-        self._partition = Partition(graph, structure.independent, probes, far)
-
-    @property
-    def description(self) -> str:
-        """How the rows are kept, in words."""
-        if self.by_partition:
-            return "all speeds in the state, their accelerations by privileged ones"
-        return "rows kept by multipliers, by elimination" + (", with inertia along the rows" if self.massless else "")
-
-    def accelerations(self, M: Columns, f: list[int], A: Columns, drift: list[int], forms=None) -> Accelerations:
-        """The accelerations under all rows, and what must not vanish on the way."""
-        if self.by_partition:
-            return self._partition.accelerations(M, f, A, drift, forms)
-        return accelerations_by_multipliers(self.graph, self._inertia(M, A), f, A, drift, self.probes, forms)
-
-    def projected_speeds(self, M: Columns, u: list[int], phi: list[int], forms=None) -> list[int]:
-        """The speeds on `phi = 0`."""
-        if self.by_partition:
-            return self._partition.projected_speeds(u, phi)
-        A = [list(row) for row in zip(*columns(self.graph, phi, u), strict=True)]
-        return projected_speeds(self.graph, self._inertia(M, A), u, phi, forms)
-
     def _inertia(self, M: Columns, A: Columns) -> Columns:
-        """M, with inertia added along the rows where it may be singular: of the size of its own."""
-        if not self.massless:
-            return M
-        heavy = np.nanmedian(np.max(np.abs(self.probes([row[i] for i, row in enumerate(M)])), axis=0))
-        sizes = [np.nanmedian(np.sum(self.probes(row) ** 2, axis=0)) for row in A]
-        return with_inertia_of_rows(self.graph, M, A, [float(2.0 ** np.round(np.log2(heavy / size))) if size > 0 else 1.0 for size in sizes])
+        return with_inertia_of_rows(self.graph, M, A, self.probes) if self.massless else M

@@ -4,8 +4,9 @@ one with the fewest operations is kept. A scene that cannot be lowered says why.
 
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import islice
 
 import jax
 import jax.numpy as jnp
@@ -53,7 +54,7 @@ def lowered(scene: Scene, every_speed: bool | None = None) -> Lowered | NotLower
     every_speed = not structure.has_minimal_state if every_speed is None else every_speed
     every_speed = every_speed or not structure.row_names
     massless = bool(every_speed and structure.row_names) and may_be_massless(scene, structure)
-    return _lowered(_Key(with_reference_parameters(scene), structure, every_speed, massless))
+    return _lowered(_Key.of(with_reference_parameters(scene), structure, every_speed, massless))
 
 
 def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
@@ -72,22 +73,24 @@ def lower(scene: Scene | BuiltFor, every_speed: bool | None = None) -> Lowered:
     return found
 
 
+@dataclass(frozen=True)
 class _Key:
-    """What the program depends on: not on the values of parameters."""
+    """What the program depends on, compared by `key`: not on the values of parameters."""
 
-    def __init__(self, scene: Scene, structure: Structure, every_speed: bool, massless: bool):
-        self.scene, self.structure, self.every_speed, self.massless = scene, structure, every_speed, massless
+    key: tuple
+    scene: Scene = field(compare=False)
+    structure: Structure = field(compare=False)
+    every_speed: bool = field(compare=False)
+    massless: bool = field(compare=False)
+
+    @staticmethod
+    def of(scene: Scene, structure: Structure, every_speed: bool, massless: bool) -> "_Key":
+        """That of a scene whose parameters are known."""
         leaves, treedef = jax.tree.flatten(scene)
         kept = (every_speed, None if every_speed else structure.independent, structure.redundant_rows, structure.affine, structure.driven)
         kept += (structure.homogeneous, structure.potentials_of_inputs, structure.may_set_in, massless)
         kept += (structure.dependent_rows, structure.well_conditioned and structure.independent) if every_speed else ()
-        self.key = (treedef, tuple(np.shape(x) for x in leaves), kept, jnp.result_type(float))
-
-    def __hash__(self):
-        return hash(self.key)
-
-    def __eq__(self, other):
-        return self.key == other.key
+        return _Key((treedef, tuple(np.shape(x) for x in leaves), kept, jnp.result_type(float)), scene, structure, every_speed, massless)
 
 
 @lru_cache(maxsize=256)
@@ -108,44 +111,40 @@ def _built_or_kept(key: _Key) -> Lowered:
         return program_as_text(built[0])
 
     found = kept_of_scene("program", key.scene, text, key.structure.potentials_of_inputs, as_text(vars(key.structure)), key.every_speed, key.massless)
-    return program_from_text(found, time.perf_counter() - begin) if found else built[0]
+    return replace(program_from_text(found) if found else built[0], seconds=time.perf_counter() - begin)
 
 
 def _built(key: _Key) -> Lowered:
-    begin = time.perf_counter()
-    structure = key.structure
-    if not (structure.affine or key.every_speed):
+    scene, structure, every_speed = key.scene, key.structure, key.every_speed
+    if not (structure.affine or every_speed):
         raise NotLowered("its rows are nonlinear in the speeds")
     if structure.may_set_in:
         named = ", ".join(f"`{name}`" for name in structure.may_set_in)
         raise NotLowered(f"rows {named} follow from the others at all probed states, but nothing says that they do elsewhere or later")
-    if key.every_speed and structure.dependent_rows and not structure.well_conditioned:
+    if every_speed and structure.dependent_rows and not structure.well_conditioned:
         raise NotLowered("its rows depend on each other, though none may be left out everywhere")
     try:
-        return _program(key, begin)
+        traced = traced_scene(scene, structure.potentials_of_inputs)
+        _check_calls(traced)
+        probes = _probes(scene, structure, traced)
+        if every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
+            probes = on_velocity_rows(probes, traced, structure.affine)
+        far = full_turns(probes, traced)
+        kept = KeptRows(traced.graph, structure, key.massless, probes, far) if every_speed and structure.row_names else None
+        return _best(scene, structure, AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference()))
     except Unsupported as reason:
         raise NotLowered(f"{reason} has no scalar form") from None
     except ZeroDivisionError:
         raise NotLowered("its rows are dependent in a way that no elimination order avoids") from None
 
 
-def _program(key: _Key, begin: float) -> Lowered:
-    scene, structure = key.scene, key.structure
-    traced = traced_scene(scene, structure.potentials_of_inputs)
+def _check_calls(traced: TracedScene) -> None:
     if traced.effects:
         raise Unsupported(traced.effects)
     for call in traced.graph.calls(n for part in traced.motion for n in part.ravel().tolist()):
         if loop := traced.graph.value[call].loop:
             # measured: a ball on a hill, whose point of contact is found by Newton's method, takes four times as long as by dense matrices
             raise Unsupported(f"the operation `{loop}`")
-    probes = _probes(scene, structure, traced)
-    if key.every_speed and len(structure.row_names) > structure.rank:  # elsewhere they contradict each other
-        probes = on_velocity_rows(probes, traced, structure.affine)
-    quaternions = tuple(first for first, _ in scene.coordinates.quaternions)
-    far = full_turns(probes, traced, quaternions)
-    kept = KeptRows(traced.graph, structure, key.massless, probes, far) if key.every_speed and structure.row_names else None
-    builder = AppellOnGraph(traced, structure, kept, probes, far, scene.coordinates.reference(), quaternions)
-    return _best(scene, structure, builder, begin)
 
 
 def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
@@ -172,7 +171,7 @@ def _probes(scene: Scene, structure: Structure, traced: TracedScene) -> Probes:
     return larger if finite.all() else probes(np.where(finite, 1.0, -1.0))
 
 
-def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: float) -> Lowered:
+def _best(scene: Scene, structure: Structure, builder: AppellOnGraph) -> Lowered:
     graph, probes = builder.graph, builder.probes
     first = Strategy(explicit=bool(builder.multiplied))
     best, way = builder.build(first), first
@@ -193,13 +192,14 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         if count < fewest and agree(values_at(candidate, probes), expected):
             best, fewest, way = candidate, count, strategy
     stages.append(Stage("normal forms modulo sin^2 + cos^2 = 1, common factors taken out", fewest))
-    put_back = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
-    groups = [best.qdot, best.ydot, best.z, best.pivots, best.guards, [best.power], best.events, best.energies, put_back.q, put_back.u]
-    outputs = graph.with_quotients(_with_equal_calls_once(builder.identity_probes, [n for group in groups for n in group]))
-    ends = np.cumsum([len(group) for group in groups])
-    parts = (tuple(outputs[end - len(group) : end]) for end, group in zip(ends, groups, strict=True))
-    qdot, ydot, z, pivots, guards, power, events, energies, put_q, put_u = parts
-    sizes = {graph.input(f"usual_pivot_{k}", False): n for k, n in enumerate(pivots)}
+    put_q, put_u = builder.projection(MOST_TERMS if fewest < SMALL else 0, held)
+    groups = {name: getattr(best, name) for name in ("qdot", "ydot", "z", "pivots", "guards", "power", "events", "energies")}
+    groups |= {"power": [best.power], "projected_q": put_q, "projected_u": put_u}
+    outputs = graph.with_quotients(_with_equal_calls_once(builder.identity_probes, [n for group in groups.values() for n in group]))
+    rest = iter(outputs)
+    nodes = {name: tuple(islice(rest, len(group))) for name, group in groups.items()}
+    (power,) = nodes.pop("power")
+    sizes = {graph.input(f"usual_pivot_{k}", False): n for k, n in enumerate(nodes["pivots"])}
     stands_for = best.usual | sizes
     names = scene.coordinate_names.entries
     leaves = tuple(jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(scene)[0])
@@ -215,26 +215,18 @@ def _best(scene: Scene, structure: Structure, builder: AppellOnGraph, begin: flo
         inputs=scene.inputs.entries,
         independent=tuple(builder.independent),
         dependent=tuple(builder.dependent),
-        qdot=qdot,
-        ydot=ydot,
-        z=z,
-        pivots=pivots,
         sizes=tuple(sizes),
-        guards=guards,
-        power=None if structure.driven else power[0],
-        events=events,
-        energies=energies,
-        projected_q=put_q,
-        projected_u=put_u,
+        power=None if structure.driven else power,
         by_partition=builder.kept is not None and builder.kept.by_partition,
         left_out=structure.redundant_rows,
         held=tuple(names[i] for i in held),
         stages=tuple(stages),
         way=builder.kept.description if builder.kept else way.description,
-        seconds=time.perf_counter() - begin,
+        seconds=0.0,  # not known yet
         fixed=graph.fixed([*outputs, *sizes]),
         usual=stands_for,
         states=_some_states(graph, probes, stands_for.values()),
+        **nodes,
     )
 
 

@@ -146,7 +146,7 @@ class Lowered:
 
         `fixed`, `t` (s), `q`, `y`, `inputs`, `with_power`: as in `rates`.
         """
-        found = list((self._with_power if with_power else self._without_power)(*self._known(fixed, t, q, y, inputs).values()))
+        found = list(self._program_of_rates(with_power)(*self._known(fixed, t, q, y, inputs).values()))
         count = len(found) - len(self.pivots)
         pivots = tuple(value / size for value, size in zip(found[count:], self.pivot_sizes(fixed), strict=True))
         count -= len(self.guards)
@@ -157,16 +157,12 @@ class Lowered:
         return tuple(found[:at]), tuple(found[at : at + len(self.ydot)]), power, pivots
 
     @functools.cached_property
-    def _without_power(self) -> Callable[..., tuple]:
-        return self._rates_and([])
+    def _program_of_rates(self) -> Callable[[bool], Callable[..., tuple]]:
+        def made(with_power: bool):
+            outputs = [*self.qdot, *self.ydot, *([self.power] if with_power and self.power is not None else []), *self.guards]
+            return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, monitored=self.pivots)
 
-    @functools.cached_property
-    def _with_power(self) -> Callable[..., tuple]:
-        return self._rates_and([] if self.power is None else [self.power])
-
-    def _rates_and(self, more: list[int]) -> Callable[..., tuple]:
-        outputs = [*self.qdot, *self.ydot, *more, *self.guards]
-        return differentiable(self.graph, outputs, self.variables, like=len(self.fixed) + 1, monitored=self.pivots)
+        return functools.cache(made)
 
     @property
     def variables(self) -> list[int]:

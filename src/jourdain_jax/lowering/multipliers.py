@@ -19,12 +19,12 @@ import numpy as np
 
 from jourdain_jax.calculus.pseudo_inverse import undecided
 from jourdain_jax.lowering.elimination import quotient, solve_symmetric
-from jourdain_jax.program.derivative import columns
+from jourdain_jax.program.derivative import matrix
 from jourdain_jax.program.evaluate import Probes
 from jourdain_jax.program.graph import Graph
+from jourdain_jax.program.polynomial import NormalForms
 
 Columns = list[list[int]]
-
 
 LEAST = 1e-4  # sine, or length of a row beside its usual one: below it rows count as dependent, and the program does not serve
 
@@ -38,14 +38,14 @@ class Accelerations(NamedTuple):
     usual: dict[int, int]  # inputs for the usual value of an entry, with the node of that entry
 
 
-def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], probes: Probes, forms=None) -> Accelerations:
+def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Columns, drift: list[int], probes: Probes, forms: NormalForms) -> Accelerations:
     """The accelerations under all rows; at `probes` usual entries are found."""
     *impulses, free = (list(column) for column in solve_symmetric(graph, M, [*A, f]).solution)  # M^-1 A' column by column, M^-1 f
     S = _products(graph, A, impulses, forms)
     for r in range(len(A)):
         alone = all(S[r][s] == graph.zero for s in range(len(A)) if s != r)
         if alone and not graph.varies[S[r][r]]:  # the entry is divided out where it costs nothing
-            impulses[r] = [n if forms is None else forms.simplified(n) for n in (quotient(graph, n, S[r][r]) for n in impulses[r])]
+            impulses[r] = [forms.simplified(quotient(graph, n, S[r][r])) for n in impulses[r]]
             S[r][r] = graph.one
     right = [graph.neg(graph.add(d, graph.dot(row, free))) for d, row in zip(drift, A, strict=True)]
     solved = solve_symmetric(graph, S, [right])
@@ -63,10 +63,13 @@ def accelerations_by_multipliers(graph: Graph, M: Columns, f: list[int], A: Colu
     return Accelerations(udot, sines, margins, usual)
 
 
-def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, weights: list[float]) -> Columns:
-    """`M + A' W A`, positive definite where M is for the velocities that the rows admit."""
+def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, probes: Probes) -> Columns:
+    """`M + A' W A`, positive definite where M is for the velocities that the rows admit; the inertia that is added is of the size of M's own."""
     made, speeds = [list(row) for row in M], range(len(M))
-    for w, row in zip(weights, A, strict=True):
+    heavy = np.nanmedian(np.max(np.abs(probes([row[i] for i, row in enumerate(M)])), axis=0))
+    for row in A:
+        size = np.nanmedian(np.sum(probes(row) ** 2, axis=0))
+        w = float(2.0 ** np.round(np.log2(heavy / size))) if size > 0 else 1.0
         weighted = [graph.mul(graph.const(w), n) for n in row]
         for i in (i for i in speeds if row[i] != graph.zero):
             for j in (j for j in speeds if row[j] != graph.zero):
@@ -76,25 +79,23 @@ def with_inertia_of_rows(graph: Graph, M: Columns, A: Columns, weights: list[flo
 
 def projected_coordinates(graph: Graph, q: list[int], closure: list[int]) -> list[int]:
     """One step of Gauss-Newton towards `closure = 0`."""
-    G = [list(row) for row in zip(*columns(graph, closure, q), strict=True)]
-    correction = solve_symmetric(graph, _products(graph, G, G), [closure]).solution[0]
+    G = matrix(graph, closure, q)
+    correction = solve_symmetric(graph, _products(graph, G, G, NormalForms(graph, 0)), [closure]).solution[0]
     return [graph.sub(n, graph.total(graph.mul(row[k], c) for row, c in zip(G, correction, strict=True))) for k, n in enumerate(q)]
 
 
-def projected_speeds(graph: Graph, M: Columns, u: list[int], phi: list[int], forms=None) -> list[int]:
+def projected_speeds(graph: Graph, M: Columns, A: Columns, u: list[int], phi: list[int], forms: NormalForms) -> list[int]:
     """The speeds on `phi = 0`, nearest in the metric of M."""
-    A = [list(row) for row in zip(*columns(graph, phi, u), strict=True)]
     impulses = solve_symmetric(graph, M, A).solution
     multipliers = solve_symmetric(graph, _products(graph, A, impulses, forms), [phi]).solution[0]
     return [graph.sub(n, graph.total(graph.mul(x[k], m) for x, m in zip(impulses, multipliers, strict=True))) for k, n in enumerate(u)]
 
 
-def _products(graph: Graph, A: Columns, X: Columns, forms=None) -> Columns:
+def _products(graph: Graph, A: Columns, X: Columns, forms: NormalForms) -> Columns:
     """`A X'`, which is symmetric; zero where no speed is shared."""
-    simple = (lambda n: n) if forms is None else forms.simplified
     S = [[graph.zero] * len(A) for _ in A]
     used = [[k for k, n in enumerate(row) if n != graph.zero] for row in A]
     for r in range(len(A)):
         for s in range(r + 1):
-            S[r][s] = S[s][r] = simple(graph.total(graph.mul(A[r][k], X[s][k]) for k in used[r]))
+            S[r][s] = S[s][r] = forms.simplified(graph.total(graph.mul(A[r][k], X[s][k]) for k in used[r]))
     return S

@@ -28,7 +28,6 @@ REGULAR = 0.02  # smallest singular value of a scaled system that a pivot has to
 TERMS = 32  # of a determinant in normal form
 FEW = 12  # equations: with more, the operations that lead to a pivot are not counted when it is chosen
 LIKE = 8.0  # rows whose sizes differ by more are combined with weights
-MOST_SIGNED = 5  # equations: of so many, rows combined keep the sign of their determinant
 
 
 @dataclass(frozen=True)
@@ -63,8 +62,6 @@ class Pivots:
         self._entries: dict[int, list[int]] = {}  # columns of a row that hold something
         self._judged: dict[int, dict[int, _Entry]] = {}
         self._determinants: dict[tuple[int, int, int, int], int | None] = {}  # of two rows and columns, where it serves as a pivot
-        self._combined: list[Pivot] = []  # by columns, since a determinant is known
-        self._determinant: int | None = None
 
     def eliminated(self, pivot: Pivot) -> None:
         """Subtract multiples of the pivot's rows from the rows that are left."""
@@ -100,8 +97,6 @@ class Pivots:
     def best(self) -> Pivot:
         """The next pivot. Rows may be combined for it."""
         graph, A, rows = self.graph, self.A, self.rows
-        if self._determinant is not None:
-            return self._by_column(None)
         judged = [(r, c, entry) for r in sorted(rows) for c, entry in self._judged_row(r).items()]
         if not judged:
             raise ZeroDivisionError("the rows are dependent")
@@ -231,13 +226,13 @@ class Pivots:
 
     # rows combined
 
-    def _by_column(self, single: tuple[int, int] | None) -> Pivot:
+    def _by_column(self, single: tuple[int, int]) -> Pivot:
         """One column by all rows that hold it, combined; the entry at the place `single` where that is no better."""
         graph, A, regular = self.graph, self.A, self._regular
         found = []
         for c in sorted(self.columns):
             users = [r for r in sorted(self.rows) if A[r][c] != graph.zero]
-            if not users or (len(users) == 1 and single is not None):
+            if len(users) < 2:
                 continue
             weights = self._weights(users)
             terms = [graph.mul(graph.const(w), graph.mul(A[r][c], A[r][c])) for r, w in zip(users, weights, strict=True)]
@@ -247,24 +242,11 @@ class Pivots:
                 worst = _least(np.sqrt(self._at([squares])[0] / size)[regular])
             fill = len({k for r in users for k in self.columns if A[r][k] != graph.zero}) * len(users)
             found.append((worst <= GOOD, graph.varies[squares], fill, -worst, c, users, weights, squares))
-        if single is not None and (not found or -min(found)[3] <= _least(np.abs(self._beside_row(single))[regular])):
+        if not found or -min(found)[3] <= _least(np.abs(self._beside_row(single))[regular]):
             return self._single(*single)
-        if not found:
-            raise ZeroDivisionError("the rows are dependent")
         *_, c, users, weights, squares = min(found)
-        if len(users) == 1:
-            pivot = self._single(users[0], c)
-        elif len(users) == 2 and not self._tall_left:
-            pivot = self._turned(c, users, weights, squares)
-        else:
-            if single is not None and not self._tall_left and len(self.columns) <= MOST_SIGNED:
-                self._determinant = self._determinant_left()
-            pivot = self._orthogonal(c, users, weights, squares)
-        return self._signed(pivot)
-
-    @property
-    def _tall_left(self) -> bool:
-        return len(self.rows) > len(self.columns)
+        combined = self._turned if len(users) == 2 and len(self.rows) <= len(self.columns) else self._orthogonal
+        return combined(c, users, weights, squares)
 
     def _weights(self, rows: list[int]) -> list[float]:
         """The weights of rows in a combination: one where their sizes are alike."""
@@ -313,30 +295,6 @@ class Pivots:
         self.rows.add(new)
         self._tall = True
         return self._single(new, c, graph.call("sqrt", squares))
-
-    def _determinant_left(self) -> int:
-        """The determinant of the rows and columns that are left, by minors."""
-        graph, rows, columns = self.graph, sorted(self.rows), sorted(self.columns)
-        minors: dict[tuple[int, ...], int] = {(): graph.one}
-        for size, r in enumerate(rows, 1):
-            more = {}
-            for chosen in combinations(columns, size):
-                signed = ((graph.mul(self.A[r][c], minors[(*chosen[:k], *chosen[k + 1 :])]), (k + size) % 2) for k, c in enumerate(chosen))
-                more[chosen] = graph.total(n if odd else graph.neg(n) for n, odd in signed)
-            minors = more
-        return minors[tuple(columns)]
-
-    def _signed(self, pivot: Pivot) -> Pivot:
-        """The last of the pivots whose rows were combined gets the sign of the determinant, of which they are the factors."""
-        if self._determinant is None:
-            return pivot
-        self._combined.append(pivot)
-        if len(self.columns) > 1:
-            return pivot
-        others = self.graph.one
-        for other in self._combined[:-1]:
-            others = self.graph.mul(others, other.monitored)
-        return Pivot(pivot.rows, pivot.columns, pivot.inverse, self.graph.div(self._determinant, others))
 
 
 def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.ndarray:

@@ -11,7 +11,7 @@ from jourdain_jax.build.smoothness import SPEEDS_WOULD_JUMP
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.jumps import jumps
 from jourdain_jax.calculus.reals import is_traced, real_type
-from jourdain_jax.eager.numpy_backend import uncompiled
+from jourdain_jax.eager.lanes import uncompiled
 from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.motion.inputs import Constant, Inputs, Sampled, inputs_at
 from jourdain_jax.program.roughness import may_bend

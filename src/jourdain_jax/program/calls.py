@@ -16,7 +16,7 @@ from jax.extend.core import Literal, jaxpr_as_fun
 
 from jourdain_jax.calculus.jaxprs import loops
 from jourdain_jax.calculus.reals import is_array
-from jourdain_jax.eager.numpy_backend import uncompiled
+from jourdain_jax.eager.lanes import uncompiled
 from jourdain_jax.program.graph import Unsupported
 
 
@@ -139,26 +139,50 @@ AT_PROBES: dict[str, Callable] = {
 }
 
 
-def description(x) -> Hashable:
-    """What tells a jaxpr, or a parameter of an operation, from another; two traces of one function have the same, unless they hold new functions."""
-    if hasattr(x, "consts") and hasattr(x, "jaxpr"):
-        return "closed", description(x.jaxpr), tuple(map(description, x.consts))
-    if hasattr(x, "eqns"):
-        number = {v: k for k, v in enumerate([*x.constvars, *x.invars])}
-        lines: list = [tuple(str(v.aval) for v in number)]
-        for equation in x.eqns:
-            inputs = tuple(description(v.val) if isinstance(v, Literal) else number[v] for v in equation.invars)
-            number |= {v: len(number) + k for k, v in enumerate(equation.outvars)}
-            lines.append((equation.primitive, inputs, description(equation.params), tuple(str(v.aval) for v in equation.outvars)))
-        return *lines, tuple(description(v.val) if isinstance(v, Literal) else number[v] for v in x.outvars)
-    if isinstance(x, dict):
-        return tuple((key, description(value)) for key, value in sorted(x.items()))
-    if isinstance(x, tuple | list):
-        return tuple(map(description, x))
-    if is_array(x) or isinstance(x, float):
-        return str(np.asarray(x).dtype), np.shape(x), np.asarray(x).tobytes()
+_SEVERAL = tuple, list  # a union of types is made anew wherever it stands
+
+
+def _itself(x) -> Hashable:
     try:
         hash(x)
     except TypeError:
         return id(x)
     return x
+
+
+def description(x, details: Callable = lambda equation: equation.params, of_other: Callable = _itself) -> Hashable:
+    """What tells a jaxpr, or a parameter of an operation, from another; two traces of one function have the same, unless they hold new functions.
+
+    `details`: what tells an equation from others of the same operation; `of_other`: what tells a thing from others that is neither jaxpr nor array nor tuple.
+    """
+
+    def of(x) -> Hashable:
+        if isinstance(x, _SEVERAL):
+            return tuple(map(of, x))
+        if isinstance(x, dict):
+            return tuple((key, of(value)) for key, value in sorted(x.items()))
+        if hasattr(x, "consts") and hasattr(x, "jaxpr"):
+            return "closed", of(x.jaxpr), tuple(map(of, x.consts))
+        if hasattr(x, "eqns"):
+            return of_jaxpr(x)
+        if (is_array(x) and not np.asarray(x).dtype.hasobject) or isinstance(x, float):
+            return str(np.asarray(x).dtype), np.shape(x), np.asarray(x).tobytes()
+        return of_other(x)
+
+    def of_jaxpr(x) -> Hashable:
+        number = {v: k for k, v in enumerate([*x.constvars, *x.invars])}
+        atom = lambda v: of(np.asarray(v.val, v.aval.dtype)) if isinstance(v, Literal) else number[v]  # noqa: E731
+        lines: list = [tuple(_said(v.aval) for v in number)]
+        for equation in x.eqns:
+            inputs = tuple(map(atom, equation.invars))
+            number |= {v: len(number) + k for k, v in enumerate(equation.outvars)}
+            lines.append((equation.primitive, inputs, of(details(equation)), tuple(_said(v.aval) for v in equation.outvars)))
+        return *lines, tuple(map(atom, x.outvars))
+
+    return of(x)
+
+
+@functools.lru_cache(maxsize=1024)
+def _said(aval) -> str:
+    """Type and shape as text, which JAX makes anew each time."""
+    return str(aval)

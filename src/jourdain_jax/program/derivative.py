@@ -10,16 +10,7 @@ from jourdain_jax.program.graph import Graph
 
 def derivatives(graph: Graph, outputs: Iterable[int], direction: dict[int, int]) -> list[int]:
     """d output/ds for each output, where `direction[n]` is dn/ds; a node in `direction` is not looked into."""
-    outputs = list(outputs)
-    tangent: dict[int, int] = {}
-    for node in graph.reachable(outputs):
-        if node in direction:
-            tangent[node] = direction[node]
-        elif not graph.args[node]:
-            tangent[node] = graph.zero
-        else:
-            tangent[node] = _derivative(graph, node, [tangent[a] for a in graph.args[node]])
-    return [tangent[n] for n in outputs]
+    return [rates.get(0, graph.zero) for rates in directional_derivative(graph, outputs, {0: direction})]
 
 
 def jacobian(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[dict[int, int]]:
@@ -96,6 +87,12 @@ def columns(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> l
     """Derivatives of all outputs with respect to each variable: the columns of the Jacobian, zeros among them."""
     variables, rows = list(variables), jacobian(graph, outputs, variables)
     return [[row.get(n, graph.zero) for row in rows] for n in variables]
+
+
+def matrix(graph: Graph, outputs: Iterable[int], variables: Iterable[int]) -> list[list[int]]:
+    """The Jacobian row by row, zeros among them."""
+    variables = list(variables)
+    return [[row.get(n, graph.zero) for n in variables] for row in jacobian(graph, outputs, variables)]
 
 
 def _derivative(graph: Graph, node: int, dots: list):

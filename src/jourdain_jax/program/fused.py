@@ -6,8 +6,9 @@ loop, though; so each value is reduced with a zero beside it. To JAX this is the
 
 import jax.numpy as jnp
 from jax import lax
-from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+
+from jourdain_jax.calculus.identities import identity
 
 
 def fused(values: tuple) -> tuple:
@@ -38,12 +39,8 @@ def _batched(values, axes):
     return [next(found[axis]) for axis in new_axes], new_axes
 
 
-fused_p = Primitive("fused")
-fused_p.multiple_results = True
-fused_p.def_impl(lambda *values: list(values))
-fused_p.def_abstract_eval(lambda *avals: list(avals))
+fused_p = identity("fused")
 ad.primitive_jvps[fused_p] = _jvp
 ad.primitive_transposes[fused_p] = _transpose
 batching.primitive_batchers[fused_p] = _batched
-mlir.register_lowering(fused_p, mlir.lower_fun(lambda *values: list(values), multiple_results=True))
 mlir.register_lowering(fused_p, mlir.lower_fun(_reduced_with_zeros, multiple_results=True), platform="cpu")

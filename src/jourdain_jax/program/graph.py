@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from jourdain_jax.calculus.scalar_operations import BRANCHES, TABLE
+from jourdain_jax.calculus.scalar_operations import TABLE
 
 MOST_NODES = 500_000  # of one graph: some seconds of building
 MOST_FACTORS = 8  # of a product that is looked at for squares of sines
@@ -342,10 +342,6 @@ class Graph:
         found = {a for n in self.reachable(outputs) if self.varies[n] for a in self.args[n]} | set(outputs)
         return tuple(sorted(n for n in found if not self.varies[n] and not self.is_const(n)))
 
-    def looked_at(self, outputs: Iterable[int]) -> list[int]:
-        """What decides between branches on the way to the outputs: arguments of comparisons, magnitudes and signs."""
-        return [a for node in self.reachable(outputs) if self.op[node] in BRANCHES for a in self.args[node]]
-
     def with_quotients(self, outputs: Iterable[int]) -> list[int]:
         """The outputs with `a (1/b)` as one division, where `1/b` serves only once."""
         outputs = list(outputs)
@@ -356,15 +352,13 @@ class Graph:
         new: dict[int, int] = {}
         for node in self.reachable(outputs):
             args = self.args[node]
-            divided = [(a, self.args[b][1]) for a, b in (args, args[::-1]) if self._divides_once(b, uses, outputs)] if self._is_product(node) else []
+            products = (args, args[::-1]) if self.op[node] == "mul" and self.varies[node] else ()
+            divided = [(a, self.args[b][1]) for a, b in products if self._divides_once(b, uses, outputs)]
             if divided:
                 new[node] = self._node("div", (new[divided[0][0]], new[divided[0][1]]))
             else:
                 new[node] = self._node(self.op[node], tuple(new[a] for a in args), self.value[node]) if args else node
         return [new[n] for n in outputs]
-
-    def _is_product(self, node: int) -> bool:
-        return self.op[node] == "mul" and self.varies[node]
 
     def _divides_once(self, node: int, uses: dict[int, int], outputs: list[int]) -> bool:
         """Whether a node is a varying reciprocal with one use."""

@@ -189,7 +189,7 @@ def on_rows(probes: IdentityProbes, near: Probes, rows: Sequence[int], coordinat
         here = probes.with_inputs(dict(zip(moved, q, strict=True)), exact)
         found = here(rows)
         values, J = np.nan_to_num(np.asarray(found)), np.nan_to_num(np.asarray(here(slopes))).T
-        step = pattern.shortest(J[moving], values.T[moving], _pseudo_inverses).T
+        step = pattern.shortest(J[moving], values.T[moving], lambda J, g: (_pseudo_inverses(J) @ g[..., None])[..., 0]).T
         moves = np.any(np.abs(step) > EPS * np.max(np.abs(q[:, moving]), axis=0), axis=0)
         if turn == STEPS or not moves.any():
             break

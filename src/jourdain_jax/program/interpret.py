@@ -12,9 +12,8 @@ from typing import TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import Literal
 
-from jourdain_jax.calculus.jaxprs import called
+from jourdain_jax.calculus.jaxprs import called, evaluated
 from jourdain_jax.calculus.scalar_operations import TABLE
 from jourdain_jax.eager.numpy_backend import applied
 from jourdain_jax.program.contractions import REDUCTIONS, product, reduced
@@ -38,18 +37,7 @@ Value: TypeAlias = Nodes | np.ndarray
 
 def interpret(graph: Graph, closed, arguments: list[Value]) -> list[Value]:
     """Outputs of a closed jaxpr at the given arguments."""
-    jaxpr = closed.jaxpr
-    environment: dict = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
-
-    def read(atom):
-        return np.asarray(atom.val) if isinstance(atom, Literal) else environment[atom]
-
-    for equation in jaxpr.eqns:
-        name, inputs = equation.primitive.name, [read(x) for x in equation.invars]
-        results = apply(graph, name, equation, inputs)
-        for variable, result in zip(equation.outvars, results, strict=True):
-            environment[variable] = result
-    return [read(x) for x in jaxpr.outvars]
+    return evaluated(closed, arguments, lambda equation, inputs: apply(graph, equation, inputs), lambda x, aval: np.asarray(x))
 
 
 def effects_of(jaxpr) -> str:
@@ -70,9 +58,10 @@ def as_nodes(graph: Graph, value: Value) -> np.ndarray:
     return np.array([graph.const(x) for x in np.ravel(value)], dtype=np.int64).reshape(np.shape(value))
 
 
-def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
+def apply(graph: Graph, equation, inputs) -> list[Value]:
     """Results of one equation."""
-    refuse(name, equation)
+    name = equation.primitive.name
+    refuse(equation)
     if graph.keeps_rules and (rule := own_rule(name, equation.params)) and any(isinstance(x, Nodes) for x in inputs):
         raise Unsupported(rule)
     inner = called(name, equation.params)
@@ -106,10 +95,10 @@ def apply(graph: Graph, name: str, equation, inputs) -> list[Value]:
     raise Unsupported(f"the operation `{name}`")
 
 
-def refuse(name: str, equation) -> None:
+def refuse(equation) -> None:
     """ValueError where an equation can be no part of a scene."""
     if any(jnp.issubdtype(v.aval.dtype, jax.dtypes.prng_key) for v in (*equation.invars, *equation.outvars)):
-        raise ValueError(f"a method of the scene draws random numbers (`{name}`); draw them outside, and give them as parameters or inputs")
+        raise ValueError(f"a method of the scene draws random numbers (`{equation.primitive.name}`); draw them outside, and give them as parameters or inputs")
 
 
 def own_rule(name: str, params) -> str:
@@ -138,17 +127,12 @@ def _moved(graph: Graph, name: str, equation, inputs: list[Value]) -> list[np.nd
     return [_OF_NODES[name](graph, given, equation.params)] if name in _OF_NODES else applied(equation, given)
 
 
-def _places(x, primitive, *operands, **params):
-    """Where each entry of a gather comes from (or a scatter goes to): the primitive itself run on the positions."""
-    positions = np.arange(x.size, dtype=np.int32).reshape(x.shape)
-    with jax.ensure_compile_time_eval():
-        return np.asarray(primitive.bind(jnp.asarray(positions), *(jnp.asarray(o) for o in operands), **params))
-
-
 def _gather(graph, inputs, params):
+    """Where each entry comes from is what the operation makes of the positions."""
     x, indices = inputs
-    params = dict(params, fill_value=-1) if params.get("fill_value") is not None or "fill_value" in params else params
-    places = _places(x, jax.lax.gather_p, indices, **params)
+    with jax.ensure_compile_time_eval():
+        positions = jnp.arange(x.size, dtype=jnp.int32).reshape(x.shape)
+        places = np.asarray(jax.lax.gather_p.bind(positions, jnp.asarray(indices), **params | {"fill_value": -1}))
     if np.any(places < 0):
         raise Unsupported("an index out of bounds")
     return np.ravel(x)[places]
@@ -178,13 +162,6 @@ def _scatter_add(graph, inputs, params):
     return flat.reshape(x.shape)
 
 
-def _pad(graph, inputs, params):
-    x, fill = inputs
-    if any(interior or low < 0 or high < 0 for low, high, interior in params["padding_config"]):
-        raise Unsupported("the operation `pad` with gaps")
-    return np.pad(x, [(low, high) for low, high, _ in params["padding_config"]], constant_values=fill.item())
-
-
 def _same(graph, inputs, params):
     return inputs[0]
 
@@ -202,7 +179,6 @@ _OF_NODES: dict[str, Callable] = {
     "gather": _gather,
     "scatter": _scatter,
     "scatter-add": _scatter_add,
-    "pad": _pad,
     **dict.fromkeys(("copy", "copy_p", "stop_gradient"), _same),
 }
 

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 
-from jourdain_jax.calculus.jaxprs import called
+from jourdain_jax.calculus.jaxprs import called, evaluated, needed_only
 from jourdain_jax.program.calls import Call
 from jourdain_jax.program.graph import Graph, Unsupported
 from jourdain_jax.program.interpret import Nodes, Value, apply, refuse
@@ -76,8 +76,7 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
     """Outputs of a closed jaxpr at the given arguments, as `interpret`, with calls for the parts that have no scalar form."""
     inputs: list[_Variable] = [_Variable(v.aval) for v in closed.jaxpr.invars]
     steps: list[_Step] = []
-    outputs = _flat(closed, inputs, steps)
-    steps = _needed(steps, outputs)
+    outputs = _flat(needed_only(closed), inputs, steps)
     numbers = _judged(Graph(graph.most_multiplications, graph.keeps_rules), steps, inputs)
     steps = [step for step in steps if any(v not in numbers for v in step.outputs)]
     for step in steps:
@@ -88,7 +87,7 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
     values: dict = dict(zip(inputs, arguments, strict=True)) | numbers
     for step in sorted(steps, key=lambda step: (step.level, not step.opaque)):  # otherwise in the order in which they came
         if not step.opaque:
-            results = apply(graph, step.equation.primitive.name, step.equation, [values[x] if isinstance(x, _Variable) else x for x in step.inputs])
+            results = apply(graph, step.equation, [values[x] if isinstance(x, _Variable) else x for x in step.inputs])
             values |= dict(zip(step.outputs, results, strict=True))
         elif step is step.part[0]:
             values |= _called(graph, step.part, values, users, asked)
@@ -97,33 +96,17 @@ def interpret_with_calls(graph: Graph, closed, arguments: list[Nodes]) -> list[V
 
 def _flat(closed: ClosedJaxpr, arguments, steps: list[_Step]) -> list:
     """Appends all equations, those of inner jaxprs in their place; functions with derivatives of their own stay whole."""
-    jaxpr = closed.jaxpr
-    environment = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
 
-    def read(atom):
-        return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, Literal) else environment[atom]
-
-    for equation in jaxpr.eqns:
-        name, inputs = equation.primitive.name, [read(x) for x in equation.invars]
-        refuse(name, equation)
+    def results(equation, inputs: list) -> list:
+        name = equation.primitive.name
+        refuse(equation)
         inner = None if name.startswith("custom_") else called(name, equation.params)
-        if inner is None:
-            results = [_Variable(v.aval) for v in equation.outvars]
-            steps.append(_Step(equation, jaxpr, inputs, results))
-        else:
-            results = _flat(inner, inputs, steps)
-        environment |= dict(zip(equation.outvars, results, strict=True))
-    return [read(x) for x in jaxpr.outvars]
+        if inner is not None:
+            return _flat(inner, inputs, steps)
+        steps.append(_Step(equation, closed.jaxpr, inputs, [_Variable(v.aval) for v in equation.outvars]))
+        return steps[-1].outputs
 
-
-def _needed(steps: list[_Step], outputs: list) -> list[_Step]:
-    """Those on which the outputs depend."""
-    wanted, found = {x for x in outputs if isinstance(x, _Variable)}, []
-    for step in reversed(steps):
-        if not wanted.isdisjoint(step.outputs):
-            found.append(step)
-            wanted.update(step.variables)
-    return found[::-1]
+    return evaluated(closed, arguments, results)
 
 
 def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict:
@@ -141,13 +124,13 @@ def _judged(scratch: Graph, steps: list[_Step], inputs: list[_Variable]) -> dict
         values[v] = introduce(v)
     for step in steps:
         given = [values[x] if isinstance(x, _Variable) else x for x in step.inputs]
-        size = max(v.aval.size for v in step.outputs)
+        size = max((v.aval.size for v in step.outputs), default=0)
         try:
             if any(x is None for x in given):
                 raise Unsupported("")  # it follows an opaque one
             if size > LARGEST and any(isinstance(x, Nodes) for x in given):
                 raise Unsupported(f"an array of {size} numbers")
-            results = apply(scratch, step.equation.primitive.name, step.equation, given)
+            results = apply(scratch, step.equation, given)
         except Unsupported as reason:
             step.opaque, step.reason = True, str(reason)
             results = [introduce(v) for v in step.outputs]

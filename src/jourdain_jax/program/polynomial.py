@@ -6,7 +6,7 @@ factors are taken out greedily (Horner's scheme in several variables).
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 from jourdain_jax.program.graph import ARRAYS, Graph
 
@@ -21,6 +21,7 @@ class TooLarge(Exception):
 class NormalForms:
     """Normal forms of nodes of one graph; squares of sines are replaced by those of cosines (the other way took fewer operations in no model).
 
+    - `most_terms`: of a normal form; 0: none are made, and nodes stay as they are.
     - `sign`: 1, -1 or 0 (unknown) for a node: |x| becomes x or -x where it is known, and x is noted in `guards` (with its sign).
     - `squares`: atoms whose squares are other polynomials (one entry of a unit quaternion).
     """
@@ -34,7 +35,6 @@ class NormalForms:
     ):
         self.graph, self.most_terms, self._sign = graph, most_terms, sign
         self.guards: set[int] = set()  # nodes that must stay positive
-        self._square_of, self._square_into = "sin", "cos"
         self._expanded: dict[int, Polynomial | None] = {graph.zero: {}}
         self._squares: dict[int, Polynomial] = dict(squares or {})
         self._simplified: dict[int, int] = {}
@@ -47,8 +47,12 @@ class NormalForms:
             self._simplified[node] = self._smaller(node)
         return self._simplified[node]
 
+    def all_simplified(self, nodes: Iterable[int]) -> list[int]:
+        """Every node `simplified`."""
+        return [self.simplified(n) for n in nodes]
+
     def _smaller(self, node: int) -> int:
-        if self.graph.op[node] in ("const", "input"):
+        if not self.most_terms or self.graph.op[node] in ("const", "input"):
             return node
         try:
             form = self.rebuilt(self.expanded(node))
@@ -131,8 +135,8 @@ class NormalForms:
         if len(p) == 2:
             (small, c), (large, d) = sorted(p.items(), key=lambda item: len(item[0]))
             extra = _rest(large, small)
-            if c == -d and len(extra) == 2 and extra[0] == extra[1] and self.graph.op[extra[0]] == self._square_into:
-                return [self.graph.call(self._square_of, self.graph.args[extra[0]][0])], {small: c}
+            if c == -d and len(extra) == 2 and extra[0] == extra[1] and self.graph.op[extra[0]] == "cos":
+                return [self.graph.call("sin", self.graph.args[extra[0]][0])], {small: c}
         return None
 
     def _absolute(self, p: Polynomial) -> Polynomial:
@@ -170,8 +174,8 @@ class NormalForms:
 
     def _atom(self, atom: int) -> Polynomial:
         graph, op = self.graph, self.graph.op[atom]
-        if op == self._square_of and atom not in self._squares:
-            other = graph.call(self._square_into, graph.args[atom][0])
+        if op == "sin" and atom not in self._squares:
+            other = graph.call("cos", graph.args[atom][0])
             self._squares[atom] = {(): 1.0, (other, other): -1.0}
         elif op == "sqrt" and atom not in self._squares:
             self._squares[atom] = self.expanded(graph.args[atom][0])
