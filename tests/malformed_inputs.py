@@ -450,6 +450,7 @@ BATCHES: dict[str, Case] = {
     "jj.rollout(b, {'x': [1.0, 2.0]}, chunk=1.5, t1=0.1)": ("ValueError", "`chunk` is 1.5, expected a whole number"),
     "jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.0)": ("ValueError", "the span from t0 = 0.0 to t1 = 0.0 s is empty or not finite"),
     "jj.rollout(b, {'x': [1.0, 2.0]}, ts=[0.2, 0.1, 0.3])": ("ValueError", "`ts` must be finite and strictly increasing"),
+    "jj.diagnose(jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.1))": ("ValueError", "`diagnose` was given a Rollout, expected a `Trajectory`; of a rollout take one"),
     "jj.rollout(b, {'x': [1.0, 2.0]}, t1=0.1, solver='tsit5')": (
         "ValueError",
         "`solver` is the text 'tsit5', expected an object of diffrax; write `diffrax.Tsit5()`",

@@ -1,6 +1,7 @@
 """A change of what a scene's methods read is noticed by everything that keeps something: the motion is that of the present numbers."""
 
 import copy
+import dataclasses
 import pickle
 import types
 
@@ -29,6 +30,19 @@ class Instance:
 
 
 INSTANCE = Instance()
+
+
+@dataclasses.dataclass(slots=True)
+class Slotted:
+    gain: float = 1.0
+
+
+class Answering:
+    def __getattr__(self, name):
+        return {"gain": SLOTTED.gain}[name]  # a KeyError for anything else
+
+
+SLOTTED, ANSWERING = Slotted(), Answering()
 
 
 def helper(x):
@@ -62,6 +76,9 @@ def with_default(x, gain=1.0):
     return gain * x
 
 
+with_default.factor = 1.0
+
+
 class Spring(jj.Scene):
     """A mass of 1 kg on a spring, whose stiffness is 1 N/m times whatever `stiffness` reads."""
 
@@ -79,7 +96,9 @@ class Spring(jj.Scene):
 
     def force(self, x):
         k = self.factor * self.numbers[1][0] * FACTORS[1] * SETTINGS["inner"]["gain"] * ARRAY[2] * LARGE[777] * PLAIN.gain * OWN_MODULE.GAIN
-        return jj.Load(generalized={"x_rate": -k * Settings.gain * INSTANCE.gain * with_default(LAW(helper(compiled(x))))})
+        return jj.Load(
+            generalized={"x_rate": -k * Settings.gain * INSTANCE.gain * ANSWERING.gain * with_default.factor * with_default(LAW(helper(compiled(x))))}
+        )
 
 
 SCENE = Spring()
@@ -122,6 +141,8 @@ CHANGES = {
     "a module of the user's": lambda m: m.setattr(OWN_MODULE, "GAIN", 4.0),
     "a class": lambda m: m.setattr(Settings, "gain", 4.0),
     "an object": lambda m: m.setattr(INSTANCE, "gain", 4.0),
+    "an object with slots": lambda m: m.setattr(SLOTTED, "gain", 4.0),
+    "an attribute of a function": lambda m: m.setattr(with_default, "factor", 4.0),
     "an attribute of the scene's class": lambda m: m.setattr(Spring, "factor", 4.0),
     "a list in an attribute": lambda m: m.setentry(Spring.numbers[1], 0, 4.0),
     "a method": lambda m: m.setattr(Spring, "loads", lambda self, motion: jj.Load(generalized={"x_rate": -4.0 * motion.q.x})),

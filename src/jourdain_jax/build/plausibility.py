@@ -52,17 +52,13 @@ def numbers_of(scene: Scene, motion: Motion) -> PoseNumbers:
         orientation={name: body.orientation for name, body in rigid.items()},
         planes=_normal_velocities(scene, pose, contacts),
         carried={name: _carried_speeds(scene, motion, name, contact) for name, contact in contacts.items() if contact.ground is not None},
-        normals={name: _normal(contact) for name, contact in contacts.items()},
-        gaps={name: _gap(pose, contact) for name, contact in contacts.items() if contact.height == "coordinates"},
+        normals={name: jnp.stack([contact.plane.normal @ contact.plane.normal, jnp.sum(jnp.abs(contact.point))]) for name, contact in contacts.items()},
+        gaps={
+            name: jnp.stack([contact.gap(), jnp.sum(jnp.abs(contact.point - pose[contact.body].position))])
+            for name, contact in contacts.items()
+            if contact.height == "coordinates"
+        },
     )
-
-
-def _normal(contact: Contact) -> Float[Array, "2"]:
-    return jnp.stack([contact.plane.normal @ contact.plane.normal, jnp.sum(jnp.abs(contact.point))])
-
-
-def _gap(pose: Pose, contact: Contact) -> Float[Array, "2"]:
-    return jnp.stack([contact.gap(), jnp.sum(jnp.abs(contact.point - pose[contact.body].position))])
 
 
 def _normal_velocities(scene: Scene, pose: Pose, contacts: dict[str, Contact]) -> dict[str, Float[Array, "3"]]:

@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jourdain_jax.calculus.reals import is_traced_type
 from jourdain_jax.scene.scene import Scene
 
 MOST_CASES = 1024  # that are kept of one function
@@ -32,7 +33,7 @@ def once_per_values(probe, of_traced: Callable | None = None):
         leaves, treedef = jax.tree.flatten(scene)
         known = _asked_about_before(leaves, treedef)
         if known is None:
-            if any(_is_traced(x) for x in leaves):
+            if any(is_traced_type(type(x)) for x in leaves):
                 if of_traced is not None:
                     return of_traced(scene, *case)
                 scene = with_reference_parameters(scene)
@@ -95,13 +96,13 @@ def with_reference_parameters(scene: Scene) -> Scene:
     Generic, because a default of zero (a tilt, a rate) must not pass for a term that is absent, nor two equal defaults for one length.
     """
     leaves, treedef = jax.tree.flatten(scene)
-    if not any(_is_traced(x) for x in leaves):
+    if not any(is_traced_type(type(x)) for x in leaves):
         return scene
     near = [default for _, default in defaults(scene)]
     known = _STAND_IN.get()
     if known is not None and jax.tree.structure(known) == treedef:
-        near = [y if not _is_traced(y) and np.shape(y) == np.shape(x) else d for x, y, d in zip(leaves, jax.tree.leaves(known), near, strict=True)]
-    numbers = [_generic(x, y, place) if _is_traced(x) else x for place, (x, y) in enumerate(zip(leaves, near, strict=True))]
+        near = [y if not is_traced_type(type(y)) and np.shape(y) == np.shape(x) else d for x, y, d in zip(leaves, jax.tree.leaves(known), near, strict=True)]
+    numbers = [_generic(x, y, place) if is_traced_type(type(x)) else x for place, (x, y) in enumerate(zip(leaves, near, strict=True))]
     return jax.tree.unflatten(treedef, numbers)
 
 
@@ -117,10 +118,6 @@ def defaults(scene: Scene) -> list[tuple[str, Any]]:
             default = [field.default if len(leaves) == 1 else None] * len(leaves)
         found += [(field.name, x) for x in default]
     return found
-
-
-def _is_traced(x) -> bool:
-    return isinstance(x, jax.core.Tracer)
 
 
 def _generic(x, near, place: int) -> np.ndarray:

@@ -187,16 +187,15 @@ def _select(equation, lanes, which, *cases):
     return np.where(np.asarray(which, bool), cases[1], cases[0]) if len(cases) == 2 else np.choose(which, cases)
 
 
-def _dynamic_slice(equation, x, *starts):
-    sizes = equation.params["slice_sizes"]
+def _window(x, starts, sizes) -> tuple[slice, ...]:
+    """The part of an array of these sizes that begins at `starts`, or as near to them as it fits."""
     begin = [min(max(int(s), 0), n - size) for s, n, size in zip(starts, x.shape, sizes, strict=True)]
-    return x[tuple(slice(s, s + size) for s, size in zip(begin, sizes, strict=True))]
+    return tuple(slice(s, s + size) for s, size in zip(begin, sizes, strict=True))
 
 
 def _dynamic_update_slice(equation, x, update, *starts):
     x = x.copy()
-    begin = [min(max(int(s), 0), n - size) for s, n, size in zip(starts, x.shape, update.shape, strict=True)]
-    x[tuple(slice(s, s + size) for s, size in zip(begin, update.shape, strict=True))] = update
+    x[_window(x, starts, update.shape)] = update
     return x
 
 
@@ -305,7 +304,7 @@ RULES_WITH_LANES: dict[str, Callable] = {
     "optimization_barrier": lambda e, lanes, *xs: list(xs),
 }
 RULES: dict[str, Callable] = {
-    "dynamic_slice": _dynamic_slice,
+    "dynamic_slice": lambda e, x, *starts: x[_window(x, starts, e.params["slice_sizes"])],
     "dynamic_update_slice": _dynamic_update_slice,
     "iota": _iota,
     "pad": _pad,

@@ -30,12 +30,8 @@ def may_be_massless(scene: Scene, structure: Structure) -> bool:
 
 def _with_zeros(scene: Scene, every: bool) -> Scene | None:
     """Numbers for the scene's parameters, with all zeros that may be; None where there are none."""
-    may_vanish = {f.name for f in fields(scene) if (every and not f.metadata.get("positive")) or f.metadata.get("non_negative") or _is_zero(f.default)}
+    may_vanish = {f.name for f in fields(scene) if (every and not f.metadata.get("positive")) or f.metadata.get("non_negative") or np.array_equal(f.default, 0)}
     given, treedef = jax.tree_util.tree_flatten_with_path(scene)
     zeros = [is_traced(x) and jax.tree_util.keystr(path[:1]).strip(".") in may_vanish for path, x in given]
     leaves = [np.zeros_like(y) if zero else y for zero, y in zip(zeros, jax.tree.leaves(with_reference_parameters(scene)), strict=True)]
     return jax.tree.unflatten(treedef, leaves) if any(zeros) else None
-
-
-def _is_zero(default) -> bool:
-    return isinstance(default, int | float) and default == 0

@@ -127,7 +127,8 @@ class Pivots:
         if row not in self._judged or not self.columns.issuperset(self._judged[row]):
             columns = self._in_row(row)
             nodes, places = [self.A[row][c] for c in columns], [(row, c) for c in columns]
-            worst = _smallest(self.probes(nodes), places, self._sizes_at(places, self.probes.count)) if columns else ()
+            ratio = _ratios(self.probes(nodes), places, self._sizes_at(places, self.probes.count)) if columns else np.empty((0, 1))
+            worst = np.min(np.where(np.isfinite(ratio), ratio, 0.0), axis=1)  # at any probe
             self._judged[row] = {c: _Entry(w, bool(w > 0) and self._is_fixed(n)) for c, n, w in zip(columns, nodes, worst, strict=True)}
         return self._judged[row]
 
@@ -305,12 +306,6 @@ def _ratios(values: Float[np.ndarray, "places probes"], places, sizes) -> np.nda
     largest = largest if sizes is None else np.fmax(largest, sizes)
     with np.errstate(all="ignore"):
         return values / np.where(largest > 0, largest, 1.0)
-
-
-def _smallest(values, places, sizes) -> np.ndarray:
-    """The smallest ratio of each entry at any probe."""
-    ratio = _ratios(values, places, sizes)
-    return np.min(np.where(np.isfinite(ratio), ratio, 0.0), axis=1)
 
 
 def turns(graph: Graph, node: int) -> bool:

@@ -78,11 +78,7 @@ class IdentityProbes:
 
     def exchanged(self, names: Collection[str]) -> Self:
         """Probes at each of which the named inputs have the value that they had at another probe; all others are kept."""
-
-        def next_one(x):
-            return np.roll(np.broadcast_to(x, self.count), 1)
-
-        return self.with_inputs({name: next_one(self.inputs[name]) for name in names}, {name: next_one(self._errors.get(name, 0.0)) for name in names})
+        return self.exchanged_in_turn([names], np.arange(self.count))
 
     def exchanged_in_turn(self, groups: Sequence[Collection[str]], at: np.ndarray) -> Self:
         """The probes numbered `at` as `exchanged` makes them, group of names after group."""

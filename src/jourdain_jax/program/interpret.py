@@ -162,10 +162,6 @@ def _scatter_add(graph, inputs, params):
     return flat.reshape(x.shape)
 
 
-def _same(graph, inputs, params):
-    return inputs[0]
-
-
 # Which operands hold entries; the others are indices.
 _MOVES: dict[str, Callable[[int], Collection[int]]] = {
     **dict.fromkeys(("broadcast_in_dim", "reshape", "squeeze", "expand_dims", "transpose", "rev", "slice", "dynamic_slice", "split"), lambda n: (0,)),
@@ -179,7 +175,7 @@ _OF_NODES: dict[str, Callable] = {
     "gather": _gather,
     "scatter": _scatter,
     "scatter-add": _scatter_add,
-    **dict.fromkeys(("copy", "copy_p", "stop_gradient"), _same),
+    **dict.fromkeys(("copy", "copy_p", "stop_gradient"), lambda graph, inputs, params: inputs[0]),
 }
 
 

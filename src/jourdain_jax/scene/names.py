@@ -17,7 +17,7 @@ class UnknownNameError(KeyError):
 def nearest(name: str, valid: Iterable[str]) -> str:
     """The end of an error message: the nearest valid name, if any is near, and all valid names."""
     valid = list(valid)
-    match = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+    match = difflib.get_close_matches(str(name), valid, n=1, cutoff=0.5)
     hint = f"did you mean `{match[0]}`? " if match else ""
     return f"{hint}Valid names: {', '.join(f'`{v}`' for v in valid) or 'none'}."
 

@@ -16,7 +16,7 @@ from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import repeat, zip_longest
 from operator import is_
-from types import CodeType, FunctionType, MethodType, ModuleType, SimpleNamespace
+from types import CodeType, FunctionType, MemberDescriptorType, MethodType, ModuleType, SimpleNamespace
 from typing import Any
 
 import jax
@@ -132,6 +132,28 @@ def _content_of(cell):
         return _NOTHING
 
 
+class _Slots(Mapping):
+    """The attributes of an object for which its classes state `__slots__`, as its `__dict__` would show them."""
+
+    def __init__(self, x, names: tuple[str, ...]):
+        self.x, self.names = x, names
+
+    def __getitem__(self, name: str):
+        return getattr(self.x, name, _NOTHING)
+
+    def __iter__(self):
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def _slots_of(x) -> _Slots | None:
+    """Slots of an object, those of its bases included; None where it has none."""
+    names = tuple(name for kind in type(x).__mro__ for name, member in vars(kind).items() if isinstance(member, MemberDescriptorType))
+    return _Slots(x, names) if names else None
+
+
 class _Reader:
     """Goes through what functions and classes read, notes where it was found, and makes a key of it."""
 
@@ -176,17 +198,21 @@ class _Reader:
             return tuple(self.key(f, depth) for f in (x.fget, x.fset) if f is not None)
         if isinstance(x, functools.partial):
             return self.key(x.func, depth), self.key(x.args, depth), self.key(x.keywords, depth)
-        if callable(inner := getattr(x, "__wrapped__", None)):  # a compiled function
+        try:
+            inner = getattr(x, "__wrapped__", None)
+        except Exception:  # an object's own `__getattr__`, which need not know it
+            inner = None
+        if callable(inner):  # a compiled function
             return self.key(inner, depth + 1)
         if type(x).__module__.startswith("equinox") and callable(inner := getattr(x, "method", None)):  # as Equinox holds methods
             return self.key(inner, depth)
-        members = getattr(x, "__dict__", None)
-        if members is None or isinstance(x, ModuleType) or (is_installed(type(x).__module__) and not isinstance(x, SimpleNamespace)):
+        members = [part for part in (getattr(x, "__dict__", None), _slots_of(x)) if part is not None]
+        if not members or isinstance(x, ModuleType) or (is_installed(type(x).__module__) and not isinstance(x, SimpleNamespace)):
             return self._identity(x)
         self._seen.add(id(x))
         self.by_identity.append(x)
-        self.members.append(members)
-        return self._identity(type(x)), tuple((name, self.key(y, depth + 1)) for name, y in members.items())
+        self.members += members
+        return self.key(type(x), depth + 1), tuple((name, self.key(y, depth + 1)) for part in members for name, y in part.items())
 
     def _identity(self, x) -> Hashable:
         self.by_identity.append(x)
@@ -195,6 +221,9 @@ class _Reader:
     def _function(self, f: FunctionType, depth: int) -> Hashable:
         own = [f.__code__, self.key(f.__defaults__, depth + 1), self.key(f.__kwdefaults__, depth + 1)]
         self.functions.append((f, f.__code__, f.__defaults__, f.__kwdefaults__))
+        if f.__dict__:
+            self.members.append(f.__dict__)
+            own += [(name, self.key(y, depth + 1)) for name, y in f.__dict__.items()]
         read = _read_in(f.__code__)
         for name in read.globals:
             own.append((name, self._named(f.__globals__, name, depth)))
@@ -230,7 +259,7 @@ class _Reader:
 
 def _is_bookkeeping(name: str) -> bool:
     """Whether a member of a class is what Python, dataclasses or Equinox put there."""
-    return (name.startswith("__") and name.endswith("__") and name != "__call__") or name.startswith("_abc_")
+    return (name.startswith("__") and name.endswith("__") and name not in ("__call__", "__getattr__", "__getitem__")) or name.startswith("_abc_")
 
 
 def _content(x) -> Hashable:

@@ -153,7 +153,7 @@ def rollout(
     - `starts`: name -> number or array of shape (lanes,) (as in `jj.start`; the rest is solved for), or a `State` with a leading axis of lanes.
     - `parameters`: parameter name -> array with a leading axis of lanes, where lanes differ in parameters.
     - `chunk`: lanes that run together (default: 512, less where saved states would pass 1 GiB); `progress`: a bar (default: with several chunks).
-    - `options`: further ones as in `simulate`.
+    - `options`: further ones as in `simulate`; inputs are those of all lanes. Where lanes differ in inputs, take `jax.vmap` of `simulate`.
 
     Raises ValueError for unknown names and unequal lengths. Lanes never raise: see `Rollout.failed` and `print(rollout)`. In reverse mode a lane whose start
     or parameters are NaN makes derivatives with respect to what all lanes share NaN, even where its result is not used, as everywhere in JAX: leave it

@@ -72,8 +72,10 @@ class ContactExtremes(eqx.Module):
 def diagnose(trajectory: Record) -> Diagnostics:
     """Drifts, residuals, conditioning and contact extremes of one `trajectory` (not of a batch: use `jax.vmap` or `rollout.lane(i)`).
 
-    Times that were not reached do not count.
+    Times that were not reached do not count. ValueError for anything else than a trajectory.
     """
+    if not hasattr(trajectory, "scene"):
+        raise ValueError(f"`diagnose` was given a {type(trajectory).__name__}, expected a `Trajectory`; of a rollout take one lane, as `rollout.lane(0)`")
     checks = Checks(jax.tree.map(jnp.asarray, usual_rows(trajectory.scene)))
     if trajectory.ts.shape[0] <= FEW_TIMES and not is_traced(trajectory):
         return jax.tree.map(jnp.asarray, _uncompiled(trajectory, uncompiled_over_times(checks, trajectory, by_inputs=True)))
