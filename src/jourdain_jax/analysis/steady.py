@@ -185,7 +185,10 @@ def _root(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unk
 
 
 def _search(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unknowns"], max_steps: int) -> _Search:
-    """Levenberg-Marquardt: `min |J d + R|^2 + damping^2 |d|^2`, of minimum norm where many steady motions are near."""
+    """Levenberg-Marquardt: `min |J d + R|^2 + damping^2 |d|^2`, of minimum norm where many steady motions are near.
+
+    That of optimistix takes 1.5 (a disc) and 1.8 times as long to compile (a bicycle, on which it finds 19 of 20 steady turns and this one all).
+    """
 
     def step(search: _Search, _):
         R, J = problem(search.trial), jnp.where(free, jax.jacfwd(problem)(search.trial), 0.0)
