@@ -24,7 +24,7 @@ from jourdain_jax.analysis.estimate import Estimate
 from jourdain_jax.analysis.experiment import Experiment
 from jourdain_jax.analysis.instruments import Instrument
 from jourdain_jax.analysis.joint_prior import Correlated
-from jourdain_jax.analysis.likelihood import as_runs, mapped
+from jourdain_jax.analysis.likelihood import as_runs, check_known, mapped
 from jourdain_jax.analysis.runs import Run, equal_runs
 from jourdain_jax.analysis.sensors import Reading, ideal
 from jourdain_jax.analysis.stop_events import StopEvent
@@ -184,13 +184,10 @@ class _Filter:
 def _check_supported(scene: Scene, runs: Sequence[Experiment]) -> None:
     if scene.coordinates.quaternions:
         raise ValueError(f"`{type(scene).__name__}` has quaternions, whose spread a filter cannot tell yet; use a scene whose coordinates are angles")
+    check_known(runs, "a filter")
     for index, run in enumerate(runs):
-        for name in run.unknown_sigma:
-            raise ValueError(f"sigma of channel `{name}` is None, but a filter needs the standard deviation of its noise; give a number")
         for name in (*run.correlation_time, *run.unknown_correlation):
             raise ValueError(f"the noise of channel `{name}` has a correlation time, but a filter takes it as white; leave it out")
-        for label in run.estimates:
-            raise ValueError(f"`{label}` is to be estimated, but a filter needs its value; give a number, which may be traced, in place of the `Estimate`")
         for name, reading in run.readings.items():
             _check_reading(name, reading, index)
         for name, given in run.unknown_start.items():

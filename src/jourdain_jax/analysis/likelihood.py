@@ -64,6 +64,15 @@ def in_all_or_none(runs: Sequence[Experiment], what: str, unknown: Callable[[Exp
     return names
 
 
+def check_known(runs: Sequence[Experiment], what: str) -> None:
+    """ValueError where a sigma, or a number of a sensor or an actuator, is not known."""
+    for run in runs:
+        for name in run.unknown_sigma:
+            raise ValueError(f"sigma of channel `{name}` is None, but {what} needs the standard deviation of its noise; give a number")
+        for label in run.estimates:
+            raise ValueError(f"`{label}` is to be estimated, but {what} needs its value; give a number, which may be traced, in place of the `Estimate`")
+
+
 def log_likelihood(scene: Scene, data: Experiment | Sequence[Experiment], **simulation) -> Float[Array, ""]:
     """Logarithm of the probability density of the measurements `data` (one run or several): `- sum r^2 / 2 - sum log(sigma sqrt(2 pi))`.
 
@@ -76,12 +85,9 @@ def log_likelihood(scene: Scene, data: Experiment | Sequence[Experiment], **simu
     **Raises** ValueError for measurements that do not fit the scene.
     """
     runs = as_runs(scene, data, simulation, forward=False)
-    if unknown := sorted({name for run in runs for name in run.unknown_sigma}):
-        raise ValueError(f"sigma of channel `{unknown[0]}` is None, but a likelihood needs the standard deviation of its noise; give a number")
     if unknown := sorted({name for run in runs for name in run.unknown_correlation}):
         raise ValueError(f"the correlation time of channel `{unknown[0]}` is None, but a likelihood needs to know it; give a number in s, or 0 for white noise")
-    if label := next((label for run in runs for label in run.estimates), None):
-        raise ValueError(f"`{label}` is to be estimated, but a likelihood needs its value; give a number, which may be traced, in place of the `Estimate`")
+    check_known(runs, "a likelihood")
     return jnp.sum(jnp.stack([jnp.sum(mapped(partial(of_run, scene, simulation=simulation), run)) for _, run in equal_runs(runs)]))
 
 

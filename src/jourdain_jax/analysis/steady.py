@@ -19,7 +19,7 @@ from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.trace import traced_scene
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.calculus.reals import Number, Numbers, described
-from jourdain_jax.dynamics.cyclic import ignorable_coordinates
+from jourdain_jax.dynamics.reduced import ignorable_coordinates
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.motion.start import State
@@ -185,7 +185,10 @@ def _root(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unk
 
 
 def _search(problem: _Problem, z: Float[Array, "unknowns"], free: Bool[Array, "unknowns"], max_steps: int) -> _Search:
-    """Levenberg-Marquardt: `min |J d + R|^2 + damping^2 |d|^2`, of minimum norm where many steady motions are near."""
+    """Levenberg-Marquardt: `min |J d + R|^2 + damping^2 |d|^2`, of minimum norm where many steady motions are near.
+
+    That of optimistix takes 1.5 (a disc) and 1.8 times as long to compile (a bicycle, on which it finds 19 of 20 steady turns and this one all).
+    """
 
     def step(search: _Search, _):
         R, J = problem(search.trial), jnp.where(free, jax.jacfwd(problem)(search.trial), 0.0)

@@ -58,7 +58,9 @@ def check_description(scene, base: Any) -> None:
             "define `coordinate_rates(self, t, q, u)`, which returns the rates of all coordinates"
         )
     _check_counts(scene)
-    _check_one_meaning(scene)
+    for name in scene.speed_names.entries:
+        if name in scene.coordinate_names.entries:
+            raise ValueError(f"`{kind.__name__}` has a coordinate and a speed of the name `{name}`; give one of them another name")
     _check_domain(scene)
     example = inspect.getattr_static(kind, "example")
     if isinstance(example, dict):
@@ -89,7 +91,7 @@ def _misspelt(kind: type, base: type) -> str:
         if owner in base.__mro__:
             continue
         for name, member in vars(owner).items():
-            known = name.startswith("_") or name in own or name in (*METHODS, *ATTRIBUTES) or hasattr(base, name)
+            known = name.startswith("_") or name in own or name in ATTRIBUTES or hasattr(base, name)
             if known or isinstance(member, type | staticmethod | classmethod):
                 continue
             callable_ = callable(member) or isinstance(member, property)
@@ -115,19 +117,11 @@ def _check_counts(scene) -> None:
             )
 
 
-def _check_one_meaning(scene) -> None:
-    for name in scene.speed_names.entries:
-        if name in scene.coordinate_names.entries:
-            raise ValueError(f"`{type(scene).__name__}` has a coordinate and a speed of the name `{name}`; give one of them another name")
-
-
 def _check_domain(scene) -> None:
     kind, domain = type(scene), scene.domain
     _check_keys(kind, "domain", domain, (*scene.coordinate_names.entries, *scene.speed_names.entries))
     for name, pair in domain.items():
-        if is_traced(pair):
-            continue
-        if np.shape(pair) != (2,) or not _is_finite(pair) or pair[0] > pair[1]:
+        if not is_traced(pair) and (np.shape(pair) != (2,) or not _is_finite(pair) or pair[0] > pair[1]):
             raise ValueError(f"`domain` of `{kind.__name__}` gives {pair} for `{name}`, expected two finite numbers (low, high) with low <= high")
 
 
