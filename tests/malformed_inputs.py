@@ -499,7 +499,7 @@ FILES: dict[str, Case] = {
     "jj.load_trajectory(rewritten('other.npz', coordinates=['r', 'phi']), Bead)": ("ValueError", "the file holds the coordinates r, phi, but `Bead` has x, y"),
     "jj.load_trajectory(rewritten('minus.npz', parameter_mass=np.array(-1.0)), Bead)": (
         "ValueError",
-        "parameter `mass` of `Bead` is -1.0, expected a positive number in kg",
+        "`minus.npz` has -1.0 as a value of the parameter `mass`, which is not finite or has the wrong sign, in a motion that did not fail for it",
     ),
     "jj.load_trajectory(rewritten('more.npz', parameter_load=np.array(1.0)), Bead)": ("ValueError", "`more.npz` has a parameter `load` that `Bead` has not"),
     "jj.save(run, 'nowhere/run.npz')": ("ValueError", "cannot write `nowhere/run.npz`: there is no folder `nowhere`; make it first"),

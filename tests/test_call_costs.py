@@ -128,7 +128,7 @@ def test_programs_that_differ_are_told_apart():
 
 def test_what_is_compiled_for_functions_is_dropped_when_others_are_used():
     client, most, x = jax.devices()[0].client, input_programs.MOST_COMPILED, jnp.ones(3)
-    compiled = input_programs.for_programs(lambda x: jnp.sin(x) + jnp.sum(x), input_programs.by_itself)
+    compiled = input_programs.for_programs(lambda x: jnp.sin(x) + jnp.sum(x))
 
     def alive(programs):
         for n in programs:

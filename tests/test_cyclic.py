@@ -2,7 +2,7 @@
 
 import pytest
 
-from jourdain_jax.dynamics.cyclic import cyclic_coordinates, ignorable_coordinates
+from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.models import ChaplyginSleigh, Suslov, TiltingDisc, TwoWheelAxleCoordinates, TwoWheelAxleFree, TwoWheelAxleQuasi
 from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 

@@ -61,7 +61,7 @@ def test_a_lane_with_wrong_parameters_comes_back_from_a_file_of_its_own(discs, t
 def test_lanes_that_were_continued_and_fields_that_are_counts_are_kept(tmp_path):
     lanes = jj.rollout(PendulumChain(links=1), parameters={"mass": np.array([[0.2], [0.3]])}, ts=TS, progress=False)
     again = dataclasses.replace(lanes.lanes, fallback=jnp.array([0, results.FULL_STATE], jnp.int32))
-    lanes = jj.Rollout(again, continued=(1,), reruns=((results.FULL_STATE, ("full", "multipliers", "Dopri8", True)),))
+    lanes = jj.Rollout(again, reruns=((results.FULL_STATE, ("full", "multipliers", "Dopri8", True)),))
     jj.save(lanes, tmp_path / "chains.npz")
     loaded = jj.load_rollout(tmp_path / "chains.npz", PendulumChain)
     assert_equal_to_the_bit(loaded, lanes)
@@ -129,8 +129,8 @@ def test_damaged_and_foreign_files_are_refused_with_the_reason(files, tmp_path):
         rewritten(path, new, change)
         with pytest.raises(ValueError, match=sentence):
             jj.load_rollout(new, TiltingDisc)
-    rewritten(path, new, drop=("continued",))
-    with pytest.raises(ValueError, match="lacks `continued`"):
+    rewritten(path, new, drop=("fallback",))
+    with pytest.raises(ValueError, match="lacks `fallback`"):
         jj.load_rollout(new, TiltingDisc)
     with pytest.raises(ValueError, match="there is no file"):
         jj.load_rollout(tmp_path / "none.npz", TiltingDisc)

@@ -115,9 +115,9 @@ def test_a_batch_goes_on_from_its_ends():
 def test_states_looked_at_a_few_at_a_time_show_what_all_at_once_do(monkeypatch):
     disc = jj.models.TiltingDisc()
     motion = jj.simulate(disc, ts=np.linspace(0.0, 1.0, 21))
-    whole = over_times.accelerations_over_times(motion), over_times.energies(motion)
+    whole = motion.accelerations(), motion.energies()
     monkeypatch.setattr(over_times, "MOST_ENTRIES", 8 * len(disc.coordinate_names) ** 2)  # seven at a time
     monkeypatch.setattr(over_times, "_compiled", lambda programs: over_times._mapped)
-    parts = over_times.accelerations_over_times(motion), over_times.energies(motion)
+    parts = motion.accelerations(), motion.energies()
     for a, b in zip(jax.tree.leaves(whole), jax.tree.leaves(parts), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)

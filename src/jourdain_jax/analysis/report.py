@@ -7,7 +7,7 @@ from jourdain_jax.analysis.integrability import growth_vector, row_integrability
 from jourdain_jax.build.domain import COORDINATE_DOMAIN, SPEED_DOMAIN
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.dynamics.accelerations import accelerations
-from jourdain_jax.dynamics.cyclic import cyclic_coordinates, ignorable_coordinates
+from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.lowering.built import Built, build
 from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.inputs import as_inputs

@@ -19,7 +19,7 @@ from jourdain_jax.build.domain import coordinate_bounds
 from jourdain_jax.build.trace import traced_scene
 from jourdain_jax.calculus.pseudo_inverse import pseudo_inverse
 from jourdain_jax.calculus.reals import Number, Numbers, described
-from jourdain_jax.dynamics.cyclic import ignorable_coordinates
+from jourdain_jax.dynamics.reduced import ignorable_coordinates
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.motion.start import State

@@ -6,44 +6,17 @@ forward, z down; R rear wheel, B rear frame with rider, H handlebar and fork, F 
 
 import math
 from collections.abc import Mapping
+from dataclasses import fields
 
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool
 
-# Name -> (meaning, unit), in the order of the paper's table; arrays of parameters keep this order.
-PARAMETERS: dict[str, tuple[str, str]] = {
-    "w": ("wheelbase", "m"),
-    "c": ("trail", "m"),
-    "lam": ("steer axis tilt from the vertical", "rad"),
-    "g": ("gravity", "m/s^2"),
-    "rR": ("rear wheel radius", "m"),
-    "mR": ("rear wheel mass", "kg"),
-    "IRxx": ("rear wheel diametral moment of inertia", "kg m^2"),
-    "IRyy": ("rear wheel axial moment of inertia", "kg m^2"),
-    "xB": ("rear frame centre of mass, forward", "m"),
-    "zB": ("rear frame centre of mass, down", "m"),
-    "mB": ("rear frame mass", "kg"),
-    "IBxx": ("rear frame moment of inertia about x", "kg m^2"),
-    "IByy": ("rear frame moment of inertia about y", "kg m^2"),
-    "IBzz": ("rear frame moment of inertia about z", "kg m^2"),
-    "IBxz": ("rear frame product of inertia", "kg m^2"),
-    "xH": ("fork centre of mass, forward", "m"),
-    "zH": ("fork centre of mass, down", "m"),
-    "mH": ("fork mass", "kg"),
-    "IHxx": ("fork moment of inertia about x", "kg m^2"),
-    "IHyy": ("fork moment of inertia about y", "kg m^2"),
-    "IHzz": ("fork moment of inertia about z", "kg m^2"),
-    "IHxz": ("fork product of inertia", "kg m^2"),
-    "rF": ("front wheel radius", "m"),
-    "mF": ("front wheel mass", "kg"),
-    "IFxx": ("front wheel diametral moment of inertia", "kg m^2"),
-    "IFyy": ("front wheel axial moment of inertia", "kg m^2"),
-}
-PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETERS)
+from jourdain_jax.models.whipple_bicycle import WhippleBicycle
 
-_POSITIVE = ("w", "g", "rR", "mR", "mB", "mH", "rF", "mF")
-_NOT_NEGATIVE = ("IRxx", "IRyy", "IBxx", "IByy", "IBzz", "IHxx", "IHyy", "IHzz", "IFxx", "IFyy")
+# name -> unit, meaning and sign, in the order of the paper's table; arrays of parameters keep this order
+PARAMETERS: dict[str, Mapping] = {field.name: field.metadata for field in fields(WhippleBicycle) if field.metadata.get("parameter")}
+PARAMETER_NAMES: tuple[str, ...] = tuple(PARAMETERS)
 
 
 def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*samples"]]:
@@ -53,10 +26,11 @@ def violations(values: Mapping[str, float | Array]) -> dict[str, Bool[Array, "*s
     **Returns:** sentence -> True where the values break it.
     """
     broken = {}
-    for name in _POSITIVE:
-        broken[f"`{name}` ({PARAMETERS[name][0]}) must be positive"] = ~(jnp.asarray(values[name]) > 0)
-    for name in _NOT_NEGATIVE:
-        broken[f"`{name}` ({PARAMETERS[name][0]}) must not be negative"] = ~(jnp.asarray(values[name]) >= 0)
+    for name, known in PARAMETERS.items():
+        if known["positive"] or name == "g":
+            broken[f"`{name}` ({known['about']}) must be positive"] = ~(jnp.asarray(values[name]) > 0)
+        elif known["non_negative"]:
+            broken[f"`{name}` ({known['about']}) must not be negative"] = ~(jnp.asarray(values[name]) >= 0)
     upright = jnp.abs(jnp.asarray(values["lam"])) < math.pi / 2
     broken["`lam` (steer axis tilt, in radians) must lie between -pi/2 and pi/2"] = ~upright
     return broken

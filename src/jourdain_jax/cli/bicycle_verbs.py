@@ -20,11 +20,11 @@ def add(verbs) -> None:
         "files", nargs="+", metavar="FILE", help="parameter files (NAME = VALUE+/-SIGMA), raw measurements (*Measured.txt), or names of shipped bicycles"
     )
     _options(job, "bicycle-results")
-    job.set_defaults(run=_bicycle)
+    job.set_defaults(run=_job)
 
     demo = verbs.add_parser("demo", help=f"the same for a shipped bicycle ({DEMO})")
     _options(demo, "demo-results")
-    demo.set_defaults(run=_demo)
+    demo.set_defaults(run=_job, files=[str(shipped_bicycles()[DEMO])])
 
 
 def _options(parser, folder: str) -> None:
@@ -35,18 +35,11 @@ def _options(parser, folder: str) -> None:
     parser.add_argument("--json", action="store_true", help="print result.json instead of the table")
 
 
-def _bicycle(options) -> bool:
-    shipped = shipped_bicycles() | {path.stem: path for path in shipped_measurements().values()}
-    return _job([shipped.get(name, name) if not os.path.exists(name) else name for name in options.files], options)
-
-
-def _demo(options) -> bool:
-    return _job([shipped_bicycles()[DEMO]], options)
-
-
-def _job(paths, options) -> bool:
+def _job(options) -> bool:
     if options.samples < 1:
         raise ValueError(f"--samples is {options.samples}, expected at least 1")
+    shipped = shipped_bicycles() | {path.stem: path for path in shipped_measurements().values()}
+    paths = [name if os.path.exists(name) else shipped.get(name, name) for name in options.files]
     out = Path(options.out)
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -38,28 +38,18 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def _compile_quickly() -> None:
-    """Spend less on compiling: a command runs each of its programs once. The flags belong to this series of jaxlib; another may not know them."""
-    if jaxlib.__version__.startswith("0.10."):
-        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
-
-
-def _collect_garbage_rarely() -> None:
-    """Tracing makes millions of objects that live for a moment; looking through all others for garbage each time took a tenth of a command's time."""
-    gc.freeze()
-    gc.set_threshold(50_000, 20, 20)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns its exit code."""
-    if arguments is None:  # as a process of its own
-        _collect_garbage_rarely()
+    if arguments is None:  # as a process of its own. Tracing makes millions of objects that live for a moment: garbage is looked for rarely
+        gc.freeze()
+        gc.set_threshold(50_000, 20, 20)
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if arguments and not arguments[0].startswith("-") and arguments[0] not in VERBS:
         print(f"jourdain-jax: unknown verb `{arguments[0]}`; {nearest(arguments[0], VERBS)}", file=sys.stderr)
         return USAGE
     options = parser().parse_args(arguments)
-    _compile_quickly()
+    if jaxlib.__version__.startswith("0.10."):  # less effort on programs that run once; another series may not know the flags
+        os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
     try:
         return OK if options.run(options) else FAILED
     except (ValueError, InUseError, ImportError) as error:

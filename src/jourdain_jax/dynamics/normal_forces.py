@@ -31,13 +31,6 @@ class NormalForce(eqx.Module):
     determined: Bool[Array, ""]
 
 
-class _Support(eqx.Module):
-    """Some contacts, and the sets of bodies whose equations they share."""
-
-    contacts: tuple[str, ...] = eqx.field(static=True)
-    sets: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-
-
 def normal_forces(contacts: dict[str, Contact], bodies: tuple[str, ...], positions: Float[Array, "bodies 3"], hidden: Wrenches, spare: Wrenches, size):
     """The normal force of every contact of `height="coordinates"`, by name.
 
@@ -47,32 +40,33 @@ def normal_forces(contacts: dict[str, Contact], bodies: tuple[str, ...], positio
     """
     carried = {name: _carried(contact, name, bodies) for name, contact in contacts.items() if contact.height == "coordinates"}
     found: dict[str, NormalForce] = {}
-    for support in _supports(carried):
-        found |= _of_support(support, contacts, carried, bodies, positions, hidden, spare, size)
+    for names in _supports(carried):
+        found |= _of_support(names, contacts, carried, bodies, positions, hidden, spare, size)
     return found
 
 
-def _supports(carried: dict[str, tuple[int, ...]]) -> list[_Support]:
+def _supports(carried: dict[str, tuple[int, ...]]) -> list[list[str]]:
     """Contacts that carry bodies in common, directly or through others, belong together."""
     groups: list[list[str]] = []
     for name, own in carried.items():
         together = [group for group in groups if any(set(own) & set(carried[other]) for other in group)]
         groups = [group for group in groups if group not in together] + [[*(other for group in together for other in group), name]]
-    return [_Support(tuple(group), tuple(dict.fromkeys(carried[name] for name in group))) for group in groups]
+    return groups
 
 
-def _of_support(support: _Support, contacts, carried, bodies, positions, hidden: Wrenches, spare: Wrenches, size) -> dict[str, NormalForce]:
-    points = jnp.stack([contacts[name].point for name in support.contacts])
-    normals = jnp.stack([contacts[name].plane.normal for name in support.contacts])
+def _of_support(names: list[str], contacts, carried, bodies, positions, hidden: Wrenches, spare: Wrenches, size) -> dict[str, NormalForce]:
+    sets = tuple(dict.fromkeys(carried[name] for name in names))  # of bodies, whose equations these contacts share
+    points = jnp.stack([contacts[name].point for name in names])
+    normals = jnp.stack([contacts[name].plane.normal for name in names])
     here = jnp.mean(points, axis=0)
-    wrenches = [_resultant(wrench, positions, support.sets, here) for wrench in (hidden, spare)]
+    wrenches = [_resultant(wrench, positions, sets, here) for wrench in (hidden, spare)]
     forces, moments = wrenches[0]
     tolerance = jnp.sqrt(jnp.finfo(forces.dtype).eps)
-    if len(support.contacts) == 1:
+    if len(names) == 1:
         normal = normals[0] @ forces
-        return {support.contacts[0]: NormalForce(normal, _unmoved(wrenches[1][0] @ normals.T, spare, tolerance)[0])}
+        return {names[0]: NormalForce(normal, _unmoved(wrenches[1][0] @ normals.T, spare, tolerance)[0])}
 
-    touches = [[bodies.index(contacts[name].body) in own or carried[name] == own for name in support.contacts] for own in support.sets]
+    touches = [[bodies.index(contacts[name].body) in own or carried[name] == own for name in names] for own in sets]
     by_set = jnp.asarray(touches, normals.dtype)[:, None, :]
     levers = points - here
     length = jnp.maximum(jnp.sqrt(jnp.max(jnp.sum(levers * levers, axis=1))), jnp.finfo(levers.dtype).tiny)
@@ -95,7 +89,7 @@ def _of_support(support: _Support, contacts, carried, bodies, positions, hidden:
     met = (missed[0] <= tolerance * size) & (missed[1] <= tolerance * (size + jnp.max(jnp.abs(hidden.torque)) / length))
     by_forces_alone, by_both = jnp.abs(jnp.diagonal(left)) <= tolerance, jnp.abs(jnp.diagonal(open_still)) <= tolerance
     determined = jax.lax.stop_gradient((by_forces_alone | (by_both & met)) & _unmoved(jax.vmap(solved)(*wrenches[1]), spare, tolerance))
-    return {name: NormalForce(N[i], determined[i]) for i, name in enumerate(support.contacts)}
+    return {name: NormalForce(N[i], determined[i]) for i, name in enumerate(names)}
 
 
 def _resultant(wrench: Wrenches, positions, sets: tuple[tuple[int, ...], ...], here):

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from jourdain_jax.ensembles import optional
+from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.ensembles.histograms import CELLS as BARS
 from jourdain_jax.ensembles.histograms import Histogram, pictures
 from jourdain_jax.ensembles.sensitivity import SobolIndices, sobol_indices
@@ -174,7 +174,7 @@ class StudyResult(Printed):
 
     def to_xarray(self):
         """All arrays as an `xarray.Dataset` with names and units, read where they are used; lanes that are not done are NaN, their result is -1."""
-        return optional.xarray().open_zarr(self.store.path, chunks=None, consolidated=True)
+        return needed("xarray", "a study as labelled arrays", "ensembles").open_zarr(self.store.path, chunks=None, consolidated=True)
 
     def to_netcdf(self, path: str | os.PathLike) -> None:
         """Write all arrays to the NetCDF file `path`, by whichever engine of xarray is installed."""
@@ -189,7 +189,7 @@ class StudyResult(Printed):
 
     def plot(self, *outputs: str, path: str | os.PathLike | None = None):
         """Histograms of `outputs` (default: all) in one figure, which is returned, and written to `path` where that is given. Needs matplotlib."""
-        plt = optional.pyplot()
+        plt = needed("matplotlib.pyplot", "a plot", "plot")
         names = outputs or self.outputs
         figure, axes = plt.subplots(1, len(names), figsize=(3.6 * len(names), 3.0), squeeze=False, layout="constrained")
         for axis, name in zip(axes[0], names, strict=True):

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jourdain_jax.ensembles.optional import sequences
+from jourdain_jax.calculus.on_first_use import needed
 
 MOST_SOBOL = 2**30  # points of the sequence, of 30 bits
 _ROUNDS = 6
@@ -63,7 +63,7 @@ def latin_hypercube(seed: int, first: int, last: int, variables: int, samples: i
 
 def sobol(seed: int, first: int, last: int, variables: int, samples: int) -> np.ndarray:
     """Points first to last - 1 of a scrambled Sobol sequence, shape (last - first, variables)."""
-    engine = sequences().Sobol(variables, scramble=True, rng=np.random.default_rng(seed))
+    engine = needed("scipy.stats.qmc", "a Sobol sequence", "ensembles").Sobol(variables, scramble=True, rng=np.random.default_rng(seed))
     with warnings.catch_warnings():  # pieces of a sequence need not be powers of two
         warnings.simplefilter("ignore", UserWarning)
         if first:

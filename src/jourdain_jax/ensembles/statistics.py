@@ -48,12 +48,12 @@ class Grid:
 
     def as_dict(self) -> dict:
         """The grid for JSON; floats keep all their digits there."""
-        return {"low": self.low.tolist(), "high": self.high.tolist(), "centre": self.centre.tolist()}
+        return {name: values.tolist() for name, values in vars(self).items()}
 
     @classmethod
     def from_dict(cls, found: dict) -> "Grid":
         """The grid that `as_dict` wrote."""
-        return cls(*(np.array(found[name], float) for name in ("low", "high", "centre")))
+        return cls(**{name: np.array(values, float) for name, values in found.items()})
 
 
 def sums_of_block(grid: Grid, values: np.ndarray) -> np.ndarray:

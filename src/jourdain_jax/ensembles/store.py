@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.ensembles import optional
 from jourdain_jax.ensembles.files import locked, write_whole
 
@@ -72,7 +73,7 @@ class Store:
     @staticmethod
     def make(path: str | os.PathLike, study: Mapping, columns: Mapping[str, Column], constants: Mapping[str, tuple], attributes: Mapping) -> "Store":
         """A new folder, whole or absent; an existing one is not touched. `constants`: name -> axis, values, attributes."""
-        zarr = optional.zarr()
+        zarr = needed("zarr", "storing a study", "ensembles")
         path = Path(path)
         if path.is_file():
             raise ValueError(f"`{path}` is a file, expected a folder for the study; give another name")

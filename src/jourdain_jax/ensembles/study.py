@@ -96,11 +96,9 @@ class Study(Printed):
     def design(self) -> Design:
         """The samples: parameters by name, start values by name with `_at_start`."""
         varying, _ = self._named
-        pairs = {tuple(map(self._column, pair)): value for pair, value in (self.correlation or {}).items()}
+        column = {name: name + AT_START for name in self.start or ()} | {name: name for name in self.vary or ()}
+        pairs = {tuple(column.get(name, name) for name in pair): value for pair, value in (self.correlation or {}).items()}
         return Design(varying, self.sampler, self.samples, self.seed, pairs or None)
-
-    def _column(self, name: str) -> str:
-        return name if name in (self.vary or {}) else name + AT_START if name in (self.start or {}) else name
 
     def task(self, *, t1=None, ts=None, t0=None, outputs: Mapping | None = None, save: str = "outputs", every: int = 1, **options) -> Task:
         """All that decides the numbers of a run; arguments as in `run`: `t1`, `ts`, `t0` in s, `outputs`, `save`, `every`, `options`."""

@@ -100,7 +100,7 @@ def _rates(traced: _Traced, structure: Structure, kept: list[int], independent: 
     M = mass_matrix(m, I, beta, gamma)
     force, torque = at["force"] - m[..., None] * a, at["torque"] - turned(alpha) - np.cross(omega, turned(omega))
     f = np.einsum("sbik,sbi->sk", beta, force) + np.einsum("sbik,sbi->sk", gamma, torque) + at["direct"]
-    return DenseRates(at["qdot"], _accelerations(M, f, A, drift, structure.row_lengths)[:, list(independent)], at["events"])
+    return DenseRates(at["qdot"], _accelerations(M, f, A[:, kept], drift[:, kept], structure.row_lengths[kept])[:, list(independent)], at["events"])
 
 
 def _accelerations(M, f, A, drift, row_lengths: np.ndarray) -> np.ndarray:

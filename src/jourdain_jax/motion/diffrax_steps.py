@@ -21,8 +21,8 @@ from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.event_location import Remembering, locate, with_tolerances
 from jourdain_jax.motion.integrators.event_search import no_event
 from jourdain_jax.motion.integrators.guarded_solver import GuardedSolver
-from jourdain_jax.motion.integrators.solver_choice import controller_of, since
-from jourdain_jax.motion.integrators.step_to_times import merged, step_to_times
+from jourdain_jax.motion.integrators.solver_choice import takes_even_steps
+from jourdain_jax.motion.integrators.step_to_times import EvenSteps, merged, step_to_times
 from jourdain_jax.motion.integrators.wrapping_solver import for_adjoint
 from jourdain_jax.motion.setup import Begun, Integrator, Setup, Solved
 from jourdain_jax.motion.trajectories import results
@@ -59,12 +59,15 @@ class Diffrax(Integrator):
         names, (rtol, atol) = self.event_names, setup.tolerances
         landings = jnp.append(ts if self.saveat is None else ts[:0], t1)
         landings = landings if knots is None else merged(landings, knots + t0, jnp.sign(t1 - t0))
-        controller = controller_of(self.solver, self.controller, landings)
-        land = (self.saveat is None or knots is not None) and controller is None
-        controller = self.controller if controller is None else controller
-        if controller is None:
-            controller = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, force_dtmin=False)
-        saveat = diffrax.SaveAt(ts=ts) if self.saveat is None else since(self.saveat, origin)
+        if takes_even_steps(self.solver) and (self.controller is None or type(self.controller) is diffrax.ConstantStepSize):
+            controller = to_times = EvenSteps(landings)
+        else:
+            by_tolerance = diffrax.PIDController(rtol=rtol, atol=atol, norm=integrands.state_norm, dtmin=setup.shortest, force_dtmin=False)
+            controller = by_tolerance if self.controller is None else self.controller
+            to_times = step_to_times(landings, controller) if self.saveat is None or knots is not None else controller
+        saveat = diffrax.SaveAt(ts=ts) if self.saveat is None else self.saveat
+        if self.saveat is not None and saveat.subs.ts is not None:
+            saveat = eqx.tree_at(lambda saveat: saveat.subs.ts, saveat, saveat.subs.ts - origin)
         solver = for_adjoint(self.solver, self.adjoint)
         implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
         rates, project = (ZeroTangentIfNonfinite(f, t0, y0) if implicit else f for f in (integrands.rates, integrands.project))
@@ -79,10 +82,10 @@ class Diffrax(Integrator):
             y0,
             args,
             saveat=diffrax.SaveAt(subs=[saveat.subs, diffrax.SubSaveAt(t1=True)], solver_state=True),
-            stepsize_controller=step_to_times(landings, controller) if land else controller,
+            stepsize_controller=to_times,
             adjoint=self.adjoint,
             event=diffrax.Event(_an_event) if names else None,
-            max_steps=self.max_steps + (0 if knots is None else len(knots)),
+            max_steps=setup.most_steps(knots),
             throw=False,
         )
         t_end, y_end = solution.ts[1][0], jax.tree.map(lambda x: x[0], solution.ys[1])

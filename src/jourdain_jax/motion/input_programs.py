@@ -152,20 +152,8 @@ def _one_of_equals(program: TimeProgram) -> TimeProgram:
     return program
 
 
-def for_programs(f: Callable, compiled_by: Callable[[Callable, Callable], Callable]) -> Callable[[Hashable], Callable]:
-    """`f` compiled for a set of input programs; what was compiled for one is dropped, machine code included, when as many other sets were used since.
-
-    `compiled_by`: takes the function and what compiles it.
-    """
-    for_none = compiled_by(f, compiled)
-    for_some = lru_cache(maxsize=MOST_COMPILED)(lambda programs: compiled_by(f, compiled))
-
-    def of(programs: Hashable) -> Callable:
-        return for_some(programs) if programs else for_none
-
-    return of
-
-
-def by_itself(f: Callable, compiler: Callable) -> Callable:
-    """`f` as the compiler makes it."""
-    return compiler(f)
+def for_programs(f: Callable, compiled_by: Callable[[Callable], Callable] = compiled) -> Callable[[Hashable], Callable]:
+    """`f` compiled for a set of input programs; what was compiled for one is dropped, machine code included, when as many other sets were used since."""
+    for_none = compiled_by(f)
+    for_some = lru_cache(maxsize=MOST_COMPILED)(lambda programs: compiled_by(f))
+    return lambda programs: for_some(programs) if programs else for_none

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jourdain_jax.calculus.reals import as_real, checked_real, checked_unless_traced, described, is_traced, real_type
-from jourdain_jax.motion.input_programs import FunctionOfTime, by_itself, for_programs, traced
+from jourdain_jax.motion.input_programs import FunctionOfTime, for_programs, traced
 from jourdain_jax.scene.arguments import ChangingInputs
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
@@ -96,7 +96,7 @@ def inputs_at(inputs: Inputs, t) -> Float[Array | np.ndarray, "inputs"]:
     return inputs(t) if is_traced(inputs, t) else _compiled_inputs(inputs.programs)(inputs, np.asarray(t, real_type()))
 
 
-_compiled_inputs = for_programs(lambda inputs, t: inputs(t), by_itself)
+_compiled_inputs = for_programs(lambda inputs, t: inputs(t))
 
 
 _NOTHING = object()

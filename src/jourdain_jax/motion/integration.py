@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.plausibility import body_faults
 from jourdain_jax.build.row_program import row_program
+from jourdain_jax.calculus.guards import forward_only, reverse_only
 from jourdain_jax.calculus.nan_where import nan_where
 from jourdain_jax.calculus.reals import in_default_precision, real_type
 from jourdain_jax.equations.reductions import SMALLEST_PIVOT
@@ -22,7 +23,7 @@ from jourdain_jax.motion.arguments import times_fit
 from jourdain_jax.motion.energy_check import conserves, energies_near, energy_lost
 from jourdain_jax.motion.input_programs import for_programs
 from jourdain_jax.motion.integrators import integrands
-from jourdain_jax.motion.integrators.solver_choice import marked_inputs, marked_outputs, time_origin
+from jourdain_jax.motion.integrators.solver_choice import time_origin
 from jourdain_jax.motion.native import seen
 from jourdain_jax.motion.quick_compilation import QUICK, RUN_SELDOM, quickly_compiled
 from jourdain_jax.motion.setup import Begun, Setup, Solved
@@ -45,8 +46,8 @@ def _one_motion(setup: Setup) -> tuple[Trajectory, Bool[Array, ""]]:
     """The motion, and whether its start came onto the rows."""
     setup, arrived = _with_machine_code(_prepared(setup)), jnp.array(True)
     if not isinstance(setup.start, State):
-        found = moved_onto_rows(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0))
-        setup, arrived = setup._replace(start=found.state), found.arrived
+        start, arrived = moved_onto_rows(setup.scene, setup.t0, setup.start, setup.inputs(setup.t0))
+        setup = setup._replace(start=start)
     begun, fitting = _begin(setup), setup.fitting()
     return _finish(setup, fitting, begun, setup.integrator.solved(fitting, begun)), arrived
 
@@ -64,9 +65,13 @@ _compiled = for_programs(_one_motion, partial(quickly_compiled, options=_compile
 
 
 def _prepared(setup: Setup) -> Setup:
-    """The setup with all numbers in the default precision (derivatives keep the type of what is differentiated), marked by the mode of differentiation."""
+    """The setup with all numbers in the default precision (derivatives keep the type of what is differentiated).
+
+    In forward mode they raise our own error where the adjoint supports reverse mode alone; outputs do the other way round (`_finish`), since reverse mode
+    comes to them first.
+    """
     numbers = in_default_precision({name: getattr(setup, name) for name in ("scene", "start", "inputs", "t0", "t1", "ts")})
-    return setup._replace(**marked_inputs(setup.integrator.mode(setup), numbers))
+    return setup._replace(**(reverse_only(numbers) if setup.integrator.mode(setup) == "reverse" else numbers))
 
 
 def _with_machine_code(setup: Setup) -> Setup:
@@ -97,7 +102,8 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     t0, field, integrator = setup.t0, setup.field, setup.integrator
     start, args = begun.start, begun.args
     _, scene, inputs, fixed, origin = args
-    solved = eqx.tree_at(lambda s: (s.ys, s.y_end, s.t_end), solved, marked_outputs(integrator.mode(given), (solved.ys, solved.y_end, solved.t_end)))
+    if integrator.mode(given) == "forward":
+        solved = eqx.tree_at(lambda s: (s.ys, s.y_end, s.t_end), solved, forward_only((solved.ys, solved.y_end, solved.t_end)))
     moving = field.projects
     stored_first = field.stored(scene, t0, start.q, inputs(t0))
     direction = jnp.sign(setup.t1 - t0)
@@ -108,9 +114,9 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
         tau, y = jnp.where(valid, tau, solved.t_end), jax.tree.map(lambda a, b: jnp.where(valid, a, b), y, solved.y_end)
         y = integrands.project(tau, y, args) if moving and not integrator.projects_saved else y
         t = origin + tau
-        seen = field.observed(scene, fixed, t, y, inputs(t))
-        work = None if y.work is None else y.work + field.stored(scene, t, seen.q, inputs(t)) - stored_first
-        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (seen.q, seen.u, work)), seen.pivot, (t, y)
+        u, pivot = field.speeds_and_pivot(scene, fixed, t, y, inputs(t))
+        work = None if y.work is None else y.work + field.stored(scene, t, y.q, inputs(t)) - stored_first
+        return jax.tree.map(lambda x: jnp.where(valid, x, jnp.nan), (y.q, u, work)), pivot, (t, y)
 
     # start and end as two more saved states, so that all this is compiled once
     start_and_end = (jnp.zeros_like(solved.t_end), begun.y0, begun.timely), (solved.t_end, solved.y_end, begun.timely)

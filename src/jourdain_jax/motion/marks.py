@@ -5,9 +5,6 @@ from functools import wraps
 
 import jax
 
-from jourdain_jax.calculus.reals import is_traced
-from jourdain_jax.motion.trajectories import results
-
 
 def nan_is_a_mark():
     """A context in which JAX does not look for NaN."""
@@ -25,14 +22,3 @@ def with_nan_as_a_mark(f: Callable) -> Callable:
             return f(*arguments, **named)
 
     return run
-
-
-def marked(integrate, setup):
-    """`integrate(setup)` under `jax_debug_nans`: NaN after an event is a mark; where the motion failed, it is integrated again for JAX to find the NaN."""
-    if not jax.config.jax_debug_nans:
-        return integrate(setup)
-    with nan_is_a_mark():
-        motion = integrate(setup)
-    if motion is None or is_traced(motion.result) or int(motion.result) in (results.SUCCESS, results.EVENT):
-        return motion
-    return integrate(setup)

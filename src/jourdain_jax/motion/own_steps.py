@@ -51,7 +51,6 @@ class OwnSteps(Integrator):
         return self.kind
 
     def reason_against_machine_code(self, setup: Setup) -> str:
-        """Why the loop over steps is one of XLA's, in words; empty where it is none."""
         if not self.native:
             return "another backend was asked for"
         return native_motion.reason_against(setup.field, setup.scene, setup.inputs, bool(self.event_names))
@@ -60,7 +59,6 @@ class OwnSteps(Integrator):
         return self._by_either(lambda mode: partial(_by_xla, mode), lambda f: f, setup, begun)
 
     def lanes_solved(self, setups: Setup, begun: Begun) -> Solved:
-        """Lanes: those of a scalar program in blocks; all arrays have a leading axis of lanes."""
         if (program := setups.field.lowered) is None:
             return super().lanes_solved(setups, begun)
         return self._by_either(lambda mode: partial(in_blocks, partial(_lanes_by_xla, mode), width(program)), eqx.filter_vmap, setups, begun)
@@ -123,7 +121,7 @@ def _loop(mode: Mode, setup: Setup, y0, args, ts, knots) -> Solved:
         rtol=jnp.broadcast_to(setup.tolerances[0], setup.t0.shape),
         atol=jnp.broadcast_to(setup.tolerances[1], setup.t0.shape),
         shortest=setup.shortest,
-        max_steps=_most_steps(setup, knots),
+        max_steps=setup.most_steps(knots),
         knots=knots,
         rates_and_pivots=integrands.rates_and_pivots if field.has_pivots else None,
     )
@@ -139,18 +137,13 @@ def _by_machine_code(setup: Setup, begun: Begun) -> Solved:
 def _motion(setup: Setup, begun: Begun) -> native_motion.Motion:
     own, knots = _own(setup), setup.knots
     rtol, atol = setup.tolerances
-    control = native_motion.Control(rtol, atol, setup.shortest, setup.dt0, _most_steps(setup, knots))
+    control = native_motion.Control(rtol, atol, setup.shortest, setup.dt0, setup.most_steps(knots))
     return native_motion.Motion(begun.args, own.solver, own.order, bool(own.event_names), begun.y0, _goals(setup, setup.ts), knots, control)
 
 
 def _own(setup: Setup) -> OwnSteps:
     assert isinstance(setup.integrator, OwnSteps)
     return setup.integrator
-
-
-def _most_steps(setup: Setup, knots) -> int:
-    """Steps that end at knots do not count."""
-    return setup.integrator.max_steps + (0 if knots is None else len(knots))
 
 
 def _rules(setup: Setup, quick: Callable, mapped: Callable, alongside: bool) -> Rules:
@@ -192,11 +185,7 @@ def _pulled(perturbed: tuple, setup: Setup, begun: Begun, found: Solved, g: Solv
 
 def _goals(setup: Setup, ts) -> Float[Array, "times *lanes"]:
     """Times since the start to go to."""
-    return _since(setup.t0, ts, setup.t1)
-
-
-def _since(t0, ts, t1) -> Float[Array, "times *lanes"]:
-    return jnp.concatenate([ts, t1[None]]) - t0
+    return jnp.concatenate([ts, setup.t1[None]]) - setup.t0
 
 
 def _as_solved(goals, ys: PyTree, reached, end: erk_loop.Progress) -> Solved:

@@ -72,12 +72,9 @@ def put_positions(scene: Scene, t, q, free, usual: Usual, known: tuple | None = 
         near_q = project_positions(scene, t, q, free=free, typical=lengths, by=by)
         return near_q, by.closures(by.given(scene), t, near_q)[0]
 
-    def by_machine_code(rows: Rows):
-        return lambda scene, t, q, free, lengths: _put(rows, scene, [t[None], q], free, lengths)
-
     given = scene, jnp.asarray(t), q, free, usual.closures
     if known is None:
-        return _by_either(usual, "positions", False, by_xla, by_machine_code)(*given)
+        return _by_either(usual, "positions", False, by_xla)(*given)
 
     def of_known(_, *given):
         return by_xla(functions_of_rows(usual), *given)
@@ -95,11 +92,8 @@ def put_speeds(scene: Scene, t, q, u, inputs, free, usual: Usual) -> tuple[Float
         near_u = project_speeds(scene, t, q, u, inputs, free=free, typical=lengths, affine=affine, determined=determined, by=by)
         return near_u, by.rows(by.given(scene), t, q, near_u, inputs)[0]
 
-    def by_machine_code(rows: Rows):
-        return lambda scene, t, q, u, inputs, free, lengths: _put(rows, scene, [t[None], q, u, inputs], free, lengths)
-
     kind = "determined speeds" if determined else "speeds"
-    return _by_either(usual, kind, affine or determined, by_xla, by_machine_code)(scene, jnp.asarray(t), q, u, inputs, free, usual.rows)
+    return _by_either(usual, kind, affine or determined, by_xla)(scene, jnp.asarray(t), q, u, inputs, free, usual.rows)
 
 
 def functions_of_rows(usual: Usual) -> RowFunctions:
@@ -107,11 +101,11 @@ def functions_of_rows(usual: Usual) -> RowFunctions:
     return BY_AUTODIFF if usual.program is None else row_functions(usual.program)
 
 
-def _by_either(usual: Usual, kind, affine: bool, by_xla, by_machine_code):
+def _by_either(usual: Usual, kind, affine: bool, by_xla):
     of_rows = partial(by_xla, functions_of_rows(usual))
     if usual.program is None or _reason_against(rows := Rows(usual.program, kind, affine)):
         return of_rows
-    return differentiated_as(of_rows, or_elsewhere(by_machine_code(rows), of_rows), "forward")
+    return differentiated_as(of_rows, or_elsewhere(partial(_put, rows), of_rows), "forward")
 
 
 @lru_cache(maxsize=MOST_KERNELS)
@@ -125,8 +119,8 @@ def _kernel(rows: Rows, given_in: np.dtype):
     return called(lambda lanes, threads: written(rows, lanes, host.fuses(), threads, cutoff), lambda *_: ((count,),), effort=1)
 
 
-def _put(rows: Rows, scene: Scene, state: list, free, lengths) -> tuple[Array, Array]:
-    """What moved, and what is left of the rows; `state`: time, coordinates and so on."""
-    real, given = real_type(), (*entries(scene, rows.program.parameters), *state, free, lengths)
+def _put(rows: Rows, scene: Scene, t, *vectors) -> tuple[Array, Array]:
+    """What moved, and what is left of the rows, by machine code."""
+    real, given = real_type(), (*entries(scene, rows.program.parameters), t[None], *vectors)
     found = _kernel(rows, real)(jnp.concatenate([jnp.asarray(x, real) for x in given]))[0]
     return found[: len(rows.moving)], found[len(rows.moving) :]

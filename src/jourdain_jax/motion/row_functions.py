@@ -90,19 +90,7 @@ def _function(graph: Graph, places: dict[int, int], size: int, variables: Sequen
         J, rows = slopes()
         return J(x).T @ g[rows]
 
-    along, back = jax.custom_jvp(by_slopes), jax.custom_jvp(by_slopes_back)
-
-    @along.defjvp
-    def along_rule(at, tangents):
-        if curved() is None:
-            return jax.jvp(by_slopes, at, tangents)
-        return along(*at), along(at[0], tangents[1]) + curved()(jnp.concatenate([*at, tangents[0]]))
-
-    @back.defjvp
-    def back_rule(at, tangents):
-        if bent() is None:
-            return jax.jvp(by_slopes_back, at, tangents)
-        return back(*at), back(at[0], tangents[1]) + bent()(jnp.concatenate([*at, tangents[0]]))
+    along, back = _with_second(by_slopes, curved), _with_second(by_slopes_back, bent)
 
     def serve(order: int, *_) -> bool:
         return order <= 2 and slopes() is not None
@@ -116,6 +104,19 @@ def _function(graph: Graph, places: dict[int, int], size: int, variables: Sequen
     by_xla, quick = _by_xla_and_machine_code(graph, places, size, variables)
     values = differentiated_as(by_xla, quick, "both", Rules(serve, push, pull), by_xla)
     return values
+
+
+def _with_second(f: Callable, second: Callable) -> Callable:
+    """`f(x, v)`, which is linear in v; its derivative along x is `second()` of x, v and the direction, where that is machine code."""
+    linear = jax.custom_jvp(f)
+
+    @linear.defjvp
+    def rule(at, tangents):
+        if second() is None:
+            return jax.jvp(f, at, tangents)
+        return linear(*at), linear(at[0], tangents[1]) + second()(jnp.concatenate([*at, tangents[0]]))
+
+    return linear
 
 
 def _second(graph: Graph, places: dict[int, int], size: int, variables: Sequence[int], back: bool) -> Callable[[Array], Array] | None:

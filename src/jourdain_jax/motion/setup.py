@@ -104,6 +104,10 @@ class Setup(NamedTuple):  # an Equinox module takes 50 us to make
         """Why the loop over steps is one of XLA's and not machine code of our own, in words; empty where it is."""
         return self.integrator.reason_against_machine_code(self)
 
+    def most_steps(self, knots: Float[Array, "knots"] | None) -> int:
+        """How many steps may be taken; those that end at knots do not count."""
+        return self.integrator.max_steps + (0 if knots is None else len(knots))
+
     @property
     def shortest(self) -> Float[Array, "*lanes"]:
         """The shortest step, s."""

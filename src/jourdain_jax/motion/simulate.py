@@ -22,13 +22,14 @@ from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.solver_choice import check_solver, fitted, takes_even_steps
 from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method, as_solver
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
-from jourdain_jax.motion.marks import marked
+from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.own_steps import own_steps, reason_against_series
 from jourdain_jax.motion.quick_compilation import nothing_is_traced
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Setup
 from jourdain_jax.motion.start import State, Unmoved, named_unmoved, put_on_rows, unmoved
+from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.vector_fields.choice import Formulation, as_formulation, vector_field
 from jourdain_jax.scene.arguments import BuiltFor, as_scene
@@ -129,7 +130,14 @@ def _run(given: dict) -> tuple[Setup, Trajectory]:
 
 
 def _integrated(setup: Setup) -> Trajectory | None:
-    return marked(integrate, setup)
+    """The motion; under `jax_debug_nans`, NaN after an event is a mark, and a motion that failed is integrated again for JAX to find the NaN."""
+    if not jax.config.jax_debug_nans:
+        return integrate(setup)
+    with nan_is_a_mark():
+        motion = integrate(setup)
+    if motion is None or is_traced(motion.result) or int(motion.result) in (results.SUCCESS, results.EVENT):
+        return motion
+    return integrate(setup)
 
 
 def set_up(scene: Scene | BuiltFor, start=None, **options) -> Setup:
@@ -203,8 +211,8 @@ def _start(scene: Scene, given, t0, inputs: Inputs, native: bool, projects: bool
     """The start; numbers that are known are put onto the rows by the program that integrates, unless it takes a search."""
     if projects and not searches and nothing_is_traced():
         if isinstance(given, State):
-            return unmoved(scene, given, native)
-        return named_unmoved(scene, named_values(scene, given), t0, inputs_at(inputs, t0), native)
+            return unmoved(scene, given.q, given.u, native)
+        return named_unmoved(scene, named_values(scene, given), t0, inputs_at(inputs, t0), native).start
     if isinstance(given, State):
         return put_on_rows(scene, t0, given.q, given.u, inputs_at(inputs, t0), native=native) if projects else given
     return as_state(scene, given, t0=t0, inputs=inputs_at(inputs, t0), native=native, onto_rows=projects)

@@ -91,14 +91,28 @@ def consistent(scene: Scene, t, q: Numbers, u: Numbers, inputs=None, *, held: tu
 
 def put_on_rows(scene: Scene, t, q, u, inputs, *, held: tuple[str, ...] = (), native: bool = True) -> State:
     """As `consistent`; `native`: whether machine code of our own may do it."""
-    t, q, u = _as_time(t), as_coordinates(scene, q), as_speeds(scene, u)
-    inputs = _as_input_vector(scene, inputs, q.dtype)
+    t, start = _as_time(t), unmoved(scene, q, u, native, held)
+    return _consistent(scene, t, start, _as_input_vector(scene, inputs, start.q.dtype), lambda: np.zeros((0, start.q.shape[0]), start.q.dtype))
+
+
+class Unmoved(NamedTuple):
+    """A start that is yet to be put onto the rows."""
+
+    q: Float[Array | np.ndarray, "coordinates"]
+    u: Float[Array | np.ndarray, "speeds"]
+    free_q: Bool[np.ndarray, "coordinates"]  # what may move
+    free_u: Bool[np.ndarray, "speeds"]
+    usual: Usual
+
+
+def unmoved(scene: Scene, q, u, native: bool, held: tuple[str, ...] = ()) -> Unmoved:
+    """Coordinates and speeds of which all move but what is `held`; a ValueError where they are none of this scene. `native`: as in `put_on_rows`."""
     coordinates, speeds = scene.coordinate_names.entries, scene.speed_names.entries
+    q, u = as_coordinates(scene, q), as_speeds(scene, u)
     for name in held:
         if name not in coordinates + speeds:
             raise ValueError(f"`held` names `{name}`, which is no coordinate or speed; {nearest(name, coordinates + speeds)}")
-    free_q, free_u = _free(coordinates, tuple(held)), _free(speeds, tuple(held))
-    return _consistent(scene, t, q, u, inputs, free_q, free_u, lambda: np.zeros((0, q.shape[0]), q.dtype), native=native)
+    return Unmoved(q, u, _free(coordinates, tuple(held)), _free(speeds, tuple(held)), usual_sizes(scene, False, native))
 
 
 @lru_cache(maxsize=1024)
@@ -107,21 +121,18 @@ def _free(names: tuple[str, ...], held: tuple[str, ...]) -> Bool[np.ndarray, "en
     return np.array([name not in held for name in names], bool)
 
 
-def _consistent(scene: Scene, t, q, u, inputs, free_q, free_u, guesses: Callable, *, native: bool, determined: bool = False) -> State:
-    """The nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`.
-
-    `determined`: rows determine the speeds that are free; `native`: as in `put_on_rows`.
-    """
-    given = scene, t, q, u, inputs, free_q, free_u
-    arguments = *given, usual_sizes(scene, determined, native)
+def _consistent(scene: Scene, t, start: Unmoved, inputs, guesses: Callable) -> State:
+    """The nearest state; where Newton's method does not arrive, what a damped search finds from q, and then from other configurations, `guesses()`."""
+    given = scene, t, start, inputs
     if not nothing_is_traced() and is_traced(given):
-        return _compiled_projection(*arguments, guesses()).state
+        return _compiled_projection(*given, guesses())[0]
     # numbers are put onto the rows at once, also where a function around this call is being traced; elsewhere that would compile constants one by one
     with nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval():
-        found = _compiled_projection(*arguments, None)
-        if not np.asarray(found.arrived) and _can_search(scene):  # rare, and long to compile
-            found = jax.tree.map(jnp.asarray, _uncompiled_projection(*given, replace(arguments[-1], program=None), guesses()))
-    return found.state
+        state, arrived = _compiled_projection(*given, None)
+        if not np.asarray(arrived) and len(start.usual.closures):  # rare, and long to compile
+            by_xla = start._replace(usual=replace(start.usual, program=None))
+            state = jax.tree.map(jnp.asarray, _uncompiled_projection(scene, t, by_xla, inputs, guesses())[0])
+    return state
 
 
 def _as_time(t):
@@ -134,43 +145,14 @@ def _as_input_vector(scene: Scene, inputs, dtype):
     return inputs if isinstance(inputs, np.ndarray) and inputs.shape == (len(scene.inputs),) else as_input_vector(scene, inputs, dtype)
 
 
-class Found(eqx.Module):
-    """A state on the rows; its residual is infinite where a number is not finite."""
+def moved_onto_rows(scene: Scene, t, start: Unmoved, inputs) -> tuple[State, Bool[Array, ""]]:
+    """The state on the rows nearest to `start`, by Newton's method alone, as a part of a larger compiled function; and whether it arrived.
 
-    state: State
-    arrived: Bool[Array, ""]  # whether the coordinates did, and are within reach of the domain
-
-
-class Unmoved(NamedTuple):
-    """A start that the compiled function which integrates it puts onto the rows first."""
-
-    q: Float[Array | np.ndarray, "coordinates"]
-    u: Float[Array | np.ndarray, "speeds"]
-    free_q: Bool[np.ndarray, "coordinates"]
-    free_u: Bool[np.ndarray, "speeds"]
-    usual: Usual
-
-
-def unmoved(scene: Scene, start: State, native: bool) -> Unmoved:
-    """A state of a scene, whose numbers are known; a ValueError where it is none of this scene."""
-    q, u = as_coordinates(scene, start.q), as_speeds(scene, start.u)
-    return Unmoved(q, u, _free(scene.coordinate_names.entries, ()), _free(scene.speed_names.entries, ()), usual_sizes(scene, False, native))
-
-
-def named_unmoved(scene: Scene, values: Mapping, t0, inputs, native: bool) -> Unmoved:
-    """As `named_start` of values that are known, before it is put onto the rows."""
-    named = _named(scene, values, t0, inputs)
-    return Unmoved(named.q, named.u, named.free_q, named.free_u, usual_sizes(scene, named.determined, native))
-
-
-def moved_onto_rows(scene: Scene, t, start: Unmoved, inputs) -> Found:
-    """The state on the rows nearest to `start`, by Newton's method alone, as a part of a larger compiled function.
-
-    Where something is held, it has arrived when nothing but round-off is left of the rows.
+    Where something is held, it has when nothing but round-off is left of the rows.
     """
-    found = _put_onto_constraints(scene, t, start.q, start.u, inputs, start.free_q, start.free_u, start.usual, None)
+    state, arrived = _put_onto_constraints(scene, t, start, inputs, None)
     holds = ~(jnp.all(start.free_q) & jnp.all(start.free_u))
-    return Found(found.state, found.arrived & ~(holds & is_off(found.state)))
+    return state, arrived & ~(holds & is_off(state))
 
 
 def is_off(state: State) -> Bool[Array | np.ndarray, ""]:
@@ -178,18 +160,17 @@ def is_off(state: State) -> Bool[Array | np.ndarray, ""]:
     return ~(state.residual <= _OFF * np.finfo(state.q.dtype).eps)
 
 
-def _can_search(scene: Scene) -> bool:
-    return bool(names_of_position_rows(scene) or scene.coordinates.quaternions)
+def _put_onto_constraints(scene: Scene, t, start: Unmoved, inputs, guesses) -> tuple[State, Bool[Array, ""]]:
+    """The start on the constraints, and whether its coordinates arrived, within reach of the domain; no search where `guesses` is None.
 
-
-def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: Usual, guesses) -> Found:
-    """q and u on the constraints; no search where `guesses` is None."""
-    q, u, free = jnp.asarray(q), jnp.asarray(u), jnp.asarray(free_q)
-    given_q = q
+    The residual is infinite where a number is not finite.
+    """
+    given_q, u, free, usual = jnp.asarray(start.q), jnp.asarray(start.u), jnp.asarray(start.free_q), start.usual
+    q = given_q
     here, at, begin = jax.lax.stop_gradient((scene, t, q))
     near_q, g = put_positions(here, at, begin, free, usual)
     arrived, found = _arrived(begin, near_q, g, usual), _Put(near_q, g, jnp.zeros((), jnp.int32), begin, jnp.array(True))
-    if guesses is not None and _can_search(scene):
+    if guesses is not None and len(usual.closures):
         other = jax.lax.cond(eqxi.unvmap_any(~arrived), lambda: _searched(here, at, begin, free, usual, jax.lax.stop_gradient(guesses)), lambda: found)
         better = ~arrived & (_left(other.g) <= _left(g))
         found = jax.tree.map(lambda x, y: jnp.where(better, x, y), other, found)
@@ -197,13 +178,13 @@ def _put_onto_constraints(scene: Scene, t, q, u, inputs, free_q, free_u, usual: 
     # derivatives are those of Newton's method from where it began; where the rows cannot be met, they would run away
     near_q, g = put_positions(scene, t, q, free, usual, (found.q, found.g))
     near_q, guess = jnp.where(found.met, near_q, q), found.guess
-    near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(free_u), usual)
+    near_u, phi = put_speeds(scene, t, near_q, u, jnp.asarray(inputs), jnp.asarray(start.free_u), usual)
     left = jnp.concatenate([g, phi])
     finite = jnp.all(jnp.isfinite(jnp.concatenate([near_q, near_u, left])))
     moved_q, moved_u, residual = (jnp.max(jnp.abs(x), initial=0.0) for x in (near_q - given_q, near_u - u, left))
     names = scene.coordinate_names, scene.speed_names
     state = State(jnp.asarray(t), near_q, near_u, moved_q, moved_u, jnp.where(finite, residual, jnp.inf), names, guess.astype(q.dtype))
-    return Found(state, arrived)
+    return state, arrived
 
 
 def _left(g: Float[Array, "closures"]) -> Float[Array, ""]:
@@ -277,12 +258,10 @@ def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bo
     move, too.
     """
     scene = as_scene(scene)
-    named = _named(scene, values, t0, inputs)
-    t, q, u, inputs, free_q, free_u = named[:6]
-    guesses = lambda: _guesses(scene, named.known, q, free_q)  # noqa: E731
-    state = _consistent(scene, t, q, u, inputs, free_q, free_u, guesses, native=native, determined=named.determined)
-    _check_residual(scene, state, inputs, named.given)
-    return _moved_if_near(scene, state, inputs, native) if onto_rows and may_contradict(scene, named.known, free_q, free_u) else state
+    t, start, inputs, known, given = named_unmoved(scene, values, t0, inputs, native)
+    state = _consistent(scene, t, start, inputs, lambda: _guesses(scene, known, start.q, start.free_q))
+    _check_residual(scene, state, inputs, given)
+    return _moved_if_near(scene, state, inputs, native) if onto_rows and may_contradict(scene, known, start.free_q, start.free_u) else state
 
 
 def _moved_if_near(scene: Scene, start: State, inputs, native: bool) -> State:
@@ -301,20 +280,17 @@ def _moved_if_near(scene: Scene, start: State, inputs, native: bool) -> State:
 
 
 class _Named(NamedTuple):
-    """Named values as vectors, and what of them may move."""
+    """Named values as a start that is yet to be put onto the rows."""
 
     t: Float[Array | np.ndarray, ""]
-    q: Float[Array | np.ndarray, "coordinates"]
-    u: Float[Array | np.ndarray, "speeds"]
+    start: Unmoved
     inputs: Float[Array | np.ndarray, "inputs"]
-    free_q: Bool[np.ndarray, "coordinates"]
-    free_u: Bool[np.ndarray, "speeds"]
-    determined: bool  # rows determine the speeds that are free
     known: Structure
     given: tuple[str, ...]
 
 
-def _named(scene: Scene, values: Mapping, t0, inputs) -> _Named:
+def named_unmoved(scene: Scene, values: Mapping, t0, inputs, native: bool) -> _Named:
+    """Named values as vectors, and what of them may move; arguments as of `named_start`."""
     q, u, given = vectors_named(scene, values)
     inputs = _as_input_vector(scene, inputs, q.dtype)
     t, free_q = _as_time(t0), _free(scene.coordinate_names.entries, given)
@@ -322,8 +298,8 @@ def _named(scene: Scene, values: Mapping, t0, inputs) -> _Named:
         _check_finite({**values, "t0": t0})
     known = _structure(scene, t, q, free_q)
     free_u = _free(scene.speed_names.entries, (*given, *_resting(scene, known, given)))
-    determined = known.affine and not any(free_u[i] for i in known.independent)
-    return _Named(t, q, u, inputs, free_q, free_u, determined, known, given)
+    determined = known.affine and not any(free_u[i] for i in known.independent)  # rows determine the speeds that are free
+    return _Named(t, Unmoved(q, u, free_q, free_u, usual_sizes(scene, determined, native)), inputs, known, given)
 
 
 def _structure(scene: Scene, t, q, free_q) -> Structure:

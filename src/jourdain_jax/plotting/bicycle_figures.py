@@ -61,16 +61,9 @@ def _mark_range(study: Study, axes) -> None:
             axis.axvline(value, color="0.4", lw=0.8, ls="--")
             if limits:
                 axis.axvspan(low, high, color="0.4", alpha=0.2, lw=0)
-        side = "right" if name == "weave" else "left"
-        axes[0].annotate(
-            f"{name} speed\n{value:.2f} m/s{limits}",
-            (value, _CEILING),
-            xytext=(-8 if side == "right" else 8, -6),
-            textcoords="offset points",
-            ha=side,
-            va="top",
-            fontsize=9,
-        )
+        side, beside = ("right", -8) if name == "weave" else ("left", 8)
+        text = f"{name} speed\n{value:.2f} m/s{limits}"
+        axes[0].annotate(text, (value, _CEILING), xytext=(beside, -6), textcoords="offset points", ha=side, va="top", fontsize=9)
 
 
 def _value(study: Study, name: str, part: str = "value") -> float | None:
@@ -89,10 +82,9 @@ def draw_rides(study: Study, path: str | os.PathLike) -> None:
         for axis, name in ((lean, "lean"), (steer, "steer")):
             axis.plot(t, np.degrees(np.asarray(lane[name])), lw=1.6, label=f"{speed:.2f} m/s, {label}")
         if np.isnan(np.asarray(lane["lean"])[-1]):
-            lean.plot(float(lane.t_end), np.degrees(float(lane.q_end[3])), "kx")
-            lean.annotate(
-                lane.event_names[int(lane.event)], (float(lane.t_end), np.degrees(float(lane.q_end[3]))), xytext=(6, -4), textcoords="offset points", fontsize=9
-            )
+            end = float(lane.t_end), np.degrees(float(lane.q_end[3]))
+            lean.plot(*end, "kx")
+            lean.annotate(lane.event_names[int(lane.event)], end, xytext=(6, -4), textcoords="offset points", fontsize=9)
     lean.set_ylabel("lean to the right in degrees")
     steer.set_ylabel("steer to the right in degrees")
     steer.set_xlabel("t in s")

@@ -29,8 +29,8 @@ class _Painted:
     polygons: list[np.ndarray]
     colours: list[tuple[float, ...]]
     nearness: float
-    width: float = 0.4  # of the edges, points
-    casts: bool = True  # a shadow
+    width: float  # of the edges, points
+    casts: bool  # whether it has a shadow
 
 
 def draw_still(
@@ -62,7 +62,7 @@ def draw_still(
     bodies = [body for name, body in drawn.bodies.items() if name]
     paths = [(bodies[0].name, (0.0, 0.0, 0.0))] if paths is None else list(paths)
     traces = [np.asarray(trajectory.point(*end))[drawn.reached] for end in paths]
-    painted = [_painted([trace[k : k + 2]], [_PATH], camera, _PATH_WIDTH) for trace in traces for k in range(len(trace) - 1)]
+    painted = [_painted([trace[k : k + 2]], [_PATH], camera, _PATH_WIDTH, casts=False) for trace in traces for k in range(len(trace) - 1)]
     for order, k in enumerate(chosen.tolist()):
         strength = 1.0 if len(chosen) == 1 else 0.35 + 0.65 * order / (len(chosen) - 1)
         for body in drawn.bodies.values():
@@ -96,14 +96,13 @@ def lit(part: Part, colour: str, strength: float, camera: Camera, opacity: float
     seen = [face for face in part if face.normal() @ camera.towards > 1e-9]
     polygons = [face.corners for face in seen]
     colours = [shaded(face, colour, camera.light, opacity, strength) for face in seen]
-    painted = _painted(polygons, colours, camera, 0.0 if opacity < 1 else 0.4)
     lifted = np.ptp(np.concatenate(polygons) @ camera.towards) if opacity < 1 and polygons else 0.0
-    return _Painted(polygons, colours, painted.nearness + lifted, painted.width)
+    return _painted(polygons, colours, camera, 0.0 if opacity < 1 else 0.4, lifted=lifted)
 
 
-def _painted(polygons: list[np.ndarray], colours: list, camera: Camera, width: float) -> _Painted:
+def _painted(polygons: list[np.ndarray], colours: list, camera: Camera, width: float, *, lifted: float = 0.0, casts: bool = True) -> _Painted:
     nearness = float(np.mean(np.concatenate(polygons) @ camera.towards)) if polygons else 0.0
-    return _Painted(polygons, colours, nearness, width, casts=width != _PATH_WIDTH)
+    return _Painted(polygons, colours, nearness + lifted, width, casts)
 
 
 def _corners(painted: list[_Painted]) -> np.ndarray:

@@ -116,15 +116,17 @@ def speeds(names: str) -> Names:
 
     The scene then states `coordinate_rates(t, q, u)`. ValueError as in `coordinates`.
     """
-    entries = _split(names, "speeds")
-    _check_names(entries, "speed")
-    return Names(tuple(entries))
+    return _named(names, "speed")
 
 
 def inputs(names: str) -> Names:
     """Names of a scene's inputs (actuator torques, say), parted by blanks in `names`; their unit is the scene's. ValueError as in `coordinates`."""
-    entries = _split(names, "inputs")
-    _check_names(entries, "input")
+    return _named(names, "input")
+
+
+def _named(names, kind: str) -> Names:
+    entries = _split(names, f"{kind}s")
+    _check_names(entries, kind)
     return Names(tuple(entries))
 
 

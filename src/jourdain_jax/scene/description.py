@@ -58,7 +58,9 @@ def check_description(scene, base: Any) -> None:
             "define `coordinate_rates(self, t, q, u)`, which returns the rates of all coordinates"
         )
     _check_counts(scene)
-    _check_one_meaning(scene)
+    for name in scene.speed_names.entries:
+        if name in scene.coordinate_names.entries:
+            raise ValueError(f"`{kind.__name__}` has a coordinate and a speed of the name `{name}`; give one of them another name")
     _check_domain(scene)
     example = inspect.getattr_static(kind, "example")
     if isinstance(example, dict):
@@ -83,13 +85,19 @@ def checked_arguments(kind: type, given: dict) -> None:
 
 @lru_cache(maxsize=512)
 def _misspelt(kind: type, base: type) -> str:
-    """What is wrong with the names of a class's methods and attributes, in words; empty where nothing is."""
+    """What is wrong with the names of a class's methods, attributes and fields, in words; empty where nothing is."""
     own = {field.name for field in fields(kind)}
     for owner in kind.__mro__:
         if owner in base.__mro__:
             continue
+        annotated = inspect.get_annotations(owner)
         for name, member in vars(owner).items():
-            known = name.startswith("_") or name in own or name in (*METHODS, *ATTRIBUTES) or hasattr(base, name)
+            if name in own and name not in annotated:
+                return (
+                    f"`{owner.__name__}` sets `{name}`, a field of a class that it extends, without an annotation, which has no effect on scenes; write "
+                    f"`{name}: float = jj.parameter(...)`, or give the value when a scene is made: `{kind.__name__}({name}=...)`"
+                )
+            known = name.startswith("_") or name in own or name in ATTRIBUTES or hasattr(base, name)
             if known or isinstance(member, type | staticmethod | classmethod):
                 continue
             callable_ = callable(member) or isinstance(member, property)
@@ -115,19 +123,11 @@ def _check_counts(scene) -> None:
             )
 
 
-def _check_one_meaning(scene) -> None:
-    for name in scene.speed_names.entries:
-        if name in scene.coordinate_names.entries:
-            raise ValueError(f"`{type(scene).__name__}` has a coordinate and a speed of the name `{name}`; give one of them another name")
-
-
 def _check_domain(scene) -> None:
     kind, domain = type(scene), scene.domain
     _check_keys(kind, "domain", domain, (*scene.coordinate_names.entries, *scene.speed_names.entries))
     for name, pair in domain.items():
-        if is_traced(pair):
-            continue
-        if np.shape(pair) != (2,) or not _is_finite(pair) or pair[0] > pair[1]:
+        if not is_traced(pair) and (np.shape(pair) != (2,) or not _is_finite(pair) or pair[0] > pair[1]):
             raise ValueError(f"`domain` of `{kind.__name__}` gives {pair} for `{name}`, expected two finite numbers (low, high) with low <= high")
 
 

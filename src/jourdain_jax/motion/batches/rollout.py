@@ -15,16 +15,15 @@ from tqdm import tqdm
 
 from jourdain_jax.build.reference import Reference
 from jourdain_jax.calculus.reals import checked_real, described, is_traced
-from jourdain_jax.motion.arguments import as_end, check_options, check_span, check_times, saved_times
-from jourdain_jax.motion.input_programs import by_itself, for_programs
+from jourdain_jax.motion.arguments import DEFAULT_SAMPLES, as_end, check_options, saved_times, span_and_times
+from jourdain_jax.motion.input_programs import for_programs
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
 from jourdain_jax.motion.integration import integrate_lanes
-from jourdain_jax.motion.integrators.stiff import OUT_OF_STEPS
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.quick_compilation import quickly_compiled
-from jourdain_jax.motion.retries import lost_codes, mark_retried, next_retry, retry_options
+from jourdain_jax.motion.retries import OUT_OF_STEPS, lost_codes, mark_retried, next_retry, retry_options
 from jourdain_jax.motion.setup import TOLERANCE
 from jourdain_jax.motion.simulate import default_solver, set_up, warn_float32
 from jourdain_jax.motion.start import State
@@ -49,7 +48,6 @@ class Rollout(Printed, eqx.Module):
     """Many motions of one scene: a `Trajectory` whose arrays have a leading axis of lanes."""
 
     lanes: Trajectory
-    continued: tuple[int, ...] = eqx.field(static=True, default=())  # lanes that lost their privileged speeds and were run again with the full state
     reruns: tuple[tuple[int, tuple], ...] = eqx.field(static=True, default=())  # fallback -> `RERUN_FIELDS` of such lanes
 
     def __len__(self) -> int:
@@ -79,6 +77,11 @@ class Rollout(Printed, eqx.Module):
     def failed(self) -> np.ndarray:
         """Numbers of the lanes that reached neither their end nor an event."""
         return np.flatnonzero((self.result != results.SUCCESS) & (self.result != results.EVENT))
+
+    @property
+    def continued(self) -> np.ndarray:
+        """Numbers of the lanes that lost their privileged speeds and were run again with the full state."""
+        return np.flatnonzero(np.asarray(self.lanes.fallback) & results.FULL_STATE)
 
     def quantiles(self, name: str, levels: Sequence[float] = (0.025, 0.5, 0.975)) -> np.ndarray:
         """Quantiles over lanes of the coordinate or speed `name` at all times, for the given `levels` (0 to 1), shape (levels, times).
@@ -121,7 +124,7 @@ class Rollout(Printed, eqx.Module):
                 named = self._wrong_parameters(lanes[:10]) if code == results.BAD_PARAMETER else ""
                 named += ": lanes " + ", ".join(map(str, lanes[:10])) + (" ..." if lanes.size > 10 else "")
             lines.append(f"  {lanes.size} {message}{named}")
-        if self.continued:
+        if self.continued.size:
             lines.append(f"  {len(self.continued)} left the domain of their privileged speeds and were run with the full state")
         stiff = int(np.count_nonzero(np.asarray(self.lanes.fallback) & results.IMPLICIT))
         if stiff:
@@ -178,16 +181,18 @@ def rollout(
     _check_times_of_lanes(scene, starts, options)
     if is_traced((scene, fixed, varied, parameters, options)):
         return Rollout(_run_lanes(scene, fixed, _with_arrays(options), varied, parameters))  # being differentiated or batched: one piece, no host loop
+
+    def run(options: dict, index) -> Trajectory:
+        return _run_lanes(scene, fixed, _with_arrays(options), *jax.tree.map(lambda x: x[index], (varied, parameters)))
+
     pieces = []
     bar = tqdm(total=count, unit="lane", disable=not (count > chunk if progress is None else progress))
     for first in range(0, count, chunk):
         index = np.minimum(np.arange(first, first + chunk), count - 1)  # the last chunk is filled up with copies of its last lane
-        piece = _run_lanes(scene, fixed, _with_arrays(options), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
-        kept = min(chunk, count - first)
-        pieces.append(jax.tree.map(lambda x, kept=kept: np.asarray(x)[:kept], piece))
-        bar.update(kept)
+        pieces.append(jax.tree.map(np.asarray, run(options, index)))
+        bar.update(min(chunk, count - first))
     bar.close()
-    lanes = jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)
+    lanes = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *pieces)
 
     reruns: dict[int, tuple] = {}
     while (again := _next_retries(scene, lanes, varied, options)).any():
@@ -195,10 +200,9 @@ def rollout(
             chosen, changed = np.flatnonzero(again == way), options | retry_options(way, options)
             for first in range(0, len(chosen), chunk):
                 index = chosen[np.minimum(np.arange(first, first + min(chunk, _round_up(len(chosen)))), len(chosen) - 1)]
-                new = _run_lanes(scene, fixed, _with_arrays(changed), *jax.tree.map(lambda x, index=index: x[index], (varied, parameters)))
+                new = run(changed, index)
                 lanes, reruns[way] = _replaced(lanes, mark_retried(new, way), index), tuple(getattr(new, name) for name in RERUN_FIELDS)
-    continued = np.flatnonzero(np.asarray(lanes.fallback) & results.FULL_STATE)
-    return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(continued.tolist()), tuple(sorted(reruns.items())))
+    return Rollout(jax.tree.map(jnp.asarray, lanes), tuple(sorted(reruns.items())))
 
 
 def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:
@@ -206,17 +210,13 @@ def _check_times_of_lanes(scene: Scene, starts, options: dict) -> None:
 
     Inside the lanes it is traced: a lane whose own time does not fit gets a result code.
     """
-    ts = None if options.get("ts") is None else saved_times(options["ts"])
-    t0, t1 = (as_end(name, options.get(name)) for name in ("t0", "t1"))
+    ts, t0, t1 = (options.get(name) for name in ("ts", "t0", "t1"))
     if t0 is None and isinstance(starts, State):
+        if ts is not None:
+            saved_times(ts)
+        as_end("t1", t1)
         return
-    t0 = as_end("t0", 0.0) if t0 is None else t0
-    t1 = (t0 + scene.example_span if ts is None else ts[-1]) if t1 is None else t1
-    if is_traced(t0, t1, ts):
-        return
-    check_span(t0, t1)
-    if ts is not None:
-        check_times(ts, t0, t1)
+    t0, _, t1 = span_and_times(scene, None, t0, t1, ts)
     check_inputs_in_rows(scene, options["inputs"], t0, t1)
 
 
@@ -267,7 +267,7 @@ def _lanes_in_lockstep(reference: Reference, scene, fixed, options, varied, para
         return integrate_lanes(eqx.filter_vmap(lane)(varied, parameters))
 
 
-_compiled_dense, _compiled_lowered = (for_programs(_lanes_in_lockstep, compiled_by) for compiled_by in (by_itself, quickly_compiled))
+_compiled_dense, _compiled_lowered = for_programs(_lanes_in_lockstep), for_programs(_lanes_in_lockstep, quickly_compiled)
 
 
 def _with_arrays(options: dict) -> dict:
@@ -319,6 +319,6 @@ def _common_length(lengths: dict) -> int:
 def _chunk(scene: Scene, count: int, chunk: int | None, options: dict) -> int:
     if chunk is not None and (not isinstance(chunk, int | np.integer) or chunk < 1):
         raise ValueError(f"`chunk` is {chunk!r}, expected a whole number, at least one lane")
-    times = 201 if options.get("ts") is None else np.shape(options["ts"])[0]
+    times = DEFAULT_SAMPLES if options.get("ts") is None else np.shape(options["ts"])[0]
     per_lane = 8 * times * (len(scene.coordinate_names) + len(scene.speed_names) + 2)
     return max(1, min(count, CHUNK if chunk is None else chunk, max(1, MEMORY // per_lane)))

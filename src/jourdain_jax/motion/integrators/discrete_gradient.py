@@ -5,20 +5,16 @@ Minimal state z = (q, y), y the privileged speeds; H(z) = T + V = y' m(q) y/2 + 
     qdot =  W m^-1 H_y                                        m = H_yy
     ydot = -m^-1 W' H_q + m^-1 G m^-1 H_y                     G(q, y) skew: G y = r,  r = m ydot + W' H_q
 
-r is quadratic in y and does no work, y.r = 0; so that G = (r_y - r_y')/3. One step puts S at the midpoint and Gonzalez's discrete gradient
-in the place of grad H:
+r is quadratic in y and does no work, y.r = 0; so that G = (r_y - r_y')/3. S comes from the rates themselves by autodiff, whatever the reduction. One step puts
+S at the midpoint and Gonzalez's discrete gradient in the place of grad H, whence H(z_1) - H(z_0) = gbar.(z_1 - z_0) = 0:
 
     z_1 - z_0 = h S(z_m) gbar,   gbar = grad H(z_m) + (H(z_1) - H(z_0) - grad H(z_m).(z_1 - z_0)) (z_1 - z_0)/|z_1 - z_0|^2
-
-whence H(z_1) - H(z_0) = gbar.(z_1 - z_0) = 0. S comes from the rates themselves by autodiff, whatever the reduction.
-Source: E. Celledoni, M. Farre Puiggali, E. H. Hoiseth and D. Martin de Diego, Energy-preserving integrators applied to nonholonomic systems,
-J. Nonlinear Sci. 29 (2019) 1523, arXiv 1605.02845; O. Gonzalez, Time integration and discrete Hamiltonian systems, J. Nonlinear Sci. 6 (1996) 449.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.newton import newton_root
@@ -26,7 +22,7 @@ from jourdain_jax.dynamics.power import needs_work
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.listed import names_of_position_rows
 from jourdain_jax.equations.virtual_power import energies_at
-from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step, Stepped
+from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step
 from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
@@ -44,7 +40,8 @@ class DiscreteGradient(FixedStepSolver):
     Worth it where an energy that drifts would decide the answer: long motions of conservative scenes, also of those where the other methods drift
     because no symmetry helps them. Other integrals are kept to the order of the method only, and it is the dearest of these methods per step.
 
-    Source: Celledoni et al., J. Nonlinear Sci. 29 (2019) 1523 (arXiv 1605.02845); Gonzalez, J. Nonlinear Sci. 6 (1996) 449.
+    Source: E. Celledoni, M. Farre Puiggali, E. H. Hoiseth and D. Martin de Diego, Energy-preserving integrators applied to nonholonomic systems,
+    J. Nonlinear Sci. 29 (2019) 1523, arXiv 1605.02845; O. Gonzalez, Time integration and discrete Hamiltonian systems, J. Nonlinear Sci. 6 (1996) 449.
     """
 
     def fitted(self, scene: Scene, field: VectorField, asked: str) -> VectorField:
@@ -56,13 +53,13 @@ class DiscreteGradient(FixedStepSolver):
             raise ValueError(f"`DiscreteGradient` does not apply to `{type(scene).__name__}`: {fault}; use solver=jj.ImplicitMidpoint()")
         return field
 
-    def stepped(self, step: Step, y: Integrated) -> Stepped:
-        """The state `y` after one `step`."""
+    def stepped(self, step: Step, y: Integrated) -> tuple[Integrated, Bool[Array, ""]]:
+        """The state `y` after one `step`, and whether its equations were solved."""
         return _stepped(step.args, step.args[4] + step.t + step.h / 2, jnp.asarray(step.h, y.q.dtype), y)
 
 
 @eqx.filter_jit  # traced once, not wherever diffrax looks at a step
-def _stepped(args, t, h, y: Integrated) -> Stepped:
+def _stepped(args, t, h, y: Integrated) -> tuple[Integrated, Bool[Array, ""]]:
     n, z0 = y.q.shape[0], jnp.concatenate([y.q, y.v])
     H0 = _energy(args, t, z0, n)
     guess = h * jnp.concatenate(_rates(args, t, y.q, y.v))
@@ -70,7 +67,7 @@ def _stepped(args, t, h, y: Integrated) -> Stepped:
     scale = jnp.broadcast_to(jnp.where(size == 0, 1.0, size), z0.shape)
     found = newton_root(lambda d: _residual(args, t, h, n, z0, H0, d), guess, jax.lax.stop_gradient(scale))
     z1 = z0 + found.x
-    return Stepped(Integrated(z1[:n], z1[n:], y.work), found.converged)
+    return Integrated(z1[:n], z1[n:], y.work), found.converged
 
 
 @eqx.filter_jit  # traced once; its derivatives are then taken of what was traced
@@ -114,8 +111,8 @@ def _rates(args, t, q, v):
 def _energy(args, t, z, n: int) -> Float[Array, ""]:
     """H = T + V in J."""
     field, scene, inputs, fixed, _ = args
-    q, u = field.unpack(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t))
-    return sum(energies_at(scene, motion_at(scene, t, q, u, inputs(t))))
+    u = field.speeds(scene, fixed, t, Integrated(z[:n], z[n:], None), inputs(t))
+    return sum(energies_at(scene, motion_at(scene, t, z[:n], u, inputs(t))))
 
 
 def _fault(scene: Scene, field: VectorField, asked: str) -> str:

@@ -94,7 +94,8 @@ def standing(problem: Problem, y: PyTree, t: Float[Array, "*lanes"], h: Float[Ar
     """Progress at a start: no step is behind, and no event is searched for."""
     zero = jnp.zeros(jnp.shape(t), jnp.int32)
     rest = jax.lax.stop_gradient(jax.tree.map(jnp.zeros_like, y)) if _rounding_adds_up(problem, y) else None
-    return Progress(t, y, h, zero + RUNNING, problem.knots_passed(t, direction), zero, zero, zero - 1, None, no_pivot(t), rest)
+    no_pivot = jax.lax.stop_gradient(jnp.full_like(t, jnp.inf))
+    return Progress(t, y, h, zero + RUNNING, problem.knots_passed(t, direction), zero, zero, zero - 1, None, no_pivot, rest)
 
 
 def _rounding_adds_up(problem: Problem, y: PyTree) -> bool:
@@ -221,11 +222,6 @@ def stages(problem: Problem, method: Method, t, y: PyTree, h, monitored: bool = 
     slopes = [jnp.zeros((len(method.c), *y.shape), y.dtype) for y in leaves]
     (y_1, slopes, extremes), at = jax.lax.scan(stage, (leaves, slopes, _no_extremes(problem, t, y) if monitored else None), rows)
     return Stages(treedef.unflatten(y_1), treedef.unflatten(slopes), treedef.unflatten(at), _pivots(extremes) if monitored else None)
-
-
-def no_pivot(t: Float[Array, "*lanes"]) -> Float[Array, "*lanes"]:
-    """What `Progress.pivot` begins with."""
-    return jax.lax.stop_gradient(jnp.full_like(t, jnp.inf))
 
 
 def _no_extremes(problem: Problem, t, y: PyTree) -> tuple[Array, Array]:

@@ -30,13 +30,6 @@ class Step(eqx.Module):
     args: PyTree
 
 
-class Stepped(eqx.Module):
-    """The state after a step, and whether the equations of the step were solved."""
-
-    y: PyTree
-    solved: Bool[Array, ""]
-
-
 class FixedStepSolver(diffrax.AbstractSolver):
     """Base of the structure-preserving solvers: subclasses say what one step is, and of which form of the state."""
 
@@ -48,8 +41,8 @@ class FixedStepSolver(diffrax.AbstractSolver):
         """The form of the state that this method integrates; `asked`: the `state` of the `Formulation`. ValueError where it does not apply."""
 
     @abc.abstractmethod
-    def stepped(self, step: Step, y: PyTree) -> Stepped:
-        """The state `y` after one `step`."""
+    def stepped(self, step: Step, y: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
+        """The state `y` after one `step`, and whether the equations of the step were solved."""
 
     def order(self, terms):
         """Two: all of these are symmetric methods of second order. `terms` as in diffrax."""
@@ -66,9 +59,9 @@ class FixedStepSolver(diffrax.AbstractSolver):
         """
         h = terms.contr(t0, t1)  # signed; diffrax itself counts time along the direction of the motion
         direction = jnp.sign(h)
-        found = self.stepped(Step(t0 * direction, h, lambda t, y: terms.vf(t * direction, y, args), args), y0)
-        y1 = jax.tree.map(lambda new, old: jnp.where(found.solved, new, old), found.y, y0)
-        result = diffrax.RESULTS.where(found.solved, diffrax.RESULTS.successful, diffrax.RESULTS.nonlinear_divergence)
+        y1, solved = self.stepped(Step(t0 * direction, h, lambda t, y: terms.vf(t * direction, y, args), args), y0)
+        y1 = jax.tree.map(lambda new, old: jnp.where(solved, new, old), y1, y0)
+        result = diffrax.RESULTS.where(solved, diffrax.RESULTS.successful, diffrax.RESULTS.nonlinear_divergence)
         return y1, None, {"y0": y0, "y1": y1}, None, result
 
     def func(self, terms, t0, y0, args):

@@ -1,17 +1,12 @@
-"""The implicit midpoint rule, on whatever form of the state is integrated.
-
-    y_1 = y_0 + h f(t_0 + h/2, (y_0 + y_1)/2)
-
-Source: E. Hairer, C. Lubich and G. Wanner, Geometric Numerical Integration (2006), sections II.1.2 and IV.2.
-"""
+"""The implicit midpoint rule, on whatever form of the state is integrated."""
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
-from jaxtyping import PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from jourdain_jax.calculus.newton import newton_root
-from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step, Stepped
+from jourdain_jax.motion.integrators.fixed_step import FixedStepSolver, Step
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.scene import Scene
 
@@ -34,8 +29,8 @@ class ImplicitMidpoint(FixedStepSolver):
         """Any `field` of any `scene` serves, whatever was `asked` for."""
         return field
 
-    def stepped(self, step: Step, y: PyTree) -> Stepped:
-        """The state `y` after one `step`."""
+    def stepped(self, step: Step, y: PyTree) -> tuple[PyTree, Bool[Array, ""]]:
+        """The state `y` after one `step`, and whether its equations were solved."""
         y0, unravel = ravel_pytree(y)
         t, h = step.t + step.h / 2, jnp.asarray(step.h, y0.dtype)
 
@@ -46,4 +41,4 @@ class ImplicitMidpoint(FixedStepSolver):
         guess = h * f(step.t, y0)
         scale = jnp.broadcast_to(jnp.max(jnp.abs(y0)) + jnp.max(jnp.abs(guess)), y0.shape)
         found = newton_root(lambda d: d - h * f(t, y0 + d / 2), guess, jax.lax.stop_gradient(jnp.where(scale == 0, 1.0, scale)))
-        return Stepped(unravel(y0 + found.x), found.converged)
+        return unravel(y0 + found.x), found.converged

@@ -1,19 +1,11 @@
-"""Runge-Kutta-Munthe-Kaas: any Runge-Kutta method, with attitudes advanced by the exponential map.
-
-    within a step   p = p_0 exp(sigma),   sigmadot = omega + 1/2 sigma x omega + k sigma x (sigma x omega),   sigma(t_0) = 0
-    at its end      p_1 = p_0 exp(sigma_1)
-
-The method sees rotation vectors in place of quaternions, so that order and error estimate are its own.
-Source: H. Munthe-Kaas, High order Runge-Kutta methods on manifolds, Applied Numerical Mathematics 29 (1999) 115.
-
-The exponential map of unit quaternions, and the inverse of its derivative:
+"""Runge-Kutta-Munthe-Kaas: any Runge-Kutta method, with attitudes advanced by the exponential map of unit quaternions.
 
     exp(sigma) = (cos(theta/2), sin(theta/2) sigma/theta),   theta = |sigma|           (a turn by the rotation vector sigma)
     p(t) = p_0 exp(sigma(t)),  pdot = 1/2 p (0, omega)   =>   sigmadot = omega + 1/2 sigma x omega + k sigma x (sigma x omega)
     k = (1 - (theta/2) cot(theta/2)) / theta^2
 
-All coefficients are smooth functions of theta^2, by series where it is small: sigma = 0 is where every step begins.
-Source: A. Iserles, H. Munthe-Kaas, S. P. Norsett and A. Zanna, Lie-group methods, Acta Numerica 9 (2000) 215, section 2 and appendix B.
+The method sees rotation vectors in place of quaternions, so that order and error estimate are its own. All coefficients are smooth functions of theta^2, by
+series where it is small: sigma = 0 is where every step begins.
 """
 
 from collections.abc import Callable
@@ -45,7 +37,8 @@ class MuntheKaas(WrappingSolver):
     Norms stay 1 to round-off with no renormalisation, and a turn about a fixed axis is exact whatever the step. Worth it for fast spinning bodies,
     and where a projection after each step would spoil what a method keeps; otherwise the default, which renormalises, is faster.
 
-    Source: Munthe-Kaas, Applied Numerical Mathematics 29 (1999) 115; Iserles et al., Acta Numerica 9 (2000) 215.
+    Source: H. Munthe-Kaas, High order Runge-Kutta methods on manifolds, Applied Numerical Mathematics 29 (1999) 115; A. Iserles, H. Munthe-Kaas, S. P.
+    Norsett and A. Zanna, Lie-group methods, Acta Numerica 9 (2000) 215, section 2 and appendix B.
     """
 
     solver: diffrax.AbstractSolver = eqx.field(default_factory=diffrax.Tsit5)

@@ -5,7 +5,6 @@
 
 The stages are collocation at the nodes of Radau, c = ((4 - sqrt 6)/10, (4 + sqrt 6)/10, 1); the estimate e is of order 3 and stays small where a
 component decays at once.
-Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (1996), section IV.5 and equations (IV.8.17) to (IV.8.19).
 """
 
 from typing import ClassVar
@@ -34,7 +33,7 @@ class RadauIIA(diffrax.AbstractSolver):
     fifty evaluations and a linear system three times the size of the state: worth it where an explicit method would need many more steps for
     stability than for accuracy. `simulate` turns to it by itself where its default solver runs out of steps on a stiff motion.
 
-    Source: Hairer and Wanner, Solving Ordinary Differential Equations II (1996), sections IV.5 and IV.8.
+    Source: E. Hairer and G. Wanner, Solving Ordinary Differential Equations II (1996), section IV.5 and equations (IV.8.17) to (IV.8.19).
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm

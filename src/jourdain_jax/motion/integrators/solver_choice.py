@@ -1,10 +1,8 @@
 """What a solver and its control of steps ask for besides rates: a form of the state, constant steps, states saved at ends of steps only, a clock."""
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from jourdain_jax.calculus.guards import forward_only, reverse_only
-from jourdain_jax.motion.integrators.of_diffrax import diffrax, discrete_gradient, fixed_step, munthe_kaas, step_to_times
+from jourdain_jax.motion.integrators.of_diffrax import diffrax, discrete_gradient, fixed_step, munthe_kaas
 from jourdain_jax.motion.integrators.tableaus import Method
 from jourdain_jax.motion.vector_fields.field import VectorField
 from jourdain_jax.scene.scene import Scene
@@ -47,33 +45,11 @@ def check_solver(solver, controller, dt0, saveat) -> None:
         raise ValueError(f"`{name}` takes steps of one length; give `dt0`, the step in s")
 
 
-def controller_of(solver, controller, ts):
-    """Even steps between the times at which steps end for a structure-preserving solver, unless the steps are given otherwise; None: no such choice."""
-    if takes_even_steps(solver) and (controller is None or type(controller) is diffrax.ConstantStepSize):
-        return step_to_times.EvenSteps(ts)
-    return None
-
-
 def time_origin(controller, t0):
     """The time from which times count in the loops: the start, but zero where a `controller` of the user's may hold times of its own."""
     return t0 if controller is None or type(controller) in (diffrax.PIDController, diffrax.ConstantStepSize) else jnp.zeros_like(t0)
 
 
-def since(saveat: "diffrax.SaveAt", origin) -> "diffrax.SaveAt":
-    """A `SaveAt` with times to save at that count from `origin`."""
-    return saveat if saveat.subs.ts is None else eqx.tree_at(lambda saveat: saveat.subs.ts, saveat, saveat.subs.ts - origin)
-
-
 def steps_are_given(controller) -> bool:
     """Whether the user says where each step ends."""
     return controller is not None and isinstance(controller, diffrax.StepTo)
-
-
-def marked_inputs(mode: str, tree):
-    """Inputs of the integration: forward mode raises our own error where the adjoint supports reverse mode alone."""
-    return reverse_only(tree) if mode == "reverse" else tree
-
-
-def marked_outputs(mode: str, tree):
-    """Outputs of the integration: reverse mode, which comes to them first, raises our own error where the adjoint supports forward mode alone."""
-    return forward_only(tree) if mode == "forward" else tree

@@ -12,6 +12,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PyTree
 
+from jourdain_jax.motion.integrators.wrapping_solver import of_wrapped
+
 NEARLY = 0.999  # of the way: such a step is stretched to the end
 
 
@@ -79,20 +81,7 @@ class _LandOnAdaptive(_Landing, diffrax.AbstractAdaptiveStepSizeController):
     controller: diffrax.AbstractAdaptiveStepSizeController
     ts: Float[Array, "times"]
 
-    @property
-    def rtol(self):
-        """As the controller."""
-        return self.controller.rtol
-
-    @property
-    def atol(self):
-        """As the controller."""
-        return self.controller.atol
-
-    @property
-    def norm(self):
-        """As the controller."""
-        return self.controller.norm
+    rtol, atol, norm = (of_wrapped("controller", name) for name in ("rtol", "atol", "norm"))
 
 
 _WHOLE = 1e-9  # a ratio this little above a whole number counts as that number

@@ -4,56 +4,26 @@ import diffrax
 import equinox as eqx
 
 
+def of_wrapped(wrapped: str, name: str) -> property:
+    """A property that is that of the object in the field `wrapped`, where it has one."""
+
+    def value(self):
+        """As what is wrapped."""
+        return getattr(getattr(self, wrapped), name)
+
+    return property(value)
+
+
 class WrappingSolver(diffrax.AbstractWrappedSolver):
     """Everything as `solver`, but its `init` and `step`."""
 
     solver: eqx.AbstractVar[diffrax.AbstractSolver]
 
-    @property
-    def scan_kind(self):
-        """As the wrapped solver. diffrax sets it on a Runge-Kutta solver itself, but not through a wrapper: see `for_adjoint`."""
-        return self.solver.scan_kind
-
-    @property
-    def term_structure(self):
-        """As the wrapped solver."""
-        return self.solver.term_structure
-
-    @property
-    def interpolation_cls(self):
-        """As the wrapped solver."""
-        return self.solver.interpolation_cls
-
-    @property
-    def term_compatible_contr_kwargs(self):
-        """As the wrapped solver."""
-        return self.solver.term_compatible_contr_kwargs
-
-    @property
-    def root_finder(self):
-        """As the wrapped solver, where it is implicit."""
-        return self.solver.root_finder
-
-    @property
-    def root_find_max_steps(self):
-        """As the wrapped solver, where it is implicit."""
-        return self.solver.root_find_max_steps
-
-    def order(self, terms):
-        """As the wrapped solver. `terms` as in diffrax."""
-        return self.solver.order(terms)
-
-    def strong_order(self, terms):
-        """As the wrapped solver. `terms` as in diffrax."""
-        return self.solver.strong_order(terms)
-
-    def error_order(self, terms):
-        """As the wrapped solver. `terms` as in diffrax."""
-        return self.solver.error_order(terms)
-
-    def func(self, terms, t0, y0, args):
-        """As the wrapped solver. `terms`, `t0`, `y0`, `args`: as in diffrax."""
-        return self.solver.func(terms, t0, y0, args)
+    # diffrax sets `scan_kind` on a Runge-Kutta solver itself, but not through a wrapper: see `for_adjoint`
+    scan_kind, term_structure, interpolation_cls = (of_wrapped("solver", name) for name in ("scan_kind", "term_structure", "interpolation_cls"))
+    term_compatible_contr_kwargs, func = of_wrapped("solver", "term_compatible_contr_kwargs"), of_wrapped("solver", "func")
+    order, strong_order, error_order = (of_wrapped("solver", name) for name in ("order", "strong_order", "error_order"))
+    root_finder, root_find_max_steps = of_wrapped("solver", "root_finder"), of_wrapped("solver", "root_find_max_steps")  # of implicit ones
 
 
 def for_adjoint(solver: diffrax.AbstractSolver, adjoint: diffrax.AbstractAdjoint) -> diffrax.AbstractSolver:

@@ -15,7 +15,7 @@ from jourdain_jax.dynamics.reactions import ContactForce
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
-from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record, energies, map_over_times, uncompiled_over_times
+from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record, map_over_times, uncompiled_over_times
 from jourdain_jax.motion.trajectories.results import FALLBACKS
 
 
@@ -67,11 +67,6 @@ class ContactExtremes(eqx.Module):
     def honest(self) -> bool:
         """Whether the contact only ever pushed, or bore nothing."""
         return not bool(self.pulls)
-
-
-def energies_of(record: Record, work) -> Energies:
-    """Kinetic and potential energy, and the work where it is tracked (`work` is None where it is not)."""
-    return Energies(*energies(record), work)
 
 
 def diagnose(trajectory: Record) -> Diagnostics:
@@ -144,7 +139,9 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
         warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
     for kind, residual, state in (("geometric", found.position_residual, trajectory.q), ("velocity", found.velocity_residual, trajectory.u)):
         if float(residual) > VIOLATED * (1.0 + float(_largest(state))):
-            warned.append(f"{kind} rows are violated by up to {float(residual):.1e} in their own units: take projection, smaller tolerances or smaller steps")
+            warned.append(
+                f"{kind} rows are violated by up to {float(residual):.1e}: take projection or smaller tolerances, or look for rows that contradict each other"
+            )
     drift, size = float(found.energy_drift), float(found.energy_size)
     if drift > DRIFTED * size:
         share = f"{drift:.1e} J, {drift / size:.0%} of the energy that moves"
@@ -178,6 +175,8 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
     saved, several = f"{reached} of {len(ts)} times saved", reached > 1
     pivot = "" if trajectory.state_form == "full" else f"; pivot of the privileged speeds at least {float(trajectory.smallest_pivot):.1e}"
     low, high = (int(r) for r in found.rank)
+    moved = float(trajectory.moved_q), float(trajectory.moved_u)
+    inputs = [f"{name} {_channel_text(channel)}" for name, channel in zip(trajectory.scene.inputs, trajectory.inputs.channels, strict=True)]
     rows = [
         ("motion", f"t {float(ts[0]):.6g} to {float(trajectory.t_end):.6g} s, {saved}; {message}"),
         ("solver", f"{trajectory.solver}, {int(trajectory.accepted)} steps accepted, {int(trajectory.rejected)} rejected"),
@@ -186,17 +185,12 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
         ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}" if several else "drift is not seen: one time was saved"),
         ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
         ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),
-        ("start", _start_text(trajectory)),
-        *([("inputs", _inputs_text(trajectory))] if trajectory.scene.inputs else []),
+        ("start", f"put onto the rows: coordinates changed by {moved[0]:.1e}, speeds by {moved[1]:.1e}; named values are kept"),
+        *([("inputs", ", ".join(inputs))] if inputs else []),
     ]
     rows += [(f"invariant {name}", f"drift {float(drift):.2e}") for name, drift in found.invariant_drifts.items() if several]
     rows += [(f"contact {name}", _contact_text(contact)) for name, contact in found.contacts.items()]
     return rows + [("warning", text) for text in warnings_of(found, trajectory) if not text.startswith("contact")]
-
-
-def _start_text(trajectory: Record) -> str:
-    q, u = float(trajectory.moved_q), float(trajectory.moved_u)
-    return f"put onto the rows: coordinates changed by {q:.1e}, speeds by {u:.1e}; named values are kept"
 
 
 def _left_domain(trajectory: Record) -> str:
@@ -214,13 +208,8 @@ def _left_domain(trajectory: Record) -> str:
     return f"; `{name}` leaves its domain, {low:.4g} to {high:.4g}: {value:.4g} at t = {float(trajectory.ts[i]):.4g} s"
 
 
-def _inputs_text(trajectory: Record) -> str:
-    """The inputs as they were given; those that were not are zero."""
-    pairs = zip(trajectory.scene.inputs, trajectory.inputs.channels, strict=True)
-    return ", ".join(f"{name} {_channel_text(channel)}" for name, channel in pairs)
-
-
 def _channel_text(channel) -> str:
+    """An input as it was given; those that were not are zero."""
     if isinstance(channel, Constant):
         return f"= {float(channel.value):.6g}"
     return f"of {channel.ts.shape[0]} samples" if isinstance(channel, Sampled) else "a function of time"

@@ -5,7 +5,6 @@ A scene states the units of its parameters. Of its coordinates and speeds only t
 
 import math
 from collections.abc import Mapping
-from typing import Protocol
 
 import numpy as np
 
@@ -28,13 +27,7 @@ OF_LANES: dict[str, tuple[str, float, dict]] = {  # name: type, what stands for 
 _FIELDS = {"result": "result", "event": "event", "steps": "accepted", "rejected_steps": "rejected", "retries": "fallback", "end_time": "t_end"}
 
 
-class WithEvents(Record, Protocol):
-    """A recorded motion that names its stop events."""
-
-    event_names: tuple[str, ...]
-
-
-def dataset(record: WithEvents, units: Mapping[str, str] | None = None):
+def dataset(record: Record, units: Mapping[str, str] | None = None):
     """The motion, or with a leading axis the lanes, as an `xarray.Dataset`; `units`: name of a coordinate or speed -> its unit."""
     xarray = needed("xarray", "a motion as labelled arrays")
     lanes = _lanes(record)

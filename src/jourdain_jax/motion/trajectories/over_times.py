@@ -1,7 +1,7 @@
 """Quantities along a recorded motion: a function of one state, mapped over all saved times."""
 
 from functools import partial
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,50 +9,53 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jourdain_jax.build.structure import structure_of, usual_rows
+from jourdain_jax.build.structure import structure_of
 from jourdain_jax.calculus.promotion import with_usual_promotion
-from jourdain_jax.calculus.reals import checked_real, is_traced
+from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.dynamics.accelerations import Accelerations, accelerations
-from jourdain_jax.dynamics.reactions import ContactForce, RowReactions, contact_forces, row_reactions
+from jourdain_jax.dynamics.reactions import ContactForce, contact_forces, row_reactions
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.projection import closure_residual
 from jourdain_jax.equations.rows import UsualRows, velocity_residual
 from jourdain_jax.equations.virtual_power import energies_at
-from jourdain_jax.motion.input_programs import by_itself, for_programs
+from jourdain_jax.motion.input_programs import for_programs
 from jourdain_jax.motion.inputs import Inputs
 from jourdain_jax.motion.marks import with_nan_as_a_mark
-from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.validated import invariants_of
 
 MOST_ENTRIES = 4_000_000  # of square matrices of the coordinates, at once: of 200 trailers at 201 times the derivatives of all poses took more than 23 GB
 
 
-@runtime_checkable
-class Record(Protocol):
-    """What is needed of a recorded motion; NaN at times that were not reached."""
+class Record(eqx.Module):
+    """The numbers of a motion; NaN at times that were not reached."""
 
     scene: Scene
-    ts: Float[Array, "times"]
+    ts: Float[Array, "times"]  # s
     q: Float[Array, "times coordinates"]
     u: Float[Array, "times speeds"]
-    t_end: Float[Array, ""]
+    work: Float[Array, "times"] | None  # J, since the start; None where all forces have potentials and no row does work
+    t_end: Float[Array, ""]  # s
     q_end: Float[Array, "coordinates"]
     u_end: Float[Array, "speeds"]
-    inputs: Inputs
-    work: Float[Array, "times"] | None
-    accepted: Int[Array, ""]
+    result: Int[Array, ""]  # code, see `jourdain_jax.motion.trajectories.results`
+    event: Int[Array, ""]  # index into `event_names`, -1: none
+    accepted: Int[Array, ""]  # steps
     rejected: Int[Array, ""]
-    last_step: Float[Array, ""]
-    fallback: Int[Array, ""]
-    moved_q: Float[Array, ""]
+    last_step: Float[Array, ""]  # s, that the step-size control would take next; NaN where it keeps that to itself
+    fallback: Int[Array, ""]  # in what other way the motion was run again, see `results.FALLBACKS`; 0: as asked
+    moved_q: Float[Array, ""]  # how far the start was moved onto the constraints
     moved_u: Float[Array, ""]
+    # of the privileged speeds, along the whole motion (lowered: of the elimination, relative to its usual size); negative if it changed sign;
+    # full state, dense: of those of the reduction, 1 where it has none
     smallest_pivot: Float[Array, ""]
-    state_form: str
-    reduction: str
-    solver: str
-    projected: bool
+    inputs: Inputs
+    state_form: str = eqx.field(static=True)  # "minimal" or "full"
+    reduction: str = eqx.field(static=True)
+    solver: str = eqx.field(static=True)
+    projected: bool = eqx.field(static=True)
+    event_names: tuple[str, ...] = eqx.field(static=True)
 
 
 @with_usual_promotion
@@ -78,7 +81,7 @@ def _mapped(f, record: Record, by_inputs: bool):
     return jax.lax.map(lambda state: one(*state), (record.ts, record.q, record.u), batch_size=block)
 
 
-_compiled = for_programs(_mapped, by_itself)
+_compiled = for_programs(_mapped)
 
 
 def _at_one_time(f, record: Record, by_inputs: bool, t, q, u):
@@ -105,56 +108,15 @@ def uncompiled_over_times(f, record: Record, by_inputs: bool = False):
 _uncompiled = eval_numpy(_at_one_time)
 
 
-def motions(record: Record) -> Motion:
-    """Poses and velocities of all bodies (leading axis: times)."""
-    return map_over_times(motion_at, record)
-
-
-def path(record: Record, body: str, local) -> Float[Array, "*lanes times 3"]:
-    """Path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m, from the mass centre)."""
-    local = checked_real(local, f"point of body `{body}`", (3,), advice="give three components in its body frame, m")
-    return map_over_times(_Point(body, local.astype(record.q.dtype)), record)
-
-
-def energies(record: Record) -> tuple[Float[Array, "*lanes times"], Float[Array, "*lanes times"]]:
-    """Kinetic and potential energy, J."""
-    return map_over_times(_energies, record)
-
-
-def accelerations_over_times(record: Record) -> Accelerations:
-    """Accelerations, multipliers, rank and smallest singular value."""
-    if record.q.ndim > 2:  # every lane has parameters of its own
-        return map_over_times(_accelerations, record, by_inputs=True)
-    return map_over_times(_Accelerations(jax.tree.map(jnp.asarray, usual_rows(record.scene))), record, by_inputs=True)
-
-
-def reactions_over_times(record: Record) -> RowReactions:
-    """Constraint forces per row and per body."""
-    return map_over_times(_reactions, record, by_inputs=True)
-
-
-def contact_forces_over_times(record: Record) -> dict[str, ContactForce]:
-    """Normal and tangential force and the friction coefficient needed, of every rolling contact."""
-    return map_over_times(_contacts, record, by_inputs=True)
-
-
-def residuals(record: Record) -> tuple[Float[Array, "*lanes times closures"], Float[Array, "*lanes times rows"]]:
-    """Residuals of the geometric rows and quaternion norms, and of the velocity rows."""
-    return map_over_times(_residuals, record)
-
-
-def invariants(record: Record) -> dict[str, Float[Array, "*lanes times"]]:
-    """The quantities that the scene is known to conserve."""
-    return map_over_times(_invariants, record)
-
-
 def _needs_rates(record: Record) -> bool:
     """Whether accelerations depend on the rates of the inputs."""
     scene = jax.tree.map(lambda x: x[(0,) * (record.q.ndim - 2)], record.scene)  # of a batch, the first
     return not record.inputs.constant and structure_of(scene).rows_of_inputs
 
 
-class _Point(eqx.Module):
+class BodyPoint(eqx.Module):
+    """The place (m, inertial frame) of the point of a body with coordinates `local` (m, body frame, from the mass centre)."""
+
     body: str = eqx.field(static=True)
     local: Float[Array, "3"]
 
@@ -162,34 +124,37 @@ class _Point(eqx.Module):
         return motion_at(scene, t, q, u, inputs)[self.body].place(self.local)
 
 
-def _energies(scene, t, q, u, inputs):
+def energies(scene, t, q, u, inputs):
+    """Kinetic and potential energy, J."""
     return energies_at(scene, motion_at(scene, t, q, u, inputs))
 
 
-class _Accelerations(eqx.Module):
-    usual: UsualRows
+class AccelerationsBySvd(eqx.Module):
+    """Accelerations, multipliers, rank and smallest singular value; `usual`: what the rows are at most states, None: as found for the scene at hand."""
 
-    def __call__(self, scene, t, q, u, inputs):
+    usual: UsualRows | None = None
+
+    def __call__(self, scene, t, q, u, inputs) -> Accelerations:
         return accelerations(scene, t, q, u, inputs, reduction="svd", usual=self.usual)
 
 
-def _accelerations(scene, t, q, u, inputs):
-    return accelerations(scene, t, q, u, inputs, reduction="svd")
+def reactions(scene, t, q, u, inputs):
+    """Constraint forces per row and per body."""
+    return row_reactions(scene, t, q, u, AccelerationsBySvd()(scene, t, q, u, inputs), inputs)
 
 
-def _reactions(scene, t, q, u, inputs):
-    return row_reactions(scene, t, q, u, _accelerations(scene, t, q, u, inputs), inputs)
+def contacts(scene, t, q, u, inputs):
+    """Normal and tangential force and the friction coefficient needed, of every rolling contact."""
+    return contact_forces(scene, t, q, u, AccelerationsBySvd()(scene, t, q, u, inputs), inputs)
 
 
-def _contacts(scene, t, q, u, inputs):
-    return contact_forces(scene, t, q, u, _accelerations(scene, t, q, u, inputs), inputs)
-
-
-def _residuals(scene, t, q, u, inputs):
+def residuals(scene, t, q, u, inputs):
+    """Residuals of the geometric rows and quaternion norms, and of the velocity rows."""
     return closure_residual(scene, t, q), velocity_residual(scene, t, q, u, inputs)
 
 
-def _invariants(scene, t, q, u, inputs):
+def invariants(scene, t, q, u, inputs):
+    """The quantities that the scene is known to conserve."""
     return invariants_of(scene, motion_at(scene, t, q, u, inputs))
 
 
@@ -210,12 +175,12 @@ class Checks(eqx.Module):
     usual: UsualRows
 
     def __call__(self, scene, t, q, u, inputs) -> Checked:
-        found = _Accelerations(self.usual)(scene, t, q, u, inputs)
+        found = AccelerationsBySvd(self.usual)(scene, t, q, u, inputs)
         return Checked(
-            _energies(scene, t, q, u, inputs),
-            _residuals(scene, t, q, u, inputs),
+            energies(scene, t, q, u, inputs),
+            residuals(scene, t, q, u, inputs),
             found.rank,
             found.smallest_singular_value,
-            _invariants(scene, t, q, u, inputs),
+            invariants(scene, t, q, u, inputs),
             contact_forces(scene, t, q, u, found, inputs),
         )

@@ -5,8 +5,8 @@ Format 1. Arrays: `ts` (times), `q` (times, coordinates), `u` (times, speeds), `
 sampled at `ts`), and `parameter:NAME` for every field that is an array. `header` is JSON text: `format`, `kind`, `scene` (class name), `coordinates`,
 `speeds`, `input_names`, `units` of the parameters, `static` (fields that are plain numbers or texts),
 `state_form`, `reduction`, `solver`, `projected`, `event_names`, `arrays` (names of all arrays), `versions`.
-`kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `continued` holds
-the numbers of the lanes that were run again with the full state; `reruns` in its header says how lanes with a `fallback` were run.
+`kind` is "trajectory" or "rollout"; in a rollout every array has a leading axis of lanes (so `result` is one code per lane), and `reruns` in its header
+says how lanes with a `fallback` were run.
 
 What is absent, or is not what the names and the number of times ask for, is an error, and so is a parameter of the scene's class that the file lacks.
 """
@@ -17,7 +17,6 @@ import os
 import secrets
 import zipfile
 import zlib
-from collections.abc import Iterator
 from dataclasses import fields
 
 import jax
@@ -25,20 +24,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.reals import described
-from jourdain_jax.motion.batches.rollout import Rollout
+from jourdain_jax.motion.batches.rollout import RERUN_FIELDS, Rollout
 from jourdain_jax.motion.inputs import Inputs, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
-from jourdain_jax.motion.trajectories.results import BAD_PARAMETER
-from jourdain_jax.motion.trajectories.storage_checks import COUNTS, check_arrays, check_fields, check_header, check_scenes, refused
+from jourdain_jax.motion.trajectories.storage_checks import AXES, HEADER, check_arrays, check_header, check_scenes, refused
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.trajectories.versions import version_of
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
-_ARRAYS = ("ts", "q", "u", "t_end", "q_end", "u_end", *COUNTS, "last_step", "moved_q", "moved_u", "smallest_pivot")
-_TEXTS = ("state_form", "reduction", "solver", "projected")
-_HEADER = ("scene", "coordinates", "speeds", "input_names", "static", "event_names", *_TEXTS, "kind", "arrays", "reruns")
+_ARRAYS = tuple(name for name in AXES if name not in ("inputs", "work"))
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
 
 
@@ -50,26 +46,22 @@ def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
     Read it with `load_trajectory` or `load_rollout`.
     """
     _check_saved(motion, path)
-    many = isinstance(motion, Rollout)
-    trajectory = motion.lanes if isinstance(motion, Rollout) else motion
+    trajectory, kind, reruns = (motion.lanes, "rollout", motion.reruns) if isinstance(motion, Rollout) else (motion, "trajectory", ())
     scene = trajectory.scene
-    arrays = {name: np.asarray(getattr(trajectory, name)) for name in _ARRAYS}
-    if trajectory.work is not None:
-        arrays["work"] = np.asarray(trajectory.work)
-    arrays["inputs"] = np.asarray((jax.vmap(_sampled) if many else _sampled)(trajectory.inputs, trajectory.ts))
-    arrays |= {f"parameter:{name}": np.asarray(getattr(scene, name)) for name in _array_fields(scene)}
-    if isinstance(motion, Rollout):
-        arrays["continued"] = np.array(motion.continued, int)
-    header = {name: getattr(trajectory, name) for name in _TEXTS} | {
+    parameters, static = _stored_fields(scene)
+    arrays = {name: np.asarray(getattr(trajectory, name)) for name in (*_ARRAYS, "work") if getattr(trajectory, name) is not None}
+    arrays["inputs"] = np.asarray((jax.vmap(_sampled) if isinstance(motion, Rollout) else _sampled)(trajectory.inputs, trajectory.ts))
+    arrays |= {f"parameter:{name}": np.asarray(value) for name, value in parameters.items()}
+    header = {name: getattr(trajectory, name) for name in RERUN_FIELDS} | {
         "format": 1,
-        "kind": "rollout" if many else "trajectory",
-        "reruns": motion.reruns if isinstance(motion, Rollout) else (),
+        "kind": kind,
+        "reruns": reruns,
         "scene": type(scene).__name__,
         "coordinates": scene.coordinate_names.entries,
         "speeds": scene.speed_names.entries,
         "input_names": scene.inputs.entries,
         "units": {name: metadata["unit"] for name, _, metadata in parameters_of(scene)},
-        "static": dict(_static_fields(scene)),
+        "static": static,
         "event_names": trajectory.event_names,
         "arrays": sorted(arrays),
         "versions": {name: version_of(name) for name in ("jourdain-jax", "jax", "diffrax", "numpy")},
@@ -105,9 +97,9 @@ def _check_saved(motion, path) -> None:
             f"`save` takes one motion and was given a batch of shape {motion.q.shape[:-2]}; save a `Rollout`, `jj.Rollout(batch)` for one axis of lanes"
         )
     scene = motion.lanes.scene if isinstance(motion, Rollout) else motion.scene
-    stored = {*_array_fields(scene), *(name for name, _ in _static_fields(scene))}
+    parameters, static = _stored_fields(scene)
     for field in fields(scene):
-        if field.init and field.name not in stored and getattr(scene, field.name) is not field.default:
+        if field.init and field.name not in (*parameters, *static) and getattr(scene, field.name) is not field.default:
             raise ValueError(
                 f"field `{field.name}` of `{type(scene).__name__}` is {described(getattr(scene, field.name))}, which `save` cannot store; "
                 "expected arrays, numbers or texts, or the class's default"
@@ -127,15 +119,9 @@ def load_trajectory(path: str | os.PathLike, scene: Scene | type[Scene]) -> Traj
 
     ValueError where the file cannot be read, is of another format, holds a rollout, or belongs to another scene.
     """
-    header, arrays = _read(path, "trajectory")
-    kind = _checked_class(path, scene, header, arrays)
-    arrays["input_ts"], arrays["inputs"] = _samples(arrays["ts"], arrays["inputs"])
-    if int(arrays["result"]) == BAD_PARAMETER:  # what cannot be built by itself: as a lane, where parameters are not looked at
-        lanes = _lanes(path, kind, header, {name: x[None] for name, x in arrays.items()})
-        return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), lanes)
-    motion = _trajectory(path, kind, header, arrays)
-    check_scenes(path, motion.scene, motion.result, many=False)
-    return motion
+    header, arrays, kind = _read(path, scene, "trajectory")
+    lanes = _lanes(path, kind, header, {name: x[None] for name, x in arrays.items()})
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), lanes)
 
 
 @with_nan_as_a_mark
@@ -145,31 +131,34 @@ def load_rollout(path: str | os.PathLike, scene: Scene | type[Scene]) -> Rollout
     `scene`: the scene's class, or any scene of that class; parameters come from the file. ValueError where the file cannot be read, is of another
     format, holds one trajectory, or belongs to another scene.
     """
-    header, arrays = _read(path, "rollout")
-    kind = _checked_class(path, scene, header, arrays)
-    continued = tuple(arrays.pop("continued").tolist())
-    lanes = [_samples(ts, inputs) for ts, inputs in zip(arrays["ts"], arrays["inputs"], strict=True)]
-    longest = max(len(times) for times, _ in lanes)  # lanes with fewer are filled up with their last sample
-    arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in lanes])
-    arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in lanes])
+    header, arrays, kind = _read(path, scene, "rollout")
     ways = tuple((int(way), tuple(tuple(x) if isinstance(x, list) else x for x in how)) for way, how in header["reruns"])
-    return Rollout(_lanes(path, kind, header, arrays), continued, ways)
+    return Rollout(_lanes(path, kind, header, arrays), ways)
 
 
 def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
     """Trajectories from arrays with a leading axis of lanes, which may be failed ones: built under `vmap`, where no value is refused."""
+    samples = [_samples(ts, inputs) for ts, inputs in zip(arrays["ts"], arrays["inputs"], strict=True)]
+    longest = max(len(times) for times, _ in samples)  # lanes with fewer are filled up with their last sample
+    arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in samples])
+    arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in samples])
     lanes = jax.vmap(lambda arrays: _trajectory(path, kind, header, arrays))(arrays)
-    check_scenes(path, lanes.scene, lanes.result, many=True)
+    check_scenes(path, lanes.scene, lanes.result)
     return lanes
 
 
 def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
-    values = {name.removeprefix("parameter:"): value for name, value in arrays.items() if name.startswith("parameter:")}
+    values = _parameters(arrays)
     try:
         scene = kind(**values, **header["static"])
     except TypeError as error:
         raise refused(path, f"does not hold what makes a `{kind.__name__}` ({str(error).splitlines()[0]})") from None
-    check_fields(path, scene, {*values, *header["static"]}, {*_array_fields(scene), *(name for name, _ in _static_fields(scene))})
+    parameters, static = _stored_fields(scene)
+    if missing := sorted({*parameters, *static} - {*values, *header["static"]}):  # their defaults would stand in for what moved
+        raise ValueError(
+            f"`{path}` lacks the parameter `{missing[0]}` of `{kind.__name__}`; it is damaged, or was written when the class had none: "
+            "pass the class as it was when the file was written"
+        )
     for name, now in (("coordinates", scene.coordinate_names), ("speeds", scene.speed_names), ("input_names", scene.inputs)):
         if tuple(header[name]) != now.entries:
             raise ValueError(
@@ -182,7 +171,7 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
         inputs=Inputs(tuple(Sampled(arrays["input_ts"], column) for column in arrays["inputs"].T)),
         event_names=tuple(header["event_names"]),
         **{name: jnp.asarray(arrays[name]) for name in _ARRAYS},
-        **{name: header[name] for name in _TEXTS},
+        **{name: header[name] for name in RERUN_FIELDS},
     )
 
 
@@ -200,25 +189,25 @@ def _checked_class(path, scene: Scene | type[Scene], header: dict, arrays: dict)
         raise ValueError(f"`scene` is {described(scene)}, expected the class of the scene that moved, or any scene of that class")
     if header["scene"] != kind.__name__:
         raise ValueError(f"`{path}` holds a {header['kind']} of `{header['scene']}`, expected `{kind.__name__}`; pass the class it was made with")
-    known = [field.name for field in fields(kind)]
-    for name in (*(name.removeprefix("parameter:") for name in arrays if name.startswith("parameter:")), *header["static"]):
+    known, parameters = [field.name for field in fields(kind)], _parameters(arrays)
+    for name in (*parameters, *header["static"]):
         if name not in known:
             raise ValueError(f"`{path}` has a parameter `{name}` that `{kind.__name__}` has not; {nearest(name, known)}")
-    for name, value in arrays.items():
-        if name.startswith("parameter:") and value.dtype.kind not in "fiub":
-            raise refused(path, f"has `{name.removeprefix('parameter:')}` of type {value.dtype}, expected numbers")
-        if name.startswith("parameter:") and header["kind"] == "rollout" and value.shape[:1] != arrays["result"].shape:
-            raise refused(path, f"has `{name.removeprefix('parameter:')}` of shape {value.shape}, expected one value for each of {len(arrays['result'])} lanes")
+    for name, value in parameters.items():
+        if value.dtype.kind not in "fiub":
+            raise refused(path, f"has `{name}` of type {value.dtype}, expected numbers")
+        if header["kind"] == "rollout" and value.shape[:1] != arrays["result"].shape:
+            raise refused(path, f"has `{name}` of shape {value.shape}, expected one value for each of {len(arrays['result'])} lanes")
     return kind
 
 
-def _read(path, kind: str) -> tuple[dict, dict]:
-    """Header and arrays of a file of this kind."""
+def _read(path, scene: Scene | type[Scene], kind: str) -> tuple[dict, dict, type[Scene]]:
+    """Header and arrays of a file of this kind, and the class of its scene."""
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"`path` is {described(path)}, expected the name of a file")
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+            arrays = {name: file[name] for name in file.files if name in (*AXES, "header") or name.startswith("parameter:")}
         header = json.loads(str(arrays.pop("header")))
         if not isinstance(header, dict):
             raise ValueError("its header is no dictionary")
@@ -231,26 +220,24 @@ def _read(path, kind: str) -> tuple[dict, dict]:
     found = header.get("kind")
     if found != kind:
         raise ValueError(f"`{path}` holds a {found}, expected a {kind}; read it with `{_READERS.get(str(found), 'the version of jourdain-jax that wrote it')}`")
-    missing = [name for name in (*_ARRAYS, "inputs", *(["continued"] if kind == "rollout" else [])) if name not in arrays]
-    missing += [name for name in _HEADER if name not in header]
-    missing += [
-        name for name in (header["arrays"] if isinstance(header.get("arrays"), list) else ()) if name not in arrays and not str(name).startswith("parameter:")
-    ]
+    missing = [name for name in (*_ARRAYS, "inputs") if name not in arrays]
+    missing += [name for name in HEADER if name not in header]
+    if not missing:
+        check_header(path, header)
+        missing = [name for name in header["arrays"] if name in AXES and name not in arrays]
     if missing:
         raise refused(path, f"lacks `{missing[0]}`")
-    check_header(path, header)
     check_arrays(path, header, arrays)
-    return header, arrays
+    return header, arrays, _checked_class(path, scene, header, arrays)
 
 
-def _array_fields(scene: Scene) -> list[str]:
-    """Parameters, and other fields that are arrays."""
-    kept = [field for field in fields(scene) if field.init and not field.metadata.get("static")]
-    return [field.name for field in kept if isinstance(getattr(scene, field.name), jax.Array | np.ndarray)]
+def _parameters(arrays: dict) -> dict:
+    """The parameters of the scene among the arrays of a file."""
+    return {name.removeprefix("parameter:"): value for name, value in arrays.items() if name.startswith("parameter:")}
 
 
-def _static_fields(scene: Scene) -> Iterator[tuple[str, object]]:
-    """Fields that are plain numbers or texts, such as a number of bodies."""
-    for field in fields(scene):
-        if field.init and isinstance(getattr(scene, field.name), int | float | str | bool):
-            yield field.name, getattr(scene, field.name)
+def _stored_fields(scene: Scene) -> tuple[dict, dict]:
+    """Fields that are arrays, parameters among them, and those that are plain numbers or texts, such as a number of bodies."""
+    values = {field: getattr(scene, field.name) for field in fields(scene) if field.init}
+    arrays = {field.name: value for field, value in values.items() if isinstance(value, jax.Array | np.ndarray) and not field.metadata.get("static")}
+    return arrays, {field.name: value for field, value in values.items() if isinstance(value, int | float | str | bool)}

@@ -16,11 +16,15 @@ from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.scene import Scene
 
 COUNTS = ("result", "event", "accepted", "rejected", "fallback")
-_STATES = {"q": "coordinates", "u": "speeds", "inputs": "input_names"}  # at all times, and what their last axis counts
-_ENDS = {"q_end": "coordinates", "u_end": "speeds"}
-_NUMBERS = ("t_end", "last_step", "moved_q", "moved_u", "smallest_pivot")
-_TEXTS = ("scene", "state_form", "reduction", "solver")
+# arrays and their axes, after that of the lanes of a rollout
+AXES: dict[str, tuple[str, ...]] = {"ts": ("times",), "q": ("times", "coordinates"), "u": ("times", "speeds"), "inputs": ("times", "input_names")}
+AXES |= {"q_end": ("coordinates",), "u_end": ("speeds",)} | dict.fromkeys(("t_end", "last_step", "moved_q", "moved_u", "smallest_pivot", *COUNTS), ())
+AXES |= {"work": ("times",)}  # absent where it is not tracked
+# entries of the header: their type, in words too
+HEADER: dict[str, tuple[type, str]] = dict.fromkeys(("scene", "state_form", "reduction", "solver", "kind"), (str, "a text"))
 _LISTS = ("coordinates", "speeds", "input_names", "event_names", "arrays")
+HEADER |= dict.fromkeys(_LISTS, (list, "a list of names"))
+HEADER |= {"static": (dict, "a dictionary"), "projected": (bool, "true or false"), "reruns": (list, "a list")}
 
 
 def refused(path, sentence: str) -> ValueError:
@@ -30,39 +34,34 @@ def refused(path, sentence: str) -> ValueError:
 
 def check_header(path, header: dict) -> None:
     """ValueError for an entry of the header that is of another kind than `save` writes."""
-    wanted: dict[str, tuple[type, str]] = dict.fromkeys(_TEXTS, (str, "a text")) | dict.fromkeys(_LISTS, (list, "a list of names"))
-    wanted |= {"static": (dict, "a dictionary"), "projected": (bool, "true or false"), "reruns": (list, "a list")}
-    for name, (kind, text) in wanted.items():
-        value = header.get(name, kind())
-        if not isinstance(value, kind) or (isinstance(value, list) and name in _LISTS and not all(isinstance(x, str) for x in value)):
-            raise refused(path, f"has {described(value)} as `{name}` of its header, expected {text}")
+    for name, (kind, text) in HEADER.items():
+        if not isinstance(header[name], kind) or (name in _LISTS and not all(isinstance(x, str) for x in header[name])):
+            raise refused(path, f"has {described(header[name])} as `{name}` of its header, expected {text}")
     if header["state_form"] not in ("minimal", "full"):
         raise refused(path, f"has the state form {header['state_form']!r}, expected 'minimal' or 'full'")
-    for way in header.get("reruns", ()):
+    for way in header["reruns"]:
         if not (isinstance(way, list) and len(way) == 2 and way[0] in FALLBACKS and isinstance(way[1], list) and len(way[1]) == len(RERUN_FIELDS)):
             raise refused(path, f"has {way!r} among the `reruns` of its header, expected a code of a fallback and how such lanes were run")
 
 
 def check_arrays(path, header: dict, arrays: dict) -> None:
     """ValueError for an array of another shape or type than the others ask for, or with numbers that no motion has."""
-    many = header["kind"] == "rollout"
-    lead = arrays["result"].shape[:1] if many else ()
+    lead = arrays["result"].shape[:1] if header["kind"] == "rollout" else ()
     times = arrays["ts"].shape[-1] if arrays["ts"].ndim else 0
-    counts = {name: len(header[name]) for name in ("coordinates", "speeds", "input_names")}
-    for name, what in (("q", "coordinates"), ("u", "speeds"), ("inputs", "input_names")):
-        if arrays[name].ndim and arrays[name].shape[-1] != counts[what]:
-            raise refused(path, f"has {arrays[name].shape[-1]} columns for {counts[what]} {what.replace('_', ' ')}")
-    shapes = {"ts": (times,), **{name: (times, counts[what]) for name, what in _STATES.items()}, **{name: (counts[what],) for name, what in _ENDS.items()}}
-    shapes |= dict.fromkeys((*_NUMBERS, *COUNTS), ()) | ({"work": (times,)} if "work" in arrays else {})
-    for name, shape in shapes.items():
-        array, expected = arrays[name], (*lead, *shape)
+    sizes = {"times": times} | {name: len(header[name]) for name in ("coordinates", "speeds", "input_names")}
+    for name in ("q", "u", "inputs"):
+        found, what = arrays[name].shape[-1:], AXES[name][1]
+        if found not in ((), (sizes[what],)):
+            raise refused(path, f"has {found[0]} columns for {sizes[what]} {what.replace('_', ' ')}")
+    for name, axes in AXES.items():
+        if name not in arrays:
+            continue
+        array, expected = arrays[name], (*lead, *(sizes[axis] for axis in axes))
         if array.shape != expected or not times or 0 in lead:
             raise refused(path, f"has `{name}` of shape {array.shape}, expected {expected if times else 'at least one time'}")
         kinds, text = ("iu", "whole numbers") if name in COUNTS else ("f", "floating-point numbers")
         if array.dtype.kind not in kinds:
             raise refused(path, f"has `{name}` of type {array.dtype}, expected {text}")
-    if many and (arrays["continued"].ndim != 1 or arrays["continued"].dtype.kind not in "iu" or not np.all(np.isin(arrays["continued"], np.arange(lead[0])))):
-        raise refused(path, f"names lanes that were continued, {arrays['continued']}, expected numbers from 0 to {lead[0] - 1}")
     _check_codes(path, header, arrays)
     _check_finite(path, arrays)
 
@@ -96,30 +95,20 @@ def _check_finite(path, arrays: dict) -> None:
             raise refused(path, f"has numbers in `{name}` that are not finite at times that were reached")
 
 
-def check_fields(path, scene: Scene, found: set[str], expected: set[str]) -> None:
-    """ValueError where the file lacks a field that the scene has: its default would stand in for what moved."""
-    missing = sorted(expected - found)
-    if missing:
-        raise ValueError(
-            f"`{path}` lacks the parameter `{missing[0]}` of `{type(scene).__name__}`; it is damaged, or was written when the class had none: "
-            "pass the class as it was when the file was written"
-        )
-
-
-def check_scenes(path, scene: Scene, result, *, many: bool) -> None:
-    """ValueError where parameters are wrong in a motion that did not end for it, or of shapes that do not make the scene."""
-    wrong = {name: np.asarray(fault) for name, fault in (jax.vmap(parameter_faults) if many else parameter_faults)(scene).items()}
-    for name, fault in wrong.items():
-        if np.any(fault & (np.asarray(result) != BAD_PARAMETER)):
-            raise refused(path, f"has a value of the parameter `{name}` that is not finite or has the wrong sign, in a motion that did not fail for it")
-    one = jax.tree.map(lambda x: x[0], scene) if many else scene
+def check_scenes(path, scene: Scene, result) -> None:
+    """ValueError where parameters of lanes are wrong in a motion that did not end for it, or of shapes that do not make the scene."""
+    for name, fault in jax.vmap(parameter_faults)(scene).items():
+        wrong = np.flatnonzero(np.asarray(fault) & (np.asarray(result) != BAD_PARAMETER))
+        if wrong.size:
+            value = f"{np.asarray(getattr(scene, name))[wrong[0]]} as a value of the parameter `{name}`"
+            raise refused(path, f"has {value}, which is not finite or has the wrong sign, in a motion that did not fail for it")
 
     def quantities(scene):
         q, u, _ = scene.named()
         return velocity_quantities(scene, motion_at(scene, jnp.zeros(()), q, u), with_events=False)
 
     try:
-        jax.eval_shape(quantities, one)
+        jax.eval_shape(quantities, jax.tree.map(lambda x: x[0], scene))
     except (ValueError, TypeError, IndexError) as error:
         said = str(error).splitlines()[0]
         raise ValueError(

@@ -3,61 +3,36 @@
 from collections.abc import Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jourdain_jax.build.plausibility import body_faults
+from jourdain_jax.build.structure import usual_rows
 from jourdain_jax.calculus.nan_where import nan_where
-from jourdain_jax.calculus.reals import is_traced
+from jourdain_jax.calculus.reals import checked_real, is_traced
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
-from jourdain_jax.motion.inputs import Inputs, inputs_at
+from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.motion.inputs import inputs_at
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.motion.trajectories import labelled, over_times, results
-from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, energies_of, summary, summary_html, warnings_of
+from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, summary, summary_html, warnings_of
+from jourdain_jax.motion.trajectories.over_times import Record, map_over_times
 from jourdain_jax.motion.trajectories.sketch import sketch
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.parameters import parameter_faults
 from jourdain_jax.scene.printing import preformatted, shapes_of
-from jourdain_jax.scene.scene import Scene
 
 
-class Trajectory(eqx.Module):
+class Trajectory(Record):
     """The motion of a scene. Times after an early end (event, failure) hold NaN.
 
     `t_end`, `q_end`, `u_end` are the last state that was reached, of a failed motion the one at which it failed. What is made of them by itself, such as a
     loss to be minimised, takes `motion.nan_if_failed()`, or looks at `motion.succeeded`.
     """
-
-    scene: Scene
-    ts: Float[Array, "times"]  # s
-    q: Float[Array, "times coordinates"]
-    u: Float[Array, "times speeds"]
-    work: Float[Array, "times"] | None  # J, since the start; None where all forces have potentials and no row does work
-    t_end: Float[Array, ""]  # s
-    q_end: Float[Array, "coordinates"]
-    u_end: Float[Array, "speeds"]
-    result: Int[Array, ""]  # code, see `jourdain_jax.motion.trajectories.results`
-    event: Int[Array, ""]  # index into `event_names`, -1: none
-    accepted: Int[Array, ""]  # steps
-    rejected: Int[Array, ""]
-    last_step: Float[Array, ""]  # s, that the step-size control would take next; NaN where it keeps that to itself
-    fallback: Int[Array, ""]  # in what other way the motion was run again, see `results.FALLBACKS`; 0: as asked
-    moved_q: Float[Array, ""]  # how far the start was moved onto the constraints
-    moved_u: Float[Array, ""]
-    # of the privileged speeds, along the whole motion (lowered: of the elimination, relative to its usual size); negative if it changed sign;
-    # full state, dense: of those of the reduction, 1 where it has none
-    smallest_pivot: Float[Array, ""]
-    inputs: Inputs
-    state_form: str = eqx.field(static=True)  # "minimal" or "full"
-    reduction: str = eqx.field(static=True)
-    solver: str = eqx.field(static=True)
-    projected: bool = eqx.field(static=True)
-    event_names: tuple[str, ...] = eqx.field(static=True)
-
-    # Named access. -------------------------------------------------------------------------------------------------
 
     def __getitem__(self, name: str) -> Float[Array, "times *shape"]:
         """A coordinate, speed, quaternion or angular velocity by name, at all times; `"t"` for the times."""
@@ -93,39 +68,40 @@ class Trajectory(eqx.Module):
             return eqx.filter_vmap(lambda motion: motion.end)(self)
         return consistent(self.scene, self.t_end, self.q_end, self.u_end, inputs_at(self.inputs, self.t_end))
 
-    # Derived quantities. -------------------------------------------------------------------------------------------
-
     def motions(self) -> Motion:
         """Poses and velocities (inertial frame) of all bodies at all times (leading axis: times)."""
-        return over_times.motions(self)
+        return map_over_times(motion_at, self)
 
     def point(self, body: str, local=(0.0, 0.0, 0.0)) -> Float[Array, "*lanes times 3"]:
         """Path (m, inertial frame) of the point of `body` with body-frame coordinates `local` (m, from the mass centre)."""
-        return over_times.path(self, body, local)
+        local = checked_real(local, f"point of body `{body}`", (3,), advice="give three components in its body frame, m")
+        return map_over_times(over_times.BodyPoint(body, local.astype(self.q.dtype)), self)
 
     def energies(self) -> Energies:
         """Kinetic and potential energy, and the work where it is tracked, in J; `.balance` is constant for a right motion."""
-        return energies_of(self, self.work)
+        kinetic, potential = map_over_times(over_times.energies, self)
+        return Energies(kinetic, potential, self.work)
 
     def accelerations(self) -> Accelerations:
         """Accelerations, multipliers, rank and smallest singular value at all times."""
-        return over_times.accelerations_over_times(self)
+        usual = None if self.q.ndim > 2 else jax.tree.map(jnp.asarray, usual_rows(self.scene))  # lanes of a batch have parameters of their own
+        return map_over_times(over_times.AccelerationsBySvd(usual), self, by_inputs=True)
 
     def constraint_forces(self) -> RowReactions:
         """Constraint forces per row and per body at all times, eqs. (68)-(70); `.forces_on("disc")` by row, in N, inertial frame."""
-        return over_times.reactions_over_times(self)
+        return map_over_times(over_times.reactions, self, by_inputs=True)
 
     def contact_forces(self) -> dict[str, ContactForce]:
         """Normal and tangential force (N) on the body and friction coefficient needed, of every rolling contact at all times."""
-        return over_times.contact_forces_over_times(self)
+        return map_over_times(over_times.contacts, self, by_inputs=True)
 
     def residuals(self) -> tuple[Float[Array, "*lanes times closures"], Float[Array, "*lanes times rows"]]:
         """Residuals of the geometric rows (and quaternion norms), and of the velocity rows, at all times."""
-        return over_times.residuals(self)
+        return map_over_times(over_times.residuals, self)
 
     def invariants(self) -> dict[str, Float[Array, "*lanes times"]]:
         """The quantities that the scene states to be conserved, by name at all times; without the energy."""
-        return over_times.invariants(self)
+        return map_over_times(over_times.invariants, self)
 
     def to_xarray(self, units: Mapping[str, str] | None = None):
         """Coordinates, speeds, result code and parameters as an `xarray.Dataset` along `time` (s).
@@ -153,8 +129,6 @@ class Trajectory(eqx.Module):
     def _outline(self) -> str:
         """What is shown of many motions, and of one whose numbers are not known."""
         return shapes_of(self) if is_traced(self) else f"Trajectories of {type(self.scene).__name__}, lanes {self.q.shape[:-2]}"
-
-    # How it ended. -------------------------------------------------------------------------------------------------
 
     @property
     def message(self) -> str:

@@ -15,7 +15,7 @@ from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.minimal import accelerations_of, minimal_kinematics, speeds_and_pivot, speeds_from_privileged
 from jourdain_jax.equations.projection import project_positions, project_speeds
 from jourdain_jax.equations.reductions import Privileged
-from jourdain_jax.motion.vector_fields.field import Integrated, Observed, VectorField
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.scene import Scene
 
@@ -58,13 +58,12 @@ class MinimalByMatrices(ByMatrices):
         """The sign of det A_z."""
         return True
 
-    def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
-        return y.q, speeds_from_privileged(scene, self.independent, t, y.q, y.v, inputs)
+    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
+        return speeds_from_privileged(scene, self.independent, t, y.q, y.v, inputs)
 
-    def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
-        """What is seen at a state, with the sign of det A_z in the pivot."""
-        u, pivot = speeds_and_pivot(scene, self.independent, t, y.q, y.v, inputs)
-        return Observed(y.q, u, pivot)
+    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+        """All speeds, and the pivot with the sign of det A_z."""
+        return speeds_and_pivot(scene, self.independent, t, y.q, y.v, inputs)
 
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots"]]:
         """As `rates`, and the sign of det A_z."""
@@ -97,14 +96,13 @@ class FullByMatrices(ByMatrices):
         """Whether round-off might decide on which branch a motion goes on."""
         return self.may_branch
 
-    def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
-        return y.q, y.v
+    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
+        return y.v
 
-    def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
-        """What is seen at a state, with the pivot of the reduction, without a sign; 1 where it has none."""
-        partitioned = isinstance(self.reduction, Privileged | GibbsAppell)
-        pivot = bare_accelerations(scene, t, y.q, y.v, inputs, reduction=self.reduction).pivot if partitioned else jnp.ones(())
-        return Observed(y.q, y.v, pivot)
+    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+        if not isinstance(self.reduction, Privileged | GibbsAppell):
+            return y.v, jnp.ones(())
+        return y.v, bare_accelerations(scene, t, y.q, y.v, inputs, reduction=self.reduction).pivot
 
     def rates_and_pivots(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Integrated, Float[Array, "pivots"]]:
         """As `rates`; and 1 where the rows say on which branch the motion goes on, -1 where round-off does."""

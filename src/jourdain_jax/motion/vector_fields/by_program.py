@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from jourdain_jax.lowering.lowered import Lowered
 from jourdain_jax.motion.native import seen
-from jourdain_jax.motion.vector_fields.field import Integrated, Observed, VectorField
+from jourdain_jax.motion.vector_fields.field import Integrated, VectorField
 from jourdain_jax.scene.scene import Scene
 
 
@@ -39,14 +39,14 @@ class ByProgram(VectorField):
         """What depends on parameters alone."""
         return seen.fixed_values(self.program, scene) if self.native else self.program.fixed_values(scene)
 
-    def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
-        return y.q, self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
+    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
+        return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)[0]
 
-    def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
+    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
         """All speeds, and the smallest pivot of the elimination relative to its usual size."""
         if self.native:
-            return Observed(y.q, *seen.speeds_and_pivot(self.program, fixed, t, y.q, y.v, inputs))
-        return Observed(y.q, *self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs))
+            return seen.speeds_and_pivot(self.program, fixed, t, y.q, y.v, inputs)
+        return self.program.speeds_and_pivot(fixed, t, tuple(y.q), tuple(y.v), inputs)
 
     def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
         if self.native:

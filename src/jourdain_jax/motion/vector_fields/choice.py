@@ -1,6 +1,5 @@
 """Which equations are integrated, given what was asked: the form of the state, how accelerations are found, what keeps the state on its constraints."""
 
-from dataclasses import replace
 from typing import Any, Literal
 
 import equinox as eqx
@@ -69,10 +68,6 @@ class Formulation(eqx.Module):
         """The terms added to the rows; None where there are none."""
         return self.stabilisation if isinstance(self.stabilisation, Baumgarte) else None
 
-    def with_state(self, state: Literal["auto", "minimal", "full"]) -> "Formulation":
-        """This formulation with another form of the state."""
-        return replace(self, state=state)
-
 
 _DEFAULT = Formulation()
 
@@ -114,7 +109,7 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
         "reduction": reduction,
         "with_work": with_work,
         "conserves": conserves,
-        "projects_positions": formulation.projects and _is_closed(scene),
+        "projects_positions": formulation.projects and bool(names_of_position_rows(scene) or scene.coordinates.quaternions),
         "projects_speeds": formulation.projects and not minimal and bool(structure.row_names),
         "of_inputs": structure.potentials_of_inputs,
         "event_names": names_of_events(scene),
@@ -173,8 +168,3 @@ def _default_reduction(structure: Structure, independent: tuple[int, ...] | None
     if program is None:
         return NullSpaceQR(_cutoff(structure))
     return Privileged(structure.independent) if program.by_partition else Multipliers()
-
-
-def _is_closed(scene: Scene) -> bool:
-    """Whether there are geometric rows or quaternion norms to keep."""
-    return bool(names_of_position_rows(scene) or scene.coordinates.quaternions)

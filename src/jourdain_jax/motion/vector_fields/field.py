@@ -31,18 +31,6 @@ class Integrated(eqx.Module):
     work: Float[Array, "*lanes"] | None
 
 
-class Observed(eqx.Module):
-    """What a vector field says of a state.
-
-    `pivot`: how well the privileged speeds determine the others, with a sign that changes where they do not; for the full state that of its reduction,
-    without a sign, and 1 where it has none.
-    """
-
-    q: Float[Array, "coordinates"]
-    u: Float[Array, "speeds"]  # all
-    pivot: Float[Array, ""]
-
-
 class VectorField(eqx.Module):
     """How a scene's state is packed, unpacked, differentiated in time and projected. All choices are static.
 
@@ -113,21 +101,24 @@ class VectorField(eqx.Module):
         return stored_by_inputs(scene, motion_at(scene, t, q, jnp.zeros(len(scene.speed_names), q.dtype), inputs), self.of_inputs)
 
     @abc.abstractmethod
-    def unpack(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "coordinates"], Float[Array, "speeds"]]:
-        """Coordinates and all speeds."""
+    def speeds(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "speeds"]:
+        """All speeds."""
 
     @abc.abstractmethod
-    def observed(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Observed:
-        """What is looked at where a state is saved."""
+    def speeds_and_pivot(self, scene: Scene, fixed, t, y: Integrated, inputs) -> tuple[Float[Array, "speeds"], Float[Array, ""]]:
+        """All speeds, and how well the privileged ones determine the others, with a sign that changes where they do not.
+
+        For the full state the second is that of its reduction, without a sign, and 1 where it has none.
+        """
 
     def events(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "events *lanes"]:
         """Values of the stop events, in the order of their names; lanes only where `lowers_events`."""
-        return event_values(scene, motion_at(scene, t, *self.unpack(scene, fixed, t, y, inputs), inputs))
+        return event_values(scene, motion_at(scene, t, y.q, self.speeds(scene, fixed, t, y, inputs), inputs))
 
     def energies(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Float[Array, "2"]:
         """Kinetic and potential energy, J; numbers to differentiation."""
         scene, fixed, t, y, inputs = jax.lax.stop_gradient((scene, fixed, t, y, inputs))
-        return jnp.stack(energies_at(scene, motion_at(scene, t, *self.unpack(scene, fixed, t, y, inputs), inputs)))
+        return jnp.stack(energies_at(scene, motion_at(scene, t, y.q, self.speeds(scene, fixed, t, y, inputs), inputs)))
 
     def rates(self, scene: Scene, fixed, t, y: Integrated, inputs) -> Integrated:
         """Time derivative of the integrated state."""
