@@ -47,6 +47,16 @@ def test_an_attribute_whose_name_is_misspelt_is_named():
         described(exemple=property(lambda self: {}))()
 
 
+def test_a_parameter_that_is_overridden_without_an_annotation_is_refused():
+    with pytest.raises(ValueError, match=r"`Described` sets `mass`, a field of a class that it extends, without an annotation, which has no effect"):
+        described(mass=5.0)()
+
+    class Heavy(Bead):
+        mass: object = jj.parameter(5.0, unit="kg")
+
+    assert float(Heavy().mass) == 5.0
+
+
 def test_a_helper_of_a_base_class_may_be_overridden():
     class Pushed(Bead):
         def loads(self, motion):

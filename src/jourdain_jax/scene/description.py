@@ -85,12 +85,18 @@ def checked_arguments(kind: type, given: dict) -> None:
 
 @lru_cache(maxsize=512)
 def _misspelt(kind: type, base: type) -> str:
-    """What is wrong with the names of a class's methods and attributes, in words; empty where nothing is."""
+    """What is wrong with the names of a class's methods, attributes and fields, in words; empty where nothing is."""
     own = {field.name for field in fields(kind)}
     for owner in kind.__mro__:
         if owner in base.__mro__:
             continue
+        annotated = inspect.get_annotations(owner)
         for name, member in vars(owner).items():
+            if name in own and name not in annotated:
+                return (
+                    f"`{owner.__name__}` sets `{name}`, a field of a class that it extends, without an annotation, which has no effect on scenes; write "
+                    f"`{name}: float = jj.parameter(...)`, or give the value when a scene is made: `{kind.__name__}({name}=...)`"
+                )
             known = name.startswith("_") or name in own or name in ATTRIBUTES or hasattr(base, name)
             if known or isinstance(member, type | staticmethod | classmethod):
                 continue

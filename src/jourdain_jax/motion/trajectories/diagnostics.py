@@ -139,7 +139,9 @@ def warnings_of(found: Diagnostics, trajectory: Record) -> tuple[str, ...]:
         warned.append(f"rows come within {smallest:.1e} of a loss of rank: digits are lost there")
     for kind, residual, state in (("geometric", found.position_residual, trajectory.q), ("velocity", found.velocity_residual, trajectory.u)):
         if float(residual) > VIOLATED * (1.0 + float(_largest(state))):
-            warned.append(f"{kind} rows are violated by up to {float(residual):.1e} in their own units: take projection, smaller tolerances or smaller steps")
+            warned.append(
+                f"{kind} rows are violated by up to {float(residual):.1e}: take projection or smaller tolerances, or look for rows that contradict each other"
+            )
     drift, size = float(found.energy_drift), float(found.energy_size)
     if drift > DRIFTED * size:
         share = f"{drift:.1e} J, {drift / size:.0%} of the energy that moves"
