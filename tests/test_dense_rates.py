@@ -48,3 +48,23 @@ def test_they_are_nan_where_a_speed_has_no_inertia():
     found = rates(Polar(), (0, 1), np.zeros(2), q, np.array([[1.0, 0.5], [1.0, 0.5]]), np.zeros((2, 0)))
     assert np.all(np.isnan(found.ydot[0]))
     np.testing.assert_allclose(found.ydot[1], [2.0 * 0.5**2, -2 * 1.0 * 0.5 / 2.0], rtol=1e-12)
+
+
+class SaidTwice(jj.Scene):
+    """A particle on a circle, by two rows that depend on each other on the circle alone."""
+
+    coordinates = jj.coordinates("x y")
+
+    def bodies(self, t, q):
+        return {"bead": jj.Particle(1.0, jnp.stack([q.x, q.y, 0 * q.x]))}
+
+    def geometric_constraints(self, pose):
+        circle = (pose.q.x**2 + pose.q.y**2 - 1.0) / 2
+        return {"circle": circle, "once more": (2.0 + pose.q.x + 3.0 * pose.q.y) * circle}
+
+
+def test_rows_that_follow_from_others_are_left_out_where_rounded_coordinates_make_them_independent():
+    scene = SaidTwice()
+    t, q, u = jj.sample_states(scene, STATES)
+    found = rates(scene, (0, 1), t, q.astype(np.float32).astype(float), u, np.zeros((STATES, 0)))
+    np.testing.assert_allclose(found.ydot, -np.sum(u**2, axis=1, keepdims=True) * q, atol=1e-5)
