@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START, UNSOLVED_STEP = range(10)
-SHRANK, STIFF, OFF_CONSTRAINTS, BAD_TIMES, ENERGY_LOST, PROCESS_DIED = 10, 11, 12, 13, 14, 15
+SHRANK, STIFF, OFF_CONSTRAINTS, BAD_TIMES, ENERGY_LOST, PROCESS_DIED, CONTRADICTORY_ROWS = 10, 11, 12, 13, 14, 15, 16
 MOST_PROJECTED = 0.5  # of the change by a step
 
 MESSAGES = {
@@ -28,6 +28,8 @@ MESSAGES = {
     BAD_TIMES: "the times to save at leave the span or are not in order, or the span is empty or not finite; give increasing `ts` between `t0` and `t1`",
     ENERGY_LOST: "the energy, which nothing changes, changed by more than the steps' tolerances explain: the motion left its branch at a singular position, "
     "missed a short feature of a load, or a load's potential is not that of its force (`verify`)",
+    CONTRADICTORY_ROWS: "velocity rows that depend on each other are not met together at some saved time: they contradict each other there; leave one out, "
+    "or mend the inputs and times that they follow",
     PROCESS_DIED: "processes died on it again and again, and the study skipped it; simulate it alone, in a process of its own, to see why",
     UNSOLVED_STEP: "the equations of an implicit step were not solved near the last time; take a shorter step (`dt0`), or look for a singularity there",
 }
