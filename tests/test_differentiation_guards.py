@@ -67,6 +67,19 @@ def test_second_derivatives_through_a_reverse_only_adjoint_name_the_adjoint_to_u
         SECOND_USES[use](1.0)
 
 
+@pytest.mark.parametrize("ask", [jj.report, jj.verify, jj.energy_balance])
+@pytest.mark.parametrize("inside", [jax.jit, jax.vmap, lambda f: lambda x: jax.jvp(f, (x,), (x,))])
+def test_functions_that_need_numbers_say_so_by_name(ask, inside):
+    with pytest.raises(jj.DifferentiationModeError, match=rf"`{ask.__name__}` was called inside jit, vmap or a derivative.*outside"):
+        inside(lambda radius: ask(jj.models.TiltingDisc(radius=radius)))(jnp.array([0.5]) if inside is jax.vmap else 0.5)
+
+
+def test_functions_that_need_numbers_take_known_ones_where_others_are_traced():
+    wire, found = BeadOnTurningWire(), []
+    jax.jit(lambda x: found.append(jj.energy_balance(wire)) or x)(0.5)
+    assert found == [jj.energy_balance(wire)]
+
+
 @pytest.mark.parametrize("use", [jax.grad(forward), jax.jit(jax.grad(jax.jit(forward)))])
 def test_reverse_mode_through_a_forward_only_adjoint_names_the_adjoint_to_use(use):
     with pytest.raises(DifferentiationModeError, match="RecursiveCheckpointAdjoint"):

@@ -17,6 +17,7 @@ from jourdain_jax.dynamics.accelerations import bare_accelerations
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.virtual_power import energies_at, unconstrained_equations
+from jourdain_jax.motion.arguments import of_known_numbers
 from jourdain_jax.scene.scene import Scene
 
 _ORIGINS = {
@@ -56,11 +57,12 @@ def energy(scene: Scene, t, q, u, inputs=None) -> Energy:
     return Energy(*energies_at(scene, motion_at(scene, t, q, u, inputs)))
 
 
+@of_known_numbers
 def energy_balance(scene: Scene) -> EnergyBalance:
     """Whether T + V is conserved, and what changes it otherwise; the powers are those of eqs. (71)-(73).
 
     Judged at eight random admissible states with random inputs, where a power counts as zero below 1e-9 of the powers at hand (1e-4 in
-    single precision). Scene parameters must be concrete.
+    single precision). A DifferentiationModeError where numbers are traced.
     """
     t, q, u = (jnp.asarray(x) for x in sample_states(scene, 8))
     inputs = jnp.asarray(np.random.default_rng(0).normal(size=(len(t), len(scene.inputs))))

@@ -9,7 +9,7 @@ from jourdain_jax.build.structure import structure_of
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.lowering.built import Built, build
-from jourdain_jax.motion.arguments import as_state
+from jourdain_jax.motion.arguments import as_state, of_known_numbers
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.start import State
@@ -152,13 +152,14 @@ class Report(Printed):
 
 
 @shown_from_users_lines
+@of_known_numbers
 def report(scene: Scene | BuiltFor, *, depth: int = 4, start: State | dict | None = None) -> Report:
     """Degrees of freedom, rows, rank, redundancy, integrability, growth vector, cyclic and ignorable coordinates of a scene.
 
     `depth` bounds the number of fields in a bracket for the growth vector. `start`: a state, or named values as for `jj.start`, at which the rank is
     compared with that at generic states (default: the scene's example, where some configurations lose rank). `print(report(scene))` shows a table;
     `as_dict()` is for machines. Found numerically at random states of the scene's `domain` and at symmetric configurations (zero and right
-    angles): what holds at all of them is taken to hold everywhere.
+    angles): what holds at all of them is taken to hold everywhere. A DifferentiationModeError where numbers are traced.
     """
     built = build(scene)
     scene, structure = built.scene, structure_of(built.scene)

@@ -36,7 +36,7 @@ from jourdain_jax.equations.lagrange import lagrange_equations, speeds_are_rates
 from jourdain_jax.equations.listed import names_of_rows
 from jourdain_jax.equations.scaling import row_scale, speed_scale
 from jourdain_jax.equations.virtual_power import energies_at, equations_and_rows
-from jourdain_jax.motion.arguments import as_state
+from jourdain_jax.motion.arguments import as_state, of_known_numbers
 from jourdain_jax.motion.start import State, consistent
 from jourdain_jax.scene.arguments import BuiltFor, as_input_vector, as_scene
 from jourdain_jax.scene.scene import Scene
@@ -45,6 +45,7 @@ from jourdain_jax.scene.validated import loads_of, potential_of
 
 
 @shown_from_users_lines
+@of_known_numbers
 def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: Numbers | dict | None = None, *, seed: int = 0) -> Verification:
     """Check the equations of a scene, and what it states, at a consistent state; a failed check names its culprit.
 
@@ -62,7 +63,7 @@ def verify(scene: Scene | BuiltFor, state: State | dict | None = None, inputs: N
       speeds, relative in the parameters; the Gibbs-Appell reduction is left out of them. Parameters that split rows which are dependent have no
       derivative there and are left out, with a note (`derivative_exists`).
 
-    **Returns** a `Verification`. Nothing is raised for a failed check; not under jit or vmap.
+    **Returns** a `Verification`. Nothing is raised for a failed check; a DifferentiationModeError where numbers are traced.
     """
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")

@@ -42,7 +42,7 @@ REVERSE_MESSAGE = (
 class DifferentiationModeError(TypeError):
     """The adjoint given to `simulate` does not support the mode of differentiation that was asked; the text says which adjoint does.
 
-    Raised where the derivative is taken, evaluated or compiled.
+    Raised where the derivative is taken, evaluated or compiled; and by functions that need numbers, such as `fit`, inside `jit`, `vmap` or a derivative.
     """
 
 
