@@ -272,6 +272,7 @@ ROWS: dict[str, Case] = {
 
 STATES: dict[str, Case] = {
     "jj.start(Bead)": ("ValueError", "`scene` is the class `Bead`, expected a scene of it; write `Bead()`, with parameters in the parentheses"),
+    "jj.start(b, 3.0)": ("ValueError", "`start` was given a float, expected named values: `jj.start(scene, lean=0.3)`, or a dictionary of them"),
     "jj.start(b, z=1.0)": ("ValueError", "scene `Bead` has no coordinate or speed `z`"),
     "jj.start(b, x=nan)": ("ValueError", "start value `x` is nan, expected a finite number; check where it was computed"),
     "jj.start(b, t0='noon')": ("ValueError", "`t` is the text 'noon', expected real numbers; give one time in s"),

@@ -101,6 +101,7 @@ def test_an_unknown_name_is_answered_without_quotes_around_the_answer():
 
 
 def test_starts_inputs_and_names_are_given_alike_everywhere():
+    assert str(jj.start(SLEIGH, {"x_rate": 0.5, "heading": 9.0}, heading=0.3)) == str(jj.start(SLEIGH, x_rate=0.5, heading=0.3))
     chain = TrailerChain(trailers=0)
     named, vector = jj.verify(chain, chain.example, {"turn": 2.0}), jj.verify(chain, None, jnp.array([0.0, 2.0]))
     assert str(named) == str(vector)

@@ -55,6 +55,9 @@ def test_a_contact_that_would_have_to_pull_is_flagged():
 def test_the_path_of_a_point_is_where_the_body_says_it_is(rolling):
     centre = np.asarray(rolling.point("disc"))
     np.testing.assert_allclose(centre[:, 2], 0.5 * np.cos(np.asarray(rolling["lean"])), atol=1e-14)
+    np.testing.assert_array_equal(centre, rolling.motions()["disc"].position)
+    with pytest.raises(KeyError, match=r'`disc` is a body of `TiltingDisc`.*`motion\.point\("disc"\)`.*`motion\.motions\(\)\["disc"\]`'):
+        rolling["disc"]
 
 
 def test_a_saved_trajectory_comes_back_as_it_was(rolling, tmp_path):

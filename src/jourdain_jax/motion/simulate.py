@@ -103,6 +103,7 @@ def simulate(
         motion = jj.simulate(disc, {"lean": 0.3, "spin_rate": -3.0}, t1=2.0)
         print(motion)                                             # result, steps, drift of the energy, contact forces
         motion["lean"], motion.q_end, motion.ts                   # by name; as vectors
+        motion.point("disc"), motion.point("disc", (0, 0.5, 0))   # paths of the mass centre and of a point fixed in the body
 
         def lean_at_end(radius):                                  # a derivative with respect to a parameter
             return jj.simulate(disc.replace(radius=radius), {"lean": 0.3, "spin_rate": -3.0}, ts=[1.0])["lean"][-1]

@@ -21,7 +21,7 @@ from jourdain_jax.build.held_values import may_contradict
 from jourdain_jax.build.sampling import NoStateFoundError, seen_on_rows
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.damped import first_root
-from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, is_traced, real_type
+from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, described, is_traced, real_type
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual, project_positions
@@ -237,10 +237,11 @@ _uncompiled_projection = eval_numpy(_put_onto_constraints)
 
 
 @shown_from_users_lines
-def start(scene: Scene | BuiltFor, *, t0: Number = 0.0, inputs=None, **values) -> State:
-    """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`.
+def start(scene: Scene | BuiltFor, given=None, *, t0: Number = 0.0, inputs=None, **values) -> State:
+    """A consistent start from named coordinates and speeds: `start(disc, lean=0.3, spin_rate=-3.0)`, or `start(disc, {"lean": 0.3, "spin_rate": -3.0})`.
 
-    `values` that are given are kept, at time `t0` (s). Coordinates that are not given begin at zero (a quaternion at the identity) and follow from the rows;
+    `values`, by keyword or in a dictionary `given` (where both name one, the keyword counts), are kept, at time `t0` (s).
+    Coordinates that are not given begin at zero (a quaternion at the identity) and follow from the rows;
     where that leads nowhere, they begin at those of states of the domain, nearest first, and the state says so (`guess`).
     Privileged speeds that are not given stay zero and the dependent speeds follow from the rows;
     where dependent speeds are given, all others are solved for: the smallest change that meets the constraints, in the metric of the mass matrix.
@@ -248,7 +249,9 @@ def start(scene: Scene | BuiltFor, *, t0: Number = 0.0, inputs=None, **values) -
     ValueError, where values are known: an unknown name, a value that is not finite, given values that contradict the constraints.
     """
     scene = as_scene(scene)
-    return named_start(scene, values, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)))
+    if given is not None and not isinstance(given, Mapping):
+        raise ValueError(f"`start` was given {described(given)}, expected named values: `jj.start(scene, lean=0.3)`, or a dictionary of them")
+    return named_start(scene, {**(given or {}), **values}, t0, inputs_at(as_inputs(scene, inputs), _as_time(t0)))
 
 
 def named_start(scene: Scene | BuiltFor, values: Mapping, t0, inputs, native: bool = True, onto_rows: bool = False) -> State:

@@ -14,6 +14,7 @@ from jourdain_jax.calculus.reals import checked_real, is_traced
 from jourdain_jax.dynamics.accelerations import Accelerations
 from jourdain_jax.dynamics.reactions import ContactForce, RowReactions
 from jourdain_jax.equations.kinematics import motion_at
+from jourdain_jax.equations.listed import names_of_bodies
 from jourdain_jax.motion.inputs import inputs_at
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.start import State, consistent
@@ -42,6 +43,11 @@ class Trajectory(Record):
             with nan_is_a_mark():
                 if name in names.view(array):
                     return names.view(array)[name]
+        if name in names_of_bodies(self.scene):
+            raise UnknownNameError(
+                f"`{name}` is a body of `{type(self.scene).__name__}`, and no coordinate or speed; "
+                f'`motion.point("{name}")` is the path of its mass centre, `motion.motions()["{name}"]` its pose and velocities at all times'
+            )
         valid = (*self.scene.coordinate_names.entries, *self.scene.speed_names.entries, "t")
         raise UnknownNameError(f"a trajectory of `{type(self.scene).__name__}` has no `{name}`; {nearest(name, valid)}")
 
