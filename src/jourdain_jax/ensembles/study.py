@@ -20,7 +20,7 @@ from jourdain_jax.ensembles.result import StudyResult
 from jourdain_jax.ensembles.run import bounded, in_this_process, run
 from jourdain_jax.ensembles.task import AT_START, SAVES, Task
 from jourdain_jax.ensembles.workers import in_processes
-from jourdain_jax.motion.arguments import as_end, check_span, check_times, saved_times
+from jourdain_jax.motion.arguments import span_and_times
 from jourdain_jax.motion.simulate import simulate
 from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.names import nearest
@@ -28,7 +28,6 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.printing import Printed
 from jourdain_jax.scene.scene import Scene
 
-TIMES = 201  # saved, where outputs look along the motion
 NO_OPTIONS = ("saveat", "adjoint", "progress", "parameters", "starts", "scene", "start")
 OPTIONS = tuple(name for name in inspect.signature(simulate).parameters if name not in NO_OPTIONS)
 
@@ -112,14 +111,9 @@ class Study(Printed):
             if name not in OPTIONS:
                 raise ValueError(f"`{name}` is no option of a study; {nearest(name, OPTIONS)}")
         known = as_outputs(self.scene, outputs)
-        first = as_end("t0", 0.0 if t0 is None else t0)
-        times = None if ts is None else saved_times(ts)
-        last = as_end("t1", t1) if t1 is not None else times[-1] if times is not None else first + self.scene.example_span
-        check_span(first, last)
-        if times is None:
-            along = save == "trajectories" or any(output.over_times for output in known.values())
-            times = np.linspace(float(first), float(last), TIMES) if along else np.array([float(last)])
-        check_times(times, first, last)
+        first, times, last = span_and_times(self.scene, None, t0, t1, ts)
+        if ts is None and save != "trajectories" and not any(output.over_times for output in known.values()):
+            times = last[None]
         settled = {"t0": float(first), "t1": float(last), "ts": np.asarray(times, float)} | options
         return Task(self.scene, self.design, self._named[1], known, settled, save, int(every))
 

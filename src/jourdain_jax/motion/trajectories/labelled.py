@@ -11,11 +11,10 @@ import numpy as np
 from jourdain_jax.calculus.on_first_use import needed
 from jourdain_jax.calculus.reals import is_traced
 from jourdain_jax.motion.trajectories.over_times import Record
+from jourdain_jax.motion.trajectories.results import CODES
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
 
-CODES = ("success", "event", "max_steps", "step_too_small", "not_finite", "inconsistent_start", "singular_partition", "bad_parameter", "bad_start",
-         "unsolved_step", "shrank", "stiff", "off_constraints", "bad_times", "energy_lost", "process_died", "contradictory_rows")  # fmt: skip
 OF_LANES: dict[str, tuple[str, float, dict]] = {  # name: type, what stands for nothing, attributes
     "result": ("int8", -1, {"long_name": "how the motion ended", "flag_values": list(range(len(CODES))), "flag_meanings": " ".join(CODES)}),
     "event": ("int8", -1, {"long_name": "which stop event ended the motion; -1: none"}),

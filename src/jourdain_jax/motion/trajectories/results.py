@@ -5,6 +5,7 @@ from jaxtyping import Array, Bool, Int
 
 SUCCESS, EVENT, MAX_STEPS, STEP_TOO_SMALL, NOT_FINITE, INCONSISTENT_START, SINGULAR_PARTITION, BAD_PARAMETER, BAD_START, UNSOLVED_STEP = range(10)
 SHRANK, STIFF, OFF_CONSTRAINTS, BAD_TIMES, ENERGY_LOST, PROCESS_DIED, CONTRADICTORY_ROWS = 10, 11, 12, 13, 14, 15, 16
+CODES = tuple(name.lower() for name, code in globals().items() if type(code) is int)  # their names, in order
 MOST_PROJECTED = 0.5  # of the change by a step
 
 MESSAGES = {
