@@ -116,6 +116,16 @@ def test_the_work_that_time_does_is_integrated_and_is_that_of_the_closed_form(ca
     assert relative_error(balance, jnp.broadcast_to(balance[0], ts.shape), float(jnp.max(jnp.abs(motion.work)))) <= tolerance("closed_form")
 
 
+def test_a_built_scene_its_report_and_its_motion_say_why_dense_matrices_integrate_its_work():
+    wire, why = small.BeadOnTurningWire(), "the work along poses that are driven, or of masses that change, needs dense matrices"
+    for text in (jj.build(wire), jj.report(wire), jj.simulate(wire, {"r": 0.5}, t1=0.1)):
+        assert why in " ".join(str(text).split())
+    without = jj.simulate(wire, {"r": 0.5}, t1=0.1, work=False)
+    assert "lowered" in without.reduction
+    assert why not in str(without)
+    assert why not in str(jj.build(TiltingDisc()))
+
+
 def test_what_changes_the_mass_is_named():
     assert jj.energy_balance(TIMED[4][0]).changed_by == ("masses or inertias that change",)
 

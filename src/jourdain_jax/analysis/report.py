@@ -54,7 +54,7 @@ class Report(Printed):
     ignorable_coordinates: tuple[str, ...]  # no privileged acceleration depends on them
     privileged_velocities: tuple[str, ...]
     privileged_by_user: bool
-    lowering: str  # operations of the scalar program that is integrated, or why there is none
+    lowering: str  # operations of the scalar program, and whether and how it is integrated, or why there is none
     worst_pivot: float  # smallest singular value of the scaled A_z over all probed states; zero: singular somewhere
     typical_pivot: float
     rank_losses: tuple[str, ...]  # probed configurations where the rows lose rank
@@ -226,5 +226,7 @@ def _lowering(built: Built) -> str:
     if found is None:
         return f"not lowered: {built.not_lowered}"
     calls = "".join(f"; {reason} has no scalar form: kept as a call" for reason in found.calls)
+    if built.not_integrated:
+        return f"a scalar program of {found.operations} operations{calls}; not integrated: {built.not_integrated}"
     reason = native_motion.reason_against(vector_field(built.scene), built.scene, as_inputs(built.scene, None), bool(built.events))
     return f"a scalar program of {found.operations} operations{calls}; {f'not to machine code: {reason}' if reason else 'to machine code'}"

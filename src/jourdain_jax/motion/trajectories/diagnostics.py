@@ -17,6 +17,7 @@ from jourdain_jax.motion.inputs import Constant, Sampled
 from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.trajectories.over_times import Checked, Checks, Record, map_over_times, uncompiled_over_times
 from jourdain_jax.motion.trajectories.results import FALLBACKS
+from jourdain_jax.motion.vector_fields.choice import reason_for_matrices
 
 
 class Energies(eqx.Module):
@@ -174,6 +175,7 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
     reached = int(np.sum(np.isfinite(np.asarray(trajectory.q)).all(axis=-1)))
     saved, several = f"{reached} of {len(ts)} times saved", reached > 1
     pivot = "" if trajectory.state_form == "full" else f"; pivot of the privileged speeds at least {float(trajectory.smallest_pivot):.1e}"
+    dense = reason_for_matrices(structure_of(trajectory.scene), trajectory.work is not None, trajectory.inputs.constant)
     low, high = (int(r) for r in found.rank)
     moved = float(trajectory.moved_q), float(trajectory.moved_u)
     inputs = [f"{name} {_channel_text(channel)}" for name, channel in zip(trajectory.scene.inputs, trajectory.inputs.channels, strict=True)]
@@ -182,6 +184,7 @@ def summary_rows(trajectory: Record, message: str) -> list[tuple[str, str]]:
         ("solver", f"{trajectory.solver}, {int(trajectory.accepted)} steps accepted, {int(trajectory.rejected)} rejected"),
         *([("run again", FALLBACKS[int(trajectory.fallback)].removeprefix("run again ") + _left_domain(trajectory))] if int(trajectory.fallback) else []),
         ("state", f"{trajectory.state_form}, reduction: {trajectory.reduction}" + (", projected after each step" if trajectory.projected else "") + pivot),
+        *([("dense", dense)] if dense else []),
         ("energy", f"drift {float(found.energy_drift):.2e} J of {found.energy_kind}" if several else "drift is not seen: one time was saved"),
         ("residuals", f"position {float(found.position_residual):.1e}, velocity {float(found.velocity_residual):.1e}"),
         ("rows", f"rank {low if low == high else f'{low} to {high}'}, smallest singular value {float(found.smallest_singular_value):.2e}"),
