@@ -9,23 +9,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.build.structure import plain_row_lengths, structure_of
-from jourdain_jax.equations.rows import velocity_residual
+from jourdain_jax.equations.projection import linearised_rows
 from jourdain_jax.motion.setup import Setup
 
-VIOLATED = 1e-2  # of a row at these speeds, or at rest: far more than steps at loose tolerances leave
+VIOLATED = 1e-2  # of what stands in a row: far more than steps at loose tolerances leave
 
 
-def may_contradict(setup: Setup) -> bool:
-    """Whether the rows depend on each other and ask for motion even at rest."""
-    known = structure_of(setup.scene)
-    return known.rank < len(known.row_names) and not (known.affine and known.homogeneous)
+def rows_violated(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]) -> Bool[Array, ""]:
+    """Whether some row is violated at some of these states; those that were not reached are NaN, and do not count.
 
+    |phi| > 1 % of |phi - A u| + |A| |u|, where that is largest
+    """
+    scene, inputs, states = jax.lax.stop_gradient((setup.scene, setup.inputs, (t, q, u)))
 
-def contradicted(setup: Setup, t: Float[Array, "times"], q: Float[Array, "times coordinates"], u: Float[Array, "times speeds"]) -> Bool[Array, ""]:
-    """Whether some row is violated at some of these states; those that were not reached are NaN, and do not count."""
-    scene, inputs, q, u = jax.lax.stop_gradient((setup.scene, setup.inputs, q, u))
-    rows = lambda t, q, u: velocity_residual(scene, t, q, u, inputs(t))  # noqa: E731
-    phi, at_rest = jax.lax.map(lambda at: (rows(*at), rows(at[0], at[1], jnp.zeros_like(at[2]))), jax.lax.stop_gradient((t, q, u)))
-    size = jnp.maximum(jnp.abs(at_rest), plain_row_lengths(scene) * jnp.max(jnp.abs(u), axis=1, keepdims=True))
-    return jnp.any(jnp.abs(phi) > VIOLATED * jnp.nanmax(size, axis=0))
+    def left_and_size(state):
+        phi, A = linearised_rows(scene, *state, inputs(state[0]))
+        return jnp.abs(phi), jnp.abs(phi - A @ state[2]) + jnp.abs(A) @ jnp.abs(state[2])
+
+    left, size = jax.lax.map(left_and_size, states)  # rows may be callbacks, which need not know batches
+    return jnp.any(left > VIOLATED * jnp.nanmax(size, axis=0))
