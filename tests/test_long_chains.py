@@ -117,7 +117,7 @@ def test_machine_code_in_a_band_puts_lanes_onto_rows_as_by_rotations(kind):
     u = generator.normal(size=(lanes, len(program.u)))
     state = [t, q + 1e-3 * generator.normal(size=q.shape)] + ([] if kind == "positions" else [u, np.zeros((lanes, 2))])
     given = [jnp.asarray(x) for x in (*state, free, typical)]
-    by = lambda rows, scene=scene: jax.vmap(lambda *x: put_on_rows._put(rows, scene, list(x[:-2]), *x[-2:]))(*given)  # noqa: E731
+    by = lambda rows, scene=scene: jax.vmap(lambda *x: put_on_rows._put(rows, scene, x[0][0], *x[1:]))(*given)  # noqa: E731
     found, expected = by(in_band), by(dense)
     for x, y in zip(found, expected, strict=True):
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-10)
@@ -139,8 +139,8 @@ def test_rows_in_a_band_are_no_numbers_where_memory_is_lost(monkeypatch):
     monkeypatch.setattr(onto_rows, "_write_row", rewritten(onto_rows._write_row, "-(entries * w.lanes * 8 // -64) * 64", "1 << 60"))
     put_on_rows._kernel.cache_clear()
     q = scene.coordinates.reference()
-    given = [jnp.zeros(1), jnp.asarray(q), jnp.ones(len(q)), jnp.zeros(len(rows.residuals))]
-    found, left = put_on_rows._put(rows, scene, given[:2], *given[2:])
+    given = [jnp.zeros(()), jnp.asarray(q), jnp.ones(len(q)), jnp.zeros(len(rows.residuals))]
+    found, left = put_on_rows._put(rows, scene, *given)
     put_on_rows._kernel.cache_clear()
     assert rows.in_band is not None
     assert np.isnan(found).all()

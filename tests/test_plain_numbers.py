@@ -16,6 +16,11 @@ TWO = {"int": 2, "float": 2.0, "float32": np.float32(2), "float64": np.float64(2
 THREE = {"list": [1, 0.0, 2], "tuple": (1, 0, 2), "array of integers": np.array([1, 0, 2]), "jax": jnp.array([1.0, 0.0, 2.0])}
 
 
+def _unit(v):
+    """A unit vector of the kind that `v` is."""
+    return type(v)((0, 0, 1)) if isinstance(v, list | tuple) else 0 * v + np.array([0, 0, 1])
+
+
 class Slider(jj.Scene):
     """A turning body and a particle, both described by plain integers."""
 
@@ -46,7 +51,7 @@ BUILT = {
     "ball": lambda n, v: jj.RigidBody.ball(n, n, position=v, orientation=jj.rot_x(n)),
     "bar": lambda n, v: jj.RigidBody.rod(n, n, axis="y", position=v, orientation=jj.rot_x(n)),
     "box": lambda n, v: jj.RigidBody.box(n, v, position=v, orientation=jj.rot_x(n)),
-    "gravity": lambda n, v: jj.gravity(_motion(), n, v),
+    "gravity": lambda n, v: jj.gravity(_motion(), n, _unit(v)),
     "spring": lambda n, v: jj.spring(_motion()["block"].point(v), jj.fixed_point(v), n, n),
     "damper": lambda n, v: jj.damper(_motion()["block"].point(v), jj.fixed_point(v), n),
     "torque": lambda n, v: jj.torque(_motion(), "block", v),

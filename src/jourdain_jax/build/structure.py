@@ -94,6 +94,11 @@ class Structure:
         return len(self.row_names) - len(self.redundant_rows) > self.rank
 
     @property
+    def rows_may_contradict(self) -> bool:
+        """Whether rows depend on each other and ask for motion even at rest: then those that are left out do not follow from the others by themselves."""
+        return self.rank < len(self.row_names) and not (self.affine and self.homogeneous)
+
+    @property
     def has_minimal_state(self) -> bool:
         """Whether coordinates and privileged speeds are the state that is integrated, unless the user asks for another."""
         return self.affine and self.well_conditioned

@@ -47,11 +47,12 @@ def _closures(scene: Scene, t, q):
     return closure_residual(scene, t, q), jax.jacfwd(lambda q: closure_residual(scene, t, q))(q)
 
 
-def _rows(scene: Scene, t, q, u, inputs):
+def linearised_rows(scene: Scene, t, q, u, inputs) -> tuple[Float[Array, "rows"], Float[Array, "rows speeds"]]:
+    """phi and A = d phi/du."""
     return velocity_residual(scene, t, q, u, inputs), jax.jacfwd(lambda u: velocity_residual(scene, t, q, u, inputs))(u)
 
 
-BY_AUTODIFF = RowFunctions(_closures, _rows, mass_matrix_at)
+BY_AUTODIFF = RowFunctions(_closures, linearised_rows, mass_matrix_at)
 
 
 def project_positions(

@@ -26,7 +26,7 @@ from jourdain_jax.motion.integrators import integrands
 from jourdain_jax.motion.integrators.solver_choice import time_origin
 from jourdain_jax.motion.native import seen
 from jourdain_jax.motion.quick_compilation import QUICK, RUN_SELDOM, quickly_compiled
-from jourdain_jax.motion.row_check import contradicted, may_contradict
+from jourdain_jax.motion.row_check import rows_violated
 from jourdain_jax.motion.setup import Begun, Setup, Solved
 from jourdain_jax.motion.start import State, moved_onto_rows
 from jourdain_jax.motion.trajectories import results
@@ -131,7 +131,7 @@ def _finish(given: Setup, setup: Setup, begun: Begun, solved: Solved) -> Traject
     pivot = jax.lax.reduce(pivots * jnp.sign(pivots[0]), jnp.asarray(jnp.inf, pivots.dtype), jnp.fmin, (0,))
     pivot = jnp.fmin(pivot, jnp.asarray(solved.pivot, pivots.dtype))
     lost = energy_lost(energies_near(setup, args, *states), solved.accepted) if conserves(setup) else False
-    violated = contradicted(setup, states[0], q, u) if may_contradict(setup) else False
+    violated = rows_violated(setup, states[0], q, u) if field.rows_may_contradict else False
     code = jnp.where(results.is_success(solved.code) & lost, results.ENERGY_LOST, solved.code)
     code = jnp.where(results.is_success(code) & violated, results.CONTRADICTORY_ROWS, code)
     return Trajectory(

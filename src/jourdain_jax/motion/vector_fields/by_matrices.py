@@ -122,6 +122,7 @@ def full_without_projection(field: VectorField, scene: Scene, own_equations: str
         conserves=field.conserves,
         projects_positions=False,
         projects_speeds=False,
+        rows_may_contradict=False,
         of_inputs=field.of_inputs,
         event_names=field.event_names,
         stabilisation=field.stabilisation if isinstance(field, ByMatrices) else None,

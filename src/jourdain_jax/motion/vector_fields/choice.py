@@ -111,6 +111,7 @@ def _vector_field(scene: Scene, formulation: Formulation, work: bool, backend: s
         "conserves": conserves,
         "projects_positions": formulation.projects and bool(names_of_position_rows(scene) or scene.coordinates.quaternions),
         "projects_speeds": formulation.projects and not minimal and bool(structure.row_names),
+        "rows_may_contradict": (minimal or formulation.projects) and structure.rows_may_contradict,
         "of_inputs": structure.potentials_of_inputs,
         "event_names": names_of_events(scene),
     }

@@ -43,6 +43,7 @@ class VectorField(eqx.Module):
     conserves: bool = eqx.field(static=True)  # T + V is constant along every motion
     projects_positions: bool = eqx.field(static=True)
     projects_speeds: bool = eqx.field(static=True)
+    rows_may_contradict: bool = eqx.field(static=True)  # each other, although the start meets all (`motion/row_check.py`)
     of_inputs: tuple[int, ...] = eqx.field(static=True)  # numbers of the loads whose potential depends on inputs
     event_names: tuple[str, ...] = eqx.field(static=True)  # sorted
 
