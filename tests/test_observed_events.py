@@ -37,6 +37,9 @@ def test_an_observed_time_tells_a_parameter_as_in_closed_form():
     mass = 5.0 * (2 * (STOP + 0.002) / np.pi) ** 2
     np.testing.assert_allclose(found["mass"].value, mass, rtol=1e-7)
     np.testing.assert_allclose(found["mass"].standard_error, 2 * mass * SIGMA / (STOP + 0.002), rtol=1e-6)
+    # samples may end long before it
+    early = jj.Experiment(np.array([0.05, 0.1]), {}, {}, start={"x": 0.3, "x_rate": 0.0}, t0=0.0, events={"buffer": (STOP + 0.002, SIGMA)})
+    np.testing.assert_allclose(fit(early)["mass"].value, mass, rtol=1e-7)
     # to less than a round-off, whatever the amplitude
     np.testing.assert_allclose(fit(run(0.6))["mass"].value, mass, rtol=1e-7)
 

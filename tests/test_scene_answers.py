@@ -58,6 +58,7 @@ def unchecked(field, value):
         ({"loads": lambda self, m: (jj.point_force(m["bead"].point((1.0, 2.0)), jnp.ones(3)),)}, "point of body `bead` has shape .2,., expected .3,."),
         ({"loads": lambda self, m: (jj.torque(m, "bead", 1.0),)}, r"torque on `bead` has shape \(\), expected \(3,\); give three components"),
         ({"loads": lambda self, m: (jj.gravity(m, 9.81, (0.0, -1.0)),)}, "direction of gravity has shape .2,., expected .3,."),
+        ({"loads": lambda self, m: (jj.gravity(m, 9.81, (1.0, 1.0, 0.0)),)}, "direction of gravity has length 1.414, expected a unit vector"),
         ({"potential": lambda self, pose: pose.q.array}, "what `potential` of `Described` returned has shape .2,., expected one number"),
         ({"bodies": lambda self, t, q: [jj.Particle(1.0, PLACE)]}, "`bodies` of `Described` returned a list, expected a dictionary by name"),
         ({"bodies": lambda self, t, q: {}}, "`bodies` of `Described` returned no body; return at least one by name"),
@@ -80,6 +81,13 @@ def unchecked(field, value):
 def test_what_a_method_returns_wrongly_is_named_with_what_to_return(members, sentence):
     with pytest.raises(ValueError, match=sentence):
         at_rest(described(**members))
+
+
+def test_a_direction_of_gravity_that_is_computed_is_looked_at_when_the_scene_is_probed():
+    tilted = described(loads=lambda self, m: (jj.gravity(m, 9.81, self.mass * jnp.array([0.6, 0.8, 0.0])),))
+    jj.simulate(tilted, {}, t1=0.1)
+    with pytest.raises(ValueError, match=r"the direction of gravity of `Described` has a length that differs from 1 by .*, expected a unit vector"):
+        jj.simulate(tilted.replace(mass=1.5), {}, t1=0.1)
 
 
 @pytest.mark.parametrize(

@@ -85,6 +85,16 @@ def test_own_methods_parameters_and_helpers_beside_the_real_method_are_left_alon
         def contact_arm(self):
             return 1.0
 
+        def velocity_constraints(self, motion):
+            return self.holonomic_constraints(motion.u)
+
+        def holonomic_constraints(self, u):
+            return {"held": self.torques * u.y_rate}
+
+        @property
+        def torques(self):
+            return 2.0
+
         def _event(self):
             return 1.0
 

@@ -58,6 +58,22 @@ def test_a_lane_with_wrong_parameters_comes_back_from_a_file_of_its_own(discs, t
     assert loaded.message.endswith("(`radius`); check where it was computed")
 
 
+class SmallDisc(TiltingDisc):
+    """A disc whose class looks at its radius when one is made."""
+
+    def __check_init__(self):
+        if self.radius > 0.6:
+            raise ValueError("too large")
+
+
+def test_a_class_that_looks_at_its_numbers_is_made_with_those_of_the_file(tmp_path):
+    lanes = jj.rollout(SmallDisc(radius=0.4), {"lean": np.array([0.2, 0.3])}, ts=TS, progress=False)
+    jj.save(lanes, tmp_path / "lanes.npz")
+    assert_equal_to_the_bit(jj.load_rollout(tmp_path / "lanes.npz", SmallDisc), lanes)
+    jj.save(lanes.lane(1), tmp_path / "lane.npz")
+    assert_equal_to_the_bit(jj.load_trajectory(tmp_path / "lane.npz", SmallDisc), lanes.lane(1))
+
+
 def test_lanes_that_were_continued_and_fields_that_are_counts_are_kept(tmp_path):
     lanes = jj.rollout(PendulumChain(links=1), parameters={"mass": np.array([[0.2], [0.3]])}, ts=TS, progress=False)
     again = dataclasses.replace(lanes.lanes, fallback=jnp.array([0, results.FULL_STATE], jnp.int32))

@@ -4,6 +4,7 @@ r = (reading - value) / sigma, zero where a sample is missing
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -56,7 +57,7 @@ class Run(NamedTuple):
         for name, weight in self.weights.items():
             sensor, at_first = self.sensors.get(name, ideal(name)), None
             if isinstance(sensor.operation, StopEvent):
-                shown = sensor.operation.time(lambda ts: self.motion(scene, simulate, ts, **simulation), self.t0, self.ts)
+                shown = self.stops(sensor.operation, name, partial(self.motion, scene, simulate, **simulation))
             else:
                 x = sensor.quantity(motion, states)
                 if sensor.has_filter and NODE in self.start:
@@ -65,6 +66,11 @@ class Run(NamedTuple):
                 filters += [y] if sensor.has_filter else []
             found[name] = jnp.where(weight > 0, (shown - self.values[name]) * weight, 0.0)
         return found | ended(motion, filters, self.start, ts)
+
+    def stops(self, event: StopEvent, name: str, motion: Callable) -> Float[Array, ""]:
+        """When the motion stops at the event whose time is the channel `name`; samples may end long before it."""
+        observed = jnp.max(jnp.where(self.weights[name] > 0, self.values[name] - self.t0, 0.0))
+        return event.time(motion, self.t0, jnp.maximum(self.ts[-1] - self.t0, observed))
 
     def at(self, layout: Layout, shared, local) -> "Run":
         """The run with these unknowns."""

@@ -18,7 +18,7 @@ from jourdain_jax.equations.listed import names_of_events
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
 
-LATEST = 4.0  # times as long as the run: where a motion meets the event later than that, or another one before, it fails
+LATEST = 4.0  # times the observed time: where a motion meets the event later than that, or another one before, it fails
 
 
 class StopEvent(eqx.Module):
@@ -34,9 +34,9 @@ class StopEvent(eqx.Module):
             raise ValueError(f"`events` of {where} names `{name}`, which is no event of the scene; {has}")
         return StopEvent(name)
 
-    def time(self, motion: Callable, t0, ts: Float[Array | np.ndarray, "times"]) -> Float[Array, ""]:
-        """When the motion stops at it, NaN where it does not. `motion`: of times, with its events."""
-        found = motion((t0 + LATEST * (ts[-1] - t0))[None])
+    def time(self, motion: Callable, t0, span) -> Float[Array, ""]:
+        """When the motion stops at it, NaN where it does not. `motion`: of times, with its events; `span`: from the start to the observed time."""
+        found = motion((t0 + LATEST * span)[None])
         return jnp.where(found.event == found.event_names.index(self.name), found.t_end, jnp.nan)
 
 

@@ -1,7 +1,7 @@
 """Whether the numbers that a scene gives for its bodies and contacts can be those of bodies and contacts; looked at while it is probed.
 
 m >= 0,   I = I' >= 0,   R' R = 1,   det R = 1
-n.n = 1,   gap = 0 where the coordinates keep a body on the ground
+n.n = 1,   e.e = 1 of gravity,   gap = 0 where the coordinates keep a body on the ground
 d[n.(p - o)]/dt at a fixed point p = - n.(v + w x (p - o))        a plane's motion, stated twice: by o(t), n(t) and by v, w
 dg/dt along the motion of the other bodies = 0  or  v, w != 0      g: all that says where the ground of a contact is
 """
@@ -19,9 +19,10 @@ from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.kinematics import inertias_of, pose_at
 from jourdain_jax.scene.bodies import RigidBody
 from jourdain_jax.scene.contacts import Contact
+from jourdain_jax.scene.loads import Gravity
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.scene import Scene
-from jourdain_jax.scene.validated import contacts_of
+from jourdain_jax.scene.validated import contacts_of, loads_of
 
 TOLERANCE = 1e-4  # relative: constants may be typed with a few digits, mistakes are larger
 _ROUNDED = 1e-2  # relative: of thin wheels the last moment is the sum of the others, and published moments have three digits
@@ -37,6 +38,7 @@ class PoseNumbers(eqx.Module):
     planes: dict[str, Float[Array, "*states 3"]]  # normal velocity by origin and tilt, by velocity and angular velocity; size of both, m/s
     carried: dict[str, Float[Array, "*states 3"]]  # rates of a ground along the motion of other bodies; size of that motion, and of the stated one, m/s
     normals: dict[str, Float[Array, "*states 2"]]  # squares of the lengths of the normals of contacts; and how far out the contact is, m
+    downwards: dict[str, Float[Array, "*states"]]  # squares of the lengths of directions of gravity
     gaps: dict[str, Float[Array, "*states 2"]]  # where the coordinates keep them closed; and the distance of the contact from the mass centre, m
 
 
@@ -53,6 +55,7 @@ def numbers_of(scene: Scene, motion: Motion) -> PoseNumbers:
         planes=_normal_velocities(scene, pose, contacts),
         carried={name: _carried_speeds(scene, motion, name, contact) for name, contact in contacts.items() if contact.ground is not None},
         normals={name: jnp.stack([contact.plane.normal @ contact.plane.normal, jnp.sum(jnp.abs(contact.point))]) for name, contact in contacts.items()},
+        downwards={str(k): load.direction @ load.direction for k, load in enumerate(loads_of(scene, motion)) if isinstance(load, Gravity)},
         gaps={
             name: jnp.stack([contact.gap(), jnp.sum(jnp.abs(contact.point - pose[contact.body].position))])
             for name, contact in contacts.items()
@@ -154,6 +157,7 @@ def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
     sentences += [_of_plane(f"the plane of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.planes.items()]
     sentences += [_of_carried(f"the ground of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.carried.items()]
     sentences += [_of_normal(f"contact `{name}` of `{who}`", squares) for name, squares in numbers.normals.items()]
+    sentences += [_of_gravity(who, squares) for squares in numbers.downwards.values()]
     sentences += [_of_gap(f"contact `{name}` of `{who}`", gaps) for name, gaps in numbers.gaps.items()]
     return tuple(sentence for sentence in sentences if sentence)
 
@@ -223,6 +227,12 @@ def _of_normal(what: str, squares: np.ndarray) -> str:
         )
     off = np.max(np.abs(np.sqrt(_finite(squares)[:, 0]) - 1), initial=0.0)
     return f"{what} has a normal whose length differs from 1 by {off:.2g}, expected a unit vector; divide it by its length" if off > TOLERANCE else ""
+
+
+def _of_gravity(who: str, squares: np.ndarray) -> str:
+    off = np.max(np.abs(np.sqrt(_finite(squares)) - 1), initial=0.0)
+    sentence = f"the direction of gravity of `{who}` has a length that differs from 1 by {off:.2g}, expected a unit vector; divide it by its length"
+    return sentence if off > TOLERANCE else ""
 
 
 def _of_gap(what: str, gaps: np.ndarray) -> str:

@@ -253,7 +253,8 @@ def _probed_structure(scene: Scene) -> Structure:
     # near round-off: work that turns out as zero does less harm than work left out
     homogeneous = "rows at rest" not in unproved and not _exceeds(found.phi_at_rest, 32 * eps, _speeds(found, u))
     rows_of_inputs = "rows of inputs" in unproved or _moves(found.row_rates_of_inputs)
-    if affine and not (faults or homogeneous or rows_of_inputs) and rank < len(names):
+    asks_for_motion = _exceeds(found.phi_at_rest, np.sqrt(eps), _speeds(found, u))  # smaller numbers may be errors of tables and of iterations
+    if affine and asks_for_motion and not (faults or rows_of_inputs) and rank < len(names):
         at_rest = (found.phi_at_rest / np.where(scaled.lengths > 0, scaled.lengths, 1))[generic]
         faults = contradictions(type(scene).__name__, names, scaled.A[generic], at_rest, [r for r, is_random in zip(ranks, generic, strict=True) if is_random])
     redundant = redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))

@@ -7,6 +7,7 @@ import difflib
 import inspect
 from dataclasses import fields
 from functools import lru_cache
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -86,10 +87,9 @@ def checked_arguments(kind: type, given: dict) -> None:
 @lru_cache(maxsize=512)
 def _misspelt(kind: type, base: type) -> str:
     """What is wrong with the names of a class's methods, attributes and fields, in words; empty where nothing is."""
-    own = {field.name for field in fields(kind)}
-    for owner in kind.__mro__:
-        if owner in base.__mro__:
-            continue
+    own, owners = {field.name for field in fields(kind)}, [owner for owner in kind.__mro__ if owner not in base.__mro__]
+    read = {name for owner in owners for member in vars(owner).values() for name in _read_in(member)}
+    for owner in owners:
         annotated = inspect.get_annotations(owner)
         for name, member in vars(owner).items():
             if name in own and name not in annotated:
@@ -98,7 +98,7 @@ def _misspelt(kind: type, base: type) -> str:
                     f"`{name}: float = jj.parameter(...)`, or give the value when a scene is made: `{kind.__name__}({name}=...)`"
                 )
             known = name.startswith("_") or name in own or name in ATTRIBUTES or hasattr(base, name)
-            if known or isinstance(member, type | staticmethod | classmethod):
+            if known or name in read or isinstance(member, type | staticmethod | classmethod):
                 continue
             callable_ = callable(member) or isinstance(member, property)
             near = [_MEANT[name]] if callable_ and name in _MEANT else []
@@ -110,6 +110,13 @@ def _misspelt(kind: type, base: type) -> str:
                     f"Rename it, or begin its name with an underscore (`_{name}`) if it is your own"
                 )
     return ""
+
+
+def _read_in(member) -> set[str]:
+    """Names that a method or property reads, functions within it included."""
+    function: Any = member.fget if isinstance(member, property) else member
+    code = function if isinstance(function, CodeType) else getattr(inspect.unwrap(function), "__code__", None)
+    return set() if code is None else {*code.co_names, *(name for inner in code.co_consts if isinstance(inner, CodeType) for name in _read_in(inner))}
 
 
 def _check_counts(scene) -> None:

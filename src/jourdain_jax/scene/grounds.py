@@ -248,7 +248,7 @@ def tangents_of(n: Float[Array, "3"]) -> Float[Array, "2 3"]:
 def unit_vector(value, what: str) -> Float[Array, "3"]:
     """A unit vector; a ValueError where it is known to have another length. Traced ones are looked at when a scene is probed."""
     vector = checked_real(value, what, (3,), advice="give a unit vector")
-    length = 1.0 if is_traced(vector) else float(np.linalg.norm(np.asarray(vector)))
+    length = 1.0 if is_traced(value) else float(np.linalg.norm(np.asarray(value, float)))  # `vector` is traced wherever the scene is
     if not abs(length - 1) <= _UNIT:
         raise ValueError(f"{what} has length {length:.4g}, expected a unit vector; divide it by its length")
     return vector

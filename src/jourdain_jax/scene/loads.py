@@ -34,6 +34,16 @@ class Load(eqx.Module):
         self.potential = None if potential is None else checked_real(potential, "potential of a load")
 
 
+class Gravity(Load):
+    """What `gravity` makes: its `direction` is looked at when a scene is probed."""
+
+    direction: Float[Array, "3"]
+
+    def __init__(self, forces, potential, direction):
+        super().__init__(forces, potential=potential)
+        self.direction = direction
+
+
 def _real_parts(kind: str, parts: dict | None) -> dict[str, Array]:
     if parts is None:
         return {}
@@ -48,10 +58,11 @@ def gravity(motion: Motion, strength, direction=(0.0, 0.0, -1.0)) -> Load:
     `strength`: g in m/s^2; `direction`: e, a unit vector of the inertial frame. ValueError for a direction of another length.
     """
     motion = _motion(motion, "gravity")
-    g = checked_real(strength, "strength of gravity", ()) * unit_vector(direction, "direction of gravity")
+    e = unit_vector(direction, "direction of gravity")
+    g = checked_real(strength, "strength of gravity", ()) * e
     forces = {name: body.mass * g for name, body in motion.bodies.items()}
     potential = -sum(body.mass * (g @ body.position) for body in motion.bodies.values())
-    return Load(forces=forces, potential=potential)
+    return Gravity(forces, potential, e)
 
 
 def point_force(point: Point, force) -> Load:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jourdain_jax.calculus.reals import checked_real, described
 from jourdain_jax.scene.bodies import Body
 from jourdain_jax.scene.contacts import Contact
-from jourdain_jax.scene.loads import Load
+from jourdain_jax.scene.loads import Gravity, Load
 from jourdain_jax.scene.motion_state import Motion, Pose
 from jourdain_jax.scene.names import Named, nearest
 from jourdain_jax.scene.scene import Scene
@@ -53,12 +53,13 @@ def _checked_load(scene: Scene, i: int, load) -> Load:
     where = f"load {i} of `{_name(scene)}`"
     if not isinstance(load, Load):
         raise ValueError(f"{where} is {described(load)}, expected a load, such as jj.point_force(...) or jj.Load(forces=...)")
-    return Load(
+    checked = Load(
         forces={body: checked_real(value, f"force of {where} on body `{body}`", (3,)) for body, value in load.forces.items()},
         torques={body: checked_real(value, f"torque of {where} on body `{body}`", (3,)) for body, value in load.torques.items()},
         generalized={speed: checked_real(value, f"force of {where} on speed `{speed}`", ()) for speed, value in load.generalized.items()},
         potential=None if load.potential is None else checked_real(load.potential, f"potential of {where}", ()),
     )
+    return Gravity(checked.forces, checked.potential, load.direction) if isinstance(load, Gravity) else checked
 
 
 def potential_of(scene: Scene, pose: Pose) -> Float[Array, ""] | None:

@@ -35,6 +35,7 @@ from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
 
 _ARRAYS = tuple(name for name in AXES if name not in ("inputs", "work"))
+_NEEDS_NUMBERS = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
 
 
@@ -142,7 +143,11 @@ def _lanes(path, kind: type[Scene], header: dict, arrays: dict) -> Trajectory:
     longest = max(len(times) for times, _ in samples)  # lanes with fewer are filled up with their last sample
     arrays["input_ts"] = np.stack([np.pad(times, (0, longest - len(times)), mode="edge") for times, _ in samples])
     arrays["inputs"] = np.stack([np.pad(values, ((0, longest - len(values)), (0, 0)), mode="edge") for _, values in samples])
-    lanes = jax.vmap(lambda arrays: _trajectory(path, kind, header, arrays))(arrays)
+    try:
+        lanes = jax.vmap(lambda arrays: _trajectory(path, kind, header, arrays))(arrays)
+    except _NEEDS_NUMBERS:  # a class that looks at them when a scene is made
+        each = [_trajectory(path, kind, header, {name: x[i] for name, x in arrays.items()}) for i in range(len(arrays["result"]))]
+        lanes = jax.tree.map(lambda *x: jnp.stack(x), *each)
     check_scenes(path, lanes.scene, lanes.result)
     return lanes
 
@@ -151,6 +156,8 @@ def _trajectory(path, kind: type[Scene], header: dict, arrays: dict) -> Trajecto
     values = _parameters(arrays)
     try:
         scene = kind(**values, **header["static"])
+    except _NEEDS_NUMBERS:
+        raise
     except TypeError as error:
         raise refused(path, f"does not hold what makes a `{kind.__name__}` ({str(error).splitlines()[0]})") from None
     parameters, static = _stored_fields(scene)
