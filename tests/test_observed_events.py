@@ -52,6 +52,9 @@ def test_runs_with_and_without_an_event_are_fitted_together_and_samples_after_it
     assert found.converged
     assert found.samples == 9 + 1 + 8 + 1
     assert not found.warnings
+    uncounted = fit(run(values=x[:2], events={"buffer": (STOP, np.inf)}), run(values=x[:8], events={}))
+    assert uncounted.samples == 2 + 8
+    assert not uncounted.warnings
     # J'J of x = x0 cos(w t),  dx/dm = x0 w t sin(w t) / (2 m), and of t, dt/dm = t / (2 m)
     m, w = float(found["mass"].value), np.sqrt(5.0 / float(found["mass"].value))
     slopes = [0.3 * w * ts[:n] * np.sin(w * ts[:n]) / (2 * m) / 0.005 for n in (9, 8)]

@@ -90,6 +90,18 @@ def test_a_direction_of_gravity_that_is_computed_is_looked_at_when_the_scene_is_
         jj.simulate(tilted.replace(mass=1.5), {}, t1=0.1)
 
 
+def test_a_direction_of_gravity_that_is_traced_hides_nothing_else():
+    class Ghost(Bead):
+        direction: object = jj.parameter((0.0, -1.0, 0.0))
+        coordinates = jj.coordinates("x y z")
+
+        def loads(self, motion):
+            return (jj.gravity(motion, 9.81, self.direction),)
+
+    with pytest.raises(ValueError, match="nothing in `Ghost` has inertia along `z_rate`"):
+        jax.jit(lambda e: jj.simulate(Ghost(direction=e), {}, t1=0.1).q_end)(jnp.array([0.0, -1.0, 0.0]))
+
+
 @pytest.mark.parametrize(
     ("events", "sentence"),
     [

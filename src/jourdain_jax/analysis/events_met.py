@@ -22,7 +22,7 @@ def events_met(problem: Problem, theta: Float[np.ndarray, "places"], simulation:
         one = run_of(run).at(layout, shared, local[index])
         motion = partial(one.motion, layout.scene(problem.scene, shared), simulate, **simulation)
         if run.ended_by:
-            if not np.isfinite(one.stops(StopEvent(run.ended_by), run.ended_by, motion)):
+            if np.any(one.weights[run.ended_by] > 0) and not np.isfinite(one.stops(StopEvent(run.ended_by), run.ended_by, motion)):
                 found.append(f"the motion of run {index} does not meet `{run.ended_by}` before {LATEST:g} times the observed time; start nearer")
             continue
         motion = motion(one.ts)

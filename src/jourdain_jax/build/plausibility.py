@@ -157,9 +157,15 @@ def implausible(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
     sentences += [_of_plane(f"the plane of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.planes.items()]
     sentences += [_of_carried(f"the ground of contact `{name}` of `{who}`", speeds) for name, speeds in numbers.carried.items()]
     sentences += [_of_normal(f"contact `{name}` of `{who}`", squares) for name, squares in numbers.normals.items()]
-    sentences += [_of_gravity(who, squares) for squares in numbers.downwards.values()]
     sentences += [_of_gap(f"contact `{name}` of `{who}`", gaps) for name, gaps in numbers.gaps.items()]
     return tuple(sentence for sentence in sentences if sentence)
+
+
+def odd_gravity(scene: Scene, numbers: PoseNumbers) -> tuple[str, ...]:
+    """Directions of gravity that are no unit vectors, one sentence each; `numbers` as in `implausible`."""
+    off = [np.max(np.abs(np.sqrt(_finite(squares)) - 1), initial=0.0) for squares in numbers.downwards.values()]
+    who = f"the direction of gravity of `{type(scene).__name__}`"
+    return tuple(f"{who} has a length that differs from 1 by {x:.2g}, expected a unit vector; divide it by its length" for x in off if x > TOLERANCE)
 
 
 def _of_nothing(what: str, piece: str, values: np.ndarray) -> str:
@@ -227,12 +233,6 @@ def _of_normal(what: str, squares: np.ndarray) -> str:
         )
     off = np.max(np.abs(np.sqrt(_finite(squares)[:, 0]) - 1), initial=0.0)
     return f"{what} has a normal whose length differs from 1 by {off:.2g}, expected a unit vector; divide it by its length" if off > TOLERANCE else ""
-
-
-def _of_gravity(who: str, squares: np.ndarray) -> str:
-    off = np.max(np.abs(np.sqrt(_finite(squares)) - 1), initial=0.0)
-    sentence = f"the direction of gravity of `{who}` has a length that differs from 1 by {off:.2g}, expected a unit vector; divide it by its length"
-    return sentence if off > TOLERANCE else ""
 
 
 def _of_gap(what: str, gaps: np.ndarray) -> str:

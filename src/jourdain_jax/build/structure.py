@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jourdain_jax.build.kept_findings import kept_of_scene
-from jourdain_jax.build.plausibility import implausible
+from jourdain_jax.build.plausibility import implausible, odd_gravity
 from jourdain_jax.build.privileged import best_privileged, pivots_at, privileged_by_user, worst_pivot
 from jourdain_jax.build.probed import TIMED, Probed
 from jourdain_jax.build.probed_on_graph import follow_from_others, probed_on_graph
@@ -257,6 +257,7 @@ def _probed_structure(scene: Scene) -> Structure:
     if affine and asks_for_motion and not (faults or rows_of_inputs) and rank < len(names):
         at_rest = (found.phi_at_rest / np.where(scaled.lengths > 0, scaled.lengths, 1))[generic]
         faults = contradictions(type(scene).__name__, names, scaled.A[generic], at_rest, [r for r, is_random in zip(ranks, generic, strict=True) if is_random])
+    faults = faults or odd_gravity(scene, found.numbers)  # last: numbers that stand in for a traced direction are no unit vector, which must hide nothing else
     redundant = redundant_rows(scaled, found.error, ranks, generic, names, lambda: _far_rows(scene, typical, *drawn))
     return Structure(
         row_names=names,
