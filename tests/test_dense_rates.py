@@ -7,7 +7,7 @@ import pytest
 
 import jourdain_jax as jj
 from jourdain_jax.build.structure import structure_of
-from jourdain_jax.lowering.dense_rates import dense_rates
+from jourdain_jax.lowering.dense_rates import _null_space, dense_rates
 
 STATES = 4
 
@@ -68,3 +68,12 @@ def test_rows_that_follow_from_others_are_left_out_where_rounded_coordinates_mak
     t, q, u = jj.sample_states(scene, STATES)
     found = rates(scene, (0, 1), t, q.astype(np.float32).astype(float), u, np.zeros((STATES, 0)))
     np.testing.assert_allclose(found.ydot, -np.sum(u**2, axis=1, keepdims=True) * q, atol=1e-5)
+
+
+def test_rows_that_rounding_makes_independent_count_once():
+    A, b = np.array([[[1.0, 0.0, 0.0], [1.0, 1e-8, 0.0]]]), np.ones((1, 2))
+    Z, c = _null_space(A, b, rank=1)
+    assert np.linalg.matrix_rank(Z[0]) == 2
+    np.testing.assert_allclose(A @ Z, 0.0, atol=2e-8)
+    np.testing.assert_allclose(c, [[1.0, 0.0, 0.0]], atol=2e-8)
+    assert np.linalg.matrix_rank(_null_space(A, b, rank=2)[0][0]) == 1

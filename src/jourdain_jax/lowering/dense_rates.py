@@ -100,26 +100,35 @@ def _rates(traced: _Traced, structure: Structure, kept: list[int], independent: 
     M = mass_matrix(m, I, beta, gamma)
     force, torque = at["force"] - m[..., None] * a, at["torque"] - turned(alpha) - np.cross(omega, turned(omega))
     f = np.einsum("sbik,sbi->sk", beta, force) + np.einsum("sbik,sbi->sk", gamma, torque) + at["direct"]
-    return DenseRates(at["qdot"], _accelerations(M, f, A[:, kept], drift[:, kept], structure.row_lengths[kept])[:, list(independent)], at["events"])
+    udot = _accelerations(M, f, A[:, kept], drift[:, kept], structure.row_lengths[kept], structure.rank)
+    return DenseRates(at["qdot"], udot[:, list(independent)], at["events"])
 
 
-def _accelerations(M, f, A, drift, row_lengths: np.ndarray) -> np.ndarray:
+def _accelerations(M, f, A, drift, row_lengths: np.ndarray, rank: int) -> np.ndarray:
     """`udot = Z zeta + c`, in speeds scaled by their inertia and rows by their length; NaN where it is not determined."""
     scale = speed_scales(M)
     M, f, A = scale[:, :, None] * M * scale[:, None], scale * f, A * scale[:, None]
     Z, c = np.broadcast_to(np.eye(f.shape[1]), M.shape), np.zeros_like(f)
     if A.shape[1]:
         length = np.maximum(np.linalg.norm(A, axis=2), row_lengths)
-        A = A / np.where(length > 0, length, 1.0)[..., None]
-        Z, c = _null_space(A), shortest(A, -drift / np.where(length > 0, length, 1.0), np.ones(A.shape[1]))
+        d = 1 / np.where(length > 0, length, 1.0)
+        Z, c = _null_space(d[..., None] * A, -d * drift, rank)
     S = Z.mT @ M @ Z + np.all(Z == 0, axis=1)[:, None] * np.eye(Z.shape[2])  # columns that stand for nothing
     determined = np.min(np.linalg.eigvalsh(np.nan_to_num(S)), axis=1, initial=1.0) > 16 * S.shape[1] * np.finfo(S.dtype).eps
     zeta = np.linalg.solve(np.where(determined[:, None, None], S, np.eye(S.shape[1])), Z.mT @ (f[..., None] - M @ c[..., None]))
     return np.where(determined[:, None], scale * ((Z @ zeta)[..., 0] + c), np.nan)
 
 
-def _null_space(A: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of the null space, in as many columns as there are speeds (the others are zero)."""
-    _, sigma, V = np.linalg.svd(np.where(np.all(np.isfinite(A), axis=(1, 2), keepdims=True), A, 0.0), full_matrices=True)
-    rank = np.count_nonzero(sigma > rank_cutoff(A.dtype) * sigma[:, :1], axis=1)
-    return V.mT * (np.arange(A.shape[2]) >= rank[:, None])[:, None]
+def _null_space(A: np.ndarray, b: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
+    """An orthonormal basis of the null space, in as many columns as there are speeds (the others are zero), and the shortest c with `A c = b`.
+
+    At most `rank` rows count: at coordinates that were rounded to single precision, rows that depend on each other are independent by some 1e-8.
+    """
+    finite = np.all(np.isfinite(A), axis=(1, 2)) & np.all(np.isfinite(b), axis=1)
+    U, sigma, V = np.linalg.svd(np.where(finite[:, None, None], A, 0.0), full_matrices=True)
+    counts = (sigma > rank_cutoff(A.dtype) * sigma[:, :1]) & (np.arange(sigma.shape[1]) < rank)
+    inverse = np.where(counts, 1 / np.where(counts, sigma, 1.0), 0.0)
+    most = sigma.shape[1]
+    c = (V[:, :most].mT @ (inverse[..., None] * (U[:, :, :most].mT @ b[..., None])))[..., 0]
+    free = np.arange(A.shape[2]) >= np.count_nonzero(counts, axis=1)[:, None]
+    return V.mT * free[:, None], np.where(finite[:, None], c, np.nan)
