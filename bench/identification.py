@@ -191,7 +191,7 @@ def optimistix_minimum(residual):
 
 
 def by_optimistix(repeats: int) -> list[Figure]:
-    """Fits by the Levenberg-Marquardt of optimistix, with derivatives by forward mode; what is above zero is the exponential of an unknown (a bijection)."""
+    """Fits by the Levenberg-Marquardt of optimistix, with derivatives in forward mode; what is above zero is the exponential of an unknown (a bijection)."""
 
     def of_disc(x, values):
         scene, start = jj.models.TiltingDisc(radius=jnp.exp(x[0]), gravity=jnp.exp(x[1])), {"lean": x[2], "spin_rate": x[3]}

@@ -7,9 +7,9 @@ converged  the undamped step is at most `tolerance` standard errors long, |J d|,
            or a step is at whose end it will be a tenth of that, as far as it shrank from the last one to this one: the end is then known without evaluation
 
 Bounds end steps, since a bijection onto their inside never reaches them: of ten fits whose damping is zero, seven by its logarithm had not converged in 256
-steps, and all ten do in 4 here. Why this is our own and not that of optimistix: its Jacobians are dense, so that of many runs each would go through the
-derivatives by the starts of all others, it has no bounds, and a run that is alone takes it 1.7 to 2.0 times as long: residuals and their derivatives are
-evaluated apart (`bench/identification.py --only optimistix`).
+steps, and all ten do in 4 here. The method of optimistix is not used for three reasons. Its Jacobian is dense: each of many runs would be differentiated with
+respect to the starts of all others. It has no bounds. It evaluates residuals and derivatives one after the other, and takes 1.7 to 2.0 times as long for a
+single run (`bench/identification.py --only optimistix`).
 
 Several problems of one shape (`members`) go side by side; those that have ended cost nothing. How damping changes: see `pace`.
 Source: D. W. Marquardt, SIAM J. Appl. Math. 11 (1963) 431; J. J. Moré, Lecture Notes in Mathematics 630 (1978) 105.
