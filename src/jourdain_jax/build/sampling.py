@@ -10,6 +10,7 @@ from jourdain_jax.build.assembling import Assembled
 from jourdain_jax.build.domain import coordinate_bounds, speed_bounds
 from jourdain_jax.build.probed import Probed
 from jourdain_jax.build.probed_on_graph import sampled_on_graph
+from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.scene import Scene
 
 SYMMETRIC_PROBES = 200
@@ -55,6 +56,7 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
         raise ValueError(f"`count` is {count!r}, expected a whole number of states, at least 1")
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
+    scene = as_scene(scene)
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
     t, q, u = random_states(scene, drawn, np.random.default_rng(seed))
     q, u, found = sampled_on_graph(scene, t, q, u)
