@@ -161,7 +161,5 @@ class OnLift(OnSledge):
 
 @pytest.mark.parametrize("ground", [lambda q, up: jj.Plane(up), lambda q, up: jj.Plane(tilt=q.rise)])
 def test_a_ground_that_a_coordinate_moves_along_its_normal_is_refused(ground):
-    with pytest.raises(
-        ValueError, match=r"the plane of contact `back` of `OnLift` moves along its normal .* where coordinates move it, leave"
-    ):
+    with pytest.raises(ValueError, match=r"the plane of contact `back` of `OnLift` moves along its normal .* where coordinates move it, leave"):
         jj.structure_of(OnLift(ground))
