@@ -17,7 +17,7 @@ from jourdain_jax.dynamics.accelerations import bare_accelerations
 from jourdain_jax.dynamics.power import power
 from jourdain_jax.equations.kinematics import motion_at
 from jourdain_jax.equations.virtual_power import energies_at, unconstrained_equations
-from jourdain_jax.motion.arguments import of_known_numbers
+from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.scene import Scene
 
 _ORIGINS = {

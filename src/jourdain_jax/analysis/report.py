@@ -9,12 +9,12 @@ from jourdain_jax.build.structure import structure_of
 from jourdain_jax.dynamics.accelerations import accelerations
 from jourdain_jax.dynamics.reduced import cyclic_coordinates, ignorable_coordinates
 from jourdain_jax.lowering.built import Built, build
-from jourdain_jax.motion.arguments import as_state, of_known_numbers
+from jourdain_jax.motion.arguments import as_state
 from jourdain_jax.motion.inputs import as_inputs
 from jourdain_jax.motion.native import native_motion
 from jourdain_jax.motion.start import State
 from jourdain_jax.motion.vector_fields.choice import vector_field
-from jourdain_jax.scene.arguments import BuiltFor
+from jourdain_jax.scene.arguments import BuiltFor, of_known_numbers
 from jourdain_jax.scene.printing import Printed, preformatted
 from jourdain_jax.scene.scene import Scene
 from jourdain_jax.scene.tracebacks import shown_from_users_lines

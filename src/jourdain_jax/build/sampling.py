@@ -10,7 +10,7 @@ from jourdain_jax.build.assembling import Assembled
 from jourdain_jax.build.domain import coordinate_bounds, speed_bounds
 from jourdain_jax.build.probed import Probed
 from jourdain_jax.build.probed_on_graph import sampled_on_graph
-from jourdain_jax.scene.arguments import as_scene
+from jourdain_jax.scene.arguments import as_scene, of_known_numbers
 from jourdain_jax.scene.scene import Scene
 
 SYMMETRIC_PROBES = 200
@@ -47,11 +47,14 @@ def states_near_what_was_seen(scene: Scene, count: int, generator: np.random.Gen
     return t, _seen[type(scene)] + near[:, None] * (q - (low + high) / 2), u
 
 
+@of_known_numbers
 def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """At most `count` random admissible states (t, q, u) from the scene's domain, on the rows, each with a leading axis of states.
 
-    `seed`: of the generator. Scene parameters must be concrete. ValueError where no state meets the geometric rows, or rows are numbers at none.
+    `seed`: of the generator. ValueError where no state meets the geometric rows, or rows are numbers at none; a DifferentiationModeError where the
+    scene's parameters are traced.
     """
+    scene = as_scene(scene)
     if not isinstance(count, int | np.integer) or count < 1:
         raise ValueError(f"`count` is {count!r}, expected a whole number of states, at least 1")
     if not isinstance(seed, int | np.integer) or seed < 0:

@@ -2,9 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
+import jax.extend.core
 import jax.numpy as jnp
 import numpy as np
 from jax import dtypes
@@ -125,6 +126,17 @@ def is_traced(*trees) -> bool:
     known = len(trees) == 1 and isinstance(trees[0], float | int | np.ndarray)  # no tree, and this takes a tenth of the time
     return not known and any(is_traced_type(type(leaf)) for leaf in jax.tree.leaves(trees))
 
+
+_core: Any = jax.extend.core if hasattr(jax.extend.core, "get_opaque_trace_state") else jax.core  # the latter before jax 0.10
+
+
+def nothing_is_traced() -> bool:
+    """Whether this call stands outside of every transformation: no function around it is being traced, and so no argument."""
+    return _core.get_opaque_trace_state(convention="flax") == _NOTHING_TRACED
+
+
+with jax.ensure_compile_time_eval():
+    _NOTHING_TRACED = _core.get_opaque_trace_state(convention="flax")
 
 # Whether what is of this type is being traced, or is an array of JAX or NumPy: looked up, at a tenth of the time of asking the classes of JAX.
 is_traced_type: Callable[[type], bool] = lru_cache(maxsize=1024)(lambda kind: issubclass(kind, jax.core.Tracer))

@@ -6,28 +6,20 @@ t0 <= ts_1 < ts_2 < ... <= t1,   or the other way round in reversed time
 """
 
 import difflib
-from collections.abc import Callable, Mapping
-from contextlib import nullcontext
-from functools import wraps
-from typing import TypeVar
+from collections.abc import Mapping
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jourdain_jax.calculus.guards import DifferentiationModeError
 from jourdain_jax.calculus.reals import as_array, checked_unless_traced, described, is_traced, real_type
 from jourdain_jax.motion.integrators.of_diffrax import diffrax
 from jourdain_jax.motion.integrators.tableaus import Method
-from jourdain_jax.motion.quick_compilation import nothing_is_traced
 from jourdain_jax.motion.start import State, named_start
-from jourdain_jax.scene.arguments import as_scene
 from jourdain_jax.scene.scene import Scene
 
 DEFAULT_SAMPLES = 201
 _EVEN = np.linspace(0.0, 1.0, DEFAULT_SAMPLES)
-F = TypeVar("F", bound=Callable)
 _SHORT = 1e-9  # s, a span for motions that are not asked for
 _ROUND_OFF = 4  # units in the last place by which a time at an end of the span may lie beyond it
 _KINDS = {  # of diffrax, and an example
@@ -36,25 +28,6 @@ _KINDS = {  # of diffrax, and an example
     "stepsize_controller": ("AbstractStepSizeController", "diffrax.PIDController(rtol=1e-8, atol=1e-8)"),
     "saveat": ("SaveAt", "diffrax.SaveAt(ts=...)"),
 }
-
-
-def of_known_numbers(function: F) -> F:
-    """The function of a scene and more, run on numbers also inside `jit`, `vmap` and derivatives.
-
-    A DifferentiationModeError that names it where one is traced.
-    """
-
-    @wraps(function)
-    def called(scene, *args, **kwargs):
-        scene = as_scene(scene)
-        if is_traced(scene, args, kwargs):
-            raise DifferentiationModeError(
-                f"`{function.__name__}` was called inside jit, vmap or a derivative, with numbers that are not known there; call it outside of them"
-            )
-        with nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval():
-            return function(scene, *args, **kwargs)
-
-    return called  # type: ignore[return-value]
 
 
 def as_state(scene: Scene, given, *, what: str = "start", t0=0.0, inputs=None, native: bool = True, onto_rows: bool = False) -> State:

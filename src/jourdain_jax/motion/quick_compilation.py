@@ -11,15 +11,13 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.extend.core
 
 from jourdain_jax.calculus.collecting import without_collecting
 from jourdain_jax.calculus.jaxprs import loops
-from jourdain_jax.calculus.reals import is_array_type
+from jourdain_jax.calculus.reals import is_array_type, nothing_is_traced
 
 QUICK: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
 RUN_SELDOM: dict[str, Any] = QUICK | {"xla_backend_optimization_level": 0}  # where a function's costs are those of its compilation
-_core: Any = jax.extend.core if hasattr(jax.extend.core, "get_opaque_trace_state") else jax.core  # the latter before jax 0.10
 MOST_STRUCTURES = 1024  # of arguments, arrays left out, for which one function is kept compiled
 
 
@@ -97,12 +95,3 @@ def sparingly_compiled(f: Callable, most_loops: int) -> Callable:
         return chosen[0](*arrays)
 
     return run
-
-
-def nothing_is_traced() -> bool:
-    """Whether this call stands outside of every transformation: no function around it is being traced, and so no argument."""
-    return _core.get_opaque_trace_state(convention="flax") == _NOTHING_TRACED
-
-
-with jax.ensure_compile_time_eval():
-    _NOTHING_TRACED = _core.get_opaque_trace_state(convention="flax")

@@ -20,8 +20,7 @@ import jax
 import numpy as np
 
 from jourdain_jax.calculus.cotangents import tap_cotangents, tap_tangents
-from jourdain_jax.calculus.reals import is_traced
-from jourdain_jax.motion.quick_compilation import nothing_is_traced
+from jourdain_jax.calculus.reals import is_traced, nothing_is_traced
 from jourdain_jax.motion.setup import Setup
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jourdain_jax.calculus.on_first_use import module_on_first_use
-from jourdain_jax.calculus.reals import Number, as_array, is_traced
+from jourdain_jax.calculus.reals import Number, as_array, is_traced, nothing_is_traced
 from jourdain_jax.motion.arguments import as_state, check_options, named_values, span_and_times
 from jourdain_jax.motion.inputs import Inputs, as_inputs, inputs_at
 from jourdain_jax.motion.inputs_in_rows import check_inputs_in_rows
@@ -24,7 +24,6 @@ from jourdain_jax.motion.integrators.tableaus import DOPRI8, TSIT5, Method, as_s
 from jourdain_jax.motion.integrators.taylor import Taylor, order_for
 from jourdain_jax.motion.marks import nan_is_a_mark
 from jourdain_jax.motion.own_steps import own_steps, reason_against_series
-from jourdain_jax.motion.quick_compilation import nothing_is_traced
 from jourdain_jax.motion.retries import mark_retried, next_retry, retry_options
 from jourdain_jax.motion.sensitivity import warn_if_ill_conditioned
 from jourdain_jax.motion.setup import MOST_STEPS, TOLERANCE, Setup

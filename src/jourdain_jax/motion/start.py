@@ -21,7 +21,7 @@ from jourdain_jax.build.held_values import may_contradict
 from jourdain_jax.build.sampling import NoStateFoundError, seen_on_rows
 from jourdain_jax.build.structure import Structure, structure_of
 from jourdain_jax.calculus.damped import first_root
-from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, described, is_traced, real_type
+from jourdain_jax.calculus.reals import Number, Numbers, checked_unless_traced, described, is_traced, nothing_is_traced, real_type
 from jourdain_jax.eager.eager import eval_numpy
 from jourdain_jax.equations.listed import names_of_position_rows, names_of_rows
 from jourdain_jax.equations.projection import closure_residual, project_positions
@@ -29,7 +29,7 @@ from jourdain_jax.equations.rows import velocity_residual
 from jourdain_jax.equations.scaling import row_scale
 from jourdain_jax.motion.inputs import as_inputs, inputs_at
 from jourdain_jax.motion.put_on_rows import Usual, functions_of_rows, put_positions, put_speeds, usual_sizes
-from jourdain_jax.motion.quick_compilation import RUN_SELDOM, nothing_is_traced, quickly_compiled
+from jourdain_jax.motion.quick_compilation import RUN_SELDOM, quickly_compiled
 from jourdain_jax.scene.arguments import BuiltFor, as_coordinates, as_input_vector, as_scene, as_speeds
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest

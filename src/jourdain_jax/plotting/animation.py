@@ -10,6 +10,7 @@ from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.backend import pyplot
 from jourdain_jax.plotting.looks import Look, looks_of
 from jourdain_jax.plotting.solids import parts_of, rgb
+from jourdain_jax.scene.arguments import of_known_numbers
 
 FRAMES = 60
 _LIGHT = np.array([0.1, -0.6, 0.79])  # unit vector towards the light
@@ -67,6 +68,7 @@ def check_suffix(path: str | os.PathLike) -> None:
         raise ValueError(f"cannot write `{path}`: an animation is a .gif file")
 
 
+@of_known_numbers
 def animate(
     trajectory: Trajectory,
     path: str | os.PathLike,

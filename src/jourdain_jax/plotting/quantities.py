@@ -11,6 +11,7 @@ from jourdain_jax.motion.trajectories import results
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.backend import check_folder, pyplot
 from jourdain_jax.plotting.units import checked_units
+from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.names import UnknownNameError, nearest
 
 ENERGIES = ("energy", "kinetic energy", "potential energy")
@@ -26,6 +27,7 @@ def check_format(path: str | os.PathLike) -> None:
         raise ValueError(f"cannot write `{path}`: a plot is a .png, .svg or .pdf file, and matplotlib knows no `{suffix or 'file without suffix'}`")
 
 
+@of_known_numbers
 def plot(
     motion,
     *names: str,

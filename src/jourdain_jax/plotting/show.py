@@ -16,6 +16,7 @@ from jourdain_jax.motion.batches.rollout import Rollout
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.plotting.backend import check_folder
 from jourdain_jax.plotting.page_data import page_data
+from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.names import nearest
 
 LANES = 12  # of a rollout, at most
@@ -41,6 +42,7 @@ class View:
         return f"View of {self.title}, {len(self.html) / 1e6:.2f} MB of HTML; shown in a notebook, or written to a file by .save('view.html')"
 
 
+@of_known_numbers
 def show(
     motion,
     path: str | os.PathLike | None = None,

@@ -3,17 +3,23 @@
 Kinds and shapes are known while a function is traced: no compiled program contains these checks.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from functools import wraps
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jourdain_jax.calculus.reals import checked_real, described, real_type
+from jourdain_jax.calculus.guards import DifferentiationModeError
+from jourdain_jax.calculus.reals import checked_real, described, is_traced, nothing_is_traced, real_type
 from jourdain_jax.scene.coordinates import Names
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.scene import Scene
+
+F = TypeVar("F", bound=Callable)
 
 
 class BuiltFor:
@@ -34,6 +40,25 @@ def as_scene(scene) -> Scene:
     if isinstance(scene, type) and issubclass(scene, Scene):
         raise ValueError(f"`scene` is the class `{scene.__name__}`, expected a scene of it; write `{scene.__name__}()`, with parameters in the parentheses")
     raise ValueError(f"`scene` is {described(scene)}, expected a scene: an instance of a subclass of `jj.Scene`")
+
+
+def of_known_numbers(function: F) -> F:
+    """The function of a scene, or of a motion, and more, run on numbers also inside `jit`, `vmap` and derivatives.
+
+    A DifferentiationModeError that names it where one is traced.
+    """
+
+    @wraps(function)
+    def called(known, *args, **kwargs):
+        known = known.scene if isinstance(known, BuiltFor) else known
+        if is_traced(known, args, kwargs):
+            raise DifferentiationModeError(
+                f"`{function.__name__}` was called inside jit, vmap or a derivative, with numbers that are not known there; call it outside of them"
+            )
+        with nullcontext() if nothing_is_traced() else jax.ensure_compile_time_eval():
+            return function(known, *args, **kwargs)
+
+    return called  # type: ignore[return-value]
 
 
 def as_time(t) -> Float[Array, ""]:

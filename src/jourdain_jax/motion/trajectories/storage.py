@@ -30,6 +30,7 @@ from jourdain_jax.motion.marks import with_nan_as_a_mark
 from jourdain_jax.motion.trajectories.storage_checks import AXES, HEADER, check_arrays, check_header, check_scenes, refused
 from jourdain_jax.motion.trajectories.trajectory import Trajectory
 from jourdain_jax.motion.trajectories.versions import version_of
+from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.names import nearest
 from jourdain_jax.scene.parameters import parameters_of
 from jourdain_jax.scene.scene import Scene
@@ -39,6 +40,7 @@ _NEEDS_NUMBERS = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConve
 _READERS = {"trajectory": "jj.load_trajectory(path, scene)", "rollout": "jj.load_rollout(path, scene)"}
 
 
+@of_known_numbers
 def save(motion: Trajectory | Rollout, path: str | os.PathLike) -> None:
     """Write a `motion`, one trajectory or a whole rollout, to `path` (`.npz`, format 1 of `motion/storage.py`).
 

@@ -22,6 +22,7 @@ from jourdain_jax.motion.trajectories import labelled, over_times, results
 from jourdain_jax.motion.trajectories.diagnostics import Energies, diagnose, summary, summary_html, warnings_of
 from jourdain_jax.motion.trajectories.over_times import Record, map_over_times
 from jourdain_jax.motion.trajectories.sketch import sketch
+from jourdain_jax.scene.arguments import of_known_numbers
 from jourdain_jax.scene.motion_state import Motion
 from jourdain_jax.scene.names import UnknownNameError, nearest
 from jourdain_jax.scene.parameters import parameter_faults
@@ -137,6 +138,7 @@ class Trajectory(Record):
         return shapes_of(self) if is_traced(self) else f"Trajectories of {type(self.scene).__name__}, lanes {self.q.shape[:-2]}"
 
     @property
+    @of_known_numbers
     def message(self) -> str:
         """How the motion ended, in words."""
         code = int(self.result)
@@ -146,6 +148,7 @@ class Trajectory(Record):
         return f"{text} `{self.event_names[int(self.event)]}`" if code == results.EVENT else text
 
     @property
+    @of_known_numbers
     def warnings(self) -> tuple[str, ...]:
         """What speaks against a motion, in words, most serious first; empty where nothing does. The printed summary shows them.
 
@@ -183,8 +186,12 @@ class Trajectory(Record):
         marked = [nan_where(jnp.broadcast_to(jnp.expand_dims(~self.succeeded, tuple(range(jnp.ndim(self.result), x.ndim))), x.shape), x) for x in parts]
         return eqx.tree_at(lambda m: [x for x in (m.q, m.u, m.q_end, m.u_end, m.work) if x is not None], self, marked)
 
+    @of_known_numbers
     def raise_if_failed(self) -> "Trajectory":
-        """The trajectory itself; a SimulationError with reason and time where it did not reach its end or an event."""
+        """The trajectory itself; a SimulationError with reason and time where it did not reach its end or an event.
+
+        A DifferentiationModeError under `jit` and `vmap`, where numbers are not known; `nan_if_failed` serves there.
+        """
         if int(self.result) not in (results.SUCCESS, results.EVENT):
             raise results.SimulationError(f"`{type(self.scene).__name__}` at t = {float(self.t_end):.6g} s: {self.message}")
         return self
