@@ -59,7 +59,6 @@ def sample_states(scene: Scene, count: int, seed: int = 0) -> tuple[np.ndarray, 
         raise ValueError(f"`count` is {count!r}, expected a whole number of states, at least 1")
     if not isinstance(seed, int | np.integer) or seed < 0:
         raise ValueError(f"`seed` is {seed!r}, expected a whole number that is not negative")
-    scene = as_scene(scene)
     drawn = -(-count // 32) * 32  # always a multiple of this, so that one program serves all small samples
     t, q, u = random_states(scene, drawn, np.random.default_rng(seed))
     q, u, found = sampled_on_graph(scene, t, q, u)
